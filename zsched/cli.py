@@ -506,6 +506,45 @@ def metrics_write(
     raise typer.Exit(write_metrics(path, runtime_dir, node))
 
 
+@app.command(cls=Verb)
+def logs(
+    task: Annotated[str, typer.Argument(metavar="TASK", help="A task of the fleet file.")],
+    whose: Annotated[str | None, typer.Argument(metavar="[NODE]", help="Whose worker; without it the owner's.")] = None,
+    follow: Annotated[bool, typer.Option("--follow", "-f", help="Also what it prints from now on.")] = False,
+    lines: Annotated[int, typer.Option("--lines", min=0, max=400, metavar="N", help="The newest N.")] = 100,
+    json_: JsonOption = False,
+    node: AskedOption = None,
+    runtime_dir: RuntimeOption = None,
+) -> None:
+    """Show what a task's worker has printed lately, on whichever node it runs.
+
+    A daemon keeps the last 400 lines of each of its workers since its own start; that machine's journal has older ones.
+    """
+    from zsched.commands.logs import LogsView, show_logs  # noqa: PLC0415 - each verb imports what it needs
+
+    view = LogsView(runtime_dir=runtime_dir, node=node, is_json=json_, is_followed=follow, most=lines)
+    raise typer.Exit(show_logs(view, task, whose))
+
+
+@app.command(cls=Verb)
+def restart(
+    task: Annotated[str, typer.Argument(metavar="TASK", help="A task of the fleet file.")],
+    whose: Annotated[str | None, typer.Argument(metavar="[NODE]", help="Whose worker; without it the owner's.")] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask, also of the owner.")] = False,
+    json_: JsonOption = False,
+    node: AskedOption = None,
+    runtime_dir: RuntimeOption = None,
+) -> None:
+    """Stop a task's worker and start it again; that counts as no failure.
+
+    The task pauses if it is the owner's, so that is asked first; without a terminal it needs --yes.
+    """
+    from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.restart import restart as ask_node  # noqa: PLC0415 - as above
+
+    raise typer.Exit(ask_node(find_door(runtime_dir, node), task, whose, is_sure=yes, is_json=json_))
+
+
 # --- the fleet file --------------------------------------------------------------------------------------------------
 
 

@@ -45,13 +45,19 @@ class Daemon:
         self.result: Json = {"outcome": "ok", "detail": "committed", "revision": 2}
         self.asked: list[Json] = []
         self.delay_s = 0.0
+        self.lines: list[Json] = []
+        self.is_here = True
         self._socket = OperatorSocket(folder / f"{node}.sock", self._answer)
 
     def _answer(self, request: Json) -> Json:
         self.asked.append(request)
         time.sleep(self.delay_s)
-        if request["verb"] in ("weights", "retry"):
+        if request["verb"] in ("weights", "retry", "restart"):
             return self.result
+        if request["verb"] == "lines":
+            lines = [one for one in self.lines if one["number"] > request["after"]][:2]
+            newest = max((one["number"] for one in self.lines), default=0)
+            return {"node": request["node"], "task": "echo", "lines": lines, "newest": newest, "is_here": self.is_here}
         if "error" in self.status:
             return self.status
         return {**self.status, "node": request.get("node", self.status["node"])}
@@ -200,7 +206,10 @@ def test_every_verb_that_asks_a_daemon_takes_the_node_that_several_daemons_make_
     main = typer.main.get_command(app)
     assert isinstance(main, typer.core.TyperGroup)
     asking = [words for words, options in verbs(main) if "--runtime-dir" in options]
-    arguments = {
+    arguments = {"write": [str(folder / "x.prom")], "wait": ["--for", "quorum", "--timeout", "0"]}
+    arguments |= {
+        "logs": ["echo"],
+        "restart": ["echo", "--yes"],
         "explain": ["echo"],
         "weights": ["echo"],
         "retry": ["echo"],
@@ -208,7 +217,6 @@ def test_every_verb_that_asks_a_daemon_takes_the_node_that_several_daemons_make_
         "hz": ["in/0"],
         "tail": ["in/0"],
     }
-    arguments |= {"write": [str(folder / "x.prom")], "wait": ["--for", "quorum", "--timeout", "0"]}
     arguments |= {"ping": ["edge1"], "bugreport": [str(folder / "report.tar.gz")]}
     assert set(asking) >= {("status",), ("weights",), ("retry",), ("stream", "list"), ("stream", "tail")}
     del asking[asking.index(("up",))]  # it starts the daemon
@@ -402,6 +410,82 @@ def test_retry_of_what_there_is_not_is_a_usage_error(daemon: Daemon, words: tupl
     assert result.exit_code == 2
     assert says in result.stderr
     assert [request["verb"] for request in daemon.asked] == ["status"]
+
+
+# --- logs, restart ---------------------------------------------------------------------------------------------------
+
+
+def printed(*texts: str) -> list[Json]:
+    return [{"number": number, "age_s": 0.5, "text": text} for number, text in enumerate(texts, 1)]
+
+
+def test_logs_shows_the_owner_s_lines_page_after_page(daemon: Daemon) -> None:
+    daemon.lines = printed("one", "two", "three\x1b[2J")
+    result = run("logs", "echo")
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert [re.sub(r"^\d\d:\d\d:\d\d ", "", line) for line in result.stdout.splitlines()] == ["one", "two", "three?[2J"]
+    asked = [request for request in daemon.asked if request["verb"] == "lines"]
+    assert asked == [{"verb": "lines", "task": "echo", "after": after, "node": "edge1"} for after in (0, 2)]
+    assert run("logs", "echo", "--lines", "1").stdout.endswith(" three?[2J\n")
+    assert run("logs", "echo", "--lines", "0").stdout == ""
+    bodies = [json.loads(line) for line in run("logs", "echo", "edge2", "--json").stdout.splitlines()]
+    assert ([faults(body) for body in bodies], {body["node"] for body in bodies}) == ([[], [], []], {"edge2"})
+
+
+def test_logs_of_a_node_that_starts_no_worker_says_so(daemon: Daemon) -> None:
+    daemon.is_here = False
+    result = run("logs", "echo", "robot2")
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert "robot2 starts no worker of echo" in result.stderr
+
+
+def test_logs_of_a_task_without_an_owner_needs_a_node(daemon: Daemon) -> None:
+    daemon.status["tasks"][0]["owner"] = None
+    result = run("logs", "echo")
+    assert result.exit_code == 1
+    assert "echo has no owner; name a node, there are edge1, edge2" in result.stderr
+    assert run("logs", "ecko").exit_code == run("logs", "echo", "egde1").exit_code == 2
+
+
+def test_logs_followed_prints_what_comes_and_starts_anew_with_another_daemon(folder: Path) -> None:
+    with Daemon(folder) as daemon:
+        daemon.lines = printed("one", "two", "three")
+        command = [*CLI, "logs", "echo", "-f", "--json", "--runtime-dir", str(folder)]
+        with subprocess.Popen(command, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+            assert process.stdout is not None
+            first = [json.loads(process.stdout.readline())["text"] for _ in range(3)]
+            daemon.lines += [{"number": 4, "age_s": 0.0, "text": "four"}]
+            first.append(json.loads(process.stdout.readline())["text"])
+            daemon.lines = printed("anew")
+            first.append(json.loads(process.stdout.readline())["text"])
+            process.send_signal(signal.SIGINT)
+            _, error = process.communicate(timeout=60)
+    assert first == ["one", "two", "three", "four", "anew"]
+    assert (process.returncode, error) == (0, "")
+
+
+def test_restart_of_another_s_worker_is_not_asked_about(daemon: Daemon) -> None:
+    daemon.result = {"outcome": "ok", "detail": "its worker is started again, it was ready", "revision": None}
+    result = run("restart", "echo", "edge2")
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert result.stdout == "echo on edge2: its worker is started again, it was ready\n"
+    assert daemon.asked[-1] == {"verb": "restart", "task": "echo", "node": "edge2"}
+
+
+def test_restart_of_the_owner_s_worker_needs_a_yes(daemon: Daemon) -> None:
+    refused = run("restart", "echo")
+    assert (refused.exit_code, [asked["verb"] for asked in daemon.asked]) == (2, ["status"])
+    assert "edge1 owns echo, which pauses meanwhile; if that may be: zsched restart echo edge1 --yes" in refused.stderr
+    assert run("restart", "echo", "--yes").exit_code == 0
+    assert daemon.asked[-1] == {"verb": "restart", "task": "echo", "node": "edge1"}
+
+
+def test_restart_that_is_refused_exits_with_1(daemon: Daemon) -> None:
+    daemon.result = {"outcome": "invalid", "detail": "its worker does not run", "revision": None}
+    text, as_json = run("restart", "echo", "edge2"), run("restart", "echo", "edge2", "--json")
+    assert (text.exit_code, text.stdout, as_json.exit_code) == (1, "", 1)
+    assert "echo on edge2: its worker does not run" in text.stderr
+    assert faults(json.loads(as_json.stdout)) == []
 
 
 # --- weights ---------------------------------------------------------------------------------------------------------

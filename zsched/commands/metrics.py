@@ -12,7 +12,7 @@ import contextlib
 import os
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -49,7 +49,7 @@ def down_text() -> str:
     return _family("zsched_up", "gauge", "Whether the daemon answers.", [({}, 0.0)])
 
 
-Family = tuple[str, str, str, list[Sample]]
+Family = tuple[str, str, str, Sequence[Sample]]
 
 
 def _of_daemon(status: Json) -> Iterator[Family]:
@@ -153,7 +153,8 @@ def _value(value: float) -> str:
     >>> _value(True), _value(3), _value(0.25)
     ('1', '3', '0.25')
     """
-    return repr(float(value)) if isinstance(value, float) and not value.is_integer() else str(int(value))
+    number = float(value)
+    return str(int(number)) if number.is_integer() else repr(number)
 
 
 # --- the verbs -------------------------------------------------------------------------------------------------------

@@ -17,7 +17,9 @@ from zsched.core.values.messages import (
     Learnt,
     Prepare,
     Promise,
+    ReadLines,
     Refused,
+    RestartTask,
     RetryTask,
     SetWeights,
     Utilities,
@@ -352,6 +354,22 @@ class ExplanationAsked:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class RestartCommanded:
+    """An operator orders that this node's worker is started again."""
+
+    request: int
+    command: RestartTask
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinesAsked:
+    """An operator asks what this node's worker has printed."""
+
+    request: int
+    command: ReadLines
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FrameDropped:
     """A frame came that is invalid or not for us: only a counter rises."""
 
@@ -411,6 +429,8 @@ Event = (
     | WeightsCommanded
     | RetryCommanded
     | ExplanationAsked
+    | RestartCommanded
+    | LinesAsked
     | FrameDropped
     | AddressesTried
     | ProblemReported
@@ -424,4 +444,8 @@ def commanded(request: int, command: Command) -> Event:
         return ExplanationAsked(request=request, command=command)
     if isinstance(command, RetryTask):
         return RetryCommanded(request=request, command=command)
+    if isinstance(command, RestartTask):
+        return RestartCommanded(request=request, command=command)
+    if isinstance(command, ReadLines):
+        return LinesAsked(request=request, command=command)
     return WeightsCommanded(request=request, command=command)

@@ -158,6 +158,13 @@ class RestartWorker:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class RenewWorker:
+    """An operator wants this node's worker for the task stopped and started again; that is no failure."""
+
+    task: TaskId
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SetRole:
     """Tell this node's worker its role."""
 
@@ -193,6 +200,15 @@ class AnswerExplanation:
 
     request: int
     explanation: Explanation
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AnswerLines:
+    """Answer an operator with what this node's worker for the task has printed behind line ``after``."""
+
+    request: int
+    task: TaskId
+    after: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -238,11 +254,13 @@ Instruction = (
     | StopWorker
     | ResetWorker
     | RestartWorker
+    | RenewWorker
     | SetRole
     | ApplyRoutes
     | AnswerStatus
     | AnswerCommand
     | AnswerExplanation
+    | AnswerLines
     | StandDown
     | RecordStory
 )

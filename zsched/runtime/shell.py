@@ -37,8 +37,17 @@ from zsched.core.relay_protocol import (
 from zsched.core.report import snapshot_json
 from zsched.core.values.decision import Explanation
 from zsched.core.values.fleet import Fleet
-from zsched.core.values.messages import Command, CommandResult, ExplainTask, RetryTask, SetWeights
-from zsched.core.values.model import NAME, NodeId
+from zsched.core.values.messages import (
+    Command,
+    CommandResult,
+    ExplainTask,
+    ReadLines,
+    RestartTask,
+    RetryTask,
+    SetWeights,
+    WorkerLines,
+)
+from zsched.core.values.model import NAME, NodeId, TaskId
 from zsched.core.values.snapshot import Snapshot
 from zsched.errors import AdapterError, WireError
 from zsched.runtime.crew import Crew
@@ -143,7 +152,10 @@ class Desk:
             return self._access(node)
         if verb == "log" and self._log is not None:
             return self._log(request) if node == self._node else {"error": f"the log of {node} is told on {node} only"}
-        return {"error": f"unknown verb {verb!r:.80}; known: access, explain, log, retry, status, weights"}
+        return {
+        known = ", ".join(sorted(("access", "log", "status", *_COMMANDS)))
+        return {"error": f"unknown verb {verb!r:.80}; known: {known}"}
+        }
 
     def _ask(self, node: NodeId, command: Command | None) -> dict[str, Any]:
         if node != self._node:
@@ -190,10 +202,23 @@ def _explain_of(request: dict[str, Any]) -> ExplainTask:
     return ExplainTask(task=str(request["task"]))
 
 
+def _restart_of(request: dict[str, Any]) -> RestartTask:
+    return RestartTask(task=str(request["task"]))
+
+
+def _lines_of(request: dict[str, Any]) -> ReadLines:
+    after = request.get("after", 0)
+    if type(after) is not int:
+        raise ValueError(f"after: expected a whole number, not {after!r:.80}")
+    return ReadLines(task=str(request["task"]), after=after)
+
+
 _COMMANDS: dict[str, Callable[[dict[str, Any]], Command]] = {
     "weights": _weights_of,
     "retry": _retry_of,
     "explain": _explain_of,
+    "restart": _restart_of,
+    "lines": _lines_of,
 }
 
 
@@ -202,6 +227,10 @@ def _as_json(value: object) -> dict[str, Any]:
         return snapshot_json(value)
     if isinstance(value, Explanation):
         return {"explanation": wire.as_plain(value)}
+    if isinstance(value, WorkerLines):
+        lines = [{"number": line.number, "age_s": line.age_s, "text": line.text} for line in value.lines]
+        body = {"node": value.node, "task": value.task, "lines": lines}
+        return {**body, "newest": value.newest, "is_here": value.is_here}
     assert isinstance(value, CommandResult)
     return {"outcome": value.outcome.value, "detail": value.detail, "revision": value.revision}
 
@@ -299,6 +328,8 @@ class Shell:
                 self._answer_operator(request, result)
             case do.AnswerExplanation(request=request, explanation=explanation):
                 self._answer_operator(request, explanation)
+            case do.AnswerLines(request=request, task=task, after=after):
+                self._answer_operator(request, self._lines(task, after))
             case do.ApplyRoutes(plan=plan):
                 self._streams().apply(plan)
             case do.SetRole(role=role):
@@ -309,6 +340,8 @@ class Shell:
                 self._workers().stop(task)
             case do.ResetWorker(task=task):
                 self._workers().reset(task)
+            case do.RenewWorker(task=task):
+                self._workers().renew(task)
             case do.RestartWorker(task=task, reason=reason):
                 self._workers().report_hung(task, self.crew.life_of(task), reason)
             case do.StandDown(reason=reason):
@@ -321,6 +354,13 @@ class Shell:
     def _workers(self) -> WorkerSupervisor:
         assert self.crew.supervisor is not None
         return self.crew.supervisor
+
+    def _lines(self, task: TaskId, after: int) -> WorkerLines:
+        kept = self._workers().output(task)
+        if kept is None:
+            return WorkerLines(node=self._node, task=task, is_here=False)
+        lines, newest = kept.behind(after)
+        return WorkerLines(node=self._node, task=task, lines=lines, newest=newest)
 
     def _streams(self) -> RelayHandle:
         assert self.relay is not None

@@ -19,6 +19,7 @@ from support.proposals import proposal_of
 from support.states import state_of
 from support.waiting import until
 from zsched.adapters.host.state_file import StateFile
+from zsched.adapters.workers.kept_lines import KeptLines
 from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
 from zsched.core import events as ev
 from zsched.core import instructions as do
@@ -33,6 +34,7 @@ from zsched.core.values.messages import (
     CommandResult,
     Learnt,
     Prepare,
+    ReadLines,
     SetWeights,
     Utilities,
 )
@@ -125,6 +127,7 @@ EVERY: dict[do.Instruction, tuple[Any, ...]] = {
     do.StartWorker(task="merge"): ("start", "merge"),
     do.StopWorker(task="merge"): ("stop", "merge"),
     do.RestartWorker(task="merge", reason="no output"): ("report_hung", "merge", 0, "no output"),
+    do.RenewWorker(task="merge"): ("renew", "merge"),
     do.SetRole(role=ROLE): ("set_role", ROLE),
     do.ApplyRoutes(plan=PLAN): ("apply", PLAN),
 }
@@ -323,8 +326,11 @@ def test_relays_other_reports_are_events_as_they_are(house: House) -> None:
 def test_desk_refuses_what_is_no_request(house: House) -> None:
     weights = {"verb": "weights", "task": "merge", "cpu": 1, "memory": 0, "network": 0}
     for request, says in (
-        ({"verb": "fly"}, "unknown verb 'fly'; known: access, explain, log, retry, status, weights"),
+        ({"verb": "fly"}, "unknown verb 'fly'; known: access, explain, lines, log, restart, retry, status, weights"),
         ({"verb": "retry"}, "retry: 'task' is missing"),
+        ({"verb": "restart"}, "restart: 'task' is missing"),
+        ({"verb": "lines", "task": "merge", "after": "1"}, "lines: after: expected a whole number, not '1'"),
+        ({"verb": "lines", "task": "merge", "after": -1}, "lines: lines.after"),
         ({"verb": "retry", "task": "merge", "whose": "No Name"}, "retry: retry.node: 'No Name' is not a name"),
         ({"verb": "status", "node": 5}, "node: 5 is not a name"),
         ({"verb": "status", "node": "*"}, "node: '*' is not a name"),
@@ -342,6 +348,28 @@ def test_desk_refuses_what_is_no_request(house: House) -> None:
         assert answer["error"].startswith(says), answer
     assert house.events() == []
     assert house.calls == []
+
+
+def test_lines_are_asked_of_the_supervisor_and_answered_as_json(house: House) -> None:
+    kept = KeptLines()
+    kept.add("one")
+    kept.add("two")
+    house.adapter.output = lambda task: kept if task == "merge" else None
+    answers: list[dict[str, Any]] = []
+    for task in ("merge", "other"):
+        request = {"verb": "lines", "task": task, "after": 1}
+        asking = threading.Thread(target=lambda asked: answers.append(house.desk.answer(asked)), args=(request,))
+        asking.start()
+        event = house.inbox.take(60.0)
+        assert isinstance(event, ev.LinesAsked)
+        assert event.command == ReadLines(task=task, after=1)
+        house.shell.carry_out((do.AnswerLines(request=event.request, task=task, after=event.command.after),))
+        asking.join(60.0)
+    found, none = answers
+    assert [(line["number"], line["text"]) for line in found["lines"]] == [(2, "two")]
+    assert found["lines"][0]["age_s"] >= 0.0
+    assert (found["node"], found["task"], found["newest"], found["is_here"]) == ("robot1", "merge", 2, True)
+    assert (none["lines"], none["newest"], none["is_here"]) == ([], 0, False)
 
 
 def test_desk_answers_several_at_once_each_with_its_own(house: House) -> None:

@@ -30,8 +30,10 @@ from zsched.core.values.messages import (
     Learnt,
     Prepare,
     Promise,
+    ReadLines,
     Refusal,
     Refused,
+    RestartTask,
     RetryTask,
     Utilities,
 )
@@ -138,7 +140,7 @@ def digest(thing: Any, seen: frozenset[int] = frozenset()) -> Any:
         return [digest(item, seen) for item in thing]
     names = [field.name for field in fields(thing)] if is_dataclass(thing) else list(getattr(thing, "__dict__", ()))
     names += [name for name in getattr(type(thing), "__slots__", ()) if hasattr(thing, name)]
-    skipped = {"counters", "knocking", "_handlers", "fleet", "_fleet"}
+    skipped = {"counters", "frames_dropped_at", "knocking", "_handlers", "fleet", "_fleet"}
     return {name: digest(getattr(thing, name), seen) for name in names if name not in skipped}
 
 
@@ -691,6 +693,48 @@ def test_a_retry_resets_the_worker_that_is_meant_and_forgives_its_node() -> None
     ):
         batch = node.handle(ev.RetryCommanded(request=9, command=RetryTask(task="merge", node=whose)), 100.0)
         assert of(batch, do.AnswerCommand)[0].result.detail == said
+
+
+def test_a_restart_is_for_a_worker_that_runs_here_and_is_no_failure() -> None:
+    edge = make("edge1")
+    for state in (WorkerState.STARTING, WorkerState.READY):
+        edge.handle(ev.WorkerChanged(task="merge", state=state), 100.0)
+        batch = edge.handle(ev.RestartCommanded(request=7, command=RestartTask(task="merge")), 100.0)
+        assert of(batch, do.RenewWorker) == [do.RenewWorker(task="merge")]
+        result = of(batch, do.AnswerCommand)[0].result
+        assert (result.outcome, result.detail) == (
+            CommandOutcome.OK,
+            f"its worker is started again, it was {state}",
+        )
+
+
+@pytest.mark.parametrize(
+    ("name", "task", "state", "said"),
+    [
+        ("edge1", "other", None, "no task 'other'"),
+        ("robot1", "merge", None, "robot1 has no worker of merge"),
+        ("edge1", "merge", WorkerState.STOPPED, "its worker does not run"),
+        (
+            "edge1",
+            "merge",
+            WorkerState.FAILED,
+            "its worker has failed for good: mend it, then `zsched retry merge edge1`",
+        ),
+    ],
+)
+def test_a_restart_of_what_does_not_run_is_refused(name: str, task: str, state: WorkerState | None, said: str) -> None:
+    node = make(name)
+    if state is not None:
+        node.handle(ev.WorkerChanged(task="merge", state=state), 100.0)
+    batch = node.handle(ev.RestartCommanded(request=7, command=RestartTask(task=task)), 100.0)
+    assert of(batch, do.RenewWorker) == []
+    result = of(batch, do.AnswerCommand)[0].result
+    assert (result.outcome, result.detail) == (CommandOutcome.INVALID, said)
+
+
+def test_a_question_for_lines_is_handed_on() -> None:
+    batch = make("edge1").handle(ev.LinesAsked(request=7, command=ReadLines(task="merge", after=3)), 100.0)
+    assert of(batch, do.AnswerLines) == [do.AnswerLines(request=7, task="merge", after=3)]
 
 
 @pytest.mark.parametrize(

@@ -29,8 +29,10 @@ from zsched.core.values.messages import (
     Learnt,
     Prepare,
     Promise,
+    ReadLines,
     Refusal,
     Refused,
+    RestartTask,
     RetryTask,
     SetWeights,
     Utilities,
@@ -313,6 +315,10 @@ class Storm:
         if self.rng.random() < 0.2:
             whose = self.rng.choice(("", self.name()))
             return ev.RetryCommanded(request=self.number(), command=RetryTask(task=self.task(), node=whose))
+        if self.rng.random() < 0.1:
+            return ev.RestartCommanded(request=self.number(), command=RestartTask(task=self.task()))
+        if self.rng.random() < 0.1:
+            return ev.LinesAsked(request=self.number(), command=ReadLines(task=self.task()))
         base = self.rng.choice((None, self.number()))
         cpu = self.rng.choice((0.25, 0.75, 2.0))
         command = SetWeights(task=self.task(), cpu=cpu, memory=1.0 - cpu, network=0.0, base_revision=base)

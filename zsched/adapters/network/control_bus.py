@@ -29,10 +29,13 @@ from zsched.core.values.messages import (
     Learnt,
     Prepare,
     Promise,
+    ReadLines,
     Refused,
+    RestartTask,
     RetryTask,
     SetWeights,
     Utilities,
+    WorkerLines,
 )
 from zsched.core.values.model import NAME, Beat, NodeId, Profile, Proposal
 from zsched.core.values.snapshot import Snapshot
@@ -48,6 +51,7 @@ CLOSE_S = 0.5
 RING = 1024
 """Periodic frames that wait for the loop; if it does not come, the oldest go, and zenoh need not wait."""
 
+Answer = Snapshot | CommandResult | Explanation | WorkerLines
 Post = Callable[[ev.Event], None]
 log = logging.getLogger("zsched.bus")
 
@@ -69,6 +73,13 @@ def _event_of(value: Beat | Profile | Proposal | Learnt) -> tuple[NodeId, ev.Eve
     if isinstance(value, Proposal):
         return value.voter, ev.ProposalReceived(proposal=value)
     return value.node, ev.LearntReceived(learnt=value)
+
+
+def answer_classes(command: Command | None) -> tuple[type[Answer], ...]:
+    """What a node may answer to an operator's command, or (``None``) to the question for its status."""
+    if command is None:
+        return (Snapshot,)
+    return (WorkerLines,) if isinstance(command, ReadLines) else (CommandResult, Explanation)
 
 
 class ControlBus:
@@ -252,7 +263,7 @@ class ControlBus:
         if kind == "status":
             return ev.StatusAsked(request=self._questions.keep(query, keys.status(node, asker)))
         if kind == "command":
-            command: Any = wire.decode(payload, SetWeights, RetryTask, ExplainTask)
+            command: Any = wire.decode(payload, SetWeights, RetryTask, ExplainTask, RestartTask, ReadLines)
             return commanded(self._questions.keep(query, keys.command(node, asker)), command)
         raise WireError("key", "unknown kind")
 
@@ -365,7 +376,7 @@ class ControlBus:
 
     # --- for operators (a thread of their own) -----------------------------------------------------------------------
 
-    def ask_node(self, node: NodeId, command: Command | None) -> Snapshot | CommandResult | Explanation:
+    def ask_node(self, node: NodeId, command: Command | None) -> Answer:
         """Ask another node for its status or an answer, or give it a command; blocks up to 3 s, never in the loop.
 
         Raises:
@@ -377,7 +388,7 @@ class ControlBus:
             selector, payload = self._keys.status(node, self._node), None
         else:
             selector, payload = self._keys.command(node, self._node), wire.encode(command)
-        kinds: tuple[type[Any], ...] = (Snapshot,) if command is None else (CommandResult, Explanation)
+        kinds = answer_classes(command)
         for reply in self._session.get(
             selector,
             payload=payload,

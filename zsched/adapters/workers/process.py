@@ -23,6 +23,7 @@ from functools import partial
 from pathlib import Path
 
 from zsched import log_limit
+from zsched.adapters.workers.kept_lines import KeptLines
 from zsched.clock import awake_s
 
 LAUNCHER = str(Path(__file__).with_name("launch.py"))
@@ -49,8 +50,9 @@ GUARD_SCRIPT = (
 class LineLog:
     """Passes a worker's output on as log lines: long ones cut, too many counted instead of written."""
 
-    def __init__(self, logger: logging.Logger) -> None:
-        self._logger = logger
+    def __init__(self, logger: logging.Logger, kept: KeptLines | None = None) -> None:
+        """``kept``: where the newest lines stay for operators."""
+        self._logger, self._kept = logger, kept
         self._partial = b""
         self._tokens = LINES_BURST
         self._refilled_s: float | None = None
@@ -84,7 +86,13 @@ class LineLog:
         self._tokens -= 1.0
         self._remember(line[:MAX_LINE_BYTES])
         cut = " ..." if len(line) > MAX_LINE_BYTES else ""
-        self._logger.info("%s%s", _printable(line[:MAX_LINE_BYTES]).rstrip(), cut, extra=log_limit.PASSED)
+        text = f"{_printable(line[:MAX_LINE_BYTES]).rstrip()}{cut}"
+        self._logger.info("%s", text, extra=log_limit.PASSED)
+        self._keep(text)
+
+    def _keep(self, text: str) -> None:
+        if self._kept is not None:
+            self._kept.add(text)
 
     def _remember(self, line: bytes) -> None:
         text = _printable(line).strip()
@@ -106,13 +114,20 @@ class LineLog:
     def _report_suppressed(self) -> None:
         if self._suppressed:
             self._logger.warning("suppressed lines=%d limit_per_s=%g", self._suppressed, LINES_PER_S)
+            self._keep(f"... {self._suppressed} lines left out: more than {LINES_PER_S:g} a second")
             self._suppressed = 0
 
 
 class WorkerProcess:
     """A running worker. Made, read and ended by one thread: the kernel ties the process to the thread that made it."""
 
-    def __init__(self, command: Sequence[str], environment: Mapping[str, str], logger: logging.Logger) -> None:
+    def __init__(
+        self,
+        command: Sequence[str],
+        environment: Mapping[str, str],
+        logger: logging.Logger,
+        kept: KeptLines | None = None,
+    ) -> None:
         """Start ``command`` (its first word ``python`` means this interpreter). Raises `OSError`."""
         self._process = subprocess.Popen(
             [sys.executable, "-I", "-S", LAUNCHER, str(os.getpid()), *_own_python(command)],
@@ -127,7 +142,7 @@ class WorkerProcess:
         self.output_fd = self._process.stdout.fileno()
         os.set_blocking(self.output_fd, False)
         self.pid_fd = _open_pid_fd(self.pid)
-        self._lines = LineLog(logger)
+        self._lines = LineLog(logger, kept)
         self._window_start_s = 0.0
         self._window_bytes = 0
 

@@ -9,8 +9,9 @@
 | stopping (SIGINT, SIGTERM, SIGKILL, each after a grace) | exit | idle; after a failure backoff, failed |
 | failed | `reset` | idle |
 
-A failure is any end of a worker that is wanted. `max_failures` of them within `failure_window_s`, or one exit with
-status 78 ("I cannot run here"), make it failed. The restart delay doubles per failure in the window, with jitter.
+A failure is any end of a worker that is wanted, but for one that `renew` asked for. `max_failures` of them within
+`failure_window_s`, or one exit with status 78 ("I cannot run here"), make it failed. The restart delay doubles per
+failure in the window, with jitter.
 
 Knows: phases, deadlines, the order of signals. Does not know: why a task starts or stops, zenoh, readiness itself
 (it is told), or how a process is made (`zsched.adapters.workers.process`).
@@ -30,6 +31,7 @@ from enum import StrEnum
 from functools import partial
 from typing import Protocol
 
+from zsched.adapters.workers.kept_lines import KeptLines
 from zsched.adapters.workers.launch import EXIT_CANNOT
 from zsched.adapters.workers.process import ProcessWatch, WorkerGuard, WorkerProcess
 from zsched.clock import awake_s
@@ -107,6 +109,7 @@ class _Worker:
     task: TaskId
     spec: WorkerSpec
     logger: logging.Logger
+    kept: KeptLines = field(default_factory=KeptLines)
     phase: _Phase = _Phase.IDLE
     is_wanted: bool = False
     process: WorkerProcess | None = None
@@ -195,6 +198,15 @@ class WorkerSupervisor:
     def reset(self, task: TaskId) -> None:
         """Forget the failures of ``task``; a wanted worker is started again."""
         self._command(self._on_reset, task)
+
+    def renew(self, task: TaskId) -> None:
+        """Stop ``task``'s worker as `stop` does, and start it again; that counts as no failure."""
+        self._command(self._on_renew, task)
+
+    def output(self, task: TaskId) -> KeptLines | None:
+        """What ``task``'s worker has printed lately; ``None`` where this supervisor starts none."""
+        worker = self._workers.get(task)
+        return worker.kept if worker is not None and worker.spec.command else None
 
     def pids(self) -> Mapping[TaskId, int]:
         """The process of every worker that has one."""
@@ -288,6 +300,11 @@ class WorkerSupervisor:
         if is_running and incarnation == worker.incarnation:
             self._begin_stop(worker, worker.spec.stop_grace_s, failure=reason, first_step=STOP_SIGNALS.index(KILL))
 
+    def _on_renew(self, task: TaskId) -> None:
+        worker = self._workers[task]
+        if worker.phase in {_Phase.STARTING, _Phase.READY} and worker.process is not None:
+            self._begin_stop(worker, worker.spec.stop_grace_s)  # whose end leads to a start, for it is still wanted
+
     def _on_reset(self, task: TaskId) -> None:
         worker = self._workers[task]
         worker.failures.clear()
@@ -329,7 +346,7 @@ class WorkerSupervisor:
         self._started += 1
         worker.incarnation = self._context.incarnation * INCARNATIONS_PER_DAEMON + self._started
         try:
-            process = WorkerProcess(worker.spec.command, self._environment_of(worker), worker.logger)
+            process = WorkerProcess(worker.spec.command, self._environment_of(worker), worker.logger, worker.kept)
         except Exception as error:  # noqa: BLE001 - whatever stops a start is that worker's failure, never the daemon's
             reason = f"cannot start: {error}"
             self._after_failure(worker, reason, now, is_last=self._count_failure(worker, reason, None, now))

@@ -1,4 +1,4 @@
-"""Operators at the door: status, explanations, a task's weights, failures to forget, and the order to stop.
+"""Operators at the door: status, explanations, weights, failures to forget, workers to restart, and the order to stop.
 
 Knows: which stage each command concerns. Does not know: how the status is put together (`zsched.core.status`), how a
 change is agreed.
@@ -16,7 +16,7 @@ from zsched.core.status import build_explanation, build_snapshot
 from zsched.core.todo import ToDo
 from zsched.core.values.fleet import runs_worker
 from zsched.core.values.messages import CommandOutcome, CommandResult
-from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.model import NodeId, TaskId, WorkerState
 
 
 def _on_status(node: Stages, event: ev.StatusAsked, todo: ToDo, now: float) -> None:
@@ -65,6 +65,34 @@ def _on_explanation(node: Stages, event: ev.ExplanationAsked, todo: ToDo, now: f
         todo.add(do.AnswerExplanation(request=event.request, explanation=build_explanation(node, task, now)))
 
 
+def _on_restart(node: Stages, event: ev.RestartCommanded, todo: ToDo, _now: float) -> None:
+    """Stop and start our own worker, where one of ours runs."""
+    task = event.command.task
+    state = node.worker_states.get(task)
+    refusal = _why_no_restart(node, task, state)
+    outcome, detail = CommandOutcome.INVALID, refusal
+    if not refusal:
+        todo.add(do.RenewWorker(task=task))
+        outcome, detail = CommandOutcome.OK, f"its worker is started again, it was {state}"
+    todo.add(do.AnswerCommand(request=event.request, result=CommandResult(outcome=outcome, detail=detail)))
+
+
+def _why_no_restart(node: Stages, task: TaskId, state: WorkerState | None) -> str:
+    if task not in node.executors:
+        return f"no task {task!r}"
+    if state is None:
+        return f"{node.me} has no worker of {task}"
+    if not node.fleet.task(task).worker.command:
+        return "somebody else starts it (the task has no `command`): start it again there"
+    if state is WorkerState.FAILED:
+        return f"its worker has failed for good: mend it, then `zsched retry {task} {node.me}`"
+    return "its worker does not run" if state is WorkerState.STOPPED else ""
+
+
+def _on_lines(_node: Stages, event: ev.LinesAsked, todo: ToDo, _now: float) -> None:
+    todo.add(do.AnswerLines(request=event.request, task=event.command.task, after=event.command.after))
+
+
 def _on_dropped(node: Stages, event: ev.FrameDropped, _todo: ToDo, now: float) -> None:
     node.counters[f"dropped_{event.kind}_{event.reason}"] += 1
     node.frames_dropped_at = now
@@ -85,6 +113,8 @@ HANDLERS: Final[Mapping[type[Any], Handler]] = {
     ev.WeightsCommanded: _on_weights,
     ev.RetryCommanded: _on_retry,
     ev.ExplanationAsked: _on_explanation,
+    ev.RestartCommanded: _on_restart,
+    ev.LinesAsked: _on_lines,
     ev.FrameDropped: _on_dropped,
     ev.ProblemReported: _on_problem,
     ev.StopRequested: _on_stop,

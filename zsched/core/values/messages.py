@@ -207,7 +207,56 @@ class ExplainTask:
         check_name("explain.task", self.task)
 
 
-Command = SetWeights | RetryTask | ExplainTask
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RestartTask:
+    """Operator command to one node: stop its worker for the task, and start it again."""
+
+    task: TaskId
+
+    def __post_init__(self) -> None:
+        check_name("restart.task", self.task)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReadLines:
+    """Operator's question to one node: what its worker for the task has printed behind line ``after``."""
+
+    task: TaskId
+    after: int = 0
+
+    def __post_init__(self) -> None:
+        check_name("lines.task", self.task)
+        check_counter("lines.after", self.after)
+
+
+Command = SetWeights | RetryTask | ExplainTask | RestartTask | ReadLines
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorkerLine:
+    """One line that a worker has printed."""
+
+    number: int
+    """Counted since the daemon started, from 1; one that is left out was not kept."""
+    age_s: float
+    text: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorkerLines:
+    """The answer to `ReadLines`: the oldest lines behind the one that was named, as many as fit."""
+
+    node: NodeId
+    task: TaskId
+    lines: tuple[WorkerLine, ...] = ()
+    newest: int = 0
+    """The number of the newest line that is kept: more can be had while ``lines`` end before it."""
+    is_here: bool = True
+    """Whether this node starts a worker of the task; if it does not, there is no output to keep."""
+
+    def __post_init__(self) -> None:
+        check_name("worker_lines.node", self.node)
+        check_name("worker_lines.task", self.task)
 
 
 class CommandOutcome(StrEnum):

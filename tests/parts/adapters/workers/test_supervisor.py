@@ -150,6 +150,43 @@ def test_stop_uses_sigint_first_and_start_runs_it_again() -> None:
         assert not [call for call in recorder.calls if call[0] == "failed"]
 
 
+def test_renew_stops_a_worker_as_stop_does_and_starts_it_again_without_a_failure() -> None:
+    with supervised(python(f"print('here', flush=True); {SLEEP}", stop_grace_s=10.0, max_failures=1)) as (
+        supervisor,
+        recorder,
+    ):
+        supervisor.renew("merge")  # nothing runs: nothing to do
+        supervisor.start("merge")
+        recorder.wait("started")
+        supervisor.mark_ready("merge", 700001)
+        kept = supervisor.output("merge")
+        assert kept is not None
+        wait_until(lambda: kept.behind(0)[1] >= 1)
+        supervisor.renew("merge")
+        assert recorder.wait("exited")[-1] == "stopped by SIGINT"
+        assert recorder.wait("started", 2)[-1] == 700002
+        wait_until(lambda: [line.text for line in kept.behind(0)[0]].count("here") == 2)
+        assert not [call for call in recorder.calls if call[0] == "failed"]
+
+
+def test_renew_starts_no_worker_that_is_not_wanted() -> None:
+    with supervised(python(SLEEP, stop_grace_s=10.0)) as (supervisor, recorder):
+        supervisor.start("merge")
+        recorder.wait("started")
+        supervisor.mark_ready("merge", 700001)
+        supervisor.renew("merge")
+        supervisor.stop("merge")
+        recorder.wait("exited")
+        wait_until(lambda: supervisor.states()["merge"] is WorkerState.STOPPED)
+        assert [call[0] for call in recorder.calls].count("started") == 1
+
+
+def test_output_is_kept_of_workers_that_are_started_here() -> None:
+    with supervised(WorkerSpec(command=())) as (supervisor, _):
+        assert supervisor.output("merge") is None
+        assert supervisor.output("other") is None
+
+
 def test_a_worker_that_is_starting_is_stopped_without_a_traceback(caplog: pytest.LogCaptureFixture) -> None:
     """It has no handlers yet: Python would answer SIGINT with a KeyboardInterrupt in the middle of an import."""
     caplog.set_level("INFO")

@@ -13,7 +13,7 @@ from support.beats import beat_of
 from support.fleets import tuning_of
 from support.profiles import load_of, profile_of
 from support.proposals import proposal_of
-from zsched.core.events import RetryCommanded, WeightsCommanded, WorkerJobs, commanded
+from zsched.core.events import LinesAsked, RestartCommanded, RetryCommanded, WeightsCommanded, WorkerJobs, commanded
 from zsched.core.relay_protocol import EndMarker, SnapshotChunk, StreamAck, WorkerTrouble
 from zsched.core.values import model
 from zsched.core.values.fleet import Demand
@@ -22,10 +22,13 @@ from zsched.core.values.messages import (
     Learnt,
     Prepare,
     Promise,
+    ReadLines,
     Refusal,
     Refused,
+    RestartTask,
     RetryTask,
     SetWeights,
+    WorkerLines,
 )
 from zsched.core.values.model import (
     MAX_COUNTER,
@@ -126,6 +129,10 @@ NAMES = [
     (ECHO, "node", "echo"),
     (RetryTask(task="merge"), "task", "retry"),
     (RetryTask(task="merge"), "node", "retry"),
+    (RestartTask(task="merge"), "task", "restart"),
+    (ReadLines(task="merge"), "task", "lines"),
+    (WorkerLines(node="edge1", task="merge"), "node", "worker_lines"),
+    (WorkerLines(node="edge1", task="merge"), "task", "worker_lines"),
 ]
 RATIO = (0.0, 1.0)
 RANGES = [
@@ -212,3 +219,5 @@ def test_each_command_is_its_own_event() -> None:
     weights = SetWeights(task="merge", cpu=1.0, memory=0.0, network=0.0)
     assert commanded(7, weights) == WeightsCommanded(request=7, command=weights)
     assert commanded(8, RetryTask(task="merge")) == RetryCommanded(request=8, command=RetryTask(task="merge"))
+    assert commanded(9, RestartTask(task="merge")) == RestartCommanded(request=9, command=RestartTask(task="merge"))
+    assert commanded(9, ReadLines(task="merge")) == LinesAsked(request=9, command=ReadLines(task="merge"))

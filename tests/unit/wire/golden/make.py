@@ -183,6 +183,14 @@ SAMPLES: dict[str, object] = {
             base_revision=6, votes=(("robot1", "edge1"),), outcome="won", winner="edge1", age_s=1.5
         ),
     ),
+    "restart_task": messages.RestartTask(task="map_merge"),
+    "read_lines": messages.ReadLines(task="map_merge", after=12),
+    "worker_lines": messages.WorkerLines(
+        node="edge1",
+        task="map_merge",
+        lines=(messages.WorkerLine(number=13, age_s=1.5, text="merged 3 maps"),),
+        newest=14,
+    ),
     "command_result": messages.CommandResult(
         outcome=messages.CommandOutcome.CONFLICT, detail="the value had changed", revision=8
     ),

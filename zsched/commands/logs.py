@@ -1,0 +1,107 @@
+"""`zsched logs`: what a task's worker has printed lately, wherever it runs, and what it prints now.
+
+Knows: which node is meant, how lines are followed. Does not know: how they are kept.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from zsched.clock import wall_ns
+from zsched.commands.ask import Door, ask_door, find_door
+from zsched.commands.common import CliError, Json, nearest, print_json
+from zsched.commands.page import clock_time, harmless
+from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE
+
+SCHEMA: Final = "zsched.logs/1"
+PAUSE_S: Final = 0.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LogsView:
+    """Whom to ask and how to show it."""
+
+    runtime_dir: Path | None
+    node: str | None
+    is_json: bool
+    is_followed: bool
+    most: int
+
+
+def show_logs(view: LogsView, task: str, whose: str | None) -> int:
+    """Print the newest lines, and with ``is_followed`` those that come, until Ctrl-C; returns the exit code.
+
+    Raises:
+        CliError: nobody answers, there is no such task or node, or no worker's output there.
+    """
+    door = find_door(view.runtime_dir, view.node)
+    node = worker_node(ask_door(door, {"verb": "status"}), task, whose)
+    asked = Door(socket=door.socket, node=node)
+    lines, after = _all_lines(asked, task, 0)
+    _print(view, node, task, lines[len(lines) - min(view.most, len(lines)) :])
+    try:
+        while view.is_followed:
+            time.sleep(PAUSE_S)
+            try:
+                lines, after = _all_lines(asked, task, after)
+            except CliError as error:
+                sys.stderr.write(f"zsched logs: {harmless(str(error))}; asking again until Ctrl-C\n")
+                continue
+            _print(view, node, task, lines)
+    except KeyboardInterrupt:
+        pass
+    return EXIT_OK
+
+
+def worker_node(status: Json, task: str, whose: str | None) -> str:
+    """The node whose worker is meant: the one that is named, else the owner.
+
+    Raises:
+        CliError: there is no such task or node, or nobody owns the task and no node is named.
+    """
+    tasks = {str(known["name"]): known for known in status["tasks"]}
+    nodes = [str(known["name"]) for known in status["nodes"]]
+    if task not in tasks:
+        raise CliError(EXIT_USAGE, f"fleet {status['fleet']} has no task {task!r}{nearest(task, list(tasks))}")
+    if whose is not None and whose not in nodes:
+        raise CliError(EXIT_USAGE, f"fleet {status['fleet']} has no node {whose!r}{nearest(whose, nodes)}")
+    node = whose or tasks[task]["owner"]
+    if node is None:
+        able = ", ".join(tasks[task]["candidates"])
+        raise CliError(EXIT_FAILED, f"{task} has no owner; name a node, there are {able}")
+    return str(node)
+
+
+def _all_lines(door: Door, task: str, after: int) -> tuple[list[Json], int]:
+    """Every line behind number ``after``, and the number of the newest."""
+    found: list[Json] = []
+    while True:
+        answer = ask_door(door, {"verb": "lines", "task": task, "after": after})
+        if not answer["is_here"]:
+            raise CliError(
+                EXIT_FAILED,
+                f"{answer['node']} starts no worker of {task}: it is no candidate, or the task has no `command`; "
+                "who starts it has its output",
+            )
+        newest: int = answer["newest"]
+        if newest < after:  # another daemon, which counts from 1
+            found, after = [], 0
+            continue
+        found += answer["lines"]
+        after = found[-1]["number"] if answer["lines"] else newest
+        if after >= newest:
+            return found, after
+
+
+def _print(view: LogsView, node: str, task: str, lines: list[Json]) -> None:
+    now = wall_ns() / 1e9
+    for line in lines:
+        if view.is_json:
+            print_json({"schema": SCHEMA, "node": node, "task": task, **line}, is_line=True)
+        else:
+            sys.stdout.write(harmless(f"{clock_time(now - line['age_s'], now)} {line['text']}") + "\n")
+    sys.stdout.flush()
