@@ -108,6 +108,10 @@ AskedOption = Annotated[
 HereOption = Annotated[
     str | None, typer.Option("--node", "-n", metavar="NAME", help="Which daemon on this machine, if there are several.")
 ]
+ConnectOption = Annotated[
+    str | None,
+    typer.Option("--connect", metavar="ENDPOINT", help="No daemon here: ask at this node's control endpoint."),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="JSON, with its schema; --json=1: of that version.")]
 
 
@@ -254,6 +258,7 @@ def status(
     interval: Annotated[float, typer.Option(min=0.1, max=3600.0, metavar="S", help="Seconds between two.")] = 1.0,
     node: AskedOption = None,
     runtime_dir: RuntimeOption = None,
+    connect: ConnectOption = None,
     no_color: Annotated[bool, typer.Option("--no-color", help="Plain text (also: NO_COLOR).")] = False,
 ) -> None:
     """Show nodes, tasks, owners and what is wrong; with -v also decisions, votes and streams.
@@ -262,7 +267,9 @@ def status(
     """
     from zsched.commands.status import StatusView, show, watch_on  # noqa: PLC0415 - each verb imports what it needs
 
-    view = StatusView(runtime_dir=runtime_dir, node=node, is_json=json_, is_plain=no_color, is_whole=verbose)
+    view = StatusView(
+        runtime_dir=runtime_dir, node=node, is_json=json_, is_plain=no_color, is_whole=verbose, connect=connect
+    )
     raise typer.Exit(watch_on(view, interval) if watch else show(view))
 
 
@@ -351,6 +358,7 @@ def weights(
     json_: JsonOption = False,
     node: AskedOption = None,
     runtime_dir: RuntimeOption = None,
+    connect: ConnectOption = None,
 ) -> None:
     """Show a task's weights, or change them on the whole running fleet.
 
@@ -362,8 +370,10 @@ def weights(
     if not pairs:
         if revision is not None:
             raise CliError(EXIT_USAGE, "--revision goes with new weights, e.g. cpu=0.6 memory=0.4")
-        show_weights(find_door(runtime_dir, node), task, is_json=json_)
+        show_weights(find_door(runtime_dir, node, connect=connect), task, is_json=json_)
         return
+    if connect is not None:
+        raise CliError(EXIT_USAGE, "--connect only asks: change weights on a machine of the fleet")
     wanted = parse_weights(pairs)
     raise typer.Exit(change_weights(find_door(runtime_dir, node), task, wanted, revision, is_json=json_))
 
@@ -472,6 +482,7 @@ def wait(
     json_: JsonOption = False,
     node: AskedOption = None,
     runtime_dir: RuntimeOption = None,
+    connect: ConnectOption = None,
 ) -> None:
     """Wait until a condition holds; say what is missing if it does not in time.
 
@@ -479,16 +490,16 @@ def wait(
     """
     from zsched.commands.wait import WaitView, wait_for  # noqa: PLC0415 - each verb imports what it needs
 
-    view = WaitView(runtime_dir=runtime_dir, node=node, timeout_s=timeout, is_json=json_)
+    view = WaitView(runtime_dir=runtime_dir, node=node, connect=connect, timeout_s=timeout, is_json=json_)
     raise typer.Exit(wait_for(view, condition))
 
 
 @metrics_app.command("print", cls=Verb)
-def metrics_print(node: AskedOption = None, runtime_dir: RuntimeOption = None) -> None:
+def metrics_print(node: AskedOption = None, runtime_dir: RuntimeOption = None, connect: ConnectOption = None) -> None:
     """Print a node's figures in Prometheus' text format."""
     from zsched.commands.metrics import print_metrics  # noqa: PLC0415 - each verb imports what it needs
 
-    raise typer.Exit(print_metrics(runtime_dir, node))
+    raise typer.Exit(print_metrics(runtime_dir, node, connect))
 
 
 @metrics_app.command("write", cls=Verb)
@@ -496,6 +507,7 @@ def metrics_write(
     path: Annotated[Path, typer.Argument(metavar="PATH", help="As /var/lib/node_exporter/zsched.prom.")],
     node: AskedOption = None,
     runtime_dir: RuntimeOption = None,
+    connect: ConnectOption = None,
 ) -> None:
     """Write them to a file, whole or not at all, for node_exporter's textfile collector.
 
@@ -503,7 +515,7 @@ def metrics_write(
     """
     from zsched.commands.metrics import write_metrics  # noqa: PLC0415 - each verb imports what it needs
 
-    raise typer.Exit(write_metrics(path, runtime_dir, node))
+    raise typer.Exit(write_metrics(path, runtime_dir, node, connect))
 
 
 @app.command(cls=Verb)
@@ -515,6 +527,7 @@ def logs(
     json_: JsonOption = False,
     node: AskedOption = None,
     runtime_dir: RuntimeOption = None,
+    connect: ConnectOption = None,
 ) -> None:
     """Show what a task's worker has printed lately, on whichever node it runs.
 
@@ -522,7 +535,7 @@ def logs(
     """
     from zsched.commands.logs import LogsView, show_logs  # noqa: PLC0415 - each verb imports what it needs
 
-    view = LogsView(runtime_dir=runtime_dir, node=node, is_json=json_, is_followed=follow, most=lines)
+    view = LogsView(runtime_dir=runtime_dir, node=node, connect=connect, is_json=json_, is_followed=follow, most=lines)
     raise typer.Exit(show_logs(view, task, whose))
 
 

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -228,6 +228,50 @@ def test_up_with_faults_in_the_fleet_file_ends_with_78_and_names_them(tmp_path: 
 # --- more than one node ----------------------------------------------------------------------------------------------
 
 
+def look_from_a_machine_without_a_daemon(folder: Path, here: Site, there: Site) -> None:
+    """Through one node's endpoint every node is asked, in every way that changes nothing."""
+    (folder / "laptop").mkdir()
+    laptop = replace(here, node="laptop", runtime=folder / "laptop")
+    endpoint = json.loads(here.file.read_text())["nodes"][here.node]["listen"]["control"]
+    assert laptop.zsched("status").returncode == 3
+    assert laptop.status("--connect", endpoint)["node"] == here.node, "the one at the endpoint"
+    assert laptop.status("--connect", endpoint, "--node", there.node)["node"] == there.node
+    for verb in (
+        ("wait", "--for", "settled=echo"),
+        ("metrics", "print"),
+        ("logs", "echo"),
+        ("weights", "echo"),
+        ("stream", "list", "--node", there.node, "--window", "0.2"),
+    ):
+        done = laptop.zsched(*verb, "--connect", endpoint)
+        assert (done.returncode, done.stderr) == (0, ""), verb
+    unknown = laptop.zsched("status", "--connect", endpoint, "--node", "robot9")
+    assert (unknown.returncode, "robot9 did not answer within 3 s" in unknown.stderr) == (3, True)
+
+
+def test_a_worker_is_restarted_through_another_node_and_what_it_prints_is_shown(tmp_path: Path) -> None:
+    robot, edge = sites(tmp_path, robots=1, edges=1)
+    tree = json.loads(robot.file.read_text())
+    echo = f"echo it starts; exec {sys.executable} -m zsched.tasks.echo"
+    tree["tasks"]["echo"]["worker"]["command"] = ["sh", "-c", echo]
+    robot.file.write_text(json.dumps(tree))
+    with contextlib.ExitStack() as stack:
+        for site in (robot, edge):
+            assert site.zsched("init").returncode == 0
+            stack.enter_context(site.up())
+        assert robot.zsched("wait", "--for", "settled=echo", "--timeout", f"{UP_S:g}").returncode == 0
+        assert robot.zsched("logs", "echo").stdout.count("it starts") == 1
+        refused = robot.zsched("restart", "echo")
+        assert (refused.returncode, "--yes" in refused.stderr) == (2, True)
+        done = robot.zsched("restart", "echo", edge.node, "--yes")
+        assert done.returncode == 0, done.stderr
+        end = time.monotonic() + UP_S
+        while robot.zsched("logs", "echo", edge.node).stdout.count("it starts") < 2:
+            assert time.monotonic() < end, robot.log()
+        assert robot.zsched("wait", "--for", "settled=echo", "--timeout", f"{UP_S:g}").returncode == 0
+        assert robot.zsched("logs", "echo", robot.node).returncode == 1
+
+
 def test_any_node_of_the_fleet_can_be_asked_through_the_one_here(tmp_path: Path) -> None:
     here, there = sites(tmp_path, robots=1, edges=1)[::-1]
     with contextlib.ExitStack() as stack:
@@ -242,6 +286,7 @@ def test_any_node_of_the_fleet_can_be_asked_through_the_one_here(tmp_path: Path)
         assert asked["tasks"][0]["decision"] is not None, "an edge does not decide, the robot does"
         changed = here.zsched("weights", "echo", "cpu=0.7", "memory=0.3", "--node", there.node)
         assert changed.returncode == 0, changed.stderr
+        look_from_a_machine_without_a_daemon(tmp_path, here, there)
         nowhere = here.zsched("status", "--node", "robot9")
         assert nowhere.returncode == 2
         assert "robot1" in nowhere.stderr

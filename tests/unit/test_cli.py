@@ -26,7 +26,7 @@ from support.schemas import faults
 from support.waiting import within
 from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.cli import app
-from zsched.commands.ask import ask_door, find_door
+from zsched.commands.ask import ask_door, endpoint_of, find_door
 from zsched.commands.common import CliError, nearest
 from zsched.commands.report import render_status
 from zsched.commands.status import _fitted
@@ -578,6 +578,38 @@ def test_revision_without_new_weights_is_a_usage_error(daemon: Daemon) -> None:
 def test_nearest_name_or_all_names() -> None:
     assert nearest("robo1", ["edge1", "robot1"]) == "; did you mean robot1?"
     assert nearest("x", ["edge1", "robot1"]) == "; there are edge1, robot1"
+
+
+# --- without a daemon here -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("robot1", "tcp/robot1:7457"),
+        ("tcp/robot1", "tcp/robot1:7457"),
+        ("192.0.2.11:7500", "tcp/192.0.2.11:7500"),
+        ("tls/robot1:7500", "tls/robot1:7500"),
+        ("[2001:db8::1]", "tcp/[2001:db8::1]:7457"),
+        ("tcp/[2001:db8::1]:7500", "tcp/[2001:db8::1]:7500"),
+    ],
+)
+def test_an_endpoint_may_be_given_without_its_protocol_and_port(text: str, expected: str) -> None:
+    assert endpoint_of(text) == expected
+
+
+@pytest.mark.parametrize("text", ["", "tcp/", "/robot1", "robot1:port", "tcp/:7457"])
+def test_what_is_no_endpoint_is_a_usage_error(folder: Path, text: str) -> None:
+    result = run("status", "--connect", text, "--runtime-dir", folder)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert "is no endpoint; write tcp/robot1:7457" in result.stderr
+
+
+def test_connect_only_asks(daemon: Daemon) -> None:
+    result = run("weights", "echo", "cpu=1", "--connect", "robot1")
+    assert (result.exit_code, daemon.asked) == (2, [])
+    assert "--connect only asks" in result.stderr
+    assert run("status", "--connect", "robot1", "--node", "*").exit_code == 2
 
 
 # --- what is imported ------------------------------------------------------------------------------------------------

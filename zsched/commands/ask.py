@@ -1,21 +1,31 @@
-"""Asks a daemon on this machine: finds its socket, sends one request, and says why when there is no answer.
+"""Asks a daemon: finds its socket on this machine, or goes to a node's endpoint; says why when there is no answer.
 
 Knows: which of several sockets is meant, what each refusal means as an exit code. Does not know: what is asked.
 """
 
 from __future__ import annotations
 
+import atexit
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from zsched import paths as places
 from zsched.adapters.host.operator_socket import ask
 from zsched.commands.common import CliError, Json, nearest
+from zsched.core.values.model import NAME
 from zsched.errors import AdapterError
 from zsched.exits import EXIT_FAILED, EXIT_TIMED_OUT, EXIT_UNREACHABLE, EXIT_USAGE
 
+if TYPE_CHECKING:
+    from zsched.adapters.network.fleet_client import FleetClient  # imports zenoh
+
+CONTROL_PORT = 7457
+"""Where a node's control session listens by the guides."""
+CONNECT_S = 3.0
 ASK_TIMEOUT_S = 5.0
 """Above the daemon's own limits (3 s for its loop, 3 s for another node), so that their reasons arrive."""
 
@@ -26,17 +36,30 @@ class Door:
 
     socket: Path
     node: str | None = None
+    endpoint: str = ""
+    """Where no daemon of this machine is asked: the control endpoint of some node."""
+
+    def to(self, node: str) -> Door:
+        """The same way, to a node."""
+        return replace(self, node=node)
 
 
-def find_door(runtime_dir: Path | None, node: str | None, env: Mapping[str, str] = os.environ) -> Door:
+def find_door(
+    runtime_dir: Path | None, node: str | None, env: Mapping[str, str] = os.environ, *, connect: str | None = None
+) -> Door:
     """The socket that is meant: ``node``'s own, else any other that passes the question on.
 
+    With ``connect`` no socket of this machine: the node at that endpoint is asked, and passes the question on.
     Without ``node``: this node's own (``ZSCHED_NODE``, host name). Where nothing but the host name says which is this
     node, the only one there is.
 
     Raises:
         CliError: there is no daemon, not the one that is meant (3), or there are several and none is meant (2).
     """
+    if connect is not None:
+        if node is not None and not NAME.fullmatch(node):
+            raise CliError(EXIT_USAGE, f"--node: {node!r} is not a name")
+        return Door(socket=Path(), node=node, endpoint=endpoint_of(connect))
     runtime = places.runtime_folder(runtime_dir, env)
     sockets = {path.stem: path for path in places.local_sockets(runtime)}
     if not sockets:
@@ -120,6 +143,8 @@ def ask_door(door: Door, request: Json, timeout_s: float = ASK_TIMEOUT_S) -> Jso
     Raises:
         CliError: nobody answers (3), not in time (5), or the daemon refuses (1).
     """
+    if door.endpoint:
+        return _ask_elsewhere(door, request)
     if door.node is not None:
         request = {**request, "node": door.node}
     try:
@@ -143,6 +168,66 @@ def _no_daemon(node: str, runtime: Path, here: Iterable[str], more: str = "") ->
         f"no daemon of {node} in {runtime} (here: {', '.join(here)}){more}; start it with `zsched up --node {node}`, "
         "or ask another one with --node"
     )
+
+
+# --- without a daemon ------------------------------------------------------------------------------------------------
+
+
+def endpoint_of(text: str) -> str:
+    """A zenoh endpoint out of what people write; the protocol and the port may be left out.
+
+    >>> endpoint_of("robot1"), endpoint_of("192.0.2.11:7500"), endpoint_of("tls/robot1:7457")
+    ('tcp/robot1:7457', 'tcp/192.0.2.11:7500', 'tls/robot1:7457')
+
+    Raises:
+        CliError: it is no endpoint that could be dialled.
+    """
+    protocol, slash, address = text.partition("/")
+    protocol, address = (protocol, address) if slash else ("tcp", text)
+    if not address.rpartition("]")[2].count(":"):
+        address = f"{address}:{CONTROL_PORT}"
+    host, _, port = address.rpartition(":")
+    if not protocol or not host or not port.isdigit():
+        raise CliError(EXIT_USAGE, f"--connect: {text!r} is no endpoint; write tcp/robot1:{CONTROL_PORT}")
+    return f"{protocol}/{address}"
+
+
+def _ask_elsewhere(door: Door, request: Json) -> Json:
+    """The answer of a node of a fleet that has no daemon here."""
+    from zsched.runtime.shell import answer_json, command_of  # noqa: PLC0415 - loads zenoh, which no socket needs
+
+    command = None if request["verb"] == "status" else command_of(request)
+    try:
+        return answer_json(_client(door.endpoint).ask(door.node, command))
+    except AdapterError as error:
+        raise CliError(EXIT_UNREACHABLE, str(error)) from error
+
+
+@cache
+def _client(endpoint: str) -> FleetClient:
+    """The one session to an endpoint, until the program ends."""
+    from zsched.adapters.network.fleet_client import FleetClient  # noqa: PLC0415 - loads zenoh
+    from zsched.sessions.config import client_config  # noqa: PLC0415 - as above
+
+    asker = places.node_name(None, os.environ)
+    config = client_config(connect=(endpoint,), operator_json5=_operator_json5(endpoint), patience_s=CONNECT_S)
+    client = FleetClient(endpoint, config, asker if NAME.fullmatch(asker) else "operator")
+    atexit.register(client.close)
+    return client
+
+
+def _operator_json5(endpoint: str) -> str:
+    """The zenoh file (certificates) that the fleet file names, where the endpoint is a secured one.
+
+    Raises:
+        ConfigError: there is no such fleet file.
+    """
+    if endpoint.startswith("tcp/"):
+        return ""
+    from zsched.config.load import load_fleet  # noqa: PLC0415 - ruamel.yaml is slow to import
+    from zsched.runtime.tls import operator_json5  # noqa: PLC0415 - as above
+
+    return operator_json5(load_fleet(places.config_path(None, os.environ)))
 
 
 def _unanswered(door: Door, error: AdapterError) -> CliError:

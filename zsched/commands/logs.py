@@ -27,6 +27,7 @@ class LogsView:
 
     runtime_dir: Path | None
     node: str | None
+    connect: str | None
     is_json: bool
     is_followed: bool
     most: int
@@ -38,9 +39,9 @@ def show_logs(view: LogsView, task: str, whose: str | None) -> int:
     Raises:
         CliError: nobody answers, there is no such task or node, or no worker's output there.
     """
-    door = find_door(view.runtime_dir, view.node)
+    door = find_door(view.runtime_dir, view.node, connect=view.connect)
     node = worker_node(ask_door(door, {"verb": "status"}), task, whose)
-    asked = Door(socket=door.socket, node=node)
+    asked = door.to(node)
     lines, after = _all_lines(asked, task, 0)
     _print(view, node, task, lines[len(lines) - min(view.most, len(lines)) :])
     try:

@@ -160,13 +160,13 @@ def _value(value: float) -> str:
 # --- the verbs -------------------------------------------------------------------------------------------------------
 
 
-def print_metrics(runtime_dir: Path | None, node: str | None) -> int:
+def print_metrics(runtime_dir: Path | None, node: str | None, connect: str | None) -> int:
     """Print the text; returns the exit code."""
-    sys.stdout.write(metrics_text(ask_door(find_door(runtime_dir, node), {"verb": "status"})))
+    sys.stdout.write(metrics_text(ask_door(find_door(runtime_dir, node, connect=connect), {"verb": "status"})))
     return EXIT_OK
 
 
-def write_metrics(path: Path, runtime_dir: Path | None, node: str | None) -> int:
+def write_metrics(path: Path, runtime_dir: Path | None, node: str | None, connect: str | None) -> int:
     """Write the text to a file, whole or not at all; returns the exit code.
 
     Where nobody answers the file says ``zsched_up 0``: figures of before would be taken for today's.
@@ -175,7 +175,7 @@ def write_metrics(path: Path, runtime_dir: Path | None, node: str | None) -> int
         CliError: nobody answers, or the file cannot be written (1).
     """
     try:
-        text = metrics_text(ask_door(find_door(runtime_dir, node), {"verb": "status"}))
+        text = metrics_text(ask_door(find_door(runtime_dir, node, connect=connect), {"verb": "status"}))
     except CliError:
         _replace(path, down_text())
         raise

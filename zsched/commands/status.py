@@ -32,13 +32,15 @@ class StatusView:
     node: str | None
     is_json: bool
     is_plain: bool
+    connect: str | None = None
+    """A node's control endpoint, to be asked instead of a daemon here."""
     is_whole: bool = False
     """All six blocks, instead of a line per node and task."""
 
 
 def show(view: StatusView) -> int:
     """Print one status; returns the exit code."""
-    status = _ask(find_door(view.runtime_dir, view.node))
+    status = _ask(find_door(view.runtime_dir, view.node, connect=view.connect))
     if view.is_json:
         print_json(_with_reasons(status))
     else:
@@ -54,7 +56,7 @@ def watch_on(view: StatusView, interval_s: float) -> int:
     Raises:
         CliError: already the first question found nobody.
     """
-    door = find_door(view.runtime_dir, view.node)
+    door = find_door(view.runtime_dir, view.node, connect=view.connect)
     status: Json | CliError = _ask(door)
     is_screen = sys.stdout.isatty() and not view.is_json
     code = EXIT_OK

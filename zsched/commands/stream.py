@@ -39,6 +39,8 @@ class StreamView:
     node: str | None
     is_json: bool
     window_s: float
+    connect: str | None = None
+    """`list` only: a node's control endpoint, to be asked instead of a daemon here."""
     count: int | None = None
     """So many windows (``tail``: samples), then the end; ``None``: until Ctrl-C."""
     timeout_s: float | None = None
@@ -50,7 +52,7 @@ class StreamView:
 
 def show_list(view: StreamView, key: str | None) -> int:
     """Print the node's streams with their rates over one window; returns the exit code."""
-    door = find_door(view.runtime_dir, view.node)
+    door = find_door(view.runtime_dir, view.node, connect=view.connect)
     first = ask_door(door, {"verb": "status"})
     started = monotonic_s()
     time.sleep(view.window_s)

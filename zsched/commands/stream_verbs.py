@@ -33,6 +33,10 @@ WindowOption = Annotated[float, typer.Option("--window", min=0.1, max=3600.0, me
 CountOption = Annotated[
     int | None, typer.Option("--count", min=1, metavar="N", help="End after so many. [go on until Ctrl-C]")
 ]
+ConnectOption = Annotated[
+    str | None,
+    typer.Option("--connect", metavar="ENDPOINT", help="No daemon here: ask at this node's control endpoint."),
+]
 RuntimeOption = Annotated[
     Path | None,
     typer.Option("--runtime-dir", metavar="DIR", help="Operator sockets. [ZSCHED_RUNTIME_DIR, else /run/zsched]"),
@@ -46,11 +50,12 @@ def list_(
     json_: JsonOption = False,
     window: WindowOption = 2.0,
     runtime_dir: RuntimeOption = None,
+    connect: ConnectOption = None,
 ) -> None:
     """List a node's streams: from where to where, how fast, and what was dropped."""
     from zsched.commands.stream import StreamView, show_list  # noqa: PLC0415 - each verb imports what it needs
 
-    view = StreamView(runtime_dir=runtime_dir, node=node, is_json=json_, window_s=window)
+    view = StreamView(runtime_dir=runtime_dir, node=node, is_json=json_, window_s=window, connect=connect)
     raise typer.Exit(show_list(view, key))
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from zsched.clock import monotonic_s
-from zsched.commands.ask import Door, ask_door, find_door
+from zsched.commands.ask import ask_door, find_door
 from zsched.commands.common import CliError, Json, nearest, print_json
 from zsched.commands.page import harmless, span
 from zsched.commands.report import all_problems
@@ -116,6 +116,7 @@ class WaitView:
 
     runtime_dir: Path | None
     node: str | None
+    connect: str | None
     timeout_s: float
     is_json: bool
 
@@ -148,7 +149,7 @@ def _look(view: WaitView, condition: Condition) -> list[str] | CliError:
         CliError: there is no such task or node (2).
     """
     try:
-        door = find_door(view.runtime_dir, view.node)
+        door = find_door(view.runtime_dir, view.node, connect=view.connect)
         first = ask_door(door, {"verb": "status"})
         _check_names(first, condition)
         statuses = {str(first["node"]): first}
@@ -157,7 +158,7 @@ def _look(view: WaitView, condition: Condition) -> list[str] | CliError:
             for other in others:
                 name = str(other["name"])
                 if name not in statuses:
-                    statuses[name] = ask_door(Door(socket=door.socket, node=name), {"verb": "status"})
+                    statuses[name] = ask_door(door.to(name), {"verb": "status"})
     except CliError as error:
         if error.code == EXIT_USAGE:
             raise

@@ -142,7 +142,7 @@ class Desk:
             return self._ask(node, None)
         if verb in _COMMANDS:
             try:
-                command = _COMMANDS[verb](request)
+                command = command_of(request)
             except KeyError as error:
                 return {"error": f"{verb}: {error} is missing"}
             except (TypeError, ValueError, OverflowError) as error:
@@ -160,7 +160,7 @@ class Desk:
     def _ask(self, node: NodeId, command: Command | None) -> dict[str, Any]:
         if node != self._node:
             try:
-                return _as_json(self._bus.ask_node(node, command))
+                return answer_json(self._bus.ask_node(node, command))
             except AdapterError as error:
                 return {"error": str(error)}
         number = next(self._numbers)
@@ -169,7 +169,7 @@ class Desk:
             self._waiting[number] = slot
         self._inbox.post(ev.StatusAsked(request=number) if command is None else ev.commanded(number, command))
         try:
-            return _as_json(slot.get(timeout=ANSWER_TIMEOUT_S))
+            return answer_json(slot.get(timeout=ANSWER_TIMEOUT_S))
         except queue.Empty:
             return {"error": f"the decision loop of {self._node} did not answer within {ANSWER_TIMEOUT_S:g} s"}
         finally:
@@ -222,7 +222,17 @@ _COMMANDS: dict[str, Callable[[dict[str, Any]], Command]] = {
 }
 
 
-def _as_json(value: object) -> dict[str, Any]:
+def command_of(request: dict[str, Any]) -> Command:
+    """The command of a request of the socket.
+
+    Raises:
+        KeyError, TypeError, ValueError, OverflowError: something is missing or wrong.
+    """
+    return _COMMANDS[request["verb"]](request)
+
+
+def answer_json(value: object) -> dict[str, Any]:
+    """A node's answer as the socket tells it."""
     if isinstance(value, Snapshot):
         return snapshot_json(value)
     if isinstance(value, Explanation):

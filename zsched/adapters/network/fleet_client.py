@@ -1,0 +1,93 @@
+"""Asks a fleet from a machine without a daemon: one session as a client, which hangs on the node at one endpoint.
+
+The node that a client hangs on passes its questions on to all nodes that it has a link to. For a moment after the
+session was opened it does not know yet who answers what, so a question that nobody answers is asked again.
+
+Knows: zenoh sessions, the keys of status and commands. Does not know: what the answers mean.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+
+import zenoh
+
+from zsched.adapters.network.control_bus import answer_class
+from zsched.clock import monotonic_s
+from zsched.core.values.messages import Command, CommandResult, WorkerLines
+from zsched.core.values.model import NodeId
+from zsched.core.values.snapshot import Snapshot
+from zsched.errors import AdapterError, WireError
+from zsched.sessions.problems import why_not_open
+from zsched.wire import codec as wire
+from zsched.wire.keyspace import Keyspace
+
+ANSWER_S = 3.0
+"""So long a question is asked again, as a daemon waits for another node."""
+ROUND_S = 1.0
+PAUSE_S = 0.1
+ANY_FLEET = "*"
+"""The endpoint says which fleet is meant; its name need not be known."""
+
+
+class FleetClient:
+    """One open session; safe to close twice."""
+
+    def __init__(self, endpoint: str, zenoh_config: str, asker: NodeId) -> None:
+        """Open the session.
+
+        Raises:
+            AdapterError: nobody takes the connection.
+        """
+        zenoh.init_log_from_env_or("off")
+        self._endpoint, self._asker, self._keys = endpoint, asker, Keyspace(ANY_FLEET)
+        try:
+            self._session = zenoh.open(zenoh.Config.from_json5(zenoh_config))
+        except zenoh.ZError as error:
+            why = why_not_open(zenoh_config, error).replace("is its router up?", "is a node's control endpoint there?")
+            raise AdapterError(f"{endpoint} {why}") from error
+
+    def close(self) -> None:
+        """End the session."""
+        with contextlib.suppress(zenoh.ZError):
+            self._session.close()
+
+    def ask(self, node: NodeId | None, command: Command | None) -> Snapshot | CommandResult | WorkerLines:
+        """The status of a node, or its answer to a command; of the node at the endpoint when none is named.
+
+        Raises:
+            AdapterError: it did not answer in time, or something that this version does not read.
+        """
+        if node is None and command is not None:
+            status = self.ask(None, None)
+            assert isinstance(status, Snapshot)
+            node = status.node
+        end = monotonic_s() + ANSWER_S
+        while monotonic_s() < end:
+            answer = self._ask_once(node, command)
+            if answer is not None:
+                return answer
+            time.sleep(PAUSE_S)
+        who = node or f"the node at {self._endpoint}"
+        raise AdapterError(f"{who} did not answer within {ANSWER_S:g} s; is that a node's control endpoint?")
+
+    def _ask_once(self, node: NodeId | None, command: Command | None) -> Snapshot | CommandResult | WorkerLines | None:
+        keys, whom = self._keys, node or "*"
+        replies = self._session.get(
+            keys.status(whom, self._asker) if command is None else keys.command(whom, self._asker),
+            payload=None if command is None else wire.encode(command),
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=ROUND_S,
+        )
+        here = {str(zid) for zid in (*self._session.info.peers_zid(), *self._session.info.routers_zid())}
+        for reply in replies:
+            replier = reply.replier_id
+            if reply.ok is None or (node is None and (replier is None or str(replier.zid) not in here)):
+                continue  # another node's, passed on
+            try:
+                return wire.decode(reply.ok.payload.to_bytes(), answer_class(command))
+            except WireError as error:
+                raise AdapterError(f"{whom} answered something else ({error}); is it another version?") from error
+        return None
