@@ -13,6 +13,8 @@ from typer.testing import CliRunner, Result
 from zsched import __version__
 from zsched.adapters.machine import core_speed
 from zsched.cli import app
+from zsched.commands.brief import render_brief
+from zsched.commands.report import render_status
 from zsched.config.load import load_fleet
 from zsched.core.values.fleet import fleet_hash
 
@@ -346,7 +348,12 @@ def test_help_of_every_verb_fits_a_small_terminal(verb: str, monkeypatch: pytest
 
 def test_the_manual_shows_what_the_program_shows() -> None:
     manual = (Path(__file__).parents[3] / "docs" / "guide" / "cli.md").read_text()
-    assert (RECORDED / "healthy.100.txt").read_text() in manual
+    status = json.loads((RECORDED / "healthy.json").read_text())
+    for stream in status["tasks"][0]["streams"]:
+        stream["hz"] = 50.0
+    at = time.mktime((2026, 3, 4, 14, 3, 26, 0, 0, -1)) + 0.9
+    for render in (render_brief, render_status):
+        assert render(status, 100, color=False, at=at) in manual
     for verb in ("up", "init", "status", "weights", "check", "demo", "version"):
         assert f"| `zsched {verb}` |" in manual
     for code in (0, 1, 2, 3, 4, 5, 78):
