@@ -703,8 +703,23 @@ def _say(text: str) -> None:
     typer.echo(text, err=True)
 
 
+NEED_ALL = ("complete", "man")
+"""Verbs that tell of the others."""
+
+
+def _leave_out_others(word: str) -> None:
+    """Keep only the verb that is meant: to build the options of all takes as long as to ask a daemon."""
+    commands = [one for one in app.registered_commands if word == (one.name or getattr(one.callback, "__name__", ""))]
+    groups = [
+        one for one in app.registered_groups if one.typer_instance is not None and one.typer_instance.info.name == word
+    ]
+    if (commands or groups) and word not in NEED_ALL:
+        app.registered_commands, app.registered_groups = commands, groups
+
+
 def main() -> None:
     """The console entry point."""
+    _leave_out_others("".join(sys.argv[1:2]))
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # bars in a terminal without UTF-8
     code: str | int | None = EXIT_FAILED

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from importlib.metadata import EntryPoint
 
 import pytest
@@ -56,3 +58,26 @@ def test_nobody_takes_a_verb_of_the_program(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_what_nobody_brings_is_a_usage_error() -> None:
     assert run("fly").exit_code == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("status", "--help"), "--interval"),
+        (("stream", "list", "--help"), "--window"),
+        (("metrics", "--help"), "write"),
+        (("complete", "--", "st"), "status\nstream\n"),
+        (("--help",), "weights"),
+    ],
+)
+def test_the_program_that_builds_the_named_verb_alone_knows_what_it_needs(words: tuple[str, ...], says: str) -> None:
+    command = [sys.executable, "-m", "zsched.cli", *words]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stderr, says in done.stdout) == (0, "", True)
+
+
+def test_only_the_named_verb_is_built() -> None:
+    code = "from zsched.cli import app, _leave_out_others as leave; leave('status'); "
+    code += "print(len(app.registered_commands), len(app.registered_groups))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout == "1 0\n"
