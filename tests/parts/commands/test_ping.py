@@ -13,6 +13,7 @@ import zenoh
 from typer.testing import CliRunner, Result
 
 from support.clinic import FLEET
+from support.schemas import faults
 from zsched.cli import app
 from zsched.config.load import load_fleet
 from zsched.core.values.snapshot import NodeStatus, QuorumStatus, Snapshot
@@ -105,6 +106,7 @@ def test_both_sessions_are_measured_and_both_ears_told(node: Node) -> None:
     assert (found["control"]["answered"], found["control"]["endpoint"]) == (3, node.control)
     assert SLOW_S <= found["control"]["least_s"] <= found["control"]["mean_s"] <= found["control"]["most_s"]
     assert (found["data"]["answered"], found["data"]["missed"]) == (3, 0)
+    assert faults(json.loads(result.stdout)) == []
     assert json.loads(result.stdout)["heard"] == {"edge1": {"robot1": "gone"}}
     text = run("edge1", "-c", "1").stdout.splitlines()
     assert text[0].startswith(f"control  {node.control}: 1 of 1 answered, ")
@@ -122,6 +124,7 @@ def test_a_session_of_somebody_else_is_no_answer(node: Node) -> None:
     node._open("control", node.control)
     result = run("edge1", "-c", "2", "--interval", "0", "--json")
     assert (result.exit_code, ways(result)["control"]["missed"]) == (3, 2)
+    assert faults(json.loads(result.stdout)) == []
 
 
 def test_nobody_at_all_is_3_and_an_unknown_name_2() -> None:

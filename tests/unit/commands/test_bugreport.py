@@ -12,6 +12,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from support.clinic import FLEET, fleet_scene
+from support.schemas import faults
 from zsched.cli import app
 from zsched.commands.bugreport import gathered
 
@@ -89,6 +90,7 @@ def test_the_file_is_its_user_s_only_and_is_never_overwritten(place: Path) -> No
 def test_without_a_name_it_is_called_by_node_and_time(place: Path) -> None:
     body = json.loads(run("--json").stdout)
     assert body["schema"] == "zsched.bugreport/1"
+    assert faults(body) == []
     (file,) = place.glob("zsched-bugreport-robot1-*.tar.gz")
     assert (body["file"], body["members"]["fleet.yaml"] > 0) == (file.name, True)
 

@@ -9,6 +9,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from support.clinic import FLEET
+from support.schemas import faults
 from zsched.cli import app
 from zsched.commands import doctor
 from zsched.doctor import model
@@ -49,6 +50,7 @@ def test_json_has_every_check_with_its_verdict() -> None:
         "robot1",
         "FAIL",
     )
+    assert faults(body) == []
     assert len(body["checks"]) == sum(body["counts"].values()) >= 20
     assert {"PASS", "SKIP", "FAIL"} <= {check["verdict"] for check in body["checks"]}
     assert all(check["fix"] for check in body["checks"] if check["verdict"] in ("WARN", "FAIL"))
