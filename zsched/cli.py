@@ -282,6 +282,7 @@ def explain(
     json_: JsonOption = False,
     node: AskedOption = None,
     runtime_dir: RuntimeOption = None,
+    connect: ConnectOption = None,
     no_color: Annotated[bool, typer.Option("--no-color", help="Plain text (also: NO_COLOR).")] = False,
 ) -> None:
     """Show a robot's last judgement of a task with all its figures, and what would have to change for a move.
@@ -294,7 +295,7 @@ def explain(
     from zsched.commands.explain import explain as ask_why  # noqa: PLC0415 - as above
 
     view = ExplainView(plan=plan, is_json=json_, is_colored=wants_color(no_color))
-    raise typer.Exit(ask_why(find_door(runtime_dir, node), task, view))
+    raise typer.Exit(ask_why(find_door(runtime_dir, node, connect=connect), task, view))
 
 
 @app.command(cls=Verb)

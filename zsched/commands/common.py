@@ -20,6 +20,7 @@ from zsched.errors import AdapterError, ConfigError, ZschedError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE
 
 Json = dict[str, Any]
+NAMED_OTHERWISE: Final = {"events": "event"}
 SCHEMAS: Final = Path(__file__).parents[1] / "schemas"
 """A JSON Schema per kind of output and major version."""
 
@@ -69,11 +70,21 @@ def of_known_major(ctx: Any, verb: Any, args: Sequence[str]) -> list[str]:
             break
         if word.startswith("--json=") and any("--json" in param.opts for param in verb.params):
             found[at], wanted = "--json", word.partition("=")[2]
-            schema = f"zsched.{'.'.join(ctx.command_path.split()[1:])}"
+            schema = schema_of(ctx.command_path.split()[1:])
             majors = known_majors(schema)
             if wanted not in majors:
                 raise CliError(EXIT_USAGE, f"{word}: {schema} has the major version {' and '.join(majors)}")
     return found
+
+
+def schema_of(words: Sequence[str]) -> str:
+    """The schema of a verb's JSON: a verb that prints a line for each of many is called by the many.
+
+    >>> schema_of(["stream", "list"]), schema_of(["events"])
+    ('zsched.stream.list', 'zsched.event')
+    """
+    name = ".".join(words)
+    return f"zsched.{NAMED_OTHERWISE.get(name, name)}"
 
 
 def known_majors(schema: str) -> list[str]:

@@ -78,7 +78,7 @@ def _asked(door: Door, task: str) -> Explanation:
     failures = []
     for robot in answer.robots:
         try:
-            return _ask(Door(socket=door.socket, node=robot), task)
+            return _ask(door.to(robot), task)
         except CliError as error:
             failures.append(error)
     raise failures[0]

@@ -152,10 +152,8 @@ class Desk:
             return self._access(node)
         if verb == "log" and self._log is not None:
             return self._log(request) if node == self._node else {"error": f"the log of {node} is told on {node} only"}
-        return {
         known = ", ".join(sorted(("access", "log", "status", *_COMMANDS)))
         return {"error": f"unknown verb {verb!r:.80}; known: {known}"}
-        }
 
     def _ask(self, node: NodeId, command: Command | None) -> dict[str, Any]:
         if node != self._node:

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from support.schemas import faults
 from zsched.commands import explain as verb
 from zsched.commands.ask import Door
 from zsched.commands.common import CliError
@@ -137,6 +138,7 @@ def test_what_is_printed_adds_up(capsys: pytest.CaptureFixture[str]) -> None:
 def test_json_names_its_schema_and_holds_the_same_sums(capsys: pytest.CaptureFixture[str]) -> None:
     assert asked(is_json=True) == 0
     body = json.loads(capsys.readouterr().out)
+    assert faults(body) == []
     assert (body["schema"], body["node"], body["task"], body["outcome"]) == (SCHEMA, "robot1", "merge", "stay")
     assert body["silent"] == ["robot3"]
     for one in body["candidates"]:
@@ -155,6 +157,7 @@ def test_a_plan_says_where_the_task_would_go(capsys: pytest.CaptureFixture[str])
     assert "propose edge2 · edge1 is gone" in text
     assert asked(plan="edge2=down", is_json=True) == 0
     body = json.loads(capsys.readouterr().out)
+    assert faults(body) == []
     assert (body["plan"]["without"], body["plan"]["would_move"], body["plan"]["outcome"]) == (
         "edge2",
         False,

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from support.schemas import faults
 from zsched.adapters.host.decision_log import NAME, DecisionLog
 from zsched.cli import app
 from zsched.commands import history as verb
@@ -103,7 +104,9 @@ def test_moves_are_told_with_age_wall_time_votes_and_how_long_the_streams_took(
 @pytest.mark.usefixtures("pages")
 def test_moves_of_one_task_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert history(HERE, "merge", is_json=True) == 0
-    assert json.loads(capsys.readouterr().out) == {
+    body = json.loads(capsys.readouterr().out)
+    assert faults(body) == []
+    assert body == {
         "schema": "zsched.history/1",
         "node": "robot1",
         "moves": [
@@ -134,6 +137,7 @@ def test_events_of_one_task_and_of_the_last_time(capsys: pytest.CaptureFixture[s
     ]
     assert events(HERE, view(is_json=True)) == 0
     found = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [faults({"schema": "zsched.event/1", **one}) for one in found] == [[]] * len(found)
     assert [one["text"] for one in found] == ["a peer came", "learnt", "judged", "flipped", "learnt \x1b[2J"]
     assert events(HERE, view()) == 0
     assert "\x1b" not in capsys.readouterr().out
@@ -231,6 +235,7 @@ def test_a_log_is_judged_again_and_all_is_equal(tmp_path: Path) -> None:
     done = run("replay", file)
     assert (done.exit_code, done.stdout) == (0, "3 judgements made again, all equal\n")
     body = json.loads(run("replay", file, "--json").stdout)
+    assert faults(body) == []
     assert (body["schema"], body["judged"], body["equal"]) == ("zsched.replay/1", 3, True)
 
 
@@ -244,6 +249,7 @@ def test_the_first_judgement_that_differs_is_named(tmp_path: Path) -> None:
     assert done.exit_code == 1
     assert [line.split(" ")[0] for line in done.stdout.splitlines()] == [f"{file}:3:", f"{file}:3:"]
     body = json.loads(run("replay", file, "--json").stdout)
+    assert faults(body) == []
     assert (body["judged"], body["equal"], body["line"]) == (1, False, 3)
 
 

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from support.schemas import faults
 from zsched.cli import app
-from zsched.commands.common import SCHEMAS, known_majors
+from zsched.commands.common import SCHEMAS, known_majors, schema_of
 from zsched.core.values.plan import StreamCount
 from zsched.core.values.snapshot import DecisionStatus, NodeStatus, QuorumStatus, Snapshot, TaskStatus, VoteStatus
 
@@ -45,12 +45,12 @@ VERBS = sorted(verbs_with_json(typer.main.get_command(app)))
 
 
 def test_every_verb_with_json_has_a_schema_and_no_file_is_left_over() -> None:
-    assert [file.name for file in FILES] == sorted(f"zsched.{'.'.join(words)}.1.json" for words in VERBS)
+    assert [file.name for file in FILES] == sorted(f"{schema_of(words)}.1.json" for words in VERBS)
 
 
 @pytest.mark.parametrize("words", VERBS, ids=" ".join)
 def test_an_unknown_major_is_refused_with_those_there_are_before_anything_is_done(words: tuple[str, ...]) -> None:
-    name = ".".join(("zsched", *words))
+    name = schema_of(words)
     for wanted in ("2", "0", "", "one"):
         result = CliRunner().invoke(app, [*words, f"--json={wanted}"])
         assert result.exit_code == 2

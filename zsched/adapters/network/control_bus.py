@@ -398,7 +398,7 @@ class ControlBus:
             if reply.ok is None:
                 continue
             try:
-                answer: Snapshot | CommandResult | Explanation = wire.decode(reply.ok.payload.to_bytes(), *kinds)
+                answer: Answer = wire.decode(reply.ok.payload.to_bytes(), *kinds)
             except WireError as error:
                 raise AdapterError(f"{node} answered something else ({error}); is it another version?") from error
             return answer

@@ -13,9 +13,9 @@ import time
 
 import zenoh
 
-from zsched.adapters.network.control_bus import answer_class
+from zsched.adapters.network.control_bus import Answer, answer_classes
 from zsched.clock import monotonic_s
-from zsched.core.values.messages import Command, CommandResult, WorkerLines
+from zsched.core.values.messages import Command
 from zsched.core.values.model import NodeId
 from zsched.core.values.snapshot import Snapshot
 from zsched.errors import AdapterError, WireError
@@ -53,7 +53,7 @@ class FleetClient:
         with contextlib.suppress(zenoh.ZError):
             self._session.close()
 
-    def ask(self, node: NodeId | None, command: Command | None) -> Snapshot | CommandResult | WorkerLines:
+    def ask(self, node: NodeId | None, command: Command | None) -> Answer:
         """The status of a node, or its answer to a command; of the node at the endpoint when none is named.
 
         Raises:
@@ -72,7 +72,7 @@ class FleetClient:
         who = node or f"the node at {self._endpoint}"
         raise AdapterError(f"{who} did not answer within {ANSWER_S:g} s; is that a node's control endpoint?")
 
-    def _ask_once(self, node: NodeId | None, command: Command | None) -> Snapshot | CommandResult | WorkerLines | None:
+    def _ask_once(self, node: NodeId | None, command: Command | None) -> Answer | None:
         keys, whom = self._keys, node or "*"
         replies = self._session.get(
             keys.status(whom, self._asker) if command is None else keys.command(whom, self._asker),
@@ -87,7 +87,7 @@ class FleetClient:
             if reply.ok is None or (node is None and (replier is None or str(replier.zid) not in here)):
                 continue  # another node's, passed on
             try:
-                return wire.decode(reply.ok.payload.to_bytes(), answer_class(command))
+                return wire.decode(reply.ok.payload.to_bytes(), *answer_classes(command))
             except WireError as error:
                 raise AdapterError(f"{whom} answered something else ({error}); is it another version?") from error
         return None
