@@ -128,7 +128,8 @@ def test_tail_shows_messages_as_they_come(site: Site) -> None:
 
 def test_silence_and_mistakes_have_their_codes(site: Site) -> None:
     command = ["hz", "nobody/here", "--node", "robot1", "--window", "0.5", "--count", "1"]
-    assert site.run(*command, code=1) == ""
+    told = "no stream here is called 'nobody/here' or touches such a key (there are echo/in/0, echo/out/0)"
+    assert site.run(*command, code=1) == f"{told}: listening on it as a key\n"
     assert "no key expression" in site.run("hz", "/scan", "--node", "robot1", code=2)
     assert "robot1" in site.run("hz", "--node", "robot9", code=2)
 
