@@ -100,11 +100,11 @@ def test_what_the_unit_names_as_its_documentation_is_installed() -> None:
     page = unit["Unit"]["Documentation"].removeprefix("file:///opt/zsched/")
     project = tomllib.loads((UNIT.parents[1] / "pyproject.toml").read_text())
     installed = project["tool"]["setuptools"]["data-files"]
-    pages = {
-        f"{folder}/{Path(file).name}": UNIT.parents[1] / file for folder, files in installed.items() for file in files
+    found = {pattern: sorted(UNIT.parents[1].glob(pattern)) for files in installed.values() for pattern in files}
+    assert all(found.values()), found
+    assert page in {
+        f"{folder}/{file.name}" for folder, files in installed.items() for name in files for file in found[name]
     }
-    assert page in pages
-    assert all(file.is_file() for file in pages.values())
 
 
 def analyze(*arguments: str) -> subprocess.CompletedProcess[str]:
