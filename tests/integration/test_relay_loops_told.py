@@ -1,4 +1,7 @@
-"""A robot whose relay ends again and again: every node's status says so, and stops when it stays."""
+"""A robot whose relay ends again and again: every node's status says so.
+
+The complaint ends when the first of the ends is a minute old (`tests/unit/core/profile/test_relay_ends.py`).
+"""
 
 from __future__ import annotations
 
@@ -6,13 +9,13 @@ import os
 import signal
 from pathlib import Path
 
-from zsched.core.profile.relay_ends import OFTEN, WINDOW_S
+from zsched.core.profile.relay_ends import OFTEN
 from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
 WAIT_S = 60.0
 
 
-def test_a_relay_that_is_killed_again_and_again_is_a_problem_on_every_node_until_it_stays(tmp_path: Path) -> None:
+def test_a_relay_that_is_killed_again_and_again_is_a_problem_on_every_node(tmp_path: Path) -> None:
     with Testbed(tmp_path, echo_fleet(robots=2, edges=1)) as bed:
         bed.init()
         bed.start()
@@ -35,5 +38,4 @@ def test_a_relay_that_is_killed_again_and_again_is_a_problem_on_every_node_until
             os.kill(relay, signal.SIGKILL)
         bed.wait(lambda: all(told(node) for node in bed.names), 10.0, "the problem on every node")
         assert "its streams rest meanwhile: look at the log of zsched on robot2" in told("robot1")[0]
-        bed.wait(lambda: not any(told(node) for node in bed.names), WINDOW_S + 10.0, "the problem is over")
         assert bed.wait_settled(WAIT_S) == "edge1"
