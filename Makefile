@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 DEMO_ARGS ?=
 # Test modules at a time; integration tests mostly wait.
 TEST_JOBS ?= 2
-REAL_JOBS ?= 3
+REAL_JOBS ?= 4
 # How the tests with real processes are run; `.ci/run` gives failed ones a second chance, alone.
 PYTEST_REAL ?= -m pytest
 
