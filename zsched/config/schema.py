@@ -227,8 +227,8 @@ SCHEDULING: Final = Record(
         **keys(TaskSpec, "reach", "memory_floor_ratio", "max_moves_per_minute"),
         "patience": Field(
             Number(0, 1000),
-            "What staying may cost before the task moves. Staying costs the best candidate's lead in utility, times the "
-            "seconds that it lasts: 0.3 is a lead of 0.1 for 3 s. `0`: the first lead that is seen is followed.",
+            "What staying may cost before the task moves. Staying costs the best candidate's lead in utility, times "
+            "the seconds that it lasts: 0.3 is a lead of 0.1 for 3 s. `0`: the first lead that is seen is followed.",
             default=f"learnt, {CHOICES[0]:g} to {CHOICES[-1]:g}; `{RADIO_PATIENCE:g}` with a weight for the network; "
             f"`{PAPER_PATIENCE:g}` with `score: paper`",
         ),
@@ -296,7 +296,11 @@ TASK: Final = Record(
     "a task",
     {
         "candidates": Field(_NODES, "The nodes that may own the task: names, or a selection.", required=True),
-        "weights": Field(WEIGHTS, "How much CPU, memory and network count in a candidate's score (Eq. 4); their sum is 1.", required=True),
+        "weights": Field(
+            WEIGHTS,
+            "How much CPU, memory and network count in a candidate's score (Eq. 4); their sum is 1.",
+            required=True,
+        ),
         "demand": Field(DEMAND, "What the task needs, before it was ever measured."),
         "scheduling": Field(SCHEDULING, "When a better candidate is worth a move."),
         "link": Field(LINK_LIMITS, "The limits of Eq. 3."),
