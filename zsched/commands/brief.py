@@ -20,12 +20,13 @@ def render_brief(status: Json, width: int, color: bool, at: float | None = None)
     page, shown = Page(width, color, at), printable(status)
     header(page, shown)
     node_rows(page, shown, "NODE")
-    _task_rows(page, shown, at)
+    task_rows(page, shown, at)
     troubles(page, shown)
     return "\n".join(page.lines) + "\n"
 
 
-def _task_rows(page: Page, status: Json, at: float | None) -> None:
+def task_rows(page: Page, status: Json, at: float | None) -> None:
+    """Titles and a line per task; ``at``: now, for wall times beside ages."""
     tasks: list[Json] = status["tasks"]
     task_room = min(max([10, *(len(task["name"]) for task in tasks)]), 20)
     owner_room = min(max([6, *(len(task["owner"] or "") for task in tasks)]), 20)

@@ -43,11 +43,7 @@ def explain(door: Door, task: str, view: ExplainView) -> int:
         CliError: nobody answers, there is no such task or node, or no judgement yet.
     """
     gone = None if view.plan is None else _planned(view.plan)
-    answer = _asked(door, task)
-    decision = answer.decision
-    if decision is None:
-        raise CliError(EXIT_FAILED, f"{answer.node} has judged nothing of {task} yet; ask again in a second")
-    body = _body(answer, decision)
+    body, decision = explanation(door, task)
     code = EXIT_OK
     if gone is not None:
         body["plan"] = _plan(decision, gone)
@@ -58,6 +54,18 @@ def explain(door: Door, task: str, view: ExplainView) -> int:
         width = max(MIN_WIDTH, min(shutil.get_terminal_size((100, 30)).columns, MAX_WIDTH))
         sys.stdout.write(render(body, width, view.is_colored))
     return code
+
+
+def explanation(door: Door, task: str) -> tuple[Json, Decision]:
+    """Why a task is where it is, as ``zsched.explain/1`` has it, and the judgement that this is made of.
+
+    Raises:
+        CliError: nobody answers, there is no such task, or no judgement yet.
+    """
+    answer = _asked(door, task)
+    if answer.decision is None:
+        raise CliError(EXIT_FAILED, f"{answer.node} has judged nothing of {task} yet; ask again in a second")
+    return _body(answer, answer.decision), answer.decision
 
 
 def _planned(word: str) -> str:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
@@ -65,8 +65,8 @@ def task_of(word: str) -> str:
 
 def history(door: Door, task: str | None, *, is_json: bool) -> int:
     """Print the moves that the log knows, the newest last; returns the exit code."""
-    node, now, entries, _ = _read(door, is_moves=True)
-    moves = list(_moves(entries, now, task))
+    node, now, entries, _ = read_log(door, is_moves=True)
+    moves = list(moves_of(entries, now, task))
     if is_json:
         print_json({"schema": SCHEMA, "node": node, "moves": moves})
         return EXIT_OK
@@ -79,7 +79,7 @@ def history(door: Door, task: str | None, *, is_json: bool) -> int:
 
 def events(door: Door, view: EventsView) -> int:
     """Print what the log tells, the newest last; with ``is_following`` on and on until Ctrl-C."""
-    _, now, entries, cursor = _read(door, is_moves=False)
+    _, now, entries, cursor = read_log(door, is_moves=False)
     since = None if view.since_s is None else now - view.since_s
     _print([entry for entry in entries if since is None or entry["at"] >= since], view)
     is_away = False
@@ -87,7 +87,7 @@ def events(door: Door, view: EventsView) -> int:
         while view.is_following:
             time.sleep(FOLLOW_S)
             try:
-                _, _, entries, cursor = _read(door, is_moves=False, cursor=cursor)
+                _, _, entries, cursor = read_log(door, is_moves=False, cursor=cursor)
             except CliError as error:
                 if error.code != EXIT_UNREACHABLE:
                     raise
@@ -102,7 +102,7 @@ def events(door: Door, view: EventsView) -> int:
     return EXIT_OK
 
 
-def _read(door: Door, *, is_moves: bool, cursor: str = "") -> tuple[str, float, list[Json], str]:
+def read_log(door: Door, *, is_moves: bool, cursor: str = "") -> tuple[str, float, list[Json], str]:
     """(node, its wall clock, entries, where they end) from ``cursor`` to the end of the log.
 
     Raises:
@@ -122,14 +122,16 @@ def _read(door: Door, *, is_moves: bool, cursor: str = "") -> tuple[str, float, 
 # --- moves -----------------------------------------------------------------------------------------------------------
 
 
-def _moves(entries: list[Json], now: float, task: str | None) -> Iterator[Json]:
+def moves_of(entries: Iterable[Json], now: float, task: str | None) -> Iterator[Json]:
+    """The changes of owner among a log's entries, as ``zsched.history/1`` has them; ``now``: the node's wall clock."""
+    entries = list(entries)
     took = {(entry["task"], entry["epoch"], entry["life"]): entry["took_s"] for entry in entries if "took_s" in entry}
     for entry in entries:
         move = entry.get("move")
         if move is None or task not in (None, entry["task"]):
             continue
         yield {
-            "at": _wall(entry["at"]),
+            "at": wall_text(entry["at"]),
             "age_s": max(now - entry["at"], 0.0),
             "task": entry["task"],
             "epoch": move["epoch"],
@@ -161,14 +163,14 @@ def _print(entries: list[Json], view: EventsView) -> None:
         if view.task not in (None, entry.get("task", "")):
             continue
         if view.is_json:
-            print_json({**entry, "at": _wall(entry["at"])}, is_line=True)
+            print_json({**entry, "at": wall_text(entry["at"])}, is_line=True)
             continue
         shown = printable(entry)
         where = f"task={shown['task']} epoch={shown.get('epoch', 0)} " if shown.get("task") else ""
-        sys.stdout.write(f"{_wall(entry['at'])} {shown['stage']:<10} {where}{shown['text']}\n")
+        sys.stdout.write(f"{wall_text(entry['at'])} {shown['stage']:<10} {where}{shown['text']}\n")
     sys.stdout.flush()
 
 
-def _wall(at: float) -> str:
+def wall_text(at: float) -> str:
     """RFC 3339 in UTC, to the millisecond."""
     return datetime.fromtimestamp(at, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -40,12 +40,12 @@ class StatusView:
 
 def show(view: StatusView) -> int:
     """Print one status; returns the exit code."""
-    status = _ask(find_door(view.runtime_dir, view.node, connect=view.connect))
+    status = ask_status(find_door(view.runtime_dir, view.node, connect=view.connect))
     if view.is_json:
         print_json(_with_reasons(status))
     else:
         sys.stdout.write(_render(view, status))
-    return _code(status)
+    return code_of(status)
 
 
 def watch_on(view: StatusView, interval_s: float) -> int:
@@ -57,13 +57,13 @@ def watch_on(view: StatusView, interval_s: float) -> int:
         CliError: already the first question found nobody.
     """
     door = find_door(view.runtime_dir, view.node, connect=view.connect)
-    status: Json | CliError = _ask(door)
+    status: Json | CliError = ask_status(door)
     is_screen = sys.stdout.isatty() and not view.is_json
     code = EXIT_OK
     try:
         sys.stdout.write(CLEAR if is_screen else "")
         while True:
-            code = status.code if isinstance(status, CliError) else _code(status)
+            code = status.code if isinstance(status, CliError) else code_of(status)
             _print_next(view, status, is_screen=is_screen)
             time.sleep(interval_s)
             status = _ask_again(door)
@@ -82,7 +82,7 @@ def _render(view: StatusView, status: Json) -> str:
 
 def _ask_again(door: Door) -> Json | CliError:
     try:
-        return _ask(door)
+        return ask_status(door)
     except CliError as error:
         return error
 
@@ -122,7 +122,12 @@ def _fitted(text: str) -> str:
     return HOME + f"{REST_OF_LINE}\n".join(lines) + REST_OF_LINE + REST_OF_SCREEN
 
 
-def _ask(door: Door) -> Json:
+def ask_status(door: Door) -> Json:
+    """The status of the node behind a door.
+
+    Raises:
+        CliError: nobody answers (3), not in time (5), or in words of another major version (1).
+    """
     status = ask_door(door, {"verb": "status"})
     if str(status.get("schema")).partition("/")[2].partition(".")[0] != MAJOR:
         found = status.get("schema")
@@ -136,7 +141,8 @@ def _with_reasons(status: Json) -> Json:
     return {**status, "degraded": list(degradations(status))}
 
 
-def _code(status: Json) -> int:
+def code_of(status: Json) -> int:
+    """The exit code that tells how the fleet is: 0, or 4 while it is degraded."""
     return EXIT_DEGRADED if degradations(status) else EXIT_OK
 
 
