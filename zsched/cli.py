@@ -274,6 +274,23 @@ def status(
 
 
 @app.command(cls=Verb)
+def top(
+    once: Annotated[bool, typer.Option("--once", help="Print one screen and exit, as status does.")] = False,
+    interval: Annotated[float, typer.Option(min=0.2, max=3600.0, metavar="S", help="Seconds between two.")] = 1.0,
+    node: AskedOption = None,
+    runtime_dir: RuntimeOption = None,
+    connect: ConnectOption = None,
+    no_color: Annotated[bool, typer.Option("--no-color", help="Plain text (also: NO_COLOR).")] = False,
+) -> None:
+    """Show the fleet on the full screen: nodes, utilities over time, streams, the last moves; q ends."""
+    from zsched.commands.watch.screen import TopView  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.watch.screen import top as show  # noqa: PLC0415 - as above
+
+    view = TopView(runtime_dir=runtime_dir, node=node, connect=connect, is_plain=no_color, interval_s=interval)
+    raise typer.Exit(show(view, is_once=once))
+
+
+@app.command(cls=Verb)
 def explain(
     task: Annotated[str, typer.Argument(metavar="TASK", help="A task of the fleet file.")],
     plan: Annotated[

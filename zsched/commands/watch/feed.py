@@ -1,0 +1,67 @@
+"""Asks one daemon again and again for its status and for what its decision log tells anew.
+
+Knows: the door, where the log was read to, that a daemon may be away for a while.
+Does not know: who looks at the answers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from zsched.clock import wall_s
+from zsched.commands.ask import Door
+from zsched.commands.common import CliError, Json
+from zsched.commands.history import read_log
+from zsched.commands.status import ask_status
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class News:
+    """What one question brought."""
+
+    at: float
+    """When it was asked: seconds since 1970, by the clock of this machine."""
+    status: Json | None
+    """``None``: nobody answered."""
+    why: str = ""
+    """Why nobody answered."""
+    entries: tuple[Json, ...] = ()
+    """Lines of the decision log since the question before, the newest last; ``at`` is the node's clock."""
+
+
+class Feed:
+    """One daemon, asked by one thread."""
+
+    def __init__(self, find: Callable[[], Door]) -> None:
+        """``find`` names the daemon; it is called again until it does."""
+        self._find = find
+        self._door: Door | None = None
+        self._cursor = ""
+
+    def door(self) -> Door:
+        """The daemon that is asked.
+
+        Raises:
+            CliError: there is none.
+        """
+        if self._door is None:
+            self._door = self._find()
+        return self._door
+
+    def ask(self) -> News:
+        """The next news; blocks for as long as a daemon may take to answer (5 s)."""
+        at = wall_s()
+        try:
+            door = self.door()
+            status = ask_status(door)
+            return News(at=at, status=status, entries=self._entries(door))
+        except CliError as error:
+            return News(at=at, status=None, why=str(error))
+
+    def _entries(self, door: Door) -> tuple[Json, ...]:
+        """Of another machine there is no log: it lies on that machine."""
+        if door.endpoint or door.node is not None:
+            return ()
+        _, _, entries, self._cursor = read_log(door, is_moves=False, cursor=self._cursor)
+        return tuple(entries)

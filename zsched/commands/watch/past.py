@@ -1,0 +1,100 @@
+"""What a fleet has answered lately: its newest status, utilities over time, moves, events; all of it bounded.
+
+Knows: how much is kept. Does not know: sockets, text.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+from zsched.commands.common import Json
+from zsched.commands.history import moves_of, wall_text
+from zsched.commands.watch.feed import News
+
+POINTS: Final = 900
+"""Of a task's utilities: a quarter of an hour at one a second."""
+SAME_S: Final = 0.1
+"""Judgements that lie nearer together are one, told twice: the age and the moment of the question are read apart."""
+MOST_MOVES: Final = 200
+MOST_EVENTS: Final = 300
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Point:
+    """The joint utilities of a task's candidates in one round."""
+
+    at: float
+    """Seconds since 1970, by the clock of this machine."""
+    owner: str | None
+    totals: dict[str, float]
+    """{candidate: joint utility}; a candidate that cannot have the task has none."""
+
+
+class Past:
+    """Takes news and keeps what they tell."""
+
+    def __init__(self) -> None:
+        self.status: Json | None = None
+        """The newest one; while nobody answers the last one of before."""
+        self.answered_at = 0.0
+        self.why = ""
+        """Why nobody answers; empty while somebody does."""
+        self.points: dict[str, deque[Point]] = {}
+        self.events: deque[Json] = deque(maxlen=MOST_EVENTS)
+        """Lines of the decision log, the newest last."""
+        self._of_moves: deque[Json] = deque(maxlen=2 * MOST_MOVES)
+        self._now = 0.0
+
+    def take(self, news: News) -> None:
+        """Keep what is new."""
+        self._now = max(news.at, self._now)
+        self.why = news.why
+        for entry in news.entries:
+            self.events.append(entry)
+            if "move" in entry or "took_s" in entry:
+                self._of_moves.append(entry)
+        if news.status is None:
+            return
+        self.status, self.answered_at = news.status, news.at
+        for task in news.status["tasks"]:
+            decision = task["decision"]
+            if decision is None:  # an edge decides nothing
+                continue
+            kept = self.points.setdefault(task["name"], deque(maxlen=POINTS))
+            judged_at = news.at - decision["age_s"]
+            if not kept or judged_at - kept[-1].at > SAME_S:
+                kept.append(Point(at=judged_at, owner=task["owner"], totals=dict(decision["aggregates"])))
+
+    def moves(self) -> list[Json]:
+        """The newest changes of owner as ``zsched.history/1`` has them, the newest last.
+
+        Where the log cannot be read, they are what the status remembers: without votes and durations.
+        """
+        if self._of_moves or self.status is None:
+            return list(moves_of(self._of_moves, self._now, None))[-MOST_MOVES:]
+        told = [move for task in self.status["tasks"] for move in _remembered(task, self.answered_at)]
+        return sorted(told, key=lambda move: str(move["at"]))[-MOST_MOVES:]
+
+
+def _remembered(task: Json, at: float) -> Iterator[Json]:
+    """The moves of a task that its status tells of."""
+    left: str | None = None
+    for number, past in enumerate(task["history"]):
+        if number and past["owner"] == left:
+            continue  # another weight, the same owner
+        yield {
+            "at": wall_text(at - past["age_s"]),
+            "age_s": past["age_s"],
+            "task": task["name"],
+            "epoch": past["epoch"],
+            "revision": past["revision"],
+            "from": left,
+            "to": past["owner"],
+            "reason": past["reason"],
+            "votes": {},
+            "switched_s": None,
+        }
+        left = past["owner"]

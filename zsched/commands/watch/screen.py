@@ -1,0 +1,147 @@
+"""`zsched top`: asks in a thread of its own, draws on a terminal, and takes keys.
+
+Knows: terminals, keys, intervals, exit codes. Does not know: what stands on the screen (`zsched.commands.watch.top`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import queue
+import select
+import shutil
+import signal
+import sys
+import termios
+import threading
+import tty
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+from zsched.clock import wall_s
+from zsched.commands.ask import find_door
+from zsched.commands.common import CliError, wants_color
+from zsched.commands.status import code_of
+from zsched.commands.watch.feed import Feed, News
+from zsched.commands.watch.past import Past
+from zsched.commands.watch.top import MIN_HEIGHT, MIN_WIDTH, Frame, render_top
+from zsched.exits import EXIT_OK, EXIT_UNREACHABLE, EXIT_USAGE
+from zsched.guard import guarded
+
+ENTER, LEAVE = "\x1b[?1049h\x1b[?25l", "\x1b[?25h\x1b[?1049l"
+"""To the other screen of the terminal, without a cursor; and back to what stood there."""
+HOME, REST_OF_LINE, REST_OF_SCREEN = "\x1b[H", "\x1b[K", "\x1b[J"
+ENDS: Final = ("q", "Q", "\x03", "\x04")
+STEPS: Final = {"\x1b[A": -1, "\x1b[B": 1, "k": -1, "j": 1, "\x1b[5~": -10, "\x1b[6~": 10}
+"""{key: by how many tasks it scrolls}."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TopView:
+    """Whom to ask and how to show it."""
+
+    runtime_dir: Path | None
+    node: str | None
+    connect: str | None
+    is_plain: bool
+    interval_s: float
+
+
+def top(view: TopView, *, is_once: bool) -> int:
+    """Show the fleet until ``q``, or once; returns the exit code of the last status.
+
+    Raises:
+        CliError: already the first question found nobody, or there is no terminal (2).
+    """
+    feed, past = Feed(lambda: find_door(view.runtime_dir, view.node, connect=view.connect)), Past()
+    feed.door()
+    first = feed.ask()
+    if first.status is None:
+        raise CliError(EXIT_UNREACHABLE, first.why)
+    past.take(first)
+    if not is_once and not (sys.stdin.isatty() and sys.stdout.isatty()):
+        raise CliError(
+            EXIT_USAGE, "a full screen needs a terminal; print it with --once, or see `zsched status --watch`"
+        )
+    if is_once:
+        lines = render_top(past, replace(_frame(view, 0), is_live=False))
+        sys.stdout.write("\n".join(lines) + "\n")
+        return code_of(first.status)
+    _live(view, feed, past)
+    return EXIT_OK if past.status is None else code_of(past.status)
+
+
+def _live(view: TopView, feed: Feed, past: Past) -> None:
+    """Draw on every news, key and change of size, until a key ends it."""
+    told: queue.SimpleQueue[News] = queue.SimpleQueue()
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)
+    stop = threading.Event()
+
+    def ask() -> None:
+        while not stop.wait(view.interval_s):
+            told.put(feed.ask())
+            with contextlib.suppress(OSError):  # full of wake-ups, or closed at the end
+                os.write(writing, b"n")
+
+    asker = guarded(ask, name="zsched-top-asker")
+    first_task = 0
+    with _screen(writing):
+        asker.start()
+        try:
+            while True:
+                sys.stdout.write(_drawn(render_top(past, _frame(view, first_task))))
+                sys.stdout.flush()
+                ready = select.select([sys.stdin.fileno(), reading], [], [])[0]
+                if reading in ready:
+                    os.read(reading, 4096)
+                while not told.empty():
+                    past.take(told.get())
+                if sys.stdin.fileno() in ready:
+                    key = os.read(sys.stdin.fileno(), 32).decode(errors="replace")
+                    if key in ENDS or not key:
+                        return
+                    tasks = 0 if past.status is None else len(past.status["tasks"])
+                    first_task = max(0, min(first_task + STEPS.get(key, 0), tasks - 1))
+        except KeyboardInterrupt:
+            return
+        finally:
+            stop.set()
+
+
+@contextlib.contextmanager
+def _screen(wake: int) -> Iterator[None]:
+    """The terminal for ourselves: no echo, keys at once; as it was afterwards. A new size is written to ``wake``."""
+    descriptor = sys.stdin.fileno()
+    before = termios.tcgetattr(descriptor)
+    old_handler = signal.signal(signal.SIGWINCH, lambda _number, _frame: None)
+    old_wake = signal.set_wakeup_fd(wake, warn_on_full_buffer=False)
+    sys.stdout.write(ENTER)
+    try:
+        tty.setcbreak(descriptor)
+        yield
+    finally:
+        termios.tcsetattr(descriptor, termios.TCSADRAIN, before)
+        sys.stdout.write(LEAVE)
+        sys.stdout.flush()
+        signal.set_wakeup_fd(old_wake)
+        signal.signal(signal.SIGWINCH, old_handler)
+
+
+def _frame(view: TopView, first_task: int) -> Frame:
+    columns, lines = shutil.get_terminal_size((100, 30))
+    return Frame(
+        width=max(columns, MIN_WIDTH),
+        height=max(lines, MIN_HEIGHT),
+        is_colored=wants_color(view.is_plain),
+        now=wall_s(),
+        first_task=first_task,
+        period_s=max(view.interval_s, 1.0),
+    )
+
+
+def _drawn(lines: list[str]) -> str:
+    """The lines from the top of the screen; what was there is overwritten, so nothing flickers."""
+    return HOME + f"{REST_OF_LINE}\r\n".join(lines) + REST_OF_LINE + REST_OF_SCREEN
