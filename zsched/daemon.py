@@ -37,11 +37,12 @@ from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
 from zsched.clock import monotonic_s, wall_tenths
 from zsched.config.load import load_fleet, require_node
 from zsched.core import events as ev
+from zsched.core.electorate.numbers import in_force
 from zsched.core.node import Node
 from zsched.core.route.route import outputs_of, watch_for
 from zsched.core.status import status_line
 from zsched.core.values.durable import DurableState
-from zsched.core.values.fleet import dial_endpoint, electorate_hash, fleet_hash, runs_worker
+from zsched.core.values.fleet import Fleet, dial_endpoint, electorate_hash, fleet_hash, runs_worker
 from zsched.core.values.model import NodeId, NodeKind, TaskId
 from zsched.errors import AdapterError, ConfigError, NameTakenError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_NAME_TAKEN, EXIT_OK
@@ -54,6 +55,7 @@ from zsched.runtime.access import StreamAccess, joins_at
 from zsched.runtime.descriptors import take_descriptors
 from zsched.runtime.endpoints import DATA_PORT, Endpoints, claim_port, endpoints_for, free_port, is_here
 from zsched.runtime.leaving import Leaving
+from zsched.runtime.library import Library
 from zsched.runtime.memory import shared_memory_objection
 from zsched.runtime.sampler import Sampler
 from zsched.runtime.sessions import SessionsRead
@@ -90,10 +92,6 @@ class Daemon:
         self._fleet = load_fleet(options.config)
         require_node(self._fleet, options.node, options.config)
         self._spec = self._fleet.node(options.node)
-        # Read once, when zenoh's runtime starts; the workers inherit it. An operator's own setting wins.
-        os.environ.setdefault(
-            "ZENOH_RUNTIME", zenoh_config.runtime_pools(len(self._fleet.nodes), len(self._fleet.tasks))
-        )
         self._inbox = Inbox()
         on_failure(lambda kind, text: self._inbox.post(ev.ProblemReported(source=f"thread/{kind}", problem=text)))
         self._notify = Notifier()
@@ -103,15 +101,28 @@ class Daemon:
         self._lacks_state_file = False
         self._door = Door(options.runtime_dir, options.node)
         self._is_ready = False
-        self._operator_json5 = daemon_tls.operator_json5(self._fleet)
-        self._protocol = daemon_tls.protocol_of(self._fleet, self._operator_json5)
-        self._memory_objection = shared_memory_objection(self._fleet, self._spec)
+        self._library = Library(
+            fleet=self._fleet.name,
+            node=options.node,
+            config=options.config.absolute(),
+            state_dir=options.state_dir,
+            post=self._inbox.post,
+        )
+        self._stored: dict[str, Fleet] = {}
+        """{hash: what it says} of the documents that the state names."""
+        self._in_file = fleet_hash(self._fleet)
+        self._read_settings()
 
     def run(self) -> int:
         """Run until SIGTERM or SIGINT; the exit code."""
         state_file = StateFile(self._options.state_dir, fleet=self._fleet.name, node=self._spec.name)
         with state_file, contextlib.ExitStack() as stack:
             durable, problem = self._restore(state_file)
+            self._take_document(durable)
+            # Read once, when zenoh's runtime starts; the workers inherit it. An operator's own setting wins.
+            os.environ.setdefault(
+                "ZENOH_RUNTIME", zenoh_config.runtime_pools(len(self._fleet.nodes), len(self._fleet.tasks))
+            )
             incarnation = durable.incarnation if durable is not None else wall_tenths()
             points = endpoints_for(
                 self._fleet, self._spec, functools.partial(self._data_port, stack), is_here, self._protocol
@@ -127,6 +138,7 @@ class Daemon:
                 rng=random.Random(f"{self._spec.name}/{incarnation}"),
                 now=monotonic_s(),
                 version=__version__,
+                stored=self._stored,
             )
             node.solitude.dialled = points.control_connect
             node.solitude.dialled_at = dial_endpoint(self._spec.listen_control, self._spec.host)
@@ -135,6 +147,7 @@ class Daemon:
                 node.problems["state"] = problem
             node.has_foreign_state = self._has_foreign_state
             node.fleet_path = str(self._options.config.absolute())
+            node.by_file = self._in_file
             node.lacks_state_file = self._lacks_state_file
             if self._memory_objection:
                 log.warning("shared_memory off why=%s", self._memory_objection)
@@ -156,7 +169,7 @@ class Daemon:
             command = f"zsched init --config {here.config} --node {here.node} --state-dir {here.state_dir}"
             log.warning("no_state why=%s (here: `%s`); no elector", loaded.problem, command)
             return None, loaded.problem
-        if loaded.state.electorate != electorate_hash(self._fleet):
+        if loaded.state.electorate != electorate_hash(self._fleet) and not _is_agreed(loaded.state):
             generation = loaded.state.generation + 1
             self._has_foreign_state = True
             return None, (
@@ -175,6 +188,35 @@ class Daemon:
         except AdapterError as error:
             return None, str(error)
         return state, None
+
+    def _take_document(self, durable: DurableState | None) -> None:
+        """Go by the agreed document if the state names one that is stored here, else by the fleet file."""
+        register = None if durable is None else durable.fleet_register
+        value = None if register is None else register.learnt
+        if register is None or value is None:
+            return
+        named = [value.document, "" if register.accepted is None else register.accepted.value.document]
+        self._library.keep(tuple(filter(None, named)))
+        for document in filter(None, named):
+            content = self._library.store.load(document)
+            if content is None:
+                continue
+            try:
+                self._stored[document] = self._library.read(content)
+            except ConfigError as error:
+                log.warning("document unusable document=%s why=%s", document, error)
+        fleet = self._stored.get(value.document)
+        if fleet is not None:
+            self._fleet = in_force(fleet, value)
+            self._spec = self._fleet.node(self._options.node)
+            self._read_settings()
+            log.info("document in force revision=%d document=%s", value.revision, value.document)
+
+    def _read_settings(self) -> None:
+        """What hangs on the fleet in force, and is the same for as long as the process lives."""
+        self._operator_json5 = daemon_tls.operator_json5(self._fleet)
+        self._protocol = daemon_tls.protocol_of(self._fleet, self._operator_json5)
+        self._memory_objection = shared_memory_objection(self._fleet, self._spec)
 
     def _data_port(self, stack: contextlib.ExitStack) -> int:
         """A port for the data session: that of the relay that may be taken over, else the default, else a free one."""
@@ -222,7 +264,10 @@ class Daemon:
         bus.open()
         stack.callback(bus.close)
         shell = Shell(node=me, inbox=self._inbox, bus=bus, state_file=state_file, desk=desk, fleet=fleet)
-        shell.log = decisions
+        shell.log, shell.library = decisions, self._library
+        self._library.fetch = bus.fetch_document
+        self._library.start()
+        stack.callback(self._library.close)
         decisions.start()
         stack.callback(decisions.close)
         shell.relay = relay = self._relay(shell, incarnation, points, operator_json5)
@@ -391,6 +436,12 @@ class Daemon:
         self._is_ready = True
         self._notify.ready()
         log.info("ready node=%s fleet=%s incarnation=%d", node.me, self._fleet.name, node.incarnation)
+
+
+def _is_agreed(state: DurableState) -> bool:
+    """Whether a fleet value names the electors, and no longer the file."""
+    value = None if state.fleet_register is None else state.fleet_register.learnt
+    return value is not None and not value.electorate.is_founding
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -9,11 +9,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from zsched.core.values.document import Flag
+from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import (
     Accept,
     Accepted,
+    ChangeFleet,
     Command,
     ExplainTask,
+    FleetAnswer,
+    FleetQuestion,
     Learnt,
     Prepare,
     Promise,
@@ -152,6 +157,56 @@ class PersistFailed:
     """The durable state could not be written; nothing that depended on it was sent."""
 
     reason: str
+
+
+# --- VOTE: the fleet register and its documents ----------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FleetAsked:
+    """A proposer asks this elector's fleet register."""
+
+    request: int
+    asker: NodeId
+    question: FleetQuestion
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FleetAnswered:
+    """An elector answered our question to its fleet register."""
+
+    answer: FleetAnswer
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DocumentAsked:
+    """A peer asks for the document with this hash."""
+
+    request: int
+    document: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DocumentStored:
+    """A document is on this node's disk, and it is valid here."""
+
+    document: str
+    """Its hash."""
+    fleet: Fleet
+    """What its text says."""
+    flags: tuple[Flag, ...] = ()
+    request: int | None = None
+    """Of `StoreDocument`; ``None``: it was fetched from a peer."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DocumentRefused:
+    """A document is not valid here, or the disk refused it; nothing is stored."""
+
+    document: str
+    reason: str
+    request: int | None = None
+    """Of `StoreDocument`; ``None``: it was fetched from a peer."""
 
 
 # --- membership ------------------------------------------------------------------------------------------------------
@@ -370,6 +425,14 @@ class LinesAsked:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class FleetCommanded:
+    """An operator changes the fleet."""
+
+    request: int
+    command: ChangeFleet
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FrameDropped:
     """A frame came that is invalid or not for us: only a counter rises."""
 
@@ -411,6 +474,11 @@ Event = (
     | LearntReceived
     | LearntAsked
     | PersistFailed
+    | FleetAsked
+    | FleetAnswered
+    | DocumentAsked
+    | DocumentStored
+    | DocumentRefused
     | BeatReceived
     | TokenSeen
     | TokenLost
@@ -431,6 +499,7 @@ Event = (
     | ExplanationAsked
     | RestartCommanded
     | LinesAsked
+    | FleetCommanded
     | FrameDropped
     | AddressesTried
     | ProblemReported
@@ -448,4 +517,6 @@ def commanded(request: int, command: Command) -> Event:
         return RestartCommanded(request=request, command=command)
     if isinstance(command, ReadLines):
         return LinesAsked(request=request, command=command)
+    if isinstance(command, ChangeFleet):
+        return FleetCommanded(request=request, command=command)
     return WeightsCommanded(request=request, command=command)

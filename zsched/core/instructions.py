@@ -12,9 +12,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from zsched.core.values.decision import Decision, Explanation, Move
+from zsched.core.values.document import Document
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import FleetValue
-from zsched.core.values.messages import Accept, Accepted, CommandResult, Learnt, Prepare, Promise, Refused, Utilities
+from zsched.core.values.messages import (
+    Accept,
+    Accepted,
+    CommandResult,
+    FleetAnswer,
+    Learnt,
+    Prepare,
+    Promise,
+    Refused,
+    Utilities,
+)
 from zsched.core.values.model import Beat, NodeId, Profile, Proposal, TaskId
 from zsched.core.values.plan import Role, RoutePlan
 from zsched.core.values.snapshot import Snapshot
@@ -235,37 +246,6 @@ class RecordStory:
     """With it, this node's streams have switched to the owner of ``epoch``, so long after it learnt the value."""
 
 
-Instruction = (
-    PersistState
-    | PublishBeat
-    | PublishProfile
-    | AskUtilities
-    | AnswerUtilities
-    | PublishProposal
-    | SendPrepare
-    | SendAccept
-    | AnswerElection
-    | PublishLearnt
-    | AskLearnt
-    | AnswerLearnt
-    | IntroducePeers
-    | TryAddresses
-    | StartWorker
-    | StopWorker
-    | ResetWorker
-    | RestartWorker
-    | RenewWorker
-    | SetRole
-    | ApplyRoutes
-    | AnswerStatus
-    | AnswerCommand
-    | AnswerExplanation
-    | AnswerLines
-    | StandDown
-    | RecordStory
-)
-
-
 # --- of the fleet register -------------------------------------------------------------------------------------------
 
 
@@ -293,4 +273,84 @@ class AskFleet:
     peer: NodeId
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AnswerFleet:
+    """Answer a question to the fleet register."""
+
+    request: int
+    answer: FleetAnswer
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StoreDocument:
+    """An operator gave this document: check it and write it; `DocumentStored` or `DocumentRefused` comes back."""
+
+    request: int
+    content: Document
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FetchDocument:
+    """Fetch the document with this hash from one of the peers, in this order; check it and write it.
+
+    `DocumentStored` or `DocumentRefused` comes back. If no peer has it, nothing comes back: the node asks again later.
+    """
+
+    document: str
+    peers: tuple[NodeId, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AnswerDocument:
+    """Answer a peer with the document that has this hash, or with nothing if it is not stored here."""
+
+    request: int
+    document: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KeepDocuments:
+    """Delete every stored document but these."""
+
+    documents: tuple[str, ...]
+
+
 FleetInstruction = AskElectors | TellFleet | AskFleet
+"""What the fleet register asks of other nodes; `zsched.core.electorate.numbers` says which instructions carry it."""
+
+
+Instruction = (
+    PersistState
+    | PublishBeat
+    | PublishProfile
+    | AskUtilities
+    | AnswerUtilities
+    | PublishProposal
+    | SendPrepare
+    | SendAccept
+    | AnswerElection
+    | AskElectors
+    | AnswerFleet
+    | StoreDocument
+    | FetchDocument
+    | AnswerDocument
+    | KeepDocuments
+    | PublishLearnt
+    | AskLearnt
+    | AnswerLearnt
+    | IntroducePeers
+    | TryAddresses
+    | StartWorker
+    | StopWorker
+    | ResetWorker
+    | RestartWorker
+    | RenewWorker
+    | SetRole
+    | ApplyRoutes
+    | AnswerStatus
+    | AnswerCommand
+    | AnswerExplanation
+    | AnswerLines
+    | StandDown
+    | RecordStory
+)

@@ -16,7 +16,7 @@ from typing import Any, Final
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.handlers import beats, choice, operators, work
+from zsched.core.handlers import beats, choice, documents, operators, work
 from zsched.core.stages import Handler, Stages
 from zsched.core.todo import ToDo
 from zsched.core.values.change import MoveOwner
@@ -27,6 +27,7 @@ _HANDLERS: Final[Mapping[type[Any], Handler]] = {
     **work.HANDLERS,
     **beats.HANDLERS,
     **operators.HANDLERS,
+    **documents.HANDLERS,
 }
 _OFTEN_QUIET: Final = frozenset(
     {
@@ -54,6 +55,8 @@ class Node(Stages):
         """The first batch: warm workers start, and what was learnt before the restart is carried out again."""
         todo = self._todo
         todo.must_persist = self.agreement.must_persist
+        todo.add(*self.agreement.at_start.send)
+        documents.compare_file(self)
         for name, executor in self.executors.items():
             executor.start(todo)
             value = self.registers[name].value
@@ -189,11 +192,19 @@ class Node(Stages):
             self.rounds.on_called(task, is_escape=is_escape, now=now)
         for task in todo.stayed:
             self.rounds.on_stayed(task)
+        for change, outcome in todo.fleet_ended:
+            self.agreement.orders.on_ended(change, outcome, todo)
         for ended in todo.ended:
             self.agreement.on_ended(ended, todo)
             if isinstance(ended.change, MoveOwner):
                 self.votes.on_commit_ended(ended.task)
-        learnt = todo.learnt
-        todo.called, todo.stayed, todo.ended, todo.learnt = [], [], [], []
+        learnt, fleet = todo.learnt, todo.in_force
+        todo.called, todo.stayed, todo.ended, todo.learnt, todo.fleet_ended = [], [], [], [], []
+        todo.in_force = None
+        if fleet is not None:
+            documents.take_effect(self, fleet, todo, now)
+        if todo.must_tell:
+            todo.must_tell = False
+            todo.add(do.PublishLearnt(learnt=self.agreement.learnt()))
         for value, reason in learnt:
             work.carry_out(self, value, reason, todo, now)

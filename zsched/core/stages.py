@@ -11,6 +11,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from random import Random
+from types import MappingProxyType
 from typing import Any
 
 from zsched.core.events import SlotReady
@@ -66,7 +67,7 @@ class Stages:
     """One daemon's whole decision state.
 
     Args:
-        fleet: the validated fleet file.
+        fleet: what the node goes by at its start: the validated fleet file, or the document that its state names.
         me: this node's name.
         durable: what the state file holds, with the incarnation of *this* start; ``None`` when there is no valid file
             (then this node is no elector).
@@ -75,6 +76,7 @@ class Stages:
         rng: seeded by the shell; the only source of chance.
         now: monotonic seconds.
         version: of the program, for status.
+        stored: {hash: what it says} of the documents on this node's disk that its state names.
     """
 
     def __init__(
@@ -88,6 +90,7 @@ class Stages:
         rng: Random,
         now: float,
         version: str = "",
+        stored: Mapping[str, Fleet] = MappingProxyType({}),
     ) -> None:
         self.fleet, self.me, self.version = fleet, me, version
         self.kind = fleet.node(me).kind
@@ -101,6 +104,8 @@ class Stages:
         self.fleet_file = fleet_hash(fleet)
         self.fleet_path = ""
         """Where that file lies, for the status."""
+        self.by_file = self.fleet_file
+        """Hash of what that file says; once a document is agreed, the node does not go by the file."""
         self.joins_at: tuple[str, ...] = ()
         """Where applications on this machine join its streams, for the status."""
         self.counters: Counter[str] = Counter()
@@ -127,6 +132,7 @@ class Stages:
             electorate=electorate,
             rng=rng,
             now=now,
+            stored=stored,
         )
         self.registers = self.agreement.registers
         # EXECUTOR, ROUTE

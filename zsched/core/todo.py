@@ -15,6 +15,7 @@ from zsched.core import instructions as do
 from zsched.core.instructions import FleetInstruction
 from zsched.core.values.change import Change, Ended, Rewrite, RoundOutcome
 from zsched.core.values.electorate import FleetValue
+from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import Allocation, TaskId
 
 _LOCAL = frozenset(
@@ -57,6 +58,10 @@ class ToDo:
     """What the fleet register asks of other nodes, and tells them."""
     fleet_ended: list[tuple[Rewrite[FleetValue], RoundOutcome]] = field(default_factory=list)
     """Changes of the fleet that were committed, overtaken or given up."""
+    must_tell: bool = False
+    """A change of the fleet was committed here: the other nodes must hear at once what this one has learnt."""
+    in_force: Fleet | None = None
+    """Another fleet is in force from now on: its document is stored, and the value with it is learnt."""
 
     stand_down: do.StandDown | None = None
     """This daemon ends: the last instruction, behind all others of the same event."""
@@ -73,7 +78,8 @@ class ToDo:
     @property
     def is_settled(self) -> bool:
         """Whether no stage has left anything for another stage."""
-        return not (self.called or self.stayed or self.ended or self.learnt)
+        is_of_fleet = self.fleet_ended or self.must_tell or self.in_force is not None
+        return not (self.called or self.stayed or self.ended or self.learnt or is_of_fleet)
 
     @property
     def is_only_sent(self) -> bool:

@@ -46,11 +46,13 @@ from zsched.core.values.messages import (
     RetryTask,
     SetWeights,
     WorkerLines,
+    fleet_question,
 )
 from zsched.core.values.model import NAME, NodeId, TaskId
 from zsched.core.values.snapshot import Snapshot
 from zsched.errors import AdapterError, WireError
 from zsched.runtime.crew import Crew
+from zsched.runtime.library import Library
 from zsched.wire import codec as wire
 
 INBOX_LIMIT = 20_000
@@ -263,6 +265,8 @@ class Shell:
         self._trial = AddressTrial(inbox.post)
         self.relay: RelayHandle | None = None
         """It reports to this shell, so it is made after it."""
+        self.library: Library | None = None
+        """The fleet's documents."""
         self.log: DecisionLog | None = None
         self.stand_down = ""
         """Why this daemon must end, for its name is taken; empty: it need not."""
@@ -318,6 +322,14 @@ class Shell:
                 bus.ask_electors(prepare, deadline_s)
             case do.SendAccept(accept=accept, deadline_s=deadline_s):
                 bus.ask_electors(accept, deadline_s)
+            case do.AskElectors(question=question, deadline_s=deadline_s):
+                bus.ask_fleet(fleet_question(question), deadline_s)
+            case do.AnswerFleet(request=request, answer=fleet_answer):
+                bus.answer(request, fleet_answer)
+            case do.StoreDocument() | do.FetchDocument() | do.KeepDocuments():
+                self._documents().order(instruction)
+            case do.AnswerDocument(request=request, document=document):
+                self._answer_document(request, document)
             case do.AskLearnt(peer=peer, deadline_s=deadline_s):
                 bus.ask_learnt(peer, deadline_s)
             case do.IntroducePeers():
@@ -369,6 +381,17 @@ class Shell:
             return WorkerLines(node=self._node, task=task, is_here=False)
         lines, newest = kept.behind(after)
         return WorkerLines(node=self._node, task=task, lines=lines, newest=newest)
+
+    def _documents(self) -> Library:
+        assert self.library is not None
+        return self.library
+
+    def _answer_document(self, request: int, document: str) -> None:
+        content = self._documents().store.load(document)
+        if content is None:
+            self._bus.answer_nothing(request)
+        else:
+            self._bus.answer(request, content)
 
     def _streams(self) -> RelayHandle:
         assert self.relay is not None

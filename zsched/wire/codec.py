@@ -22,7 +22,7 @@ from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 import msgpack
 
 from zsched.core.membership.beat_room import MAX_BEAT_BYTES
-from zsched.core.values import decision, durable, messages, model, plan, snapshot
+from zsched.core.values import decision, document, durable, messages, model, plan, snapshot
 from zsched.errors import WireError
 
 VERSION = 1
@@ -44,6 +44,10 @@ KINDS: dict[str, tuple[type, int]] = {
     "accept": (messages.Accept, SMALL),
     "accepted": (messages.Accepted, SMALL),
     "refused": (messages.Refused, SMALL),
+    "fleet_question": (messages.FleetQuestion, LARGE),
+    "fleet_answer": (messages.FleetAnswer, LARGE),
+    "ask_document": (messages.AskDocument, SMALL),
+    "document": (document.Document, LARGE),
     "learnt": (messages.Learnt, LARGE),
     "set_weights": (messages.SetWeights, SMALL),
     "retry_task": (messages.RetryTask, SMALL),
@@ -51,6 +55,7 @@ KINDS: dict[str, tuple[type, int]] = {
     "explanation": (decision.Explanation, LARGE),
     "restart_task": (messages.RestartTask, SMALL),
     "read_lines": (messages.ReadLines, SMALL),
+    "change_fleet": (messages.ChangeFleet, LARGE),
     "worker_lines": (messages.WorkerLines, LARGE),
     "command_result": (messages.CommandResult, SMALL),
     "status": (snapshot.Snapshot, LARGE),
@@ -88,6 +93,13 @@ def _read_str(value: Any) -> str:
     return value
 
 
+def _read_text(value: Any) -> str:
+    """A document's text: its class checks how long it is."""
+    if type(value) is not str:
+        raise _fail("expected a string", value)
+    return value
+
+
 def _read_int(value: Any) -> int:
     if type(value) is not int:
         raise _fail("expected an integer", value)
@@ -119,7 +131,13 @@ def _write_str(value: str) -> str:
     return value if value.isascii() else value.encode("utf-8", "replace").decode()
 
 
-_SCALARS: dict[Any, Reader] = {str: _read_str, int: _read_int, float: _read_float, bool: _read_bool}
+_SCALARS: dict[Any, Reader] = {
+    str: _read_str,
+    document.Text: _read_text,
+    int: _read_int,
+    float: _read_float,
+    bool: _read_bool,
+}
 _AS_IT_IS = {
     str: f"type({{0}}) is str and len({{0}}) <= {MAX_STRING}",
     int: "type({0}) is int",
@@ -367,6 +385,26 @@ def from_plain(body: Any, cls: type[T]) -> T:
     except (ValueError, TypeError, OverflowError) as error:
         raise WireError("range", str(error)[:200]) from error
     return value
+
+
+def document_hash(content: document.Document) -> str:
+    """32 hex digits over a document's frame: its name in fleet values, and on disks."""
+    return _named(encode(content))
+
+
+def decode_document(frame: bytes, name: str) -> document.Document:
+    """The document in a frame, which must be the one with the hash ``name``.
+
+    Raises:
+        WireError: anything is wrong; ``reason`` "checksum": it is another document.
+    """
+    if _named(frame) != name:
+        raise WireError("checksum", f"these bytes are not the document {name}")
+    return decode(frame, document.Document)
+
+
+def _named(frame: bytes) -> str:
+    return hashlib.blake2s(frame, digest_size=16, person=b"zsched1", salt=b"document").hexdigest()
 
 
 # --- the state file's payload --------------------------------------------------------------------------------------

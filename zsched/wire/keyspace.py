@@ -95,6 +95,10 @@ class Keyspace:
         """Queryable of ``elector``: prepare and accept."""
         return self._key("register", elector, proposer)
 
+    def document(self, node: NodeId, asker: NodeId) -> str:
+        """Queryable of ``node``: the fleet's documents, by their hashes."""
+        return self._key("document", node, asker)
+
     def allocation(self, node: NodeId) -> str:
         """Put: the register values that ``node`` has learnt."""
         return self._key("allocation", node)

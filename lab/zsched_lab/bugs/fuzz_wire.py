@@ -31,10 +31,23 @@ from zsched.core import instructions as do
 from zsched.core.electorate.founding import founded
 from zsched.core.node import Node
 from zsched.core.status import build_snapshot
+from zsched.core.values.document import Text
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, electorate_hash
-from zsched.core.values.messages import Accept, Accepted, Learnt, Prepare, Promise, Refused, SetWeights, Utilities
+from zsched.core.values.messages import (
+    Accept,
+    Accepted,
+    ChangeFleet,
+    FleetAnswer,
+    FleetQuestion,
+    Learnt,
+    Prepare,
+    Promise,
+    Refused,
+    SetWeights,
+    Utilities,
+)
 from zsched.core.values.model import (
     Beat,
     DeviceSample,
@@ -73,6 +86,14 @@ CLASSES: tuple[type[Any], ...] = tuple(cls for cls, _ in wire.KINDS.values())
 FOUNDED = tuple(founded("lab", generation, ("robot1", "robot2")) for generation in (0, 1))
 
 
+ONE_OF: dict[type, tuple[str, ...]] = {
+    FleetQuestion: ("prepare", "accept"),
+    FleetAnswer: ("promise", "accepted", "refused"),
+    ChangeFleet: ("document", "add_elector", "remove_elector"),
+}
+"""{class: its fields of which exactly one is given}."""
+
+
 def sample(hint: Any, rng: Random, name: str = "") -> Any:
     """Some value of a type hint; ``name`` is the field that holds it."""
     if hint is bool:
@@ -81,6 +102,8 @@ def sample(hint: Any, rng: Random, name: str = "") -> Any:
         return rng.choice((0, 1, 2, 5, rng.randrange(1000)))
     if hint is float:
         return rng.random()
+    if hint is Text:
+        return rng.choice(("", "fleet: lab  # a comment\n"))
     if hint is str:
         return rng.choice(TASKS) if "task" in name else rng.choice(NAMES)
     origin, inner = get_origin(hint), get_args(hint)
@@ -108,18 +131,26 @@ def _dataclass(cls: Any, rng: Random) -> Any:
     values = {one.name: sample(hints[one.name], rng, one.name) for one in fields(made)}
     if made is Accept:
         values["task"] = values["acceptance"].value.task
+    chosen = rng.choice(ONE_OF.get(made, ("",)))
+    for other in ONE_OF.get(made, ()):
+        if other != chosen:
+            values[other] = "" if hints[other] is str else None
+        while not values[chosen]:
+            values[chosen] = sample(hints[chosen], rng, chosen)
     for _ in range(20):
         try:
             return made(**values)
         except ValueError as error:  # a range that the hint does not tell: the message names the field
             wrong = str(error).partition(":")[0].rpartition(".")[2]
-            values[wrong] = _in_range(wrong, hints[wrong])
+            values[wrong] = _in_range(wrong, hints[wrong], rng)
     raise AssertionError(f"cannot make a {made.__name__}")
 
 
-def _in_range(name: str, hint: Any) -> Any:
+def _in_range(name: str, hint: Any, rng: Random) -> Any:
     if hint is int:
         return 1
+    if hint is str:
+        return rng.choice(("0d", "0e"))
     return -50.0 if "dbm" in name else 1.0
 
 
@@ -202,6 +233,9 @@ _EVENTS: dict[type[Any], Callable[[Any], ev.Event]] = {
     Promise: lambda v: ev.ElectorAnswered(answer=v),
     Accepted: lambda v: ev.ElectorAnswered(answer=v),
     Refused: lambda v: ev.ElectorAnswered(answer=v),
+    FleetQuestion: lambda v: ev.FleetAsked(request=1, asker=v.ballot.node, question=v),
+    FleetAnswer: lambda v: ev.FleetAnswered(answer=v),
+    ChangeFleet: lambda v: ev.FleetCommanded(request=1, command=v),
     SetWeights: lambda v: ev.WeightsCommanded(request=1, command=v),
     ev.WorkerJobs: lambda v: v,  # of this node's own worker, by way of its relay
 }

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from zsched.core.electorate.founding import founded
 from zsched.core.membership.beat_room import MAX_BEAT_BYTES
-from zsched.core.values import messages, model
+from zsched.core.values import document, messages, model
 from zsched.core.values.electorate import FleetValue
 from zsched.errors import WireError
 from zsched.ipc import pipe as relay_pipe
@@ -76,6 +76,12 @@ def test_golden_frames_of_kinds_that_are_gone_are_not_deleted() -> None:
 FOUNDED = founded("lab", 1, ("r1", "r2"))
 NAMES = st.from_regex(r"[a-z0-9][a-z0-9_-]{0,20}", fullmatch=True)
 TEXTS = st.text(st.characters(codec="utf-8"), max_size=60)
+ONE_OF = {
+    messages.FleetQuestion: ("prepare", "accept"),
+    messages.FleetAnswer: ("promise", "accepted", "refused"),
+    messages.ChangeFleet: ("document", "add_elector", "remove_elector"),
+}
+IDS = {"disk", "document"}
 FREE_TEXT = {"reason", "detail", "electorate", "hardware", "problem", "source", "zid", "incarnation", "from_expr"}
 RANGES: dict[str, tuple[float, float]] = {
     "rssi_dbm": (-120.0, 0.0),
@@ -101,6 +107,10 @@ def strategy(hint: Any, name: str = "") -> st.SearchStrategy[Any]:
         return st.integers(int(low), int(high) if name in RANGES else model.MAX_COUNTER)
     if hint is float:
         return st.floats(low, high)
+    if hint is document.Text:
+        return TEXTS
+    if hint is str and name in IDS:
+        return st.text("0123456789abcdef", min_size=1, max_size=32)
     if hint is str:
         return TEXTS if name in FREE_TEXT else NAMES
     if get_origin(hint) is tuple:
@@ -126,17 +136,25 @@ def dataclass_strategy(cls: type[Any]) -> st.SearchStrategy[Any]:
         )
     if cls is FleetValue:
         return st.sampled_from((FOUNDED, replace(FOUNDED, document="0a", revision=2)))
-    if cls is messages.Accept:
+    if (get_origin(cls) or cls) is messages.Accept:
         return st.builds(
             lambda acceptance, electorate: messages.Accept(
                 task=acceptance.value.task, acceptance=acceptance, electorate=electorate
             ),
-            strategy(model.Acceptance),
+            strategy(wire.hints_of(cls)["acceptance"]),
             TEXTS,
         )
     hints = wire.hints_of(cls)
     made = get_origin(cls) or cls
-    return st.builds(made, **{field.name: strategy(hints[field.name], field.name) for field in fields(made)})
+    parts = {field.name: strategy(hints[field.name], field.name) for field in fields(made)}
+    if made not in ONE_OF:
+        return st.builds(made, **parts)
+    whole = [
+        {other: parts[other] for other in parts if other not in ONE_OF[made] or other == one} for one in ONE_OF[made]
+    ]
+    for one, kept in zip(ONE_OF[made], whole, strict=True):
+        kept[one] = kept[one].filter(bool)
+    return st.one_of(*(st.builds(made, **kept) for kept in whole))
 
 
 @pytest.mark.parametrize("kind", sorted(wire.KINDS))

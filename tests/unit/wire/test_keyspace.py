@@ -29,6 +29,7 @@ for _method, _arguments in {
     "register": ("robot1", "robot2"),
     "allocation": ("edge1",),
     "learnt": ("edge1", "robot1"),
+    "document": ("edge1", "robot1"),
     "worker": ("edge1", "map_merge", "7"),
     "role": ("edge1", "map_merge"),
     "trouble": ("edge1", "map_merge", "7"),

@@ -159,14 +159,9 @@ class StateFile:
         """
         if self._lock_fd is None:
             raise AdapterError(f"the lock of {self.folder} is not held: acquire it before saving")
-        content, new = encode_state(state), self.folder / NEW_NAME
         try:
-            _write_synced(new, content)
-            new.replace(self.path)
-            _sync_folder(self.folder)
+            replace_synced(self.path, self.folder / NEW_NAME, encode_state(state))
         except OSError as error:
-            with contextlib.suppress(OSError):
-                new.unlink()
             raise AdapterError(
                 f"cannot write {self.path}: {error.strerror}; free or remount the disk (the old state is whole)"
             ) from error
@@ -219,6 +214,27 @@ def is_same_hardware(stored: str, current: str) -> bool:
 
 def _parts(hardware: str) -> dict[str, str]:
     return dict(part.partition(":")[::2] for part in hardware.split(",") if part)
+
+
+def replace_synced(path: Path, new: Path, content: bytes) -> None:
+    """Let the file at ``path`` hold ``content``; when this returns it survives a power cut.
+
+    Args:
+        path: the file.
+        new: where it is written first, in the same folder.
+        content: all of it.
+
+    Raises:
+        OSError: the disk is full, read-only or gone; what was at ``path`` is whole.
+    """
+    try:
+        _write_synced(new, content)
+        new.replace(path)
+        _sync_folder(path.parent)
+    except OSError:
+        with contextlib.suppress(OSError):
+            new.unlink()
+        raise
 
 
 def _write_synced(path: Path, content: bytes) -> None:

@@ -23,9 +23,13 @@ from zsched.core.values.decision import Explanation
 from zsched.core.values.messages import (
     Accept,
     Accepted,
+    AskDocument,
+    ChangeFleet,
     Command,
     CommandResult,
     ExplainTask,
+    FleetAnswer,
+    FleetQuestion,
     Learnt,
     Prepare,
     Promise,
@@ -61,7 +65,8 @@ _PUTS: dict[str, type[Beat | Profile | Proposal | Learnt]] = {
     "proposal": Proposal,
     "allocation": Learnt,
 }
-_QUESTIONS = frozenset({"utility", "register", "allocation", "status", "command"})
+_COMMANDS = (SetWeights, RetryTask, ExplainTask, RestartTask, ReadLines, ChangeFleet)
+_QUESTIONS = frozenset({"utility", "register", "allocation", "document", "status", "command"})
 
 
 def _event_of(value: Beat | Profile | Proposal | Learnt) -> tuple[NodeId, ev.Event]:
@@ -157,7 +162,8 @@ class ControlBus:
         keys, node = self._keys, self._node
         if self._is_voter:
             return [keys.all_questions(node)]
-        return [keys.register(node, "*"), keys.learnt(node, "*"), keys.status(node, "*"), keys.command(node, "*")]
+        asked = (keys.register, keys.learnt, keys.document, keys.status, keys.command)
+        return [key(node, "*") for key in asked]
 
     def waiting(self) -> Iterator[ev.Event]:
         """The periodic beats and profiles that have come since the last call (the loop)."""
@@ -253,17 +259,22 @@ class ControlBus:
             number = self._questions.keep(query, keys.utility(node, asker))
             return ev.UtilityAsked(request=number, asker=asker)
         if kind == "register":
-            value: Any = wire.decode(payload, Prepare, Accept)
+            value: Any = wire.decode(payload, Prepare, Accept, FleetQuestion)
             number = self._questions.keep(query, keys.register(node, asker))
+            if isinstance(value, FleetQuestion):
+                return ev.FleetAsked(request=number, asker=asker, question=value)
             if isinstance(value, Prepare):
                 return ev.PrepareAsked(request=number, asker=asker, prepare=value)
             return ev.AcceptAsked(request=number, asker=asker, accept=value)
         if kind == "allocation":
             return ev.LearntAsked(request=self._questions.keep(query, keys.learnt(node, asker)))
+        if kind == "document":
+            wanted = wire.decode(payload, AskDocument).document
+            return ev.DocumentAsked(request=self._questions.keep(query, keys.document(node, asker)), document=wanted)
         if kind == "status":
             return ev.StatusAsked(request=self._questions.keep(query, keys.status(node, asker)))
         if kind == "command":
-            command: Any = wire.decode(payload, SetWeights, RetryTask, ExplainTask, RestartTask, ReadLines)
+            command: Any = wire.decode(payload, *_COMMANDS)
             return commanded(self._questions.keep(query, keys.command(node, asker)), command)
         raise WireError("key", "unknown kind")
 
@@ -290,6 +301,10 @@ class ControlBus:
         except (zenoh.ZError, WireError) as error:
             raise AdapterError(f"cannot answer question {request}: {error}") from error
 
+    def answer_nothing(self, request: int) -> None:
+        """End a question of a peer without an answer."""
+        self._questions.drop(request)
+
     def ask_utilities(self, gather: int, deadline_s: float) -> None:
         """One query to every robot; answers are posted as they come."""
 
@@ -312,6 +327,17 @@ class ControlBus:
 
         kinds = (Promise, Accepted, Refused)
         self._ask(self._keys.register("*", self._node), wire.encode(question), deadline_s, kinds, on_answer)
+
+    def ask_fleet(self, question: FleetQuestion, deadline_s: float) -> None:
+        """One query to every node, ourselves included: who is an elector answers; answers are posted as they come."""
+
+        def on_answer(owner: NodeId, value: FleetAnswer, _zid: str) -> None:
+            if owner == value.content.elector:
+                self._post(ev.FleetAnswered(answer=value))
+            else:
+                self._post(ev.FrameDropped(kind="register", reason="foreign"))
+
+        self._ask(self._keys.register("*", self._node), wire.encode(question), deadline_s, (FleetAnswer,), on_answer)
 
     def ask_learnt(self, peer: NodeId, deadline_s: float) -> None:
         """Ask one peer for what it has learnt."""
@@ -373,6 +399,28 @@ class ControlBus:
             )
         except zenoh.ZError as error:
             raise AdapterError(f"cannot ask {selector}: {error}") from error
+
+    # --- for the library (a thread of its own) -----------------------------------------------------------------------
+
+    def fetch_document(self, peer: NodeId, document: str, deadline_s: float) -> bytes | None:
+        """The frame of a document that ``peer`` has stored, or ``None``; blocks up to ``deadline_s``.
+
+        Nothing is checked: the caller compares the hash.
+        """
+        session = self._session
+        if session is None:
+            return None
+        try:
+            replies = session.get(
+                self._keys.document(peer, self._node),
+                payload=wire.encode(AskDocument(document=document)),
+                consolidation=zenoh.ConsolidationMode.NONE,
+                timeout=deadline_s,
+                allowed_destination=zenoh.Locality.REMOTE,
+            )
+            return next((reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None), None)
+        except zenoh.ZError:
+            return None  # it is being closed
 
     # --- for operators (a thread of their own) -----------------------------------------------------------------------
 

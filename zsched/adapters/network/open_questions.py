@@ -50,6 +50,13 @@ class Questions:
         finally:
             query.drop()
 
+    def drop(self, number: int) -> None:
+        """Let a question end without an answer."""
+        with self._lock:
+            entry = self._open.pop(number, None)
+        if entry is not None:
+            entry[0].drop()
+
     def clear(self) -> None:
         """Let go of everything (the session closes)."""
         with self._lock:

@@ -4,7 +4,8 @@ Knows: the rules of a change. Does not know: rounds (`zsched.core.vote.register`
 
 * A change of the electors adds one or removes one, never the last. It raises the number and unsettles the value.
 * A change of the lease's length raises the number, too: an elector of the number before waits for another length.
-* Both need a settled value. A change of the document is allowed at any time; it keeps number and ``settled``.
+* Both need a settled value. A change of the document is allowed at any time; it keeps number and ``settled``, unless it
+  brings another length of leases.
 * A fleet that goes by its files agrees a document first: without one, nobody knows its leases and registers.
 * A task that is created gets the next number of all creations, so a register that was removed never comes back.
 
@@ -122,14 +123,21 @@ class SetDocument:
     document: str
     tasks: tuple[tuple[TaskId, bool], ...]
     """(task, whether it is exclusive) of every task of the document."""
+    lease_s: float | None = None
+    """The document's length of leases; ``None``: as it is."""
     reason: str = "the fleet is changed"
 
     def fault(self, read: FleetValue) -> str:
         """Why this change cannot be made now; empty: it can."""
-        return "" if read.document else "no document is agreed yet"
+        if not read.document:
+            return "no document is agreed yet"
+        return _unsettled(read) if self._is_of_lease(read) else ""
+
+    def _is_of_lease(self, read: FleetValue) -> bool:
+        return self.lease_s is not None and self.lease_s != read.lease_s
 
     def apply(self, read: FleetValue) -> FleetValue:
-        """The value with this document; electors, number and ``settled`` stay."""
+        """The value with this document; electors stay, and so do number and ``settled`` unless the lease changes."""
         if self.fault(read):
             return read
         creations, tasks = read.creations, []
@@ -141,9 +149,14 @@ class SetDocument:
             tasks.append(Creation(task=task, number=number, exclusive=exclusive))
         if self.document == read.document and tuple(tasks) == read.tasks:
             return read
-        return replace(
+        changed = replace(
             read, revision=read.revision + 1, creations=creations, tasks=tuple(tasks), document=self.document
         )
+        if self.lease_s is None or not self._is_of_lease(read):
+            return changed
+        longest = max(self.lease_s, read.guard_lease_s)
+        numbered = replace(changed, number=read.number + 1, settled=False)
+        return replace(numbered, lease_s=self.lease_s, guard_lease_s=longest)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,6 +6,8 @@ Knows: which counters a fleet value has, to whom its questions go. Does not know
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from zsched.core.instructions import AskElectors
 from zsched.core.todo import ToDo
 from zsched.core.values.change import Rewrite, RoundOutcome
@@ -20,6 +22,11 @@ class FleetRegister(Register[FleetValue]):
     What was accepted under a number before is dropped: either it is the value that was learnt, or it can be chosen no
     more. Every elector that answers under a number has learnt its first value, so a blank one reads as that.
     """
+
+    holds: Callable[[FleetValue], bool] = staticmethod(lambda _value: True)
+    """Whether the document of a value is stored here: only then this node accepts it, or asks others to accept it."""
+    lacking: FleetValue | None = None
+    """The newest value that a majority was found to hold, and whose document is not stored here."""
 
     def count_with(self, count: Electorate, *, is_elector: bool, is_blank: bool, now: float) -> None:
         """Begin under another number with what is learnt."""
@@ -36,6 +43,11 @@ class FleetRegister(Register[FleetValue]):
     def _replaces(self, change: Rewrite[FleetValue]) -> bool:
         del change
         return False
+
+    def _may_carry(self, value: FleetValue) -> bool:
+        may = self.holds(value)
+        self.lacking = None if may else value
+        return may
 
     def _named(self, value: FleetValue) -> str:
         return f"number {value.number} with {', '.join(value.electorate.names)}"

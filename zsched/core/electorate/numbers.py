@@ -1,23 +1,29 @@
-"""The numbers by which one node's agreement counts: founded from its file and state, or learnt.
+"""The numbers by which one node's agreement counts: founded from its file and state, learnt, or changed by itself.
 
-Knows: when a node founds a fleet value, what of it goes to disk and into messages. Does not know: what an elector
-answers beyond that (`zsched.core.vote.agreement`), how anything travels. Nodes follow a changed fleet value; they do
-not change it themselves yet.
+Knows: when a node founds a fleet value, what of it goes to disk and into messages, that a value's document comes before
+the value. Does not know: what an elector answers beyond that (`zsched.core.vote.agreement`), how anything travels, who
+wants a change (`zsched.core.electorate.orders`).
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
+from dataclasses import replace
 from random import Random
 
 from zsched.core import instructions as do
+from zsched.core.electorate.changes import AddElector, AdoptDocument, FleetChange, SetDocument
+from zsched.core.electorate.documents import Documents
 from zsched.core.electorate.founding import founded
 from zsched.core.electorate.roll import Admission, Roll
 from zsched.core.todo import ToDo
+from zsched.core.values.change import Rewrite
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import Creation, FleetValue
 from zsched.core.values.fleet import Fleet
-from zsched.core.values.messages import Accept, Prepare, Refused
-from zsched.core.values.model import NodeId, RegisterState, TaskId
+from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refusal, Refused
+from zsched.core.values.model import NO_BALLOT, NodeId, RegisterState, TaskId
 from zsched.core.vote.task_register import TaskRegister
 
 
@@ -25,12 +31,13 @@ class Numbers:
     """One node's roll, from the moment on at which the node knows its generation.
 
     Args:
-        fleet: the fleet file.
+        fleet: what this node goes by at its start: its fleet file, or the document that its state names.
         me: this node.
         durable: its state, or ``None``.
         incarnation: of this daemon.
         registers: its tasks' registers, which the roll renumbers.
         rng: for back-off.
+        stored: {hash: what it says} of the documents on this node's disk that its state names.
     """
 
     def __init__(
@@ -42,14 +49,20 @@ class Numbers:
         incarnation: int,
         registers: dict[TaskId, TaskRegister],
         rng: Random,
+        stored: Mapping[str, Fleet],
     ) -> None:
         self._fleet, self._me, self._incarnation = fleet, me, incarnation
         self._registers, self._rng = registers, rng
         self._disk = "" if durable is None else durable.disk
         self._stored = None if durable is None else durable.fleet_register
+        self.documents = Documents(me, stored)
         self.roll: Roll | None = None
+        self._before = ""
+        """The document that was in force before this one: it is kept, too."""
+        self._held_for: FleetValue | None = None
+        """The newest value that a peer has told as learnt, while its document is missing."""
 
-    def begin(self, generation: int, now: float, *, may_elect: bool) -> None:
+    def begin(self, generation: int, electorate: str, todo: ToDo, now: float, *, may_elect: bool) -> None:
         """The generation is known: count by what the state holds, or by what every node makes of its file."""
         first = founded(self._fleet.name, generation, self._fleet.electors)
         self.roll = Roll(
@@ -59,22 +72,32 @@ class Numbers:
             state=self._stored or RegisterState(task=self._fleet.name, learnt=first),
             registers=self._registers,
             begin=self._created,
+            holds=self.documents.holds,
+            electorate=electorate,
             ballot_s=self._fleet.timing.ballot_s,
             stagger_s=self._fleet.timing.stagger_s,
             rng=self._rng,
             now=now,
             may_elect=may_elect,
         )
+        if not self.documents.holds(self.roll.value):
+            self._want(self.roll.value, (), todo, now)
 
-    def _created(self, creation: Creation) -> TaskRegister:
+    def _created(self, creation: Creation) -> TaskRegister | None:
         """The blank register of a task that the document lists; its electors are told by the roll."""
+        stored = None if self._stored is None else self._stored.learnt
+        value = stored if self.roll is None else self.roll.value
+        fleet = self._fleet if value is None else self.documents.fleet(value.document)
+        task = None if fleet is None else next((one for one in fleet.tasks if one.name == creation.task), None)
+        if task is None:
+            return None  # its document is missing: it is fetched
         return TaskRegister(
             me=self._me,
             incarnation=self._incarnation,
             electors=(),
             electorate="",
             is_elector=False,
-            initial=self._fleet.task(creation.task).first_value(creation.start),
+            initial=task.first_value(creation.start),
             state=RegisterState(task=creation.task, creation=creation.number),
             ballot_s=self._fleet.timing.ballot_s,
             stagger_s=self._fleet.timing.stagger_s,
@@ -85,15 +108,34 @@ class Numbers:
     # --- queries -----------------------------------------------------------------------------------------------------
 
     @property
+    def value(self) -> FleetValue | None:
+        """The learnt fleet value; ``None`` while the generation is not known."""
+        return None if self.roll is None else self.roll.value
+
+    @property
     def changed(self) -> FleetValue | None:
         """The learnt fleet value; ``None`` while it is the one that every node makes of its file."""
-        value = None if self.roll is None else self.roll.value
+        value = self.value
         return None if value is None or value.electorate.is_founding else value
 
     @property
     def state(self) -> RegisterState[FleetValue] | None:
         """What goes to disk."""
-        return None if self.roll is None or self.changed is None else self.roll.state
+        if self.roll is None:
+            return None
+        state = self.roll.state
+        has_voted = state.promised != NO_BALLOT or state.accepted is not None
+        return state if self.changed is not None or has_voted else None
+
+    @property
+    def in_force(self) -> Fleet | None:
+        """What this node goes by: the agreed document, electors and length of leases.
+
+        ``None``: its file, or the document is not stored here.
+        """
+        value = self.changed
+        fleet = None if value is None else self.documents.fleet(value.document)
+        return None if fleet is None or value is None else in_force(fleet, value)
 
     @property
     def electors(self) -> tuple[NodeId, ...]:
@@ -110,7 +152,26 @@ class Numbers:
         """Likewise."""
         return 0 if self.changed is None else self.changed.number
 
-    # --- what is heard -----------------------------------------------------------------------------------------------
+    @property
+    def problems(self) -> dict[str, str]:
+        """{subject: what does not work here as it should}."""
+        found = {} if self.roll is None or not self.roll.problem else {"fleet/register": self.roll.problem}
+        for document, reason in self.documents.refused.items():
+            text = (
+                f"the agreed document {document[:8]} cannot be used here, this node goes on by its last one: {reason}"
+            )
+            found["fleet/document"] = text
+        if "fleet/document" not in found and self.roll is not None and not self.documents.holds(self.roll.value):
+            document = self.roll.value.document[:8]
+            found["fleet/document"] = f"the agreed document {document} is not on this disk: this node asks its peers"
+        return found
+
+    def next_deadline(self) -> float:
+        """When `tick` may have something to do."""
+        due = math.inf if self.roll is None else self.roll.next_deadline()
+        return min(due, self.documents.next_deadline())
+
+    # --- elector -----------------------------------------------------------------------------------------------------
 
     def turned_away(self, question: Prepare | Accept, asker: NodeId, todo: ToDo) -> Refused | None:
         """The no to a question that names another number or creation; ``None``: its register answers."""
@@ -120,20 +181,168 @@ class Numbers:
         self._carry(todo)
         return self.roll.refused(question) if admission is Admission.REFUSED else None
 
+    def on_question(
+        self,
+        question: Prepare | Accept[FleetValue],
+        asker: NodeId,
+        todo: ToDo,
+        now: float,
+        refusal: Refusal | None = None,
+    ) -> Promise[FleetValue] | Accepted | Refused | None:
+        """A proposer asks the fleet register; ``None``: no answer. ``refusal``: why this elector says no to any."""
+        if self.roll is None:
+            return None
+        answer = self.roll.on_question(question, asker, todo, now, refusal)
+        if isinstance(answer, Refused) and answer.refusal is Refusal.DOCUMENT and not isinstance(question, Prepare):
+            self._want(question.acceptance.value, (asker,), todo, now)
+        if isinstance(answer, Accepted):
+            self._keep(todo)
+        self._carry(todo)
+        return answer
+
+    # --- what is heard -----------------------------------------------------------------------------------------------
+
     def hear(self, answer: Refused, todo: ToDo, now: float) -> bool:
         """An elector has refused; whether this node counts by another fleet value from now on."""
-        before = self.roll and self.roll.value
+        before = self.value
         if self.roll is not None:
-            self.roll.hear(answer, todo, now)
-            self._carry(todo)
-        return self.roll is not None and self.roll.value is not before
+            self.roll.hear(self._readable(answer, todo, now), todo, now)
+            self._after(before, todo)
+        return self.value is not before
 
-    def learn(self, value: FleetValue, todo: ToDo, now: float) -> bool:
-        """A peer has answered what it has learnt; whether this node counts by it from now on."""
-        before = self.roll and self.roll.value
+    def on_answer(self, answer: Promise[FleetValue] | Accepted | Refused, todo: ToDo, now: float) -> bool:
+        """An elector answered our question to its fleet register; whether this node counts by another value now."""
+        before = self.value
         if self.roll is not None:
+            if isinstance(answer, Refused):
+                answer = self._readable(answer, todo, now)
+            self.roll.on_answer(answer, todo, now)
+            if self.roll.lacking is not None:
+                self._want(self.roll.lacking, self.electors, todo, now)
+            self._after(before, todo)
+        return self.value is not before
+
+    def learn(self, value: FleetValue, teller: NodeId, todo: ToDo, now: float) -> bool:
+        """A peer has answered what it has learnt; whether this node counts by it from now on."""
+        before = self.value
+        if self.roll is not None:
+            if self._is_news(value) and not self.documents.holds(value):
+                self._hold(value, teller, todo, now)
             self.roll.learn(value, todo, now)
-        return self.roll is not None and self.roll.value is not before
+            self._after(before, todo)
+        return self.value is not before
+
+    def _is_news(self, value: FleetValue) -> bool:
+        ours = self.value
+        is_ours = ours is not None and (value.fleet, value.generation_id) == (ours.fleet, ours.generation_id)
+        return is_ours and ours is not None and value.revision > ours.revision
+
+    def _readable(self, answer: Refused, todo: ToDo, now: float) -> Refused:
+        """A refusal without its fleet value if that one's document is still to be fetched."""
+        value = answer.fleet
+        if value is None or not self._is_news(value) or self.documents.holds(value):
+            return answer
+        self._hold(value, answer.elector, todo, now)
+        return replace(answer, fleet=None)
+
+    def _hold(self, value: FleetValue, teller: NodeId, todo: ToDo, now: float) -> None:
+        """Keep a learnt value until its document is here."""
+        if self._held_for is None or value.revision >= self._held_for.revision:
+            self._held_for = value
+        self._want(value, (teller,), todo, now)
+
+    def _want(self, value: FleetValue, first: tuple[NodeId, ...], todo: ToDo, now: float) -> None:
+        """Fetch a document: from who told of it, from an elector, or from any node."""
+        others = [*value.electorate.names, *(node.name for node in self._fleet.nodes)]
+        peers = tuple(dict.fromkeys((*first, *others)))
+        self.documents.want(value, peers, todo, now)
+
+    def on_stored(self, document: str, fleet: Fleet, todo: ToDo, now: float) -> bool:
+        """A document is on disk, and valid; whether this node goes by another fleet from now on."""
+        was_missing = self.roll is not None and not self.documents.holds(self.roll.value)
+        self.documents.on_stored(document, fleet)
+        if self.roll is None:
+            return False
+        before = self.value
+        if was_missing and self.documents.holds(self.roll.value):
+            self.roll.list_again(todo, now)
+            self._adopt(todo)
+        held = self._held_for
+        if held is not None and self.documents.holds(held):
+            self._held_for = None
+            self.roll.learn(held, todo, now)
+            self._after(before, todo)
+        return self.value is not before or was_missing
+
+    def _after(self, before: FleetValue | None, todo: ToDo) -> None:
+        """A fleet value may have been learnt: keep its document, and let the stages go by it."""
+        value = self.value
+        if value is not before and value is not None and before is not None:
+            if value.document != before.document:
+                self._before = before.document
+            if self._held_for is not None and self._held_for.revision <= value.revision:
+                self._held_for = None
+            if self.documents.holds(value):
+                self.documents.refused.clear()
+            self._keep(todo)
+            self._adopt(todo)
+        self._carry(todo)
+
+    def _adopt(self, todo: ToDo) -> None:
+        fleet = self.in_force
+        if fleet is not None:
+            self._fleet = todo.in_force = fleet
+
+    def _keep(self, todo: ToDo) -> None:
+        """The state's documents, and the one before: older ones may go."""
+        if self.roll is not None:
+            accepted = self.roll.state.accepted
+            named = (self.roll.value.document, self._before, "" if accepted is None else accepted.value.document)
+            self.documents.keep(tuple(dict.fromkeys(filter(None, named))), todo)
+
+    # --- proposer ----------------------------------------------------------------------------------------------------
+
+    def fault(self, change: Rewrite[FleetValue]) -> str:
+        """Why a change cannot be made now; empty: it can."""
+        value = self.value
+        if value is None:
+            return "this node does not know the fleet's generation yet"
+        if isinstance(change, AddElector):
+            is_known = any(node.name == change.name for node in self._fleet.nodes)
+            return change.fault(value) or ("" if is_known else f"{change.name} is no node of the fleet")
+        if isinstance(change, AdoptDocument | SetDocument):
+            return change.fault(value) or self._fault_of_document(change.document)
+        return change.fault(value) if isinstance(change, FleetChange) else ""
+
+    def _fault_of_document(self, document: str) -> str:
+        fleet = self.documents.fleet(document)
+        if fleet is None:
+            return f"the document {document[:8]} is not stored here"
+        names = {node.name for node in fleet.nodes}
+        gone = [name for name in self.electors if name not in names]
+        return f"{', '.join(gone)}: an elector, and not in the document; remove it as an elector first" if gone else ""
+
+    def propose(self, change: FleetChange, todo: ToDo, now: float) -> str:
+        """Try to commit a change; why it cannot be made, or nothing. Its end is one of `ToDo.fleet_ended`."""
+        fault = self.fault(change)
+        if not fault and self.roll is not None:
+            self.roll.propose(change, todo, now)
+            self._carry(todo)
+        return fault
+
+    def settle(self, todo: ToDo, now: float) -> None:
+        """After a start: an elector that has accepted a value, and has not learnt it, looks what became of it."""
+        if self.roll is not None and self.roll.is_elector and self.roll.is_unlearnt:
+            self.roll.settle(todo, now)
+            self._carry(todo)
+
+    def tick(self, todo: ToDo, now: float) -> None:
+        """Time has passed."""
+        if self.roll is not None and now >= self.roll.next_deadline():
+            self.roll.tick(todo, now)
+            self._carry(todo)
+        if now >= self.documents.next_deadline():
+            self.documents.tick(todo, now)
 
     def _carry(self, todo: ToDo) -> None:
         """Ask for, or tell, what was learnt: fleet values travel with the tasks' values."""
@@ -141,5 +350,12 @@ class Numbers:
             if isinstance(order, do.AskFleet):
                 todo.add(do.AskLearnt(peer=order.peer, deadline_s=self._fleet.timing.ballot_s))
             elif isinstance(order, do.TellFleet):
-                todo.must_beat = True  # the beat shows the revision, and peers ask
+                todo.must_beat = todo.must_tell = True  # who hears it asks
+            else:
+                todo.add(order)
         todo.fleet.clear()
+
+
+def in_force(fleet: Fleet, value: FleetValue) -> Fleet:
+    """What a node goes by: a document, with the electors and the length of leases that are agreed."""
+    return replace(fleet, electors=value.electorate.names, timing=replace(fleet.timing, lease_s=value.lease_s))

@@ -47,11 +47,13 @@ class Roll:
         incarnation: this start's number.
         state: of the fleet register, as stored or founded; its learnt value is the one to follow.
         registers: the tasks' registers; the roll adds, removes and renumbers them.
-        begin: makes the blank register of a task that was created.
+        begin: makes the blank register of a task that was created; ``None``: nothing is known of the task yet.
         ballot_s: deadline of one phase.
         stagger_s: base of the back-off.
         rng: for back-off.
         now: monotonic seconds.
+        holds: whether the document of a fleet value is stored here; without it no value is accepted or learnt.
+        electorate: hash of the fleet file's electors, which nodes compare until a change has touched them.
         may_elect: whether this node may be an elector at all: it has its state, and nobody disputes its name.
     """
 
@@ -63,11 +65,13 @@ class Roll:
         incarnation: int,
         state: RegisterState[FleetValue],
         registers: dict[TaskId, TaskRegister],
-        begin: Callable[[Creation], TaskRegister],
+        begin: Callable[[Creation], TaskRegister | None],
         ballot_s: float,
         stagger_s: float,
         rng: Random,
         now: float,
+        holds: Callable[[FleetValue], bool] = lambda _value: True,
+        electorate: str = "",
         may_elect: bool = True,
     ) -> None:
         if state.learnt is None:
@@ -83,7 +87,7 @@ class Roll:
             me=me,
             incarnation=incarnation,
             electors=self.value.electorate.names,
-            electorate="",
+            electorate=electorate,
             is_elector=self.is_elector,
             initial=self.value,
             state=state,
@@ -92,6 +96,7 @@ class Roll:
             rng=rng,
             disk=disk,
         )
+        self._holds = self._register.holds = holds
         self._settling = Settling(2 * ballot_s)
         self._list(ToDo(), now)
         self._count(is_blank=False, is_new=False, now=now)
@@ -124,6 +129,16 @@ class Roll:
     def is_busy(self) -> bool:
         """Whether a change of this node's is under way."""
         return self._register.is_busy
+
+    @property
+    def is_unlearnt(self) -> bool:
+        """Whether this node has accepted a fleet value that it has not learnt."""
+        return self._register.is_unlearnt
+
+    @property
+    def lacking(self) -> FleetValue | None:
+        """A value that a round has read, and whose document is not stored here; the round waits for it."""
+        return self._register.lacking
 
     def next_deadline(self) -> float:
         """When `tick` may have something to do."""
@@ -185,18 +200,30 @@ class Roll:
         )
 
     def on_question(
-        self, question: Prepare | Accept[FleetValue], asker: NodeId, todo: ToDo, now: float
+        self,
+        question: Prepare | Accept[FleetValue],
+        asker: NodeId,
+        todo: ToDo,
+        now: float,
+        refusal: Refusal | None = None,
     ) -> Promise[FleetValue] | Accepted | Refused | None:
-        """A proposer asks the fleet register; ``None``: no answer."""
+        """A proposer asks the fleet register; ``None``: no answer.
+
+        ``refusal``: a reason outside the register, for which a question that is admitted gets a no.
+        """
         admission = self.admission(question, asker, todo)
         if admission is Admission.SILENT:
             return None
         if admission is Admission.REFUSED:
             return self.refused(question)
+        if refusal is not None:
+            return self._register.refuse(_ballot_of(question), refusal)
         if isinstance(question, Prepare):
             return self._register.on_prepare(question, todo)
         if question.acceptance.value.generation_id != self.value.generation_id:
             return None
+        if not self._holds(question.acceptance.value) and self._register.would_accept(question):
+            return self._register.refuse(_ballot_of(question), Refusal.DOCUMENT)
         return self._register.on_accept(question, todo, now)
 
     # --- learner -----------------------------------------------------------------------------------------------------
@@ -208,8 +235,9 @@ class Roll:
         if value.generation_id != self.value.generation_id:
             self.strangers.add(value.generation_id)
             return
-        self._register.learn(value, todo, now)
-        self._follow(todo, now)
+        if self._holds(value):
+            self._register.learn(value, todo, now)
+            self._follow(todo, now)
 
     def hear(self, answer: Refused, todo: ToDo, now: float) -> None:
         """An elector has refused because of its number: one of the two learns."""
@@ -240,9 +268,14 @@ class Roll:
             if creation is None or creation.number != self._registers[task].state.creation:
                 self._registers.pop(task).close(todo)
         for creation in self.value.tasks:
-            if creation.task not in self._registers:
-                self._registers[creation.task] = register = self._begin(creation)
+            register = None if creation.task in self._registers else self._begin(creation)
+            if register is not None:
+                self._registers[creation.task] = register
                 register.count_with(self.value.electorate, is_elector=self.is_elector, is_blank=False, now=now)
+
+    def list_again(self, todo: ToDo, now: float) -> None:
+        """The document of the value in force was not stored here at the start, and is now."""
+        self._list(todo, now)
 
     def _count(self, *, is_blank: bool, is_new: bool, now: float) -> None:
         """Tell every register with whom it counts; the fleet register is blank under a new number."""

@@ -45,10 +45,10 @@ def send_beat(node: Stages, todo: ToDo, now: float) -> None:
         votes=node.agreement.witness.votes,
         number=node.agreement.number,
         fleet_revision=node.agreement.fleet_revision,
-        has_lost_state=node.me in node.fleet.electors and not node.agreement.is_elector,
+        has_lost_state=node.me in node.agreement.electors and not node.agreement.is_elector,
         electorate=node.agreement.electorate if node.agreement.is_elector else "",
         twins=node.namesakes.names(now),
-        lacks_state_file=node.me in node.fleet.electors and node.lacks_state_file,
+        lacks_state_file=node.me in node.agreement.electors and node.lacks_state_file,
     )
     node.loop_lag_s = 0.0
     node.beat_at = now + node.fleet.timing.beat_s

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Generic
 
-from zsched.core.values.electorate import FleetValue
+from zsched.core.values.document import Document
+from zsched.core.values.electorate import FleetValue, check_id
 from zsched.core.values.model import (
     Acceptance,
     Allocation,
@@ -99,6 +100,7 @@ class Refusal(StrEnum):
     RATE = "rate"  # this proposer asks too often
     DISK = "disk"  # it could not persist
     VALUE = "value"  # it does not take this value for a true one: its fleet file knows no such node
+    DOCUMENT = "document"  # it has not stored the document of this fleet value yet
     NUMBER = "number"  # it counts by another number of the fleet value, or has no such register
     YOUNG = "young"  # it has just started, and asks the others first what they remember of it
 
@@ -120,6 +122,73 @@ class Refused:
     def __post_init__(self) -> None:
         check_name("refused.elector", self.elector)
         check_name("refused.task", self.task)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FleetQuestion:
+    """A question of the fleet register to an elector: one of the two."""
+
+    prepare: Prepare | None = None
+    accept: Accept[FleetValue] | None = None
+
+    def __post_init__(self) -> None:
+        if (self.prepare is None) == (self.accept is None):
+            raise ValueError("fleet_question: expected a prepare or an accept")
+
+    @property
+    def content(self) -> Prepare | Accept[FleetValue]:
+        """The question itself."""
+        asked = self.prepare or self.accept
+        assert asked is not None
+        return asked
+
+    @property
+    def ballot(self) -> Ballot:
+        """The proposer's ballot."""
+        content = self.content
+        return content.ballot if isinstance(content, Prepare) else content.acceptance.ballot
+
+
+def fleet_question(content: Prepare | Accept[FleetValue]) -> FleetQuestion:
+    """A question of the fleet register as it travels."""
+    return FleetQuestion(prepare=content) if isinstance(content, Prepare) else FleetQuestion(accept=content)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FleetAnswer:
+    """An elector's answer to a `FleetQuestion`: one of the three."""
+
+    promise: Promise[FleetValue] | None = None
+    accepted: Accepted | None = None
+    refused: Refused | None = None
+
+    def __post_init__(self) -> None:
+        if sum(one is not None for one in (self.promise, self.accepted, self.refused)) != 1:
+            raise ValueError("fleet_answer: expected a promise, an acceptance or a refusal")
+
+    @property
+    def content(self) -> Promise[FleetValue] | Accepted | Refused:
+        """The answer itself."""
+        answer = self.promise or self.accepted or self.refused
+        assert answer is not None
+        return answer
+
+
+def fleet_answer(content: Promise[FleetValue] | Accepted | Refused) -> FleetAnswer:
+    """An answer of the fleet register as it travels."""
+    if isinstance(content, Accepted):
+        return FleetAnswer(accepted=content)
+    return FleetAnswer(refused=content) if isinstance(content, Refused) else FleetAnswer(promise=content)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AskDocument:
+    """Asks a node for the document with this hash; the answer is the `Document`, or nothing."""
+
+    document: str
+
+    def __post_init__(self) -> None:
+        check_id("ask_document.document", self.document)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -229,7 +298,36 @@ class ReadLines:
         check_counter("lines.after", self.after)
 
 
-Command = SetWeights | RetryTask | ExplainTask | RestartTask | ReadLines
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChangeFleet:
+    """Operator command to one node: commit one change of the fleet. Exactly one of the three changes is given.
+
+    The answer comes when a majority of the electors has the change; settling them may go on after that.
+    """
+
+    document: Document | None = None
+    """Go by this document: the first one that is agreed, or another one."""
+    add_elector: NodeId = ""
+    """Let this node be an elector, too; it holds its seat with the disk whose id is ``disk``."""
+    disk: str = ""
+    remove_elector: NodeId = ""
+    base_revision: int | None = None
+    """The fleet value's revision that the operator saw; ``None``: whatever is current at this node."""
+    reason: str = ""
+    """Why, in the operator's words; it stands in the journal."""
+
+    def __post_init__(self) -> None:
+        for name in filter(None, (self.add_elector, self.remove_elector)):
+            check_name("fleet.elector", name)
+        check_id("fleet.disk", self.disk)
+        check_counter("fleet.base_revision", self.base_revision or 0)
+        if sum(map(bool, (self.document, self.add_elector, self.remove_elector))) != 1:
+            raise ValueError("fleet: expected one of document, add_elector and remove_elector")
+        if self.add_elector and not self.disk:
+            raise ValueError(f"fleet.disk: {self.add_elector} needs the id of its disk")
+
+
+Command = SetWeights | RetryTask | ExplainTask | RestartTask | ReadLines | ChangeFleet
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -11,15 +11,29 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 from random import Random
+from types import MappingProxyType
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
+from zsched.core.electorate.changes import FleetChange
 from zsched.core.electorate.numbers import Numbers
+from zsched.core.electorate.orders import Orders
 from zsched.core.todo import ToDo
 from zsched.core.values.change import Change, Ended, MoveOwner, Retune, RoundOutcome
 from zsched.core.values.durable import DurableState
+from zsched.core.values.electorate import CREATION_STEP, FleetValue
 from zsched.core.values.fleet import Fleet
-from zsched.core.values.messages import Accepted, CommandOutcome, CommandResult, Learnt, Promise, Refusal, Refused
+from zsched.core.values.messages import (
+    Accepted,
+    CommandOutcome,
+    CommandResult,
+    Learnt,
+    Prepare,
+    Promise,
+    Refusal,
+    Refused,
+    fleet_answer,
+)
 from zsched.core.values.model import (
     NO_BALLOT,
     Allocation,
@@ -69,6 +83,7 @@ class Agreement:
         electorate: hash of the electorate in force.
         rng: for back-off.
         now: monotonic seconds.
+        stored: {hash: what it says} of the documents on this node's disk that its state names.
     """
 
     def __init__(
@@ -81,6 +96,7 @@ class Agreement:
         electorate: str,
         rng: Random,
         now: float,
+        stored: Mapping[str, Fleet] = MappingProxyType({}),
     ) -> None:
         self._fleet, self._me = fleet, me
         self._nodes = frozenset(node.name for node in fleet.nodes)
@@ -118,18 +134,23 @@ class Agreement:
         # A state of today's names no creations: its registers are those of its generation.
         held = () if durable is None else durable.registers
         creation = self.generation or 0
-        stored = {state.task: replace(state, creation=state.creation or creation) for state in held}
-        # What blank electors have agreed on: a generation's first value, which the operator has written everywhere.
-        start = (self.generation or 0) * GENERATION_STEP
+        states = {state.task: replace(state, creation=state.creation or creation) for state in held}
+        agreed = None if durable is None or durable.fleet_register is None else durable.fleet_register.learnt
+
+        def blank(task: TaskId) -> RegisterState:
+            one = None if agreed is None else agreed.creation(task)
+            return RegisterState(task=task, creation=creation if one is None else one.number)
+
         self.registers = {
             task.name: TaskRegister(
                 me=me,
                 incarnation=incarnation,
                 electors=fleet.electors,
-                electorate=self.electorate,
+                electorate=self._by_file,
                 is_elector=self.is_elector,
-                initial=task.first_value(start),
-                state=stored.get(task.name, RegisterState(task=task.name, creation=creation)),
+                # What blank electors have agreed on: the first value of its creation, or of a generation.
+                initial=task.first_value(states.get(task.name, blank(task.name)).creation * CREATION_STEP),
+                state=states.get(task.name, blank(task.name)),
                 disk="" if durable is None else durable.disk,
                 ballot_s=fleet.timing.ballot_s,
                 stagger_s=fleet.timing.stagger_s,
@@ -137,14 +158,23 @@ class Agreement:
             )
             for task in fleet.tasks
         }
-        # A task that left the fleet file may come back: its promises must not be forgotten.
         self._numbers = Numbers(
-            fleet=fleet, me=me, durable=durable, incarnation=incarnation, registers=self.registers, rng=rng
+            fleet=fleet,
+            me=me,
+            durable=durable,
+            incarnation=incarnation,
+            registers=self.registers,
+            rng=rng,
+            stored=stored,
         )
+        self.orders = Orders(self._numbers)
+        self.at_start = ToDo()
+        """What the first batch must do: fetch a document that is missing."""
         if self.generation is not None:
             may_elect = durable is not None and not self._disputed and not self._lost
-            self._numbers.begin(self.generation, now, may_elect=may_elect)
-        self._foreign = tuple(stored[name] for name in sorted(stored) if name not in self.registers)
+            self._numbers.begin(self.generation, self._by_file, self.at_start, now, may_elect=may_elect)
+        # A task that left the fleet file may come back: its promises must not be forgotten.
+        self._foreign = tuple(states[name] for name in sorted(states) if name not in self.registers)
         self._settle_at = now + SETTLE_AFTER_START_S if self.is_elector else math.inf
         self._asked_at: dict[tuple[NodeId, bool], float] = {}
         """{(peer, whether for a newer revision): when}: news of votes must not delay a question about revisions."""
@@ -157,17 +187,23 @@ class Agreement:
             now=now,
             granted_s=0.0 if durable is None else durable.lease_s,
         )
-        self._count_anew()
         self._parked: dict[tuple[TaskId, NodeId], tuple[ev.AcceptAsked, float]] = {}
+        self._count_anew(self.at_start)
         self._seen: list[RegisterState] = []
         """The registers' states from which `values` and `accepted` were made."""
         self._values: dict[TaskId, Allocation] = {}
         self._accepted: dict[TaskId, tuple[NodeId, int]] = {}
 
     @property
-    def electorate(self) -> str:
-        """The electorate's hash; generations refuse each other's ballots."""
+    def _by_file(self) -> str:
+        """Hash of the file's electors, and the generation: by it nodes refuse each other's ballots."""
         return f"{self._electorate}/{self.generation}" if self.generation else self._electorate
+
+    @property
+    def electorate(self) -> str:
+        """What a beat shows of the electors in force; once a change is learnt, that is their generation."""
+        value = self._numbers.changed
+        return self._by_file if value is None else f"fleet/{value.generation_id}"
 
     # --- queries -----------------------------------------------------------------------------------------------------
 
@@ -175,7 +211,7 @@ class Agreement:
     def problems(self) -> dict[str, str]:
         """{subject: why agreement does not work here as it should}."""
         stuck = {f"register/{name}": register.problem for name, register in self.registers.items() if register.problem}
-        return {**self._problems, **stuck}
+        return {**self._problems, **self._numbers.problems, **stuck}
 
     def values(self) -> Mapping[TaskId, Allocation]:
         """{task: the newest learnt value}; a new mapping whenever one changes."""
@@ -219,7 +255,7 @@ class Agreement:
 
     def next_deadline(self) -> float:
         """When `tick` may have something to do."""
-        due = self._settle_at
+        due = min(self._settle_at, self._numbers.next_deadline())
         for register in self.registers.values():
             due = min(due, register.next_deadline())
         return min(due, *(deadline for _, deadline in self._parked.values())) if self._parked else due
@@ -245,7 +281,7 @@ class Agreement:
         states = tuple(self.registers[name].state for name in sorted(self.registers))
         self._durable = replace(
             self._durable,
-            registers=(*states, *self._foreign),
+            registers=states if self._is_agreed else (*states, *self._foreign),
             voted=tuple(sorted(self.voted)),
             disputed=self._disputed,
             lease_s=self.leases.to_remember_s(now),
@@ -255,6 +291,12 @@ class Agreement:
             lost=self._lost,
         )
         return self._durable
+
+    @property
+    def _is_agreed(self) -> bool:
+        """Whether a document says which tasks have a register: of any other task nothing is remembered."""
+        value = self._numbers.changed
+        return value is not None and bool(value.document)
 
     @property
     def must_persist(self) -> bool:
@@ -288,6 +330,54 @@ class Agreement:
             answer = register.on_prepare(event.prepare, todo)
             self.witness.votes += isinstance(answer, Promise)
         todo.add(do.AnswerElection(request=event.request, answer=answer))
+
+    def on_fleet_asked(self, event: ev.FleetAsked, todo: ToDo, now: float) -> None:
+        """A proposer asks this elector's fleet register: only for its own ballots, at the rate of all prepares."""
+        question = event.question.content
+        if not self._is_its_own(event.question.ballot, event.asker):
+            self.counters["fleet_foreign"] += 1
+            return
+        refusal = None
+        if isinstance(question, Prepare) and not self._may_ask(event.asker, now):
+            self.counters["prepare_rate"] += 1
+            refusal = Refusal.RATE
+        elif self.is_elector and not self.witness.may_vote(now):
+            refusal = Refusal.YOUNG
+        answer = self._numbers.on_question(question, event.asker, todo, now, refusal)
+        if answer is not None:
+            self.witness.votes += not isinstance(answer, Refused)
+            todo.add(do.AnswerFleet(request=event.request, answer=fleet_answer(answer)))
+
+    def on_fleet_answer(self, event: ev.FleetAnswered, todo: ToDo, now: float) -> None:
+        """An elector answered our question to its fleet register."""
+        answer = event.answer.content
+        if answer.elector not in self._nodes:
+            self.counters["answer_foreign"] += 1
+        elif self._numbers.on_answer(answer, todo, now):
+            self._count_anew(todo)
+
+    def on_stored(self, event: ev.DocumentStored, todo: ToDo, now: float) -> None:
+        """A document is on disk: the value that waits for it is learnt, or an operator's command goes on."""
+        if self._numbers.on_stored(event.document, event.fleet, todo, now):
+            self._count_anew(todo)
+        self.orders.on_stored(event, todo, now)
+
+    def on_refused(self, event: ev.DocumentRefused, todo: ToDo) -> None:
+        """A document cannot be used here."""
+        self.counters["document_refused"] += 1
+        if event.request is None:
+            self._numbers.documents.on_refused(event.document, event.reason)
+        self.orders.on_refused(event, todo)
+
+    def change_fleet(self, change: FleetChange, todo: ToDo, now: float) -> str:
+        """Try to commit a change of the fleet; why it cannot be made, or nothing."""
+        return self._numbers.propose(change, todo, now)
+
+    def adopt(self, fleet: Fleet) -> None:
+        """Another fleet is in force: the registers count by it already."""
+        self._fleet = fleet
+        self._nodes = frozenset(node.name for node in fleet.nodes)
+        self.witness.nodes = self._nodes
 
     def _may_ask(self, asker: NodeId, now: float) -> bool:
         """Take one token of the asker's bucket (`PREPARES_PER_S`, at most `PREPARE_BURST` saved); a no costs none."""
@@ -358,7 +448,7 @@ class Agreement:
         """An elector answered our prepare or accept."""
         answer = event.answer
         if isinstance(answer, Refused) and answer.elector in self._nodes and self._numbers.hear(answer, todo, now):
-            self._count_anew()
+            self._count_anew(todo)
         register = self.registers.get(answer.task)
         if register is None or answer.elector not in self.electors:
             self.counters["answer_foreign"] += 1
@@ -371,6 +461,17 @@ class Agreement:
         return self._numbers.electors
 
     @property
+    def document(self) -> Fleet | None:
+        """What the agreed document says; ``None``: none is agreed, or it is not stored here."""
+        value = self._numbers.changed
+        return None if value is None else self._numbers.documents.fleet(value.document)
+
+    @property
+    def fleet_value(self) -> FleetValue | None:
+        """The learnt fleet value; ``None`` while the generation is not known."""
+        return self._numbers.value
+
+    @property
     def number(self) -> int:
         """Of the learnt fleet value; 0 until a change of the fleet is learnt."""
         return self._numbers.number
@@ -380,11 +481,17 @@ class Agreement:
         """Likewise its revision."""
         return self._numbers.revision
 
-    def _count_anew(self) -> None:
+    def _count_anew(self, todo: ToDo) -> None:
         """A newer fleet value is learnt, and the registers count by it already: so do leases and the witness."""
         value, roll = self._numbers.changed, self._numbers.roll
         if value is None or roll is None:
             return
+        for key, (event, _) in tuple(self._parked.items()):
+            if key[0] not in self.registers:
+                del self._parked[key]
+                refused = self._numbers.roll.refused(event.accept) if self._numbers.roll else None
+                if refused is not None:
+                    todo.add(do.AnswerElection(request=event.request, answer=refused))
         self.witness.electors = self.electors
         self.is_elector = roll.is_elector
         self.leases.count_with(
@@ -418,7 +525,7 @@ class Agreement:
             self.counters["learnt_foreign"] += 1
             return
         if event.is_answer:
-            self._follow(learnt, now)
+            self._follow(learnt, todo, now)
         if not self._is_our_generation(learnt.node, learnt.generation):
             return
         if not event.is_answer:
@@ -426,8 +533,8 @@ class Agreement:
             is_news = learnt.fleet is not None and learnt.fleet.revision > self.fleet_revision
             self._ask(learnt.node, newer, ASK_AT_ONCE_S, todo, now, is_news=is_news)
             return
-        if learnt.fleet is not None and self._numbers.learn(learnt.fleet, todo, now):
-            self._count_anew()
+        if learnt.fleet is not None and self._numbers.learn(learnt.fleet, learnt.node, todo, now):
+            self._count_anew(todo)
         self._lose(self.witness.on_answer(learnt), todo)
         if learnt.has_voted and learnt.node in self.electors and learnt.node not in self.voted:
             self.voted.add(learnt.node)
@@ -457,8 +564,9 @@ class Agreement:
 
     def _hear_electorate(self, beat: Beat) -> None:
         """Note whether an elector and this node refuse each other's ballots (other electors, or another generation)."""
-        is_apart = beat.generation != self.generation or beat.electorate not in ("", self.electorate)
-        is_apart |= self._is_no_elector_there(beat)
+        is_apart = beat.electorate not in ("", self.electorate) or self._is_no_elector_there(beat)
+        is_apart &= beat.number == self.number  # one of two is behind, and will learn
+        is_apart |= beat.generation != self.generation
         if is_apart and not self._is_guest_of(beat.generation) and beat.node in self.electors:
             self.apart.add(beat.node)
         elif self.apart:
@@ -494,9 +602,9 @@ class Agreement:
         """Whether this node, without a state, follows a newer generation."""
         return not self._has_state and (self.generation is None or generation > self.generation)
 
-    def _follow(self, learnt: Learnt, now: float) -> None:
+    def _follow(self, learnt: Learnt, todo: ToDo, now: float) -> None:
         """An elector with a state has answered: a node without one joins the newest generation that it hears of."""
-        is_elector = learnt.node in self._fleet.electors and (learnt.incarnation > 0 or learnt.has_voted)
+        is_elector = learnt.node in self.electors and (learnt.incarnation > 0 or learnt.has_voted)
         if not is_elector or learnt.generation > MAX_GENERATION or not self._is_guest_of(learnt.generation):
             return
         self.generation = learnt.generation
@@ -504,8 +612,8 @@ class Agreement:
         self.voted.clear()
         for task in self._fleet.tasks:
             initial = task.first_value(learnt.generation * GENERATION_STEP)
-            self.registers[task.name].follow(self.electorate, initial, learnt.generation)
-        self._numbers.begin(learnt.generation, now, may_elect=False)
+            self.registers[task.name].follow(self._by_file, initial, learnt.generation)
+        self._numbers.begin(learnt.generation, self._by_file, todo, now, may_elect=False)
 
     def dispute(self, reason: str, todo: ToDo) -> None:
         """Another daemon uses our name, too: no elector any more, on disk, until the operator settles the dispute."""
@@ -533,7 +641,7 @@ class Agreement:
             return
         is_news = beat.has_voted and beat.node not in self.voted and beat.node in self.electors
         is_news |= self.witness.must_ask(beat) or beat.fleet_revision > self.fleet_revision
-        is_news |= self._is_guest_of(beat.generation) and beat.node in self._fleet.electors
+        is_news |= self._is_guest_of(beat.generation) and beat.node in self.electors
         newer = [(task, revision) for task, revision, _ in beat.learnt]
         self._ask(beat.node, newer, ASK_LEARNT_EVERY_S, todo, now, is_news=is_news)
 
@@ -594,7 +702,14 @@ class Agreement:
 
     def tick(self, todo: ToDo, now: float) -> None:
         """Time has passed."""
-        for register in self.registers.values():
+        if now >= self._settle_at:
+            self._numbers.settle(todo, now)
+        if now >= self._numbers.next_deadline():
+            before = self._numbers.value
+            self._numbers.tick(todo, now)
+            if self._numbers.value is not before:
+                self._count_anew(todo)
+        for register in tuple(self.registers.values()):
             if now >= self._settle_at:
                 register.settle(todo, now)
             if now >= register.next_deadline():
@@ -605,7 +720,12 @@ class Agreement:
     def on_ended(self, ended: Ended, todo: ToDo) -> None:
         """A change of this node has ended: tell the other nodes, and the operator that waits for it."""
         task, change, outcome = ended.task, ended.change, ended.outcome
-        value = self.registers[task].value
+        register = self.registers.get(task)
+        if register is None:  # its task has left the fleet
+            if isinstance(change, Retune) and change.request is not None:
+                _refuse(change.request, CommandOutcome.INVALID, f"{task} has left the fleet", todo)
+            return
+        value = register.value
         if outcome is RoundOutcome.COMMITTED:
             todo.add(do.PublishLearnt(learnt=self.learnt()))
         if isinstance(change, MoveOwner):

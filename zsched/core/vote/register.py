@@ -173,6 +173,11 @@ class Register(ABC, Generic[V]):
     def _replaces(self, change: Rewrite[V]) -> bool:
         """Whether ``change`` may be applied to a value that no majority of electors takes."""
 
+    def _may_carry(self, value: V) -> bool:
+        """Whether this node has all that belongs to ``value``, so that it may ask others to accept it."""
+        del value
+        return True
+
     @abstractmethod
     def _named(self, value: V) -> str:
         """``value`` in a word, for a problem."""
@@ -265,6 +270,11 @@ class Register(ABC, Generic[V]):
             promised=self.state.promised,
             number=self._count.number,
         )
+
+    @property
+    def is_unlearnt(self) -> bool:
+        """Whether this node has accepted a value that is newer than what it has learnt."""
+        return self._is_unlearnt()
 
     def _is_unlearnt(self) -> bool:
         accepted = self.state.accepted
@@ -412,6 +422,9 @@ class Register(ABC, Generic[V]):
         if read.revision < self.value.revision:  # learnt since we asked: a higher ballot has overtaken this one
             self._again(running, todo, now)
             return
+        if not self._may_carry(read):
+            self._again(running, todo, now)
+            return
         is_identity = running.change is None or running.sent is not None
         if is_identity and newest is None:
             self.written_under = self._count
@@ -461,16 +474,20 @@ class Register(ABC, Generic[V]):
             self._counter = max(self._counter, answer.promised.counter)
         running.no[answer.elector] = answer.refusal
         if len(self._count.electors) - len(running.no) < majority(len(self._count.electors)):
-            if self._waits_for_leases(running):
+            if self._waits_for_others(running):
                 return  # the same accept is sent once more at its deadline
             if Refusal.VALUE in running.no.values():
                 running.unfit = running.value
             self._again(running, todo, now)
 
     @staticmethod
-    def _waits_for_leases(running: _Round[V]) -> bool:
-        """Whether only an exclusive task's lease stands against our accept: it will end, and the ballot is good."""
-        return running.phase is _Phase.ACCEPT and set(running.no.values()) == {Refusal.LEASE}
+    def _waits_for_others(running: _Round[V]) -> bool:
+        """Whether only what will end stands against our accept, and the ballot is good.
+
+        That is an exclusive task's lease, or that an elector has not fetched the fleet's document yet.
+        """
+        passes = {Refusal.LEASE, Refusal.DOCUMENT}
+        return running.phase is _Phase.ACCEPT and passes.issuperset(running.no.values()) and bool(running.no)
 
     def _ask_again(self, running: _Round[V], todo: ToDo, now: float) -> None:
         """Send the same accept again: a new ballot could only find out the outcome, without a move."""
@@ -529,7 +546,7 @@ class Register(ABC, Generic[V]):
                 running.deadline = until  # our next ballot would end the accept that waits
             elif running.phase is _Phase.WAIT:
                 self._begin(todo, now)
-            elif self._waits_for_leases(running):
+            elif self._waits_for_others(running):
                 self._ask_again(running, todo, now)
             else:
                 self._again(running, todo, now)

@@ -59,6 +59,7 @@ def make(fleet_value: FleetValue | None = None, *, me: str = "robot1", has_state
         electorate="e",
         rng=Random(1),
         now=100.0,
+        stored={"0d": FLEET},
     )
     for name in NAMES:
         if name != me:

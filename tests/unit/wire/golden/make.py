@@ -11,7 +11,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from zsched.core import events, relay_protocol
-from zsched.core.values import decision, durable, fleet, messages, model, plan, snapshot
+from zsched.core.values import decision, document, durable, electorate, fleet, messages, model, plan, snapshot
 from zsched.ipc import pipe as relay_pipe
 from zsched.ipc import protocol
 from zsched.wire import codec as wire
@@ -28,6 +28,25 @@ _BALLOT = model.Ballot(counter=12, node="robot1", incarnation=3)
 _ACCEPTANCE = model.Acceptance(ballot=_BALLOT, value=_VALUE)
 _WORKER = model.WorkerLoad(task="map_merge", state=model.WorkerState.READY, cpu_cores=0.5, memory_mb=200.0)
 _LINK = model.Link(source=model.LinkSource.NL80211, peer="edge1", rssi_dbm=-61.5, bitrate_mbps=433.3, retry_ratio=0.05)
+_FLEET_VALUE = electorate.FleetValue(
+    fleet="lab",
+    generation_id="0a1b",
+    revision=3,
+    number=2,
+    electors=(electorate.Elector(name="robot1"), electorate.Elector(name="robot2", disk="d2", joining=1)),
+    settled=False,
+    lease_s=1.0,
+    guard_lease_s=2.0,
+    creations=1,
+    tasks=(electorate.Creation(task="map_merge", number=1, exclusive=True),),
+    document="0d0e",
+)
+_DOCUMENT = document.Document(
+    text=document.Text("fleet: lab  # the hall's\n"),
+    flags=(
+        document.Flag(kind=document.FlagKind.DRAIN, subject="robot2", reason="a new wheel", by="ana", for_s=3600.0),
+    ),
+)
 _UTILITY = model.Utility(candidate="edge1", value=0.5, cpu=0.75, memory=0.25, network=0.5, reachable=False)
 _VECTOR = model.UtilityVector(
     voter="robot1", task="map_merge", revision=7, utilities=(_UTILITY,), refused=(("edge2", "draining"),)
@@ -183,6 +202,28 @@ SAMPLES: dict[str, object] = {
             base_revision=6, votes=(("robot1", "edge1"),), outcome="won", winner="edge1", age_s=1.5
         ),
     ),
+    "fleet_question": messages.FleetQuestion(
+        accept=messages.Accept(
+            task="lab",
+            acceptance=model.Acceptance(ballot=_BALLOT, value=_FLEET_VALUE),
+            electorate="0123456789abcdef",
+            generation_id="0a1b",
+            number=2,
+        )
+    ),
+    "fleet_answer": messages.FleetAnswer(
+        promise=messages.Promise(
+            elector="robot2",
+            task="lab",
+            ballot=_BALLOT,
+            accepted=model.Acceptance(ballot=_BALLOT, value=_FLEET_VALUE),
+            disk="d2",
+            joining=1,
+        )
+    ),
+    "ask_document": messages.AskDocument(document="0d0e"),
+    "document": _DOCUMENT,
+    "change_fleet": messages.ChangeFleet(document=_DOCUMENT, base_revision=3, reason="a third robot"),
     "restart_task": messages.RestartTask(task="map_merge"),
     "read_lines": messages.ReadLines(task="map_merge", after=12),
     "worker_lines": messages.WorkerLines(

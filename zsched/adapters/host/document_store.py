@@ -1,0 +1,65 @@
+"""The fleet's documents on this node's disk: one file each in the state folder, named by the document's hash.
+
+Knows: files, how one is written so that it survives a power cut. Does not know: which documents matter
+(`zsched.core.electorate.numbers`), what a text means.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Collection
+from pathlib import Path
+
+from zsched.adapters.host.state_file import replace_synced
+from zsched.core.values.document import Document
+from zsched.core.values.electorate import check_id
+from zsched.errors import AdapterError, WireError
+from zsched.files import read_regular
+from zsched.wire.codec import LARGE, decode_document, document_hash, encode
+
+FOLDER_NAME = "documents"
+NEW_NAME = "new"
+
+
+class DocumentStore:
+    """The documents in ``folder``/documents. Reading is allowed from any thread, writing from one."""
+
+    def __init__(self, folder: Path) -> None:
+        """Name the place; touches nothing."""
+        self.folder = folder / FOLDER_NAME
+
+    def save(self, content: Document) -> str:
+        """Write a document, unless it is there already; its hash. When this returns it survives a power cut.
+
+        Raises:
+            AdapterError: the disk is full, read-only or gone.
+            WireError: the document is too large for a frame.
+        """
+        name = document_hash(content)
+        if self.load(name) is not None:
+            return name
+        try:
+            self.folder.mkdir(mode=0o700, exist_ok=True)
+            replace_synced(self.folder / name, self.folder / NEW_NAME, encode(content))
+        except OSError as error:
+            raise AdapterError(
+                f"cannot write the fleet's document into {self.folder}: {error.strerror}; free or remount the disk"
+            ) from error
+        return name
+
+    def load(self, name: str) -> Document | None:
+        """The document with this hash; ``None``: it is not stored, or its file is damaged."""
+        check_id("document", name)
+        if not name:
+            return None
+        try:
+            return decode_document(read_regular(self.folder / name, LARGE), name)
+        except (OSError, WireError):
+            return None
+
+    def delete_others(self, keep: Collection[str]) -> None:
+        """Delete every document whose hash is not in ``keep``; a file that cannot be deleted stays."""
+        with contextlib.suppress(OSError):
+            for file in sorted(self.folder.iterdir()):
+                if file.name not in keep:
+                    file.unlink()

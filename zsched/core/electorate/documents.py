@@ -1,0 +1,110 @@
+"""The fleet's documents as one node knows them: which are stored here, which are wanted, and from whom.
+
+Knows: hashes, what the stored texts say. Does not know: bytes, disks, how a document is fetched and checked
+(`zsched.runtime.library`), which fleet value is in force (`zsched.core.electorate.numbers`).
+
+A fleet value is neither accepted nor learnt before its document is stored here. A document that is not valid here is
+not asked for again: the node goes on by its last one, and says so.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+
+from zsched.core import instructions as do
+from zsched.core.todo import ToDo
+from zsched.core.values.electorate import FleetValue
+from zsched.core.values.fleet import Fleet
+from zsched.core.values.model import NodeId
+
+FETCH_EVERY_S = 3.0
+"""A document that no peer has sent is asked for again after this time."""
+RECENT = 3
+"""So many documents that were stored last are known beside those that the node's state names."""
+MAX_WANTED = 4
+"""A peer's word must not fill the memory: of more wanted documents the oldest are forgotten."""
+
+
+class Documents:
+    """One node's documents.
+
+    Args:
+        me: this node.
+        stored: {hash: what it says} of those that the state names.
+    """
+
+    def __init__(self, me: NodeId, stored: Mapping[str, Fleet]) -> None:
+        self._me = me
+        self._fleets: dict[str, Fleet] = dict(stored)
+        """The newest last."""
+        self._wanted: dict[str, list[NodeId]] = {}
+        """{hash: who said that it has it, the last first}."""
+        self._ask_at: dict[str, float] = {}
+        self._kept: tuple[str, ...] = tuple(stored)
+        self.refused: dict[str, str] = {}
+        """{hash: why it is not valid here}."""
+
+    def holds(self, value: FleetValue) -> bool:
+        """Whether the document of a fleet value is stored here; a value without one needs none."""
+        return not value.document or value.document in self._fleets
+
+    def fleet(self, document: str) -> Fleet | None:
+        """What a stored document says."""
+        return self._fleets.get(document)
+
+    def next_deadline(self) -> float:
+        """When `tick` has something to do."""
+        return min((self._ask_at[document] for document in self._wanted), default=math.inf)
+
+    def want(self, value: FleetValue, peers: Iterable[NodeId], todo: ToDo, now: float) -> None:
+        """Fetch the document of a fleet value from one of these peers."""
+        document = value.document
+        if self.holds(value) or document in self.refused:
+            return
+        known = self._wanted.pop(document, [])
+        told = [peer for peer in peers if peer != self._me]
+        self._wanted[document] = [*told, *(peer for peer in known if peer not in told)]
+        for old in tuple(self._wanted)[:-MAX_WANTED]:
+            self._forget(old)
+        if now >= self._ask_at.get(document, -math.inf):
+            self._ask(document, todo, now)
+
+    def tick(self, todo: ToDo, now: float) -> None:
+        """Ask again for what nobody has sent."""
+        for document in tuple(self._wanted):
+            if now >= self._ask_at[document]:
+                self._ask(document, todo, now)
+
+    def _ask(self, document: str, todo: ToDo, now: float) -> None:
+        self._ask_at[document] = now + FETCH_EVERY_S
+        todo.add(do.FetchDocument(document=document, peers=tuple(self._wanted[document])))
+
+    def _forget(self, document: str) -> None:
+        self._wanted.pop(document, None)
+        self._ask_at.pop(document, None)
+
+    def on_stored(self, document: str, fleet: Fleet) -> None:
+        """A document is on disk, and valid."""
+        self._forget(document)
+        self.refused.pop(document, None)
+        self._fleets.pop(document, None)
+        self._fleets[document] = fleet
+        self._drop_old()
+
+    def on_refused(self, document: str, reason: str) -> None:
+        """A document that a peer sent is not valid here: it is not asked for again."""
+        self._forget(document)
+        self.refused = {document: reason}
+
+    def keep(self, documents: tuple[str, ...], todo: ToDo) -> None:
+        """The node's state names these from now on; of the others those that were stored last stay."""
+        if documents != self._kept:
+            self._kept = documents
+            self._drop_old()
+            todo.add(do.KeepDocuments(documents=documents))
+
+    def _drop_old(self) -> None:
+        others = [document for document in self._fleets if document not in self._kept]
+        for document in others[:-RECENT]:
+            del self._fleets[document]

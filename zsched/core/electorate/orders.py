@@ -1,0 +1,132 @@
+"""Operators' changes of the fleet: what a command asks for, and what becomes of it.
+
+Knows: which change of a fleet value each command is, in which words it ends. Does not know: how a change is agreed
+(`zsched.core.electorate.numbers`), how a document is stored.
+
+A command ends when its change is chosen, or cannot be. The electors of the new number are settled after that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from zsched.core import events as ev
+from zsched.core import instructions as do
+from zsched.core.electorate.changes import AddElector, AdoptDocument, FleetChange, RemoveElector, SetDocument
+from zsched.core.electorate.numbers import Numbers
+from zsched.core.todo import ToDo
+from zsched.core.values.change import Rewrite, RoundOutcome
+from zsched.core.values.electorate import FleetValue
+from zsched.core.values.fleet import Fleet
+from zsched.core.values.messages import ChangeFleet, CommandOutcome, CommandResult
+
+MAX_OPEN = 16
+"""So many commands may wait for their documents; of more the oldest end without an answer."""
+
+_ENDED = {
+    RoundOutcome.CONFLICT: (CommandOutcome.CONFLICT, "another change came first; look and try again"),
+    RoundOutcome.UNCHANGED: (CommandOutcome.UNCHANGED, "that is what is agreed"),
+    RoundOutcome.NO_QUORUM: (CommandOutcome.NO_QUORUM, "no majority of the electors answered; nothing is changed"),
+    RoundOutcome.UNKNOWN: (CommandOutcome.UNKNOWN, "the electors fell silent; `zsched status` tells"),
+}
+
+
+class Orders:
+    """One node's open commands."""
+
+    def __init__(self, numbers: Numbers) -> None:
+        self._numbers = numbers
+        self._storing: dict[int, ChangeFleet] = {}
+        """{request: its command} while the document is checked and written."""
+        self._running: list[tuple[FleetChange, int]] = []
+
+    def take(self, event: ev.FleetCommanded, todo: ToDo, now: float) -> None:
+        """An operator gives a command."""
+        command, request = event.command, event.request
+        value = self._numbers.value
+        if value is None:
+            detail = "this node does not know the fleet's generation yet; wait until it hears an elector"
+            self._answer(request, CommandOutcome.NO_QUORUM, detail, todo)
+        elif command.base_revision not in (None, value.revision):
+            detail = f"the fleet is at revision {value.revision}, not {command.base_revision}; look and try again"
+            self._answer(request, CommandOutcome.CONFLICT, detail, todo)
+        elif command.document is not None:
+            self._storing[request] = replace(command, base_revision=value.revision)
+            for old in tuple(self._storing)[:-MAX_OPEN]:
+                del self._storing[old]
+            todo.add(do.StoreDocument(request=request, content=command.document))
+        elif command.add_elector:
+            change = AddElector(base_revision=value.revision, name=command.add_elector, disk=command.disk)
+            self._propose(request, change, todo, now)
+        else:
+            gone = RemoveElector(base_revision=value.revision, name=command.remove_elector)
+            self._propose(request, gone, todo, now)
+
+    def on_stored(self, event: ev.DocumentStored, todo: ToDo, now: float) -> None:
+        """The document of a command is on disk: propose it."""
+        command = None if event.request is None else self._storing.pop(event.request, None)
+        value = self._numbers.value
+        if command is None or event.request is None or value is None or command.base_revision is None:
+            return
+        change = document_change(value, event.document, event.fleet, base_revision=command.base_revision)
+        self._propose(event.request, change, todo, now)
+
+    def on_refused(self, event: ev.DocumentRefused, todo: ToDo) -> None:
+        """The document of a command is not valid here, or the disk refused it."""
+        if event.request is not None and self._storing.pop(event.request, None) is not None:
+            self._answer(event.request, CommandOutcome.INVALID, event.reason, todo)
+
+    def _propose(self, request: int, change: FleetChange, todo: ToDo, now: float) -> None:
+        fault = self._numbers.propose(change, todo, now)
+        if fault:
+            self._answer(request, CommandOutcome.INVALID, fault, todo)
+        else:
+            self._running.append((change, request))
+
+    def on_ended(self, change: Rewrite[FleetValue], outcome: RoundOutcome, todo: ToDo) -> None:
+        """A change of the fleet has ended; if a command asked for it, its operator hears so."""
+        request = next((number for one, number in self._running if one is change), None)
+        self._running = [one for one in self._running if one[0] is not change]
+        value = self._numbers.value
+        text = f"{change.reason}, on revision {change.base_revision}: {outcome}"
+        todo.add(do.RecordStory(stage="vote", text=text))
+        if request is None or value is None:
+            return
+        if outcome is RoundOutcome.COMMITTED:
+            self._answer(request, CommandOutcome.OK, _committed(value), todo, value.revision)
+            return
+        kind, detail = _ENDED[outcome]
+        fault = self._numbers.fault(change) if outcome is RoundOutcome.UNCHANGED else ""
+        if fault:
+            kind, detail = CommandOutcome.INVALID, fault
+        self._answer(request, kind, detail, todo, value.revision)
+
+    @staticmethod
+    def _answer(request: int, outcome: CommandOutcome, detail: str, todo: ToDo, revision: int | None = None) -> None:
+        result = CommandResult(outcome=outcome, detail=detail, revision=revision)
+        todo.add(do.AnswerCommand(request=request, result=result))
+
+
+def document_change(
+    value: FleetValue, document: str, fleet: Fleet, *, base_revision: int | None = None
+) -> AdoptDocument | SetDocument:
+    """The change by which a fleet goes by a document: the first one, or another one.
+
+    Args:
+        value: the fleet value that it is to change.
+        document: the document's hash.
+        fleet: what it says.
+        base_revision: of the value that the operator saw; ``None``: this one.
+    """
+    base = value.revision if base_revision is None else base_revision
+    tasks = tuple((task.name, task.exclusive) for task in fleet.tasks)
+    lease_s = fleet.timing.lease_s
+    if value.document:
+        return SetDocument(base_revision=base, document=document, tasks=tasks, lease_s=lease_s)
+    return AdoptDocument(base_revision=base, document=document, tasks=tasks, lease_s=lease_s)
+
+
+def _committed(value: FleetValue) -> str:
+    names = ", ".join(value.electorate.names)
+    told = f"committed by a majority of the electors; electors: {names}"
+    return told if value.settled else f"{told}; number {value.number} is being settled, which the next change waits for"

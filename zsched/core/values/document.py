@@ -1,0 +1,63 @@
+"""The fleet's document: the fleet file's text as its operator wrote it, and what operators have said of nodes since.
+
+Knows: the fields of a document and their sizes. Does not know: what the text means (`zsched.config`), its hash
+(`zsched.wire.codec`), who agrees on it (`zsched.core.electorate`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import NewType
+
+from zsched.core.values.model import MAX_REASON, check_name, check_range
+
+Text = NewType("Text", str)
+"""A string that may be longer than any other on the wire: at most `MAX_DOCUMENT_BYTES` in UTF-8."""
+MAX_DOCUMENT_BYTES = 192 * 1024
+"""Of a document's text in UTF-8: with its flags it fits into one frame."""
+MAX_FLAGS = 64
+MAX_FLAG_S = 366 * 86400.0
+
+
+class FlagKind(StrEnum):
+    """What an operator has said of a node."""
+
+    DRAIN = "drain"  # its tasks move away, and none comes
+    INELIGIBLE = "ineligible"  # no task comes; what it owns stays
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Flag:
+    """One thing that an operator has said of a node, until it is taken back or its time is over."""
+
+    kind: FlagKind
+    subject: str
+    """The node."""
+    reason: str = ""
+    by: str = ""
+    """The operator, as the program that set the flag names the person."""
+    for_s: float | None = None
+    """How long it lasts, in seconds; ``None``: until it is taken back."""
+
+    def __post_init__(self) -> None:
+        check_name("flag.subject", self.subject)
+        check_range("flag.for_s", self.for_s, 0.0, MAX_FLAG_S)
+        for what in ("reason", "by"):
+            if len(getattr(self, what)) > MAX_REASON:
+                raise ValueError(f"flag.{what}: longer than {MAX_REASON} characters")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Document:
+    """What all machines of a fleet go by, once it is agreed."""
+
+    text: Text
+    """The fleet file, comments and all."""
+    flags: tuple[Flag, ...] = ()
+
+    def __post_init__(self) -> None:
+        if len(self.text.encode("utf-8", "surrogatepass")) > MAX_DOCUMENT_BYTES:
+            raise ValueError(f"document.text: larger than {MAX_DOCUMENT_BYTES} bytes")
+        if len(self.flags) > MAX_FLAGS:
+            raise ValueError(f"document.flags: more than {MAX_FLAGS}")

@@ -1,0 +1,153 @@
+"""The fleet's documents in a daemon: fetched from peers, checked, written to disk; a thread of its own.
+
+Knows: where a document comes from, that it is valid here before it is stored. Does not know: which document is wanted
+and why (`zsched.core.electorate.numbers`). To read a large fleet file takes longer than the decision loop may stand
+still.
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+
+from zsched.adapters.host.document_store import DocumentStore
+from zsched.config.load import check_bytes
+from zsched.config.reader import render_all
+from zsched.core import events as ev
+from zsched.core import instructions as do
+from zsched.core.values.document import Document
+from zsched.core.values.fleet import Fleet
+from zsched.core.values.model import NodeId
+from zsched.errors import AdapterError, ConfigError, WireError
+from zsched.guard import guarded
+from zsched.wire.codec import decode_document, document_hash
+
+FETCH_S = 2.0
+"""So long one peer may take to send a document."""
+RECENT = 8
+"""So many documents that were stored last are never deleted: the node may just be hearing of them."""
+MAX_FAULT = 400
+
+Fetch = Callable[[NodeId, str, float], bytes | None]
+log = logging.getLogger("zsched.library")
+
+
+class Library:
+    """One node's documents. All methods but `close` may be called from the loop; none of them blocks."""
+
+    def __init__(
+        self, *, fleet: str, node: NodeId, config: Path, state_dir: Path, post: Callable[[ev.Event], None]
+    ) -> None:
+        """``config`` is the file this node was started with: paths in a document are relative to its folder."""
+        self._fleet, self._node, self._config, self._post = fleet, node, config, post
+        self.store = DocumentStore(state_dir)
+        self.fetch: Fetch = lambda _peer, _document, _deadline_s: None
+        self._orders: queue.SimpleQueue[do.StoreDocument | do.FetchDocument | do.KeepDocuments | None] = (
+            queue.SimpleQueue()
+        )
+        self._wanted: set[str] = set()
+        """Hashes whose fetch waits or is under way: once is enough."""
+        self._recent: deque[str] = deque(maxlen=RECENT)
+        self._kept: tuple[str, ...] = ()
+        """What the node's state names; at a start `keep` says it, before anything is stored."""
+        self._thread = guarded(self._run, name="zsched-library")
+
+    def keep(self, documents: tuple[str, ...]) -> None:
+        """Say at the start which documents the node's state names; before `start`."""
+        self._kept = documents
+
+    def start(self) -> None:
+        """Begin to take orders."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Take no further order; what is under way ends with the process."""
+        self._orders.put(None)
+
+    def read(self, content: Document) -> Fleet:
+        """What a document says on this node; any thread.
+
+        Raises:
+            ConfigError: it cannot be used here.
+        """
+        return read_document(content, self._fleet, self._node, self._config)
+
+    def order(self, order: do.StoreDocument | do.FetchDocument | do.KeepDocuments) -> None:
+        """Enqueue; an event tells what became of it."""
+        if isinstance(order, do.FetchDocument):
+            if order.document in self._wanted:
+                return
+            self._wanted.add(order.document)
+        self._orders.put(order)
+
+    def _run(self) -> None:
+        while (order := self._orders.get()) is not None:
+            if isinstance(order, do.StoreDocument):
+                self._accept(order.content, order.request)
+            elif isinstance(order, do.FetchDocument):
+                self._bring(order)
+                self._wanted.discard(order.document)
+            else:
+                self._kept = order.documents
+                self._tidy()
+
+    def _tidy(self) -> None:
+        """Delete what nobody needs; a peer can only make this node store a few documents more."""
+        self.store.delete_others({*self._kept, *self._recent})
+
+    def _bring(self, order: do.FetchDocument) -> None:
+        """Fetch a document from the first peer that has it."""
+        content = self.store.load(order.document)
+        for peer in order.peers:
+            if content is not None:
+                break
+            frame = self.fetch(peer, order.document, FETCH_S)
+            if frame is None:
+                continue
+            try:
+                content = decode_document(frame, order.document)
+            except WireError as error:
+                self._post(ev.FrameDropped(kind="document", reason=error.reason))
+        if content is not None:
+            self._accept(content, None)
+
+    def _accept(self, content: Document, request: int | None) -> None:
+        """Check a document, write it and say so."""
+        name = ""
+        try:
+            name = document_hash(content)
+            fleet = self.read(content)
+            self.store.save(content)
+        except (ConfigError, AdapterError, WireError) as error:
+            reason = str(error)
+            log.warning("document refused document=%s why=%s", name, reason)
+            self._post(ev.DocumentRefused(document=name, reason=reason[:MAX_FAULT], request=request))
+            return
+        self._recent.append(name)
+        self._tidy()
+        self._post(ev.DocumentStored(document=name, fleet=fleet, flags=content.flags, request=request))
+
+
+def read_document(content: Document, fleet: str, node: NodeId, config: Path) -> Fleet:
+    """What a document says, if it can be used on this node.
+
+    Args:
+        content: the document.
+        fleet: the name that it must have.
+        node: this node, which must be in it.
+        config: the file this node was started with: paths in the document are relative to its folder.
+
+    Raises:
+        ConfigError: it cannot be used here.
+    """
+    result = check_bytes(content.text.encode("utf-8", "replace"), str(config.parent / "the fleet's document"))
+    if result.fleet is None:
+        raise ConfigError(render_all("the document", result.faults))
+    if result.fleet.name != fleet:
+        raise ConfigError(f"the document is of the fleet {result.fleet.name!r}, this node of {fleet!r}")
+    if all(one.name != node for one in result.fleet.nodes):
+        raise ConfigError(f"the document names no node {node!r}: this machine goes on by its last one")
+    return result.fleet
