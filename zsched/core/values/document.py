@@ -17,7 +17,7 @@ Text = NewType("Text", str)
 MAX_DOCUMENT_BYTES = 192 * 1024
 """Of a document's text in UTF-8: with its flags it fits into one frame."""
 MAX_FLAGS = 64
-MAX_FLAG_S = 366 * 86400.0
+MAX_FLAG_S = 366 * 86_400
 
 
 class FlagKind(StrEnum):
