@@ -63,6 +63,8 @@ class Invariants:
     """{(machine, task): the newest revision that it ever learnt}."""
     ballots: dict[tuple[TaskId, Ballot], tuple[str, Allocation | None]] = field(default_factory=dict)
     """{(task, ballot): (whose it is, what it carries)}."""
+    _counted: dict[str, tuple[NodeId, ...]] = field(default_factory=dict)
+    """{machine: the electors of its newest fleet value}."""
     _floors: dict[str, dict[TaskId, Ballot]] = field(default_factory=dict)
     """{machine: {task: the highest ballot before the newest write of this batch, and of the answers since}}."""
 
@@ -97,6 +99,10 @@ class Invariants:
     def on_synced(self, machine: Machine, state: DurableState, now: float) -> None:
         """A state reached the disk: promises only rise, and what it holds is history from now on."""
         old = machine.disk.registers
+        agreed = None if state.fleet_register is None else state.fleet_register.learnt
+        if agreed is not None and agreed.electorate.names != self._counted.get(machine.key):
+            self._counted[machine.key] = agreed.electorate.names
+            self.expect(state.generation, agreed.electorate.names)
         for register in state.registers:
             known = old.get(register.task)
             if known is register:
@@ -165,7 +171,8 @@ class Invariants:
         return machine.disk.registers.get(task) or RegisterState(task=task)
 
     def _check_answer(self, machine: Machine, answer: Promise | Accepted, now: float) -> None:
-        if not machine.is_elector:
+        seat = None if machine.node is None else machine.node.agreement.is_elector
+        if not machine.is_elector and not seat:
             raise InvariantError(f"{machine.key} is no elector and answered {answer}")
         held = self._register(machine, answer.task)
         if held.promised < answer.ballot:

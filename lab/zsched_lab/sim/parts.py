@@ -60,6 +60,8 @@ class Disk:
     """What ``state`` holds, by task."""
     is_broken: bool = False
     """Full or read-only: it refuses every write."""
+    documents: list[str] = field(default_factory=list)
+    """Hashes of the fleet's documents that are stored beside the state, the newest last."""
     past: deque[bytes] = field(default_factory=lambda: deque(maxlen=PAST_KEPT))
     """What the file held before: what a backup may bring back."""
     _unsynced: DurableState | None = None
@@ -129,6 +131,7 @@ class Disk:
         """The disk is new."""
         self.state = self.content = self._unsynced = self._in_cache = None
         self.past.clear()
+        self.documents.clear()
         self._index()
 
     def _index(self) -> None:

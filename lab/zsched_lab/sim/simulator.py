@@ -18,8 +18,8 @@ from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.node import Node
 from zsched.core.values.durable import DurableState
-from zsched.core.values.fleet import Fleet, electorate_hash
-from zsched.core.values.messages import Refused
+from zsched.core.values.fleet import Fleet, electorate_hash, fleet_hash
+from zsched.core.values.messages import FleetQuestion, Refused, fleet_question
 from zsched.core.values.model import Allocation, DeviceSample, NodeId, PeerState, TaskId
 from zsched.core.values.plan import RoutePlan
 from zsched.core.vote.generations import blank_state
@@ -27,6 +27,7 @@ from zsched.errors import InvariantError, WireError
 from zsched.wire import codec as wire
 from zsched_lab.sim.checks import Invariants, are_same, check_replayed, unsettled
 from zsched_lab.sim.clocks import LOOK_S, awake
+from zsched_lab.sim.documents import Documents
 from zsched_lab.sim.links import Links
 from zsched_lab.sim.loops import TICK_S
 from zsched_lab.sim.memory import Memory
@@ -70,6 +71,7 @@ class Simulator(Links):
     invariants: Invariants = field(init=False)
     memory: Memory = field(init=False)
     work: Work = field(init=False)
+    documents: Documents = field(init=False)
     events: int = 0
     most_events: float = math.inf
     """More than this is a storm: nodes that answer each other without end."""
@@ -78,12 +80,14 @@ class Simulator(Links):
     _asked: dict[int, tuple[Machine, Machine, Make]] = field(default_factory=dict)
     _frames: dict[tuple[str, type[Any]], tuple[object, bytes, Any]] = field(default_factory=dict)
     """{(sender, class): (the newest value of this class, its frame, what is read in it)}."""
+    _disks: Iterator[int] = field(default_factory=lambda: itertools.count(1))
     _requests: Iterator[int] = field(default_factory=lambda: itertools.count(1))
 
     def __post_init__(self) -> None:
         self.rng = Random(self.seed)
         self.invariants = Invariants(self.fleet)
         self.memory, self.work = Memory(self), Work(self)
+        self.documents = Documents(self, self.rng.choice)
         for spec in self.fleet.nodes:
             machine = self.machines[spec.name] = Machine(key=spec.name, name=spec.name, fleet=self.fleet)
             self.initialise(machine, generation=self.generation)
@@ -91,7 +95,10 @@ class Simulator(Links):
     def initialise(self, machine: Machine, *, incarnation: int = 0, generation: int = 0) -> None:
         """`zsched init`: a blank durable state, which says that this name has never voted."""
         before = machine.disk.state
-        blank = blank_state(machine.fleet, machine.name, generation, before, incarnation=incarnation, hardware="")
+        disk = f"{next(self._disks):04x}"
+        blank = blank_state(
+            machine.fleet, machine.name, generation, before, incarnation=incarnation, hardware="", disk=disk
+        )
         machine.disk.wipe()
         self.invariants.expect(generation, machine.fleet.electors)
         machine.disk.write(blank)
@@ -193,8 +200,10 @@ class Simulator(Links):
         kept, local = machine.is_durable, machine.clock.local(self.now)
         is_first = machine.life == 0
         state = machine.disk.read()
-        if state is not None and (state.electorate != electorate or self._is_refused(machine)):
+        is_agreed = state is not None and _has_changed(state)
+        if state is not None and ((state.electorate != electorate and not is_agreed) or self._is_refused(machine)):
             state = None
+        fleet, stored = self.documents.at_start(machine, state)
         # No two machines' clocks agree to the millisecond, not even where power comes back to all of them at once.
         wall_count = self.wall_count + (machine.key != machine.name)
         if state is not None:
@@ -203,17 +212,19 @@ class Simulator(Links):
             machine.disk.sync()
         machine.life += 1
         machine.is_durable = state is not None
-        machine.is_elector = state is not None and machine.name in machine.fleet.electors
+        machine.is_elector = state is not None and machine.name in fleet.electors
         self.invariants.on_started(machine, self.now, has_state=state is not None and (kept or is_first))
         machine.node = Node(
-            fleet=machine.fleet,
+            fleet=fleet,
             me=machine.name,
             durable=state,
             incarnation=state.incarnation if state is not None else wall_count,
             electorate=electorate,
             rng=Random(self.rng.random()),
             now=local,
+            stored=stored,
         )
+        machine.node.by_file = fleet_hash(machine.fleet)
         self.memory.on_started(machine, state)
         self._tell_token(machine, ev.TokenSeen(node=machine.name, incarnation=machine.node.incarnation), TOKEN_DELAY_S)
         self._carry_out(machine, machine.node.start(local), 0)
@@ -310,6 +321,7 @@ class Simulator(Links):
                     return
                 self._sync(machine, instruction.state)
                 continue
+            self.documents.on_sent(instruction)
             self.invariants.on_leaving(machine, instruction, self.now)
             self._one(machine, instruction)
         if end is not None:
@@ -321,6 +333,7 @@ class Simulator(Links):
             self._start(machine)
 
     def _sync(self, machine: Machine, state: DurableState) -> None:
+        self.documents.on_synced(machine, state)
         self.invariants.on_synced(machine, state, self.now)
         machine.disk.sync()
 
@@ -357,9 +370,21 @@ class Simulator(Links):
                 self._elect(me, prepare, lambda n, value: ev.PrepareAsked(request=n, asker=me.name, prepare=value))
             case do.SendAccept(accept=accept):
                 self._elect(me, accept, lambda n, value: ev.AcceptAsked(request=n, asker=me.name, accept=value))
+            case do.AskElectors(to=to, question=fleet_asked):
+                self._ask_fleet(me, to, fleet_question(fleet_asked))
+            case do.AnswerFleet(request=request, answer=fleet_vote):
+                if fleet_vote.refused is None:
+                    self.memory.on_vote(me)
+                self._answer(request, fleet_vote)
+            case do.StoreDocument() | do.FetchDocument() | do.KeepDocuments():
+                self.documents.do(me, instruction)
+            case do.AnswerDocument(request=request, document=document):
+                content = self.documents.content(me, document)
+                if content is not None:
+                    self._answer(request, content)
             case do.AskLearnt(peer=peer):
                 for other in self.named(peer):
-                    number = self._question(other, me, lambda value: ev.LearntReceived(learnt=value, is_answer=True))
+                    number = self.ask(other, me, lambda value: ev.LearntReceived(learnt=value, is_answer=True))
                     self.send(me, other, Message(ev.LearntAsked(request=number)))
             case do.AnswerUtilities(request=request, utilities=value):
                 self._answer(request, value)
@@ -405,7 +430,15 @@ class Simulator(Links):
         frame, read = self._framed(me, value)
         self.spread(me, Message(make(read), frame, type(value)))
 
-    def _question(self, asked: Machine, asker: Machine, make: Make) -> int:
+    def _ask_fleet(self, me: Machine, to: tuple[NodeId, ...], question: FleetQuestion) -> None:
+        frame, read = self._framed(me, question)
+        for elector in to:
+            for other in self.named(elector):
+                number = self.ask(other, me, lambda answer: ev.FleetAnswered(answer=answer))
+                asked = ev.FleetAsked(request=number, asker=me.name, question=read)
+                self.send(me, other, Message(asked, frame, FleetQuestion))
+
+    def ask(self, asked: Machine, asker: Machine, make: Make) -> int:
         """A request number whose answers travel back from ``asked`` to ``asker`` (a repeated question's, too)."""
         number = next(self._requests)
         self._asked[number] = (asked, asker, make)
@@ -427,12 +460,19 @@ class Simulator(Links):
 
         for name in self.fleet.voters:
             for other in self.named(name) if name != me.name else ():
-                number = self._question(other, me, make)
+                number = self.ask(other, me, make)
                 self.send(me, other, Message(ev.UtilityAsked(request=number, asker=me.name)))
 
     def _elect(self, me: Machine, question: object, make: Callable[[int, Any], ev.Event]) -> None:
         (frame, value), kind = self._framed(me, question), type(question)
-        for elector in me.fleet.electors:
+        assert me.node is not None
+        for elector in me.node.agreement.electors:
             for other in self.named(elector):
-                number = self._question(other, me, lambda answer: ev.ElectorAnswered(answer=answer))
+                number = self.ask(other, me, lambda answer: ev.ElectorAnswered(answer=answer))
                 self.send(me, other, Message(make(number, value), frame, kind))
+
+
+def _has_changed(state: DurableState) -> bool:
+    """Whether a learnt fleet value names the electors, and no longer the file."""
+    learnt = None if state.fleet_register is None else state.fleet_register.learnt
+    return learnt is not None and not learnt.electorate.is_founding

@@ -7,6 +7,7 @@ fleet means to each stage.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, Final
 
 from zsched.core import events as ev
@@ -19,8 +20,11 @@ from zsched.core.values.fleet import Fleet, fleet_hash
 def take_effect(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
     """Another fleet is in force: its document is stored, the value with it is learnt, the registers count by it."""
     del todo, now
+    has_changed = replace(fleet, electors=node.fleet.electors, timing=node.fleet.timing) != node.fleet
     node.fleet = fleet
     node.agreement.adopt(fleet)
+    if has_changed:
+        node.set_problem("fleet/restart", "another document is agreed: restart this daemon, and it goes by all of it")
     compare_file(node)
 
 

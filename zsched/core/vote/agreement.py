@@ -358,6 +358,9 @@ class Agreement:
 
     def on_stored(self, event: ev.DocumentStored, todo: ToDo, now: float) -> None:
         """A document is on disk: the value that waits for it is learnt, or an operator's command goes on."""
+        if obstacle := self._numbers.obstacle(event.fleet):
+            self.on_refused(ev.DocumentRefused(document=event.document, reason=obstacle, request=event.request), todo)
+            return
         if self._numbers.on_stored(event.document, event.fleet, todo, now):
             self._count_anew(todo)
         self.orders.on_stored(event, todo, now)
