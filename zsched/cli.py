@@ -291,6 +291,41 @@ def top(
 
 
 @app.command(cls=Verb)
+def web(
+    listen: Annotated[
+        str, typer.Option("--listen", metavar="ADDRESS:PORT", help="Where; beyond this machine only with a token.")
+    ] = "127.0.0.1:7459",
+    token_file: Annotated[
+        Path | None,
+        typer.Option("--token-file", metavar="FILE", help="Who looks must know its only word. [ZSCHED_WEB_TOKEN]"),
+    ] = None,
+    host: Annotated[
+        list[str] | None,
+        typer.Option("--host", metavar="NAME", help="Browsers may call this server so, besides its addresses."),
+    ] = None,
+    node: AskedOption = None,
+    runtime_dir: RuntimeOption = None,
+    connect: ConnectOption = None,
+) -> None:
+    """Serve a page that shows the fleet live, and Prometheus' figures under /metrics; it changes nothing.
+
+    It asks one daemon once a second, however many look; a daemon that is not there is waited for.
+    """
+    from zsched.commands.watch.web import WebView  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.watch.web import web as serve  # noqa: PLC0415 - as above
+
+    view = WebView(
+        runtime_dir=runtime_dir,
+        node=node,
+        connect=connect,
+        listen=listen,
+        token_file=token_file,
+        hosts=tuple(host or ()),
+    )
+    raise typer.Exit(serve(view))
+
+
+@app.command(cls=Verb)
 def explain(
     task: Annotated[str, typer.Argument(metavar="TASK", help="A task of the fleet file.")],
     plan: Annotated[

@@ -10,10 +10,12 @@ import os
 import subprocess
 import sys
 import time
+import urllib.request
 from collections.abc import Callable
 from pathlib import Path
 
 UNIT = "zsched.service"
+WEB = "zsched-web.service"
 RESULT = Path("/result/report.json")
 EXPECTED = Path("/opt/expected").read_text() if Path("/opt/expected").exists() else ""
 """What the status line says once all is well."""
@@ -90,6 +92,26 @@ def crash_and_restart(report: dict[str, object], pid: int) -> int:
     return int(again["MainPID"])
 
 
+def look_at_the_page() -> dict[str, object]:
+    """Start the page's unit, ask it for the status, stop it."""
+    run("systemctl", "start", WEB)
+    report: dict[str, object] = {}
+    end_s = time.monotonic() + 20.0
+    address = f"http://127.0.0.1:{Path('/opt/web_port').read_text()}/api/status"
+    while not report.get("status") and time.monotonic() < end_s:
+        try:
+            with urllib.request.urlopen(address, timeout=5.0) as answer:
+                report = json.loads(answer.read())
+        except OSError as error:
+            report = {"why": str(error)}
+        time.sleep(0.1)
+    pid = int(run("systemctl", "show", WEB, "-p", "MainPID").strip().partition("=")[2])
+    report["user"] = Path(f"/proc/{pid}").stat().st_uid if pid else None
+    run("systemctl", "stop", WEB)
+    report["said"] = run("journalctl", "--no-pager", "-u", WEB, "-o", "cat", "-n", "30")
+    return report
+
+
 def observe() -> dict[str, object]:
     report: dict[str, object] = {}
     start_s, start_said = timed("systemctl", "start", UNIT)
@@ -106,6 +128,7 @@ def observe() -> dict[str, object]:
         path.name: path.read_text(errors="replace")[:2000] for path in Path("/run/zsched").glob("*.txt")
     }
     report["relay"] = relays()
+    report["web"] = look_at_the_page() if report["relay"] else None
     if report["relay"]:
         pid = crash_and_restart(report, pid)
     os.kill(pid, 19)  # SIGSTOP: the loop is wedged, the process lives

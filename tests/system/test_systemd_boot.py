@@ -57,6 +57,7 @@ export PYTHONPATH=/opt/zsched/src:/opt/zsched/site PYTHONDONTWRITEBYTECODE=1
 exec /usr/bin/python3 "$@"
 """
 STANDIN, REAL = "/opt/standin.py", "-m zsched.cli"
+WEB_DROP_IN = "[Service]\nExecStart=\nExecStart=/opt/zsched/bin/zsched web --listen 127.0.0.1:{port}\n"
 STANDIN_WORKS = "worker works"
 REAL_WORKS = "echo@edge1 epoch 1"
 """What the status line says, after the watchdog's restart, too: the state was on the disk."""
@@ -97,9 +98,13 @@ def fleet_file() -> str:
 def furnish(root: Path, start: str, expected: str) -> None:
     """Put the unit, its program, the fleet file and the driver into the machine."""
     unit = (REPO / "systemd" / "zsched.service").read_text()
+    port = free_endpoints(1)[0].rpartition(":")[2]
     files = {
         "etc/systemd/system/zsched.service": unit,
         "etc/systemd/system/zsched.service.d/test.conf": "[Service]\nWatchdogSec=3\n",
+        "etc/systemd/system/zsched-web.service": (REPO / "systemd" / "zsched-web.service").read_text(),
+        "etc/systemd/system/zsched-web.service.d/test.conf": WEB_DROP_IN.format(port=port),
+        "opt/web_port": port,
         "etc/systemd/system/drive.service": DRIVE_UNIT,
         "etc/zsched/fleet.yaml": fleet_file(),
         "opt/expected": expected,
@@ -206,6 +211,9 @@ def test_daemon_lives_by_its_unit_and_remembers_the_allocation(reports: dict[str
     report = reports["real"].result()
     check_life(report, REAL_WORKS)
     assert any("zsched.relay" in line for line in report["processes"]), report["processes"]
+    web = report["web"]  # it reads by the operator socket, as the daemon's own user, and leaves the relay alone
+    assert web.get("status"), web["said"]
+    assert (web["status"]["fleet"], web["why"]) == ("boot", ""), web
     for when in ("crashed", "restarted", "watchdog"):  # the relay is the same one through all of them
         assert report[when]["ActiveState"] == "active", report["journal"]
         assert report[when]["relay"] == report["relay"] != [], report["journal"]
