@@ -73,7 +73,7 @@ OUTSIDE: Final[dict[str, str]] = {
     # library: who alone may import it, besides lab and tasks
     "zenoh": r"(adapters\.network|relay|worker|sessions)(\..+)?",
     "msgpack": r"wire\.codec",
-    "ruamel": r"config\.reader",
+    "ruamel": r"config\.(reader|editing)",
     "typer": r"cli|commands\..+",
 }
 

@@ -1,0 +1,191 @@
+"""Two fleet files become a list of changes in the file's words, each with what follows from it."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from zsched.config.difference import Change, Danger, Effect, difference
+from zsched.config.editing import add_entries
+from zsched.config.load import check_bytes
+from zsched.core.values.fleet import Fleet, LinkSpec, LocalSide, NodeSpec, TaskSpec
+from zsched.core.values.model import LinkSource, NodeKind, Weights
+
+TEXT = (Path(__file__).parents[3] / "configs" / "fleet.yaml").read_text()
+RULES = "tasks.map_merge.scheduling"
+EXCLUSIVE = """\
+  pick:
+    candidates: [edge1, edge2]
+    weights: {cpu: 1}
+    worker: {command: [python, pick.py]}
+    exclusive: true
+"""
+
+
+def fleet_of(text: str) -> Fleet:
+    result = check_bytes(text.encode())
+    assert result.fleet is not None, result.report()
+    return result.fleet
+
+
+def told(new: str, old: str = TEXT, **owners: str) -> list[tuple[str, str | None, str | None, str]]:
+    return [(one.path, one.before, one.after, one.consequence) for one in changes(new, old, **owners)]
+
+
+def changes(new: str, old: str = TEXT, **owners: str) -> tuple[Change, ...]:
+    return difference(fleet_of(old), fleet_of(new), (old, new), owners)
+
+
+def with_(old: str, new: str, text: str = TEXT) -> str:
+    assert old in text
+    return text.replace(old, new, 1)
+
+
+def test_the_same_file_and_other_comments_are_no_change() -> None:
+    assert changes(TEXT) == ()
+    assert changes(with_("# A zsched fleet file.", "# The fleet file.")) == ()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("cool_down_s: 2}", "cool_down_s: 2.0}", (f"{RULES}.cool_down_s", "2", "2.0", "nothing notices")),
+        ("timing: wifi", "timing: {profile: wifi}", ("timing", "wifi", "{profile: wifi}", "nothing notices")),
+        ("cool_down_s: 2}", "cool_down_s: 4}", (f"{RULES}.cool_down_s", "2", "4", "takes effect at once")),
+        (", cool_down_s: 2}", "}", (f"{RULES}.cool_down_s", "2", None, "nothing notices")),
+        (
+            "--mode, estimate]",
+            "--mode, known]",
+            (
+                "tasks.map_merge.worker.command",
+                "[python, -m, zsched.tasks.map_merge, --mode, estimate]",
+                "[python, -m, zsched.tasks.map_merge, --mode, known]",
+                "workers of map_merge restart one after another",
+            ),
+        ),
+        (
+            "class: latest, keep_last: 1}",
+            "class: latest, keep_last: 3}",
+            ("tasks.map_merge.inputs[0].keep_last", "1", "3", "the streams map_merge/in/0 move"),
+        ),
+        (
+            "host: 192.0.2.11 ",
+            "host: 192.0.2.13 ",
+            ("nodes.edge1.host", "192.0.2.11", "192.0.2.13", "the others dial it there"),
+        ),
+        (
+            "  robot3: {kind: robot, wifi: wlan0}\n",
+            "  robot3: {kind: robot, wifi: wlan0}\n  edge3: {kind: edge}\n",
+            ("nodes.edge3", None, "{kind: edge}", "edge3 may join: start its daemon"),
+        ),
+    ],
+)
+def test_one_place_is_one_change_with_what_follows(old: str, new: str, expected: tuple[str | None, ...]) -> None:
+    assert expected in told(with_(old, new))
+
+
+def test_what_follows_from_another_place_is_a_change_of_its_own() -> None:
+    """A third edge is a candidate of a task that takes every edge; no line of the task says so."""
+    text = with_("  robot3:", "  edge3: {kind: edge}\n  robot3:")
+    assert ("tasks.map_merge.candidates", "edge1, edge2", "edge1, edge2, edge3", "takes effect at once") in told(text)
+
+
+def test_an_owner_that_is_no_candidate_any_more_is_left() -> None:
+    text = with_("candidates: {kind: edge}", "candidates: [edge2]")
+    row = ("tasks.map_merge.candidates", "{kind: edge}", "[edge2]")
+    assert told(text, map_merge="edge1") == [(*row, "map_merge leaves edge1: its streams move")]
+    assert told(text, map_merge="edge2") == [(*row, "takes effect at once")]
+
+
+def test_a_rule_that_comes_goes_or_differs_names_its_streams() -> None:
+    line = '      - {from: "{target}/map_merge/{epoch}/tf", to: "{robot}/map_merge/tf", class: latest}\n'
+    gone = with_(line, "")
+    assert [(one.path, one.after, one.consequence) for one in changes(gone)] == [
+        ("tasks.map_merge.outputs[1]", None, "the streams map_merge/out/2 end; the streams map_merge/out/1 move")
+    ]
+    assert [one.consequence for one in changes(TEXT, gone)] == [
+        "the streams map_merge/out/2 begin; the streams map_merge/out/1 move"
+    ]
+
+
+def test_dangers_have_names_and_say_what_is_accepted() -> None:
+    extended = add_entries(TEXT, "tasks", f"tasks:\n{EXCLUSIVE}")
+    shared = with_("exclusive: true", "exclusive: false", extended)
+    electors = TEXT + "electorate: [robot1, robot2, edge1]\n"
+    robot = with_("  robot3: {kind: robot, wifi: wlan0}\n", "")
+    alone = with_("candidates: {kind: edge}", "candidates: [edge2]")
+    cases: list[tuple[str, str, set[Danger]]] = [
+        (TEXT, extended, set()),
+        (extended, TEXT, {Danger.REMOVE_TASK}),
+        (shared, extended, {Danger.MAKE_EXCLUSIVE}),
+        (extended, shared, {Danger.END_EXCLUSIVE}),
+        (TEXT, electors, {Danger.CHANGE_ELECTORS}),
+        (TEXT, robot, {Danger.REMOVE_NODE, Danger.CHANGE_ELECTORS}),
+        (alone, with_("--mode, estimate", "--mode, known", alone), {Danger.PAUSE_TASK}),
+    ]
+    for old, new, expected in cases:
+        found = changes(new, old)
+        assert {one.danger for one in found if one.danger is not None} == expected
+        assert all(bool(one.warning()) == (one.danger is not None) for one in found)
+    assert next(one.warning() for one in changes(TEXT, extended)).startswith("pick: its worker stops")
+
+
+def test_changes_of_sessions_need_a_restart_of_the_daemons_that_have_them() -> None:
+    moved = with_("tcp/0.0.0.0:7457", "tcp/0.0.0.0:7557")
+    assert [one.consequence for one in changes(moved)] == ["the daemon of edge1 must be restarted"]
+    assert [one.consequence for one in changes(TEXT + "shared_memory: auto\n")] == ["every daemon must be restarted"]
+
+
+def another(value: Any) -> Any:
+    """Another value of the same type, for a field that no rule of the file is held against here."""
+    if isinstance(value, bool):
+        return not value
+    if isinstance(value, StrEnum):
+        return next(one for one in type(value) if one is not value)
+    if isinstance(value, int | float):
+        return value * 2 + 1
+    return f"{value}x" if isinstance(value, str) else (*value, "x")
+
+
+def differing(value: Any, *left_out: str) -> list[Any]:
+    """``value`` with each of its fields changed in turn, records field by field."""
+    found: list[Any] = []
+    for one in fields(value):
+        held = getattr(value, one.name)
+        if one.name in left_out:
+            continue
+        if isinstance(held, Weights):
+            found.append(replace(value, weights=Weights(cpu=1.0, memory=0.0, network=0.0)))
+        elif hasattr(held, "__dataclass_fields__"):
+            found += [replace(value, **{one.name: inner}) for inner in differing(held)]
+        elif held is not None:
+            try:
+                found.append(replace(value, **{one.name: another(held)}))
+            except ValueError:  # out of its range: half of it is in
+                found.append(replace(value, **{one.name: held / 2}))
+    return found
+
+
+def test_no_field_of_a_fleet_changes_unnoticed() -> None:
+    """A field that comes later must have its consequence, or this fails."""
+    old = fleet_of(TEXT)
+    fleets = differing(old, "name", "nodes", "tasks")
+    task, rest = old.tasks[0], old.tasks[1:]
+    tasks: list[TaskSpec] = differing(task, "name", "rules")
+    fleets += [replace(old, tasks=(one, *rest)) for one in tasks]
+    node = old.nodes[0]
+    nodes: list[NodeSpec] = differing(replace(node, links=(), labels=()), "name", "kind", "links", "labels")
+    nodes += [replace(node, kind=NodeKind.ROBOT), replace(node, labels=()), replace(node, local=LocalSide())]
+    nodes += [replace(node, links=(LinkSpec(source=LinkSource.FIXED, value="-50"),))]
+    fleets += [replace(old, nodes=(one, *old.nodes[1:])) for one in nodes]
+    assert len(fleets) > 50
+    for new in fleets:
+        if new == old or new.timing.name != old.timing.name:
+            continue  # the profile's name is only what its clocks began with
+        found = difference(old, new, (TEXT, TEXT))
+        assert found, [one.name for one in fields(old) if getattr(old, one.name) != getattr(new, one.name)]
+        assert all(one.effect is not Effect.NOTHING for one in found)

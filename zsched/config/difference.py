@@ -1,0 +1,362 @@
+"""Decides what a changed fleet file changes: place by place in the file's own words, and what follows from each.
+
+Knows: which parts of a running fleet are made from which keys. Does not know: how a change is agreed
+(`zsched.core.electorate`), how a node takes it over.
+
+Two sources are joined. The texts say where the files differ (`zsched.config.rows`). The validated fleets say what of it
+matters: a place that differs while the fleets are equal there is noticed by nothing. A setting that follows from
+another place, as candidates from a label, is a change of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields, replace
+from enum import StrEnum
+from typing import Any, Final
+
+from zsched.config.reader import read_yaml
+from zsched.config.rows import rows
+from zsched.core.route.templates import named_rules
+from zsched.core.values.fleet import Fleet, NodeSpec, StreamRule, TaskSpec, WorkerSpec, runs_worker
+from zsched.core.values.model import NodeId, TaskId
+
+EVERY_DAEMON: Final = "every daemon must be restarted"
+
+
+class Effect(StrEnum):
+    """What a change does to the running fleet."""
+
+    NOTHING = "nothing"
+    AT_ONCE = "at_once"
+    STREAMS = "streams"
+    WORKERS = "workers"
+    TASK = "task"
+    NODE = "node"
+    ELECTORS = "electors"
+    RESTART = "restart"
+
+
+class Danger(StrEnum):
+    """A consequence that an operator must accept by this name."""
+
+    REMOVE_TASK = "remove-task"
+    REMOVE_NODE = "remove-node"
+    MAKE_EXCLUSIVE = "make-exclusive"
+    END_EXCLUSIVE = "end-exclusive"
+    CHANGE_ELECTORS = "change-electors"
+    PAUSE_TASK = "pause-task"
+
+
+_MEANS: Final[Mapping[Danger, str]] = {
+    Danger.REMOVE_TASK: "{about}: its worker stops, its streams end, and its state is forgotten",
+    Danger.REMOVE_NODE: "{about}: it does not belong to the fleet any more",
+    Danger.MAKE_EXCLUSIVE: "{about}: it rests until all its candidates go by the new document",
+    Danger.END_EXCLUSIVE: "{about}: two workers may work at the same time from then on",
+    Danger.CHANGE_ELECTORS: "{about}: other nodes agree on everything from then on",
+    Danger.PAUSE_TASK: "{about}: its only candidate restarts the worker in place",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Change:
+    """One place of the file, and what follows."""
+
+    path: str
+    """As ``tasks.echo.weights.cpu``."""
+    before: str | None
+    """``None``: nothing stands there."""
+    after: str | None
+    effect: Effect
+    consequence: str
+    """One clause, for people."""
+    danger: Danger | None = None
+    about: str = ""
+    """The task or node in danger."""
+
+    def warning(self) -> str:
+        """What an operator accepts with the danger's name; empty without a danger."""
+        return "" if self.danger is None else _MEANS[self.danger].format(about=self.about)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Verdict:
+    """What follows where the two fleets differ in one part."""
+
+    effect: Effect
+    text: str
+    paths: tuple[str, ...] = ()
+    """Where the file may say it; the first stands for it when the file says it nowhere."""
+    before: str | None = None
+    after: str | None = None
+    danger: Danger | None = None
+    about: str = ""
+
+
+NOTHING: Final = _Verdict(effect=Effect.NOTHING, text="nothing notices")
+AT_ONCE: Final = _Verdict(effect=Effect.AT_ONCE, text="takes effect at once")
+_ORDER: Final = tuple(Effect)
+"""Of two effects of one place the later one is told first."""
+
+
+def difference(
+    old: Fleet, new: Fleet, texts: tuple[str, str], owners: Mapping[TaskId, NodeId | None] | None = None
+) -> tuple[Change, ...]:
+    """All changes from ``old`` to ``new``, in the order of the new file; what only follows stands behind.
+
+    Args:
+        old: the fleet in force.
+        new: the one that shall be.
+        texts: the files of the two.
+        owners: who owns each task now; without them nobody is said to move.
+    """
+    verdicts = tuple(_verdicts(old, new, owners or {}))
+    (before, _), (after, _) = (read_yaml(text.encode()) for text in texts)
+    changes: list[Change] = []
+    told: set[_Verdict] = set()
+    for row in rows(before, after):
+        found = [verdict for verdict in verdicts if any(_meet(path, row.path) for path in verdict.paths)]
+        told.update(found)
+        changes += _joined(row.path, row.before, row.after, found or [NOTHING])
+    for verdict in verdicts:
+        if verdict not in told:
+            changes += _joined(verdict.paths[0], verdict.before, verdict.after, [verdict])
+    return tuple(changes)
+
+
+def _meet(one: str, other: str) -> bool:
+    """Whether one place is the other, or a place in it."""
+    inner, outer = (one, other) if len(one) >= len(other) else (other, one)
+    return inner == outer or inner.startswith((f"{outer}.", f"{outer}["))
+
+
+def _joined(path: str, before: str | None, after: str | None, found: list[_Verdict]) -> Iterator[Change]:
+    """One change of all that follows from one place; dangers beyond the first are changes of their own."""
+    found = sorted(found, key=lambda one: (one.danger is None, -_ORDER.index(one.effect)))
+    effect = max((one.effect for one in found), key=_ORDER.index)
+    text = "; ".join(dict.fromkeys(one.text for one in found))
+    first = found[0]
+    yield Change(
+        path=path,
+        before=before,
+        after=after,
+        effect=effect,
+        consequence=text,
+        danger=first.danger,
+        about=first.about,
+    )
+    for one in found[1:]:
+        if one.danger is not None and one.danger is not first.danger:
+            yield Change(
+                path=path,
+                before=before,
+                after=after,
+                effect=one.effect,
+                consequence=one.text,
+                danger=one.danger,
+                about=one.about,
+            )
+
+
+# --- the fleets ------------------------------------------------------------------------------------------------------
+
+
+def _verdicts(old: Fleet, new: Fleet, owners: Mapping[TaskId, NodeId | None]) -> Iterator[_Verdict]:
+    yield from _timing(old, new)
+    yield from _nodes(old, new)
+    yield from _tasks(old, new, owners)
+    if old.electors != new.electors:
+        yield _electors(old, new)
+    if old.seeds != new.seeds:
+        yield _set(AT_ONCE, "seeds", old.seeds, new.seeds)
+    before, after = (fleet.zenoh_config.rpartition("/")[2] for fleet in (old, new))
+    if before != after:
+        yield _restart(EVERY_DAEMON, "zenoh", before, after)
+    if old.relay_orphan_s != new.relay_orphan_s:
+        yield _set(AT_ONCE, "relay_orphan_s", old.relay_orphan_s, new.relay_orphan_s)
+    if old.shared_memory is not new.shared_memory:
+        yield _restart(EVERY_DAEMON, "shared_memory", old.shared_memory, new.shared_memory)
+
+
+def _timing(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
+    for one in fields(old.timing):
+        before, after = getattr(old.timing, one.name), getattr(new.timing, one.name)
+        if one.name == "name" or before == after:
+            continue
+        if one.name == "zenoh_lease_s":
+            yield _restart(EVERY_DAEMON, "timing.zenoh_lease_s", before, after)
+        else:
+            yield _set(AT_ONCE, f"timing.{one.name}", before, after)
+
+
+def _electors(old: Fleet, new: Fleet) -> _Verdict:
+    come = [f"{name} becomes one" for name in new.electors if name not in old.electors]
+    go = [f"{name} is none any more" for name in old.electors if name not in new.electors]
+    return _Verdict(
+        effect=Effect.ELECTORS,
+        text=f"electors change: {', '.join((*come, *go))}",
+        paths=("electorate",),
+        before=_text(old.electors),
+        after=_text(new.electors),
+        danger=Danger.CHANGE_ELECTORS,
+        about=", ".join(new.electors),
+    )
+
+
+def _nodes(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
+    before, after = ({node.name: node for node in fleet.nodes} for fleet in (old, new))
+    for name in (name for name in after if name not in before):
+        yield _Verdict(effect=Effect.NODE, text=f"{name} may join: start its daemon", paths=(f"nodes.{name}",))
+    for name in (name for name in before if name not in after):
+        text = f"node {name} is removed: the others forget it"
+        yield _Verdict(effect=Effect.NODE, text=text, paths=(f"nodes.{name}",), danger=Danger.REMOVE_NODE, about=name)
+    for name, node in before.items():
+        if name in after and after[name] != node:
+            yield from _node(node, after[name])
+
+
+def _node(old: NodeSpec, new: NodeSpec) -> Iterator[_Verdict]:
+    path = f"nodes.{old.name}"
+    restart = f"the daemon of {old.name} must be restarted"
+    if old.kind is not new.kind:
+        yield _restart(restart, f"{path}.kind", old.kind, new.kind)
+    if old.host != new.host:
+        dialled = replace(AT_ONCE, text="the others dial it there")
+        yield _set(dialled, f"{path}.host", old.host, new.host)
+    for name in ("control", "data"):
+        before, after = getattr(old, f"listen_{name}"), getattr(new, f"listen_{name}")
+        if before != after:
+            yield _restart(restart, f"{path}.listen.{name}", before, after)
+    if old.local != new.local:
+        yield _restart(restart, f"{path}.local", _plain(old.local), _plain(new.local))
+    if old.labels != new.labels:
+        yield _set(AT_ONCE, f"{path}.labels", old.labels, new.labels)
+    if old.links != new.links:
+        sources = tuple(f"{path}.{source}" for source in ("links", "wifi", "wired", "fixed", "trace"))
+        yield replace(AT_ONCE, paths=sources)
+
+
+def _tasks(old: Fleet, new: Fleet, owners: Mapping[TaskId, NodeId | None]) -> Iterator[_Verdict]:
+    before, after = ({task.name: task for task in fleet.tasks} for fleet in (old, new))
+    for name in (name for name in after if name not in before):
+        text = f"task {name} begins, on one of {', '.join(after[name].candidates)}"
+        yield _Verdict(effect=Effect.TASK, text=text, paths=(f"tasks.{name}",))
+    for name in (name for name in before if name not in after):
+        text = f"task {name} is removed: its worker stops, its streams end"
+        yield _Verdict(effect=Effect.TASK, text=text, paths=(f"tasks.{name}",), danger=Danger.REMOVE_TASK, about=name)
+    for name, task in before.items():
+        if name in after and after[name] != task:
+            yield from _task(task, after[name], (old, new), owners.get(name))
+
+
+def _task(old: TaskSpec, new: TaskSpec, fleets: tuple[Fleet, Fleet], owner: NodeId | None) -> Iterator[_Verdict]:
+    path = f"tasks.{old.name}"
+    if old.candidates != new.candidates:
+        verdict = AT_ONCE
+        if owner is not None and owner not in new.candidates:
+            verdict = _Verdict(effect=Effect.STREAMS, text=f"{old.name} leaves {owner}: its streams move")
+        yield _set(verdict, f"{path}.candidates", old.candidates, new.candidates)
+    yield from _tuning(old, new, path)
+    for name, key in _OWN_KEYS.items():
+        if getattr(old, name) != getattr(new, name):
+            yield _set(AT_ONCE, f"{path}.{key}", _plain(getattr(old, name)), _plain(getattr(new, name)))
+    if old.exclusive != new.exclusive:
+        text = f"{old.name} rests until all its candidates go by this" if new.exclusive else "its leases end"
+        danger = Danger.MAKE_EXCLUSIVE if new.exclusive else Danger.END_EXCLUSIVE
+        verdict = _Verdict(effect=Effect.TASK, text=text, danger=danger, about=old.name)
+        yield _set(verdict, f"{path}.exclusive", old.exclusive, new.exclusive)
+    yield from _worker(old, new, fleets)
+    yield from _rules(old, new)
+
+
+_OWN_KEYS: Final = {"demand": "demand", "limits": "link", "on_isolation": "on_isolation", "drain_s": "drain_s"}
+"""Fields of a task that one key of the task makes, and that nothing else follows from."""
+
+
+def _tuning(old: TaskSpec, new: TaskSpec, path: str) -> Iterator[_Verdict]:
+    for one in fields(old.tuning):
+        before, after = getattr(old.tuning, one.name), getattr(new.tuning, one.name)
+        if before != after:
+            key = "weights" if one.name == "weights" else f"scheduling.{one.name}"
+            yield _set(AT_ONCE, f"{path}.{key}", _plain(before), _plain(after))
+    for name in ("reach", "memory_floor_ratio", "max_moves_per_minute"):
+        if getattr(old, name) != getattr(new, name):
+            yield _set(AT_ONCE, f"{path}.scheduling.{name}", getattr(old, name), getattr(new, name))
+    patience, other = ("learnt" if task.learns_patience else task.patience for task in (old, new))
+    if patience != other:
+        yield _set(AT_ONCE, f"{path}.scheduling.patience", patience, other)
+
+
+_OF_A_PROCESS: Final = ("command", "env", "link", "ready_when")
+"""What a worker is told when it starts."""
+
+
+def _worker(old: TaskSpec, new: TaskSpec, fleets: tuple[Fleet, Fleet]) -> Iterator[_Verdict]:
+    kinds = {node.name: node.kind for fleet in fleets for node in fleet.nodes}
+    homes = [name for name in sorted(kinds) if runs_worker(new, name, kinds[name])]
+    for one in fields(WorkerSpec):
+        before, after = getattr(old.worker, one.name), getattr(new.worker, one.name)
+        if before == after:
+            continue
+        verdict = AT_ONCE
+        if one.name in _OF_A_PROCESS and len(homes) > 1:
+            verdict = _Verdict(effect=Effect.WORKERS, text=f"workers of {old.name} restart one after another")
+        elif one.name in _OF_A_PROCESS:
+            text = f"the worker of {old.name} restarts in place"
+            verdict = _Verdict(effect=Effect.WORKERS, text=text, danger=Danger.PAUSE_TASK, about=old.name)
+        key = "ready" if one.name == "ready_when" else one.name
+        yield _set(verdict, f"tasks.{old.name}.worker.{key}", _plain(before), _plain(after))
+
+
+_LISTS: Final = {"in": "inputs", "out": "outputs", "srv": "services"}
+
+
+def _rules(old: TaskSpec, new: TaskSpec) -> Iterator[_Verdict]:
+    """Streams that come, go, or go another way; a stream is called by its place in its list."""
+    for word, key in _LISTS.items():
+        before, after = (_of_kind(task, word) for task in (old, new))
+        come, go = [name for name in after if name not in before], [name for name in before if name not in after]
+        differ = [name for name in before if name in after and before[name] != after[name]]
+        texts = [
+            f"{_streams(names)} {verb}" for names, verb in ((come, "begin"), (go, "end"), (differ, "move")) if names
+        ]
+        if texts:
+            paths = (f"tasks.{old.name}.{key}", f"tasks.{old.name}.ros2.{key}")
+            yield _Verdict(effect=Effect.STREAMS, text="; ".join(texts), paths=paths)
+
+
+def _of_kind(task: TaskSpec, word: str) -> dict[str, StreamRule]:
+    return {name: rule for name, rule in named_rules(task) if name.split("/")[1] == word}
+
+
+def _streams(names: list[str]) -> str:
+    return f"the streams {', '.join(names)}"
+
+
+# --- values ----------------------------------------------------------------------------------------------------------
+
+
+def _set(verdict: _Verdict, path: str, before: object, after: object) -> _Verdict:
+    return replace(verdict, paths=(path,), before=_text(before), after=_text(after))
+
+
+def _restart(text: str, path: str, before: object, after: object) -> _Verdict:
+    return _set(_Verdict(effect=Effect.RESTART, text=text), path, before, after)
+
+
+def _plain(value: Any) -> Any:
+    """A record as the file writes it."""
+    if hasattr(value, "__dataclass_fields__"):
+        pairs = ((one.name, getattr(value, one.name)) for one in fields(value))
+        return "{" + ", ".join(f"{name}: {_text(held)}" for name, held in pairs) + "}"
+    return value
+
+
+def _text(value: object) -> str | None:
+    if value in (None, ""):
+        return None
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple):
+        return ", ".join(" ".join(item) if isinstance(item, tuple) else str(item) for item in value)
+    return f"{value:g}" if isinstance(value, float) else str(value)
