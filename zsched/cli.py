@@ -22,6 +22,16 @@ import typer
 
 from zsched.commands.common import CliError, Json, Verb, Verbs, print_json
 from zsched.commands.example import Example, write_example
+from zsched.commands.fleet_verbs import (
+    AcceptOption,
+    PlanOption,
+    ReasonOption,
+    RevisionOption,
+    YesOption,
+    fleet_app,
+    node_app,
+    task_app,
+)
 from zsched.commands.program import Program
 from zsched.commands.stream_verbs import stream_app
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE
@@ -48,6 +58,8 @@ app = typer.Typer(
 
 
 app.add_typer(stream_app)
+for group in (fleet_app, task_app, node_app):
+    app.add_typer(group)
 metrics_app = typer.Typer(
     name="metrics", cls=Verbs, help="Figures for Prometheus.", no_args_is_help=True, rich_markup_mode=None
 )
@@ -651,6 +663,57 @@ def check(
         typer.echo(f"hash: {digest} (nodes whose files have another one say so in `zsched status`)")
     for first, *more in told_once(fleet.tasks, fleet.timing) if fleet is not None and not json_ else ():
         typer.echo("\n".join((first, *(f"  {line}" for line in more))))
+
+
+@app.command(cls=Verb)
+def apply(
+    file: Annotated[str, typer.Argument(metavar="FILE", help="Fleet file; -: stdin.")],
+    plan: PlanOption = False,
+    yes: YesOption = False,
+    revision: RevisionOption = None,
+    accept: AcceptOption = None,
+    reason: ReasonOption = "",
+    json_: JsonOption = False,
+    node: AskedOption = None,
+    runtime_dir: RuntimeOption = None,
+    connect: ConnectOption = None,
+) -> None:
+    """Change the running fleet to what a fleet file says: shows what follows, asks, and has it agreed for all nodes.
+
+    The first one of a fleet agrees the file that its nodes run by. A danger has a name, and --accept takes it.
+    Exits with 1 when the fleet was changed meanwhile, with 4 without a quorum, with 10 when --plan shows a change.
+    """
+    from zsched.commands.apply import apply as change  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.apply import read_text  # noqa: PLC0415 - as above
+    from zsched.commands.ask import find_door  # noqa: PLC0415 - as above
+    from zsched.commands.fleet_verbs import view_of  # noqa: PLC0415 - as above
+
+    words = ("apply", file)
+    view = view_of(words, plan=plan, yes=yes, revision=revision, accept=accept, reason=reason, is_json=json_)
+    text = read_text(file)
+    raise typer.Exit(change(find_door(runtime_dir, node, connect=connect), view, lambda _held: text, file))
+
+
+@app.command(cls=Verb)
+def edit(
+    plan: PlanOption = False,
+    yes: YesOption = False,
+    accept: AcceptOption = None,
+    reason: ReasonOption = "",
+    node: AskedOption = None,
+    runtime_dir: RuntimeOption = None,
+    connect: ConnectOption = None,
+) -> None:
+    """Open the fleet's document in your editor (VISUAL, EDITOR, else vi), and apply what comes of it.
+
+    A text with faults, or one that is refused, stays in a file that the message names.
+    """
+    from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.fleet import edit as open_document  # noqa: PLC0415 - as above
+    from zsched.commands.fleet_verbs import view_of  # noqa: PLC0415 - as above
+
+    view = view_of(("edit",), plan=plan, yes=yes, revision=None, accept=accept, reason=reason, is_json=False)
+    raise typer.Exit(open_document(find_door(runtime_dir, node, connect=connect), view))
 
 
 # --- everything else -------------------------------------------------------------------------------------------------

@@ -20,7 +20,10 @@ from zsched.errors import AdapterError, ConfigError, ZschedError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE
 
 Json = dict[str, Any]
-NAMED_OTHERWISE: Final = {"events": "event"}
+NAMED_OTHERWISE: Final = {
+    "events": "event",
+    **dict.fromkeys(("task.add", "task.remove", "node.add", "node.remove", "node.forget"), "apply"),
+}
 SCHEMAS: Final = Path(__file__).parents[1] / "schemas"
 """A JSON Schema per kind of output and major version."""
 
@@ -79,6 +82,8 @@ def of_known_major(ctx: Any, verb: Any, args: Sequence[str]) -> list[str]:
 
 def schema_of(words: Sequence[str]) -> str:
     """The schema of a verb's JSON: a verb that prints a line for each of many is called by the many.
+
+    Every verb that changes the document tells it as `zsched apply` does.
 
     >>> schema_of(["stream", "list"]), schema_of(["events"])
     ('zsched.stream.list', 'zsched.event')

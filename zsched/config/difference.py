@@ -10,12 +10,13 @@ another place, as candidates from a label, is a change of its own.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 from typing import Any, Final
 
-from zsched.config.reader import read_yaml
+from zsched.config.reader import Mapping as Block
+from zsched.config.reader import Scalar, read_yaml
 from zsched.config.rows import rows
 from zsched.core.route.templates import named_rules
 from zsched.core.values.fleet import Fleet, NodeSpec, StreamRule, TaskSpec, WorkerSpec, runs_worker
@@ -99,8 +100,25 @@ _ORDER: Final = tuple(Effect)
 """Of two effects of one place the later one is told first."""
 
 
+def wanted_electors(agreed: Sequence[NodeId], new: Fleet, text: str) -> tuple[NodeId, ...]:
+    """The electors that a fleet shall have by its new file, sorted; ``agreed`` are those that it has.
+
+    A file that names electors means them. Another one leaves them as they are, but for nodes that it does not have.
+    """
+    root, _ = read_yaml(text.encode())
+    named = [held for key, held in root.pairs if key.text == "electorate"] if isinstance(root, Block) else []
+    if any(not isinstance(held, Scalar) for held in named):
+        return new.electors
+    nodes = {node.name for node in new.nodes}
+    return tuple(sorted(name for name in agreed if name in nodes))
+
+
 def difference(
-    old: Fleet, new: Fleet, texts: tuple[str, str], owners: Mapping[TaskId, NodeId | None] | None = None
+    old: Fleet,
+    new: Fleet,
+    texts: tuple[str, str],
+    owners: Mapping[TaskId, NodeId | None] | None = None,
+    electors: Sequence[NodeId] = (),
 ) -> tuple[Change, ...]:
     """All changes from ``old`` to ``new``, in the order of the new file; what only follows stands behind.
 
@@ -109,9 +127,13 @@ def difference(
         new: the one that shall be.
         texts: the files of the two.
         owners: who owns each task now; without them nobody is said to move.
+        electors: those that are agreed; none: the old file's.
     """
-    verdicts = tuple(_verdicts(old, new, owners or {}))
     (before, _), (after, _) = (read_yaml(text.encode()) for text in texts)
+    agreed = tuple(sorted(electors)) or old.electors
+    wanted = wanted_electors(agreed, new, texts[1])
+    elections = (_electors(agreed, wanted),) if agreed != wanted else ()
+    verdicts = (*_verdicts(old, new, owners or {}), *elections)
     changes: list[Change] = []
     told: set[_Verdict] = set()
     for row in rows(before, after):
@@ -165,8 +187,6 @@ def _verdicts(old: Fleet, new: Fleet, owners: Mapping[TaskId, NodeId | None]) ->
     yield from _timing(old, new)
     yield from _nodes(old, new)
     yield from _tasks(old, new, owners)
-    if old.electors != new.electors:
-        yield _electors(old, new)
     if old.seeds != new.seeds:
         yield _set(AT_ONCE, "seeds", old.seeds, new.seeds)
     before, after = (fleet.zenoh_config.rpartition("/")[2] for fleet in (old, new))
@@ -189,17 +209,17 @@ def _timing(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
             yield _set(AT_ONCE, f"timing.{one.name}", before, after)
 
 
-def _electors(old: Fleet, new: Fleet) -> _Verdict:
-    come = [f"{name} becomes one" for name in new.electors if name not in old.electors]
-    go = [f"{name} is none any more" for name in old.electors if name not in new.electors]
+def _electors(agreed: tuple[NodeId, ...], wanted: tuple[NodeId, ...]) -> _Verdict:
+    come = [f"{name} becomes one" for name in wanted if name not in agreed]
+    go = [f"{name} is none any more" for name in agreed if name not in wanted]
     return _Verdict(
         effect=Effect.ELECTORS,
         text=f"electors change: {', '.join((*come, *go))}",
         paths=("electorate",),
-        before=_text(old.electors),
-        after=_text(new.electors),
+        before=_text(agreed),
+        after=_text(wanted),
         danger=Danger.CHANGE_ELECTORS,
-        about=", ".join(new.electors),
+        about=", ".join(wanted) or "nobody",
     )
 
 

@@ -45,7 +45,7 @@ VERBS = sorted(verbs_with_json(typer.main.get_command(app)))
 
 
 def test_every_verb_with_json_has_a_schema_and_no_file_is_left_over() -> None:
-    assert [file.name for file in FILES] == sorted(f"{schema_of(words)}.1.json" for words in VERBS)
+    assert [file.name for file in FILES] == sorted({f"{schema_of(words)}.1.json" for words in VERBS})
 
 
 @pytest.mark.parametrize("words", VERBS, ids=" ".join)

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from zsched.config.difference import Change, Danger, Effect, difference
+from zsched.config.difference import Change, Danger, Effect, difference, wanted_electors
 from zsched.config.editing import add_entries
 from zsched.config.load import check_bytes
 from zsched.core.values.fleet import Fleet, LinkSpec, LocalSide, NodeSpec, TaskSpec
@@ -125,6 +125,7 @@ def test_dangers_have_names_and_say_what_is_accepted() -> None:
         (extended, shared, {Danger.END_EXCLUSIVE}),
         (TEXT, electors, {Danger.CHANGE_ELECTORS}),
         (TEXT, robot, {Danger.REMOVE_NODE, Danger.CHANGE_ELECTORS}),
+        (robot, TEXT, set()),
         (alone, with_("--mode, estimate", "--mode, known", alone), {Danger.PAUSE_TASK}),
     ]
     for old, new, expected in cases:
@@ -138,6 +139,21 @@ def test_changes_of_sessions_need_a_restart_of_the_daemons_that_have_them() -> N
     moved = with_("tcp/0.0.0.0:7457", "tcp/0.0.0.0:7557")
     assert [one.consequence for one in changes(moved)] == ["the daemon of edge1 must be restarted"]
     assert [one.consequence for one in changes(TEXT + "shared_memory: auto\n")] == ["every daemon must be restarted"]
+
+
+def test_electors_change_only_where_the_file_names_them_or_has_them_no_more() -> None:
+    """The fleet may have changed them by itself since: a file that names none does not mean to take that back."""
+    agreed = ("edge1", "robot1", "robot2")
+    new = with_("cool_down_s: 2}", "cool_down_s: 3}")
+    assert [one.path for one in difference(fleet_of(TEXT), fleet_of(new), (TEXT, new), {}, agreed)] == [
+        f"{RULES}.cool_down_s"
+    ]
+    named = f"{new}electorate: [edge2, robot1, robot2]\n"
+    found = difference(fleet_of(TEXT), fleet_of(named), (TEXT, named), {}, agreed)
+    told = "electors change: edge2 becomes one, edge1 is none any more"
+    assert [(one.path, one.consequence) for one in found][1:] == [("electorate", told)]
+    assert wanted_electors(agreed, fleet_of(named), named) == ("edge2", "robot1", "robot2")
+    assert wanted_electors(("gone", "robot1"), fleet_of(TEXT), TEXT) == ("robot1",)
 
 
 def another(value: Any) -> Any:
@@ -173,7 +189,7 @@ def differing(value: Any, *left_out: str) -> list[Any]:
 def test_no_field_of_a_fleet_changes_unnoticed() -> None:
     """A field that comes later must have its consequence, or this fails."""
     old = fleet_of(TEXT)
-    fleets = differing(old, "name", "nodes", "tasks")
+    fleets = differing(old, "name", "nodes", "tasks", "electors")
     task, rest = old.tasks[0], old.tasks[1:]
     tasks: list[TaskSpec] = differing(task, "name", "rules")
     fleets += [replace(old, tasks=(one, *rest)) for one in tasks]

@@ -1,0 +1,338 @@
+"""The verbs that change the fleet's document, against a node whose answers are written down here."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from support.schemas import faults
+from zsched.adapters.host.operator_socket import OperatorSocket
+from zsched.cli import app
+from zsched.config.load import check_bytes
+from zsched.core.values.fleet import fleet_hash
+
+Json = dict[str, Any]
+TEXT = """\
+fleet: hall   # the large one
+nodes:
+  robot1: {kind: robot, host: 127.0.0.1, listen: {control: tcp/127.0.0.1:7457, data: tcp/127.0.0.1:7458}}
+  robot2: {kind: robot}
+  edge1: {kind: edge}
+electorate: [robot1, robot2, edge1]
+tasks:
+  merge:
+    candidates: {kind: robot}   # who has a map
+    weights: {cpu: 0.5, memory: 0.5}
+"""
+TASK = "tasks:\n  count: {candidates: [edge1], weights: {cpu: 1}}  # pallets\n"
+
+
+class Node:
+    """A node that goes by a document, agrees on every change of it, and counts the questions."""
+
+    def __init__(self, text: str = TEXT) -> None:
+        self.text, self.revision, self.document = text, 7, "ab12" * 8
+        self.states = {"robot1": "alive", "robot2": "alive", "edge1": "alive"}
+        self.owner = "robot1"
+        self.electors = ["edge1", "robot1", "robot2"]
+        self.files: dict[str, str] = {}
+        self.changes: list[Json] = []
+        self.outcome = "ok"
+        self.refused = "nothing"
+        """The kind of change that another operator has overtaken."""
+
+    def answer(self, request: Json) -> Json:
+        verb, node = request["verb"], str(request.get("node") or "robot1")
+        if self.states[node] != "alive":
+            return {"error": f"{node} did not answer within 3 s"}
+        if verb == "status":
+            nodes = [{"name": name, "state": state} for name, state in self.states.items()]
+            digest = self.files.get(node, digest_of(self.text))
+            tasks = [{"name": "merge", "owner": self.owner}]
+            return {"fleet": "hall", "nodes": nodes, "tasks": tasks, "fleet_file": digest, "schema": "zsched.status/1"}
+        if verb == "fleet":
+            electors = [{"name": name, "disk": f"d{name}"} for name in self.electors]
+            body = {"node": node, "fleet": "hall", "revision": self.revision, "number": 2, "settled": True}
+            told = {"electors": electors, "document": self.document, "text": self.text if self.document else ""}
+            return {**body, **told, "fleet_file": digest_of(self.text), "disk": f"d{node}"}
+        assert verb == "change"
+        self.changes.append(request)
+        if self.refused in request:
+            return {"outcome": "conflict", "detail": "it was overtaken", "revision": None}
+        if self.outcome != "ok":
+            return {"outcome": self.outcome, "detail": "it was so", "revision": None}
+        self.revision += 1
+        self.text, self.document = request.get("text", self.text), self.document or "cd34" * 8
+        if removed := request.get("remove_elector"):
+            self.electors.remove(removed)
+        if added := request.get("add_elector"):
+            assert request["disk"] == f"d{added}"
+            self.electors.append(added)
+        return {"outcome": "ok", "detail": "agreed", "revision": self.revision}
+
+
+def digest_of(text: str) -> str:
+    fleet = check_bytes(text.encode()).fleet
+    assert fleet is not None
+    return fleet_hash(fleet)
+
+
+@pytest.fixture
+def node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Node]:
+    monkeypatch.setenv("ZSCHED_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("ZSCHED_NODE", "robot1")
+    one = Node()
+    door = OperatorSocket(tmp_path / "robot1.sock", one.answer)
+    door.open()
+    yield one
+    door.close()
+
+
+def run(*words: object, stdin: str = "") -> Result:
+    return CliRunner().invoke(app, [str(word) for word in words], input=stdin)
+
+
+def changed(tmp_path: Path, old: str, new: str) -> Path:
+    assert old in TEXT
+    file = tmp_path / "new.yaml"
+    file.write_text(TEXT.replace(old, new))
+    return file
+
+
+# --- apply -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_plan_shows_before_and_after_in_the_files_words_and_changes_nothing(node: Node, tmp_path: Path) -> None:
+    file = changed(tmp_path, "cpu: 0.5, memory: 0.5", "cpu: 0.6, memory: 0.4")
+    result = run("apply", file, "--plan")
+    assert result.exit_code == 10
+    assert result.stdout.splitlines() == [
+        "hall, revision 7:",
+        "  tasks.merge.weights.cpu     0.5 -> 0.6  takes effect at once",
+        "  tasks.merge.weights.memory  0.5 -> 0.4  takes effect at once",
+    ]
+    assert node.changes == []
+    body = json.loads(run("apply", file, "--plan", "--json").stdout)
+    assert faults(body) == []
+    assert (body["outcome"], body["revision"], body["is_first"]) == ("planned", 7, False)
+    assert [one["path"] for one in body["changes"]] == ["tasks.merge.weights.cpu", "tasks.merge.weights.memory"]
+
+
+def test_the_document_in_force_changes_nothing_and_another_comment_is_told(node: Node, tmp_path: Path) -> None:
+    file = changed(tmp_path, "the large one", "the large one")
+    for words in (("--plan",), ("--yes",), ()):
+        result = run("apply", file, *words)
+        assert (result.exit_code, result.stdout) == (0, "hall, revision 7: nothing would change\n")
+    file = changed(tmp_path, "the large one", "the north one")
+    result = run("apply", file, "--plan")
+    assert result.exit_code == 10
+    assert "only comments, blanks or the order of keys differ: nothing notices" in result.stdout
+    assert node.changes == []
+
+
+def test_off_a_terminal_the_command_with_yes_is_printed_and_that_command_works(node: Node, tmp_path: Path) -> None:
+    file = changed(tmp_path, "cpu: 0.5, memory: 0.5", "cpu: 0.6, memory: 0.4")
+    refused = run("apply", file, "-m", "less swapping")
+    assert refused.exit_code == 2
+    command = f"zsched apply {file} -m 'less swapping' --yes"
+    assert command in refused.stderr
+    assert node.changes == []
+    done = run("apply", file, "-m", "less swapping", "--yes")
+    assert (done.exit_code, done.stdout.splitlines()[-1]) == (0, "hall: revision 8 is agreed")
+    assert [(one["base_revision"], one["reason"]) for one in node.changes] == [(7, "less swapping")]
+    assert node.text == file.read_text()
+
+
+def test_stdin_is_a_file_called_minus(node: Node) -> None:
+    text = TEXT.replace("cpu: 0.5, memory: 0.5", "cpu: 1")
+    assert run("apply", "-", "--yes", stdin=text).exit_code == 0
+    assert node.text == text
+
+
+def test_a_revision_that_was_overtaken_is_refused_with_the_one_there_is(node: Node, tmp_path: Path) -> None:
+    file = changed(tmp_path, "cpu: 0.5, memory: 0.5", "cpu: 1")
+    result = run("apply", file, "--yes", "--revision", 6)
+    assert (result.exit_code, node.changes) == (1, [])
+    assert "revision 6 is overtaken: hall has revision 7" in result.stderr
+    assert run("apply", file, "--yes", "--revision", 7).exit_code == 0
+
+
+@pytest.mark.parametrize(("outcome", "code"), [("conflict", 1), ("invalid", 1), ("no_quorum", 4), ("unknown", 5)])
+def test_what_does_not_come_about_has_its_exit_code(node: Node, tmp_path: Path, outcome: str, code: int) -> None:
+    node.outcome = outcome
+    result = run("apply", changed(tmp_path, "cpu: 0.5, memory: 0.5", "cpu: 1"), "--yes")
+    assert result.exit_code == code
+    assert f"{outcome.replace('_', ' ')}: it was so" in result.stderr
+
+
+def test_a_danger_is_accepted_by_its_name_only(node: Node, tmp_path: Path) -> None:
+    file = tmp_path / "new.yaml"
+    file.write_text(TEXT[: TEXT.index("tasks:")] + "tasks: {}\n")
+    refused = run("apply", file, "--yes")
+    assert refused.exit_code == 1
+    assert "remove-task: merge: its worker stops, its streams end" in refused.stderr
+    assert f"zsched apply {file} --accept remove-task" in refused.stderr
+    assert node.changes == []
+    unknown = run("apply", file, "--yes", "--accept", "remove-tasks")
+    assert unknown.exit_code == 2
+    assert "did you mean remove-task?" in unknown.stderr
+    assert run("apply", file, "--yes", "--accept", "remove-task").exit_code == 0
+
+
+def test_faults_are_those_of_check_and_another_fleets_file_is_refused(node: Node, tmp_path: Path) -> None:
+    bad = changed(tmp_path, "cpu: 0.5", "cpu: 5")
+    result = run("apply", bad, "--yes")
+    assert (result.exit_code, result.stderr) == (78, run("check", bad).stderr)
+    other = changed(tmp_path, "fleet: hall", "fleet: yard")
+    result = run("apply", other, "--yes")
+    assert result.exit_code == 1
+    assert "is the file of fleet yard, and this is fleet hall; ask a node of yard with --connect" in result.stderr
+    assert run("apply", tmp_path / "absent.yaml").exit_code == 78
+    assert node.changes == []
+
+
+def test_a_change_that_stops_half_way_says_how_far_it_came(node: Node, tmp_path: Path) -> None:
+    """Electors and document are several changes; another operator was faster at the second."""
+    file = changed(tmp_path, "electorate: [robot1, robot2, edge1]", "electorate: [robot1, edge1]")
+    node.refused = "remove_elector"
+    result = run("apply", file, "--yes", "--accept", "change-electors")
+    assert result.exit_code == 5
+    assert "1 of 2 changes are agreed, up to revision 8, and the next is not: conflict" in result.stderr
+    assert node.text == file.read_text()
+
+
+def test_electors_change_one_after_another_and_only_when_accepted(node: Node, tmp_path: Path) -> None:
+    """A removal counts before the document, for a node that leaves; an addition after it, for a node that comes."""
+    node.electors = ["robot1", "robot2", "edge1"]
+    file = changed(tmp_path, "electorate: [robot1, robot2, edge1]", "electorate: [robot1, edge1]")
+    assert run("apply", file, "--yes").exit_code == 1
+    assert run("apply", file, "--yes", "--accept", "change-electors").exit_code == 0
+    assert node.electors == ["robot1", "edge1"]
+    back = tmp_path / "back.yaml"
+    back.write_text(TEXT)
+    result = run("apply", back, "--yes", "--accept", "change-electors")
+    assert result.exit_code == 0, result.stderr
+    assert sorted(node.electors) == ["edge1", "robot1", "robot2"]
+    assert [one["base_revision"] for one in node.changes] == [7, 8, 9, 10]
+
+
+# --- the first document ----------------------------------------------------------------------------------------------
+
+
+def test_the_first_document_is_the_file_that_all_nodes_run_by(node: Node, tmp_path: Path) -> None:
+    file = changed(tmp_path, "the large one", "the large one")
+    node.document, node.revision = "", 0
+    plan = run("apply", file, "--plan")
+    assert plan.exit_code == 10
+    assert "hall goes by the file on each machine; from then on by this one document" in plan.stdout
+    node.files["edge1"] = "0123456789abcdef"
+    refused = run("apply", file, "--yes")
+    assert refused.exit_code == 1
+    assert "other-files: edge1 go by another file now" in refused.stderr
+    node.states["edge1"] = "gone"
+    plan = run("apply", file, "--plan")
+    assert "not asked, for they do not answer: edge1" in plan.stdout
+    assert run("apply", file, "--yes").exit_code == 0
+    assert [one["text"] for one in node.changes] == [TEXT]
+
+
+# --- one entry -------------------------------------------------------------------------------------------------------
+
+
+def test_a_task_comes_and_goes_and_the_comments_stay(node: Node, tmp_path: Path) -> None:
+    file = tmp_path / "count.yaml"
+    file.write_text(TASK)
+    added = run("task", "add", file, "--yes")
+    assert added.exit_code == 0, added.stderr
+    assert "task count begins, on one of edge1" in added.stdout
+    assert node.text == TEXT + TASK.partition("\n")[2]
+    assert run("task", "add", file, "--yes").exit_code == 78
+    node.owner = "robot1"
+    unknown = run("task", "remove", "merg", "--yes")
+    assert unknown.exit_code == 2
+    assert "fleet hall has no task 'merg'; did you mean merge?" in unknown.stderr
+    assert run("task", "remove", "merge", "--yes", "--accept", "remove-task").exit_code == 0
+    assert "merge" not in node.text
+    assert "# the large one" in node.text
+
+
+def test_a_node_may_go_that_is_no_last_elector_and_owns_nothing_while_it_lives(node: Node) -> None:
+    owner = run("node", "remove", "robot1", "--yes")
+    assert owner.exit_code == 1
+    assert "robot1 is alive and owns merge; stop its daemon" in owner.stderr
+    assert "robot2 is alive: zsched node remove robot2" in run("node", "forget", "robot2", "--yes").stderr
+    accepted = ("--accept", "remove-node", "--accept", "change-electors")
+    assert run("node", "remove", "robot2", "--yes", *accepted[:2]).exit_code == 1
+    done = run("node", "remove", "robot2", "--yes", *accepted)
+    assert done.exit_code == 0, done.stderr
+    assert [sorted({"remove_elector", "text"} & set(one)) for one in node.changes] == [["remove_elector"], ["text"]]
+    assert "electorate: [robot1, edge1]" in node.text
+    node.electors = ["edge1"]
+    last = run("node", "remove", "edge1", "--yes")
+    assert "edge1 is the last elector: without it nothing can be agreed; add another elector first" in last.stderr
+
+
+def test_a_node_that_is_gone_is_forgotten(node: Node) -> None:
+    node.states["edge1"], node.electors = "gone", ["robot1"]
+    text = node.text = TEXT.replace("electorate: [robot1, robot2, edge1]\n", "")
+    result = run("node", "forget", "edge1", "--yes", "--accept", "remove-node")
+    assert result.exit_code == 0, result.stderr
+    assert node.text == text.replace("  edge1: {kind: edge}\n", "")
+
+
+# --- export, edit, show ----------------------------------------------------------------------------------------------
+
+
+def test_export_gives_the_text_back_byte_for_byte(node: Node, tmp_path: Path) -> None:
+    node.text = "\ufeff" + TEXT.replace("\n", "\r\n") + "# ä"
+    assert run("fleet", "export").stdout_bytes == node.text.encode()
+    file = tmp_path / "out.yaml"
+    assert run("fleet", "export", "-o", file).exit_code == 0
+    assert file.read_bytes() == node.text.encode()
+    node.document = ""
+    result = run("fleet", "export")
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert "agree one: zsched apply" in result.stderr
+
+
+def test_edit_applies_what_the_editor_leaves_and_keeps_what_is_refused(
+    node: Node, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    monkeypatch.setenv("EDITOR", "sed -i s/0.5,.memory:.0.5/1/")
+    monkeypatch.delenv("VISUAL", raising=False)
+    done = run("edit", "--yes")
+    assert done.exit_code == 0, done.stderr
+    assert node.text == TEXT.replace("0.5, memory: 0.5", "1")
+    monkeypatch.setenv("EDITOR", "sed -i s/robot2,/robot9,/")
+    faulty = run("edit", "--yes")
+    assert faulty.exit_code == 78
+    (kept,) = (path for path in tmp_path.iterdir() if path.suffix == ".yaml")
+    assert f"your text is in {kept}" in faulty.stderr
+    assert "robot9" in kept.read_text()
+    assert kept.stat().st_mode & 0o077 == 0
+    monkeypatch.setenv("EDITOR", "false")
+    assert "ended with 1; nothing was changed" in run("edit", "--yes").stderr
+    monkeypatch.setenv("EDITOR", os.fspath(tmp_path / "absent"))
+    assert "cannot be started" in run("edit", "--yes").stderr
+
+
+def test_show_names_the_electors_and_who_goes_by_something_else(node: Node) -> None:
+    node.states["edge1"] = "gone"
+    result = run("fleet", "show")
+    assert result.stdout.splitlines() == [
+        "hall: revision 7, number 2, settled",
+        "document ab12ab12ab12",
+        "electors: edge1 (disk dedge1), robot1 (disk drobot1), robot2 (disk drobot2)",
+        "  robot1  revision 7, document ab12ab12ab12",
+        "  robot2  revision 7, document ab12ab12ab12",
+        "  edge1   no answer",
+    ]
+    assert faults(json.loads(run("fleet", "show", "--json").stdout)) == []

@@ -1,0 +1,317 @@
+"""`zsched apply` and the verbs that change one entry: shows what a changed document does, asks, and has it agreed.
+
+Knows: plans, dangers that are accepted by name, the first document of a fleet. Does not know: what follows from a place
+of the file (`zsched.config.difference`), how a change is agreed.
+"""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from zsched.commands.ask import Door
+from zsched.commands.common import CliError, Json, nearest, print_json
+from zsched.commands.document import QUESTION, InForce, ask_all, change, in_force, status_of, wait_until_settled
+from zsched.commands.page import cut, harmless
+from zsched.config.difference import Change, Danger, difference, wanted_electors
+from zsched.config.load import check_bytes
+from zsched.config.reader import MAX_FILE_BYTES
+from zsched.core.values.fleet import Fleet, fleet_hash
+from zsched.errors import ConfigError
+from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE, EXIT_WOULD_CHANGE
+from zsched.files import read_regular
+
+SCHEMA = "zsched.apply/1"
+OTHER_FILES = "other-files"
+"""The danger of a first document: nodes that go by another file now."""
+DANGERS = (*(danger.value for danger in Danger), OTHER_FILES)
+PATH_ROOM, VALUE_ROOM = 44, 28
+STDIN = "-"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ApplyView:
+    """How a change is shown and confirmed."""
+
+    words: tuple[str, ...]
+    """The verb with its arguments, to be shown where it must be given again."""
+    is_plan: bool = False
+    is_sure: bool = False
+    is_json: bool = False
+    accepted: tuple[str, ...] = ()
+    """Names of dangers."""
+    revision: int | None = None
+    """The only revision that may be changed; ``None``: whichever is in force."""
+    reason: str = ""
+
+    def again(self, *more: str) -> str:
+        """The command, with more words."""
+        kept = [part for name in self.accepted for part in ("--accept", name)]
+        kept += ["-m", self.reason] if self.reason else []
+        kept += ["--revision", str(self.revision)] if self.revision is not None else []
+        return shlex.join(("zsched", *self.words, *kept, *more))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """What is to be agreed, and what follows."""
+
+    held: InForce
+    text: str
+    fleet: Fleet
+    changes: tuple[Change, ...]
+    dangers: tuple[tuple[str, str], ...]
+    """(name, what is accepted with it)."""
+    warnings: str = ""
+    note: str = ""
+    """One line above the table."""
+
+    @property
+    def is_nothing(self) -> bool:
+        """Whether the document in force is this very text."""
+        return self.text == self.held.text
+
+    @property
+    def is_first(self) -> bool:
+        """Whether no document was agreed yet."""
+        return not self.held.document
+
+
+def read_text(file: str) -> str:
+    """The text of a fleet file; ``-`` is stdin.
+
+    Raises:
+        ConfigError: it cannot be read, or is no UTF-8.
+    """
+    try:
+        data = sys.stdin.buffer.read(MAX_FILE_BYTES + 1) if file == STDIN else read_regular(Path(file), MAX_FILE_BYTES)
+        return data.decode()
+    except OSError as error:
+        raise ConfigError(f"{file}: cannot be read: {error.strerror}; give the path of a fleet file") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{file}: byte 0x{error.object[error.start]:02x} is not UTF-8; save it as UTF-8") from error
+
+
+def apply(door: Door, view: ApplyView, make: Callable[[InForce], str], file: str) -> int:
+    """Plan the change that ``make`` makes of the document in force, show it, ask, have it agreed; the exit code.
+
+    Raises:
+        CliError: nobody answers, the change is refused, overtaken, or not accepted.
+        ConfigError: the new file has faults.
+    """
+    _check_accepted(view)
+    held = in_force(door)
+    if view.revision is not None and view.revision != held.revision:
+        raise CliError(EXIT_FAILED, f"revision {view.revision} is overtaken: {held.fleet} has revision {held.revision}")
+    plan = make_plan(door, held, make(held), file)
+    if plan.warnings and not view.is_json:
+        sys.stderr.write(harmless(plan.warnings) + "\n")
+    if plan.is_nothing:
+        return _tell(view, plan, "unchanged", held.revision, EXIT_OK)
+    if not view.is_json:
+        sys.stdout.write(harmless(table(plan)) + "\n")
+    if view.is_plan:
+        return _tell(view, plan, "planned", held.revision, EXIT_WOULD_CHANGE)
+    missing = [(name, means) for name, means in plan.dangers if name not in view.accepted]
+    if missing:
+        names = [part for name in dict.fromkeys(name for name, _ in missing) for part in ("--accept", name)]
+        lines = "\n".join(f"  {name}: {means}" for name, means in missing)
+        raise CliError(EXIT_FAILED, f"nothing was changed; if this may be:\n{lines}\n{view.again(*names)}")
+    _confirm(view, plan)
+    return _commit(door, view, plan)
+
+
+def make_plan(door: Door, held: InForce, text: str, file: str) -> Plan:
+    """What ``text`` would change, and which dangers are in it.
+
+    Raises:
+        CliError: it is another fleet's file, or the document in force cannot be read here.
+        ConfigError: it has faults.
+    """
+    result = check_bytes(text.encode(), file)
+    if result.fleet is None:
+        raise ConfigError(result.report())
+    fleet = result.fleet
+    if fleet.name != held.fleet:
+        advice = f"ask a node of {fleet.name} with --connect, or write `fleet: {held.fleet}`"
+        raise CliError(
+            EXIT_FAILED, f"{file} is the file of fleet {fleet.name}, and this is fleet {held.fleet}; {advice}"
+        )
+    warnings = result.report()
+    if not held.document:
+        return _first(door, held, text, fleet, warnings)
+    old = check_bytes(held.text.encode(), file).fleet
+    if old is None:
+        advice = "update zsched here; `zsched fleet export` shows the document"
+        raise CliError(EXIT_FAILED, f"the document in force has faults for this version of zsched; {advice}")
+    status = status_of(door)
+    owners = {str(task["name"]): task["owner"] for task in status["tasks"]}
+    electors = tuple(name for name, _ in held.electors)
+    changes = difference(old, fleet, (held.text, text), owners, electors)
+    if not wanted_electors(electors, fleet, text):
+        raise CliError(EXIT_FAILED, f"{file}: no elector would be left; keep one of {', '.join(electors)}")
+    dangers = [(one.danger.value, one.warning()) for one in changes if one.danger is not None]
+    note = "" if changes or text == held.text else "only comments, blanks or the order of keys differ: nothing notices"
+    return Plan(
+        held=held, text=text, fleet=fleet, changes=changes, dangers=tuple(dangers), warnings=warnings, note=note
+    )
+
+
+def _first(door: Door, held: InForce, text: str, fleet: Fleet, warnings: str) -> Plan:
+    """The first document: every node is asked which file it goes by.
+
+    Raises:
+        CliError: its electors are not those by which the fleet runs.
+    """
+    electors = tuple(sorted(name for name, _ in held.electors))
+    if fleet.electors != electors:
+        advice = f"agree the file that {held.node} runs by first, then apply this one"
+        raise CliError(
+            EXIT_FAILED,
+            f"this file has the electors {', '.join(fleet.electors)}, the fleet has {', '.join(electors)}; {advice}",
+        )
+    names = [node.name for node in fleet.nodes]
+    answers = ask_all(door, names, {"verb": "status"})
+    digest = fleet_hash(fleet)
+    other, silent = [], []
+    for name, answer in answers.items():
+        if isinstance(answer, CliError):
+            silent.append(name)
+        elif answer["fleet_file"] != digest:
+            other.append(name)
+    dangers: tuple[tuple[str, str], ...] = ()
+    if other:
+        means = (
+            f"{', '.join(other)} go by another file now (`zsched check` tells a file's hash); this one takes its place"
+        )
+        dangers = ((OTHER_FILES, means),)
+    note = f"{held.fleet} goes by the file on each machine; from then on by this one document"
+    if silent:
+        note += f"\nnot asked, for they do not answer: {', '.join(silent)}; they follow when they are back"
+    return Plan(held=held, text=text, fleet=fleet, changes=(), dangers=dangers, warnings=warnings, note=note)
+
+
+# --- what is shown ---------------------------------------------------------------------------------------------------
+
+
+def table(plan: Plan) -> str:
+    """What changes, place by place: before -> after, and what follows."""
+    head = f"{plan.held.fleet}, revision {plan.held.revision}"
+    lines = [f"{head}: {plan.note}" if plan.note else f"{head}:"]
+    room = min(max((len(one.path) for one in plan.changes), default=0), PATH_ROOM)
+    values = [_values(one) for one in plan.changes]
+    wide = min(max((len(value) for value in values), default=0), 2 * VALUE_ROOM + 4)
+    for one, value in zip(plan.changes, values, strict=True):
+        danger = f" [{one.danger}]" if one.danger is not None else ""
+        lines.append(f"  {cut(one.path, room):{room}}  {value:{wide}}  {one.consequence}{danger}")
+    return "\n".join(lines)
+
+
+def _values(one: Change) -> str:
+    before, after = ("-" if value is None else cut(value, VALUE_ROOM) for value in (one.before, one.after))
+    return f"{before} -> {after}"
+
+
+def _tell(view: ApplyView, plan: Plan, outcome: str, revision: int, code: int) -> int:
+    """The end of it, for people or as JSON."""
+    if view.is_json:
+        print_json(_body(plan, outcome, revision))
+    elif outcome == "unchanged":
+        sys.stdout.write(f"{plan.held.fleet}, revision {revision}: nothing would change\n")
+    elif outcome == "ok":
+        sys.stdout.write(f"{plan.held.fleet}: revision {revision} is agreed\n")
+    return code
+
+
+def _body(plan: Plan, outcome: str, revision: int) -> Json:
+    changes = [
+        {
+            "path": one.path,
+            "before": one.before,
+            "after": one.after,
+            "effect": one.effect.value,
+            "consequence": one.consequence,
+            "danger": None if one.danger is None else one.danger.value,
+        }
+        for one in plan.changes
+    ]
+    dangers = [{"name": name, "means": means} for name, means in plan.dangers]
+    body = {"schema": SCHEMA, "fleet": plan.held.fleet, "outcome": outcome, "revision_before": plan.held.revision}
+    return {**body, "revision": revision, "is_first": plan.is_first, "changes": changes, "dangers": dangers}
+
+
+# --- asking, and agreeing --------------------------------------------------------------------------------------------
+
+
+def _check_accepted(view: ApplyView) -> None:
+    for name in view.accepted:
+        if name not in DANGERS:
+            raise CliError(EXIT_USAGE, f"--accept: there is no danger {name!r}{nearest(name, DANGERS)}")
+
+
+def _confirm(view: ApplyView, plan: Plan) -> None:
+    """Let the operator decide; off a terminal it takes --yes."""
+    if view.is_sure:
+        return
+    if not sys.stdin.isatty() or view.words[-1] == STDIN:
+        raise CliError(EXIT_USAGE, f"nothing was changed; to change it without being asked: {view.again('--yes')}")
+    sys.stderr.write(f"Change {plan.held.fleet} for all its nodes? [y/N] ")
+    sys.stderr.flush()
+    if sys.stdin.readline().strip().lower() not in ("y", "yes"):
+        raise CliError(EXIT_FAILED, "nothing was changed")
+
+
+def _commit(door: Door, view: ApplyView, plan: Plan) -> int:
+    """Have it agreed, one change after another, each on the revision that the one before made.
+
+    An elector that leaves the fleet goes first: it would not take a document that does not name it. One that comes, or
+    only ceases to be one, follows the document.
+    """
+    steps = tuple(_steps(door, plan))
+    held, document = plan.held, plan.held.document
+    for number, step in enumerate(steps):
+        try:
+            if held.document != document:
+                raise CliError(EXIT_FAILED, "another document was agreed meanwhile")
+            answer = change(door, {**step, "base_revision": held.revision, "reason": view.reason})
+            held = wait_until_settled(door, int(answer["revision"]))
+        except CliError as error:
+            if number == 0 or error.code == EXIT_TIMED_OUT:
+                raise
+            done = f"{number} of {len(steps)} changes are agreed, up to revision {held.revision}, and the next is not"
+            raise CliError(EXIT_TIMED_OUT, f"{done}: {error}; give the command again") from error
+        document = held.document if "text" in step else document
+    return _tell(view, plan, "ok", held.revision, EXIT_OK)
+
+
+def _steps(door: Door, plan: Plan) -> Iterator[Json]:
+    """The changes that make the plan true, in their order."""
+    there = tuple(name for name, _ in plan.held.electors)
+    wanted = there if plan.is_first else wanted_electors(there, plan.fleet, plan.text)
+    come, go = [name for name in wanted if name not in there], [name for name in there if name not in wanted]
+    disks = _disks(door, come)
+    nodes = {node.name for node in plan.fleet.nodes}
+    leave = [name for name in go if name not in nodes]
+    yield from ({"remove_elector": name} for name in leave)
+    yield {"text": plan.text}
+    yield from ({"add_elector": name, "disk": disks[name]} for name in come)
+    yield from ({"remove_elector": name} for name in go if name not in leave)
+
+
+def _disks(door: Door, names: list[str]) -> dict[str, str]:
+    """{node: id of the disk with which it shall be an elector}.
+
+    Raises:
+        CliError: one does not answer, or has no state.
+    """
+    found = {}
+    for name, answer in ask_all(door, names, QUESTION).items() if names else ():
+        disk = "" if isinstance(answer, CliError) else str(answer["disk"])
+        if not disk:
+            why = str(answer) if isinstance(answer, CliError) else "it has no state: zsched init there"
+            raise CliError(EXIT_FAILED, f"nothing was changed: {name} cannot become an elector now: {why}")
+        found[name] = disk
+    return found

@@ -1,0 +1,124 @@
+"""The fleet's document, as a node tells it: asks for it, proposes another one, and waits until it is in force.
+
+Knows: the questions of the operator socket, what each outcome means for the exit code. Does not know: what a change
+does to the fleet (`zsched.config.difference`), how it is agreed.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+
+from zsched.clock import monotonic_s
+from zsched.commands.ask import Door, ask_door
+from zsched.commands.common import CliError, Json
+from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_TIMED_OUT
+
+QUESTION: Json = {"verb": "fleet"}
+AT_ONCE = 8
+"""Nodes asked at a time: one that is silent takes 3 s to be given up, and the socket has 16 places."""
+PAUSE_S = 0.1
+IN_FORCE_S = 10.0
+"""How long a change that is agreed is waited for at the node that was asked."""
+CODES = {"invalid": EXIT_FAILED, "conflict": EXIT_FAILED, "no_quorum": EXIT_DEGRADED, "unknown": EXIT_TIMED_OUT}
+ADVICE = {
+    "conflict": "the fleet was changed meanwhile; look at it again with --plan",
+    "no_quorum": "nothing was changed; `zsched fleet show` names the electors",
+    "unknown": "it may or may not have been agreed: `zsched fleet show` tells the revision",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InForce:
+    """What one node goes by."""
+
+    node: str
+    """Who tells it."""
+    fleet: str
+    revision: int
+    number: int
+    is_settled: bool
+    electors: tuple[tuple[str, str], ...]
+    """(name, id of its disk; empty: not known)."""
+    document: str
+    """Hash of the document; empty: none is agreed, and each node goes by its own fleet file."""
+    text: str
+    """Of the document; empty while none is agreed, or while this node is still fetching it."""
+
+
+def in_force(door: Door) -> InForce:
+    """What the node at the door goes by.
+
+    Raises:
+        CliError: nobody answers.
+    """
+    told = ask_door(door, QUESTION)
+    return InForce(
+        node=str(told["node"]),
+        fleet=str(told["fleet"]),
+        revision=int(told["revision"]),
+        number=int(told["number"]),
+        is_settled=bool(told["settled"]),
+        electors=tuple((str(one["name"]), str(one["disk"])) for one in told["electors"]),
+        document=str(told["document"]),
+        text=str(told["text"]),
+    )
+
+
+def status_of(door: Door) -> Json:
+    """The status of the node at the door.
+
+    Raises:
+        CliError: nobody answers.
+    """
+    return ask_door(door, {"verb": "status"})
+
+
+def ask_all(door: Door, names: Sequence[str], request: Json) -> dict[str, Json | CliError]:
+    """{node: its answer, or why there is none} of every node in ``names``."""
+    with ThreadPoolExecutor(AT_ONCE) as errands:
+        return dict(zip(names, errands.map(partial(_ask, door, request), names), strict=True))
+
+
+def _ask(door: Door, request: Json, name: str) -> Json | CliError:
+    try:
+        return ask_door(door.to(name), request)
+    except CliError as error:
+        return error
+
+
+def change(door: Door, what: Json) -> Json:
+    """Propose a change of the fleet, and return what became of it.
+
+    Raises:
+        CliError: nobody answers, or the change did not come about (1, 4, 5).
+    """
+    answer = ask_door(door, {"verb": "change", **what}, timeout_s=IN_FORCE_S)
+    outcome, detail = str(answer["outcome"]), str(answer["detail"])
+    if outcome in ("ok", "unchanged"):
+        return answer
+    advice = ADVICE.get(outcome, "")
+    words = f"{outcome.replace('_', ' ')}: {detail}{'; ' if advice else ''}{advice}"
+    raise CliError(CODES.get(outcome, EXIT_FAILED), words)
+
+
+def wait_until_settled(door: Door, revision: int) -> InForce:
+    """Wait until the node at the door knows a settled value of at least ``revision``, and has its document.
+
+    Raises:
+        CliError: it does not in time (5), or nobody answers.
+    """
+    end = monotonic_s() + IN_FORCE_S
+    while True:
+        held = in_force(door)
+        if held.revision >= revision and held.is_settled and (held.text or not held.document):
+            return held
+        if monotonic_s() > end:
+            why = "has not fetched its document" if held.is_settled else f"number {held.number} is not settled"
+            raise CliError(
+                EXIT_TIMED_OUT, f"revision {revision} is agreed, but {held.node} {why} yet; see `zsched fleet show`"
+            )
+        time.sleep(PAUSE_S)

@@ -1,0 +1,160 @@
+"""`zsched fleet show|export` and `zsched edit`: what the fleet goes by, its text, and the text in an editor.
+
+Knows: which nodes tell what they go by, how an editor is started. Does not know: what a change does.
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from zsched.commands.apply import ApplyView, apply, read_text
+from zsched.commands.ask import Door
+from zsched.commands.common import CliError, Json, print_json
+from zsched.commands.document import QUESTION, InForce, ask_all, in_force, status_of
+from zsched.commands.page import harmless
+from zsched.errors import ConfigError
+from zsched.exits import EXIT_FAILED, EXIT_OK
+from zsched.files import write_regular
+
+SCHEMA = "zsched.fleet.show/1"
+
+
+def show(door: Door, *, is_json: bool) -> int:
+    """Print the fleet's revision, electors and document, and which node goes by which; the exit code.
+
+    Raises:
+        CliError: nobody answers.
+    """
+    held = in_force(door)
+    names = [str(node["name"]) for node in status_of(door)["nodes"]]
+    told = [_row(name, answer) for name, answer in ask_all(door, names, QUESTION).items()]
+    if is_json:
+        electors = [{"name": name, "disk": disk} for name, disk in held.electors]
+        body = {"schema": SCHEMA, "fleet": held.fleet, "node": held.node, "revision": held.revision}
+        body |= {"number": held.number, "settled": held.is_settled, "document": held.document}
+        print_json({**body, "electors": electors, "nodes": told})
+    else:
+        sys.stdout.write(harmless(_text(held, told)))
+    return EXIT_OK
+
+
+def _row(name: str, answer: Json | CliError) -> Json:
+    """What one node goes by; ``None`` where it did not answer."""
+    if isinstance(answer, CliError):
+        return {"name": name, "revision": None, "document": None, "fleet_file": None, "problem": str(answer)}
+    told = {key: answer[key] for key in ("revision", "document", "fleet_file")}
+    return {"name": name, **told, "problem": None}
+
+
+def _text(held: InForce, told: list[Json]) -> str:
+    """For people: what stands out is said at the node that differs."""
+    state = "settled" if held.is_settled else "not settled yet: a majority of the electors is still being asked"
+    goes_by = f"document {held.document[:12]}" if held.document else "no document: each node goes by its own file"
+    electors = ", ".join(f"{name} (disk {disk[:8]})" if disk else name for name, disk in held.electors)
+    lines = [f"{held.fleet}: revision {held.revision}, number {held.number}, {state}", goes_by, f"electors: {electors}"]
+    wide = max((len(one["name"]) for one in told), default=0)
+    lines += [f"  {one['name']:{wide}}  {_said(held, one, told)}" for one in told]
+    return "\n".join(lines) + "\n"
+
+
+def _said(held: InForce, one: Json, told: list[Json]) -> str:
+    if one["problem"] is not None:
+        return "no answer"
+    if not held.document and not one["document"]:
+        files = [other["fleet_file"] for other in told if other["fleet_file"] is not None]
+        is_odd = one["fleet_file"] != max(sorted(files), key=files.count)
+        return f"file {one['fleet_file']}{': another one than most nodes have' if is_odd else ''}"
+    skew = "" if one["document"] == held.document else f": not {held.document[:12] or 'by its file'}, as {held.node}"
+    return f"revision {one['revision']}, document {one['document'][:12] or 'none'}{skew}"
+
+
+def export(door: Door, file: Path | None) -> int:
+    """Write the document's text as its operator wrote it, to stdout or to ``file``; the exit code.
+
+    Raises:
+        CliError: nobody answers, there is no document, or the file cannot be written.
+    """
+    held = in_force(door)
+    text = document_text(held)
+    if file is None:
+        sys.stdout.flush()
+        sys.stdout.buffer.write(text.encode())
+        sys.stdout.buffer.flush()
+        return EXIT_OK
+    try:
+        write_regular(file, text.encode())
+    except OSError as error:
+        raise CliError(EXIT_FAILED, f"{file}: {error.strerror}; give a file that can be written") from error
+    sys.stdout.write(f"{file}: {held.fleet}, revision {held.revision}\n")
+    return EXIT_OK
+
+
+def document_text(held: InForce) -> str:
+    """The text of the document in force.
+
+    Raises:
+        CliError: none is agreed, or this node has not fetched it yet.
+    """
+    if not held.document:
+        advice = "agree one: zsched apply /etc/zsched/fleet.yaml"
+        raise CliError(EXIT_FAILED, f"{held.fleet} goes by the file on each machine, and has no document yet; {advice}")
+    if not held.text:
+        advice = "ask another node with --node, or again in a moment"
+        raise CliError(EXIT_FAILED, f"{held.node} has not fetched document {held.document[:12]} yet; {advice}")
+    return held.text
+
+
+def edit(door: Door, view: ApplyView, env: Mapping[str, str] = os.environ) -> int:
+    """Open the document in the operator's editor and apply what comes of it; the exit code.
+
+    Raises:
+        CliError: the editor failed, or as of `apply`.
+        ConfigError: the text has faults; it stays in a file that the message names.
+    """
+    kept: list[Path] = []
+
+    def make(held: InForce) -> str:
+        path = _draft(held.fleet, document_text(held))
+        kept.append(path)
+        _open_editor(path, env)
+        return read_text(str(path))
+
+    try:
+        code = apply(door, view, make, "the edited document")
+    except (CliError, ConfigError) as error:
+        if not kept:
+            raise
+        text = f"{error}\nyour text is in {kept[0]}: mend it there, then zsched apply {shlex.quote(str(kept[0]))}"
+        raise _like(error, text) from error
+    for path in kept:
+        path.unlink(missing_ok=True)
+    return code
+
+
+def _like(error: Any, text: str) -> CliError | ConfigError:
+    return CliError(error.code, text) if isinstance(error, CliError) else ConfigError(text)
+
+
+def _draft(fleet: str, text: str) -> Path:
+    """A new file of the operator alone, with the text."""
+    number, name = tempfile.mkstemp(prefix=f"{fleet}-", suffix=".yaml")
+    with os.fdopen(number, "wb") as draft:
+        draft.write(text.encode())
+    return Path(name)
+
+
+def _open_editor(path: Path, env: Mapping[str, str]) -> None:
+    editor = env.get("VISUAL") or env.get("EDITOR") or "vi"
+    try:
+        done = subprocess.run([*shlex.split(editor), str(path)], check=False)
+    except (OSError, ValueError) as error:
+        raise CliError(EXIT_FAILED, f"the editor {editor!r} cannot be started: {error}; set EDITOR") from error
+    if done.returncode:
+        raise CliError(EXIT_FAILED, f"the editor {editor!r} ended with {done.returncode}; nothing was changed")
