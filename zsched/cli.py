@@ -4,7 +4,7 @@ Knows: verbs, options, exit codes. Does not know: how anything is done. What a v
 `status` must answer within 200 ms, and a robot has no numpy.
 
 Exit codes: 0 fine, 1 failed, 2 usage, 3 daemon not reachable, 4 reachable but degraded (no quorum, a task without a
-live owner), 5 timed out, 10 a plan would move the task, 75 the name is another machine's, 78 bad configuration.
+live owner), 5 timed out, 10 by a plan something would change, 75 the name is another machine's, 78 bad configuration.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 EPILOG = (
     "Exit codes: 0 fine, 1 failed, 2 usage, 3 daemon not reachable, 4 reachable but degraded, 5 timed out, "
-    "10 it would move (explain --plan), 75 the name is taken by another machine (up), 78 bad fleet file."
+    "10 something would change (--plan), 75 the name is taken by another machine (up), 78 bad fleet file."
 )
 
 app = typer.Typer(

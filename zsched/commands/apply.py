@@ -274,8 +274,7 @@ def _commit(door: Door, view: ApplyView, plan: Plan) -> int:
     held, document = plan.held, plan.held.document
     for number, step in enumerate(steps):
         try:
-            if held.document != document:
-                raise CliError(EXIT_FAILED, "another document was agreed meanwhile")
+            _check_same(held, document)
             answer = change(door, {**step, "base_revision": held.revision, "reason": view.reason})
             held = wait_until_settled(door, int(answer["revision"]))
         except CliError as error:
@@ -285,6 +284,11 @@ def _commit(door: Door, view: ApplyView, plan: Plan) -> int:
             raise CliError(EXIT_TIMED_OUT, f"{done}: {error}; give the command again") from error
         document = held.document if "text" in step else document
     return _tell(view, plan, "ok", held.revision, EXIT_OK)
+
+
+def _check_same(held: InForce, document: str) -> None:
+    if held.document != document:
+        raise CliError(EXIT_FAILED, "another document was agreed meanwhile")
 
 
 def _steps(door: Door, plan: Plan) -> Iterator[Json]:
