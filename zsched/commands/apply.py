@@ -300,7 +300,7 @@ def _steps(door: Door, plan: Plan) -> Iterator[Json]:
     nodes = {node.name for node in plan.fleet.nodes}
     leave = [name for name in go if name not in nodes]
     yield from ({"remove_elector": name} for name in leave)
-    yield {"text": plan.text}
+    yield {"text": plan.text, "flags": plan.held.flags}
     yield from ({"add_elector": name, "disk": disks[name]} for name in come)
     yield from ({"remove_elector": name} for name in go if name not in leave)
 

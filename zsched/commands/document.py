@@ -17,7 +17,8 @@ from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json
 from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_TIMED_OUT
 
-QUESTION: Json = {"verb": "fleet"}
+QUESTION: Json = {"verb": "fleet", "with_document": False}
+"""What a node goes by, without its document."""
 AT_ONCE = 8
 """Nodes asked at a time: one that is silent takes 3 s to be given up, and the socket has 16 places."""
 PAUSE_S = 0.1
@@ -47,15 +48,20 @@ class InForce:
     """Hash of the document; empty: none is agreed, and each node goes by its own fleet file."""
     text: str
     """Of the document; empty while none is agreed, or while this node is still fetching it."""
+    flags: tuple[Json, ...] = ()
+    """What operators have said of nodes: a document that takes this one's place keeps them."""
 
 
 def in_force(door: Door) -> InForce:
     """What the node at the door goes by.
 
     Raises:
-        CliError: nobody answers.
+        CliError: nobody answers, or the node knows no fleet value yet.
     """
-    told = ask_door(door, QUESTION)
+    told = ask_door(door, {"verb": "fleet"})
+    if told["revision"] is None:
+        advice = "wait until it hears an elector; `zsched status` shows which are away"
+        raise CliError(EXIT_DEGRADED, f"{told['node']} does not know the fleet's generation yet; {advice}")
     return InForce(
         node=str(told["node"]),
         fleet=str(told["fleet"]),
@@ -65,6 +71,7 @@ def in_force(door: Door) -> InForce:
         electors=tuple((str(one["name"]), str(one["disk"])) for one in told["electors"]),
         document=str(told["document"]),
         text=str(told["text"]),
+        flags=tuple(told["flags"]),
     )
 
 

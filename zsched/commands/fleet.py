@@ -49,7 +49,7 @@ def _row(name: str, answer: Json | CliError) -> Json:
     """What one node goes by; ``None`` where it did not answer."""
     if isinstance(answer, CliError):
         return {"name": name, "revision": None, "document": None, "fleet_file": None, "problem": str(answer)}
-    told = {key: answer[key] for key in ("revision", "document", "fleet_file")}
+    told = {key: answer.get(key) for key in ("revision", "document", "fleet_file")}
     return {"name": name, **told, "problem": None}
 
 
@@ -67,6 +67,8 @@ def _text(held: InForce, told: list[Json]) -> str:
 def _said(held: InForce, one: Json, told: list[Json]) -> str:
     if one["problem"] is not None:
         return "no answer"
+    if one["revision"] is None:
+        return "does not know the fleet's generation yet"
     if not held.document and not one["document"]:
         files = [other["fleet_file"] for other in told if other["fleet_file"] is not None]
         is_odd = one["fleet_file"] != max(sorted(files), key=files.count)

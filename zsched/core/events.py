@@ -22,6 +22,7 @@ from zsched.core.values.messages import (
     Learnt,
     Prepare,
     Promise,
+    ReadFleet,
     ReadLines,
     Refused,
     RestartTask,
@@ -433,6 +434,14 @@ class FleetCommanded:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class FleetReadAsked:
+    """An operator asks by which fleet value and document this node goes."""
+
+    request: int
+    command: ReadFleet
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FrameDropped:
     """A frame came that is invalid or not for us: only a counter rises."""
 
@@ -500,6 +509,7 @@ Event = (
     | RestartCommanded
     | LinesAsked
     | FleetCommanded
+    | FleetReadAsked
     | FrameDropped
     | AddressesTried
     | ProblemReported
@@ -519,4 +529,6 @@ def commanded(request: int, command: Command) -> Event:
         return LinesAsked(request=request, command=command)
     if isinstance(command, ChangeFleet):
         return FleetCommanded(request=request, command=command)
+    if isinstance(command, ReadFleet):
+        return FleetReadAsked(request=request, command=command)
     return WeightsCommanded(request=request, command=command)

@@ -20,6 +20,7 @@ from zsched.core.values.messages import (
     Accepted,
     CommandResult,
     FleetAnswer,
+    FleetTold,
     Learnt,
     Prepare,
     Promise,
@@ -309,6 +310,15 @@ class AnswerDocument:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class AnswerFleetRead:
+    """Answer an operator by which fleet value this node goes; with the value's document if that is asked for."""
+
+    request: int
+    told: FleetTold
+    with_document: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class KeepDocuments:
     """Delete every stored document but these."""
 
@@ -334,6 +344,7 @@ Instruction = (
     | StoreDocument
     | FetchDocument
     | AnswerDocument
+    | AnswerFleetRead
     | KeepDocuments
     | PublishLearnt
     | AskLearnt

@@ -15,6 +15,7 @@ import queue
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any, assert_never
 
 from zsched.adapters.host.decision_log import DecisionLog
@@ -36,11 +37,15 @@ from zsched.core.relay_protocol import (
 )
 from zsched.core.report import snapshot_json
 from zsched.core.values.decision import Explanation
+from zsched.core.values.document import Document, Flag, Text
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import (
+    ChangeFleet,
     Command,
     CommandResult,
     ExplainTask,
+    FleetTold,
+    ReadFleet,
     ReadLines,
     RestartTask,
     RetryTask,
@@ -48,7 +53,7 @@ from zsched.core.values.messages import (
     WorkerLines,
     fleet_question,
 )
-from zsched.core.values.model import NAME, NodeId, TaskId
+from zsched.core.values.model import MAX_REASON, NAME, NodeId, TaskId
 from zsched.core.values.snapshot import Snapshot
 from zsched.errors import AdapterError, WireError
 from zsched.runtime.crew import Crew
@@ -213,12 +218,39 @@ def _lines_of(request: dict[str, Any]) -> ReadLines:
     return ReadLines(task=str(request["task"]), after=after)
 
 
+def _change_of(request: dict[str, Any]) -> ChangeFleet:
+    """The whole document, or one elector: exactly one of them is named."""
+    base, text = request.get("base_revision"), request.get("text")
+    if base is not None and type(base) is not int:
+        raise ValueError(f"base_revision: expected a whole number, not {base!r:.80}")
+    if text is not None and not isinstance(text, str):
+        raise ValueError(f"text: expected the text of a fleet file, not {text!r:.80}")
+    try:
+        flags = tuple(wire.from_plain(flag, Flag) for flag in request.get("flags", ()))
+    except WireError as error:
+        raise ValueError(f"flags: {error}") from error
+    return ChangeFleet(
+        document=None if text is None else Document(text=Text(text), flags=flags),
+        add_elector=str(request.get("add_elector") or ""),
+        disk=str(request.get("disk") or ""),
+        remove_elector=str(request.get("remove_elector") or ""),
+        base_revision=base,
+        reason=str(request.get("reason") or "")[:MAX_REASON],
+    )
+
+
+def _fleet_of(request: dict[str, Any]) -> ReadFleet:
+    return ReadFleet(with_document=request.get("with_document") is not False)
+
+
 _COMMANDS: dict[str, Callable[[dict[str, Any]], Command]] = {
     "weights": _weights_of,
     "retry": _retry_of,
     "explain": _explain_of,
     "restart": _restart_of,
     "lines": _lines_of,
+    "change": _change_of,
+    "fleet": _fleet_of,
 }
 
 
@@ -241,8 +273,32 @@ def answer_json(value: object) -> dict[str, Any]:
         lines = [{"number": line.number, "age_s": line.age_s, "text": line.text} for line in value.lines]
         body = {"node": value.node, "task": value.task, "lines": lines}
         return {**body, "newest": value.newest, "is_here": value.is_here}
+    if isinstance(value, FleetTold):
+        return _fleet_json(value)
     assert isinstance(value, CommandResult)
     return {"outcome": value.outcome.value, "detail": value.detail, "revision": value.revision}
+
+
+def _fleet_json(told: FleetTold) -> dict[str, Any]:
+    """By which fleet value a node goes; its revision is ``None`` while it knows none."""
+    value, content = told.value, told.content
+    body = {"node": told.node, "fleet_file": told.fleet_file, "disk": told.disk}
+    if value is None:
+        return {**body, "revision": None}
+    electors = [{"name": one.name, "disk": one.disk, "joining": one.joining} for one in value.electors]
+    flags = [] if content is None else [wire.as_plain(flag) for flag in content.flags]
+    return {
+        **body,
+        "fleet": value.fleet,
+        "generation_id": value.generation_id,
+        "revision": value.revision,
+        "number": value.number,
+        "settled": value.settled,
+        "electors": electors,
+        "document": value.document,
+        "text": "" if content is None else content.text,
+        "flags": flags,
+    }
 
 
 class Shell:
@@ -328,6 +384,8 @@ class Shell:
                 bus.answer(request, fleet_answer)
             case do.StoreDocument() | do.FetchDocument() | do.KeepDocuments():
                 self._documents().order(instruction)
+            case do.AnswerFleetRead(request=request, told=told, with_document=with_document):
+                self._answer_operator(request, self._with_document(told) if with_document else told)
             case do.AnswerDocument(request=request, document=document):
                 self._answer_document(request, document)
             case do.AskLearnt(peer=peer, deadline_s=deadline_s):
@@ -385,6 +443,12 @@ class Shell:
     def _documents(self) -> Library:
         assert self.library is not None
         return self.library
+
+    def _with_document(self, told: FleetTold) -> FleetTold:
+        value = told.value
+        if value is None or not value.document:
+            return told
+        return replace(told, content=self._documents().store.load(value.document))
 
     def _answer_document(self, request: int, document: str) -> None:
         content = self._documents().store.load(document)

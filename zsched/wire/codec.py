@@ -56,6 +56,8 @@ KINDS: dict[str, tuple[type, int]] = {
     "restart_task": (messages.RestartTask, SMALL),
     "read_lines": (messages.ReadLines, SMALL),
     "change_fleet": (messages.ChangeFleet, LARGE),
+    "read_fleet": (messages.ReadFleet, SMALL),
+    "fleet_told": (messages.FleetTold, LARGE),
     "worker_lines": (messages.WorkerLines, LARGE),
     "command_result": (messages.CommandResult, SMALL),
     "status": (snapshot.Snapshot, LARGE),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -23,8 +24,10 @@ from zsched.adapters.workers.kept_lines import KeptLines
 from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
 from zsched.core import events as ev
 from zsched.core import instructions as do
+from zsched.core.electorate.founding import founded
 from zsched.core.relay_protocol import RelayStarted, WorkerSeen
 from zsched.core.values.decision import Explanation
+from zsched.core.values.document import Document, Flag, FlagKind, Text
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import WorkerSpec
 from zsched.core.values.messages import (
@@ -32,6 +35,7 @@ from zsched.core.values.messages import (
     Accepted,
     CommandOutcome,
     CommandResult,
+    FleetTold,
     Learnt,
     Prepare,
     ReadLines,
@@ -42,7 +46,9 @@ from zsched.core.values.model import Acceptance, WorkerState
 from zsched.core.values.plan import Role, RoutePhase, RoutePlan, WorkerRole
 from zsched.errors import AdapterError, WireError
 from zsched.runtime import shell as shell_module
+from zsched.runtime.library import Library
 from zsched.runtime.shell import INBOX_LIMIT, LOCAL_REQUESTS_FROM, PROBLEM_TTL_S, WAITING_LIMIT, Desk, Inbox, Shell
+from zsched.wire.codec import document_hash
 
 BALLOT = ballot_of()
 VALUE = allocation_of()
@@ -326,11 +332,20 @@ def test_relays_other_reports_are_events_as_they_are(house: House) -> None:
 def test_desk_refuses_what_is_no_request(house: House) -> None:
     weights = {"verb": "weights", "task": "merge", "cpu": 1, "memory": 0, "network": 0}
     for request, says in (
-        ({"verb": "fly"}, "unknown verb 'fly'; known: access, explain, lines, log, restart, retry, status, weights"),
+        (
+            {"verb": "fly"},
+            "unknown verb 'fly'; known: access, change, explain, fleet, lines, log, restart, retry, status, weights",
+        ),
         ({"verb": "retry"}, "retry: 'task' is missing"),
         ({"verb": "restart"}, "restart: 'task' is missing"),
         ({"verb": "lines", "task": "merge", "after": "1"}, "lines: after: expected a whole number, not '1'"),
         ({"verb": "lines", "task": "merge", "after": -1}, "lines: lines.after"),
+        ({"verb": "change"}, "change: fleet: expected one of document, add_elector and remove_elector"),
+        ({"verb": "change", "text": 7}, "change: text: expected the text of a fleet file, not 7"),
+        ({"verb": "change", "text": "x" * 200_000}, "change: document.text: larger than 196608 bytes"),
+        ({"verb": "change", "text": "x", "flags": [{"kind": "sleep"}]}, "change: flags: "),
+        ({"verb": "change", "text": "x", "base_revision": "7"}, "change: base_revision: expected a whole number"),
+        ({"verb": "change", "add_elector": "edge1"}, "change: fleet.disk: edge1 needs the id of its disk"),
         ({"verb": "retry", "task": "merge", "whose": "No Name"}, "retry: retry.node: 'No Name' is not a name"),
         ({"verb": "status", "node": 5}, "node: 5 is not a name"),
         ({"verb": "status", "node": "*"}, "node: '*' is not a name"),
@@ -370,6 +385,31 @@ def test_lines_are_asked_of_the_supervisor_and_answered_as_json(house: House) ->
     assert found["lines"][0]["age_s"] >= 0.0
     assert (found["node"], found["task"], found["newest"], found["is_here"]) == ("robot1", "merge", 2, True)
     assert (none["lines"], none["newest"], none["is_here"]) == ([], 0, False)
+
+
+def test_a_question_for_the_fleet_is_answered_with_the_text_of_its_document(house: House, tmp_path: Path) -> None:
+    content = Document(text=Text("fleet: lab  # ours"), flags=(Flag(kind=FlagKind.DRAIN, subject="edge1"),))
+    library = Library(fleet="lab", node="robot1", config=tmp_path / "f.yaml", state_dir=tmp_path, post=lambda _: None)
+    library.store.save(content)
+    house.shell.library = library
+    value = replace(founded("lab", 0, ("robot1",)), document=document_hash(content))
+    answers: list[dict[str, Any]] = []
+    for with_document, known in ((True, value), (False, value), (True, None)):
+        request = {"verb": "fleet", "with_document": with_document}
+        asking = threading.Thread(target=lambda asked: answers.append(house.desk.answer(asked)), args=(request,))
+        asking.start()
+        event = house.inbox.take(60.0)
+        assert isinstance(event, ev.FleetReadAsked)
+        told = FleetTold(node="robot1", value=known, fleet_file="ab", disk="d1")
+        is_wanted = event.command.with_document
+        order = do.AnswerFleetRead(request=event.request, told=told, with_document=is_wanted)
+        house.shell.carry_out((order,))
+        asking.join(60.0)
+    whole, short, blank = answers
+    assert (whole["text"], whole["flags"]) == (content.text, [{"kind": "drain", "subject": "edge1"}])
+    assert (whole["electors"], whole["document"]) == ([{"name": "robot1", "disk": "", "joining": 0}], value.document)
+    assert (short["text"], short["revision"], short["disk"]) == ("", value.revision, "d1")
+    assert (blank["revision"], blank["node"], blank["fleet_file"]) == (None, "robot1", "ab")
 
 
 def test_desk_answers_several_at_once_each_with_its_own(house: House) -> None:

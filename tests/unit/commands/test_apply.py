@@ -30,6 +30,7 @@ tasks:
     candidates: {kind: robot}   # who has a map
     weights: {cpu: 0.5, memory: 0.5}
 """
+FLAGS = [{"kind": "drain", "subject": "robot2"}]
 TASK = "tasks:\n  count: {candidates: [edge1], weights: {cpu: 1}}  # pallets\n"
 
 
@@ -59,7 +60,12 @@ class Node:
         if verb == "fleet":
             electors = [{"name": name, "disk": f"d{name}"} for name in self.electors]
             body = {"node": node, "fleet": "hall", "revision": self.revision, "number": 2, "settled": True}
-            told = {"electors": electors, "document": self.document, "text": self.text if self.document else ""}
+            told = {
+                "electors": electors,
+                "document": self.document,
+                "text": self.text if self.document else "",
+                "flags": FLAGS,
+            }
             return {**body, **told, "fleet_file": digest_of(self.text), "disk": f"d{node}"}
         assert verb == "change"
         self.changes.append(request)
@@ -145,7 +151,9 @@ def test_off_a_terminal_the_command_with_yes_is_printed_and_that_command_works(n
     assert node.changes == []
     done = run("apply", file, "-m", "less swapping", "--yes")
     assert (done.exit_code, done.stdout.splitlines()[-1]) == (0, "hall: revision 8 is agreed")
-    assert [(one["base_revision"], one["reason"]) for one in node.changes] == [(7, "less swapping")]
+    assert [(one["base_revision"], one["reason"], one["flags"]) for one in node.changes] == [
+        (7, "less swapping", FLAGS)
+    ]
     assert node.text == file.read_text()
 
 

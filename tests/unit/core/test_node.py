@@ -30,6 +30,7 @@ from zsched.core.values.messages import (
     Learnt,
     Prepare,
     Promise,
+    ReadFleet,
     ReadLines,
     Refusal,
     Refused,
@@ -735,6 +736,16 @@ def test_a_restart_of_what_does_not_run_is_refused(name: str, task: str, state: 
 def test_a_question_for_lines_is_handed_on() -> None:
     batch = make("edge1").handle(ev.LinesAsked(request=7, command=ReadLines(task="merge", after=3)), 100.0)
     assert of(batch, do.AnswerLines) == [do.AnswerLines(request=7, task="merge", after=3)]
+
+
+def test_a_node_tells_by_which_fleet_value_it_goes() -> None:
+    node = make("robot1")
+    for with_document in (True, False):
+        command = ReadFleet(with_document=with_document)
+        (order,) = of(node.handle(ev.FleetReadAsked(request=7, command=command), 100.0), do.AnswerFleetRead)
+        assert (order.request, order.with_document) == (7, with_document)
+        assert (order.told.node, order.told.value) == ("robot1", node.agreement.fleet_value)
+        assert (order.told.fleet_file, order.told.content) == (node.fleet_file, None)
 
 
 @pytest.mark.parametrize(

@@ -29,6 +29,7 @@ from zsched.core.values.messages import (
     Learnt,
     Prepare,
     Promise,
+    ReadFleet,
     ReadLines,
     Refusal,
     Refused,
@@ -319,6 +320,8 @@ class Storm:
             return ev.RestartCommanded(request=self.number(), command=RestartTask(task=self.task()))
         if self.rng.random() < 0.1:
             return ev.LinesAsked(request=self.number(), command=ReadLines(task=self.task()))
+        if self.rng.random() < 0.1:
+            return ev.FleetReadAsked(request=self.number(), command=ReadFleet())
         base = self.rng.choice((None, self.number()))
         cpu = self.rng.choice((0.25, 0.75, 2.0))
         command = SetWeights(task=self.task(), cpu=cpu, memory=1.0 - cpu, network=0.0, base_revision=base)

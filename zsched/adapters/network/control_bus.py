@@ -30,9 +30,11 @@ from zsched.core.values.messages import (
     ExplainTask,
     FleetAnswer,
     FleetQuestion,
+    FleetTold,
     Learnt,
     Prepare,
     Promise,
+    ReadFleet,
     ReadLines,
     Refused,
     RestartTask,
@@ -55,7 +57,7 @@ CLOSE_S = 0.5
 RING = 1024
 """Periodic frames that wait for the loop; if it does not come, the oldest go, and zenoh need not wait."""
 
-Answer = Snapshot | CommandResult | Explanation | WorkerLines
+Answer = Snapshot | CommandResult | Explanation | WorkerLines | FleetTold
 Post = Callable[[ev.Event], None]
 log = logging.getLogger("zsched.bus")
 
@@ -65,7 +67,7 @@ _PUTS: dict[str, type[Beat | Profile | Proposal | Learnt]] = {
     "proposal": Proposal,
     "allocation": Learnt,
 }
-_COMMANDS = (SetWeights, RetryTask, ExplainTask, RestartTask, ReadLines, ChangeFleet)
+_COMMANDS = (SetWeights, RetryTask, ExplainTask, RestartTask, ReadLines, ChangeFleet, ReadFleet)
 _QUESTIONS = frozenset({"utility", "register", "allocation", "document", "status", "command"})
 
 
@@ -84,6 +86,8 @@ def answer_classes(command: Command | None) -> tuple[type[Answer], ...]:
     """What a node may answer to an operator's command, or (``None``) to the question for its status."""
     if command is None:
         return (Snapshot,)
+    if isinstance(command, ReadFleet):
+        return (FleetTold,)
     return (WorkerLines,) if isinstance(command, ReadLines) else (CommandResult, Explanation)
 
 

@@ -15,7 +15,7 @@ import zenoh
 
 from zsched.adapters.network.control_bus import Answer, answer_classes
 from zsched.clock import monotonic_s
-from zsched.core.values.messages import Command
+from zsched.core.values.messages import ChangeFleet, Command
 from zsched.core.values.model import NodeId
 from zsched.core.values.snapshot import Snapshot
 from zsched.errors import AdapterError, WireError
@@ -26,6 +26,7 @@ from zsched.wire.keyspace import Keyspace
 ANSWER_S = 3.0
 """So long a question is asked again, as a daemon waits for another node."""
 ROUND_S = 1.0
+"""After which it is asked again; a command that changes something is not, for the first one may yet have its effect."""
 PAUSE_S = 0.1
 ANY_FLEET = "*"
 """The endpoint says which fleet is meant; its name need not be known."""
@@ -79,7 +80,7 @@ class FleetClient:
             payload=None if command is None else wire.encode(command),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=ROUND_S,
+            timeout=ANSWER_S if isinstance(command, ChangeFleet) else ROUND_S,
         )
         here = {str(zid) for zid in (*self._session.info.peers_zid(), *self._session.info.routers_zid())}
         for reply in replies:

@@ -53,7 +53,7 @@ class Numbers:
     ) -> None:
         self._fleet, self._me, self._incarnation = fleet, me, incarnation
         self._registers, self._rng = registers, rng
-        self._disk = "" if durable is None else durable.disk
+        self.disk = "" if durable is None else durable.disk
         self._stored = None if durable is None else durable.fleet_register
         self.documents = Documents(me, stored)
         self.roll: Roll | None = None
@@ -67,7 +67,7 @@ class Numbers:
         first = founded(self._fleet.name, generation, self._fleet.electors)
         self.roll = Roll(
             me=self._me,
-            disk=self._disk,
+            disk=self.disk,
             incarnation=self._incarnation,
             state=self._stored or RegisterState(task=self._fleet.name, learnt=first),
             registers=self._registers,
@@ -102,7 +102,7 @@ class Numbers:
             ballot_s=self._fleet.timing.ballot_s,
             stagger_s=self._fleet.timing.stagger_s,
             rng=self._rng,
-            disk=self._disk,
+            disk=self.disk,
         )
 
     # --- queries -----------------------------------------------------------------------------------------------------

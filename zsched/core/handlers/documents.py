@@ -15,6 +15,7 @@ from zsched.core import instructions as do
 from zsched.core.stages import Handler, Stages
 from zsched.core.todo import ToDo
 from zsched.core.values.fleet import Fleet, fleet_hash
+from zsched.core.values.messages import FleetTold
 
 
 def take_effect(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
@@ -64,6 +65,13 @@ def _on_refused(node: Stages, event: ev.DocumentRefused, todo: ToDo, _now: float
     node.agreement.on_refused(event, todo)
 
 
+def _on_read(node: Stages, event: ev.FleetReadAsked, todo: ToDo, _now: float) -> None:
+    agreement = node.agreement
+    told = FleetTold(node=node.me, value=agreement.fleet_value, fleet_file=node.fleet_file, disk=agreement.disk)
+    wanted = event.command.with_document
+    todo.add(do.AnswerFleetRead(request=event.request, told=told, with_document=wanted))
+
+
 HANDLERS: Final[Mapping[type[Any], Handler]] = {
     ev.FleetAsked: _on_asked,
     ev.FleetAnswered: _on_answered,
@@ -71,4 +79,5 @@ HANDLERS: Final[Mapping[type[Any], Handler]] = {
     ev.DocumentAsked: _on_document_asked,
     ev.DocumentStored: _on_stored,
     ev.DocumentRefused: _on_refused,
+    ev.FleetReadAsked: _on_read,
 }

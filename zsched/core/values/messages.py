@@ -327,7 +327,34 @@ class ChangeFleet:
             raise ValueError(f"fleet.disk: {self.add_elector} needs the id of its disk")
 
 
-Command = SetWeights | RetryTask | ExplainTask | RestartTask | ReadLines | ChangeFleet
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReadFleet:
+    """Operator's question to one node: by which fleet value and document it goes."""
+
+    with_document: bool = True
+    """Tell the document itself, too: it may be large."""
+
+
+Command = SetWeights | RetryTask | ExplainTask | RestartTask | ReadLines | ChangeFleet | ReadFleet
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FleetTold:
+    """The answer to `ReadFleet`."""
+
+    node: NodeId
+    value: FleetValue | None
+    """What it has learnt; ``None`` while it does not know the fleet's generation."""
+    fleet_file: str
+    """Hash of the fleet by which it goes, whether a document or its own file says it (`fleet_hash`)."""
+    disk: str = ""
+    """Id of the disk with which it may be an elector; empty: it has no state."""
+    content: Document | None = None
+    """The document of the value; ``None``: not asked for, none is agreed, or it is not stored there."""
+
+    def __post_init__(self) -> None:
+        check_name("fleet_told.node", self.node)
+        check_id("fleet_told.disk", self.disk)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -475,6 +475,11 @@ class Agreement:
         return self._numbers.value
 
     @property
+    def disk(self) -> str:
+        """Id of the disk with which this node may be an elector; empty: it has no state."""
+        return self._numbers.disk
+
+    @property
     def number(self) -> int:
         """Of the learnt fleet value; 0 until a change of the fleet is learnt."""
         return self._numbers.number

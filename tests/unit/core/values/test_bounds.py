@@ -13,15 +13,25 @@ from support.beats import beat_of
 from support.fleets import tuning_of
 from support.profiles import load_of, profile_of
 from support.proposals import proposal_of
-from zsched.core.events import LinesAsked, RestartCommanded, RetryCommanded, WeightsCommanded, WorkerJobs, commanded
+from zsched.core.events import (
+    FleetReadAsked,
+    LinesAsked,
+    RestartCommanded,
+    RetryCommanded,
+    WeightsCommanded,
+    WorkerJobs,
+    commanded,
+)
 from zsched.core.relay_protocol import EndMarker, SnapshotChunk, StreamAck, WorkerTrouble
 from zsched.core.values import model
 from zsched.core.values.fleet import Demand
 from zsched.core.values.messages import (
     Accepted,
+    FleetTold,
     Learnt,
     Prepare,
     Promise,
+    ReadFleet,
     ReadLines,
     Refusal,
     Refused,
@@ -133,6 +143,7 @@ NAMES = [
     (ReadLines(task="merge"), "task", "lines"),
     (WorkerLines(node="edge1", task="merge"), "node", "worker_lines"),
     (WorkerLines(node="edge1", task="merge"), "task", "worker_lines"),
+    (FleetTold(node="edge1", value=None, fleet_file=""), "node", "fleet_told"),
 ]
 RATIO = (0.0, 1.0)
 RANGES = [
@@ -221,3 +232,4 @@ def test_each_command_is_its_own_event() -> None:
     assert commanded(8, RetryTask(task="merge")) == RetryCommanded(request=8, command=RetryTask(task="merge"))
     assert commanded(9, RestartTask(task="merge")) == RestartCommanded(request=9, command=RestartTask(task="merge"))
     assert commanded(9, ReadLines(task="merge")) == LinesAsked(request=9, command=ReadLines(task="merge"))
+    assert commanded(9, ReadFleet()) == FleetReadAsked(request=9, command=ReadFleet())

@@ -223,6 +223,10 @@ SAMPLES: dict[str, object] = {
     ),
     "ask_document": messages.AskDocument(document="0d0e"),
     "document": _DOCUMENT,
+    "read_fleet": messages.ReadFleet(with_document=False),
+    "fleet_told": messages.FleetTold(
+        node="robot1", value=_FLEET_VALUE, fleet_file="0123456789abcdef", disk="d1", content=_DOCUMENT
+    ),
     "change_fleet": messages.ChangeFleet(document=_DOCUMENT, base_revision=3, reason="a third robot"),
     "restart_task": messages.RestartTask(task="map_merge"),
     "read_lines": messages.ReadLines(task="map_merge", after=12),
