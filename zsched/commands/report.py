@@ -108,7 +108,8 @@ def header(page: Page, status: Json) -> None:
     parts = [f"fleet {status['fleet']}", f"{status['node']} ({status['kind']}{role})"]
     parts.append(f"quorum {quorum['alive']} of {quorum['electors']}, needs {quorum['needed']}")
     room = page.width - len(health) - 1
-    for extra in (f"up {span(status['up_s'])}", f"zsched {status['version']}"):
+    revision = [f"revision {status['fleet_revision']}"] if status.get("document") else []
+    for extra in (*revision, f"up {span(status['up_s'])}", f"zsched {status['version']}"):
         parts += [extra] if len(" · ".join([*parts, extra])) <= room else []
     page.row((" · ".join(parts), room, "bold"), (health, len(health), style))
 

@@ -66,6 +66,8 @@ def build_snapshot(node: Stages, now: float) -> Snapshot:
         nodes=tuple(_node_status(node, spec, now) for spec in node.fleet.nodes),
         tasks=tuple(_task_status(node, spec, now) for spec in node.fleet.tasks),
         fleet_file=node.fleet_file,
+        fleet_revision=node.agreement.fleet_revision,
+        document=node.agreement.document_hash,
         joins_at=node.joins_at,
         counters=tuple(sorted((node.counters + node.agreement.counters).items())),
         frames_dropped_s=None if node.frames_dropped_at is None else now - node.frames_dropped_at,

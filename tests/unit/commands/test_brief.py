@@ -96,3 +96,11 @@ def test_text_of_another_node_cannot_steer_the_terminal() -> None:
     status = recorded("healthy")
     status["tasks"][0]["owner"] = "a\x1b[2J"
     assert "\x1b" not in render_brief(status, 100, color=False)
+
+
+def test_the_first_line_tells_the_revision_of_an_agreed_document_only() -> None:
+    status = recorded("healthy")
+    assert "revision" not in render_brief(status, 120, color=False).splitlines()[0]
+    told = {**status, "document": "ab12" * 8, "fleet_revision": 7}
+    assert " · revision 7 · up " in render_brief(told, 120, color=False).splitlines()[0]
+    assert "revision" not in render_brief({**told, "document": ""}, 120, color=False).splitlines()[0]

@@ -144,7 +144,11 @@ class Snapshot:
     nodes: tuple[NodeStatus, ...]
     tasks: tuple[TaskStatus, ...]
     fleet_file: str = ""
-    """Hash of the fleet file that the answering node goes by."""
+    """Hash of the fleet file, or of what the document says, by which the answering node goes."""
+    fleet_revision: int = 0
+    """Of the fleet value that it has learnt; 0: no change of the fleet was ever agreed."""
+    document: str = ""
+    """Hash of the document by which it goes; empty: by its own file."""
     joins_at: tuple[str, ...] = ()
     """Where applications on this machine join its streams: zenoh endpoints for a client to dial."""
     counters: tuple[tuple[str, int], ...] = ()

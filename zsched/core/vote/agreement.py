@@ -470,6 +470,12 @@ class Agreement:
         return None if value is None else self._numbers.documents.fleet(value.document)
 
     @property
+    def document_hash(self) -> str:
+        """Hash of the agreed document by which this node goes; empty: by its file."""
+        value = self._numbers.changed
+        return "" if value is None or self.document is None else value.document
+
+    @property
     def fleet_value(self) -> FleetValue | None:
         """The learnt fleet value; ``None`` while the generation is not known."""
         return self._numbers.value
