@@ -6,7 +6,10 @@ of the file (`zsched.config.difference`), how a change is agreed.
 
 from __future__ import annotations
 
+import getpass
+import os
 import shlex
+import socket
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -275,7 +278,7 @@ def _commit(door: Door, view: ApplyView, plan: Plan) -> int:
     for number, step in enumerate(steps):
         try:
             _check_same(held, document)
-            answer = change(door, {**step, "base_revision": held.revision, "reason": view.reason})
+            answer = change(door, {**step, "base_revision": held.revision, "reason": _reason(view)})
             held = wait_until_settled(door, int(answer["revision"]))
         except CliError as error:
             if number == 0 or error.code == EXIT_TIMED_OUT:
@@ -284,6 +287,15 @@ def _commit(door: Door, view: ApplyView, plan: Plan) -> int:
             raise CliError(EXIT_TIMED_OUT, f"{done}: {error}; give the command again") from error
         document = held.document if "text" in step else document
     return _tell(view, plan, "ok", held.revision, EXIT_OK)
+
+
+def _reason(view: ApplyView) -> str:
+    """Why, and who gives the command on which machine: for the journal."""
+    try:
+        who = getpass.getuser()
+    except (KeyError, OSError):  # this user has no name
+        who = f"uid {os.getuid()}"
+    return f"{view.reason or shlex.join(view.words[:1])}, by {who}@{socket.gethostname()}"
 
 
 def _check_same(held: InForce, document: str) -> None:

@@ -153,7 +153,13 @@ def _meet(one: str, other: str) -> bool:
 
 
 def _joined(path: str, before: str | None, after: str | None, found: list[_Verdict]) -> Iterator[Change]:
-    """One change of all that follows from one place; dangers beyond the first are changes of their own."""
+    """One change of all that follows from one place; dangers beyond the first are changes of their own.
+
+    Where a setting begins or ceases to be written down, its default is told.
+    """
+    whole = next((one for one in found if one.paths[:1] == (path,) and one.before and one.after), None)
+    if whole is not None:
+        before, after = before or whole.before, after or whole.after
     found = sorted(found, key=lambda one: (one.danger is None, -_ORDER.index(one.effect)))
     effect = max((one.effect for one in found), key=_ORDER.index)
     text = "; ".join(dict.fromkeys(one.text for one in found))

@@ -58,6 +58,12 @@ def test_the_same_file_and_other_comments_are_no_change() -> None:
         ("cool_down_s: 2}", "cool_down_s: 4}", (f"{RULES}.cool_down_s", "2", "4", "takes effect at once")),
         (", cool_down_s: 2}", "}", (f"{RULES}.cool_down_s", "2", None, "nothing notices")),
         (
+            "cool_down_s: 2}",
+            "cool_down_s: 2, reach: all}",
+            (f"{RULES}.reach", "majority", "all", "takes effect at once"),
+        ),
+        ("bonus: 0.05, ", "", (f"{RULES}.bonus", "0.05", None, "nothing notices")),
+        (
             "--mode, estimate]",
             "--mode, known]",
             (

@@ -57,10 +57,10 @@ class Orders:
             todo.add(do.StoreDocument(request=request, content=command.document))
         elif command.add_elector:
             change = AddElector(base_revision=value.revision, name=command.add_elector, disk=command.disk)
-            self._propose(request, change, todo, now)
+            self._propose(request, _explained(change, command), todo, now)
         else:
             gone = RemoveElector(base_revision=value.revision, name=command.remove_elector)
-            self._propose(request, gone, todo, now)
+            self._propose(request, _explained(gone, command), todo, now)
 
     def on_stored(self, event: ev.DocumentStored, todo: ToDo, now: float) -> None:
         """The document of a command is on disk: propose it."""
@@ -69,7 +69,7 @@ class Orders:
         if command is None or event.request is None or value is None or command.base_revision is None:
             return
         change = document_change(value, event.document, event.fleet, base_revision=command.base_revision)
-        self._propose(event.request, change, todo, now)
+        self._propose(event.request, _explained(change, command), todo, now)
 
     def on_refused(self, event: ev.DocumentRefused, todo: ToDo) -> None:
         """The document of a command is not valid here, or the disk refused it."""
@@ -105,6 +105,11 @@ class Orders:
     def _answer(request: int, outcome: CommandOutcome, detail: str, todo: ToDo, revision: int | None = None) -> None:
         result = CommandResult(outcome=outcome, detail=detail, revision=revision)
         todo.add(do.AnswerCommand(request=request, result=result))
+
+
+def _explained(change: FleetChange, command: ChangeFleet) -> FleetChange:
+    """The change with its operator's reason, if there is one."""
+    return replace(change, reason=command.reason) if command.reason else change
 
 
 def document_change(

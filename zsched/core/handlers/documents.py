@@ -35,8 +35,8 @@ def compare_file(node: Stages) -> None:
     complaint = None
     if agreed is not None and fleet_hash(agreed) != node.by_file:
         complaint = (
-            f"the fleet file here differs from the agreed document, by which this node goes; "
-            f"to agree on the file: `zsched apply {node.fleet_path}`"
+            f"the fleet file here differs from the agreed document, by which this node goes; what it would change: "
+            f"`zsched apply {node.fleet_path} --plan`; to take the document: `zsched fleet export -o {node.fleet_path}`"
         )
     node.set_problem("fleet/file", complaint)
 
