@@ -18,9 +18,10 @@ from typing import Any, Final
 from zsched.config.reader import Mapping as Block
 from zsched.config.reader import Scalar, read_yaml
 from zsched.config.rows import rows
+from zsched.core.route.route import outputs_of
 from zsched.core.route.templates import named_rules
-from zsched.core.values.fleet import Fleet, NodeSpec, StreamRule, TaskSpec, WorkerSpec, runs_worker
-from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.fleet import Fleet, NodeSpec, StreamRule, TaskSpec, WorkerSpec, dial_endpoint, runs_worker
+from zsched.core.values.model import NodeId, NodeKind, TaskId
 
 EVERY_DAEMON: Final = "every daemon must be restarted"
 
@@ -193,13 +194,14 @@ def _verdicts(old: Fleet, new: Fleet, owners: Mapping[TaskId, NodeId | None]) ->
     yield from _timing(old, new)
     yield from _nodes(old, new)
     yield from _tasks(old, new, owners)
+    yield from _sessions(old, new)
     if old.seeds != new.seeds:
-        yield _set(AT_ONCE, "seeds", old.seeds, new.seeds)
+        yield _restart("every daemon dials them from its next start on", "seeds", old.seeds, new.seeds)
     before, after = (fleet.zenoh_config.rpartition("/")[2] for fleet in (old, new))
     if before != after:
         yield _restart(EVERY_DAEMON, "zenoh", before, after)
     if old.relay_orphan_s != new.relay_orphan_s:
-        yield _set(AT_ONCE, "relay_orphan_s", old.relay_orphan_s, new.relay_orphan_s)
+        yield _restart(EVERY_DAEMON, "relay_orphan_s", old.relay_orphan_s, new.relay_orphan_s)
     if old.shared_memory is not new.shared_memory:
         yield _restart(EVERY_DAEMON, "shared_memory", old.shared_memory, new.shared_memory)
 
@@ -229,6 +231,23 @@ def _electors(agreed: tuple[NodeId, ...], wanted: tuple[NodeId, ...]) -> _Verdic
     )
 
 
+def _sessions(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
+    """Workers dial every robot that has an address: a new one takes a new session."""
+    known, tasks = set(_addresses(old).values()), {task.name for task in old.tasks}
+    come = [name for name, address in _addresses(new).items() if address not in known]
+    for name in come:
+        for verdict in (_renewed(task) for task in new.tasks if task.name in tasks):
+            yield replace(verdict, text=f"{verdict.text}, to dial {name}", paths=(f"nodes.{name}",))
+
+
+def _addresses(fleet: Fleet) -> dict[NodeId, str]:
+    """{robot: where others dial its data session}, of robots that have an address."""
+    found = {
+        node.name: dial_endpoint(node.listen_data, node.host) for node in fleet.nodes if node.kind is NodeKind.ROBOT
+    }
+    return {name: address for name, address in found.items() if address}
+
+
 def _nodes(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
     before, after = ({node.name: node for node in fleet.nodes} for fleet in (old, new))
     for name in (name for name in after if name not in before):
@@ -247,8 +266,8 @@ def _node(old: NodeSpec, new: NodeSpec) -> Iterator[_Verdict]:
     if old.kind is not new.kind:
         yield _restart(restart, f"{path}.kind", old.kind, new.kind)
     if old.host != new.host:
-        dialled = replace(AT_ONCE, text="the others dial it there")
-        yield _set(dialled, f"{path}.host", old.host, new.host)
+        text = f"the others dial {old.name} there from their next start on"
+        yield _restart(text, f"{path}.host", old.host, new.host)
     for name in ("control", "data"):
         before, after = getattr(old, f"listen_{name}"), getattr(new, f"listen_{name}")
         if before != after:
@@ -313,25 +332,35 @@ def _tuning(old: TaskSpec, new: TaskSpec, path: str) -> Iterator[_Verdict]:
         yield _set(AT_ONCE, f"{path}.scheduling.patience", patience, other)
 
 
-_OF_A_PROCESS: Final = ("command", "env", "link", "ready_when")
-"""What a worker is told when it starts."""
+_OF_A_PROCESS: Final = ("command", "env", "link")
+"""What a worker's process keeps until it ends."""
 
 
 def _worker(old: TaskSpec, new: TaskSpec, fleets: tuple[Fleet, Fleet]) -> Iterator[_Verdict]:
+    path = f"tasks.{old.name}"
     kinds = {node.name: node.kind for fleet in fleets for node in fleet.nodes}
     homes = [name for name in sorted(kinds) if runs_worker(new, name, kinds[name])]
     for one in fields(WorkerSpec):
         before, after = getattr(old.worker, one.name), getattr(new.worker, one.name)
-        if before == after:
-            continue
-        verdict = AT_ONCE
-        if one.name in _OF_A_PROCESS and len(homes) > 1:
-            verdict = _Verdict(effect=Effect.WORKERS, text=f"workers of {old.name} restart one after another")
-        elif one.name in _OF_A_PROCESS:
-            text = f"the worker of {old.name} restarts in place"
-            verdict = _Verdict(effect=Effect.WORKERS, text=text, danger=Danger.PAUSE_TASK, about=old.name)
-        key = "ready" if one.name == "ready_when" else one.name
-        yield _set(verdict, f"tasks.{old.name}.worker.{key}", _plain(before), _plain(after))
+        if before != after:
+            verdict = _renewed(new) if one.name in _OF_A_PROCESS else AT_ONCE
+            key = "ready" if one.name == "ready_when" else one.name
+            yield _set(verdict, f"{path}.worker.{key}", _plain(before), _plain(after))
+    deadlines = old.tuning.deadline_ms, new.tuning.deadline_ms
+    if deadlines[0] != deadlines[1]:
+        yield _set(_renewed(new), f"{path}.scheduling.deadline_ms", *deadlines)
+    if any(outputs_of(old, name) != outputs_of(new, name) for name in homes):
+        yield replace(_renewed(new), paths=(f"{path}.outputs", f"{path}.ros2.outputs"))
+
+
+def _renewed(task: TaskSpec) -> _Verdict:
+    """What follows when a task's workers need another process."""
+    if not task.worker.command:
+        return _Verdict(effect=Effect.WORKERS, text=f"restart the workers of {task.name}, which somebody else starts")
+    if len(task.candidates) > 1:
+        return _Verdict(effect=Effect.WORKERS, text=f"workers of {task.name} restart one after another")
+    text = f"the worker of {task.name} restarts in place"
+    return _Verdict(effect=Effect.WORKERS, text=text, danger=Danger.PAUSE_TASK, about=task.name)
 
 
 _LISTS: Final = {"in": "inputs", "out": "outputs", "srv": "services"}

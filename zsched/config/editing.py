@@ -257,10 +257,9 @@ def _added(text: str, section: str, fragment: str, added: Node) -> str:
     if found is None:
         return f"{_ended(text)}\n{section}:\n{_block(fragment, section, added, _STEP)}"
     if found.is_flow and found.entries:
-        inside = text[: found.end - 1].rstrip()
-        comma = "" if inside.endswith(",") else ","
+        at = found.entries[-1].end
         more = ", ".join(f"{name}: {flow(held)}" for name, held in _pairs(added))
-        return f"{text[: found.end - 1]}{comma} {more}{text[found.end - 1 :]}"
+        return f"{text[:at]}, {more}{text[at:]}"
     if not found.entries:
         if found.is_flow:
             text = text[: found.start].rstrip(" ") + text[found.end :]

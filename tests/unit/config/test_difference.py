@@ -81,7 +81,7 @@ def test_the_same_file_and_other_comments_are_no_change() -> None:
         (
             "host: 192.0.2.11 ",
             "host: 192.0.2.13 ",
-            ("nodes.edge1.host", "192.0.2.11", "192.0.2.13", "the others dial it there"),
+            ("nodes.edge1.host", "192.0.2.11", "192.0.2.13", "the others dial edge1 there from their next start on"),
         ),
         (
             "  robot3: {kind: robot, wifi: wlan0}\n",
@@ -110,11 +110,28 @@ def test_an_owner_that_is_no_candidate_any_more_is_left() -> None:
 def test_a_rule_that_comes_goes_or_differs_names_its_streams() -> None:
     line = '      - {from: "{target}/map_merge/{epoch}/tf", to: "{robot}/map_merge/tf", class: latest}\n'
     gone = with_(line, "")
+    workers = "workers of map_merge restart one after another"
+    ends = f"{workers}; the streams map_merge/out/2 end; the streams map_merge/out/1 move"
     assert [(one.path, one.after, one.consequence) for one in changes(gone)] == [
-        ("tasks.map_merge.outputs[1]", None, "the streams map_merge/out/2 end; the streams map_merge/out/1 move")
+        ("tasks.map_merge.outputs[1]", None, ends)
     ]
-    assert [one.consequence for one in changes(TEXT, gone)] == [
-        "the streams map_merge/out/2 begin; the streams map_merge/out/1 move"
+    begins = f"{workers}; the streams map_merge/out/2 begin; the streams map_merge/out/1 move"
+    assert [one.consequence for one in changes(TEXT, gone)] == [begins]
+
+
+def test_workers_take_a_new_process_for_all_that_a_process_keeps() -> None:
+    """A robot with an address is one more whom they dial; a deadline is told in their environment."""
+    listen = "listen: {control: tcp/0.0.0.0:7457, data: tcp/0.0.0.0:7458}"
+    robot = with_("  robot3:", f"  robot4: {{kind: robot, host: 192.0.2.24, {listen}}}\n  robot3:")
+    text = "robot4 may join: start its daemon; workers of map_merge restart one after another, to dial robot4"
+    assert ("nodes.robot4", text) in [(one.path, one.consequence) for one in changes(robot)]
+    late = with_("cool_down_s: 2}", "cool_down_s: 2, objective: latency, deadline_ms: 80}")
+    (told,) = (one for one in changes(late) if one.path.endswith("deadline_ms"))
+    assert (told.effect, told.after) == (Effect.WORKERS, "80")
+    by_hand = with_("      command: [python, -m, zsched.tasks.map_merge, --mode, estimate]\n", "      link: peer\n")
+    other = with_("link: peer", "link: client", by_hand)
+    assert [one.consequence for one in changes(other, by_hand)] == [
+        "restart the workers of map_merge, which somebody else starts"
     ]
 
 

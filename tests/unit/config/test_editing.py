@@ -78,7 +78,7 @@ def test_a_task_that_was_added_is_removed_without_a_trace_of_its_lines(name: str
         ("tasks:\nseeds: [e1]\n", "tasks:\n  t: {a: 1}\nseeds: [e1]\n"),
         ("seeds: [e1]", "seeds: [e1]\n\ntasks:\n  t: {a: 1}\n"),
         ("tasks: {u: {b: 2}}\n", "tasks: {u: {b: 2}, t: {a: 1}}\n"),
-        ("tasks: {\n  u: {b: 2},\n}\n", "tasks: {\n  u: {b: 2},\n t: {a: 1}}\n"),
+        ("tasks: {\n  u: {b: 2},\n}\n", "tasks: {\n  u: {b: 2}, t: {a: 1},\n}\n"),
         ("tasks:\n   u: {b: 2}\n   # of u?\n# end\n", "tasks:\n   u: {b: 2}\n   t: {a: 1}\n   # of u?\n# end\n"),
         (
             "tasks:\n  u:\n    text: |\n      one\n\nz: 1\n",
@@ -88,6 +88,14 @@ def test_a_task_that_was_added_is_removed_without_a_trace_of_its_lines(name: str
 )
 def test_an_entry_goes_into_every_style_of_section(before: str, after: str) -> None:
     assert add_entries(before, "tasks", "tasks: {t: {a: 1}}") == after
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["tasks: {u: 2}\n", "tasks: {\n u: 2,  # c\n}\n", "tasks:\n  # c\n  u: 2  # d\n\n# e\n", '{"tasks": {"u": 2\n}}'],
+)
+def test_what_comes_and_goes_leaves_no_trace(text: str) -> None:
+    assert remove_task(add_entries(text, "tasks", "tasks: {t: {a: [1]}}"), "t") == text
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,142 @@
+"""`zsched apply` on real daemons: a task comes and goes by the document while a reliable stream of another one runs."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from support.sessions import matches
+from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
+
+SECOND = """\
+tasks:
+  # the second shift
+  second:
+    candidates: {kind: edge}
+    weights: {cpu: 0.5, memory: 0.5}
+    scheduling: {score: paper, cool_down_s: 0}
+    worker: {command: [python, -m, zsched.tasks.echo]}
+    inputs: [{from: "{robot}/in2", to: "{target}/second/{robot}/in"}]
+    outputs: [{from: "{target}/second/{epoch}/{robot}/out", to: "{robot}/out2"}]
+"""
+PERIOD_S = 0.01
+
+
+class Operator:
+    """The command line of one machine."""
+
+    def __init__(self, bed: Testbed) -> None:
+        kept = {name: value for name, value in os.environ.items() if not name.startswith("ZSCHED_")}
+        self._env = {**kept, "ZSCHED_RUNTIME_DIR": str(bed.folder), "ZSCHED_NODE": "robot1"}
+
+    def zsched(self, *words: object) -> subprocess.CompletedProcess[bytes]:
+        """One verb, to its end."""
+        command = [sys.executable, "-m", "zsched.cli", *map(str, words)]
+        return subprocess.run(command, env=self._env, capture_output=True, timeout=60, check=False)
+
+    def done(self, *words: object) -> str:
+        """What a verb prints that must succeed."""
+        result = self.zsched(*words)
+        assert result.returncode == 0, (words, result.stderr.decode())
+        return result.stdout.decode()
+
+
+class Stream:
+    """An application that puts numbers into the first task's input and keeps what comes back."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self.back: list[int] = []
+        self.sent = 0
+        self._sub = session.declare_subscriber(
+            "robot1/out", lambda sample: self.back.append(int(sample.payload.to_bytes()))
+        )
+        self.publisher = session.declare_publisher("robot1/in", congestion_control=zenoh.CongestionControl.BLOCK)
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._ended.wait(PERIOD_S):
+            self.publisher.put(str(self.sent).encode())
+            self.sent += 1
+
+    def end(self) -> None:
+        self._ended.set()
+        self._thread.join(60)
+
+
+def as_written(tree: dict[str, Any]) -> str:
+    """The fleet file as an operator would write it, with comments."""
+    lines = ["# ours", f"fleet: {tree['fleet']}", f"timing: {tree['timing']}  # on the shop floor"]
+    for section in ("nodes", "tasks"):
+        lines += [f"{section}:", *(f"  {name}: {json.dumps(held)}" for name, held in tree[section].items())]
+    return "\n".join((*lines, "# end", ""))
+
+
+def tasks_of(bed: Testbed, node: str) -> dict[str, str | None]:
+    """{task: its owner}, as a node tells."""
+    return {str(task["name"]): task["owner"] for task in bed.status(node)["tasks"]}
+
+
+def test_a_task_comes_and_goes_by_the_document_while_a_stream_runs(tmp_path: Path) -> None:
+    tree = echo_fleet(edges=2, stream_class="reliable")
+    with Testbed(tmp_path, tree) as bed:
+        bed.init()
+        bed.start()
+        bed.wait_settled()
+        operator, session = Operator(bed), bed.app("robot1")
+        stream = Stream(session)
+        bed.wait(lambda: matches(stream.publisher), 60, "the relay subscribes")
+        stream.start()
+        bed.wait(lambda: len(stream.back) > 20, 60, "the stream flows")
+
+        # the first document is the file that runs; another text of it is another document
+        file = tmp_path / "agreed.yaml"
+        file.write_text(as_written(tree))
+        assert operator.zsched("apply", file, "--plan").returncode == 10
+        operator.done("apply", file, "--yes")
+        assert operator.zsched("fleet", "export").stdout == file.read_bytes(), "byte for byte"
+        first = int(bed.status("robot1")["fleet_revision"])
+
+        # a task comes: it gets an owner, and its streams work
+        fragment = tmp_path / "second.yaml"
+        fragment.write_text(SECOND)
+        told = operator.done("task", "add", fragment, "--yes", "-m", "more work")
+        assert "task second begins, on one of edge1, edge2" in told
+        bed.wait(lambda: all(tasks_of(bed, name).get("second") for name in bed.names), 60, "all nodes know its owner")
+        back: list[bytes] = []
+        sub = session.declare_subscriber("robot1/out2", lambda sample: back.append(sample.payload.to_bytes()))
+        publisher = session.declare_publisher("robot1/in2")
+
+        def answers() -> bool:
+            publisher.put(b"1")
+            return bool(back)
+
+        bed.wait(answers, 60, "an answer of the task that came")
+        assert "more work, by " in operator.done("events")
+
+        # who saw the fleet before that is refused
+        late = operator.zsched("apply", file, "--yes", "--accept", "remove-task", "--revision", first)
+        assert late.returncode == 1
+        assert b"is overtaken" in late.stderr
+        assert "second" in tasks_of(bed, "robot2")
+
+        # it goes: its worker and its streams end, the first stream has lost nothing
+        operator.done("task", "remove", "second", "--yes", "--accept", "remove-task")
+        bed.wait(lambda: all(list(tasks_of(bed, name)) == [TASK] for name in bed.names), 60, "the task is gone")
+        assert operator.zsched("fleet", "export").stdout == file.read_bytes(), "nothing of it is left in the text"
+        reached = len(stream.back)
+        bed.wait(lambda: len(stream.back) > reached + 20, 60, "the stream flows on")
+        stream.end()
+        bed.wait(lambda: len(stream.back) >= stream.sent, 60, "every sample is answered")
+        assert stream.back == list(range(stream.sent))
+        sub.undeclare()
