@@ -18,13 +18,18 @@ from support.proposals import proposal_of
 from support.states import state_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
+from zsched.core.electorate.changes import AdoptDocument
+from zsched.core.electorate.founding import founded
 from zsched.core.node import Node
 from zsched.core.report import snapshot_json
 from zsched.core.status import build_snapshot, status_line
+from zsched.core.values.document import Document, Text
+from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Standby, StreamRule, TaskSpec, WorkerSpec, electorate_hash
 from zsched.core.values.messages import (
     Accept,
     Accepted,
+    ChangeFleet,
     ExplainTask,
     Learnt,
     Prepare,
@@ -37,6 +42,8 @@ from zsched.core.values.messages import (
     RetryTask,
     SetWeights,
     Utilities,
+    fleet_answer,
+    fleet_question,
 )
 from zsched.core.values.model import (
     Acceptance,
@@ -98,6 +105,16 @@ def make(me: str, *, has_state: bool = True) -> Node:
     )
 
 
+FOUNDING = founded(FLEET.name, 0, FLEET.electors)
+
+
+def adopted(document: str) -> FleetValue:
+    """The fleet value by which the fleet goes by a first document."""
+    tasks = tuple((name, name == "alone") for name in TASKS if name != "other")
+    change = AdoptDocument(base_revision=1, document=document, tasks=tasks, lease_s=FLEET.timing.lease_s)
+    return change.apply(FOUNDING)
+
+
 class Storm:
     """Well-formed events by seed; about half of them fit the moment, so that rounds and handovers get somewhere."""
 
@@ -110,14 +127,18 @@ class Storm:
         self.makers: tuple[Callable[[], ev.Event], ...] = (
             ev.DeadlineReached, self.sampled, self.profile, self.utility, self.proposal, self.prepare, self.accept,
             self.answer, self.answer, self.answer, self.learnt, self.beat, self.beat, self.token, self.worker,
-            self.slot, self.slot, self.counted, self.relay, self.status, self.command, self.problem,
+            self.slot, self.slot, self.counted, self.relay, self.status, self.command, self.problem, self.fleet,
         )  # fmt: skip
+        self.electors: list[do.AskElectors] = []
+        self.storing: list[do.StoreDocument] = []
 
     def hear(self, batch: tuple[do.Instruction, ...]) -> None:
         self.asked += [one for one in batch if isinstance(one, do.AskUtilities | do.SendPrepare | do.SendAccept)]
         self.plans += [one for one in batch if isinstance(one, do.ApplyRoutes)]
         self.epochs |= {one.role.task: one.role.epoch for one in batch if isinstance(one, do.SetRole)}
-        del self.asked[:-6], self.plans[:-4]
+        self.electors += [one for one in batch if isinstance(one, do.AskElectors)]
+        self.storing += [one for one in batch if isinstance(one, do.StoreDocument)]
+        del self.asked[:-6], self.plans[:-4], self.electors[:-2], self.storing[:-2]
 
     def event(self) -> ev.Event:
         if self.rng.random() < 0.002:
@@ -236,7 +257,8 @@ class Storm:
     def learnt(self) -> ev.Event:
         if self.rng.random() < 0.9:
             return ev.LearntAsked(request=self.number())
-        learnt = Learnt(node=self.name(), values=(self.value(self.task()),))
+        changed = adopted(self.rng.choice(("ab", "cd"))) if self.rng.random() < 0.3 else None
+        learnt = Learnt(node=self.name(), values=(self.value(self.task()),), fleet=changed)
         return ev.LearntReceived(learnt=learnt, is_answer=self.rng.random() < 0.8)
 
     def beat(self) -> ev.Event:
@@ -306,6 +328,54 @@ class Storm:
 
     def relay(self) -> ev.Event:
         return ev.RelayChanged(is_running=self.rng.random() < 0.5, reason="x")
+
+    def fleet(self) -> ev.Event:
+        """The fleet register and its documents, which all say what the file says."""
+        kind = self.rng.randrange(8)
+        if kind == 0:
+            change = ChangeFleet(document=Document(text=Text(self.rng.choice("ab"))))
+            return ev.FleetCommanded(request=self.number(), command=change)
+        if kind == 1:
+            removal = ChangeFleet(remove_elector=self.rng.choice(ROBOTS), base_revision=self.rng.choice((None, 1)))
+            return ev.FleetCommanded(request=self.number(), command=removal)
+        if kind == 2:
+            return ev.DocumentAsked(request=self.number(), document="ab")
+        if kind == 3:
+            return self.stored()
+        return self.fleet_answer() if self.electors and self.rng.random() < 0.7 else self.fleet_asked()
+
+    def stored(self) -> ev.Event:
+        order = self.storing[-1] if self.storing and self.rng.random() < 0.5 else None
+        name = "ab" if order is None else wire.document_hash(order.content)
+        request = None if order is None else order.request
+        if self.rng.random() < 0.1:
+            return ev.DocumentRefused(document=name, reason="no", request=request)
+        return ev.DocumentStored(document=name, fleet=FLEET, request=request)
+
+    def fleet_asked(self) -> ev.Event:
+        asker = self.name()
+        generation_id = FOUNDING.generation_id if self.rng.random() < 0.9 else "ff"
+        ballot, number = self.ballot(asker), self.rng.choice((1, 1, 1, 2))
+        question: Prepare | Accept[FleetValue] = Prepare(
+            task=FLEET.name, ballot=ballot, electorate=ELECTORATE, generation_id=generation_id, number=number
+        )
+        if self.rng.random() < 0.5:
+            question = Accept(
+                task=FLEET.name,
+                acceptance=Acceptance(ballot=ballot, value=adopted(self.rng.choice(("ab", "cd")))),
+                electorate=ELECTORATE,
+                generation_id=generation_id,
+                number=number,
+            )
+        return ev.FleetAsked(request=self.number(), asker=asker, question=fleet_question(question))
+
+    def fleet_answer(self) -> ev.Event:
+        last = self.electors[-1].question
+        elector = self.rng.choice(self.electors[-1].to)
+        if isinstance(last, Prepare):
+            return ev.FleetAnswered(answer=fleet_answer(Promise(elector=elector, task=last.task, ballot=last.ballot)))
+        at = last.acceptance.ballot
+        return ev.FleetAnswered(answer=fleet_answer(Accepted(elector=elector, task=last.task, ballot=at)))
 
     def status(self) -> ev.Event:
         return ev.StatusAsked(request=self.number())
