@@ -465,6 +465,22 @@ class ProblemReported:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class RecipeCompared:
+    """What the process of this node's worker was started with was compared with what it would be started with now."""
+
+    task: TaskId
+    is_old: bool
+    """It runs by an old command, environment or session; false as well once it has ended."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FleetChanged:
+    """Another fleet file, read and validated, holds on this node from now on."""
+
+    fleet: Fleet
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class StopRequested:
     """The daemon must stop: this node takes no new task and hands its tasks over."""
 
@@ -513,6 +529,8 @@ Event = (
     | FrameDropped
     | AddressesTried
     | ProblemReported
+    | RecipeCompared
+    | FleetChanged
     | StopRequested
 )
 

@@ -15,6 +15,7 @@ from zsched.core.values.decision import Decision, Explanation, Move
 from zsched.core.values.document import Document
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import FleetValue
+from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import (
     Accept,
     Accepted,
@@ -172,6 +173,26 @@ class RestartWorker:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RenewWorker:
     """An operator wants this node's worker for the task stopped and started again; that is no failure."""
+
+    task: TaskId
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AdoptFleet:
+    """Go by another fleet file: commands, environments, sessions to come, and what the relay watches.
+
+    It is the first instruction of its batch that is not sent.
+    """
+
+    fleet: Fleet
+    """As it was read: what this daemon cannot take over is to be told to the operator."""
+    is_agreed: bool = False
+    """It is an agreed document: electors and leases are those in force."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EndTask:
+    """The task left the fleet file: the relay ends its streams and forgets it."""
 
     task: TaskId
 
@@ -356,6 +377,8 @@ Instruction = (
     | ResetWorker
     | RestartWorker
     | RenewWorker
+    | AdoptFleet
+    | EndTask
     | SetRole
     | ApplyRoutes
     | AnswerStatus

@@ -16,10 +16,11 @@ from typing import Any, Final
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.handlers import beats, choice, documents, operators, work
+from zsched.core.handlers import beats, choice, documents, fleet, operators, work
 from zsched.core.stages import Handler, Stages
 from zsched.core.todo import ToDo
 from zsched.core.values.change import MoveOwner
+from zsched.core.values.plan import WorkerRole
 
 _HANDLERS: Final[Mapping[type[Any], Handler]] = {
     ev.DeadlineReached: lambda _node, _event, _todo, _now: None,
@@ -28,6 +29,7 @@ _HANDLERS: Final[Mapping[type[Any], Handler]] = {
     **beats.HANDLERS,
     **operators.HANDLERS,
     **documents.HANDLERS,
+    **fleet.HANDLERS,
 }
 _OFTEN_QUIET: Final = frozenset(
     {
@@ -56,7 +58,7 @@ class Node(Stages):
         todo = self._todo
         todo.must_persist = self.agreement.must_persist
         todo.add(*self.agreement.at_start.send)
-        documents.compare_file(self)
+        fleet.compare_file(self)
         for name, executor in self.executors.items():
             executor.start(todo)
             value = self.registers[name].value
@@ -169,6 +171,9 @@ class Node(Stages):
             self.votes.count(self.values(), self.membership.states(), todo, now)
         for task, change in self.votes.due_commits(now):
             self.agreement.propose(task, change, todo, now)
+        for task, retune in () if self.retuning.is_idle else self.retuning.due(self.values(), now):
+            if not self.registers[task].is_busy:
+                self.agreement.propose(task, retune, todo, now)
         if now >= self.agreement.next_deadline():
             self.agreement.tick(todo, now)
 
@@ -182,6 +187,21 @@ class Node(Stages):
         for executor in self.executors.values():
             if now >= executor.next_deadline():
                 executor.tick(todo, now)
+        self._renew_workers(todo, now)
+
+    def _renew_workers(self, todo: ToDo, now: float) -> None:
+        """Start workers again that run by an old recipe, when it is their turn."""
+        for name in self.renewals() if self.renewing.told else ():
+            executor = self.executors[name]
+            self.renewing.tend(
+                executor.spec,
+                self.registers[name].value,
+                self.heard_candidates(executor.spec, now),
+                todo,
+                now,
+                is_at_work=executor.role.role is not WorkerRole.IDLE,
+                fleet_file=self.fleet_file,
+            )
 
     def _settle(self, now: float) -> None:
         """What a stage has left for another one: calls to a vote, its end, changes that have ended, learnt values."""

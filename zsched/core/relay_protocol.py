@@ -3,10 +3,10 @@
 Knows: the messages between the daemon and its relay beside plans, roles and the events of `zsched.core.events`; the
 content of end markers. Does not know: pipes, frames, zenoh.
 
-Commands (daemon to relay): `RoutePlan`, `Role`, `WorkerWatch`, `RelayStop`. Reports (relay to daemon): `RelayStarted`,
-`WorkerSeen`, `WorkerMatched`, `WorkerTrouble`, `WorkerJobs`, `SlotLost` and the events `SlotReady`, `SlotFlipped`,
-`SlotDrained`, `RoleEnded`, `StreamsCounted`, `ProblemReported`, `FrameDropped`. The handle adds `RelayChanged`. Between
-workers and relays: `WorkerTrouble`, `WorkerJobs`, `EndMarker`, `StreamAcks`.
+Commands (daemon to relay): `RoutePlan`, `Role`, `WorkerWatch`, `TaskEnded`, `RelayStop`. Reports (relay to daemon):
+`RelayStarted`, `WorkerSeen`, `WorkerMatched`, `WorkerTrouble`, `WorkerJobs`, `SlotLost` and the events `SlotReady`,
+`SlotFlipped`, `SlotDrained`, `RoleEnded`, `StreamsCounted`, `ProblemReported`, `FrameDropped`. The handle adds
+`RelayChanged`. Between workers and relays: `WorkerTrouble`, `WorkerJobs`, `EndMarker`, `StreamAcks`.
 """
 
 from __future__ import annotations
@@ -36,6 +36,16 @@ class RelayStop:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class TaskEnded:
+    """The task left the fleet file: close its streams, watch nothing of it, tell its worker nothing any more."""
+
+    task: TaskId
+
+    def __post_init__(self) -> None:
+        check_name("ended.task", self.task)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RelayStarted:
     """The relay's data session is open."""
 
@@ -59,7 +69,7 @@ class WorkerSeen:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorkerWatch:
-    """A task's keys that do not depend on its owner; told once, when the daemon starts.
+    """A task's keys that do not depend on its owner; told when the daemon starts, and when they change.
 
     The first three are for a worker of this node that shows no token (`zsched.relay.matching`).
     """
@@ -224,7 +234,7 @@ class SlotLost:
     samples: int
 
 
-RelayCommand = RoutePlan | Role | WorkerWatch | RelayStop
+RelayCommand = RoutePlan | Role | WorkerWatch | TaskEnded | RelayStop
 RelayReport = (
     RelayStarted
     | WorkerSeen

@@ -17,6 +17,7 @@ from typing import Any
 from zsched.core.events import SlotReady
 from zsched.core.executor.handover import Executor
 from zsched.core.executor.progress import HangWatch
+from zsched.core.executor.renewing import Renewing
 from zsched.core.executor.sealing import Sealing
 from zsched.core.executor.tenure import Tenure
 from zsched.core.executor.workers import Workers
@@ -38,9 +39,10 @@ from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts
 from zsched.core.todo import ToDo
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet, TaskSpec, fleet_hash
-from zsched.core.values.model import Allocation, NodeId, NodeKind, PeerState, TaskId
+from zsched.core.values.model import Allocation, NodeId, NodeKind, PeerState, Profile, TaskId
 from zsched.core.values.plan import StreamCount
 from zsched.core.vote.agreement import Agreement
+from zsched.core.vote.retuning import Retuning
 from zsched.core.vote.votes import Votes
 
 HISTORY = 32
@@ -101,6 +103,8 @@ class Stages:
         """The state file is whole, and of another electorate than the fleet file: it stays on its disk."""
         self.lacks_state_file = False
         """There is none at all, rather than one that cannot be used."""
+        self.told_fleet = fleet
+        """The newest fleet file that was given to the runtime; what of it is in force is `fleet`."""
         self.fleet_file = fleet_hash(fleet)
         self.fleet_path = ""
         """Where that file lies, for the status."""
@@ -135,12 +139,14 @@ class Stages:
             stored=stored,
         )
         self.registers = self.agreement.registers
+        self.retuning = Retuning(me)
         # EXECUTOR, ROUTE
         self.executors = {
             task.name: Executor(spec=task, me=me, has_streams=self.kind is NodeKind.ROBOT) for task in fleet.tasks
         }
         self.workers = Workers.of(fleet, me)
         self.worker_states = self.workers.states
+        self.renewing = Renewing(me)
         self.hangs = HangWatch(fleet)
         self.tenure = Tenure(fleet, me, self.agreement.leases, self.executors)
         self.sealing = Sealing(fleet, me, self.executors, self.agreement.leases.over_at)
@@ -202,6 +208,16 @@ class Stages:
     def is_orphan(self, owner: NodeId | None) -> bool:
         """Whether a task's owner is gone: nobody could be found for it so far."""
         return owner is not None and self.membership.state(owner) is PeerState.GONE
+
+    def renewals(self) -> tuple[TaskId, ...]:
+        """The tasks whose worker here runs by an old recipe, as far as the fleet file names them."""
+        return tuple(name for name in sorted(self.renewing.told) if name in self.executors)
+
+    def heard_candidates(self, spec: TaskSpec, now: float) -> Mapping[NodeId, Profile]:
+        """{candidate: its fresh profile} of the living ones, this node left out."""
+        living = [name for name in spec.candidates if self.membership.state(name) is PeerState.ALIVE]
+        profiles = ((name, self.gateway.fresh(name, now)) for name in living if name != self.me)
+        return {name: profile for name, profile in profiles if profile is not None}
 
     def _doubts(self, spec: TaskSpec, now: float) -> Doubts:
         in_grace, unproven = self.membership.in_grace(), self.probation.doubts(spec, now)

@@ -20,11 +20,14 @@ from zsched.core.values.model import Allocation, TaskId
 
 _LOCAL = frozenset(
     {
+        do.AdoptFleet,
+        do.EndTask,
         do.ApplyRoutes,
         do.SetRole,
         do.StartWorker,
         do.StopWorker,
         do.ResetWorker,
+        do.RenewWorker,
         do.RestartWorker,
         do.RecordStory,
         do.StandDown,

@@ -62,6 +62,10 @@ class Numbers:
         self._held_for: FleetValue | None = None
         """The newest value that a peer has told as learnt, while its document is missing."""
 
+    def adopt(self, fleet: Fleet) -> None:
+        """Go by another fleet file; its registers are there already, but for those of a document (`Roll`)."""
+        self._fleet = fleet
+
     def begin(self, generation: int, electorate: str, todo: ToDo, now: float, *, may_elect: bool) -> None:
         """The generation is known: count by what the state holds, or by what every node makes of its file."""
         first = founded(self._fleet.name, generation, self._fleet.electors)
@@ -104,6 +108,12 @@ class Numbers:
             rng=self._rng,
             disk=self.disk,
         )
+
+    def count_in(self, register: TaskRegister, now: float) -> None:
+        """A register begins by the file: it counts as the others do."""
+        if self.roll is not None:
+            count, is_elector = self.roll.value.electorate, self.roll.is_elector
+            register.count_with(count, is_elector=is_elector, is_blank=False, now=now)
 
     # --- queries -----------------------------------------------------------------------------------------------------
 

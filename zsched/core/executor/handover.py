@@ -36,7 +36,7 @@ import math
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
-from zsched.core.instructions import ApplyRoutes, RecordStory, SetRole, StartWorker, StopWorker
+from zsched.core.instructions import ApplyRoutes, EndTask, RecordStory, SetRole, StartWorker, StopWorker
 from zsched.core.route.route import plan_for, slot_for
 from zsched.core.todo import ToDo
 from zsched.core.values.fleet import OnIsolation, Standby, TaskSpec, runs_worker
@@ -109,7 +109,11 @@ class Executor:
 
     @property
     def runs_worker(self) -> bool:
-        """Whether this node keeps a worker of the task."""
+        """Whether this node keeps a worker of the task: by the file, or because its work here is not over."""
+        return self._keeps_worker or self.role.role is not WorkerRole.IDLE
+
+    @property
+    def _keeps_worker(self) -> bool:
         return runs_worker(self.spec, self.me, NodeKind.ROBOT if self.has_streams else NodeKind.EDGE)
 
     @property
@@ -131,8 +135,7 @@ class Executor:
             if self.spec.worker.standby is Standby.COLD and self.role.role is WorkerRole.IDLE:
                 todo.add(StopWorker(task=self.spec.name))
         if self._current is not None:
-            phases = {Phase.PREPARING: RoutePhase.PREPARE, Phase.SETTLED: RoutePhase.CLOSE}
-            todo.add(ApplyRoutes(plan=self._plan(self._current, phases.get(self.phase, RoutePhase.FLIP))))
+            todo.add(ApplyRoutes(plan=self._plan(self._current, self._plan_phase)))
 
     def next_deadline(self) -> float:
         """When `tick` may have something to do; infinity when never."""
@@ -142,6 +145,65 @@ class Executor:
         """The node starts: warm candidates start their worker."""
         if self.runs_worker and self.spec.worker.command and self.spec.worker.standby is Standby.WARM:
             todo.add(StartWorker(task=self.spec.name))
+
+    # --- a changed fleet file ------------------------------------------------------------------------------------
+
+    def adopt(self, spec: TaskSpec, todo: ToDo, *, is_agreed_leased: bool) -> None:
+        """Go by another version of the task's file: worker, right to work and streams follow it at once.
+
+        The slots of predecessors stay as they were opened. ``is_agreed_leased``: the task is exclusive for everybody.
+        """
+        before, kept_worker = self.spec, self._keeps_worker
+        was_leased = self.is_leased
+        self.spec, self.is_leased = spec, spec.exclusive or is_agreed_leased
+        if spec == before and self.is_leased is was_leased:
+            return
+        if self.is_local and spec.on_isolation is not OnIsolation.LOCAL:
+            self.rejoin(todo)
+        self._adopt_worker(before, todo, had_worker=kept_worker)
+        if self.is_leased is not was_leased:
+            self._change_terms(todo)
+        self._adopt_routes(before, todo)
+
+    def _adopt_worker(self, before: TaskSpec, todo: ToDo, *, had_worker: bool) -> None:
+        worker, known = self.spec.worker, before.worker
+        if self._keeps_worker and self.owner == self.me and self.role.role is WorkerRole.IDLE and not had_worker:
+            self._take_up(None, todo)  # it was chosen by nodes that had this file before
+        if (self._keeps_worker, worker.command, worker.standby) == (had_worker, known.command, known.standby):
+            return
+        if not self.runs_worker:
+            todo.add(StopWorker(task=self.spec.name))
+        elif worker.command and (worker.standby is Standby.WARM or self.role.role is not WorkerRole.IDLE):
+            todo.add(StartWorker(task=self.spec.name))
+        elif worker.command or known.command:
+            todo.add(StopWorker(task=self.spec.name))
+
+    def _adopt_routes(self, before: TaskSpec, todo: ToDo) -> None:
+        if self._current is None:
+            return
+        slot = slot_for(self.spec, self.me, self._current.owner, self._current.epoch)
+        if slot == self._current and self.spec.exclusive is before.exclusive:
+            return
+        self._current = slot
+        todo.add(ApplyRoutes(plan=self._plan(slot, self._plan_phase)))
+        text = "goes by the changed fleet file: streams that it does not touch run on"
+        todo.add(RecordStory(stage="executor", text=text, task=self.spec.name, epoch=self.epoch))
+
+    @property
+    def _plan_phase(self) -> RoutePhase:
+        """The phase of the newest plan."""
+        phases = {Phase.PREPARING: RoutePhase.PREPARE, Phase.SETTLED: RoutePhase.CLOSE}
+        return phases.get(self.phase, RoutePhase.FLIP)
+
+    def end(self, todo: ToDo) -> None:
+        """The task left the fleet file: its worker here stops, and its streams end."""
+        if self.runs_worker:
+            todo.add(SetRole(role=Role(task=self.spec.name, role=WorkerRole.IDLE)), StopWorker(task=self.spec.name))
+        todo.add(EndTask(task=self.spec.name))
+        story = "the fleet file does not name the task any more: its worker stops, its streams end"
+        todo.add(RecordStory(stage="executor", text=story, task=self.spec.name, epoch=self.epoch))
+
+    # --- learnt values -------------------------------------------------------------------------------------------
 
     def execute(self, allocation: Allocation, todo: ToDo, now: float) -> None:
         """Carry out a learnt allocation if its epoch is newer than the present one."""
@@ -162,17 +224,7 @@ class Executor:
         if not self.runs_worker:
             return
         if allocation.owner == self.me:
-            self._role_deadline = math.inf
-            role = Role(
-                task=self.spec.name,
-                role=WorkerRole.ACTIVE,
-                epoch=allocation.epoch,
-                # An exclusive task's worker may run at once, but works only from its first lease on.
-                lease_until_s=0.0 if self.is_leased else None,
-                predecessor=None if before == self.me else before,
-            )
-            self._wake_worker(role, todo)
-            self._become(role, todo)
+            self._take_up(before, todo)
         elif self.role.role is WorkerRole.ACTIVE and self.is_leased:
             # The new owner may be working already: nothing of the old epoch may leave any more.
             self._role_deadline = now
@@ -184,12 +236,28 @@ class Executor:
             self._role_deadline = now + starts_s + self.spec.drain_s + ROLE_DRAIN_MARGIN_S
             self._become(Role(task=self.spec.name, role=WorkerRole.DRAINING, epoch=self.role.epoch), todo)
 
+    def _take_up(self, before: NodeId | None, todo: ToDo) -> None:
+        """The worker here is the owner's from now on; ``before``: whose was, ``None`` where nobody is to be asked."""
+        self._role_deadline = math.inf
+        role = Role(
+            task=self.spec.name,
+            role=WorkerRole.ACTIVE,
+            epoch=self.epoch,
+            # An exclusive task's worker may run at once, but works only from its first lease on.
+            lease_until_s=0.0 if self.is_leased else None,
+            predecessor=None if before == self.me else before,
+        )
+        self._wake_worker(role, todo)
+        self._become(role, todo)
+
     def _become(self, role: Role, todo: ToDo) -> None:
         """Change the role; remember a role without a lease until the worker has stopped."""
         self.role = role
         if role.role is WorkerRole.ACTIVE and role.lease_until_s is None:
             self._unleased_epoch = role.epoch
         todo.add(SetRole(role=role))
+        if role.role is WorkerRole.IDLE and not self._keeps_worker:
+            todo.add(StopWorker(task=self.spec.name))  # it stayed for this work only
 
     def _change_terms(self, todo: ToDo) -> None:
         """The owner stays, but its worker needs a lease from now on, or no longer needs one."""

@@ -54,11 +54,16 @@ class Progress:
     """A robot's view: does the owner's worker return anything for its inputs?"""
 
     def __init__(self, specs: Iterable[TaskSpec]) -> None:
+        self._seen: dict[TaskId, _Seen] = {}
+        self.adopt(tuple(specs))
+
+    def adopt(self, specs: tuple[TaskSpec, ...]) -> None:
+        """Watch these tasks from now on; what was seen of the others is forgotten."""
         self._deadlines = {spec.name: spec.worker.output_deadline_s for spec in specs}
         self._has_outputs = {
             spec.name: any(rule.direction is Direction.OUTPUT for rule in spec.rules) for spec in specs
         }
-        self._seen: dict[TaskId, _Seen] = {}
+        self._seen = {task: seen for task, seen in self._seen.items() if task in self._deadlines}
 
     def absorb(self, counts: tuple[StreamCount, ...], executors: Mapping[TaskId, Executor], now: float) -> None:
         """Take the relay's counters in."""
@@ -176,12 +181,30 @@ class HangWatch:
     """Both views of one node, over all tasks that say `output_deadline_s`."""
 
     def __init__(self, fleet: Fleet) -> None:
-        self._specs = {spec.name: spec for spec in fleet.tasks if spec.worker.output_deadline_s is not None}
-        self._voters = fleet.voters
-        self._progress = Progress(self._specs.values())
+        self._progress = Progress(())
         self._judge = HangJudge()
         self._back_at: dict[NodeId, float] = {}
         """{robot: when it was heard again after a silence}."""
+        self._specs: dict[TaskId, TaskSpec] = {}
+        self.adopt(fleet, {}, 0.0)
+
+    def adopt(self, fleet: Fleet, workers: Mapping[TaskId, WorkerState], now: float) -> None:
+        """Take the tasks with a deadline and the robots from ``fleet``.
+
+        Args:
+            fleet: the fleet file.
+            workers: {task: state} of the workers here; a ready one that was not watched gets its whole time from now.
+            now: monotonic seconds.
+        """
+        known = self._specs
+        self._specs = {spec.name: spec for spec in fleet.tasks if spec.worker.output_deadline_s is not None}
+        self._voters = fleet.voters
+        self._progress.adopt(tuple(self._specs.values()))
+        for task in [task for task in known if task not in self._specs]:
+            self._judge.note_worker(task, WorkerState.STOPPED, now)
+        for task in [task for task in self._specs if task not in known and task in workers]:
+            self._judge.note_worker(task, workers[task], now)
+        self._back_at = {robot: at for robot, at in self._back_at.items() if robot in self._voters}
 
     def absorb(self, counts: tuple[StreamCount, ...], executors: Mapping[TaskId, Executor], now: float) -> None:
         """Our relay has counted."""

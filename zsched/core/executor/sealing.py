@@ -43,6 +43,13 @@ class Sealing:
     _answers: dict[NodeId, Learnt] = field(default_factory=dict)
     _asked_at: float = -math.inf
 
+    def adopt(self, fleet: Fleet) -> None:
+        """Go by ``fleet``; nodes that it does not name are asked no more."""
+        self.fleet = fleet
+        names = {node.name for node in fleet.nodes}
+        self._files = {name: file for name, file in self._files.items() if name in names}
+        self._answers = {name: answer for name, answer in self._answers.items() if name in names}
+
     def hear(self, beat: Beat) -> None:
         """Note the fleet file that a peer's beat names."""
         self._files[beat.node] = beat.fleet_file

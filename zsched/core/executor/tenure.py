@@ -38,7 +38,13 @@ class Tenure:
     _local: tuple[TaskId, ...] = field(init=False)
 
     def __post_init__(self) -> None:
+        self.adopt(self.fleet)
+
+    def adopt(self, fleet: Fleet) -> None:
+        """Go by ``fleet``, whose tasks the executors are for already."""
+        self.fleet = fleet
         self._note_leased()
+        self._alone_since = {task: at for task, at in self._alone_since.items() if task in self.executors}
         self._local = tuple(task.name for task in self.fleet.tasks if task.on_isolation is OnIsolation.LOCAL)
 
     @property

@@ -6,12 +6,13 @@ Knows: which tasks have a worker here. Does not know: processes, tokens, who own
 from __future__ import annotations
 
 from collections.abc import Mapping
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 
 from zsched.core import events as ev
 from zsched.core.instructions import RecordStory
 from zsched.core.values.fleet import Fleet, runs_worker
-from zsched.core.values.model import NodeId, Profile, TaskId, WorkerState, as_reason, told_of_worker
+from zsched.core.values.model import NodeId, Profile, Renewal, TaskId, WorkerState, as_reason, told_of_worker
 
 TROUBLE_S = 60.0
 """Status shows a callback's error for this long after the last one."""
@@ -20,6 +21,11 @@ TROUBLE_S = 60.0
 def failed_workers(profile: Profile) -> set[TaskId]:
     """The tasks whose worker on that node has failed for good."""
     return {load.task for load in profile.workers if load.state is WorkerState.FAILED}
+
+
+def given_away(profile: Profile) -> set[TaskId]:
+    """The tasks that the owner gives away, because its worker is to start again (`zsched.core.executor.renewing`)."""
+    return {load.task for load in profile.workers if load.renewal is Renewal.LEAVES}
 
 
 @dataclass(slots=True)
@@ -34,6 +40,31 @@ class Workers:
     """{task: a mistake of a ready worker that lasts as long as it lives}."""
     _outdated: dict[TaskId, str] = field(default_factory=dict)
     """{task: why a ready worker should be started again}."""
+
+    _leaving: set[TaskId] = field(default_factory=set)
+    """The tasks of which this node keeps no worker any more, while the one that it had is at work."""
+
+    def adopt(self, fleet: Fleet, me: NodeId, busy: AbstractSet[TaskId]) -> None:
+        """Take the tasks with a worker here from ``fleet``.
+
+        Args:
+            fleet: the fleet file.
+            me: this node.
+            busy: the tasks whose worker here has not ended its work: it is told of until it has stopped.
+        """
+        kind = fleet.node(me).kind
+        kept = {task.name for task in fleet.tasks if runs_worker(task, me, kind)}
+        self._leaving = {task for task in self.states if task not in kept and task in busy}
+        for task in [task for task in self.states if task not in kept | self._leaving]:
+            self._forget(task)
+        for task in sorted(kept - self.states.keys()):
+            self.states[task] = WorkerState.STOPPED
+
+    def _forget(self, task: TaskId) -> None:
+        self._leaving.discard(task)
+        del self.states[task]
+        for told in (self.reasons, self._troubles, self._mistakes, self._outdated):
+            told.pop(task, None)
 
     @classmethod
     def of(cls, fleet: Fleet, me: NodeId) -> Workers:
@@ -55,6 +86,8 @@ class Workers:
         if self.states[event.task] is event.state:
             return None
         self.states[event.task] = event.state
+        if event.task in self._leaving and event.state is WorkerState.STOPPED:
+            self._forget(event.task)
         text = f"worker {told_of_worker(event.state, event.reason).removeprefix('is ')}"
         return RecordStory(stage="executor", text=text, task=event.task)
 

@@ -27,16 +27,24 @@ class Gateway:
     """This node's knowledge of every node, itself included."""
 
     def __init__(self, fleet: Fleet) -> None:
-        self._names = frozenset(node.name for node in fleet.nodes)
-        self._ttl_s = fleet.timing.profile_ttl_s
         self._profiles: dict[NodeId, tuple[Profile, float]] = {}
         self._tracks: dict[NodeId, Track] = {}
         self.demands = Demands()
         """What tasks need, as this node has learnt it."""
         self._shares = Shares()
-        self._candidates = {task.name: task.candidates for task in fleet.tasks}
         self.version = 0
         """Rises with every change; a result from an older version may be wrong."""
+        self.adopt(fleet)
+
+    def adopt(self, fleet: Fleet) -> None:
+        """Take nodes, candidates and the profiles' time to live from ``fleet``; profiles of other nodes go."""
+        self._names = frozenset(node.name for node in fleet.nodes)
+        self._ttl_s = fleet.timing.profile_ttl_s
+        self._candidates = {task.name: task.candidates for task in fleet.tasks}
+        for known in (self._profiles, self._tracks):
+            for name in [name for name in known if name not in self._names]:
+                del known[name]
+        self.version += 1
 
     def absorb(self, profile: Profile, now: float, life: int | None = None) -> str | None:
         """Take a profile in; returns why it was refused (one word for a counter), or ``None``.

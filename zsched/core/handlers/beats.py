@@ -119,6 +119,8 @@ def _on_beat(node: Stages, event: ev.BeatReceived, todo: ToDo, now: float) -> No
     elif node.fileless:
         node.fileless.discard(beat.node)
     node.sealing.hear(beat)
+    if node.renewing.told:
+        node.renewing.hear(beat.node, beat.fleet_file, now)
     if beat.fleet_file != node.fleet_file or node.problems:
         node.set_problem(f"fleet/{beat.node}", node.identity.file_complaint(beat, node.fleet_path))
     _hear_leases(node, beat, todo, now, is_newest=node.membership.is_newest(beat.node))

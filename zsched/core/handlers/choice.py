@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.executor.workers import failed_workers
+from zsched.core.executor.workers import failed_workers, given_away
 from zsched.core.handlers.beats import on_twins
 from zsched.core.stages import Handler, Stages
 from zsched.core.todo import ToDo
@@ -30,6 +30,7 @@ def publish_profile(node: Stages, todo: ToDo, now: float) -> None:
         reasons=node.workers.told(now),
         echoes=node.round_trips.echoes(now),
         relay=node.relay_ends.told(now),
+        renewals=node.renewing.told,
     )
     if profile is None:
         return
@@ -63,7 +64,7 @@ def _on_profile(node: Stages, event: ev.ProfileReceived, todo: ToDo, now: float)
     failed = failed_workers(profile)
     values = node.values()
     owned = {name for name, value in values.items() if value.owner == profile.node}
-    is_to_leave = bool(owned) and (profile.draining or bool(owned & failed))
+    is_to_leave = bool(owned) and (profile.draining or bool(owned & failed) or bool(owned & given_away(profile)))
     # With an orphan about, this may be the candidate that the task waits for.
     todo.must_decide |= is_to_leave or any(node.is_orphan(value.owner) for value in values.values())
 

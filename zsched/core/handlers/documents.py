@@ -7,38 +7,22 @@ fleet means to each stage.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any, Final
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
+from zsched.core.handlers.fleet import adopt, compare_file, follow
 from zsched.core.stages import Handler, Stages
 from zsched.core.todo import ToDo
-from zsched.core.values.fleet import Fleet, fleet_hash
+from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import FleetTold
 
 
 def take_effect(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
     """Another fleet is in force: its document is stored, the value with it is learnt, the registers count by it."""
-    del todo, now
-    has_changed = replace(fleet, electors=node.fleet.electors, timing=node.fleet.timing) != node.fleet
-    node.fleet = fleet
-    node.agreement.adopt(fleet)
-    if has_changed:
-        node.set_problem("fleet/restart", "another document is agreed: restart this daemon, and it goes by all of it")
+    follow(node, fleet, todo, is_agreed=True)
+    adopt(node, fleet, todo, now)
     compare_file(node)
-
-
-def compare_file(node: Stages) -> None:
-    """Show whether this machine's fleet file says something else than the agreed document."""
-    agreed = node.agreement.document
-    complaint = None
-    if agreed is not None and fleet_hash(agreed) != node.by_file:
-        complaint = (
-            f"the fleet file here differs from the agreed document, by which this node goes; what it would change: "
-            f"`zsched apply {node.fleet_path} --plan`; to take the document: `zsched fleet export -o {node.fleet_path}`"
-        )
-    node.set_problem("fleet/file", complaint)
 
 
 def _on_asked(node: Stages, event: ev.FleetAsked, todo: ToDo, now: float) -> None:

@@ -25,6 +25,11 @@ class Knocking:
     _heard: dict[NodeId, tuple[Beat, float]] = field(default_factory=dict)
     """{name: (newest beat, when)}."""
 
+    def adopt(self, fleet_file: str, nodes: frozenset[NodeId]) -> None:
+        """The fleet file has this hash and names these nodes, from now on."""
+        self.fleet_file = fleet_file
+        self._heard = {name: known for name, known in self._heard.items() if name not in nodes}
+
     def on_beat(self, beat: Beat, now: float) -> None:
         """A beat of a node that the fleet file does not name."""
         self._heard = {name: known for name, known in self._heard.items() if now < known[1] + QUIET_S}

@@ -57,10 +57,24 @@ class Namesakes:
     """The daemons with a shared name that one node hears."""
 
     def __init__(self, beat_s: float) -> None:
-        self._beside_s = max(BESIDE_S, BESIDE_BEATS * beat_s)
+        self.adopt(beat_s)
         self._names: dict[NodeId, _Name] = {}
         self._watched: dict[NodeId, _Name] = {}
         """Names with two tokens: usually none. The set is kept because thirty beats a second are looked up."""
+
+    def adopt(self, beat_s: float) -> None:
+        """The fleet file says this period of beats, from now on."""
+        self._beside_s = max(BESIDE_S, BESIDE_BEATS * beat_s)
+
+    def forget(self, node: NodeId) -> None:
+        """The fleet file does not name that node any more."""
+        self._names.pop(node, None)
+        self._watched.pop(node, None)
+
+    @property
+    def nodes(self) -> tuple[NodeId, ...]:
+        """The nodes of which something is known."""
+        return tuple(sorted(self._names))
 
     def on_token(self, node: NodeId, incarnation: int, *, is_present: bool) -> None:
         """A peer's token came or went."""

@@ -69,19 +69,28 @@ class Membership:
 
     def __init__(self, me: NodeId, nodes: tuple[NodeId, ...], timing: Timing) -> None:
         self._me = me
-        self._timing = timing
-        self._peers = {name: _Peer() for name in sorted(nodes) if name != me}
-        self._size = len(nodes)
+        self._peers: dict[NodeId, _Peer] = {}
         self._lag_factor = 1.0
         self._started_at = math.inf
-        self._deadline: float | None = None
-        """`next_deadline`, until something changes it."""
-        self._states = dict.fromkeys(sorted(nodes), PeerState.UNKNOWN) | {me: PeerState.ALIVE}
-        self._has_suspect = False
-        self._misses_anybody = bool(self._peers)
-        self._has_heard = not self._peers
+        self._has_heard = False
         self._has_watched = False
         """Whether this node has listened for as long as silence takes to mean something."""
+
+        self.adopt(nodes, timing)
+
+    def adopt(self, nodes: tuple[NodeId, ...], timing: Timing) -> None:
+        """The fleet file names these nodes and times, from now on: what is known of a node that stays is kept."""
+        self._timing = timing
+        self._size = len(nodes)
+        self._peers = {name: self._peers.get(name) or _Peer() for name in sorted(nodes) if name != self._me}
+        self._states = {
+            name: PeerState.ALIVE if name == self._me else self._peers[name].state for name in sorted(nodes)
+        }
+        self._has_suspect = PeerState.SUSPECT in self._states.values()
+        self._misses_anybody = any(state is not PeerState.ALIVE for state in self._states.values())
+        self._has_heard |= not self._peers
+        self._deadline: float | None = None
+        """`next_deadline`, until something changes it."""
 
     # --- queries -----------------------------------------------------------------------------------------------
 

@@ -32,6 +32,7 @@ from zsched.core.values.model import (
     LinkSource,
     NodeId,
     Profile,
+    Renewal,
     TaskId,
     TaskProgress,
     WorkerLoad,
@@ -53,6 +54,7 @@ SIGNAL_SMOOTHING_S = 0.5
 RSSI_WINDOW = 5
 """A reading further than 25 dB from the median of the last 5 is dropped (measured on real drives)."""
 NO_REASONS: Mapping[TaskId, str] = {}
+NO_RENEWALS: Mapping[TaskId, Renewal] = {}
 
 
 class SignalFilter:
@@ -125,6 +127,16 @@ class Profiler:
         self._sent_at = -math.inf
         self._sequence = 0
 
+    def adopt(self, timing: Timing) -> None:
+        """Go by other times; with another time constant all means begin anew, with the next sample."""
+        before, self._timing = self._timing, timing
+        if (before.smoothing_s, before.sample_s) == (timing.smoothing_s, timing.sample_s):
+            return
+        for mean in (self._cpu, self._memory, self._pressure, self._runnable):
+            mean.tau_s = timing.smoothing_s
+        for known in (self._signals, self._worker_cpu, self._worker_memory, self._jobs):
+            known.clear()
+
     def absorb(self, device: DeviceSample, links: tuple[LinkSample, ...], now: float) -> None:
         """Take one reading of the machine and its links in."""
         self._device, self._sampled_at, self._is_new = device, now, True
@@ -180,6 +192,7 @@ class Profiler:
         reasons: Mapping[TaskId, str] = NO_REASONS,
         echoes: tuple[Echo, ...] = (),
         relay: str = "",
+        renewals: Mapping[TaskId, Renewal] = NO_RENEWALS,
     ) -> Profile | None:
         """The profile to send now, or ``None`` when nothing is due.
 
@@ -191,13 +204,14 @@ class Profiler:
             reasons: why workers are not ready.
             echoes: which profiles this node has of others; they are no reason to send one.
             relay: what is wrong with this node's relay.
+            renewals: which workers run by an old recipe.
         """
         is_due = now - self._sent_at >= self._timing.publish_s
-        flags = (is_draining, *states.values(), *reasons.values(), progress, bool(relay))
+        flags = (is_draining, *states.values(), *reasons.values(), progress, bool(relay), *renewals.items())
         if not is_due and not self._is_new and flags == self._flags:
             return None  # nothing was measured since the last look
         self._is_new, self._flags = False, flags
-        profile = self._current(states, reasons, is_draining=is_draining, now=now)
+        profile = self._current(states, reasons, renewals, is_draining=is_draining, now=now)
         if profile is None:
             return None
         if progress or relay:
@@ -212,7 +226,13 @@ class Profiler:
         return profile
 
     def _current(
-        self, states: dict[TaskId, WorkerState], reasons: Mapping[TaskId, str], *, is_draining: bool, now: float
+        self,
+        states: dict[TaskId, WorkerState],
+        reasons: Mapping[TaskId, str],
+        renewals: Mapping[TaskId, Renewal],
+        *,
+        is_draining: bool,
+        now: float,
     ) -> Profile | None:
         if self._device is None:
             return None
@@ -227,6 +247,7 @@ class Profiler:
                 wanted_cores=loads[task].wanted_cores if task in loads else None,
                 reason=reasons.get(task, ""),
                 jobs=loads[task].jobs if task in loads else None,
+                renewal=renewals.get(task, Renewal.NONE),
             )
             for task in sorted(states)
         )
@@ -320,7 +341,7 @@ def _kinds(profile: Profile) -> tuple[object, ...]:
     """The parts of a profile that are no figures: every change of them counts."""
     workers = [
         # what a worker that is ready complains of is a count: it goes along with the figures
-        (load.task, load.state, bool(load.reason) if load.state is WorkerState.READY else load.reason)
+        (load.task, load.state, bool(load.reason) if load.state is WorkerState.READY else load.reason, load.renewal)
         for load in profile.workers
     ]
     return (

@@ -19,7 +19,16 @@ from zsched.core.scheduler.patience import LONGEST_GAP_S, LearntPatience, spend
 from zsched.core.scheduler.scoring import Standing, joined, pick
 from zsched.core.values.decision import JudgeMemory
 from zsched.core.values.fleet import TaskSpec
-from zsched.core.values.model import Allocation, NodeId, PeerState, Profile, ScoreForm, WorkerState, told_of_worker
+from zsched.core.values.model import (
+    Allocation,
+    NodeId,
+    PeerState,
+    Profile,
+    Renewal,
+    ScoreForm,
+    WorkerState,
+    told_of_worker,
+)
 
 INITIAL_SETTLE_S = 3.0
 """A task that nobody owns yet waits so long for candidates that are still starting."""
@@ -251,6 +260,8 @@ def escape_reason(
         why = "" if load is None or not load.reason else f": {load.reason}"
         if load is not None and load.state is WorkerState.FAILED:
             return f"the worker on {owner} failed{why}"
+        if load is not None and load.renewal is Renewal.LEAVES:
+            return f"{owner} gives it away: its worker starts again, by the changed fleet file"
         if _is_told(spec, profile) and not_ready_for_s > spec.worker.start_deadline_s:
             return f"the worker on {owner} has not been ready for {not_ready_for_s:.1f} s{why}"
         if allocation.tuning.score is ScoreForm.PAPER and profile.memory_used_mb is not None:

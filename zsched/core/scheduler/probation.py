@@ -46,6 +46,15 @@ class Probation:
     _tokens: dict[tuple[NodeId, TaskId], dict[str, float]] = field(default_factory=dict)
     """{(node, task): {worker's incarnation: when its token came}} of the tokens that are there."""
 
+    def adopt(self, fleet: Fleet) -> None:
+        """Go by ``fleet``; what was known of nodes and tasks that it does not name is forgotten."""
+        self.fleet = fleet
+        nodes, tasks = {node.name for node in fleet.nodes}, {task.name for task in fleet.tasks}
+        for node in [node for node in self._returns if node not in nodes]:
+            del self._returns[node]
+        for node, task in [known for known in self._tokens if known[0] not in nodes or known[1] not in tasks]:
+            del self._tokens[node, task]
+
     def on_gone(self, node: NodeId, now: float) -> None:
         """A peer is gone: what was known of its streams is worth nothing any more."""
         self._returns[node] = _Return(gone_at=now)

@@ -67,6 +67,15 @@ class TaskRound:
     def __post_init__(self) -> None:
         self.rules = rules_of(self.spec)
 
+    def by(self, spec: TaskSpec) -> TaskRound:
+        """The same standing by another version of the task's file; the last judgement was by the one before."""
+        if spec != self.spec:
+            self.spec = self.judge.spec = spec
+            self.rules = rules_of(spec)
+            self.figures = self.standing = self.judgement = None
+            self.told = ""
+        return self
+
 
 class Rounds:
     """All tasks' rounds at one robot (on edges it is idle)."""
@@ -82,16 +91,38 @@ class Rounds:
         doubts: Callable[[TaskSpec, float], Doubts] = lambda _spec, _now: NO_DOUBTS,
         round_trips: RoundTrips | None = None,
     ) -> None:
-        self._fleet, self._me, self._gateway, self._turns, self._rng = fleet, me, gateway, turns, rng
+        self._me, self._gateway, self._turns, self._rng = me, gateway, turns, rng
         self._doubts = doubts
         self._round_trips = round_trips or RoundTrips(me)
-        self.is_voter = me in fleet.voters
-        self.tasks = {spec.name: TaskRound(spec=spec, judge=Judge(spec=spec), settled_at=now) for spec in fleet.tasks}
-        self._gather: _Gather | None = None
-        self._answer: tuple[int, float, object, Utilities] = (-1, -math.inf, None, Utilities(voter=me, vectors=()))
-        """(gateway's version, until when, (states, values, doubts), vectors): the newest answer to a gather."""
+        self.tasks: dict[TaskId, TaskRound] = {}
+        self._adopt(fleet, now)
         self._number = 0
         self._round_at = now if self.is_voter else math.inf
+
+    def adopt(self, fleet: Fleet, now: float) -> None:
+        """Take tasks, robots and times from ``fleet``: what is remembered of a task that stays is kept.
+
+        A gather under way ends without a judgement, for it has asked the robots of before; another one follows at once.
+        """
+        was_gathering = self._gather is not None
+        self._adopt(fleet, now)
+        if was_gathering:
+            self.hurry(now)
+
+    def _adopt(self, fleet: Fleet, now: float) -> None:
+        self._fleet = fleet
+        self.is_voter = self._me in fleet.voters
+        kept = self.tasks
+        self.tasks = {
+            spec.name: TaskRound(spec=spec, judge=Judge(spec=spec), settled_at=now)
+            if spec.name not in kept
+            else kept[spec.name].by(spec)
+            for spec in fleet.tasks
+        }
+        self._gather: _Gather | None = None
+        nothing = Utilities(voter=self._me, vectors=())
+        self._answer: tuple[int, float, object, Utilities] = (-1, -math.inf, None, nothing)
+        """(gateway's version, until when, (states, values, doubts), vectors): the newest answer to a gather."""
 
     # --- time ----------------------------------------------------------------------------------------------------
 

@@ -57,7 +57,7 @@ class Retune:
     @property
     def reason(self) -> str:
         """Why the value is what it is, once this is committed."""
-        return "retuned by an operator"
+        return "its tuning in the fleet file has changed" if self.request is None else "retuned by an operator"
 
     def apply(self, read: Allocation) -> Allocation:
         """The new value, with another tuning and revision; for the present tuning the value as read."""

@@ -241,6 +241,14 @@ class Jobs:
         return min(self.done_hz / self.wanted_hz, 1.0) if self.wanted_hz > 0.0 else None
 
 
+class Renewal(StrEnum):
+    """Whether a worker runs by an old recipe and is to start again (`zsched.core.executor.renewing`)."""
+
+    NONE = ""
+    DUE = "due"
+    LEAVES = "leaves"  # as the owner it gives the task away first
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorkerLoad:
     """One task's worker on one node: its state and what its process tree uses now (cores, MiB)."""
@@ -255,6 +263,7 @@ class WorkerLoad:
     """Why it is not ready, or what is wrong with it though it is; at most `MAX_REASON` characters."""
     jobs: Jobs | None = None
     """Its report of its jobs; ``None``: none."""
+    renewal: Renewal = Renewal.NONE
 
     def __post_init__(self) -> None:
         check_name("worker.task", self.task)

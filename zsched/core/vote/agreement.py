@@ -22,7 +22,7 @@ from zsched.core.todo import ToDo
 from zsched.core.values.change import Change, Ended, MoveOwner, Retune, RoundOutcome
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import CREATION_STEP, FleetValue
-from zsched.core.values.fleet import Fleet
+from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.messages import (
     Accepted,
     CommandOutcome,
@@ -136,26 +136,9 @@ class Agreement:
         creation = self.generation or 0
         states = {state.task: replace(state, creation=state.creation or creation) for state in held}
         agreed = None if durable is None or durable.fleet_register is None else durable.fleet_register.learnt
-
-        def blank(task: TaskId) -> RegisterState:
-            one = None if agreed is None else agreed.creation(task)
-            return RegisterState(task=task, creation=creation if one is None else one.number)
-
+        self._incarnation, self._rng = incarnation, rng
         self.registers = {
-            task.name: TaskRegister(
-                me=me,
-                incarnation=incarnation,
-                electors=fleet.electors,
-                electorate=self._by_file,
-                is_elector=self.is_elector,
-                # What blank electors have agreed on: the first value of its creation, or of a generation.
-                initial=task.first_value(states.get(task.name, blank(task.name)).creation * CREATION_STEP),
-                state=states.get(task.name, blank(task.name)),
-                disk="" if durable is None else durable.disk,
-                ballot_s=fleet.timing.ballot_s,
-                stagger_s=fleet.timing.stagger_s,
-                rng=rng,
-            )
+            task.name: self._register(task, states.get(task.name) or self._blank(task.name, agreed))
             for task in fleet.tasks
         }
         self._numbers = Numbers(
@@ -193,6 +176,58 @@ class Agreement:
         """The registers' states from which `values` and `accepted` were made."""
         self._values: dict[TaskId, Allocation] = {}
         self._accepted: dict[TaskId, tuple[NodeId, int]] = {}
+
+    def _register(self, task: TaskSpec, state: RegisterState) -> TaskRegister:
+        """A task's register. Blank electors have agreed on the first value of its creation, or of a generation."""
+        return TaskRegister(
+            me=self._me,
+            incarnation=self._incarnation,
+            electors=self._fleet.electors,
+            electorate=self._by_file,
+            is_elector=self.is_elector,
+            initial=task.first_value(state.creation * CREATION_STEP),
+            state=state,
+            disk="" if self._durable is None else self._durable.disk,
+            ballot_s=self._fleet.timing.ballot_s,
+            stagger_s=self._fleet.timing.stagger_s,
+            rng=self._rng,
+        )
+
+    def _blank(self, task: TaskId, value: FleetValue | None) -> RegisterState:
+        creation = None if value is None else value.creation(task)
+        return RegisterState(task=task, creation=(self.generation or 0) if creation is None else creation.number)
+
+    def adopt(self, fleet: Fleet, todo: ToDo, now: float) -> None:
+        """Take nodes, tasks and times from ``fleet``, with the electors in force; changes of tasks that go end.
+
+        The roll has the registers of an agreed document already. By a file, the state of a register whose task goes is
+        kept, for the task may come back.
+        """
+        self._fleet, self._nodes = fleet, frozenset(node.name for node in fleet.nodes)
+        self.witness.nodes = self._nodes
+        self._numbers.adopt(fleet)
+        kept = dict(self.registers)
+        self.registers.clear()  # the roll goes by the same table
+        away = {state.task: state for state in self._foreign}
+        for task in fleet.tasks:
+            register = kept.pop(task.name, None)
+            if register is None:
+                state = away.pop(task.name, None) or self._blank(task.name, self._numbers.changed)
+                register = self._register(task, state)
+                self._numbers.count_in(register, now)
+                self._settle_at = now + SETTLE_AFTER_START_S if self.is_elector else math.inf
+            first = task.first_value(register.state.creation * CREATION_STEP)
+            register.adopt(first, ballot_s=fleet.timing.ballot_s, stagger_s=fleet.timing.stagger_s)
+            self.registers[task.name] = register
+        for register in kept.values():
+            register.close(todo)
+            if register.state != RegisterState(task=register.state.task, creation=register.state.creation):
+                away[register.state.task] = register.state
+        self._foreign = tuple(away[name] for name in sorted(away))
+        self._parked = {key: known for key, known in self._parked.items() if key[0] in self.registers}
+        self._seen = []
+        self.leases.adopt(fleet, self.standing() if self.is_elector else {}, now)
+        todo.must_persist |= self.must_persist
 
     @property
     def _by_file(self) -> str:
@@ -375,12 +410,6 @@ class Agreement:
     def change_fleet(self, change: FleetChange, todo: ToDo, now: float) -> str:
         """Try to commit a change of the fleet; why it cannot be made, or nothing."""
         return self._numbers.propose(change, todo, now)
-
-    def adopt(self, fleet: Fleet) -> None:
-        """Another fleet is in force: the registers count by it already."""
-        self._fleet = fleet
-        self._nodes = frozenset(node.name for node in fleet.nodes)
-        self.witness.nodes = self._nodes
 
     def _may_ask(self, asker: NodeId, now: float) -> bool:
         """Take one token of the asker's bucket (`PREPARES_PER_S`, at most `PREPARE_BURST` saved); a no costs none."""

@@ -383,6 +383,27 @@ class Leases:
             if task not in self._granters and value is not None and value.leased:
                 self._watch(task, value.owner, math.inf if self.is_in_doubt else -math.inf)
 
+    def adopt(self, fleet: Fleet, standing: Mapping[TaskId, Allocation | None], now: float) -> None:
+        """Take the exclusive tasks from ``fleet``, with the same electors and length of leases.
+
+        Args:
+            fleet: the fleet file.
+            standing: as at the start, by the tasks of ``fleet``.
+            now: monotonic seconds. What an earlier time here may have granted of a task that comes is over in a lease.
+        """
+        self.fleet, self.standing = fleet, standing
+        leased = {task.name for task in fleet.tasks if task.exclusive}
+        leased |= {task for task, value in standing.items() if value is not None and value.leased}
+        until = math.inf if self.is_in_doubt else now + hold_s(max(self.lease_s, self.granted_s))
+        for task in [task for task in self._granters if task not in leased or task not in standing]:
+            del self._granters[task]
+        for task, value in standing.items():
+            if task in leased and task not in self._granters:
+                self._watch(task, None if value is None else value.owner, until)
+        # Nothing is released: the worker of a task that goes may still be at work.
+        names = {task.name for task in fleet.tasks}
+        self._holders = {task: holder for task, holder in self._holders.items() if task in names}
+
     # --- electors ----------------------------------------------------------------------------------------------------
 
     def may_accept(self, task: TaskId, owner: NodeId | None, now: float) -> bool:

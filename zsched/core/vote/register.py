@@ -132,6 +132,16 @@ class Register(ABC, Generic[V]):
                 task=self.state.task, creation=self.state.creation
             )  # it never promised anything, and this was another fleet's
 
+    def adopt(self, initial: V, *, ballot_s: float, stagger_s: float) -> None:
+        """Go by another fleet file; its first value holds while nothing was learnt.
+
+        Args:
+            initial: that first value.
+            ballot_s: deadline of one phase, seconds.
+            stagger_s: wait per rank, seconds.
+        """
+        self._initial, self._ballot_s, self._stagger_s = initial, ballot_s, stagger_s
+
     def count_with(self, count: Electorate, *, is_elector: bool, is_blank: bool, now: float) -> None:
         """A newer fleet value is learnt: rounds count with its electors, and the one under way begins again.
 

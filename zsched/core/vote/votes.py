@@ -22,7 +22,16 @@ class Votes:
     """All tasks' votes at one robot (on edges none is ever open)."""
 
     def __init__(self, fleet: Fleet, me: NodeId) -> None:
+        self._me = me
         self.tasks = {spec.name: Voting(fleet, me) for spec in fleet.tasks}
+
+    def adopt(self, fleet: Fleet) -> None:
+        """Take tasks and robots from ``fleet``: votes on tasks that stay go on."""
+        kept = dict(self.tasks)
+        self.tasks.clear()  # the rounds look into the same table
+        for spec in fleet.tasks:
+            voting = self.tasks[spec.name] = kept.get(spec.name) or Voting(fleet, self._me)
+            voting.adopt(fleet)
 
     def next_deadline(self) -> float:
         """When a commit is due or an open vote ends; infinity when neither."""
@@ -82,7 +91,8 @@ class Votes:
 
     def on_commit_ended(self, task: TaskId) -> None:
         """Our change was committed, overtaken or given up: votes may be called again."""
-        self.tasks[task].end_commit()
+        if task in self.tasks:  # it may have left the fleet file
+            self.tasks[task].end_commit()
 
     def on_learnt(self, task: TaskId) -> None:
         """A newer revision is known: drop proposals on older bases."""

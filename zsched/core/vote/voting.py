@@ -32,8 +32,7 @@ class Voting:
     """One task's voting at one robot. Times are monotonic seconds."""
 
     def __init__(self, fleet: Fleet, me: NodeId) -> None:
-        self._voters, self._timing, self._me = fleet.voters, fleet.timing, me
-        self._vote_s = vote_time(fleet.timing)
+        self._me = me
         self.proposals: dict[NodeId, tuple[Proposal, float]] = {}
         """Each robot's newest proposal and when it came."""
         self.called_at = -math.inf
@@ -50,6 +49,13 @@ class Voting:
         self.commit_at = math.inf
         self.awaited_until = -math.inf
         """A vote on a move was won: until when its value should be learnt."""
+        self.adopt(fleet)
+
+    def adopt(self, fleet: Fleet) -> None:
+        """Take the robots and the times of a vote from ``fleet``; what a robot proposed that left does not count."""
+        self._voters, self._timing = fleet.voters, fleet.timing
+        self._vote_s = vote_time(fleet.timing)
+        self.proposals = {voter: known for voter, known in self.proposals.items() if voter in self._voters}
 
     def next_deadline(self) -> float:
         """When a commit is due or the open vote ends; infinity when neither."""

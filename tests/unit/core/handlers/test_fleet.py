@@ -1,0 +1,153 @@
+"""A node that takes another fleet file over is from then on a node that was started with it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from random import Random
+
+import pytest
+
+from support.ballots import ballot_of
+from support.fleets import fleet_of, task_of, tuning_of
+from support.states import state_of
+from support.storm import ELECTORATE, FLEET, ROBOTS, Storm, some_fleet
+from zsched.core import events as ev
+from zsched.core import instructions as do
+from zsched.core.node import Node
+from zsched.core.status import build_snapshot
+from zsched.core.values.fleet import Fleet
+from zsched.core.values.messages import Learnt, Prepare
+
+START = 100.0
+
+
+class Even(Random):
+    """Chance that is always even: how often a node has drawn before makes no difference."""
+
+    def random(self) -> float:
+        return 0.5
+
+
+def node_of(fleet: Fleet, me: str = "robot1") -> Node:
+    return Node(
+        fleet=fleet,
+        me=me,
+        durable=state_of(me, electorate=ELECTORATE),
+        incarnation=7,
+        electorate=ELECTORATE,
+        rng=Even(),
+        now=START,
+    )
+
+
+def adopt(node: Node, fleet: Fleet, now: float = START) -> tuple[do.Instruction, ...]:
+    return node.handle(ev.FleetChanged(fleet=fleet), now)
+
+
+def kinds(batch: Iterable[do.Instruction]) -> set[type]:
+    return {type(one) for one in batch}
+
+
+@pytest.mark.parametrize("seed", range(16))
+@pytest.mark.parametrize("me", ["robot1", "edge1"])
+def test_a_node_that_takes_a_file_over_acts_as_one_that_was_started_with_it(me: str, seed: int) -> None:
+    """What must differ: how many beats and gathers there were before. All else is the same, batch by batch."""
+    rng = Random(f"{me}/{seed}")
+    first, second = some_fleet(rng), some_fleet(rng)
+    adopter, starter = node_of(first, me), node_of(second, me)
+    adopter.start(START)
+    adopt(adopter, second)
+    starter.start(START)
+    adopter.handle(ev.DeadlineReached(), START)
+    starter.handle(ev.DeadlineReached(), START)
+    starter.beat_sequence = adopter.beat_sequence
+    starter.rounds._number = adopter.rounds._number
+    weather, now = Storm(me, seed), START
+    for _ in range(250):
+        now += weather.rng.choice((0.0, 0.01, 0.05, weather.rng.uniform(0, 0.5)))
+        event = weather.event()
+        batch = starter.handle(event, now)
+        assert adopter.handle(event, now) == batch, event
+        weather.hear(batch)
+        assert adopter.next_deadline() == starter.next_deadline()
+    assert build_snapshot(adopter, now) == build_snapshot(starter, now)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_same_file_again_changes_nothing(seed: int) -> None:
+    fleet = some_fleet(Random(seed))
+    node, other = node_of(fleet), node_of(fleet)
+    weather, now = Storm("robot1", seed), START
+    assert node.start(now) == other.start(now)
+    for _ in range(150):
+        now += 0.03
+        assert adopt(node, node.told_fleet, now) == other.handle(ev.DeadlineReached(), now)
+        event = weather.event()
+        if not isinstance(event, ev.FleetChanged):
+            assert node.handle(event, now) == other.handle(event, now)
+
+
+def test_electors_and_leases_stay_until_they_are_agreed() -> None:
+    node = node_of(FLEET)
+    node.start(START)
+    timing = replace(FLEET.timing, lease_s=9.0)
+    adopt(node, replace(FLEET, electors=("edge1",), timing=timing, nodes=FLEET.nodes[:-1]))
+    assert node.fleet.electors == ROBOTS
+    assert node.fleet.timing.lease_s == FLEET.timing.lease_s
+    assert "robot3" in node.fleet.voters, "an elector stays a node as long as it is counted with"
+    assert node.told_fleet.electors == ("edge1",), "the runtime tells what is not in force"
+
+
+@pytest.mark.parametrize(
+    ("changed", "why"),
+    [
+        (replace(FLEET, name="other"), "of fleet 'other'"),
+        (fleet_of(*FLEET.tasks, of=("edge1", "edge2", "robot2", "robot3")), "no node 'robot1'"),
+    ],
+)
+def test_a_file_of_somebody_else_is_refused_and_told(changed: Fleet, why: str) -> None:
+    node = node_of(FLEET)
+    node.start(START)
+    assert do.AdoptFleet not in kinds(adopt(node, changed))
+    assert why in node.problems["fleet"]
+    assert node.fleet == FLEET
+    adopt(node, FLEET)
+    assert "fleet" not in node.problems
+
+
+def test_a_task_that_goes_ends_and_comes_back_with_what_it_had_promised() -> None:
+    node = node_of(fleet_of(task_of("merge"), task_of("other"), of=("edge1", "edge2", *ROBOTS)), "robot1")
+    node.start(START)
+    beats = [ev.LearntReceived(learnt=Learnt(node=name, values=()), is_answer=True) for name in ("robot2", "robot3")]
+    for heard in beats:
+        node.handle(heard, START)
+    asked = Prepare(task="merge", ballot=ballot_of(5, "robot2"), electorate=ELECTORATE)
+    node.handle(ev.PrepareAsked(request=1, asker="robot2", prepare=asked), START + 1)
+    promised = node.registers["merge"].state.promised
+    assert promised.counter == 5
+    gone = adopt(node, fleet_of(task_of("other"), of=("edge1", "edge2", *ROBOTS)), START + 50)
+    assert do.EndTask(task="merge") in gone
+    assert "merge" not in node.registers
+    asked = Prepare(task="other", ballot=ballot_of(5, "robot2"), electorate=ELECTORATE)
+    batch = node.handle(ev.PrepareAsked(request=2, asker="robot2", prepare=asked), START + 51)
+    states = [one.state for one in batch if isinstance(one, do.PersistState)]
+    assert [one.task for one in states[0].registers] == ["other", "merge"], "what was promised stays on disk"
+    adopt(node, fleet_of(task_of("merge"), task_of("other"), of=("edge1", "edge2", *ROBOTS)), START + 52)
+    assert node.registers["merge"].state.promised == promised
+
+
+def test_a_changed_tuning_becomes_a_change_of_the_agreed_one() -> None:
+    fleet = fleet_of(task_of("merge", tuning=tuning_of(0.5, 0.5)), of=("edge1", "edge2", *ROBOTS))
+    node = node_of(fleet)
+    node.start(START)
+    node.registers["merge"].state = replace(
+        node.registers["merge"].state,
+        learnt=replace(node.registers["merge"].value, revision=3, epoch=2, owner="edge1"),
+    )
+    adopt(node, fleet_of(task_of("merge", tuning=tuning_of(0.9, 0.1)), of=("edge1", "edge2", *ROBOTS)), START + 1)
+    asked: list[do.Instruction] = []
+    for step in range(40):
+        asked += node.handle(ev.DeadlineReached(), START + 1 + step / 10)
+    assert [one for one in asked if isinstance(one, do.SendPrepare)], "it is proposed to the register"
+    assert node.values()["merge"].tuning.weights.cpu == 0.5, "and counts when it is agreed"

@@ -1,0 +1,152 @@
+"""A changed fleet file at the door: every part that is made from the file takes its share of another one over.
+
+Each part that holds something of the file has an `adopt`, which says what it takes and what it keeps. A node that has
+taken file B over acts from then on as one that was started with B, with what it knows of nodes and tasks that are in
+both. The order below is the parts' order in `zsched.core.stages`.
+
+Knows: which parts there are, which of them asks another one. Does not know: what a part takes, who read the file, how
+processes and sessions follow (`zsched.runtime.adoption`).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from typing import Any, Final
+
+from zsched.core import events as ev
+from zsched.core import instructions as do
+from zsched.core.executor.handover import Executor
+from zsched.core.handlers.work import carry_out
+from zsched.core.stages import HISTORY, Handler, Stages
+from zsched.core.todo import ToDo
+from zsched.core.values.adoption import in_force, obstacle
+from zsched.core.values.fleet import Fleet, fleet_hash
+from zsched.core.values.model import NodeKind
+from zsched.core.values.plan import WorkerRole
+
+SOURCE: Final = "fleet"
+"""Of the problem that a file cannot be taken over."""
+
+
+def adopt(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
+    """Go by another validated fleet from now on; the same one again changes nothing.
+
+    One that this daemon cannot take over at all becomes a problem in the status, and the one before stays in force.
+
+    Args:
+        node: the stages.
+        fleet: with the electors and the length of leases that are counted with.
+        todo: what there is to do.
+        now: monotonic seconds.
+    """
+    why = obstacle(node.fleet, fleet, node.me)
+    node.set_problem(SOURCE, f"a changed fleet file is not in force here: {why}" if why else None)
+    before = node.fleet
+    if why or fleet == before:
+        return
+    node.fleet, node.fleet_file = fleet, fleet_hash(fleet)
+    _adopt_nodes(node, fleet)
+    _adopt_choice(node, fleet, todo, now)
+    _adopt_work(node, fleet, todo, now)
+    node.retuning.adopt(before, fleet, node.values(), now)
+    text = f"goes by another fleet file: {node.fleet_file}"
+    todo.add(do.RecordStory(stage="membership", text=text))
+    todo.must_beat = todo.must_decide = True
+
+
+def follow(node: Stages, fleet: Fleet, todo: ToDo, *, is_agreed: bool = False) -> None:
+    """Let the runtime follow another fleet, and tell what it cannot follow; the same one again is not told."""
+    if fleet != node.told_fleet and not obstacle(node.fleet, fleet, node.me):
+        node.told_fleet = fleet
+        todo.add(do.AdoptFleet(fleet=fleet, is_agreed=is_agreed))
+
+
+def _adopt_nodes(node: Stages, fleet: Fleet) -> None:
+    """Membership, and what is remembered node by node."""
+    names = frozenset(one.name for one in fleet.nodes)
+    node.membership.adopt(tuple(one.name for one in fleet.nodes), fleet.timing)
+    node.identity.fleet_file, node.identity.beat_s = node.fleet_file, fleet.timing.beat_s
+    node.namesakes.adopt(fleet.timing.beat_s)
+    for name in [name for name in node.namesakes.nodes if name not in names]:
+        node.namesakes.forget(name)
+    node.knocking.adopt(node.fleet_file, names)
+    node.solitude.timing = fleet.timing
+    node.stateless &= names
+    node.fileless &= names
+    for source in [source for source in node.problems if source.startswith("fleet/")]:
+        del node.problems[source]  # the next beats say it again, where it is still so
+    node.gateway.adopt(fleet)
+    node.probation.adopt(fleet)
+
+
+def _adopt_choice(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
+    """PROFILE, SCHEDULER and VOTE."""
+    node.profiler.adopt(fleet.timing)
+    node.has_deadlines = any(task.tuning.deadline_ms is not None for task in fleet.tasks)
+    node.votes.adopt(fleet)
+    node.rounds.adopt(fleet, now)
+    node.agreement.adopt(fleet, todo, now)
+    node.history = {task.name: node.history.get(task.name) or deque(maxlen=HISTORY) for task in fleet.tasks}
+
+
+def _adopt_work(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
+    """EXECUTOR and ROUTE: workers, roles and streams of tasks that come, stay and go."""
+    kept = dict(node.executors)
+    node.executors.clear()  # tenure and sealing go by the same table
+    values, come = node.values(), []
+    for spec in fleet.tasks:
+        executor = kept.pop(spec.name, None)
+        if executor is None:
+            executor = Executor(spec=spec, me=node.me, has_streams=node.kind is NodeKind.ROBOT)
+            come.append(executor)
+        else:
+            executor.adopt(spec, todo, is_agreed_leased=values[spec.name].leased)
+        node.executors[spec.name] = executor
+    for executor in kept.values():
+        executor.end(todo)
+    busy = {name for name, one in node.executors.items() if one.role.role is not WorkerRole.IDLE}
+    node.workers.adopt(fleet, node.me, busy)
+    node.hangs.adopt(fleet, node.worker_states, now)
+    node.sealing.adopt(fleet)
+    node.tenure.adopt(fleet)
+    for name in node.executors:
+        node.tenure.hold(values[name], node.beat_sequence + 1)
+    for name in kept:
+        node.unready.pop(name, None)
+        node.renewing.forget(name)
+    for stream in [stream for stream in node.dropped if stream.partition("/")[0] in kept]:
+        del node.dropped[stream]
+    for executor in come:
+        executor.start(todo)
+        value = values[executor.spec.name]
+        if value.revision > 0:
+            carry_out(node, value, "known from before the task left the fleet file", todo, now)
+
+
+def compare_file(node: Stages) -> None:
+    """Show whether this machine's fleet file says something else than the agreed document."""
+    agreed = node.agreement.document
+    complaint = None
+    if agreed is not None and fleet_hash(agreed) != node.by_file:
+        complaint = (
+            f"the fleet file here differs from the agreed document, by which this node goes; what it would change: "
+            f"`zsched apply {node.fleet_path} --plan`; to take the document: `zsched fleet export -o {node.fleet_path}`"
+        )
+    node.set_problem("fleet/file", complaint)
+
+
+def _on_fleet(node: Stages, event: ev.FleetChanged, todo: ToDo, now: float) -> None:
+    """An operator has changed the file; once a document is agreed, a file is only compared with it."""
+    node.by_file = fleet_hash(event.fleet)
+    compare_file(node)
+    if node.agreement.document is not None:
+        return
+    follow(node, event.fleet, todo)
+    adopt(node, in_force(node.fleet, event.fleet), todo, now)
+
+
+HANDLERS: Final[Mapping[type[Any], Handler]] = {
+    ev.FleetChanged: _on_fleet,
+    ev.RecipeCompared: lambda node, event, _todo, _now: node.renewing.on_compared(event.task, is_old=event.is_old),
+}

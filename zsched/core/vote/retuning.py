@@ -1,0 +1,72 @@
+"""VOTE, a changed tuning in the fleet file: one node proposes it to the task's register, for all robots at once.
+
+A task's tuning is agreed: the file's counts for its first value only. When a node takes over a file with another
+tuning, it wants these fields changed in the agreed one. All nodes that take the file over want the same. So they try
+one after another, by rank, and the first success ends it for all. A tuning that somebody else has changed meanwhile is
+left as it is: the newer word counts.
+
+Knows: which fields differ, whose turn it is. Does not know: how a value is agreed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+from zsched.core.values.change import Retune
+from zsched.core.values.fleet import Fleet
+from zsched.core.values.model import Allocation, NodeId, TaskId, Tuning
+
+RANK_S = 0.5
+"""The next node in rank tries so much later."""
+AGAIN_S = 5.0
+"""A node whose change found no quorum tries again so much later."""
+
+
+@dataclass(slots=True)
+class _Wish:
+    seen: Tuning
+    """The agreed tuning when the file was taken over."""
+    wanted: Tuning
+    at: float
+
+
+@dataclass(slots=True)
+class Retuning:
+    """What one node wants changed in agreed tunings."""
+
+    me: NodeId
+    _wishes: dict[TaskId, _Wish] = field(default_factory=dict)
+
+    def adopt(self, old: Fleet, new: Fleet, values: Mapping[TaskId, Allocation], now: float) -> None:
+        """Want what differs between two files; a task that was never agreed begins with the new file's tuning."""
+        before = {task.name: task.tuning for task in old.tasks}
+        rank = [node.name for node in new.nodes].index(self.me)
+        self._wishes = {task: wish for task, wish in self._wishes.items() if any(one.name == task for one in new.tasks)}
+        for task in new.tasks:
+            value = values[task.name]
+            changed = _changed(before.get(task.name, task.tuning), task.tuning)
+            if changed and value.revision > 0 and value.owner is not None:
+                wanted = replace(value.tuning, **changed)
+                self._wishes[task.name] = _Wish(seen=value.tuning, wanted=wanted, at=now + rank * RANK_S)
+
+    def due(self, values: Mapping[TaskId, Allocation], now: float) -> Iterator[tuple[TaskId, Retune]]:
+        """The changes to propose now."""
+        for task, wish in tuple(self._wishes.items()):
+            value = values[task]
+            if value.tuning != wish.seen or wish.seen == wish.wanted:
+                del self._wishes[task]
+            elif now >= wish.at:
+                wish.at = now + AGAIN_S
+                yield task, Retune(base_revision=value.revision, tuning=wish.wanted)
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether nothing is wanted."""
+        return not self._wishes
+
+
+def _changed(before: Tuning, after: Tuning) -> dict[str, Any]:
+    pairs = ((one.name, getattr(before, one.name), getattr(after, one.name)) for one in fields(Tuning))
+    return {name: new for name, old, new in pairs if new != old}
