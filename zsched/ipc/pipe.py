@@ -26,6 +26,7 @@ _SMALL: Final = 8 * 1024
 
 _REGISTERED: Final[tuple[tuple[str, type, int], ...]] = (
     ("relay_stop", relay_protocol.RelayStop, _SMALL),
+    ("task_ended", relay_protocol.TaskEnded, _SMALL),
     ("relay_started", relay_protocol.RelayStarted, _SMALL),
     ("relay_pulse", protocol.RelayPulse, _SMALL),
     ("relay_hello", protocol.RelayHello, _SMALL),
@@ -55,6 +56,7 @@ COMMANDS: Final[tuple[type[Any], ...]] = (
     RoutePlan,
     Role,
     relay_protocol.WorkerWatch,
+    relay_protocol.TaskEnded,
     relay_protocol.RelayStop,
 )
 REPORTS: Final[tuple[type[Any], ...]] = (

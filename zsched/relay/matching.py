@@ -69,7 +69,7 @@ class Matching:
         """Nothing is declared, and no thread runs, before the first `watch`."""
         self._session = session
         self._report = report
-        self._queue: queue.SimpleQueue[WorkerWatch | None] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[WorkerWatch | TaskId | None] = queue.SimpleQueue()
         self._watched: dict[TaskId, _Watched] = {}
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
@@ -81,6 +81,12 @@ class Matching:
                 self._thread = guarded(self._run, name="matching")
                 self._thread.start()
         self._queue.put(watch)
+
+    def forget(self, task: TaskId) -> None:
+        """Watch a task's worker no more."""
+        with self._lock:
+            if self._thread is not None:
+                self._queue.put(task)
 
     def _wake(self, _status: Any) -> None:
         """Something matches, or does not any more (zenoh's thread: it must only enqueue)."""
@@ -95,8 +101,10 @@ class Matching:
             except queue.Empty:
                 watch = None
             try:
-                if watch is not None:
+                if isinstance(watch, WorkerWatch):
                     self._take(watch)
+                elif watch is not None and (known := self._watched.pop(watch, None)) is not None:
+                    known.close()
                 self._look()
             except Exception:  # noqa: BLE001 - a probe that zenoh refuses must not end the watch
                 _log.exception("workers cannot be watched")

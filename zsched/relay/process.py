@@ -24,7 +24,7 @@ import zenoh
 from zsched.clock import awake_s
 from zsched.core.events import ProblemReported, RoleEnded, StreamsCounted
 from zsched.core.membership.relink import Introductions
-from zsched.core.relay_protocol import RelayReport, RelayStarted, RelayStop, WorkerSeen, WorkerWatch
+from zsched.core.relay_protocol import RelayReport, RelayStarted, RelayStop, TaskEnded, WorkerSeen, WorkerWatch
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.plan import Role, Route, RoutePlan
 from zsched.errors import WireError
@@ -227,7 +227,10 @@ class RelayProcess:
         for seen in self._tokens.seen():
             self._reporter.report(seen)
 
-    def _do(self, command: RoutePlan | Role | WorkerWatch) -> None:
+    def _do(self, command: RoutePlan | Role | WorkerWatch | TaskEnded) -> None:
+        if isinstance(command, TaskEnded):
+            self._end(command.task)
+            return
         if isinstance(command, Role):
             self._roles.set(command)
             return
@@ -249,6 +252,18 @@ class RelayProcess:
             if self._graph is not None:
                 self._graph.set_routes(_standbys_of(watch.task), watch.standbys)
                 self._listen(watch.task, watch.unowned, self._graph)
+
+    def _end(self, name: TaskId) -> None:
+        self._roles.end(name)
+        self._matching.forget(name)
+        with self._lock:
+            for table in (self._waiting, self._standbys, self._unowned):
+                table.pop(name, None)
+            if self._graph is not None:
+                self._graph.set_routes(_standbys_of(name), ())
+            task = self._tasks.pop(name, None)
+        if task is not None:
+            task.end()
 
     def _listen(self, task: TaskId, routes: tuple[Route, ...], graph: GraphMirror) -> None:
         if routes:

@@ -41,6 +41,10 @@ class RoleServer:
         """Tell nobody anything any more, until the next `set`: the daemon whose word these roles were is gone."""
         self._roles.clear()
 
+    def end(self, task: TaskId) -> None:
+        """The task is no task any more: whoever asks for its role gets no answer."""
+        self._roles.pop(task, None)
+
     def tell(self, task: TaskId) -> None:
         """Put the task's role again (its worker has just appeared); nothing when there is none yet."""
         role = self._roles.get(task)

@@ -81,6 +81,10 @@ class _Orphaned:
     """In the queue of plans: those behind it are another daemon's."""
 
 
+class _Ended:
+    """In the queue of plans: the task left the fleet file, nothing follows."""
+
+
 @dataclass(frozen=True, slots=True)
 class _Unowned:
     """In the queue of plans: inputs that are taken whether or not there is an owner."""
@@ -111,7 +115,7 @@ class TaskRelay:
         self._acks = acks
         self._own_ids = own_ids
         self._report = report
-        self._queue: queue.SimpleQueue[RoutePlan | _Orphaned | _Unowned | None] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[RoutePlan | _Orphaned | _Unowned | _Ended | None] = queue.SimpleQueue()
         self._plan: RoutePlan | None = None
         self._slots: dict[int, _OpenSlot] = {}
         self._inputs: dict[str, InputStream] = {}
@@ -140,6 +144,10 @@ class TaskRelay:
         """Nobody would tell us of another owner from now on, until the next plan."""
         self._queue.put(_Orphaned())
 
+    def end(self) -> None:
+        """The task left the fleet file: close everything, and end."""
+        self._queue.put(_Ended())
+
     @property
     def misses_its_worker(self) -> bool:
         """Whether streams are meant to go to a worker that is not ready, or cannot be reached."""
@@ -161,6 +169,9 @@ class TaskRelay:
             except queue.Empty:
                 plan = None
             try:
+                if isinstance(plan, _Ended):
+                    self._close_all()
+                    return
                 if isinstance(plan, _Orphaned):
                     self._pause()
                 elif isinstance(plan, _Unowned):
@@ -204,6 +215,17 @@ class TaskRelay:
             for sink in self._outputs.values():
                 sink.pause()
 
+    def _close_all(self) -> None:
+        for epoch in sorted(self._slots):
+            self._close(epoch)
+        streams: list[InputStream | OutputStream] = [*self._inputs.values(), *self._outputs.values()]
+        for stream in streams:
+            stream.close()
+        self._inputs.clear()
+        self._outputs.clear()
+        self._services.keep(set())
+        self._graph.set_routes(self._task, ())
+
     def _listen(self, routes: tuple[Route, ...]) -> None:
         for route in routes:
             if route.stream in self._inputs:
@@ -227,8 +249,11 @@ class TaskRelay:
             self._open(plan.current)
             self._flip(self._slots[plan.current.epoch])
         for epoch, state in sorted(self._slots.items()):
-            if wanted.get(epoch) != state.slot:
+            slot = wanted.get(epoch)
+            if slot is None or (slot.owner, slot.ready_when) != (state.slot.owner, state.slot.ready_when):
                 self._close(epoch)
+            elif slot != state.slot:
+                self._change(state, slot)
         for old in olds:
             if old.epoch not in self._slots:  # we were not there when it opened: it carries, or did
                 self._open(old)
@@ -263,10 +288,41 @@ class TaskRelay:
             return
         self._slots[slot.epoch] = _OpenSlot(slot=slot)
         for route in slot.routes:
-            try:
-                self._open_route(slot, route, is_from_start=is_from_start)
-            except (ValueError, zenoh.ZError) as error:
-                self._problem(f"{route.stream}: {route.from_expr} -> {route.to_expr}: {error}")
+            self._try_route(slot, route, is_from_start=is_from_start)
+
+    def _change(self, state: _OpenSlot, slot: Slot) -> None:
+        """The fleet file has changed within an epoch: close and open the streams that differ, touch no other one."""
+        epoch, before = slot.epoch, {route.stream: route for route in state.slot.routes}
+        wanted = {route.stream: route for route in slot.routes}
+        lost = sum(self._close_stream(epoch, route) for stream, route in before.items() if wanted.get(stream) != route)
+        if lost:
+            self._report(SlotLost(task=self._task, epoch=epoch, owner=slot.owner, samples=lost))
+        state.slot = slot
+        for stream, route in wanted.items():
+            if before.get(stream) != route:
+                self._try_route(slot, route, is_from_start=False)
+        if state.is_flipped:  # those that ran on are there already
+            for sink in self._outputs.values():
+                sink.flip(epoch, drops_held=False)
+            for source in self._inputs.values():
+                source.flip(epoch, has_answer=self._has_answer)
+            self._services.flip(epoch)
+
+    def _close_stream(self, epoch: int, route: Route) -> int:
+        """Close one stream's part of a slot; how many of its samples the worker had not acknowledged."""
+        if route.direction is Direction.SERVICE:
+            self._services.close_stream(epoch, route.stream)
+            return 0
+        if route.stream in self._outputs:
+            self._outputs[route.stream].close_slot(epoch)
+        source = self._inputs.get(route.stream)
+        return 0 if source is None else source.take_left(epoch) + source.close_slot(epoch, has_answer=self._has_answer)
+
+    def _try_route(self, slot: Slot, route: Route, *, is_from_start: bool) -> None:
+        try:
+            self._open_route(slot, route, is_from_start=is_from_start)
+        except (ValueError, zenoh.ZError) as error:
+            self._problem(f"{route.stream}: {route.from_expr} -> {route.to_expr}: {error}")
 
     def _open_route(self, slot: Slot, route: Route, *, is_from_start: bool) -> None:
         epoch = slot.epoch

@@ -23,8 +23,8 @@ from zsched.adapters.relay.child import ENDING_S, RelayChild, start_relay
 from zsched.adapters.relay.silence import Silence
 from zsched.clock import awake_s
 from zsched.core.events import ProblemReported, RelayChanged
-from zsched.core.relay_protocol import HandleReport, RelayStarted, RelayStop, WorkerWatch
-from zsched.core.values.model import NodeId
+from zsched.core.relay_protocol import HandleReport, RelayStarted, RelayStop, TaskEnded, WorkerWatch
+from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.plan import Role, RoutePlan
 from zsched.errors import AdapterError, WireError
 from zsched.guard import guarded
@@ -53,7 +53,9 @@ EVICT_S: Final = 2.0
 _log = logging.getLogger("zsched.streams")
 
 _Key = tuple[str, str]
-_Told = RoutePlan | Role | WorkerWatch
+_Told = RoutePlan | Role | WorkerWatch | TaskEnded
+_KINDS: Final = ("plan", "role", "watch")
+"""What a task has in the table."""
 
 
 @dataclass(slots=True)
@@ -163,6 +165,13 @@ class RelayHandle:
     def watch(self, watch: WorkerWatch) -> None:
         """Let the relay look after what of a task does not depend on its owner."""
         self._tell(("watch", watch.task), watch)
+
+    def end(self, task: TaskId) -> None:
+        """Let the relay end everything of a task; a relay that starts later is told nothing of it."""
+        with self._lock:
+            for kind in _KINDS:
+                self._newest.pop((kind, task), None)
+            self._outbox.put(("ended", task), TaskEnded(task=task))
 
     def stop(self, deadline_s: float = 2.0) -> None:
         """Stop the relay in order, with SIGKILL at the deadline; returns when it is gone."""

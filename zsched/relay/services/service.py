@@ -388,6 +388,11 @@ class Services:
         for stream in self._streams.values():
             stream.close_slot(epoch)
 
+    def close_stream(self, epoch: int, name: str) -> None:
+        """Close one service's slot of one epoch."""
+        if name in self._streams:
+            self._streams[name].close_slot(epoch)
+
     def keep(self, names: set[str]) -> None:
         """Close the services whose stream is not among ``names``."""
         for name in tuple(self._streams):
