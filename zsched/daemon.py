@@ -13,7 +13,6 @@ import contextlib
 import faulthandler
 import functools
 import gc
-import json
 import logging
 import os
 import random
@@ -39,24 +38,25 @@ from zsched.config.load import load_fleet, require_node
 from zsched.core import events as ev
 from zsched.core.electorate.numbers import in_force
 from zsched.core.node import Node
-from zsched.core.route.route import outputs_of, watch_for
 from zsched.core.status import status_line
 from zsched.core.values.durable import DurableState
-from zsched.core.values.fleet import Fleet, dial_endpoint, electorate_hash, fleet_hash, runs_worker
-from zsched.core.values.model import NodeId, NodeKind, TaskId
+from zsched.core.values.fleet import Fleet, dial_endpoint, electorate_hash, fleet_hash
+from zsched.core.values.model import NodeId, NodeKind
 from zsched.errors import AdapterError, ConfigError, NameTakenError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_NAME_TAKEN, EXIT_OK
-from zsched.files import write_regular
 from zsched.guard import on_failure
 from zsched.ipc.takeover import Door
 from zsched.log_limit import limit_handlers
 from zsched.runtime import tls as daemon_tls
 from zsched.runtime.access import StreamAccess, joins_at
+from zsched.runtime.adoption import Adoption
 from zsched.runtime.descriptors import take_descriptors
 from zsched.runtime.endpoints import DATA_PORT, Endpoints, claim_port, endpoints_for, free_port, is_here
 from zsched.runtime.leaving import Leaving
 from zsched.runtime.library import Library
 from zsched.runtime.memory import shared_memory_objection
+from zsched.runtime.recipes import Recipes
+from zsched.runtime.reload import Reload
 from zsched.runtime.sampler import Sampler
 from zsched.runtime.sessions import SessionsRead
 from zsched.runtime.shell import Desk, Inbox, Shell
@@ -68,6 +68,8 @@ LOOP_MAX_WAIT_S = 1.0
 STDERR = 2
 RESTART_SIGNAL = signal.SIGUSR2
 """As SIGTERM, but the relay stays and carries the streams on for the daemon that follows (`systemctl restart`)."""
+RELOAD_SIGNAL = signal.SIGHUP
+"""Read the fleet file again and go by it (`systemctl reload`)."""
 ALERT_S, ALERT_WAIT_S = 1.0, 0.01
 """After a token went, beats are looked at so often and for so long: they tell whether its node lives."""
 
@@ -273,12 +275,26 @@ class Daemon:
         shell.relay = relay = self._relay(shell, incarnation, points, operator_json5)
         shell.crew.supervisor = supervisor = self._supervisor(stack, shell, incarnation, points, operator_json5)
         shell.crew.begin()
-        for watch in filter(None, (watch_for(fleet, task, me) for task in fleet.tasks)):
-            relay.watch(watch)
+        sampler = Sampler(self._spec, fleet.timing.sample_s, self._options.state_dir, shell, self._inbox)
+        adoption = Adoption(
+            me=me,
+            started_with=fleet,
+            points=points,
+            protocol=self._protocol,
+            recipes=self._recipes,
+            crew=shell.crew,
+            supervisor=supervisor,
+            relay=relay,
+            bus=bus,
+            access=access,
+            sampler=sampler,
+            post=self._inbox.post,
+        )
+        adoption.begin()
+        shell.follow = adoption.adopt
         relay.start()
         stack.callback(lambda: relay.leave() if self._is_restart else relay.stop(1.0))
         stack.callback(supervisor.close, CLOSE_WORKERS_S)
-        sampler = Sampler(self._spec, fleet.timing.sample_s, self._options.state_dir, shell, self._inbox)
         sampler.start()
         stack.callback(sampler.stop)
         return shell
@@ -314,52 +330,22 @@ class Daemon:
         self, stack: contextlib.ExitStack, shell: Shell, incarnation: int, points: Endpoints, operator_json5: str
     ) -> WorkerSupervisor:
         fleet, me = self._fleet, self._spec.name
-        mine = {task.name: task.worker for task in fleet.tasks if runs_worker(task, me, self._spec.kind)}
-        deadlines = {
-            task.name: {"ZSCHED_DEADLINE_MS": f"{task.tuning.deadline_ms:g}"}
-            for task in fleet.tasks
-            if task.tuning.deadline_ms is not None
-        }
-        outputs = {
-            task.name: {"ZSCHED_OUTPUT_KEYS": json.dumps(keys)}
-            for task in fleet.tasks
-            if (keys := outputs_of(task, me))
-        }
-        folder = self._options.runtime_dir
-        paths: dict[TaskId, Path] = {}
-        sessions_read = SessionsRead(self._options.state_dir)
-        for name, spec in mine.items():
-            paths[name] = folder / f"{me}-{name}.zenoh.json5"
-            config = zenoh_config.worker_config(
-                connect=points.worker_connect,
-                listen=(),
-                timing=fleet.timing,
-                link=spec.link,
-                shared_memory=self._memory_objection == "",
-                operator_json5=operator_json5,
-                dials_by_gossip=points.worker_by_gossip,
-            )
-            try:
-                write_regular(paths[name], config.encode())
-            except OSError as error:
-                raise AdapterError(f"cannot write {paths[name]}: {error.strerror}; check --runtime-dir") from error
-            stack.callback(paths[name].unlink, missing_ok=True)
-            if not spec.command:
-                sessions_read.begin(name, config)
-        if any(not spec.command for spec in mine.values()):
-            sessions_read.save()
-        shell.crew.sessions, shell.crew.sessions_read = paths, sessions_read
+        recipes = self._recipes = Recipes(
+            me,
+            self._options.runtime_dir,
+            SessionsRead(self._options.state_dir),
+            shared_memory=self._memory_objection == "",
+            operator_json5=operator_json5,
+        )
+        stack.callback(recipes.close)
+        recipes.adopt(fleet, points.worker_connect, dials_by_gossip=points.worker_by_gossip)
+        shell.crew.sessions, shell.crew.sessions_read = recipes.paths, recipes.read
         return WorkerSupervisor(
-            specs=mine,
+            specs=recipes.specs,
             context=WorkerContext(fleet=fleet.name, node=me, incarnation=incarnation),
             events=shell.crew,
-            environment=lambda task: {
-                "PYTHONFAULTHANDLER": "1",
-                "ZSCHED_ZENOH_CONFIG": str(paths[task]),
-                "ZENOH_SESSION_CONFIG_URI": str(paths[task]),  # a ROS node (rmw_zenoh) joins the data network by this
-                **deadlines.get(task, {}),
-                **outputs.get(task, {}),
-            },
+            environment=recipes.environment,
+            session=recipes.session,
             rng=random.Random(f"{me}/{incarnation}/workers"),
             why_not_ready=shell.crew.why_not_ready,
         )
@@ -374,6 +360,11 @@ class Daemon:
         for number in (signal.SIGTERM, signal.SIGINT, RESTART_SIGNAL):
             previous = signal.signal(number, stop)
             stack.callback(signal.signal, number, previous)
+        reload = Reload(self._options.config, self._spec.name, self._inbox.post)
+        # at a terminal the same signal says that the terminal is gone: then nobody is there to stop us later
+        hung_up = stop if os.isatty(0) else lambda _number, _frame: reload.ask()
+        previous = signal.signal(RELOAD_SIGNAL, hung_up)
+        stack.callback(signal.signal, RELOAD_SIGNAL, previous)
         # `zsched up` has held them back since before we loaded: an early Ctrl-C is an orderly stop, and no traceback
         signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGTERM, signal.SIGINT))
 

@@ -62,6 +62,9 @@ class Events:
     def on_reset(self, task: str) -> None:
         print("reset", task, flush=True)
 
+    def on_compared(self, task: str, *, is_old: bool) -> None:
+        print("compared", task, is_old, flush=True)
+
 
 def load_state(file: StateFile) -> DurableState:
     result = file.load()

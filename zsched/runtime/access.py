@@ -26,6 +26,10 @@ class StreamAccess:
         self._own = own_endpoints
         self._operator_json5 = operator_json5
 
+    def adopt(self, fleet: Fleet) -> None:
+        """Answer by another fleet file from now on."""
+        self._fleet = fleet
+
     def answer(self, node: NodeId) -> Json:
         """``{"sides": {name: zenoh configuration}, "via": node}`` or ``{"error": ...}``.
 

@@ -17,7 +17,7 @@ from zsched.adapters.workers.supervisor import WorkerSupervisor
 from zsched.clock import monotonic_s, wall_time
 from zsched.core import events as ev
 from zsched.core.relay_protocol import WorkerMatched, WorkerSeen, WorkerTrouble
-from zsched.core.values.fleet import Fleet
+from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.model import MAX_REASON, WAS_READY, NodeId, TaskId, WorkerState
 from zsched.core.values.plan import ReadyWhen
 from zsched.runtime.sessions import SessionsRead
@@ -43,9 +43,7 @@ class Crew:
     def __init__(self, post: Callable[[ev.Event], None], fleet: Fleet | None = None, node: NodeId = "") -> None:
         """``fleet`` says which workers show themselves by matching; without one all show tokens."""
         self._keys, self._node = Keyspace("" if fleet is None else fleet.name), node
-        tasks = () if fleet is None else fleet.tasks
-        self._matching = frozenset(task.name for task in tasks if task.worker.ready_when is ReadyWhen.MATCHING)
-        self._foreign = frozenset(task.name for task in tasks if not task.worker.command)
+        self._take(() if fleet is None else fleet.tasks)
         self._post = post
         self.supervisor: WorkerSupervisor | None = None
         """It reports to this crew, so it is made after it."""
@@ -64,6 +62,21 @@ class Crew:
         self._outdated: set[TaskId] = set()
         self._relay_at = -math.inf
         self._lock = threading.Lock()  # an end and a token's end come from two threads
+
+    def _take(self, tasks: tuple[TaskSpec, ...]) -> None:
+        self._matching = frozenset(task.name for task in tasks if task.worker.ready_when is ReadyWhen.MATCHING)
+        self._foreign = frozenset(task.name for task in tasks if not task.worker.command)
+
+    def adopt(self, fleet: Fleet, sessions: Mapping[TaskId, Path]) -> None:
+        """Take from another fleet file which workers show themselves how, and which ones somebody else starts."""
+        known = self._foreign
+        with self._lock:
+            self._take(fleet.tasks)
+            for task in self._foreign - known:
+                self._lives.pop(task, None)  # lives of ours mean nothing any more
+            self._outdated &= self._foreign
+        self.sessions = sessions
+        self._say_missing(self._foreign - self._matching - known)
 
     def life_of(self, task: TaskId) -> int:
         """The running process's incarnation, 0 when none runs."""
@@ -89,8 +102,11 @@ class Crew:
 
     def begin(self) -> None:
         """Say what is missing of the workers that somebody else starts; the relay says it of those seen by matching."""
-        for task in sorted(self._foreign - self._matching):
-            if self._supervisor_of(task) is not None:
+        self._say_missing(self._foreign - self._matching)
+
+    def _say_missing(self, tasks: frozenset[TaskId]) -> None:
+        for task in sorted(tasks):
+            if task in self.sessions:
                 key = self._keys.worker(self._node, task, "NUMBER")
                 reason = f"no token {key}: {self._start_it(task)}; without zsched.worker say `ready: matching`"
                 self._post(ev.WorkerChanged(task=task, state=WorkerState.STOPPED, reason=reason))
@@ -245,6 +261,10 @@ class Crew:
     def on_failed(self, task: TaskId, reason: str) -> None:
         """The supervisor: the worker is not started again."""
         self._post(ev.WorkerChanged(task=task, state=WorkerState.FAILED, reason=reason))
+
+    def on_compared(self, task: TaskId, *, is_old: bool) -> None:
+        """The supervisor: the worker's process runs by an old recipe, or does not any more."""
+        self._post(ev.RecipeCompared(task=task, is_old=is_old))
 
     def on_reset(self, task: TaskId) -> None:
         """The supervisor: the worker may be started again."""

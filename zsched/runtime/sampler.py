@@ -26,7 +26,7 @@ class Sampler:
     """Measures the machine and its links in a thread of its own: a slow driver must not stop the beats."""
 
     def __init__(self, spec: NodeSpec, period_s: float, state_dir: Path, shell: Shell, inbox: Inbox) -> None:
-        self._readers = readers_for(spec)
+        self._links, self._readers = spec.links, readers_for(spec)
         self._state_dir = state_dir
         self._device, self._clocks = DeviceProfiler(), ClockWatch()
         self._period_s, self._shell, self._inbox = period_s, shell, inbox
@@ -37,6 +37,12 @@ class Sampler:
     def start(self) -> None:
         """Begin measuring."""
         self._thread.start()
+
+    def adopt(self, spec: NodeSpec, period_s: float) -> None:
+        """Measure these links, at this pace, from the next time on."""
+        self._period_s = period_s
+        if spec.links != self._links:
+            self._links, self._readers = spec.links, readers_for(spec)
 
     def stop(self) -> None:
         """End measuring; the thread ends with its current reading."""
@@ -76,7 +82,8 @@ class Sampler:
         supervisor = self._shell.crew.supervisor
         states, pids = (supervisor.states(), supervisor.pids()) if supervisor is not None else ({}, {})
         device = self._device.sample({task: (state, pids.get(task)) for task, state in states.items()})
-        links = tuple(reader.read() for reader in self._readers)
+        readers = self._readers
+        links = tuple(reader.read() for reader in readers)
         self._inbox.post_quietly(ev.ProfileSampled(device=device, links=links))
-        for index, reader in enumerate(self._readers):
+        for index, reader in enumerate(readers):
             self._report(f"profile/link{index}", reader.problem)

@@ -14,15 +14,15 @@ import json
 import logging
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from zsched.core.values.model import TaskId
 from zsched.files import read_regular, write_regular
+from zsched.sessions.comparison import lacking
 
 NAME: Final = "sessions.json"
 MAX_BYTES: Final = 4 << 20
 BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")
-OTHER_SETTINGS: Final = "new settings"
 
 _log = logging.getLogger("zsched.daemon")
 
@@ -83,31 +83,6 @@ class SessionsRead:
             return {str(task): _Read(str(one["text"]), int(one["life"])) for task, one in found["workers"].items()}
         except (OSError, ValueError, KeyError, TypeError, AttributeError):  # not there, cut, or somebody else's
             return {}
-
-
-def lacking(read: str, now: str) -> str:
-    """What who has read one session lacks of another, in words; empty: nothing.
-
-    Whom it dials beyond that is gone, or joins by itself: no reason to start it again.
-    """
-    if read == now:
-        return ""
-    try:
-        old, new = json.loads(read), json.loads(now)
-        old_ends, new_ends = _take_endpoints(old), _take_endpoints(new)
-    except (ValueError, KeyError, TypeError, AttributeError):
-        return OTHER_SETTINGS
-    if old != new:
-        return OTHER_SETTINGS
-    return ", ".join(one.partition("#")[0] for one in new_ends if one not in old_ends)
-
-
-def _take_endpoints(session: dict[str, Any]) -> list[str]:
-    """Whom a session dials, taken out of it."""
-    endpoints = session["connect"].pop("endpoints")
-    if not isinstance(endpoints, list):
-        raise TypeError
-    return [str(one) for one in endpoints]
 
 
 def _first_line(path: Path) -> str:

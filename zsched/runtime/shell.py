@@ -324,6 +324,8 @@ class Shell:
         self.library: Library | None = None
         """The fleet's documents."""
         self.log: DecisionLog | None = None
+        self.follow: Callable[[Fleet, bool], None] = lambda _fleet, _is_agreed: None
+        """Lets the adapters follow another fleet (`zsched.runtime.adoption`), once they are all made."""
         self.stand_down = ""
         """Why this daemon must end, for its name is taken; empty: it need not."""
         self._failed_at: dict[str, float] = {}
@@ -410,6 +412,10 @@ class Shell:
                 self._answer_operator(request, self._lines(task, after))
             case do.ApplyRoutes(plan=plan):
                 self._streams().apply(plan)
+            case do.AdoptFleet(fleet=fleet, is_agreed=is_agreed):
+                self.follow(fleet, is_agreed)
+            case do.EndTask(task=task):
+                self._streams().end(task)
             case do.SetRole(role=role):
                 self._streams().set_role(role)
             case do.StartWorker(task=task):

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from zsched.runtime.sessions import NAME, OTHER_SETTINGS, SessionsRead, lacking
+from zsched.runtime.sessions import NAME, SessionsRead
+from zsched.sessions.comparison import OTHER_SETTINGS, lacking
 from zsched.sessions.config import worker_config
 
 ONE, TWO = "tcp/10.0.0.1:7458", "tcp/10.0.0.2:7458"

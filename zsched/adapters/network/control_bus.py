@@ -161,6 +161,17 @@ class ControlBus:
         self._ring = session.declare_subscriber(key, zenoh.handlers.RingChannel(RING))
         return [self._ring]
 
+    def hear_all_at_once(self) -> None:
+        """Wake the loop up for every periodic frame from now on: a task has become exclusive."""
+        if self._hears_all_at_once or self._session is None:
+            return
+        self._hears_all_at_once = True
+        ring, self._ring = self._ring, None
+        self._kept += self._hear_in_turn(self._session)  # before the other one ends: none is missed
+        if ring is not None:
+            self._kept.remove(ring)
+            ring.undeclare()
+
     def _questions_to_us(self) -> list[str]:
         """An edge has no utilities, so it is not to be asked for them."""
         keys, node = self._keys, self._node

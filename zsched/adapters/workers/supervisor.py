@@ -38,6 +38,7 @@ from zsched.clock import awake_s
 from zsched.core.values.fleet import WorkerSpec
 from zsched.core.values.model import MAX_REASON, RESTARTING, NodeId, TaskId, WorkerState, as_reason
 from zsched.guard import guarded
+from zsched.sessions.comparison import lacking
 
 log = logging.getLogger("zsched.worker")
 
@@ -64,6 +65,9 @@ class WorkerEvents(Protocol):
 
     def on_reset(self, task: TaskId) -> None:
         """The worker may be started again: its failures are forgotten."""
+
+    def on_compared(self, task: TaskId, *, is_old: bool) -> None:
+        """The worker's process runs by an old recipe, or does not any more."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -102,6 +106,25 @@ class _Phase(StrEnum):
 _SHOWN = {_Phase.STARTING: WorkerState.STARTING, _Phase.READY: WorkerState.READY, _Phase.FAILED: WorkerState.FAILED}
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recipe:
+    """All that a worker's process is made with and keeps until it ends."""
+
+    command: tuple[str, ...] = ()
+    environment: tuple[tuple[str, str], ...] = ()
+    session: str = ""
+    """The text of the session that it opens, as JSON."""
+
+    def is_old(self, new: Recipe) -> bool:
+        """Whether a process that was made by this one lacks something of ``new``.
+
+        Of sessions only what is missing counts: a robot that has gone is no reason to start again.
+        """
+        return (self.command, self.environment) != (new.command, new.environment) or bool(
+            lacking(self.session, new.session)
+        )
+
+
 @dataclass(slots=True, kw_only=True)
 class _Worker:
     """The supervisor's record of one task; touched by its thread only."""
@@ -126,6 +149,12 @@ class _Worker:
     """Since its last failure, until it is ready: which one that was, and that it is started again."""
     stop_step: int = 0
     stop_grace_s: float = 0.0
+    is_kept: bool = True
+    """False: it left the fleet file, and is forgotten once it has stopped."""
+    made_by: Recipe = Recipe()
+    """The recipe of this process."""
+    is_old: bool = False
+    """This process runs by another recipe than the next one will; as it was told."""
 
 
 class WorkerSupervisor:
@@ -141,6 +170,7 @@ class WorkerSupervisor:
         rng: random.Random | None = None,
         policy: RestartPolicy = RestartPolicy(),
         why_not_ready: Callable[[TaskId], str] = lambda _task: "",
+        session: Callable[[TaskId], str] = lambda _task: "",
     ) -> None:
         """Start the supervisor's thread; no worker yet.
 
@@ -152,6 +182,7 @@ class WorkerSupervisor:
                 ``ZSCHED_ZENOH_CONFIG``.
             rng: the source of the jitter; seed it in tests.
             policy: delays between restarts.
+            session: called at every start: the text of the session that the worker opens.
             why_not_ready: asked when a start-up deadline is over: what the worker lacks, in words.
         """
         self._workers = {
@@ -159,7 +190,7 @@ class WorkerSupervisor:
         }
         self._context, self._events, self._environment = context, events, environment
         self._rng, self._policy = rng or random.Random(), policy
-        self._why_not_ready = why_not_ready
+        self._why_not_ready, self._session = why_not_ready, session
         self._started = 0
         self._guard = WorkerGuard()
         self._commands: deque[Callable[[], None]] = deque()
@@ -203,6 +234,15 @@ class WorkerSupervisor:
         """Stop ``task``'s worker as `stop` does, and start it again; that counts as no failure."""
         self._command(self._on_renew, task)
 
+    def adopt(self, specs: Mapping[TaskId, WorkerSpec]) -> None:
+        """Keep these workers from now on, with these settings.
+
+        No process ends by it but one whose task has no ``command`` any more: a worker that is not among ``specs`` goes
+        with its next `stop`, one that runs by an old recipe is told of (`WorkerEvents.on_compared`). Failures of a
+        worker whose recipe has changed are forgotten.
+        """
+        self._command(self._on_adopt, dict(specs))
+
     def output(self, task: TaskId) -> KeptLines | None:
         """What ``task``'s worker has printed lately; ``None`` where this supervisor starts none."""
         worker = self._workers.get(task)
@@ -218,7 +258,8 @@ class WorkerSupervisor:
 
     def why_again(self, task: TaskId) -> str:
         """Which failure ``task``'s worker is started again after; empty once it is ready, or nobody starts it again."""
-        return self._workers[task].why_again
+        worker = self._workers.get(task)
+        return "" if worker is None else worker.why_again
 
     def close(self, within_s: float = 1.5) -> None:
         """Stop every worker within ``within_s`` seconds (SIGTERM after half, SIGKILL after 80 %) and end the thread."""
@@ -237,7 +278,7 @@ class WorkerSupervisor:
             while self._commands:
                 self._commands.popleft()()
             now = awake_s()
-            for worker in self._workers.values():
+            for worker in tuple(self._workers.values()):
                 self._advance(worker, now)
             self._publish()
         self._guard.close()
@@ -268,11 +309,51 @@ class WorkerSupervisor:
 
     # --- commands, in the thread ---
 
+    def _on_adopt(self, specs: Mapping[TaskId, WorkerSpec]) -> None:
+        kept = {
+            task: self._workers.get(task) or _Worker(task=task, spec=spec, logger=log.getChild(task))
+            for task, spec in specs.items()
+        }
+        leaving = {task: worker for task, worker in self._workers.items() if task not in kept}
+        for worker in leaving.values():
+            worker.is_kept = False
+        self._workers = dict(sorted({**kept, **leaving}.items()))
+        for task, worker in kept.items():
+            has_changed = worker.spec != specs[task]
+            worker.spec, worker.is_kept = specs[task], True
+            if not worker.spec.command and worker.process is not None:
+                self._on_stop(task)
+            if has_changed and worker.phase in {_Phase.FAILED, _Phase.BACKOFF}:
+                self._on_reset(task)
+        for worker in self._workers.values():
+            self._compare(worker)
+
+    def _compare(self, worker: _Worker) -> None:
+        """Tell whether the process runs by an old recipe, when that has changed."""
+        is_old = worker.process is not None and worker.made_by.is_old(self._recipe_of(worker))
+        if is_old is not worker.is_old:
+            worker.is_old = is_old
+            self._tell(partial(self._events.on_compared, is_old=is_old), worker.task)
+
+    def _recipe_of(self, worker: _Worker) -> Recipe:
+        if not worker.is_kept:
+            return worker.made_by
+        environment = {**self._environment(worker.task), **dict(worker.spec.env)}
+        return Recipe(
+            command=worker.spec.command,
+            environment=tuple(sorted(environment.items())),
+            session=self._session(worker.task),
+        )
+
     def _on_start(self, task: TaskId) -> None:
-        self._workers[task].is_wanted = bool(self._workers[task].spec.command) and self._close_by_s is None
+        worker = self._workers.get(task)
+        if worker is not None:
+            worker.is_wanted = bool(worker.spec.command) and worker.is_kept and self._close_by_s is None
 
     def _on_stop(self, task: TaskId) -> None:
-        worker = self._workers[task]
+        worker = self._workers.get(task)
+        if worker is None:
+            return
         worker.is_wanted, worker.why_again = False, ""
         if worker.phase in {_Phase.STARTING, _Phase.READY} and worker.process is not None:
             self._begin_stop(worker, worker.spec.stop_grace_s)
@@ -280,7 +361,9 @@ class WorkerSupervisor:
             worker.phase, worker.deadline_s = _Phase.IDLE, None
 
     def _on_ready(self, task: TaskId, incarnation: int) -> None:
-        worker = self._workers[task]
+        worker = self._workers.get(task)
+        if worker is None:
+            return
         if not worker.spec.command:
             worker.phase = _Phase.READY
         elif worker.phase is _Phase.STARTING and incarnation == worker.incarnation:
@@ -288,25 +371,33 @@ class WorkerSupervisor:
             worker.why_again, worker.ready_at = "", awake_s()
 
     def _on_gone(self, task: TaskId, incarnation: int) -> None:
-        worker = self._workers[task]
+        worker = self._workers.get(task)
+        if worker is None:
+            return
         if not worker.spec.command:
             worker.phase = _Phase.IDLE
         elif worker.phase is _Phase.READY and incarnation == worker.incarnation:
             worker.phase, worker.deadline_s = _Phase.STARTING, awake_s() + worker.spec.start_deadline_s
 
     def _on_hung(self, task: TaskId, incarnation: int, reason: str) -> None:
-        worker = self._workers[task]
+        worker = self._workers.get(task)
+        if worker is None:
+            return
         is_running = worker.process is not None and worker.phase in {_Phase.STARTING, _Phase.READY}
         if is_running and incarnation == worker.incarnation:
             self._begin_stop(worker, worker.spec.stop_grace_s, failure=reason, first_step=STOP_SIGNALS.index(KILL))
 
     def _on_renew(self, task: TaskId) -> None:
-        worker = self._workers[task]
+        worker = self._workers.get(task)
+        if worker is None:
+            return
         if worker.phase in {_Phase.STARTING, _Phase.READY} and worker.process is not None:
             self._begin_stop(worker, worker.spec.stop_grace_s)  # whose end leads to a start, for it is still wanted
 
     def _on_reset(self, task: TaskId) -> None:
-        worker = self._workers[task]
+        worker = self._workers.get(task)
+        if worker is None:
+            return
         worker.failures.clear()
         worker.why_again = ""
         if worker.phase in {_Phase.FAILED, _Phase.BACKOFF}:
@@ -329,6 +420,8 @@ class WorkerSupervisor:
             self._on_deadline(worker, now)
         if worker.phase is _Phase.IDLE and worker.is_wanted:
             self._spawn(worker, now)
+        if not worker.is_kept and worker.process is None and not worker.is_wanted:
+            del self._workers[worker.task]
 
     def _on_deadline(self, worker: _Worker, now: float) -> None:
         worker.deadline_s = None
@@ -344,6 +437,7 @@ class WorkerSupervisor:
 
     def _spawn(self, worker: _Worker, now: float) -> None:
         self._started += 1
+        worker.made_by = self._recipe_of(worker)
         worker.incarnation = self._context.incarnation * INCARNATIONS_PER_DAEMON + self._started
         try:
             process = WorkerProcess(worker.spec.command, self._environment_of(worker), worker.logger, worker.kept)
@@ -355,6 +449,7 @@ class WorkerSupervisor:
         worker.process, worker.phase, worker.has_been_ready = process, _Phase.STARTING, False
         worker.deadline_s = now + worker.spec.start_deadline_s
         self._watch.add(process)
+        self._compare(worker)
         log.info("worker_started task=%s pid=%d incarnation=%d", worker.task, process.pid, worker.incarnation)
         self._tell(self._events.on_started, worker.task, process.pid, worker.incarnation)
 
@@ -399,6 +494,7 @@ class WorkerSupervisor:
         self._guard.discard(process.pid)
         returncode = process.finish(now)
         worker.process, worker.deadline_s = None, None
+        self._compare(worker)
         if worker.phase is _Phase.STOPPING and not worker.failure:
             worker.phase = _Phase.IDLE
             reason = f"stopped by {STOP_SIGNALS[worker.stop_step].name}"

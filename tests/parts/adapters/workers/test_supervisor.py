@@ -45,6 +45,9 @@ class Recorder:
     def on_reset(self, task: str) -> None:
         self._add("reset", task)
 
+    def on_compared(self, task: str, *, is_old: bool) -> None:
+        self._add("compared", task, is_old)
+
     def _add(self, *call: object) -> None:
         with self._changed:
             self.calls.append(call)
@@ -461,3 +464,45 @@ def test_kernel_without_pidfd_is_polled(monkeypatch: pytest.MonkeyPatch) -> None
     with supervised(python("raise SystemExit(5)")) as (supervisor, recorder):
         supervisor.start("merge")
         assert recorder.wait("failed")[2] == "exited with status 5"
+
+
+# --- a changed fleet file --------------------------------------------------------------------------------------------
+
+
+def test_a_changed_command_waits_for_the_order_and_then_runs() -> None:
+    with supervised(python(SLEEP)) as (supervisor, recorder):
+        supervisor.start("merge")
+        recorder.wait("started")
+        supervisor.adopt({"merge": python(f"{SLEEP} # another")})
+        assert recorder.wait("compared") == ("compared", "merge", True)
+        assert [call for call in recorder.calls if call[0] == "exited"] == [], "nobody has asked for an end"
+        supervisor.renew("merge")
+        recorder.wait("started", 2)
+        assert recorder.wait("compared", 2) == ("compared", "merge", False)
+        supervisor.adopt({"merge": python(f"{SLEEP} # another", start_deadline_s=50.0)})
+        supervisor.adopt({"merge": python(f"{SLEEP} # a third")})
+        assert recorder.wait("compared", 3) == ("compared", "merge", True), "a deadline alone makes nothing old"
+
+
+def test_workers_come_and_go_with_the_file() -> None:
+    with supervised(python(SLEEP)) as (supervisor, recorder):
+        supervisor.start("merge")
+        recorder.wait("started")
+        supervisor.adopt({"other": python(SLEEP)})
+        supervisor.start("other")
+        assert recorder.wait("started", 2)[1] == "other"
+        assert "merge" in supervisor.pids(), "it works until it is told to stop"
+        supervisor.stop("merge")
+        wait_until(lambda: set(supervisor.states()) == {"other"})
+        supervisor.start("merge")
+        supervisor.stop("other")
+        wait_until(lambda: not supervisor.pids())
+        assert len([call for call in recorder.calls if call[0] == "started"]) == 2, "nobody runs what is not there"
+
+
+def test_a_mended_command_is_tried_although_the_one_before_has_failed_for_good() -> None:
+    with supervised(python("raise SystemExit(78)")) as (supervisor, recorder):
+        supervisor.start("merge")
+        recorder.wait("failed")
+        supervisor.adopt({"merge": python(SLEEP)})
+        recorder.wait("started", 2)

@@ -1,0 +1,155 @@
+"""A changed fleet file under running daemons (SIGHUP): a reliable stream runs on, whole, while the rest changes."""
+
+from __future__ import annotations
+
+import json
+import signal
+import threading
+import time
+from collections.abc import Callable
+from copy import deepcopy
+from pathlib import Path
+from typing import Any, Self
+
+import zenoh
+
+from support.sessions import matches
+from zsched.core.hop.books import unaccounted
+from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
+
+Tree = dict[str, Any]
+PERIOD_S = 0.005
+
+
+class Stream:
+    """An application that puts numbers into a reliable input and keeps what comes back."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self.back: list[int] = []
+        self.sent = 0
+        self._kept = session.declare_subscriber(
+            "robot1/out", lambda sample: self.back.append(int(sample.payload.to_bytes()))
+        )
+        self.publisher = session.declare_publisher("robot1/in", congestion_control=zenoh.CongestionControl.BLOCK)
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end()
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._ended.wait(PERIOD_S):
+            self.publisher.put(str(self.sent).encode())
+            self.sent += 1
+
+    def end(self) -> None:
+        self._ended.set()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def flows(self) -> Callable[[], bool]:
+        """Whether 50 more samples have come back since now."""
+        wanted = len(self.back) + 50
+        return lambda: len(self.back) >= wanted
+
+
+def reload(bed: Testbed, tree: Tree) -> None:
+    bed.file.write_text(json.dumps(tree, indent=1))
+    for name in bed.running():
+        bed.send(name, signal.SIGHUP)
+
+
+def worker_lives(bed: Testbed) -> dict[str, list[str]]:
+    """{node: the pids of the workers of the first task that were started there}, in their order."""
+    lines = {name: bed.log(name).splitlines() for name in bed.names}
+    return {
+        name: [line.rpartition("pid=")[2].split()[0] for line in lines[name] if f"worker_started task={TASK} " in line]
+        for name in bed.names
+    }
+
+
+def has_another_task(bed: Testbed) -> bool:
+    status = bed.status("robot1")
+    return any(task["name"] == "second" and task["owner"] and task["phase"] == "settled" for task in status["tasks"])
+
+
+def test_tasks_weights_and_commands_change_while_a_reliable_stream_runs(tmp_path: Path) -> None:
+    tree = echo_fleet(robots=1, edges=2, timing="wired", stream_class="reliable")
+    with Testbed(tmp_path, tree) as bed:
+        bed.init()
+        bed.start()
+        bed.wait_settled()
+        with Stream(bed.app("robot1")) as stream:
+            bed.wait(lambda: matches(stream.publisher), 60, "the relay subscribes")
+            stream.start()
+            bed.wait(stream.flows(), 60, "the stream through the first owner")
+            relay = bed.relay_pid("robot1")
+
+            # a task comes, and the weights of the one that runs change
+            tree = deepcopy(tree)
+            tree["tasks"]["second"] = deepcopy(tree["tasks"][TASK])
+            tree["tasks"]["second"]["inputs"][0] |= {"from": "{robot}/in2", "to": "{target}/second/{robot}/in"}
+            tree["tasks"]["second"]["outputs"][0] |= {
+                "from": "{target}/second/{epoch}/{robot}/out",
+                "to": "{robot}/out2",
+            }
+            tree["tasks"][TASK]["weights"] = {"cpu": 0.25, "memory": 0.75, "network": 0.0}
+            reload(bed, tree)
+            bed.wait(lambda: has_another_task(bed), 60, "the task that came has an owner")
+            bed.wait(lambda: bed.task("robot1")["tuning"]["weights"]["cpu"] == 0.25, 60, "the weights are agreed anew")
+            assert [len(lives) for lives in worker_lives(bed).values()] == [1, 1, 0], "no worker was started again"
+
+            # another command: standby first, then a move, then the owner of before
+            owner = bed.owner("robot1")
+            tree["tasks"][TASK]["worker"]["env"] = {"ANOTHER": "1"}
+            reload(bed, tree)
+            bed.wait(lambda: [len(one) for one in worker_lives(bed).values()] == [2, 2, 0], 90, "each worker runs anew")
+            assert bed.owner("robot1") != owner, "the owner has given the task away before its worker ended"
+            bed.wait(stream.flows(), 60, "the stream through the next owner")
+
+            # the task that came goes again
+            del tree["tasks"]["second"]
+            reload(bed, tree)
+            bed.wait(lambda: len(bed.status("robot1")["tasks"]) == 1, 60, "the task is gone")
+            bed.wait(stream.flows(), 60, "the stream runs on")
+            stream.end()
+
+            def is_settled() -> bool:
+                count = next(count for count in bed.counts("robot1") if count.stream == f"{TASK}/in/0")
+                return count.acknowledged == stream.sent and len(stream.back) >= stream.sent
+
+            bed.wait(is_settled, 60, "every sample is acknowledged, and answered")
+            assert stream.back == list(range(stream.sent)), "lost 0, doubled 0, in order"
+            count = next(count for count in bed.counts("robot1") if count.stream == f"{TASK}/in/0")
+            assert (count.lost, count.at_most_lost, unaccounted(count)) == (0, 0, 0)
+            assert bed.relay_pid("robot1") == relay, "the relay is the same"
+            assert [problem for problem in bed.status("robot1")["problems"] if "fleet" in problem] == []
+
+
+def test_what_needs_a_restart_is_told_and_a_wrong_file_changes_nothing(tmp_path: Path) -> None:
+    tree = echo_fleet(robots=1, edges=1, timing="wired")
+    with Testbed(tmp_path, tree) as bed:
+        bed.init()
+        bed.start()
+        bed.wait_settled()
+        changed = deepcopy(tree)
+        changed["shared_memory"] = "auto"
+        reload(bed, changed)
+        bed.wait(lambda: told(bed, "`shared_memory`"), 30, "what needs a restart is told")
+        bed.file.write_text("nodes: [")
+        bed.send("robot1", signal.SIGHUP)
+        bed.wait(lambda: told(bed, "the changed fleet file is not in force"), 30, "a wrong file is told")
+        reload(bed, tree)
+        bed.wait(lambda: not told(bed, "fleet file") and not told(bed, "restarted"), 30, "all is as it was")
+        assert bed.owner("robot1") == "edge1"
+
+
+def told(bed: Testbed, text: str) -> bool:
+    time.sleep(0.01)
+    return any(text in problem for problem in bed.status("robot1")["problems"])

@@ -1,0 +1,94 @@
+"""Lets a running daemon's adapters follow another fleet file; what they cannot follow is told.
+
+Knows: which adapter is made from which part of the file. Does not know: what the node makes of it
+(`zsched.core.handlers.fleet`).
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from zsched.adapters.network.control_bus import ControlBus
+from zsched.adapters.relay.streams import RelayHandle
+from zsched.adapters.workers.supervisor import WorkerSupervisor
+from zsched.core import events as ev
+from zsched.core.relay_protocol import WorkerWatch
+from zsched.core.route.route import watch_for
+from zsched.core.values.fleet import Fleet
+from zsched.core.values.model import NodeId, TaskId
+from zsched.runtime.access import StreamAccess
+from zsched.runtime.crew import Crew
+from zsched.runtime.endpoints import Endpoints, endpoints_for
+from zsched.runtime.recipes import Recipes
+from zsched.runtime.restarts import restarts
+from zsched.runtime.sampler import Sampler
+
+SOURCE = "restart"
+"""Of the problem that says what a restart is needed for."""
+
+_log = logging.getLogger("zsched.daemon")
+
+
+@dataclass(slots=True, kw_only=True)
+class Adoption:
+    """The adapters of one daemon that follow the fleet file."""
+
+    me: NodeId
+    started_with: Fleet
+    points: Endpoints
+    """Where its sessions listen and whom they dial, since the start."""
+    protocol: str
+    recipes: Recipes
+    crew: Crew
+    supervisor: WorkerSupervisor
+    relay: RelayHandle
+    bus: ControlBus
+    access: StreamAccess
+    post: Callable[[ev.Event], None]
+    sampler: Sampler
+    _watches: dict[TaskId, WorkerWatch | None] = field(default_factory=dict)
+
+    def begin(self) -> None:
+        """Tell the relay what it watches by the file that the daemon starts with."""
+        self._tell_watches(self.started_with)
+
+    def adopt(self, fleet: Fleet, is_agreed: bool = False) -> None:
+        """Follow another file of the same fleet, which names this node with the same kind.
+
+        Args:
+            fleet: the file.
+            is_agreed: it is an agreed document, with the electors in force.
+
+        Raises:
+            AdapterError: a worker's session cannot be written; workers stay as they are.
+        """
+        _log.info("fleet_file node=%s: adapters follow another one", self.me)
+        listen = self.points.data_listen[0]
+        points = endpoints_for(fleet, fleet.node(self.me), lambda: _port(listen), protocol=self.protocol)
+        connect = (self.points.worker_connect[0], *points.worker_connect[1:])
+        self.recipes.adopt(fleet, connect, dials_by_gossip=points.worker_by_gossip)
+        self.crew.adopt(fleet, self.recipes.paths)
+        self.supervisor.adopt(self.recipes.specs)
+        self.access.adopt(fleet)
+        self.sampler.adopt(fleet.node(self.me), fleet.timing.sample_s)
+        if any(task.exclusive for task in fleet.tasks):
+            self.bus.hear_all_at_once()
+        self._tell_watches(fleet)
+        needs = restarts(self.started_with, fleet, self.me, is_agreed=is_agreed)
+        text = f"until this daemon is restarted: {'; '.join(needs)}" if needs else None
+        self.post(ev.ProblemReported(source=SOURCE, problem=text))
+
+    def _tell_watches(self, fleet: Fleet) -> None:
+        found = {task.name: watch_for(fleet, task, self.me) for task in fleet.tasks}
+        for task, watch in found.items():
+            if watch != self._watches.get(task):
+                self.relay.watch(watch or WorkerWatch(task=task))
+        self._watches = found
+
+
+def _port(endpoint: str) -> int:
+    """The port of the data session, which stays; 1 where it is no number."""
+    port = endpoint.partition("#")[0].partition("?")[0].rpartition(":")[2]
+    return int(port) if port.isdigit() else 1

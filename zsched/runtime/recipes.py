@@ -1,0 +1,131 @@
+"""Decides what this node's workers are made with: commands, environments, and the sessions that they open.
+
+Knows: the fleet file's workers, their session files in the runtime folder. Does not know: processes
+(`zsched.adapters.workers.supervisor`), when a worker is started again.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from zsched.core.route.route import outputs_of
+from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec, runs_worker
+from zsched.core.values.model import NodeId, TaskId
+from zsched.errors import AdapterError
+from zsched.files import write_regular
+from zsched.runtime.sessions import SessionsRead
+from zsched.sessions import config as zenoh_config
+
+NOTHING: Final[Mapping[str, str]] = {}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Made:
+    """All workers of one fleet file; replaced as a whole, for the supervisor's thread reads it."""
+
+    specs: Mapping[TaskId, WorkerSpec]
+    sessions: Mapping[TaskId, str]
+    environments: Mapping[TaskId, Mapping[str, str]]
+
+
+class Recipes:
+    """The recipes of one node's workers."""
+
+    def __init__(
+        self, me: NodeId, folder: Path, read: SessionsRead, *, shared_memory: bool, operator_json5: str
+    ) -> None:
+        """``folder``: where the session files go; ``read``: of workers that somebody else starts."""
+        self._me, self._folder, self.read = me, folder, read
+        self._shared_memory, self._operator_json5 = shared_memory, operator_json5
+        self._made = _Made(specs={}, sessions={}, environments={})
+
+    @property
+    def specs(self) -> Mapping[TaskId, WorkerSpec]:
+        """{task: how its worker is run} of the workers of this node."""
+        return self._made.specs
+
+    @property
+    def paths(self) -> Mapping[TaskId, Path]:
+        """{task: the file with the session that its worker opens}."""
+        return {task: self._path(task) for task in self._made.specs}
+
+    def environment(self, task: TaskId) -> Mapping[str, str]:
+        """The variables of a task's worker beside those of the daemon, of its life and of the fleet file."""
+        return self._made.environments.get(task, NOTHING)
+
+    def session(self, task: TaskId) -> str:
+        """The text of the session that a task's worker opens."""
+        return self._made.sessions.get(task, "")
+
+    def adopt(self, fleet: Fleet, connect: tuple[str, ...], *, dials_by_gossip: bool) -> None:
+        """Make the recipes of a fleet file, and write the session files that have changed.
+
+        Args:
+            fleet: the file.
+            connect: whom workers dial, their own relay first.
+            dials_by_gossip: whether they dial robots without an address, too.
+
+        Raises:
+            AdapterError: a file cannot be written; the recipes stay as they are.
+        """
+        kind = fleet.node(self._me).kind
+        mine = [task for task in fleet.tasks if runs_worker(task, self._me, kind)]
+        sessions = {
+            task.name: zenoh_config.worker_config(
+                connect=connect,
+                listen=(),
+                timing=fleet.timing,
+                link=task.worker.link,
+                shared_memory=self._shared_memory,
+                operator_json5=self._operator_json5,
+                dials_by_gossip=dials_by_gossip,
+            )
+            for task in mine
+        }
+        for name, text in sessions.items():
+            if text != self._made.sessions.get(name):
+                self._write(name, text)
+        for name in [name for name in self._made.specs if name not in sessions]:
+            self._path(name).unlink(missing_ok=True)
+        for task in mine:
+            if not task.worker.command:
+                self.read.begin(task.name, sessions[task.name])
+        if any(not task.worker.command for task in mine):
+            self.read.save()
+        self._made = _Made(
+            specs={task.name: task.worker for task in mine},
+            sessions=sessions,
+            environments={task.name: self._environment(task) for task in mine},
+        )
+
+    def close(self) -> None:
+        """Remove the session files."""
+        for path in self.paths.values():
+            path.unlink(missing_ok=True)
+
+    def _path(self, task: TaskId) -> Path:
+        return self._folder / f"{self._me}-{task}.zenoh.json5"
+
+    def _write(self, task: TaskId, text: str) -> None:
+        path = self._path(task)
+        try:
+            write_regular(path, text.encode())
+        except OSError as error:
+            raise AdapterError(f"cannot write {path}: {error.strerror}; check --runtime-dir") from error
+
+    def _environment(self, task: TaskSpec) -> dict[str, str]:
+        path = str(self._path(task.name))
+        made = {
+            "PYTHONFAULTHANDLER": "1",
+            "ZSCHED_ZENOH_CONFIG": path,
+            "ZENOH_SESSION_CONFIG_URI": path,  # a ROS node (rmw_zenoh) joins the data network by this
+        }
+        if task.tuning.deadline_ms is not None:
+            made["ZSCHED_DEADLINE_MS"] = f"{task.tuning.deadline_ms:g}"
+        if keys := outputs_of(task, self._me):
+            made["ZSCHED_OUTPUT_KEYS"] = json.dumps(keys)
+        return made

@@ -1,0 +1,36 @@
+"""What somebody who has opened one session lacks of another one: the workers that were started before it changed.
+
+Knows: the text of a zenoh configuration. Does not know: who has read which.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Any, Final
+
+OTHER_SETTINGS: Final = "new settings"
+
+
+def lacking(read: str, now: str) -> str:
+    """What who has read one session lacks of another, in words; empty: nothing.
+
+    Whom it dials beyond that is gone, or joins by itself: no reason to start it again.
+    """
+    if read == now:
+        return ""
+    try:
+        old, new = json.loads(read), json.loads(now)
+        old_ends, new_ends = _take_endpoints(old), _take_endpoints(new)
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return OTHER_SETTINGS
+    if old != new:
+        return OTHER_SETTINGS
+    return ", ".join(one.partition("#")[0] for one in new_ends if one not in old_ends)
+
+
+def _take_endpoints(session: dict[str, Any]) -> list[str]:
+    """Whom a session dials, taken out of it."""
+    endpoints = session["connect"].pop("endpoints")
+    if not isinstance(endpoints, list):
+        raise TypeError
+    return [str(one) for one in endpoints]
