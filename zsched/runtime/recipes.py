@@ -125,7 +125,7 @@ class Recipes:
             "ZENOH_SESSION_CONFIG_URI": path,  # a ROS node (rmw_zenoh) joins the data network by this
         }
         if task.tuning.deadline_ms is not None:
-            made["ZSCHED_DEADLINE_MS"] = f"{task.tuning.deadline_ms:g}"
+            made |= {"ZSCHED_DEADLINE_MS": f"{task.tuning.deadline_ms:g}"}
         if keys := outputs_of(task, self._me):
-            made["ZSCHED_OUTPUT_KEYS"] = json.dumps(keys)
+            made |= {"ZSCHED_OUTPUT_KEYS": json.dumps(keys)}
         return made

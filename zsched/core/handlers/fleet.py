@@ -40,10 +40,8 @@ def adopt(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
         todo: what there is to do.
         now: monotonic seconds.
     """
-    why = obstacle(node.fleet, fleet, node.me)
-    node.set_problem(SOURCE, f"a changed fleet file is not in force here: {why}" if why else None)
     before = node.fleet
-    if why or fleet == before:
+    if _is_refused(node, fleet) or fleet == before:
         return
     node.fleet, node.fleet_file = fleet, fleet_hash(fleet)
     _adopt_nodes(node, fleet)
@@ -53,6 +51,13 @@ def adopt(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
     text = f"goes by another fleet file: {node.fleet_file}"
     todo.add(do.RecordStory(stage="membership", text=text))
     todo.must_beat = todo.must_decide = True
+
+
+def _is_refused(node: Stages, fleet: Fleet) -> bool:
+    """Whether this daemon cannot take a fleet over at all; the status says so."""
+    why = obstacle(node.fleet, fleet, node.me)
+    node.set_problem(SOURCE, f"a changed fleet file is not in force here: {why}" if why else None)
+    return bool(why)
 
 
 def follow(node: Stages, fleet: Fleet, todo: ToDo, *, is_agreed: bool = False) -> None:
@@ -140,7 +145,7 @@ def _on_fleet(node: Stages, event: ev.FleetChanged, todo: ToDo, now: float) -> N
     """An operator has changed the file; once a document is agreed, a file is only compared with it."""
     node.by_file = fleet_hash(event.fleet)
     compare_file(node)
-    if node.agreement.document is not None:
+    if node.agreement.document is not None or _is_refused(node, event.fleet):
         return
     follow(node, event.fleet, todo)
     adopt(node, in_force(node.fleet, event.fleet), todo, now)

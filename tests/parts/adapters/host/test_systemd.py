@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from zsched.adapters.host.systemd import Notifier, watchdog_interval_s
-from zsched.daemon import RESTART_SIGNAL
+from zsched.daemon import RELOAD_SIGNAL, RESTART_SIGNAL
 from zsched.runtime.descriptors import WANTED
 
 UNIT = Path(__file__).parents[4] / "systemd" / "zsched.service"
@@ -89,6 +89,7 @@ def test_unit_promises_what_the_daemon_keeps() -> None:
     assert service["WatchdogSec"] == "10"
     assert service["KillMode"] == "process"
     assert service["RestartKillSignal"] == RESTART_SIGNAL.name
+    assert service["ExecReload"] == f"/bin/kill -{RELOAD_SIGNAL.name.removeprefix('SIG')} $MAINPID"
     assert service["RuntimeDirectoryPreserve"] == "restart"
     assert service["ExecStopPost"].endswith("-m zsched.runtime.cleanup")
     assert int(service["LimitNOFILE"]) == WANTED

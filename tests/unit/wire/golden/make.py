@@ -268,6 +268,7 @@ SAMPLES: dict[str, object] = {
         task="map_merge", phase=plan.RoutePhase.FLIP, current=_SLOT, predecessors=(_SLOT, _SLOT)
     ),
     "relay_stop": relay_protocol.RelayStop(),
+    "task_ended": relay_protocol.TaskEnded(task="map_merge"),
     "relay_pulse": protocol.RelayPulse(counted_s=0.5),
     "relay_hello": protocol.RelayHello(fleet="warehouse", node="robot1", incarnation=3, digest="0123456789abcdef"),
     "relay_here": protocol.RelayHere(pid=4711),
