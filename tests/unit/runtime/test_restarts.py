@@ -1,0 +1,76 @@
+"""What a running daemon cannot take over is said in full, and nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from support.fleets import fleet_of, task_of
+from zsched.core.values.fleet import Fleet, NodeSpec, SharedMemory
+from zsched.core.values.model import NodeKind
+from zsched.runtime.restarts import restarts
+
+
+def addressed(name: str, kind: NodeKind = NodeKind.EDGE, host: str = "") -> NodeSpec:
+    at = host or f"10.0.0.{sum(map(ord, name)) % 200}"
+    return NodeSpec(name=name, kind=kind, host=at, listen_control="tcp/0.0.0.0:7457", listen_data="tcp/0.0.0.0:7458")
+
+
+NODES = (
+    addressed("edge1"),
+    addressed("edge2"),
+    addressed("robot1", NodeKind.ROBOT),
+    addressed("robot2", NodeKind.ROBOT),
+)
+OLD = replace(fleet_of(task_of("merge"), electors=("robot1", "robot2")), nodes=NODES, seeds=("edge1", "edge2"))
+
+
+def with_node(node: NodeSpec, seeds: tuple[str, ...] = ("edge1", "edge2")) -> Fleet:
+    others = [one for one in OLD.nodes if one.name != node.name]
+    return replace(OLD, nodes=tuple(sorted((*others, node), key=lambda one: one.name)), seeds=seeds)
+
+
+@pytest.mark.parametrize(
+    ("new", "told"),
+    [
+        (replace(OLD, electors=("robot1",)), "need a new generation"),
+        (replace(OLD, timing=replace(OLD.timing, lease_s=2.0)), "leases of exclusive tasks stay 1 s"),
+        (replace(OLD, timing=replace(OLD.timing, zenoh_lease_s=3.0)), "zenoh's lease (3 s"),
+        (replace(OLD, shared_memory=SharedMemory.AUTO), "`shared_memory`"),
+        (replace(OLD, zenoh_config="z.json5"), "`zenoh: {config}`"),
+        (replace(OLD, relay_orphan_s=3.0), "`relay_orphan_s`"),
+        (with_node(replace(NODES[2], listen_control="tcp/0.0.0.0:9")), "robot1: `listen: {control}`"),
+        (with_node(addressed("edge2", host="10.9.9.9")), "tcp/10.9.9.9:7457, tcp/10.9.9.9:7458 would be dialled"),
+        (with_node(addressed("edge3", host="10.9.9.9")), "named under `seeds`"),
+    ],
+)
+def test_what_holds_after_a_restart_only_is_told(new: Fleet, told: str) -> None:
+    found = restarts(OLD, new, "robot1")
+    assert len(found) == 1 or told == "named under `seeds`"
+    assert any(told in sentence for sentence in found)
+
+
+@pytest.mark.parametrize(
+    "new",
+    [
+        OLD,
+        replace(OLD, tasks=(task_of("merge", ("edge1",)), task_of("other"))),
+        replace(OLD, timing=replace(OLD.timing, beat_s=0.1)),
+        replace(OLD, nodes=tuple(one for one in NODES if one.name != "edge2"), seeds=("edge1",)),
+        with_node(addressed("robot9", NodeKind.ROBOT)),
+    ],
+)
+def test_what_is_taken_over_is_not_told(new: Fleet) -> None:
+    small = replace(new, nodes=new.nodes) if new is not OLD else new
+    assert [one for one in restarts(OLD, small, "robot1") if "zenoh's pools" not in one] == []
+
+
+def test_a_node_that_comes_dials_those_that_are_named_as_seeds() -> None:
+    come = with_node(addressed("edge0"), seeds=("edge1", "edge2", "robot1", "robot2"))
+    assert [one for one in restarts(OLD, come, "robot1") if "dialled" in one] == []
+    assert [one for one in restarts(OLD, come, "edge1") if "dialled" in one] == []
+
+
+def test_agreed_electors_need_no_generation() -> None:
+    assert restarts(OLD, replace(OLD, electors=("robot1",)), "robot1", is_agreed=True) == ()
