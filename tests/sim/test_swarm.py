@@ -47,6 +47,7 @@ def test_plans_have_every_fault_every_size_and_every_kind_of_task() -> None:
         "clock_rate",
         "clock_jump",
         "load",
+        "reload",
         "slew",
         "suspend",
     } | set(LATER) - {"fsync"}

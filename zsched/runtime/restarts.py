@@ -43,7 +43,7 @@ def _agreed(old: Fleet, new: Fleet) -> Iterator[str]:
     if new.timing.lease_s != old.timing.lease_s:
         yield (
             f"leases of exclusive tasks stay {old.timing.lease_s:g} s ({new.timing.lease_s:g} s from the restart on): "
-            "restart all daemons"
+            "restart all daemons soon, for nodes with leases of different lengths grant each other none"
         )
 
 

@@ -123,3 +123,23 @@ CHANGES: dict[str, Change] = {
     "streams": _other_streams,
 }
 """In the order of a fault's size."""
+
+
+def _other_command(rng: Random, fleet: Fleet) -> Fleet:
+    """The workers run by another command."""
+    command = ("work", f"--version={rng.randrange(10**6)}")
+    return _with_task(fleet, lambda task: replace(task, worker=replace(task.worker, command=command)))
+
+
+def _other_times(rng: Random, fleet: Fleet) -> Fleet:
+    """Other clocks, with the same length of leases: that one needs a restart of all."""
+    changed = _other_timing(rng, fleet)
+    return replace(changed, timing=replace(changed.timing, lease_s=fleet.timing.lease_s))
+
+
+RELOADED: dict[str, Change] = {
+    **{name: change for name, change in CHANGES.items() if name != "electors"},
+    "timing": _other_times,
+    "command": _other_command,
+}
+"""What a file that running nodes take over may differ in, in the order of a fault's size."""

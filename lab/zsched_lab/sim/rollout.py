@@ -7,12 +7,13 @@ nodes make of it.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from random import Random
 
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId
 from zsched.core.vote.lease import RHO
-from zsched_lab.sim.files import CHANGES, other_electors
+from zsched_lab.sim.files import CHANGES, RELOADED, other_electors
 from zsched_lab.sim.parts import Machine
 from zsched_lab.sim.scene import Carry, Scene
 from zsched_lab.sim.swarm import Fault
@@ -29,7 +30,12 @@ class Rollouts:
 
     def table(self) -> dict[str, Carry]:
         """{kind of fault: who carries it out}."""
-        return {"electorate": self._electorate, "rollout": self._rollout, "generation": self._generation}
+        return {
+            "electorate": self._electorate,
+            "rollout": self._rollout,
+            "reload": self._reload,
+            "generation": self._generation,
+        }
 
     def _electorate(self, fault: Fault) -> None:
         """A node is restarted with a fleet file that names other electors, and later with the right one."""
@@ -54,6 +60,21 @@ class Rollouts:
         scene.sim.invariants.allow(scene.fleet)
         for name, after_s in _one_by_one(rng, scene.fleet, fault):
             scene.then(after_s, lambda name=name, file=scene.fleet: scene.restart(scene.sim.machines[name], file))  # type: ignore[misc]
+
+    def _reload(self, fault: Fault) -> None:
+        """As a rollout, but most nodes take the file over while they run, each at its own time."""
+        scene = self.scene
+        rng = Random(f"reload {scene.plan.seed} {fault.at!r}")
+        name = list(RELOADED)[int(fault.size)]
+        if not self._may_roll_out(name):
+            return
+        scene.fleet = RELOADED[name](rng, scene.fleet)
+        scene.done[f"rollout of {name}"] += 1
+        scene.done["reload"] += 1
+        scene.sim.invariants.allow(scene.fleet)
+        for node, after_s in _one_by_one(rng, scene.fleet, fault):
+            take = scene.reload if rng.random() < 0.8 else scene.restart
+            scene.then(after_s, partial(take, scene.sim.machines[node], scene.fleet))
 
     def _may_roll_out(self, name: str) -> bool:
         """Whether leases are promised all the same (docs/decisions/0026).

@@ -57,6 +57,12 @@ class Scene:
         if is_up:
             self.sim.start(machine.key)
 
+    def reload(self, machine: Machine, fleet: Fleet) -> None:
+        """A running node takes another fleet file over; one that is down finds it when it comes back."""
+        machine.fleet = fleet
+        if machine.node is not None:
+            self.sim.reload(machine)
+
     # --- generations -------------------------------------------------------------------------------------------------
 
     def begin_generation(self) -> None:

@@ -249,6 +249,10 @@ class Simulator(Links):
         self.later(self.fleet.timing.sample_s, self._sample, machine, life)
         self.deliver(machine, ev.ProfileSampled(device=sample))
 
+    def reload(self, machine: Machine) -> None:
+        """A running node is given its machine's fleet file, and its workers' commands are compared with it."""
+        self.deliver(machine, ev.FleetChanged(fleet=machine.fleet))
+
     def frozen(self, machine: Machine) -> None:
         """Its workers stand still with it."""
         self.work.freeze(machine)

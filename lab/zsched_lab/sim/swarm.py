@@ -17,7 +17,7 @@ from zsched.config.timing import WAN, WIFI, WIRED
 from zsched.core.values.fleet import Fleet, NodeSpec, OnIsolation, Standby, TaskSpec, WorkerSpec
 from zsched.core.values.model import Aggregate, NodeId, NodeKind, Tuning, Weights
 from zsched_lab.sim.clocks import clock_faults, suspensions
-from zsched_lab.sim.files import CHANGES
+from zsched_lab.sim.files import CHANGES, RELOADED
 from zsched_lab.sim.foreign import absences, with_foreign_workers
 from zsched_lab.sim.many import with_many_tasks
 
@@ -87,6 +87,8 @@ def plan(seed: int, *, nodes: int | None = None, seconds: float = SECONDS, kinds
     if is_leased and "rollout" in kinds and later.random() < 0.25:
         fleet, rollout = _made_exclusive(later, fleet)
         faults += (rollout,)
+    if "reload" in kinds:
+        faults += _reloads(Random(f"reload {seed}"), fleet, until)
     others = Random(f"foreign {seed}")
     fleet = with_foreign_workers(others, fleet)
     for at, name, away_s in absences(others, fleet, until):
@@ -230,6 +232,15 @@ def _later_faults(
     return tuple(found)
 
 
+def _reloads(rng: Random, fleet: Fleet, until: float) -> tuple[Fault, ...]:
+    """In one schedule of six running nodes take another fleet file over, once or twice."""
+    if rng.random() < 5 / 6:
+        return ()
+    return tuple(
+        _one_node("reload", 2, 8.0, tuple(float(number) for number in range(len(RELOADED))))(rng, fleet, until)
+    )
+
+
 def _at_candidate(rng: Random, fault: Fault, candidates: tuple[NodeId, ...]) -> Fault:
     """The same fault, mostly of a candidate; one node's is often short enough to end within a lease."""
     if not fault.nodes or rng.random() < 0.3:
@@ -370,7 +381,7 @@ LATER: dict[str, Maker] = {
     "generation": _one_node("generation", 1, 8.0),
 }
 """Faults that came later, drawn apart from `MAKERS`."""
-KINDS: frozenset[str] = frozenset(LATER) | {"suspend"}
+KINDS: frozenset[str] = frozenset(LATER) | {"suspend", "reload"}
 """Faults that a plan may leave out; no other fault of the plan changes by that."""
 PENDING: frozenset[str] = frozenset()
 """Faults whose mend has not landed: only ``--with`` plays them."""

@@ -14,12 +14,15 @@ from typing import Any, Protocol
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
+from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId, TaskId, WorkerState
 from zsched.core.values.plan import Role, RoutePhase, RoutePlan, WorkerRole
 from zsched_lab.sim.checks import Invariants
 from zsched_lab.sim.parts import Machine
 
 WORKER_START_S = 0.4
+COMPARED_S = 0.01
+"""A supervisor has compared its processes so long after it heard of another file."""
 FLIP_S = 0.005
 WORKER_STOP_S = (0.002,)
 LOOK_AGAIN_S = 0.05
@@ -63,6 +66,8 @@ class Work:
         """{(machine, task): how often its worker was made active}: one that is again before it has stopped works on."""
         self._absent: Counter[str] = Counter()
         """{machine: how many reasons the workers that somebody else runs there have to be away}."""
+        self._made_by: dict[tuple[str, TaskId], tuple[str, ...]] = {}
+        """{(machine, task): the command of its worker's process}."""
         self.stop_s: tuple[float, ...] = WORKER_STOP_S
         """What an exclusive worker may take to stop, one of these each time."""
 
@@ -73,6 +78,12 @@ class Work:
                 self._start(machine, task)
             case do.StopWorker(task=task):
                 self._stop(machine, task)
+            case do.RenewWorker(task=task):
+                self._renew(machine, task)
+            case do.AdoptFleet(fleet=fleet):
+                self._compare(machine, fleet)
+            case do.EndTask(task=task):
+                self.plans.pop((machine.name, task), None)
             case do.ApplyRoutes(plan=plan):
                 self._apply(machine, plan)
             case do.SetRole(role=role):
@@ -85,6 +96,7 @@ class Work:
     def _start(self, machine: Machine, task: TaskId) -> None:
         if task not in machine.workers:
             machine.workers[task] = machine.life
+            self._made_by[machine.key, task] = self._command(machine.fleet, task)
             self._sim.later(WORKER_START_S, self._ready, machine, task, machine.life)
 
     def _ready(self, machine: Machine, task: TaskId, life: int) -> None:
@@ -92,6 +104,26 @@ class Work:
             self._sim.deliver(machine, ev.WorkerChanged(task=task, state=WorkerState.READY))
             for other in tuple(self._sim.machines.values()):
                 self._show_later(machine, task, other)
+
+    @staticmethod
+    def _command(fleet: Fleet, task: TaskId) -> tuple[str, ...]:
+        return next((one.worker.command for one in fleet.tasks if one.name == task), ())
+
+    def _compare(self, machine: Machine, fleet: Fleet) -> None:
+        """The supervisor compares its processes with a changed file; a thread's word comes a little later."""
+        for task in machine.workers:
+            is_old = self._made_by.get((machine.key, task)) != self._command(fleet, task)
+            if is_old and self._command(fleet, task):
+                told = ev.RecipeCompared(task=task, is_old=True)
+                self._sim.later(COMPARED_S, self._sim.deliver, machine, told)
+
+    def _renew(self, machine: Machine, task: TaskId) -> None:
+        """A worker is stopped and started again."""
+        if task in machine.workers:
+            self._stop(machine, task)
+            self._start(machine, task)
+            self._sim.deliver(machine, ev.WorkerChanged(task=task, state=WorkerState.STARTING))
+            self._sim.deliver(machine, ev.RecipeCompared(task=task, is_old=False))
 
     def meet(self, machine: Machine) -> None:
         """A daemon has started beside workers that somebody else runs."""

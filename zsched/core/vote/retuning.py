@@ -47,7 +47,7 @@ class Retuning:
         for task in new.tasks:
             value = values[task.name]
             changed = _changed(before.get(task.name, task.tuning), task.tuning)
-            if changed and value.revision > 0 and value.owner is not None:
+            if changed and value.revision > 0:
                 wanted = replace(value.tuning, **changed)
                 self._wishes[task.name] = _Wish(seen=value.tuning, wanted=wanted, at=now + rank * RANK_S)
 
