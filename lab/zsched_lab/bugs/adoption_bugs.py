@@ -46,7 +46,8 @@ ADOPTION_BUGS: tuple[Bug, ...] = (
         "robots vote as by the file before",
         FLEET,
         "    node.votes.adopt(fleet)\n",
-        "    [node.votes.tasks.pop(name) for name in tuple(node.votes.tasks) if name not in [t.name for t in fleet.tasks]]\n",
+        "    known = {one.name for one in fleet.tasks}\n"
+        "    for name in {*node.votes.tasks} - known:\n        node.votes.tasks.pop(name)\n",
         _FLEET,
     ),
     _bug(

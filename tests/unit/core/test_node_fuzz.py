@@ -68,9 +68,6 @@ def test_the_storm_reaches_every_part_of_the_door() -> None:
     """The test above is worth something: within a few storms every instruction occurs."""
     # a twin that beats twice; a worker that a majority finds hung; addresses, which only a daemon gives a node
     by_hand = {do.StandDown, do.RestartWorker, do.TryAddresses}
-    # the fleet register and its documents have storms of their own (the simulator's)
-    by_hand |= {do.AskElectors, do.AnswerFleet}
-    by_hand |= {do.StoreDocument, do.FetchDocument, do.AnswerDocument, do.KeepDocuments}
     missing = set(do.Instruction.__args__) - by_hand
     storms = itertools.product(range(16), ("robot1", "edge1"))
     while missing and (one := next(storms, None)):
