@@ -437,9 +437,9 @@ class WorkerSupervisor:
 
     def _spawn(self, worker: _Worker, now: float) -> None:
         self._started += 1
-        worker.made_by = self._recipe_of(worker)
         worker.incarnation = self._context.incarnation * INCARNATIONS_PER_DAEMON + self._started
         try:
+            worker.made_by = self._recipe_of(worker)
             process = WorkerProcess(worker.spec.command, self._environment_of(worker), worker.logger, worker.kept)
         except Exception as error:  # noqa: BLE001 - whatever stops a start is that worker's failure, never the daemon's
             reason = f"cannot start: {error}"
