@@ -12,7 +12,7 @@ import shlex
 import socket
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from zsched.commands.ask import Door
@@ -26,6 +26,7 @@ from zsched.core.values.fleet import Fleet, fleet_hash
 from zsched.errors import ConfigError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE, EXIT_WOULD_CHANGE
 from zsched.files import read_regular
+from zsched.runtime.restarts import restarts
 
 SCHEMA = "zsched.apply/1"
 OTHER_FILES = "other-files"
@@ -68,6 +69,8 @@ class Plan:
     changes: tuple[Change, ...]
     dangers: tuple[tuple[str, str], ...]
     """(name, what is accepted with it)."""
+    restarts: tuple[tuple[str, str], ...] = ()
+    """(nodes, what of it their daemons go by after a restart only)."""
     warnings: str = ""
     note: str = ""
     """One line above the table."""
@@ -159,8 +162,27 @@ def make_plan(door: Door, held: InForce, text: str, file: str) -> Plan:
     dangers = [(one.danger.value, one.warning()) for one in changes if one.danger is not None]
     note = "" if changes or text == held.text else "only comments, blanks or the order of keys differ: nothing notices"
     return Plan(
-        held=held, text=text, fleet=fleet, changes=changes, dangers=tuple(dangers), warnings=warnings, note=note
+        held=held,
+        text=text,
+        fleet=fleet,
+        changes=changes,
+        dangers=tuple(dangers),
+        restarts=_restarts(old, fleet),
+        warnings=warnings,
+        note=note,
     )
+
+
+def _restarts(old: Fleet, new: Fleet) -> tuple[tuple[str, str], ...]:
+    """(nodes, what of the new fleet their daemons cannot take over); electors and leases change by agreement."""
+    agreed = replace(new, electors=old.electors, timing=replace(new.timing, lease_s=old.timing.lease_s))
+    stay = {node.name: node.kind for node in old.nodes}
+    who: dict[str, list[str]] = {}
+    for node in agreed.nodes:
+        if stay.get(node.name) is node.kind:
+            for sentence in restarts(old, agreed, node.name):
+                who.setdefault(sentence, []).append(node.name)
+    return tuple((", ".join(names), sentence) for sentence, names in who.items())
 
 
 def _first(door: Door, held: InForce, text: str, fleet: Fleet, warnings: str) -> Plan:
@@ -210,6 +232,7 @@ def table(plan: Plan) -> str:
     for one, value in zip(plan.changes, values, strict=True):
         danger = f" [{one.danger}]" if one.danger is not None else ""
         lines.append(f"  {cut(one.path, room):{room}}  {value:{wide}}  {one.consequence}{danger}")
+    lines += [f"until {names} restarts: {why}" for names, why in plan.restarts]
     return "\n".join(lines)
 
 
@@ -243,7 +266,9 @@ def _body(plan: Plan, outcome: str, revision: int) -> Json:
     ]
     dangers = [{"name": name, "means": means} for name, means in plan.dangers]
     body = {"schema": SCHEMA, "fleet": plan.held.fleet, "outcome": outcome, "revision_before": plan.held.revision}
-    return {**body, "revision": revision, "is_first": plan.is_first, "changes": changes, "dangers": dangers}
+    waiting = [{"nodes": names.split(", "), "why": why} for names, why in plan.restarts]
+    told = {"changes": changes, "dangers": dangers, "restarts": waiting}
+    return {**body, "revision": revision, "is_first": plan.is_first, **told}
 
 
 # --- asking, and agreeing --------------------------------------------------------------------------------------------

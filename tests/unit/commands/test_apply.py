@@ -131,6 +131,21 @@ def test_a_plan_shows_before_and_after_in_the_files_words_and_changes_nothing(no
     assert [one["path"] for one in body["changes"]] == ["tasks.merge.weights.cpu", "tasks.merge.weights.memory"]
 
 
+def test_what_a_daemon_cannot_take_over_while_it_runs_is_told_with_its_nodes(node: Node, tmp_path: Path) -> None:
+    file = changed(tmp_path, "fleet: hall", "shared_memory: auto\nfleet: hall")
+    result = run("apply", file, "--plan")
+    assert "shared_memory  off -> auto  every daemon must be restarted" in result.stdout
+    assert result.stdout.splitlines()[-1].startswith(
+        "until edge1, robot1, robot2 restarts: `shared_memory`: its sessions"
+    )
+    body = json.loads(run("apply", file, "--plan", "--json").stdout)
+    assert faults(body) == []
+    assert [one["nodes"] for one in body["restarts"]] == [["edge1", "robot1", "robot2"]]
+    electors = changed(tmp_path, "electorate: [robot1, robot2, edge1]", "electorate: [robot1, edge1]")
+    assert json.loads(run("apply", electors, "--plan", "--json").stdout)["restarts"] == [], "they are agreed"
+    assert node.changes == []
+
+
 def test_the_document_in_force_changes_nothing_and_another_comment_is_told(node: Node, tmp_path: Path) -> None:
     file = changed(tmp_path, "the large one", "the large one")
     for words in (("--plan",), ("--yes",), ()):

@@ -14,6 +14,7 @@ from zsched.config.editing import add_entries
 from zsched.config.load import check_bytes
 from zsched.core.values.fleet import Fleet, LinkSpec, LocalSide, NodeSpec, TaskSpec
 from zsched.core.values.model import LinkSource, NodeKind, Weights
+from zsched.runtime.restarts import restarts
 
 TEXT = (Path(__file__).parents[3] / "configs" / "fleet.yaml").read_text()
 RULES = "tasks.map_merge.scheduling"
@@ -228,3 +229,7 @@ def test_no_field_of_a_fleet_changes_unnoticed() -> None:
         found = difference(old, new, (TEXT, TEXT))
         assert found, [one.name for one in fields(old) if getattr(old, one.name) != getattr(new, one.name)]
         assert all(one.effect is not Effect.NOTHING for one in found)
+        agreed = replace(new, electors=old.electors, timing=replace(new.timing, lease_s=old.timing.lease_s))
+        waits = any(restarts(old, agreed, one.name) for one in new.nodes if one.kind is old.node(one.name).kind)
+        is_told = any(one.effect in (Effect.RESTART, Effect.NODE) for one in found)
+        assert is_told or not waits, "what a daemon cannot take over while it runs is told as that"
