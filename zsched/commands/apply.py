@@ -19,9 +19,9 @@ from zsched.commands.ask import Door
 from zsched.commands.common import CliError, Json, nearest, print_json
 from zsched.commands.document import QUESTION, InForce, ask_all, change, in_force, status_of, wait_until_settled
 from zsched.commands.page import cut, harmless
-from zsched.config.difference import Change, Danger, difference, wanted_electors
+from zsched.config.difference import Change, Danger, difference, names_electors, wanted_electors
 from zsched.config.load import check_bytes
-from zsched.config.reader import MAX_FILE_BYTES
+from zsched.config.reader import MAX_FILE_BYTES, render_all
 from zsched.core.values.fleet import Fleet, fleet_hash
 from zsched.errors import ConfigError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE, EXIT_WOULD_CHANGE
@@ -146,9 +146,11 @@ def make_plan(door: Door, held: InForce, text: str, file: str) -> Plan:
         raise CliError(
             EXIT_FAILED, f"{file} is the file of fleet {fleet.name}, and this is fleet {held.fleet}; {advice}"
         )
-    warnings = result.report()
+    warnings = render_all(file, result.warnings, "warning")
     if not held.document:
         return _first(door, held, text, fleet, warnings)
+    if not names_electors(text):  # then those that are agreed stay, and what the file's default would be is moot
+        warnings = render_all(file, tuple(one for one in result.warnings if "elector" not in one.message), "warning")
     old = check_bytes(held.text.encode(), file).fleet
     if old is None:
         advice = "update zsched here; `zsched fleet export` shows the document"

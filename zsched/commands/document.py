@@ -6,6 +6,7 @@ does to the fleet (`zsched.config.difference`), how it is agreed.
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -25,6 +26,8 @@ PAUSE_S = 0.1
 IN_FORCE_S = 10.0
 """How long a change that is agreed is waited for at the node that was asked."""
 CODES = {"invalid": EXIT_FAILED, "conflict": EXIT_FAILED, "no_quorum": EXIT_DEGRADED, "unknown": EXIT_TIMED_OUT}
+TELL_S = 1.0
+"""After so long it says what it waits for."""
 ADVICE = {
     "conflict": "the fleet was changed meanwhile; look at it again with --plan",
     "no_quorum": "nothing was changed; `zsched fleet show` names the electors",
@@ -118,12 +121,16 @@ def wait_until_settled(door: Door, revision: int) -> InForce:
     Raises:
         CliError: it does not in time (5), or nobody answers.
     """
-    end = monotonic_s() + IN_FORCE_S
+    start = monotonic_s()
+    is_told = False
     while True:
         held = in_force(door)
         if held.revision >= revision and held.is_settled and (held.text or not held.document):
             return held
-        if monotonic_s() > end:
+        if not is_told and monotonic_s() > start + TELL_S:
+            is_told = True
+            sys.stderr.write(f"revision {revision} is agreed, and is being settled; Ctrl-C takes nothing back\n")
+        if monotonic_s() > start + IN_FORCE_S:
             why = "has not fetched its document" if held.is_settled else f"number {held.number} is not settled"
             raise CliError(
                 EXIT_TIMED_OUT, f"revision {revision} is agreed, but {held.node} {why} yet; see `zsched fleet show`"

@@ -101,14 +101,19 @@ _ORDER: Final = tuple(Effect)
 """Of two effects of one place the later one is told first."""
 
 
+def names_electors(text: str) -> bool:
+    """Whether a fleet file says who its electors are."""
+    root, _ = read_yaml(text.encode())
+    named = [held for key, held in root.pairs if key.text == "electorate"] if isinstance(root, Block) else []
+    return any(not isinstance(held, Scalar) for held in named)
+
+
 def wanted_electors(agreed: Sequence[NodeId], new: Fleet, text: str) -> tuple[NodeId, ...]:
     """The electors that a fleet shall have by its new file, sorted; ``agreed`` are those that it has.
 
     A file that names electors means them. Another one leaves them as they are, but for nodes that it does not have.
     """
-    root, _ = read_yaml(text.encode())
-    named = [held for key, held in root.pairs if key.text == "electorate"] if isinstance(root, Block) else []
-    if any(not isinstance(held, Scalar) for held in named):
+    if names_electors(text):
         return new.electors
     nodes = {node.name for node in new.nodes}
     return tuple(sorted(name for name in agreed if name in nodes))

@@ -15,6 +15,7 @@ from typer.testing import CliRunner, Result
 from support.schemas import faults
 from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.cli import app
+from zsched.config.editing import add_entries
 from zsched.config.load import check_bytes
 from zsched.core.values.fleet import fleet_hash
 
@@ -285,6 +286,23 @@ def test_a_task_comes_and_goes_and_the_comments_stay(node: Node, tmp_path: Path)
     assert run("task", "remove", "merge", "--yes", "--accept", "remove-task").exit_code == 0
     assert "merge" not in node.text
     assert "# the large one" in node.text
+
+
+def test_a_document_that_names_no_electors_is_not_warned_of_those_that_a_first_file_would_have(
+    node: Node, tmp_path: Path
+) -> None:
+    node.text = TEXT.replace("electorate: [robot1, robot2, edge1]\n", "")
+    file = tmp_path / "robots.yaml"
+    file.write_text("nodes: {robot3: {kind: robot}, robot4: {kind: robot}}\n")
+    result = run("node", "add", file, "--plan")
+    assert (result.exit_code, result.stderr) == (10, "")
+    assert "electors survive the loss" in run("check", file_of(tmp_path, node.text, file)).stderr
+
+
+def file_of(tmp_path: Path, text: str, fragment: Path) -> Path:
+    whole = tmp_path / "whole.yaml"
+    whole.write_text(add_entries(text, "nodes", fragment.read_text()))
+    return whole
 
 
 def test_a_node_may_go_that_is_no_last_elector_and_owns_nothing_while_it_lives(node: Node) -> None:
