@@ -18,6 +18,7 @@ from zsched.core.electorate.documents import Documents
 from zsched.core.electorate.founding import founded
 from zsched.core.electorate.roll import Admission, Roll
 from zsched.core.todo import ToDo
+from zsched.core.values.adoption import obstacle
 from zsched.core.values.change import Rewrite
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import Creation, FleetValue
@@ -328,19 +329,15 @@ class Numbers:
         fleet = self.documents.fleet(document)
         if fleet is None:
             return f"the document {document[:8]} is not stored here"
-        if obstacle := self.obstacle(fleet):
-            return obstacle
+        if why := self.obstacle(fleet):
+            return why
         names = {node.name for node in fleet.nodes}
         gone = [name for name in self.electors if name not in names]
         return f"{', '.join(gone)}: an elector, and not in the document; remove it as an elector first" if gone else ""
 
     def obstacle(self, fleet: Fleet) -> str:
-        """Why a running daemon cannot take a document over; empty: it can."""
-        of = ((self._fleet.nodes, fleet.nodes, "nodes"), (self._fleet.tasks, fleet.tasks, "tasks"))
-        for before, after, what in of:
-            if tuple(one.name for one in before) != tuple(one.name for one in after):
-                return f"the document has other {what} than this daemon runs with, which takes no {what} over yet"
-        return ""
+        """Why this daemon cannot take a document over while it runs; empty: it can."""
+        return obstacle(self._fleet, fleet, self._me)
 
     def propose(self, change: FleetChange, todo: ToDo, now: float) -> str:
         """Try to commit a change; why it cannot be made, or nothing. Its end is one of `ToDo.fleet_ended`."""
