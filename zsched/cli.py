@@ -690,8 +690,9 @@ def apply(
 
     words = ("apply", file)
     view = view_of(words, plan=plan, yes=yes, revision=revision, accept=accept, reason=reason, is_json=json_)
+    door = find_door(runtime_dir, node, connect=connect)
     text = read_text(file)
-    raise typer.Exit(change(find_door(runtime_dir, node, connect=connect), view, lambda _held: text, file))
+    raise typer.Exit(change(door, view, lambda _held: text, file))
 
 
 @app.command(cls=Verb)

@@ -102,6 +102,10 @@ def _values(param: Any) -> list[str]:
         return fleet_names("nodes")
     if name == "CONDITION":
         return list(CONDITIONS)
+    if name == "DANGER":
+        from zsched.commands.apply import DANGERS  # noqa: PLC0415 - only who completes it pays for it
+
+        return list(DANGERS)
     if name == "SHELL":
         return list(SCRIPTS)
     kind = getattr(getattr(param, "type_descriptor", None), "annotation", None)

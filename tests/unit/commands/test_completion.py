@@ -56,6 +56,7 @@ def offered(*words: str) -> list[str]:
         (("status", "--node", "b"), ["bob"]),
         (("status", "-n", ""), ["ada", "bob", "eve"]),
         (("completion", ""), ["bash", "fish", "zsh"]),
+        (("apply", "--accept", "remove-"), ["remove-node", "remove-task"]),
         (("up", "--log-level", "D"), ["DEBUG"]),
         (("check", ""), []),
         (("nothing", ""), []),

@@ -371,7 +371,7 @@ def test_answer_of_another_kind_is_dropped(mesh: tuple[Peer, Peer, Peer]) -> Non
         ("register/b/x", None, ("register", "garbage")),
         ("register/b/x", wire.encode(BEAT), ("register", "kind")),
         ("command/b/x", wire.encode(RESULT), ("command", "kind")),
-        ("command/b/x", b"\x00" * 9000, ("command", "size")),
+        ("command/b/x", b"\x00" * 300_000, ("command", "size")),
         ("made-up/b/x", None, ("key", "key")),
         ("utility/b/No.Name", None, ("utility", "key")),
     ],
