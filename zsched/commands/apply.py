@@ -17,7 +17,16 @@ from pathlib import Path
 
 from zsched.commands.ask import Door
 from zsched.commands.common import CliError, Json, nearest, print_json
-from zsched.commands.document import QUESTION, InForce, ask_all, change, in_force, status_of, wait_until_settled
+from zsched.commands.document import (
+    QUESTION,
+    InForce,
+    ask_all,
+    change,
+    document_text,
+    in_force,
+    status_of,
+    wait_until_settled,
+)
 from zsched.commands.page import cut, harmless
 from zsched.config.difference import Change, Danger, difference, names_electors, wanted_electors
 from zsched.config.load import check_bytes
@@ -77,8 +86,8 @@ class Plan:
 
     @property
     def is_nothing(self) -> bool:
-        """Whether the document in force is this very text."""
-        return self.text == self.held.text
+        """Whether the document in force is this very text, and its electors are those that are agreed."""
+        return self.text == self.held.text and not self.changes
 
     @property
     def is_first(self) -> bool:
@@ -134,7 +143,7 @@ def make_plan(door: Door, held: InForce, text: str, file: str) -> Plan:
     """What ``text`` would change, and which dangers are in it.
 
     Raises:
-        CliError: it is another fleet's file, or the document in force cannot be read here.
+        CliError: it is another fleet's file, or the document in force is not there or cannot be read here.
         ConfigError: it has faults.
     """
     result = check_bytes(text.encode(), file)
@@ -151,7 +160,7 @@ def make_plan(door: Door, held: InForce, text: str, file: str) -> Plan:
         return _first(door, held, text, fleet, warnings)
     if not names_electors(text):  # then those that are agreed stay, and what the file's default would be is moot
         warnings = render_all(file, tuple(one for one in result.warnings if "elector" not in one.message), "warning")
-    old = check_bytes(held.text.encode(), file).fleet
+    old = check_bytes(document_text(held).encode(), file).fleet
     if old is None:
         advice = "update zsched here; `zsched fleet export` shows the document"
         raise CliError(EXIT_FAILED, f"the document in force has faults for this version of zsched; {advice}")
@@ -339,7 +348,8 @@ def _steps(door: Door, plan: Plan) -> Iterator[Json]:
     nodes = {node.name for node in plan.fleet.nodes}
     leave = [name for name in go if name not in nodes]
     yield from ({"remove_elector": name} for name in leave)
-    yield {"text": plan.text, "flags": plan.held.flags}
+    if plan.text != plan.held.text:
+        yield {"text": plan.text, "flags": plan.held.flags}
     yield from ({"add_elector": name, "disk": disks[name]} for name in come)
     yield from ({"remove_elector": name} for name in go if name not in leave)
 

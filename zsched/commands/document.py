@@ -78,6 +78,21 @@ def in_force(door: Door) -> InForce:
     )
 
 
+def document_text(held: InForce) -> str:
+    """The text of the document in force.
+
+    Raises:
+        CliError: none is agreed, or this node has not fetched it yet.
+    """
+    if not held.document:
+        advice = "agree one: zsched apply /etc/zsched/fleet.yaml"
+        raise CliError(EXIT_FAILED, f"{held.fleet} goes by the file on each machine, and has no document yet; {advice}")
+    if not held.text:
+        advice = "ask another node with --node, or again in a moment"
+        raise CliError(EXIT_FAILED, f"{held.node} has not fetched document {held.document[:12]} yet; {advice}")
+    return held.text
+
+
 def status_of(door: Door) -> Json:
     """The status of the node at the door.
 

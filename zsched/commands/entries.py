@@ -11,8 +11,7 @@ from pathlib import Path
 from zsched.commands.apply import ApplyView, apply, read_text
 from zsched.commands.ask import Door
 from zsched.commands.common import CliError, Json, nearest
-from zsched.commands.document import InForce, status_of
-from zsched.commands.fleet import document_text
+from zsched.commands.document import InForce, document_text, status_of
 from zsched.config.editing import add_entries, remove_node, remove_task
 from zsched.exits import EXIT_FAILED, EXIT_USAGE
 

@@ -17,7 +17,7 @@ from typing import Any
 from zsched.commands.apply import ApplyView, apply, read_text
 from zsched.commands.ask import Door
 from zsched.commands.common import CliError, Json, print_json
-from zsched.commands.document import QUESTION, InForce, ask_all, in_force, status_of
+from zsched.commands.document import QUESTION, InForce, ask_all, document_text, in_force, status_of
 from zsched.commands.page import harmless
 from zsched.errors import ConfigError
 from zsched.exits import EXIT_FAILED, EXIT_OK
@@ -96,21 +96,6 @@ def export(door: Door, file: Path | None) -> int:
         raise CliError(EXIT_FAILED, f"{file}: {error.strerror}; give a file that can be written") from error
     sys.stdout.write(f"{file}: {held.fleet}, revision {held.revision}\n")
     return EXIT_OK
-
-
-def document_text(held: InForce) -> str:
-    """The text of the document in force.
-
-    Raises:
-        CliError: none is agreed, or this node has not fetched it yet.
-    """
-    if not held.document:
-        advice = "agree one: zsched apply /etc/zsched/fleet.yaml"
-        raise CliError(EXIT_FAILED, f"{held.fleet} goes by the file on each machine, and has no document yet; {advice}")
-    if not held.text:
-        advice = "ask another node with --node, or again in a moment"
-        raise CliError(EXIT_FAILED, f"{held.node} has not fetched document {held.document[:12]} yet; {advice}")
-    return held.text
 
 
 def edit(door: Door, view: ApplyView, env: Mapping[str, str] = os.environ) -> int:

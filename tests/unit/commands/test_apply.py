@@ -47,6 +47,7 @@ class Node:
         self.files: dict[str, str] = {}
         self.changes: list[Json] = []
         self.outcome = "ok"
+        self.is_fetching = False
         self.refused = "nothing"
         """The kind of change that another operator has overtaken."""
 
@@ -65,7 +66,7 @@ class Node:
             told = {
                 "electors": electors,
                 "document": self.document,
-                "text": self.text if self.document else "",
+                "text": self.text if self.document and not self.is_fetching else "",
                 "flags": FLAGS,
             }
             return {**body, **told, "fleet_file": digest_of(self.text), "disk": f"d{node}"}
@@ -223,6 +224,16 @@ def test_faults_are_those_of_check_and_another_fleets_file_is_refused(node: Node
     assert node.changes == []
 
 
+def test_a_node_that_is_still_fetching_the_document_cannot_be_asked_what_would_change(
+    node: Node, tmp_path: Path
+) -> None:
+    file = changed(tmp_path, "the large one", "the north one")
+    node.is_fetching = True
+    result = run("apply", file, "--plan")
+    assert result.exit_code == 1
+    assert "robot1 has not fetched document ab12ab12ab12 yet; ask another node with --node" in result.stderr
+
+
 def test_a_change_that_stops_half_way_says_how_far_it_came(node: Node, tmp_path: Path) -> None:
     """Electors and document are several changes; another operator was faster at the second."""
     file = changed(tmp_path, "electorate: [robot1, robot2, edge1]", "electorate: [robot1, edge1]")
@@ -231,6 +242,11 @@ def test_a_change_that_stops_half_way_says_how_far_it_came(node: Node, tmp_path:
     assert result.exit_code == 5
     assert "1 of 2 changes are agreed, up to revision 8, and the next is not: conflict" in result.stderr
     assert node.text == file.read_text()
+    node.refused = "nothing"
+    assert run("apply", file, "--yes", "--accept", "change-electors").exit_code == 0, "it begins where it stopped"
+    assert node.electors == ["edge1", "robot1"]
+    assert ["text" in one for one in node.changes] == [True, False, False]
+    assert run("apply", file, "--plan").exit_code == 0
 
 
 def test_electors_change_one_after_another_and_only_when_accepted(node: Node, tmp_path: Path) -> None:
