@@ -18,6 +18,7 @@ from zsched.config.schema import FLEET
 from zsched.config.tasks import read_tasks
 from zsched.config.timing import WIFI, timing_faults
 from zsched.core.membership.beat_room import MAX_BEAT_BYTES, most_bytes
+from zsched.core.values.document import MAX_DOCUMENT_BYTES
 from zsched.core.values.fleet import Fleet, NodeSpec, Timing, dial_endpoint
 from zsched.core.values.model import NodeId, NodeKind
 from zsched.errors import ConfigError
@@ -104,12 +105,12 @@ def check_bytes(data: bytes, file: str = "fleet.yaml") -> CheckResult:
     if root is not None:
         section = FLEET.read(root, out)
         if section is not None:
-            fleet = _fleet(section, Path(file).absolute().parent, out)
+            fleet = _fleet(section, Path(file).absolute().parent, len(data), out)
     is_good = fleet is not None and out.count == 0
     return CheckResult(file=file, fleet=fleet if is_good else None, faults=out.faults, warnings=out.warnings)
 
 
-def _fleet(section: Section, folder: Path, out: Collector) -> Fleet | None:
+def _fleet(section: Section, folder: Path, size: int, out: Collector) -> Fleet | None:
     cast = read_nodes(section, folder, out)
     timing = _timing(section, out)
     seeds = _seeds(section, cast, out)
@@ -128,8 +129,16 @@ def _fleet(section: Section, folder: Path, out: Collector) -> Fleet | None:
         zenoh_config=zenoh_config,
         **{name: section.get(name) for name in ("relay_orphan_s", "shared_memory") if name in section.values},
     )
+    _check_size(size, section.where("tasks"), out)
     _check_beats(fleet, section.where("tasks"), out)
     return fleet
+
+
+def _check_size(size: int, place: Place, out: Collector) -> None:
+    """A daemon reads a larger file than nodes can agree on."""
+    if size > MAX_DOCUMENT_BYTES:
+        message = f"the file has {size} bytes: nodes agree on a document of at most {MAX_DOCUMENT_BYTES}"
+        out.warn(place, message, "shorten comments; write {robot} and {target} in place of names")
 
 
 def _check_beats(fleet: Fleet, place: Place, out: Collector) -> None:

@@ -1,0 +1,283 @@
+"""Schedules of whole nodes whose fleet changes under faults: documents, electors, lost disks, cuts, crashes.
+
+``python -m zsched_lab.sim.fleets --seeds N``.
+
+Knows: what operators and faults do in a schedule, by its seed. Does not know: the rules (`zsched.core.electorate`),
+what must hold after every write (`zsched_lab.sim.chosen`, `zsched_lab.sim.checks`).
+
+After the faults every node runs. If a majority of the electors in force has its state, the fleet must come to rest:
+all nodes have learnt one settled value, and the exclusive task has one owner with a lease. A further change must then
+be carried out. The last line is ``N schedules, V violations``; the exit code is 1 when there is any.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import Counter
+from dataclasses import dataclass, field, replace
+from random import Random
+
+from zsched.core import events as ev
+from zsched.core.values.electorate import FleetValue
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.messages import ChangeFleet, CommandOutcome
+from zsched.core.values.model import NodeId, NodeKind, ScoreForm, Tuning, Weights
+from zsched.core.values.quorum import majority
+from zsched_lab.sim.links import Pair
+from zsched_lab.sim.simulator import Simulator
+
+FAULTS_S, REST_S = 25.0, 40.0
+ROBOTS = ("robot1", "robot2", "robot3", "robot4")
+EDGES = ("edge1", "edge2")
+STEPS = ("change", "change", "change", "kill", "kill", "power", "cut", "pause", "blackout", "document", "unfit", "lose")
+
+
+class ScheduleError(AssertionError):
+    """What must hold does not."""
+
+
+@dataclass(slots=True)
+class Schedule:
+    """One schedule."""
+
+    seed: int
+    sim: Simulator = field(init=False)
+    rng: Random = field(init=False)
+    fleet: Fleet = field(init=False)
+    done: Counter[str] = field(default_factory=Counter)
+    lost: int = 0
+    """Disks that were lost."""
+    _number: int = 0
+
+    def __post_init__(self) -> None:
+        self.rng = Random(f"fleets {self.seed}")
+        self.fleet = fleet_of(self.rng)
+        self.sim = Simulator(fleet=self.fleet, seed=self.seed)
+        self.sim.work.stop_s = (0.002, 0.02, 0.1, 0.4)
+        self.sim.documents.judge_from(self.fleet, 0)
+
+    def play(self) -> None:
+        """Run it all.
+
+        Raises:
+            AssertionError, InvariantError: what must hold does not.
+        """
+        sim, rng = self.sim, self.rng
+        sim.start()
+        sim.run(rng.uniform(0.0, 5.0))
+        end = sim.now + FAULTS_S
+        while sim.now < end:
+            getattr(self, f"_{rng.choice(STEPS)}")()
+            sim.run(rng.choice((0.01, 0.1, 0.5, 2.0, 4.0)))
+        self._calm()
+        if not self._can_agree():
+            self.done["no majority is left"] += 1
+            return
+        if not sim.run_until(self._is_at_rest, REST_S):
+            raise ScheduleError(f"not at rest {REST_S:g} s after the faults: {self._why()}")
+        self._change_once_more()
+
+    # --- operators ---------------------------------------------------------------------------------------------------
+
+    def _tell(self, command: ChangeFleet, node: NodeId | None = None) -> int:
+        running = self.sim.running()
+        if not running:
+            return 0
+        self._number += 1
+        asked = node or self.rng.choice(running)
+        self.sim.deliver(self.sim.machines[asked], ev.FleetCommanded(request=self._number, command=command))
+        return self._number
+
+    def _outcome(self, number: int) -> CommandOutcome | None:
+        return next((one.result.outcome for one in self.sim.answers if one.request == number), None)
+
+    def _change(self) -> None:
+        """An elector comes or goes, or the first document is agreed."""
+        name = self.rng.choice([node.name for node in self.fleet.nodes])
+        value = self._newest()
+        if value is None or not value.document:
+            self._document()
+        elif value.electorate.seat(name) is None or self.rng.random() < 0.2:
+            state = self.sim.disk(name)
+            if state is not None:
+                self._tell(ChangeFleet(add_elector=name, disk=state.disk))
+                self.done["elector added"] += 1
+        else:
+            self._tell(ChangeFleet(remove_elector=name))
+            self.done["elector removed"] += 1
+
+    def _document(self) -> None:
+        """Another document; now and then with another length of leases."""
+        lease_s = self.rng.choice((self.fleet.timing.lease_s, self.fleet.timing.lease_s, 0.7, 1.6))
+        timing = replace(self.fleet.timing, lease_s=lease_s)
+        said = replace(self.fleet, relay_orphan_s=float(self.rng.randint(1, 20)), timing=timing)
+        self._tell(ChangeFleet(document=self.sim.documents.write(said)))
+        self.done["document"] += 1
+
+    def _unfit(self) -> None:
+        """Some document is not valid on one machine until the faults end."""
+        known = list(self.sim.documents.says)
+        if known and self.rng.random() < 0.3:
+            self.sim.documents.unfit.add((self.rng.choice(sorted(self.sim.machines)), self.rng.choice(known)))
+            self.done["unfit document"] += 1
+
+    # --- faults ------------------------------------------------------------------------------------------------------
+
+    def _kill(self) -> None:
+        self._end(self.rng.choice(sorted(self.sim.machines)), is_power_lost=False)
+
+    def _power(self) -> None:
+        self._end(self.rng.choice(sorted(self.sim.machines)), is_power_lost=True)
+
+    def _blackout(self) -> None:
+        if self.rng.random() < 0.3:
+            for name in self.sim.running():
+                self._end(name, is_power_lost=True)
+
+    def _end(self, name: NodeId, *, is_power_lost: bool) -> None:
+        self.sim.crash(name, is_power_lost=is_power_lost)
+        self.sim.later(self.rng.choice((0.05, 0.5, 3.0, 12.0)), self.sim.start, name)
+        self.done["crash"] += 1
+
+    def _cut(self) -> None:
+        names = sorted(self.sim.machines)
+        side = tuple(self.rng.sample(names, self.rng.randint(1, len(names) - 1)))
+        pairs: set[Pair] = {(one, other) for one in names for other in names if (one in side) != (other in side)}
+        if self.rng.random() < 0.3:
+            pairs = {pair for pair in pairs if pair[0] in side}
+        self.sim.hold(pairs, until=self.sim.now + self.rng.choice((0.3, 2.0, 6.0)))
+        self.done["cut"] += 1
+
+    def _pause(self) -> None:
+        self.sim.pause(self.sim.machines[self.rng.choice(sorted(self.sim.machines))], self.rng.choice((0.3, 1.0, 5.0)))
+        self.done["pause"] += 1
+
+    def _lose(self) -> None:
+        """A disk is lost for good: the machine comes back with a blank one, as another member.
+
+        One that is an elector by its file only is left alone: it would be the same elector, and forget.
+        """
+        name = self.rng.choice(sorted(self.sim.machines))
+        values = [self.sim.machines[one].disk.state for one in sorted(self.sim.machines)]
+        founded = [one for one in values if one is None or one.fleet_register is None]
+        value = self._newest()
+        if founded or value is None or value.number <= 1 or self.rng.random() < 0.5:
+            return
+        seat = value.electorate.seat(name)
+        if seat is not None and (seat.disk == "" or self.lost):
+            return
+        self.sim.crash(name)
+        self.sim.initialise(self.sim.machines[name], incarnation=self.sim.wall_count)
+        self.sim.later(1.0, self.sim.start, name)
+        self.lost += seat is not None
+        self.done["disk lost"] += 1
+
+    # --- the end -----------------------------------------------------------------------------------------------------
+
+    def _calm(self) -> None:
+        sim = self.sim
+        sim.documents.unfit.clear()
+        sim.heal()
+        for machine in tuple(sim.machines.values()):
+            sim.unpause(machine, machine.life)
+            if machine.node is not None and machine.node.agreement.problems.get("fleet/document"):
+                sim.crash(machine.key)  # the operator has put it right: it looks at the document again
+        sim.start()
+
+    def _newest(self) -> FleetValue | None:
+        judge = self.sim.documents.judge
+        assert judge is not None
+        (generation,) = {name[0] for name in judge.values if name[1] == ""}
+        return judge.newest_fleet(generation)
+
+    def _can_agree(self) -> bool:
+        value = self._newest()
+        assert value is not None
+        held = [self.sim.disk(one.name) for one in value.electors]
+        fit = [
+            one
+            for one, state in zip(value.electors, held, strict=True)
+            if state and one.is_held_by(one.name, state.disk)
+        ]
+        return len(fit) >= majority(len(value.electors))
+
+    def _is_at_rest(self) -> bool:
+        return not self._why()
+
+    def _why(self) -> str:
+        values = {name: self.sim.node(name).agreement.fleet_value for name in self.sim.running()}
+        first = next(iter(values.values()))
+        if first is None or any(value != first for value in values.values()):
+            told = {name: (value.revision, value.number) for name, value in values.items() if value is not None}
+            return f"nodes know different fleet values: {told}"
+        return f"number {first.number} is not settled" if not first.settled else self.sim.unsettled()
+
+    def _change_once_more(self) -> None:
+        """What is at rest can be changed again."""
+        command = ChangeFleet(document=self.sim.documents.write(replace(self.fleet, relay_orphan_s=99.0)))
+        outcome = None
+        for _ in range(3):  # an operator's change of before may still come first
+            number = self._tell(command)
+            if not self.sim.run_until(lambda number=number: self._outcome(number) is not None, REST_S):  # type: ignore[misc]
+                raise ScheduleError("no answer to a change at rest")
+            outcome = self._outcome(number)
+            if outcome is not CommandOutcome.CONFLICT:
+                break
+        if outcome not in (CommandOutcome.OK, CommandOutcome.UNCHANGED):
+            raise ScheduleError(f"a change at rest ended as {outcome}")
+        if not self.sim.run_until(self._is_at_rest, REST_S):
+            raise ScheduleError(f"not at rest {REST_S:g} s after the last change: {self._why()}")
+
+
+def fleet_of(rng: Random) -> Fleet:
+    """Some fleet: two to four robots, one or two edges, an exclusive task and maybe another one."""
+    robots, edges = ROBOTS[: rng.randint(2, 4)], EDGES[: rng.randint(1, 2)]
+    names = tuple(sorted((*robots, *edges)))
+    weights = Weights(cpu=0.5, memory=0.5, network=0.0)
+    tuning = Tuning(weights=weights, bonus=0.1, cool_down_s=0.0, score=ScoreForm.PAPER)
+    tasks = tuple(
+        TaskSpec(
+            name=name,
+            candidates=names,
+            tuning=tuning,
+            exclusive=name == "merge",
+            patience=0.1,
+            worker=WorkerSpec(command=("work",)),
+        )
+        for name in ("merge", "other")[: rng.randint(1, 2)]
+    )
+    nodes = tuple(NodeSpec(name=name, kind=NodeKind.ROBOT if name in robots else NodeKind.EDGE) for name in names)
+    return Fleet(name="lab", timing=Timing(), nodes=nodes, tasks=tasks, electors=robots)
+
+
+def play(seed: int) -> tuple[str, Counter[str]]:
+    """(what was violated or nothing, what was done) of one schedule."""
+    schedule = Schedule(seed)
+    try:
+        schedule.play()
+    except Exception as error:  # noqa: BLE001 - whatever escapes is what is looked for
+        return f"seed {seed}: {type(error).__name__}: {error}", schedule.done
+    return "", schedule.done
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Play schedules, print what was violated, return the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m zsched_lab.sim.fleets", description=__doc__)
+    parser.add_argument("--seeds", type=int, default=100)
+    parser.add_argument("--first", type=int, default=0)
+    given = parser.parse_args(arguments)
+    found, done = [], Counter[str]()
+    for seed in range(given.first, given.first + given.seeds):
+        violation, did = play(seed)
+        done += did
+        if violation:
+            found.append(violation)
+            print(violation[:1000], flush=True)
+    print(", ".join(f"{what} {count}" for what, count in sorted(done.items())))
+    print(f"{given.seeds} schedules, {len(found)} violations")
+    return 1 if found else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

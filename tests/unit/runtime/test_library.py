@@ -1,0 +1,132 @@
+"""The library: a document is fetched, checked and stored before the node hears of it."""
+
+from __future__ import annotations
+
+import queue
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from zsched.adapters.host.document_store import DocumentStore
+from zsched.core import events as ev
+from zsched.core import instructions as do
+from zsched.core.values.document import Document, Text
+from zsched.core.values.model import NodeId
+from zsched.runtime.library import RECENT, Library
+from zsched.wire.codec import document_hash, encode
+
+FILE = """
+fleet: lab
+nodes:
+  robot1: {kind: robot, host: 192.0.2.1, listen: {control: tcp/0.0.0.0:7457, data: tcp/0.0.0.0:7458}, wired: true}
+  edge1: {kind: edge, host: 192.0.2.2, listen: {control: tcp/0.0.0.0:7457, data: tcp/0.0.0.0:7458}, wired: true}
+zenoh: {config: keys/zenoh.json5}
+tasks:
+  echo:
+    candidates: [edge1]
+    weights: {cpu: 0.5, memory: 0.5, network: 0.0}
+    worker: {command: [python, -m, zsched.tasks.echo]}
+"""
+
+
+def document(more: str = "", text: str = FILE) -> Document:
+    return Document(text=Text(text + more))
+
+
+class Desk:
+    """A library, what it has posted, and peers that have documents."""
+
+    def __init__(self, folder: Path) -> None:
+        self.events: queue.SimpleQueue[ev.Event] = queue.SimpleQueue()
+        self.held: dict[NodeId, bytes] = {}
+        self.asked: list[NodeId] = []
+        self.library = Library(
+            fleet="lab", node="edge1", config=folder / "config" / "fleet.yaml", state_dir=folder, post=self.events.put
+        )
+        self.library.fetch = self._fetch
+        self.library.start()
+        self.store = DocumentStore(folder)
+
+    def _fetch(self, peer: NodeId, _document: str, _deadline_s: float) -> bytes | None:
+        self.asked.append(peer)
+        return self.held.get(peer)
+
+    def next(self) -> ev.Event:
+        return self.events.get(timeout=30)
+
+
+@pytest.fixture
+def desk(tmp_path: Path) -> Iterator[Desk]:
+    made = Desk(tmp_path)
+    yield made
+    made.library.close()
+
+
+def test_an_operator_s_document_is_on_disk_before_the_node_hears_of_it(desk: Desk, tmp_path: Path) -> None:
+    desk.library.order(do.StoreDocument(request=7, content=document()))
+    event = desk.next()
+    assert isinstance(event, ev.DocumentStored)
+    assert (event.document, event.request) == (document_hash(document()), 7)
+    assert desk.store.load(event.document) == document()
+    assert event.fleet.zenoh_config == str(tmp_path / "config" / "keys" / "zenoh.json5")
+
+
+def test_a_document_comes_from_the_first_peer_that_has_it(desk: Desk) -> None:
+    wanted = document_hash(document())
+    desk.held = {"robot2": encode(document("# another\n")), "robot3": encode(document()), "robot4": b""}
+    desk.library.order(do.FetchDocument(document=wanted, peers=("robot1", "robot2", "robot3", "robot4")))
+    assert desk.next() == ev.FrameDropped(kind="document", reason="checksum")
+    event = desk.next()
+    assert isinstance(event, ev.DocumentStored)
+    assert (event.document, event.request) == (wanted, None)
+    assert desk.asked == ["robot1", "robot2", "robot3"]
+
+
+def test_what_nobody_has_is_asked_for_again(desk: Desk) -> None:
+    wanted = document_hash(document())
+    desk.library.order(do.FetchDocument(document=wanted, peers=("robot1",)))
+    desk.library.order(do.StoreDocument(request=1, content=document("# another\n")))
+    desk.next()  # the fetch before it has ended
+    desk.held = {"robot1": encode(document())}
+    desk.library.order(do.FetchDocument(document=wanted, peers=("robot1",)))
+    event = desk.next()
+    assert isinstance(event, ev.DocumentStored)
+    assert event.document == wanted
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        (FILE.replace("candidates", "candidate"), "candidate"),
+        (FILE.replace("fleet: lab", "fleet: hall"), "of the fleet 'hall', this node of 'lab'"),
+        (FILE.replace("edge1", "edge2"), "names no node 'edge1'"),
+    ],
+)
+def test_a_document_that_is_not_valid_here_is_refused_and_not_stored(desk: Desk, text: str, why: str) -> None:
+    desk.library.order(do.StoreDocument(request=3, content=document(text=text)))
+    event = desk.next()
+    assert isinstance(event, ev.DocumentRefused)
+    assert event.request == 3
+    assert why in event.reason
+    assert desk.store.load(event.document) is None
+
+
+def test_a_full_disk_refuses_a_document(desk: Desk, tmp_path: Path) -> None:
+    (tmp_path / "documents").write_text("in the way")
+    desk.library.order(do.StoreDocument(request=3, content=document()))
+    event = desk.next()
+    assert isinstance(event, ev.DocumentRefused)
+    assert "cannot write" in event.reason
+
+
+def test_what_the_state_names_is_kept_and_peers_fill_no_disk(desk: Desk) -> None:
+    desk.library.order(do.StoreDocument(request=0, content=document()))
+    first = desk.next()
+    assert isinstance(first, ev.DocumentStored)
+    desk.library.order(do.KeepDocuments(documents=(first.document,)))
+    for number in range(2 * RECENT):
+        desk.library.order(do.StoreDocument(request=number, content=document(f"# {number}\n")))
+        desk.next()
+    assert desk.store.load(first.document) == document()
+    assert len(list(desk.store.folder.iterdir())) == RECENT + 1
