@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Any, Final, Union, get_args, get_origin
+from typing import Any, Final, NewType, Union, get_args, get_origin
 
 import pytest
 import typer.main
@@ -214,7 +214,8 @@ def shown(hint: Any) -> str:
         return " or ".join("nil" if part is type(None) else shown(part) for part in get_args(hint))
     if isinstance(hint, type) and issubclass(hint, Enum):
         return "one of " + " ".join(str(member.value) for member in hint)
-    return str(hint.__name__) if isinstance(hint, type) or is_dataclass(get_origin(hint)) else str(hint)
+    has_name = isinstance(hint, type | NewType) or is_dataclass(get_origin(hint))
+    return str(hint.__name__) if has_name else str(hint)
 
 
 def fields_of(cls: type) -> str:

@@ -43,7 +43,7 @@ KINDS: dict[str, tuple[type, int]] = {
     "promise": (messages.Promise, SMALL),
     "accept": (messages.Accept, SMALL),
     "accepted": (messages.Accepted, SMALL),
-    "refused": (messages.Refused, SMALL),
+    "refused": (messages.Refused, 8 * SMALL),
     "fleet_question": (messages.FleetQuestion, LARGE),
     "fleet_answer": (messages.FleetAnswer, LARGE),
     "ask_document": (messages.AskDocument, SMALL),

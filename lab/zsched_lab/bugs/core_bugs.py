@@ -25,6 +25,8 @@ class Bug:
     """A schedule that has found it before: tried first."""
     has_schedules: bool = True
     """Whether the simulator runs the module at all."""
+    has_changing_fleets: bool = False
+    """Whether schedules of whole nodes whose fleet changes are played (`zsched_lab.sim.fleets`)."""
     has_changing_electors: bool = False
     """Whether schedules of electors that change are played, not those of whole nodes."""
     also: Bug | None = None
@@ -563,7 +565,7 @@ MEMBERSHIP_BUGS = (
     _bug(
         "a lease that forbids an accept ends its ballot",
         REGISTER,
-        "return running.phase is _Phase.ACCEPT and set(running.no.values()) == {Refusal.LEASE}",
+        "return running.phase is _Phase.ACCEPT and passes.issuperset(running.no.values()) and bool(running.no)",
         "return False",
         ("tests/unit/core/vote/test_register_proposer.py",),
     ),
@@ -639,7 +641,7 @@ MEMBERSHIP_BUGS = (
     _bug(
         "node without state proposes by generation 0",
         AGREEMENT,
-        "self.registers[task.name].follow(self.electorate, initial",
+        "self.registers[task.name].follow(self._by_file, initial",
         "self.registers[task.name].follow(self._electorate, initial",
         _GENERATIONS,
         26,

@@ -32,6 +32,15 @@ def _numbers_bug(name: str, module: str, *changes: tuple[str, str], also: Bug | 
     return Bug(name=name, module=module, changes=changes, tests=tests, has_schedules=False, also=also)
 
 
+def _fleet_bug(name: str, module: str, *changes: tuple[str, str], has_schedules: bool = True) -> Bug:
+    tests = ("tests/sim/test_fleet_changes.py", "tests/unit/core/electorate/test_orders.py")
+    return Bug(
+        name=name, module=module, changes=changes, tests=tests, has_schedules=has_schedules, has_changing_fleets=True
+    )
+
+
+NUMBERS, DOCUMENTS = "zsched.core.electorate.numbers", "zsched.core.electorate.documents"
+
 ELECTOR_BUGS: tuple[Bug, ...] = (
     _bug(
         "two electors change at once",
@@ -53,8 +62,8 @@ ELECTOR_BUGS: tuple[Bug, ...] = (
         "a length of leases keeps the number",
         CHANGES,
         (
-            "return replace(_renumbered(read, read.electors), lease_s=self.lease_s, guard_lease_s=longest)",
-            "return replace(read, revision=read.revision + 1, lease_s=self.lease_s, guard_lease_s=longest)",
+            "return replace(changed, number=read.number + 1, settled=False, lease_s=lease_s, guard_lease_s=longest)",
+            "return replace(changed, lease_s=lease_s, guard_lease_s=longest)",
         ),
         has_schedules=False,
     ),
@@ -156,7 +165,7 @@ ELECTOR_BUGS: tuple[Bug, ...] = (
     _bug(
         "the guard goes by the new lease alone",
         CHANGES,
-        ("longest = max(self.lease_s, read.guard_lease_s)", "longest = self.lease_s"),
+        ("longest = max(lease_s, read.guard_lease_s)", "longest = lease_s"),
         has_schedules=False,
     ),
     _bug(
@@ -275,5 +284,56 @@ ELECTOR_BUGS: tuple[Bug, ...] = (
                 "        if not event.is_answer:\n"
             ),
         ),
+    ),
+    _fleet_bug(
+        "an elector accepts a fleet value without its document",
+        ROLL,
+        ("if not self._holds(question.acceptance.value) and", "if False and"),
+    ),
+    _fleet_bug(
+        "a fleet value is learnt without its document",
+        ROLL,
+        (
+            "        if self._holds(value):\n            self._register.learn",
+            "        if True:\n            self._register.learn",
+        ),
+    ),
+    _fleet_bug(
+        "a document that nobody has sent is not asked for again",
+        DOCUMENTS,
+        ("            if now >= self._ask_at[document]:\n", "            if False:\n"),
+        ("return min((self._ask_at[document] for document in self._wanted), default=math.inf)", "return math.inf"),
+    ),
+    _fleet_bug(
+        "a promise of the first change is not on disk",
+        NUMBERS,
+        (
+            "return state if self.changed is not None or has_voted else None",
+            "return state if self.changed is not None else None",
+        ),
+    ),
+    _fleet_bug(
+        "the document of an acceptance is not kept",
+        NUMBERS,
+        ('"" if accepted is None else accepted.value.document)', '"")'),
+        has_schedules=False,
+    ),
+    _fleet_bug(
+        "an elector answers a fleet ballot that is not its asker's",
+        AGREEMENT,
+        ("if not self._is_its_own(event.question.ballot, event.asker):", "if False:"),
+        has_schedules=False,
+    ),
+    _fleet_bug(
+        "a document leaves an elector out",
+        NUMBERS,
+        ("gone = [name for name in self.electors if name not in names]", "gone: list[NodeId] = []"),
+        has_schedules=False,
+    ),
+    _fleet_bug(
+        "the node keeps its file's electors though others are agreed",
+        NUMBERS,
+        ("return replace(fleet, electors=value.electorate.names,", "return replace(fleet,"),
+        has_schedules=False,
     ),
 )

@@ -109,6 +109,10 @@ def _player(bug: Bug) -> Callable[[int], str]:
         from zsched_lab.sim.electorate import play as play_electors  # noqa: PLC0415 - see above
 
         return lambda seed: play_electors(seed).violation
+    if bug.has_changing_fleets:
+        from zsched_lab.sim.fleets import play as play_fleets  # noqa: PLC0415 - see above
+
+        return lambda seed: play_fleets(seed)[0]
     from zsched_lab.sim.faults import play as play_nodes  # noqa: PLC0415 - see above
     from zsched_lab.sim.swarm import plan  # noqa: PLC0415 - see above
 

@@ -315,8 +315,8 @@ STREAM_BUGS = (
     _bug(
         "a node's processes have as many threads as zenoh likes",
         "zsched.daemon",
-        'os.environ.setdefault(\n            "ZENOH_RUNTIME",',
-        'os.environ.setdefault(\n            "ZENOH_RUNTIME_UNREAD",',
+        'os.environ.setdefault(\n                "ZENOH_RUNTIME",',
+        'os.environ.setdefault(\n                "ZENOH_RUNTIME_UNREAD",',
         ("tests/integration/test_zenoh_pools.py",),
     ),
     _bug(

@@ -109,9 +109,21 @@ class Chosen:
         if count >= majority(len(electors)) and key not in self._done:
             self._done.add(key)
             newest = self._newest.get(name, 0)
+            if self._is_late(key, held.value):
+                return
             if held.value.revision < newest:
                 raise ChosenError(f"{name[1:]}: revision {newest} is forgotten: {_text(held.value)} is chosen")
             self._choose(name, held.value)
+
+    def _is_late(self, key: tuple[Name, Ballot], value: Value) -> bool:
+        """Whether the value that ended a number is chosen once more under that number, in a later ballot.
+
+        The fleet register begins anew under each number, so nothing of the later numbers falls behind it.
+        """
+        if not isinstance(value, FleetValue):
+            return False
+        is_known = self.values[key[0]].get(value.revision) == value
+        return is_known and self._numbers[key] < value.number and key[0] in self._newest
 
     def _choose(self, name: Name, value: Value) -> None:
         known = self.values.setdefault(name, {})

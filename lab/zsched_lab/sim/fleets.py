@@ -156,19 +156,17 @@ class Schedule:
     def _lose(self) -> None:
         """A disk is lost for good: the machine comes back with a blank one, as another member.
 
-        One that is an elector by its file only is left alone: it would be the same elector, and forget.
+        An elector of the file is left alone, for its first seat names no disk: `zsched init` asks the fleet before it
+        makes such a state anew.
         """
-        name = self.rng.choice(sorted(self.sim.machines))
-        values = [self.sim.machines[one].disk.state for one in sorted(self.sim.machines)]
-        founded = [one for one in values if one is None or one.fleet_register is None]
+        name = self.rng.choice([one for one in sorted(self.sim.machines) if one not in self.fleet.electors])
         value = self._newest()
-        if founded or value is None or value.number <= 1 or self.rng.random() < 0.5:
-            return
-        seat = value.electorate.seat(name)
-        if seat is not None and (seat.disk == "" or self.lost):
+        seat = None if value is None else value.electorate.seat(name)
+        if seat is not None and self.lost:
             return
         self.sim.crash(name)
         self.sim.initialise(self.sim.machines[name], incarnation=self.sim.wall_count)
+        self.sim.machines[name].is_durable = False  # what it once knew is gone
         self.sim.later(1.0, self.sim.start, name)
         self.lost += seat is not None
         self.done["disk lost"] += 1
@@ -222,8 +220,10 @@ class Schedule:
             if not self.sim.run_until(lambda number=number: self._outcome(number) is not None, REST_S):  # type: ignore[misc]
                 raise ScheduleError("no answer to a change at rest")
             outcome = self._outcome(number)
-            if outcome is not CommandOutcome.CONFLICT:
+            if outcome in (CommandOutcome.OK, CommandOutcome.UNCHANGED):
                 break
+            sim = self.sim
+            sim.run_until(self._is_at_rest, REST_S)
         if outcome not in (CommandOutcome.OK, CommandOutcome.UNCHANGED):
             raise ScheduleError(f"a change at rest ended as {outcome}")
         if not self.sim.run_until(self._is_at_rest, REST_S):

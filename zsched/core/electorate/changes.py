@@ -78,8 +78,7 @@ class SetLease:
         """The value with another lease, under the next number."""
         if self.fault(read) or self.lease_s == read.lease_s:
             return read
-        longest = max(self.lease_s, read.guard_lease_s)
-        return replace(_renumbered(read, read.electors), lease_s=self.lease_s, guard_lease_s=longest)
+        return _relet(replace(read, revision=read.revision + 1), read, self.lease_s)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -154,9 +153,7 @@ class SetDocument:
         )
         if self.lease_s is None or not self._is_of_lease(read):
             return changed
-        longest = max(self.lease_s, read.guard_lease_s)
-        numbered = replace(changed, number=read.number + 1, settled=False)
-        return replace(numbered, lease_s=self.lease_s, guard_lease_s=longest)
+        return _relet(changed, read, self.lease_s)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -190,3 +187,9 @@ def _unsettled(read: FleetValue) -> str:
 
 def _renumbered(read: FleetValue, electors: tuple[Elector, ...]) -> FleetValue:
     return replace(read, revision=read.revision + 1, number=read.number + 1, electors=electors, settled=False)
+
+
+def _relet(changed: FleetValue, read: FleetValue, lease_s: float) -> FleetValue:
+    """The value with another length of leases, under the next number; until that is settled, longer ones may run."""
+    longest = max(lease_s, read.guard_lease_s)
+    return replace(changed, number=read.number + 1, settled=False, lease_s=lease_s, guard_lease_s=longest)

@@ -1,0 +1,327 @@
+"""A node's changes of the fleet: which commands are taken, what is on disk before an answer, what is kept."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from random import Random
+from typing import TypeVar
+
+import pytest
+
+from support.fleets import fleet_of, tuning_of
+from support.todos import agreed
+from zsched.core import events as ev
+from zsched.core import instructions as do
+from zsched.core.electorate.changes import AdoptDocument
+from zsched.core.electorate.founding import founded
+from zsched.core.electorate.numbers import in_force
+from zsched.core.todo import ToDo
+from zsched.core.values.change import RoundOutcome
+from zsched.core.values.document import Document, Text
+from zsched.core.values.durable import DurableState
+from zsched.core.values.electorate import FleetValue
+from zsched.core.values.fleet import Fleet, TaskSpec
+from zsched.core.values.messages import (
+    Accept,
+    ChangeFleet,
+    CommandOutcome,
+    FleetAnswer,
+    Learnt,
+    Prepare,
+    Promise,
+    Refusal,
+    Refused,
+    fleet_question,
+)
+from zsched.core.values.model import Acceptance, Ballot, RegisterState
+from zsched.core.vote.agreement import Agreement
+
+T = TypeVar("T")
+NAMES = ("edge1", "robot1", "robot2", "robot3")
+ROBOTS = NAMES[1:]
+TASK = TaskSpec(name="merge", candidates=NAMES, tuning=tuning_of(), exclusive=True)
+FLEET = fleet_of(TASK, of=NAMES, electors=ROBOTS)
+SAID = replace(FLEET, relay_orphan_s=5.0)
+FIRST = founded(FLEET.name, 0, ROBOTS)
+ADOPT = AdoptDocument(base_revision=1, document="0d", tasks=(("merge", True),), lease_s=1.0)
+ADOPTED = replace(ADOPT.apply(FIRST), settled=True)
+BALLOT = Ballot(counter=5, node="robot2", incarnation=9)
+
+
+def make(value: FleetValue | None = None, stored: dict[str, Fleet] | None = None) -> Agreement:
+    state = DurableState(
+        fleet=FLEET.name,
+        node="robot1",
+        incarnation=7,
+        generation=0,
+        hardware="h",
+        electorate="e",
+        disk="d1",
+        fleet_register=None if value is None else RegisterState(task=FLEET.name, learnt=value),
+    )
+    agreement = Agreement(
+        fleet=FLEET,
+        me="robot1",
+        durable=state,
+        incarnation=7,
+        electorate="e",
+        rng=Random(1),
+        now=100.0,
+        stored=stored or {},
+    )
+    for name in NAMES:
+        agreement.witness.on_answer(Learnt(node=name, values=()))
+    return agreement
+
+
+def of(todo: ToDo, kind: type[T]) -> list[T]:
+    return [one for one in (*todo.send, *todo.apply) if isinstance(one, kind)]
+
+
+def prepare_of(ballot: Ballot = BALLOT, value: FleetValue = FIRST) -> Prepare:
+    return Prepare(
+        task=FLEET.name, ballot=ballot, electorate="e", generation_id=value.generation_id, number=value.number
+    )
+
+
+def accept_of(value: FleetValue, under: FleetValue = FIRST) -> Accept[FleetValue]:
+    acceptance = Acceptance(ballot=BALLOT, value=value)
+    return Accept(
+        task=FLEET.name,
+        acceptance=acceptance,
+        electorate="e",
+        generation_id=under.generation_id,
+        number=under.number,
+    )
+
+
+def asked(
+    agreement: Agreement, question: Prepare | Accept[FleetValue], asker: str = "robot2"
+) -> tuple[ToDo, FleetAnswer | None]:
+    event = ev.FleetAsked(request=1, asker=asker, question=fleet_question(question))
+    todo = agreed(agreement.on_fleet_asked, event, 100.1)
+    answers = of(todo, do.AnswerFleet)
+    return todo, answers[0].answer if answers else None
+
+
+def commanded(agreement: Agreement, command: ChangeFleet, request: int = 3) -> ToDo:
+    todo = ToDo()
+    agreement.orders.take(ev.FleetCommanded(request=request, command=command), todo, 100.1)
+    return todo
+
+
+def told(todo: ToDo) -> tuple[CommandOutcome, str]:
+    (answer,) = of(todo, do.AnswerCommand)
+    return answer.result.outcome, answer.result.detail
+
+
+# --- electors --------------------------------------------------------------------------------------------------------
+
+
+def test_a_promise_of_the_first_change_is_on_disk_before_its_answer_and_after_a_restart() -> None:
+    agreement = make()
+    todo, answer = asked(agreement, prepare_of())
+    assert answer is not None
+    assert answer.promise is not None
+    assert todo.must_persist
+    state = agreement.to_persist(100.1)
+    assert state is not None
+    assert state.fleet_register is not None
+    assert state.fleet_register.promised == BALLOT
+    again = Agreement(fleet=FLEET, me="robot1", durable=state, incarnation=8, electorate="e", rng=Random(1), now=200.0)
+    for name in NAMES:
+        again.witness.on_answer(Learnt(node=name, values=()))
+    _, answer = asked(again, prepare_of(replace(BALLOT, counter=4)))
+    assert answer is not None
+    assert answer.refused is not None
+    assert answer.refused.refusal is Refusal.BALLOT
+
+
+@pytest.mark.parametrize("asker", ["robot3", "ghost"])
+def test_a_ballot_that_is_not_its_asker_s_is_counted_and_not_answered(asker: str) -> None:
+    agreement = make()
+    assert asked(agreement, prepare_of(), asker)[1] is None
+    assert agreement.counters["fleet_foreign"] == 1
+
+
+def test_another_electorate_of_a_file_is_refused() -> None:
+    _, answer = asked(make(), replace(prepare_of(), electorate="other"))
+    assert answer is not None
+    assert answer.refused is not None
+    assert answer.refused.refusal is Refusal.ELECTORATE
+
+
+def test_a_value_is_accepted_once_its_document_is_stored() -> None:
+    agreement = make()
+    asked(agreement, prepare_of())
+    accept = accept_of(ADOPT.apply(FIRST))
+    todo, answer = asked(agreement, accept)
+    assert answer is not None
+    assert answer.refused is not None
+    assert answer.refused.refusal is Refusal.DOCUMENT
+    (fetch,) = of(todo, do.FetchDocument)
+    assert (fetch.document, fetch.peers[0]) == ("0d", "robot2")
+    assert "robot1" not in fetch.peers
+    agreed(agreement.on_stored, ev.DocumentStored(document="0d", fleet=SAID), 100.2)
+    todo, answer = asked(agreement, accept)
+    assert answer is not None
+    assert answer.accepted is not None
+    assert todo.must_persist
+    assert of(todo, do.KeepDocuments) == [do.KeepDocuments(documents=("0d",))]
+    assert agreement.fleet_value == FIRST, "accepted is not learnt"
+
+
+def test_a_value_is_refused_for_good_while_its_document_is_not_valid_here() -> None:
+    agreement = make()
+    asked(agreement, prepare_of())
+    asked(agreement, accept_of(ADOPT.apply(FIRST)))
+    agreement.on_refused(ev.DocumentRefused(document="0d", reason="no robot"), ToDo())
+    todo, answer = asked(agreement, accept_of(ADOPT.apply(FIRST)))
+    assert answer is not None
+    assert answer.refused is not None
+    assert of(todo, do.FetchDocument) == []
+    assert "no robot" in agreement.problems["fleet/document"]
+    assert agreement.counters["document_refused"] == 1
+
+
+# --- what is learnt --------------------------------------------------------------------------------------------------
+
+
+def test_a_learnt_value_is_followed_once_its_document_is_stored_and_asked_for_until_then() -> None:
+    agreement = make()
+    value = ADOPT.apply(FIRST)
+    answer = Learnt(node="robot3", values=(), fleet=value)
+    todo = agreed(agreement.on_learnt, ev.LearntReceived(learnt=answer, is_answer=True), 100.1)
+    (fetch,) = of(todo, do.FetchDocument)
+    assert fetch.peers[0] == "robot3"
+    assert (agreement.number, todo.must_persist) == (0, False)
+    assert of(agreed(agreement.tick, agreement.next_deadline()), do.FetchDocument) == []
+    assert of(agreed(agreement.tick, 103.2), do.FetchDocument) == [fetch]
+    todo = agreed(agreement.on_stored, ev.DocumentStored(document="0d", fleet=SAID), 104.0)
+    assert (agreement.fleet_value, todo.must_persist, todo.in_force) == (value, True, in_force(SAID, value))
+
+
+def test_the_document_before_is_kept_and_older_ones_go() -> None:
+    agreement = make(ADOPTED, {"0d": FLEET})
+    before = ADOPTED
+    for document in ("0e", "0f"):
+        after = replace(before, document=document, revision=before.revision + 1)
+        agreed(agreement.on_stored, ev.DocumentStored(document=document, fleet=SAID), 100.0)
+        answer = Learnt(node="robot3", values=(), fleet=after)
+        todo = agreed(agreement.on_learnt, ev.LearntReceived(learnt=answer, is_answer=True), 100.1)
+        assert of(todo, do.KeepDocuments) == [do.KeepDocuments(documents=(document, before.document))]
+        before = after
+
+
+def test_a_node_that_has_lost_its_document_goes_on_and_asks_for_it() -> None:
+    agreement = make(ADOPTED, {})
+    assert [one.document for one in of(agreement.at_start, do.FetchDocument)] == ["0d"]
+    assert "not on this disk" in agreement.problems["fleet/document"]
+    todo = agreed(agreement.on_stored, ev.DocumentStored(document="0d", fleet=SAID), 100.2)
+    assert todo.in_force == in_force(SAID, ADOPTED)
+    assert agreement.problems == {}
+
+
+def test_the_agreed_electors_and_lease_are_in_force_and_not_the_document_s() -> None:
+    value = replace(ADOPTED, electors=ADOPTED.electors[1:], lease_s=0.7)
+    fleet = in_force(SAID, value)
+    assert (fleet.electors, fleet.timing.lease_s, fleet.relay_orphan_s) == (("robot2", "robot3"), 0.7, 5.0)
+
+
+# --- commands --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("command", "outcome", "detail"),
+    [
+        (ChangeFleet(remove_elector="robot2", base_revision=1), CommandOutcome.CONFLICT, "at revision 2, not 1"),
+        (ChangeFleet(remove_elector="edge1"), CommandOutcome.INVALID, "edge1 is no elector"),
+        (ChangeFleet(add_elector="robot2", disk="d2"), CommandOutcome.INVALID, "robot2 is an elector"),
+        (ChangeFleet(add_elector="robot9", disk="d9"), CommandOutcome.INVALID, "robot9 is no node of the fleet"),
+    ],
+)
+def test_a_change_that_cannot_be_made_is_answered_at_once(
+    command: ChangeFleet, outcome: CommandOutcome, detail: str
+) -> None:
+    kind, text = told(commanded(make(ADOPTED, {"0d": FLEET}), command))
+    assert kind is outcome
+    assert detail in text
+
+
+def test_no_elector_is_changed_before_a_document_is_agreed() -> None:
+    assert told(commanded(make(), ChangeFleet(remove_elector="robot2"))) == (
+        CommandOutcome.INVALID,
+        "no document is agreed yet",
+    )
+
+
+def test_a_document_is_stored_then_proposed() -> None:
+    agreement = make()
+    content = Document(text=Text("fleet: test"))
+    todo = commanded(agreement, ChangeFleet(document=content))
+    assert todo.send == [do.StoreDocument(request=3, content=content)]
+    todo = agreed(agreement.on_stored, ev.DocumentStored(document="0d", fleet=SAID, request=3), 100.2)
+    (ask,) = of(todo, do.AskElectors)
+    assert ask.to == ROBOTS
+    assert isinstance(ask.question, Prepare)
+    todo = ToDo()
+    for name in ROBOTS[1:]:
+        promise: Promise[FleetValue] = Promise(elector=name, task=FLEET.name, ballot=ask.question.ballot)
+        agreement.on_fleet_answer(ev.FleetAnswered(answer=FleetAnswer(promise=promise)), todo, 100.3)
+    (accept,) = [one.question for one in of(todo, do.AskElectors)]
+    assert isinstance(accept, Accept)
+    assert accept.acceptance.value == ADOPT.apply(FIRST)
+
+
+def test_a_document_that_cannot_be_used_answers_its_command() -> None:
+    agreement = make()
+    commanded(agreement, ChangeFleet(document=Document(text=Text("?"))))
+    todo = ToDo()
+    agreement.on_refused(ev.DocumentRefused(document="0d", reason="no nodes", request=3), todo)
+    assert told(todo) == (CommandOutcome.INVALID, "no nodes")
+    assert agreement.problems == {}, "it is the operator's mistake, not this node's"
+
+
+def test_a_document_without_an_elector_is_refused() -> None:
+    agreement = make(ADOPTED, {"0d": FLEET})
+    commanded(agreement, ChangeFleet(document=Document(text=Text("fewer"))))
+    fewer = replace(SAID, nodes=tuple(node for node in SAID.nodes if node.name != "robot3"))
+    event = ev.DocumentStored(document="0e", fleet=fewer, request=3)
+    kind, text = told(agreed(agreement.on_stored, event, 100.2))
+    assert kind is CommandOutcome.INVALID
+    assert "robot3" in text or "other nodes" in text
+
+
+def test_each_end_of_a_change_has_its_answer() -> None:
+    words = {
+        RoundOutcome.COMMITTED: CommandOutcome.OK,
+        RoundOutcome.CONFLICT: CommandOutcome.CONFLICT,
+        RoundOutcome.NO_QUORUM: CommandOutcome.NO_QUORUM,
+        RoundOutcome.UNKNOWN: CommandOutcome.UNKNOWN,
+    }
+    for outcome, kind in words.items():
+        agreement = make(ADOPTED, {"0d": FLEET})
+        commanded(agreement, ChangeFleet(remove_elector="robot2"))
+        ((change, _),) = agreement.orders._running
+        todo = ToDo()
+        agreement.orders.on_ended(change, outcome, todo)
+        assert told(todo)[0] is kind
+        agreement.orders.on_ended(change, outcome, again := ToDo())
+        assert of(again, do.AnswerCommand) == []
+
+
+def test_a_refusal_s_fleet_value_waits_for_its_document() -> None:
+    agreement = make(ADOPTED, {"0d": FLEET})
+    newer = replace(ADOPTED, document="0e", number=3, revision=5)
+    refused = Refused(
+        elector="robot2",
+        task=FLEET.name,
+        ballot=BALLOT,
+        refusal=Refusal.NUMBER,
+        promised=BALLOT,
+        number=3,
+        fleet=newer,
+    )
+    todo = agreed(agreement.on_fleet_answer, ev.FleetAnswered(answer=FleetAnswer(refused=refused)), 100.1)
+    assert [one.document for one in of(todo, do.FetchDocument)] == ["0e"]
+    assert agreement.fleet_value == ADOPTED
