@@ -257,7 +257,7 @@ def play(seed: int) -> tuple[str, Counter[str]]:
     try:
         schedule.play()
     except Exception as error:  # noqa: BLE001 - whatever escapes is what is looked for
-        return f"seed {seed}: {type(error).__name__}: {error}", schedule.done
+        return f"{type(error).__name__}: {error}", schedule.done
     return "", schedule.done
 
 
@@ -273,7 +273,7 @@ def main(arguments: list[str] | None = None) -> int:
         done += did
         if violation:
             found.append(violation)
-            print(violation[:1000], flush=True)
+            print(f"seed {seed}: {violation[:1000]}", flush=True)
     print(", ".join(f"{what} {count}" for what, count in sorted(done.items())))
     print(f"{given.seeds} schedules, {len(found)} violations")
     return 1 if found else 0
