@@ -63,8 +63,8 @@ class Invariants:
     """{(machine, task): the newest revision that it ever learnt}."""
     ballots: dict[tuple[TaskId, Ballot], tuple[str, Allocation | None]] = field(default_factory=dict)
     """{(task, ballot): (whose it is, what it carries)}."""
-    _counted: dict[str, tuple[NodeId, ...]] = field(default_factory=dict)
-    """{machine: the electors of its newest fleet value}."""
+    _counted: dict[str, int] = field(default_factory=dict)
+    """{machine: the revision of its newest fleet value}."""
     _floors: dict[str, dict[TaskId, Ballot]] = field(default_factory=dict)
     """{machine: {task: the highest ballot before the newest write of this batch, and of the answers since}}."""
 
@@ -100,9 +100,10 @@ class Invariants:
         """A state reached the disk: promises only rise, and what it holds is history from now on."""
         old = machine.disk.registers
         agreed = None if state.fleet_register is None else state.fleet_register.learnt
-        if agreed is not None and agreed.electorate.names != self._counted.get(machine.key):
-            self._counted[machine.key] = agreed.electorate.names
-            self.expect(state.generation, agreed.electorate.names)
+        if agreed is not None and agreed.revision != self._counted.get(machine.key):
+            self._counted[machine.key] = agreed.revision
+            for creation in {state.generation, *(one.number for one in agreed.tasks)}:
+                self.expect(creation, agreed.electorate.names)
         for register in state.registers:
             known = old.get(register.task)
             if known is register:

@@ -24,6 +24,7 @@ from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSp
 from zsched.core.values.messages import ChangeFleet, CommandOutcome
 from zsched.core.values.model import NodeId, NodeKind, ScoreForm, Tuning, Weights
 from zsched.core.values.quorum import majority
+from zsched_lab.sim.checks import unsettled
 from zsched_lab.sim.links import Pair
 from zsched_lab.sim.simulator import Simulator
 
@@ -108,10 +109,15 @@ class Schedule:
             self.done["elector removed"] += 1
 
     def _document(self) -> None:
-        """Another document; now and then with another length of leases."""
+        """Another document, with tasks that come and go; now and then with another length of leases."""
         lease_s = self.rng.choice((self.fleet.timing.lease_s, self.fleet.timing.lease_s, 0.7, 1.6))
         timing = replace(self.fleet.timing, lease_s=lease_s)
-        said = replace(self.fleet, relay_orphan_s=float(self.rng.randint(1, 20)), timing=timing)
+        first = self.fleet.tasks[0]
+        extra = tuple(
+            replace(first, name=name, exclusive=False) for name in ("other", "third") if self.rng.random() < 0.4
+        )
+        tasks = (first, *extra)
+        said = replace(self.fleet, relay_orphan_s=float(self.rng.randint(1, 20)), timing=timing, tasks=tasks)
         self._tell(ChangeFleet(document=self.sim.documents.write(said)))
         self.done["document"] += 1
 
@@ -209,7 +215,10 @@ class Schedule:
         if first is None or any(value != first for value in values.values()):
             told = {name: (value.revision, value.number) for name, value in values.items() if value is not None}
             return f"nodes know different fleet values: {told}"
-        return f"number {first.number} is not settled" if not first.settled else self.sim.unsettled()
+        if not first.settled:
+            return f"number {first.number} is not settled"
+        said = self.sim.documents.says.get(first.document, self.fleet)
+        return unsettled(said, self.sim.machines, self.sim.work.working, self.sim.now)
 
     def _change_once_more(self) -> None:
         """What is at rest can be changed again."""

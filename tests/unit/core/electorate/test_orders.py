@@ -289,7 +289,7 @@ def test_a_document_without_an_elector_is_refused() -> None:
     event = ev.DocumentStored(document="0e", fleet=fewer, request=3)
     kind, text = told(agreed(agreement.on_stored, event, 100.2))
     assert kind is CommandOutcome.INVALID
-    assert "robot3" in text or "other nodes" in text
+    assert "robot3: an elector, and not in the document" in text
 
 
 def test_each_end_of_a_change_has_its_answer() -> None:
