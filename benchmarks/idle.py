@@ -1,87 +1,298 @@
-"""What a daemon and its relay cost while nothing happens: memory and CPU of every node in a fleet of six.
+"""What a fleet costs while nothing happens: CPU, wake-ups, threads, memory and packets of all processes of its nodes.
 
-``python -m benchmarks.idle [--seconds 60]``. Workers are not counted. PSS shares the pages that the processes have in
-common; on a robot that runs one node the private part (USS) plus the libraries counts, which RSS bounds.
+``python -m benchmarks.idle [--nodes 3 6 12] [--seconds 20] [--rounds 3] [--other PATH] [--threads]``.
+Half of the nodes are robots, half edges; the echo worker runs on every edge, one of them owns. Every node has a network
+namespace of its own (root, Linux).
+
+With ``--other`` (another working tree of zsched) each round measures both trees, one after the other, in turn first:
+what else the machine does then meets both. Daemons, relays and workers of the other tree are its own programs.
+
+* CPU: percent of one core, the time that the kernel gave the process's threads (``schedstat``); not wall time.
+* wake-ups: voluntary context switches a second, of all threads.
+* PSS: pages that processes share count in parts. A node alone on its machine shares with nobody; ``uss`` is the part
+  that is its own.
+* packets, bytes: what leaves a node's interface for other nodes; between processes of one node: ``local``.
+
+``--threads`` adds CPU and wake-ups by group of threads.
 """
 
 from __future__ import annotations
 
 import argparse
+import re
+import statistics
+import subprocess
 import tempfile
 import time
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
-import psutil
+from benchmarks.common import machine
+from benchmarks.record import progress
+from zsched.core.values.model import NodeId
+from zsched_lab.fleet.netbed import Netbed, descendants
+from zsched_lab.fleet.netns import INTERFACE, run
+from zsched_lab.fleet.testbed import echo_fleet
 
-from benchmarks.common import machine, mean
-from zsched_lab.fleet.testbed import Testbed, echo_fleet
+KIB_PER_MIB = 1024
+REST_S = 6.0
+"""After the fleet has settled: the start's own work must not count."""
+ROLES = {"zsched.daemon": "daemon", "zsched.relay": "relay", "zsched-guard": "guard"}
+KINDS = ("daemon", "relay", "standby", "owner", "guard")
+"""The processes of a node: its daemon, its relay, the worker (which owns the task or does not), and the shell that ends
+what a daemon leaves."""
 
-MIB = 1024 * 1024
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Process:
+    """One process of the fleet."""
+
+    pid: int
+    node: NodeId
+    kind: str
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, kw_only=True)
+class Reading:
+    """What the kernel has counted of one process so far."""
+
+    cpu_ns: Counter[str] = field(default_factory=Counter)
+    """{group of threads: nanoseconds on a core}."""
+    wakeups: Counter[str] = field(default_factory=Counter)
+    threads: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Usage:
-    """One process: MiB, and percent of one core over the whole time."""
+    """One process over the whole time: percent of a core and wake-ups a second by group of threads, MiB."""
 
-    rss: float
+    process: Process
+    cpu: dict[str, float]
+    wakeups: dict[str, float]
+    threads: int
     pss: float
     uss: float
-    cpu: float
 
 
-def relay_of(pid: int) -> psutil.Process:
-    """The relay process of a daemon."""
-    for child in psutil.Process(pid).children():
-        if "zsched.relay" in child.cmdline():
-            return child
-    raise RuntimeError(f"daemon {pid} has no relay")
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Traffic:
+    """What one node sent a second: to other nodes, and between its own processes."""
+
+    packets: float
+    bytes: float
+    local_packets: float
+    local_bytes: float
 
 
-def measure(processes: list[psutil.Process], seconds: float) -> list[Usage]:
-    """Memory now and CPU over ``seconds`` of every process."""
-    before = [sum(process.cpu_times()[:2]) for process in processes]
+class TreeBed(Netbed):
+    """A fleet whose daemons, relays and workers are those of one working tree."""
+
+    tree: Path | None = None
+
+    def spawn(self, place: str, command: Sequence[str | Path], *, log: str) -> subprocess.Popen[bytes]:
+        """As `Netbed.spawn`."""
+        if self.tree is not None:
+            command = ("env", f"PYTHONPATH={self.tree}:{self.tree / 'lab'}", *command)
+        return super().spawn(place, command, log=log)
+
+
+# --- reading ---------------------------------------------------------------------------------------------------------
+
+
+def group_of(comm: str, *, is_main: bool) -> str:
+    """Threads of one kind count together: ``rx-0`` and ``rx-11`` are ``rx``."""
+    return "main" if is_main else re.sub(r"[-_ ]?\d+$", "", comm)
+
+
+def read(pid: int) -> Reading:
+    """The counters of a process now."""
+    found = Reading()
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        try:
+            group = group_of((task / "comm").read_text().strip(), is_main=task.name == str(pid))
+            cpu_ns = int((task / "schedstat").read_text().split()[0])
+            status = (task / "status").read_text()
+        except FileNotFoundError:  # it has ended meanwhile
+            continue
+        found.threads += 1
+        found.cpu_ns[group] += cpu_ns
+        found.wakeups[group] += int(status.partition("\nvoluntary_ctxt_switches:")[2].split()[0])
+    return found
+
+
+def memory(pid: int) -> tuple[float, float]:
+    """(PSS, USS) of a process in MiB."""
+    rollup = dict(line.split(":") for line in Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()[1:])
+    parts = {name: int(text.split()[0]) / KIB_PER_MIB for name, text in rollup.items()}
+    return parts["Pss"], parts["Private_Clean"] + parts["Private_Dirty"]
+
+
+def sent(bed: Netbed, node: NodeId) -> tuple[int, int, int, int]:
+    """(packets, bytes, local packets, local bytes) that a node has sent."""
+    text = run("nsenter", f"--net=/run/netns/{bed.network.name_of(node)}", "cat", "/proc/net/dev")
+    lines = {name.strip(): words.split() for name, _, words in (line.partition(":") for line in text.splitlines())}
+    (outside, local) = lines[INTERFACE], lines["lo"]
+    return int(outside[9]), int(outside[8]), int(local[9]), int(local[8])
+
+
+def processes(bed: Netbed, owner: NodeId) -> Iterator[Process]:
+    """All processes of the fleet's nodes."""
+    for node in bed.names:
+        daemon = bed.pid(node)
+        yield Process(pid=daemon, node=node, kind="daemon")
+        for pid in descendants(daemon):
+            words = Path(f"/proc/{pid}/cmdline").read_text().split("\0")
+            kind = next((ROLES[word] for word in words if word in ROLES), "owner" if node == owner else "standby")
+            yield Process(pid=pid, node=node, kind=kind)
+
+
+# --- measuring -------------------------------------------------------------------------------------------------------
+
+
+def measure(bed: Netbed, owner: NodeId, seconds: float) -> tuple[list[Usage], list[Traffic]]:
+    """Every process's use over ``seconds``, and every node's traffic."""
+    found = list(processes(bed, owner))
+    sent_before = {node: sent(bed, node) for node in bed.names}
+    before, began = {one.pid: read(one.pid) for one in found}, time.monotonic()
     time.sleep(seconds)
+    after, took = {one.pid: read(one.pid) for one in found}, time.monotonic() - began
+    sent_after = {node: sent(bed, node) for node in bed.names}
     usages = []
-    for process, start in zip(processes, before, strict=True):
-        memory = process.memory_full_info()
-        cpu = 100 * (sum(process.cpu_times()[:2]) - start) / seconds
-        usages.append(Usage(memory.rss / MIB, memory.pss / MIB, memory.uss / MIB, cpu))
-    return usages
+    for one in found:
+        old, new = before[one.pid], after[one.pid]
+        pss, uss = memory(one.pid)
+        usages.append(
+            Usage(
+                process=one,
+                cpu={name: (new.cpu_ns[name] - old.cpu_ns[name]) / took / 1e7 for name in new.cpu_ns},
+                wakeups={name: (new.wakeups[name] - old.wakeups[name]) / took for name in new.wakeups},
+                threads=new.threads,
+                pss=pss,
+                uss=uss,
+            )
+        )
+    traffic = []
+    for node in bed.names:
+        rates = [(new - old) / took for new, old in zip(sent_after[node], sent_before[node], strict=True)]
+        traffic.append(Traffic(packets=rates[0], bytes=rates[1], local_packets=rates[2], local_bytes=rates[3]))
+    return usages, traffic
 
 
-def show(name: str, usages: list[Usage]) -> str:
-    """One line of means, with the largest PSS and CPU."""
-    parts = [f"{field} {mean([getattr(usage, field) for usage in usages]):5.1f}" for field in ("rss", "pss", "uss")]
-    largest, busiest = max(usage.pss for usage in usages), max(usage.cpu for usage in usages)
-    cpu = mean([usage.cpu for usage in usages])
-    return f"{name:<22} {'  '.join(parts)} MiB (largest pss {largest:.1f})   cpu {cpu:.2f} % (largest {busiest:.2f})"
+def one_fleet(nodes: int, tree: Path | None, seconds: float) -> tuple[list[Usage], list[Traffic]]:
+    """Start a fleet of so many nodes, let it come to rest, measure it."""
+    edges = nodes // 2
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        TreeBed(Path(folder), echo_fleet(robots=nodes - edges, edges=edges)) as bed,
+    ):
+        bed.tree = tree
+        bed.init()
+        owner = bed.wait_whole(120.0)
+        time.sleep(REST_S)
+        return measure(bed, owner, seconds)
+
+
+# --- telling ---------------------------------------------------------------------------------------------------------
+
+
+def mean(values: Sequence[float]) -> float:
+    """Arithmetic mean; 0 of none."""
+    return statistics.fmean(values) if values else 0.0
+
+
+def rows(nodes: int, name: str, usages: list[Usage], traffic: list[Traffic]) -> list[str]:
+    """The table's rows of one tree: one per kind of process, and the node."""
+    lines = []
+    node = Counter[str]()
+    for kind in KINDS:
+        ours = [usage for usage in usages if usage.process.kind == kind]
+        if not ours:
+            continue
+        figures = {
+            "cpu": mean([sum(usage.cpu.values()) for usage in ours]),
+            "wakeups": mean([sum(usage.wakeups.values()) for usage in ours]),
+            "threads": mean([usage.threads for usage in ours]),
+            "pss": mean([usage.pss for usage in ours]),
+            "uss": mean([usage.uss for usage in ours]),
+        }
+        if kind in {"daemon", "relay"}:
+            node.update({name: round(1000 * value) for name, value in figures.items()})
+        lines.append(_row(nodes, name, kind, figures) + " | | |")
+    packets, size = mean([one.packets for one in traffic]), mean([one.bytes for one in traffic])
+    local = mean([one.local_packets for one in traffic])
+    lines.append(
+        _row(nodes, name, "daemon + relay", {name: value / 1000 for name, value in node.items()})
+        + f" {packets:.0f} | {size / 1000:.1f} | {local:.0f} |"
+    )
+    return lines
+
+
+def _row(nodes: int, name: str, kind: str, of: dict[str, float]) -> str:
+    figures = f"{of['cpu']:.2f} | {of['wakeups']:.0f} | {of['threads']:.0f} | {of['pss']:.1f} | {of['uss']:.1f} |"
+    return f"| {nodes} | {name} | {kind} | {figures}"
+
+
+def thread_rows(nodes: int, name: str, usages: list[Usage]) -> list[str]:
+    """CPU and wake-ups by kind of process and group of threads, the dearest first."""
+    lines = []
+    for kind in KINDS:
+        ours = [usage for usage in usages if usage.process.kind == kind]
+        groups = sorted({group for usage in ours for group in usage.cpu})
+        found = [
+            (
+                mean([usage.cpu.get(group, 0.0) for usage in ours]),
+                mean([usage.wakeups.get(group, 0.0) for usage in ours]),
+                group,
+            )
+            for group in groups
+        ]
+        lines += [
+            f"| {nodes} | {name} | {kind} | {group} | {cpu:.3f} | {wakeups:.1f} |"
+            for cpu, wakeups, group in sorted(found, reverse=True)
+        ]
+    return lines
 
 
 def main() -> None:
-    """Print daemon, relay and their sum per node."""
+    """Print a table per process and node, for every size of fleet and each tree."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=float, default=60.0)
-    arguments = parser.parse_args()
+    parser.add_argument("--nodes", type=int, nargs="+", default=[6])
+    parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--rounds", type=int, default=1)
+    parser.add_argument("--other", type=Path)
+    parser.add_argument("--threads", action="store_true")
+    given = parser.parse_args()
+    trees: dict[str, Path | None] = {"this": None}
+    if given.other is not None:
+        trees["other"] = given.other.resolve()
     print(machine())
-    with tempfile.TemporaryDirectory() as folder, Testbed(Path(folder), echo_fleet()) as bed:
-        bed.init()
-        bed.start()
-        bed.wait_settled()
-        time.sleep(5)  # the start's own work must not count
-        daemons = [psutil.Process(bed.pid(node)) for node in bed.names]
-        relays = [relay_of(daemon.pid) for daemon in daemons]
-        usages = measure(daemons + relays, arguments.seconds)
-    half = len(usages) // 2
-    robots = sum(name.startswith("robot") for name in bed.names)
-    nodes = [
-        Usage(d.rss + r.rss, d.pss + r.pss, d.uss + r.uss, d.cpu + r.cpu)
-        for d, r in zip(usages[:half], usages[half:], strict=True)
-    ]
-    print(f"means of {half} nodes ({robots} robots), {arguments.seconds:g} s")
-    print(show("daemon", usages[:half]))
-    print(show("relay", usages[half:]))
-    print(show("node (daemon + relay)", nodes) + "   goal: pss 50 MB, cpu 1 %")
+    tables, threads = [], []
+    for nodes in given.nodes:
+        found: dict[str, tuple[list[Usage], list[Traffic]]] = {name: ([], []) for name in trees}
+        for number in range(given.rounds):
+            for name in sorted(trees, reverse=bool(number % 2)):
+                progress(f"{nodes} nodes, round {number + 1}, {name}")
+                usages, traffic = one_fleet(nodes, trees[name], given.seconds)
+                found[name][0].extend(usages)
+                found[name][1].extend(traffic)
+        for name in trees:
+            tables += rows(nodes, name, *found[name])
+            threads += thread_rows(nodes, name, found[name][0])
+    print(
+        "| nodes | tree | process | CPU % | wake-ups/s | threads | PSS MiB | USS MiB | packets/s | kB/s | local |",
+        "| ---: | --- | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
+        *tables,
+        sep="\n",
+    )
+    if given.threads:
+        print(
+            "\n| nodes | tree | process | threads | CPU % | wake-ups/s |",
+            "| ---: | --- | --- | --- | ---: | ---: |",
+            sep="\n",
+        )
+        print(*threads, sep="\n")
 
 
 if __name__ == "__main__":
