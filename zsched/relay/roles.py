@@ -5,12 +5,11 @@ Knows: the newest role per task, the role keys of this node. Does not know: who 
 
 from __future__ import annotations
 
-import zenoh
 from zenoh import CongestionControl, Priority, Query, Session
 
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.plan import Role, WorkerRole
-from zsched.guard import guarded
+from zsched.guard import tolerant
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import Keyspace
 
@@ -23,8 +22,7 @@ class RoleServer:
         self._keyspace = keyspace
         self._node = node
         self._roles: dict[TaskId, Role] = {}
-        self._queryable = session.declare_queryable(keyspace.role(node, "*"), zenoh.handlers.FifoChannel(256))
-        guarded(self._serve, self._queryable.handler, name="roles").start()
+        self._queryable = session.declare_queryable(keyspace.role(node, "*"), tolerant(self._answer, "roles"))
 
     def set(self, role: Role) -> None:
         """Take and tell a task's newest role."""
@@ -56,10 +54,6 @@ class RoleServer:
             priority=Priority.INTERACTIVE_HIGH,
             congestion_control=CongestionControl.BLOCK_FIRST,
         )
-
-    def _serve(self, handler: zenoh.handlers.Handler[Query]) -> None:
-        for query in handler:
-            self._answer(query)
 
     def _answer(self, query: Query) -> None:
         with query:  # a query that is kept alive hangs its asker

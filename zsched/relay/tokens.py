@@ -10,13 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import zenoh
 from zenoh import Sample, SampleKind, Session
 
 from zsched.core.events import RoleEnded
 from zsched.core.relay_protocol import WorkerSeen
 from zsched.core.values.model import NodeId, TaskId
-from zsched.guard import guarded
+from zsched.guard import tolerant
 from zsched.wire.keyspace import Keyspace, counter, parse
 
 MAX_TOKENS = 16_384
@@ -41,10 +40,9 @@ class Tokens:
         self._on_role_ended = on_role_ended
         self._wake = wake
         self._present: frozenset[str] = frozenset()  # replaced whole: readers need no lock
-        # one watch for both kinds: a waiting receiver costs ten wake-ups a second
         selector = keyspace.worker("*", "*", "*").replace(f"/{WORKER}/", "/*/")
-        self._watch = session.liveliness().declare_subscriber(selector, zenoh.handlers.FifoChannel(1024), history=True)
-        guarded(self._run, self._watch.handler, name="tokens").start()
+        # a callback: its thread sleeps until a token comes, one that waits at a handler wakes up ten times a second
+        self._watch = session.liveliness().declare_subscriber(selector, tolerant(self._hear, "tokens"), history=True)
 
     def workers(self, node: NodeId, task: TaskId) -> frozenset[str]:
         """The tokens of the node's workers for the task: one, or two while one restarts."""
@@ -64,9 +62,8 @@ class Tokens:
         found = (_worker(key, is_present=True) for key in sorted(self._present))
         return tuple(worker for worker in found if worker is not None)
 
-    def _run(self, handler: zenoh.handlers.Handler[Sample]) -> None:
-        for sample in handler:
-            self._note(str(sample.key_expr), is_present=sample.kind == SampleKind.PUT)
+    def _hear(self, sample: Sample) -> None:
+        self._note(str(sample.key_expr), is_present=sample.kind == SampleKind.PUT)
 
     def _note(self, key: str, *, is_present: bool) -> None:
         if is_present and len(self._present) >= MAX_TOKENS:

@@ -96,21 +96,18 @@ class Offer:
         """Declare it; ``snapshot`` is called in a thread of its own, once per query."""
         self._key = key
         self._snapshot = snapshot
-        self._queryable = session.declare_queryable(key, zenoh.handlers.FifoChannel(16), complete=True)
-        handler = self._queryable.handler
-        guarded(self._run, handler, name="zsched snapshot").start()
+        self._queryable = session.declare_queryable(key, tolerant(self._hear, "snapshot"), complete=True)
 
     def undeclare(self) -> None:
         """Offer it no more."""
         self._queryable.undeclare()
 
-    def _run(self, handler: zenoh.handlers.Handler[zenoh.Query]) -> None:
-        for query in handler:
-            try:
-                with query:
-                    self._answer(query)
-            except zenoh.ZError as error:
-                _log.info("a snapshot could not be sent (%s)", error)
+    def _hear(self, query: zenoh.Query) -> None:
+        try:
+            with query:
+                self._answer(query)
+        except zenoh.ZError as error:
+            _log.info("a snapshot could not be sent (%s)", error)
 
     def _answer(self, query: zenoh.Query) -> None:
         try:

@@ -38,7 +38,7 @@ from zsched.core.relay_protocol import ERROR_ENCODING, REFUSED_ENCODING, Service
 from zsched.core.route.keyexpr import is_wild
 from zsched.core.route.wildcards import Rewriter, rewriter
 from zsched.core.values.plan import Route, StreamCount
-from zsched.guard import guarded
+from zsched.guard import guarded, tolerant
 from zsched.relay.services.replies import Replies
 from zsched.relay.streams.counter import StreamCounter
 from zsched.relay.streams.receive import undeclare
@@ -119,12 +119,11 @@ class ServiceStream:
         self._slots: dict[int, _ServiceSlot] = {}
         self._active: _ServiceSlot | None = None
         self._running = 0
+        self._ended = threading.Event()
+        take = zenoh.handlers.Callback(tolerant(self._take, "asked"), self._ended.set)
         self._queryable = (local or session).declare_queryable(
-            route.from_expr, zenoh.handlers.FifoChannel(256), complete=True, allowed_origin=zenoh.Locality.REMOTE
+            route.from_expr, take, complete=True, allowed_origin=zenoh.Locality.REMOTE
         )
-        handler = self._queryable.handler
-        self._thread = guarded(self._run, handler, name=f"asked {route.from_expr}", kind="asked")
-        self._thread.start()
 
     def open(self, epoch: int, route: Route) -> None:
         """Make a slot ready; it is not asked yet.
@@ -191,7 +190,7 @@ class ServiceStream:
         undeclare(self._queryable)
         for epoch in tuple(self._slots):
             self.close_slot(epoch)
-        self._thread.join(JOIN_S)
+        self._ended.wait(JOIN_S)
 
     def count(self) -> StreamCount:
         """The counters now: requests, their bytes, and how many ended otherwise than with the owner's answer."""
@@ -199,13 +198,6 @@ class ServiceStream:
             return self._counter.value()
 
     # --- requests ----------------------------------------------------------------------------------------------------
-
-    def _run(self, handler: zenoh.handlers.Handler[Query]) -> None:
-        for query in handler:
-            try:
-                self._take(query)
-            except Exception:  # noqa: BLE001 - one bad request must not end its service
-                _log.exception("%s: a request could not be taken", self.route.stream)
 
     def _take(self, query: Query) -> None:
         with self._lock:

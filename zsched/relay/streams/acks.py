@@ -15,15 +15,14 @@ from dataclasses import dataclass
 from typing import Final
 from weakref import WeakSet
 
-import zenoh
-from zenoh import Sample, Session
+from zenoh import CongestionControl, Priority, Sample, Session
 
 from zsched.clock import monotonic_s
 from zsched.core.relay_protocol import StreamAck, StreamAcks
 from zsched.core.values.fleet import Timing
 from zsched.core.values.model import NodeId, TaskId
 from zsched.errors import WireError
-from zsched.guard import guarded
+from zsched.guard import tolerant
 from zsched.hop.acknowledger import Acknowledger
 from zsched.sessions.stalled_links import StalledLinks
 from zsched.wire import codec as wire
@@ -63,8 +62,7 @@ class Acks:
         self.strangers = 0
         """Acknowledgements of workers that the stream does not go to."""
         key = keyspace.ack("*", "*", "*", str(session.zid()))
-        self._subscriber = session.declare_subscriber(key, zenoh.handlers.FifoChannel(1024))
-        guarded(self._run, self._subscriber.handler, name="acks").start()
+        self._subscriber = session.declare_subscriber(key, tolerant(self._hear, "acks"))
 
     def answers(self) -> Acknowledger:
         """How far one output stream is with the answers that come numbered; two may be given the same ones."""
@@ -101,24 +99,23 @@ class Acks:
         self._session.put(
             self._keyspace.received(self._node, self._own_id, worker),
             wire.encode(frame),
-            priority=zenoh.Priority.INTERACTIVE_HIGH,
-            congestion_control=zenoh.CongestionControl.DROP,
+            priority=Priority.INTERACTIVE_HIGH,
+            congestion_control=CongestionControl.DROP,
         )
 
-    def _run(self, handler: zenoh.handlers.Handler[Sample]) -> None:
-        for sample in handler:
-            try:
-                acks = wire.decode(sample.payload.to_bytes(), StreamAcks)
-            except WireError as error:
-                _log.warning("an unreadable acknowledgement was ignored (%s)", error)
-                continue
-            key = parse(str(sample.key_expr))
-            if key is None or len(key.rest) != 3:
-                _log.warning("an acknowledgement under a malformed key was ignored")
-                continue
-            task, incarnation, _ = key.rest
-            for ack in acks.acks:
-                self._tell(key.owner, task, incarnation, ack)
+    def _hear(self, sample: Sample) -> None:
+        try:
+            acks = wire.decode(sample.payload.to_bytes(), StreamAcks)
+        except WireError as error:
+            _log.warning("an unreadable acknowledgement was ignored (%s)", error)
+            return
+        key = parse(str(sample.key_expr))
+        if key is None or len(key.rest) != 3:
+            _log.warning("an acknowledgement under a malformed key was ignored")
+            return
+        task, incarnation, _ = key.rest
+        for ack in acks.acks:
+            self._tell(key.owner, task, incarnation, ack)
 
     def _tell(self, node: NodeId, task: TaskId, incarnation: str, ack: StreamAck) -> None:
         found = self._listeners.get(ack.eid)

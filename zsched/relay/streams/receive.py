@@ -24,7 +24,7 @@ from zenoh import Sample, Session
 
 from zsched.clock import awake_s
 from zsched.core.values.plan import StreamClass, StreamSettings
-from zsched.guard import guarded
+from zsched.guard import guarded, tolerant
 from zsched.relay.streams.history import History
 
 JOIN_S: Final = 0.3
@@ -77,12 +77,15 @@ class Receiver:
         if with_history and is_latest and settings.keep_last:
             self._history = History(session, expr, settings.keep_last, carry, origin)
         self._carry = carry if self._history is None else self._history.live
-        self._subscriber = _subscribe(session, expr, settings, origin)
-        self._depth = settings.depth
-        self._give_way = give_way if settings.stream_class is StreamClass.BEST_EFFORT else None
-        self._handler = self._subscriber.handler  # the thread's own: undeclare() refuses while recv() borrows
-        self._thread = guarded(self._run, name=f"from {expr}", kind="from")
-        self._thread.start()
+        self._depth, self._give_way = settings.depth, give_way
+        self._ended = threading.Event()
+        self._subscriber: Declared
+        if settings.stream_class is StreamClass.BEST_EFFORT or settings.depth > QUEUE_DEPTH:
+            self._drain(_subscribe(session, expr, settings, origin), expr, settings)
+        else:
+            # zenoh's own thread sleeps until a sample comes; one that waits at a handler wakes up ten times a second
+            take = zenoh.handlers.Callback(tolerant(self._carry, "from"), self._ended.set)
+            self._subscriber = session.declare_subscriber(expr, take, allowed_origin=origin)
         if self._history is not None:
             self._history.start()
 
@@ -91,14 +94,21 @@ class Receiver:
         undeclare(self._subscriber)
         if self._history is not None:
             self._history.close()
-        if self._thread is not threading.current_thread():
-            self._thread.join(JOIN_S)
+        self._ended.wait(JOIN_S)
 
-    def _run(self) -> None:
-        if self._give_way is None:
-            for sample in self._handler:
-                self._carry_one(sample)
-            return
+    def _drain(self, subscriber: _Subscriber, expr: str, settings: StreamSettings) -> None:
+        """Start a thread of our own for what zenoh's queue holds."""
+        self._subscriber = subscriber
+        self._handler = subscriber.handler  # the thread's own: undeclare() refuses while recv() borrows
+        carry = self._carry_newest if settings.stream_class is StreamClass.BEST_EFFORT else self._carry_all
+        guarded(carry, name=f"from {expr}", kind="from").start()
+
+    def _carry_all(self) -> None:
+        for sample in self._handler:
+            self._carry_one(sample)
+        self._ended.set()
+
+    def _carry_newest(self) -> None:
         waiting: deque[Sample] = deque()
         for first in self._handler:
             waiting.append(first)
@@ -108,6 +118,7 @@ class Receiver:
                     self._take(waiting)
                     while len(waiting) > self._depth:
                         self._give_way(waiting.popleft())
+        self._ended.set()
 
     def _is_behind(self, waiting: deque[Sample]) -> bool:
         """Carry one sample at least, and all that wait unless that takes too long: then newer ones may have come."""
