@@ -95,6 +95,8 @@ class Executor:
     """The epoch in which the worker here worked without a lease; ``None`` once it has confirmed its end."""
     _leaves_until: float = -math.inf
     """Until when a worker that has drained, and so has left its epoch, learns that it is idle."""
+    _has_told: bool = False
+    """The worker here has been told a role."""
     _is_owner_gone: bool = False
     """The owner went during its epoch: nobody asks for its worker's snapshot."""
     _current: Slot | None = None
@@ -235,6 +237,8 @@ class Executor:
             starts_s = worker.start_deadline_s if worker.standby is Standby.COLD else 0.0
             self._role_deadline = now + starts_s + self.spec.drain_s + ROLE_DRAIN_MARGIN_S
             self._become(Role(task=self.spec.name, role=WorkerRole.DRAINING, epoch=self.role.epoch), todo)
+        elif not self._has_told:
+            self._become(self.role, todo)  # a standby that hears nothing asks again and again
 
     def _take_up(self, before: NodeId | None, todo: ToDo) -> None:
         """The worker here is the owner's from now on; ``before``: whose was, ``None`` where nobody is to be asked."""
@@ -252,7 +256,7 @@ class Executor:
 
     def _become(self, role: Role, todo: ToDo) -> None:
         """Change the role; remember a role without a lease until the worker has stopped."""
-        self.role = role
+        self.role, self._has_told = role, True
         if role.role is WorkerRole.ACTIVE and role.lease_until_s is None:
             self._unleased_epoch = role.epoch
         todo.add(SetRole(role=role))

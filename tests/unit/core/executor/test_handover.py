@@ -338,7 +338,8 @@ def test_owner_that_is_chosen_again_while_it_drains_stays_active() -> None:
 
 def test_moves_between_others_do_not_touch_the_role() -> None:
     one = edge("edge3")
-    assert done(one.execute, allocation_of(1, "edge1"), 0.0) == ()
+    told = roles(done(one.execute, allocation_of(1, "edge1"), 0.0))
+    assert told == [(WorkerRole.IDLE, 0)], "once: a standby that hears nothing asks its relay again and again"
     assert done(one.execute, allocation_of(2, "edge2"), 0.0) == ()
     drained = edge()
     done(drained.execute, allocation_of(1, "edge1"), 0.0)
