@@ -2,7 +2,8 @@
 
 ``python -m benchmarks.idle [--nodes 3 6 12] [--seconds 20] [--rounds 3] [--other PATH] [--threads]``.
 Half of the nodes are robots, half edges; the echo worker runs on every edge, one of them owns. Every node has a network
-namespace of its own (root, Linux).
+namespace and a control group of its own (root, Linux): a quota of one core makes the group the machine that its daemon
+measures, so that other work is not taken for load, as on a machine of its own.
 
 With ``--other`` (another working tree of zsched) each round measures both trees, one after the other, in turn first:
 what else the machine does then meets both. Daemons, relays and workers of the other tree are its own programs.
@@ -19,6 +20,7 @@ what else the machine does then meets both. Daemons, relays and workers of the o
 from __future__ import annotations
 
 import argparse
+import os
 import re
 import statistics
 import subprocess
@@ -32,6 +34,7 @@ from pathlib import Path
 from benchmarks.common import machine
 from benchmarks.record import progress
 from zsched.core.values.model import NodeId
+from zsched_lab.fleet.limits import NodeLimits, make_limits
 from zsched_lab.fleet.netbed import Netbed, descendants
 from zsched_lab.fleet.netns import INTERFACE, run
 from zsched_lab.fleet.testbed import echo_fleet
@@ -39,6 +42,8 @@ from zsched_lab.fleet.testbed import echo_fleet
 KIB_PER_MIB = 1024
 REST_S = 6.0
 """After the fleet has settled: the start's own work must not count."""
+CORES, MEMORY_MB = 1.0, 1024.0
+"""Of each node's group."""
 ROLES = {"zsched.daemon": "daemon", "zsched.relay": "relay", "zsched-guard": "guard"}
 KINDS = ("daemon", "relay", "standby", "owner", "guard")
 """The processes of a node: its daemon, its relay, the worker (which owns the task or does not), and the shell that ends
@@ -90,11 +95,19 @@ class TreeBed(Netbed):
     """A fleet whose daemons, relays and workers are those of one working tree."""
 
     tree: Path | None = None
+    limits: NodeLimits | None = None
+
+    def start(self, *nodes: NodeId) -> None:
+        """As `Netbed.start`, each daemon in its node's group."""
+        for node in nodes or tuple(name for name in self.names if name not in self._processes):
+            super().start(node)
+            if self.limits is not None:
+                self.limits.put(node, self.pid(node))
 
     def spawn(self, place: str, command: Sequence[str | Path], *, log: str) -> subprocess.Popen[bytes]:
         """As `Netbed.spawn`."""
         if self.tree is not None:
-            command = ("env", f"PYTHONPATH={self.tree}:{self.tree / 'lab'}", *command)
+            command = ("env", "-C", self.tree, f"PYTHONPATH={self.tree}:{self.tree / 'lab'}", *command)
         return super().spawn(place, command, log=log)
 
 
@@ -188,10 +201,15 @@ def one_fleet(nodes: int, tree: Path | None, seconds: float) -> tuple[list[Usage
         TreeBed(Path(folder), echo_fleet(robots=nodes - edges, edges=edges)) as bed,
     ):
         bed.tree = tree
-        bed.init()
-        owner = bed.wait_whole(120.0)
-        time.sleep(REST_S)
-        return measure(bed, owner, seconds)
+        bed.limits = make_limits(f"zsched-idle-{os.getpid()}", dict.fromkeys(bed.names, CORES), MEMORY_MB)
+        try:
+            bed.init()
+            owner = bed.wait_whole(120.0)
+            time.sleep(REST_S)
+            return measure(bed, owner, seconds)
+        finally:
+            bed.stop()
+            bed.limits.remove()
 
 
 # --- telling ---------------------------------------------------------------------------------------------------------
