@@ -32,6 +32,9 @@ LIMITS_EVERY_S = 5.0
 """How often quotas, limits and the set of CPUs are looked up again; they change by an operator's hand only."""
 MIN_INTERVAL_S = 0.02
 """Two samples closer than this would divide one tick by nothing: the previous figure stands."""
+RESTING_CORES = 0.05
+RESTING_LOOK_S = 1.0
+"""Threads and children of a worker that uses less are read so often: there may be dozens, with two files each."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -212,11 +215,13 @@ class _ProcessTrees:
         self._has_children_files = os.path.exists(f"{proc}/self/task/{os.getpid()}/children")  # noqa: PTH110 - str paths
         self._seen: dict[TaskId, tuple[float, dict[int, ProcessTimes]]] = {}
         self._appetites: dict[TaskId, Appetite] = {}
+        self._rests_until: dict[TaskId, float] = {}
+        """Until when the threads and children of a worker that is at rest are not looked at."""
 
     def loads(self, workers: Mapping[TaskId, tuple[WorkerState, int | None]], now: float) -> tuple[WorkerLoad, ...]:
         """One load per worker, sorted by task."""
         children = None if self._has_children_files else self._scan_children()
-        seen = {task: (now, self._tree(pid, children)) for task, (_, pid) in workers.items() if pid is not None}
+        seen = {task: (now, self._tree(task, pid, children, now)) for task, (_, pid) in workers.items() if pid}
         loads = tuple(self._load(task, workers[task][0], seen.get(task)) for task in sorted(workers))
         self._seen = seen
         self._appetites = {task: self._appetites[task] for task in seen if task in self._appetites}
@@ -229,7 +234,11 @@ class _ProcessTrees:
         before = self._seen.get(task)
         cpu_cores = None if before is None else _cores(before[1], tree, now - before[0], now)
         appetite = self._appetites.setdefault(task, Appetite())
-        appetite.look(self._threads(tree), now)
+        if not self._is_at_rest(task, now):
+            appetite.look(self._threads(tree), now)
+            self._rests_until[task] = now + RESTING_LOOK_S - MIN_INTERVAL_S
+        if cpu_cores is None or cpu_cores >= RESTING_CORES or appetite.wanted_cores() is not None:
+            self._rests_until[task] = now
         return WorkerLoad(
             task=task,
             state=state,
@@ -237,6 +246,10 @@ class _ProcessTrees:
             memory_mb=sum(times.rss_mb for times in tree.values()),
             wanted_cores=appetite.wanted_cores(),
         )
+
+    def _is_at_rest(self, task: TaskId, now: float) -> bool:
+        """Whether its threads and children need no look now: it hardly runs, and lacked nothing at the last look."""
+        return now < self._rests_until.get(task, now)
 
     def _threads(self, tree: Iterable[int]) -> dict[Thread, tuple[float, float]]:
         """Seconds that each has run, and has waited to run."""
@@ -249,16 +262,21 @@ class _ProcessTrees:
                     found[pid, thread] = times
         return found
 
-    def _tree(self, pid: int, children: dict[int, list[int]] | None) -> dict[int, ProcessTimes]:
+    def _tree(
+        self, task: TaskId, pid: int, children: dict[int, list[int]] | None, now: float
+    ) -> dict[int, ProcessTimes]:
+        known = self._seen[task][1] if task in self._seen and self._is_at_rest(task, now) else {}
+        is_known = pid in known
         tree: dict[int, ProcessTimes] = {}
-        waiting = [pid]
+        waiting = [*known] if is_known else [pid]
         while waiting:
             process = waiting.pop()
             times = parse_process_stat(read_file(f"{self._proc}/{process}/stat"))
             if times is None or process in tree:
                 continue
             tree[process] = times
-            waiting += self._children(process) if children is None else children.get(process, [])
+            if not is_known:
+                waiting += self._children(process) if children is None else children.get(process, [])
         return tree
 
     def _children(self, pid: int) -> list[int]:

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Iterable
 from pathlib import Path
 
 import psutil
@@ -16,6 +17,7 @@ from zsched.adapters.machine import device_profiler
 from zsched.adapters.machine.cgroup import LimitedGroup
 from zsched.adapters.machine.device_profiler import (
     DeviceProfiler,
+    _ProcessTrees,
     parse_cpu_list,
     parse_cpu_stat,
     parse_pressure,
@@ -250,6 +252,36 @@ def test_a_wait_that_is_told_when_it_ends_counts_in_full(tmp_path: Path, clock: 
         write(tmp_path, queued(10, (runs, waits)))
         seen.append(profiler.sample(workers).workers[0].wanted_cores)
     assert all(wanted is not None and wanted > 0.9 for wanted in seen[120:])
+
+
+def test_the_threads_and_children_of_a_worker_that_rests_are_looked_at_once_a_second(
+    tmp_path: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looks: list[float] = []
+    threads = _ProcessTrees._threads
+
+    def count(trees: _ProcessTrees, tree: Iterable[int]) -> dict[tuple[int, str], tuple[float, float]]:
+        looks.append(clock.now)
+        return threads(trees, tree)
+
+    monkeypatch.setattr(_ProcessTrees, "_threads", count)
+    profiler = machine(tmp_path, **process(10, 1, own=0), **queued(10, (0.0, 0.0)))
+    workers = {"merge": (WorkerState.READY, 10)}
+
+    def sample(times: int) -> int:
+        before = len(looks)
+        for _ in range(times):
+            profiler.sample(workers)
+            clock.now += 0.2
+        return len(looks) - before
+
+    sample(5)
+    assert sample(50) == 10
+    found = 0
+    for step in range(10):
+        write(tmp_path, process(10, 1, own=100 + 10 * step))
+        found += sample(1)
+    assert found >= 9, "it runs: each sample looks, but perhaps the first"
 
 
 def test_without_schedstat_nothing_is_said_and_garbage_is_none(tmp_path: Path, clock: Clock) -> None:
