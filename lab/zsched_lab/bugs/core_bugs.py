@@ -46,7 +46,7 @@ NAMESAKES = "zsched.core.membership.namesakes"
 BELIEF = "zsched.core.vote.belief"
 AGREEMENT, MEMBERSHIP, NODE = "zsched.core.vote.agreement", "zsched.core.membership.peers", "zsched.core.node"
 VOTE, VOTING = "zsched.core.vote.tally", "zsched.core.vote.voting"
-DECISION = "zsched.core.scheduler.decision"
+DECISION, ROUNDS = "zsched.core.scheduler.decision", "zsched.core.scheduler.rounds"
 SCHEDULER, SCORING, EXECUTOR = (
     "zsched.core.scheduler.judge",
     "zsched.core.scheduler.scoring",
@@ -755,6 +755,20 @@ VOTE_BUGS = (
         VOTING,
         "return self._me in self._voters and self.commit is None and (",
         "return False and (",
+        _ROUNDS,
+    ),
+    _bug(
+        "a robot at rest goes by its first answers for ever",
+        ROUNDS,
+        " or now >= kept.at + self._fleet.timing.profile_ttl_s",
+        "",
+        _ROUNDS,
+    ),
+    _bug(
+        "a robot that sees a change goes by the answers from before it",
+        ROUNDS,
+        " and is_like(own, kept.vectors[self._me])",
+        "",
         _ROUNDS,
     ),
     _bug(

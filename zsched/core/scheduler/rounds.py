@@ -3,7 +3,8 @@
 Knows: the round's course and its deadlines. Does not know: how scores arise (`scoring`), stickiness (`judge`), what
 becomes of a proposal (`zsched.core.vote.votes`), bytes.
 
-A robot gathers the others' utilities every ``decide_s``, and at once when an owner is gone or another robot's proposal
+A robot judges every ``decide_s``, by the others' utilities: it gathers them, unless all is at rest
+(`zsched.core.scheduler.rest`). It gathers at once when an owner is gone or another robot's proposal
 for a move arrives: the first proposal *calls* the vote, so rounds need no synchronised clocks. In a called vote every
 robot answers with today's winner, or with the owner: its own patience and cool-down do not count, the caller's
 did (docs/decisions/0004).
@@ -22,6 +23,7 @@ from zsched.core.instructions import AskUtilities, RecordStory
 from zsched.core.scheduler.damping import Damping
 from zsched.core.scheduler.decision import decide, rules_of, verdict_of
 from zsched.core.scheduler.judge import Judge, Judgement, Outcome
+from zsched.core.scheduler.rest import Answers, is_like
 from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts, Standing, book, is_out, score
 from zsched.core.scheduler.turns import Turn, in_turn, who_moves_first
 from zsched.core.todo import ToDo
@@ -40,6 +42,8 @@ class _Gather:
     deadline: float
     expected: list[NodeId]
     vectors: dict[NodeId, tuple[UtilityVector, ...]]
+    answered: Answers | None = None
+    """The answers that it goes by without asking; ``None``: it asks."""
 
 
 @dataclass(slots=True)
@@ -123,6 +127,9 @@ class Rounds:
         nothing = Utilities(voter=self._me, vectors=())
         self._answer: tuple[int, float, object, Utilities] = (-1, -math.inf, None, nothing)
         """(gateway's version, until when, (states, values, doubts), vectors): the newest answer to a gather."""
+        self._kept: Answers | None = None
+        self._must_ask = True
+        """Something has happened since the last gather that may need a decision."""
 
     # --- time ----------------------------------------------------------------------------------------------------
 
@@ -137,7 +144,7 @@ class Rounds:
     def hurry(self, now: float) -> None:
         """Something happened that may need a decision: run a round now."""
         if self.is_voter:
-            self._round_at = min(self._round_at, now)
+            self._round_at, self._must_ask = min(self._round_at, now), True
 
     # --- SCHEDULER: the gather -----------------------------------------------------------------------------------
 
@@ -193,21 +200,35 @@ class Rounds:
     def _open(
         self, values: Mapping[TaskId, Allocation], states: Mapping[NodeId, PeerState], todo: ToDo, now: float
     ) -> list[NodeId]:
-        """Start a gather; the other robots that it asks."""
+        """Start a gather; the other robots that it asks: none while all is at rest (`zsched.core.scheduler.rest`)."""
         timing = self._fleet.timing
         self._round_at = now + timing.decide_s * (0.9 + 0.2 * self._rng.random())
         self._number += 1
         own = self.vectors(values, states, now)
         expected = [name for name in self._fleet.voters if name != self._me and states[name] is PeerState.ALIVE]
+        answered = self._kept if self._rests(own.vectors, states, now) else None
         self._gather = _Gather(
             number=self._number,
             deadline=now + timing.gather_s,
-            expected=expected,
-            vectors={self._me: own.vectors},
+            expected=expected if answered is None else [],
+            vectors={**({} if answered is None else answered.vectors), self._me: own.vectors},
+            answered=answered,
         )
+        if answered is not None:
+            return []
+        self._must_ask = False
         if expected:
             todo.add(AskUtilities(gather=self._number, deadline_s=timing.gather_s))
         return expected
+
+    def _rests(self, own: tuple[UtilityVector, ...], states: Mapping[NodeId, PeerState], now: float) -> bool:
+        """Whether the answers of the last gather still hold, so that nobody need be asked."""
+        kept = self._kept
+        if kept is None or self._must_ask or now >= kept.at + self._fleet.timing.profile_ttl_s:
+            return False
+        judgements = (task.judgement for task in self.tasks.values())
+        stays = all(one is not None and one.outcome is Outcome.STAY for one in judgements)
+        return stays and states == kept.states and is_like(own, kept.vectors[self._me])
 
     def absorb_utilities(self, gather: int, utilities: Utilities) -> bool:
         """A robot answered; false when the answer is late, foreign or not its own."""
@@ -228,6 +249,9 @@ class Rounds:
         """Everybody alive has answered, or the deadline passed: judge every task."""
         assert self._gather is not None
         gathered, self._gather = self._gather, None
+        if gathered.answered is None:
+            whole = Answers(vectors=gathered.vectors, states=states, at=now)
+            self._kept = None if gathered.expected else whole
         for name in in_turn(self._turns):
             task = self.tasks[name]
             vectors = {

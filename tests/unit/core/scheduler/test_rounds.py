@@ -151,6 +151,62 @@ def test_gather_does_not_wait_for_a_robot_that_goes_meanwhile() -> None:
     assert robot.task.judged_at == robot.now
 
 
+def asks(robot: Robot, rounds: int, **cpu: float) -> int:
+    """How often a robot asks in so many rounds, with a profile of everybody before each; all answer."""
+    found = 0
+    for _ in range(rounds):
+        robot.now = max(robot.now, robot.decider.next_deadline())
+        robot.profiles({"edge1": 1.0, **cpu})
+        found += len(of(robot.round(), AskUtilities))
+    return found
+
+
+def test_a_robot_at_rest_judges_by_what_it_has_heard_and_asks_again_when_that_is_old() -> None:
+    robot = Robot()
+    assert asks(robot, 1) == 1
+    asked_at = robot.now
+    while robot.decider.next_deadline() < asked_at + FLEET.timing.profile_ttl_s:
+        assert asks(robot, 1) == 0
+        assert robot.task.judged_at == robot.now
+        assert robot.task.silent == ()
+    assert asks(robot, 1) == 1
+
+
+def test_a_robot_that_sees_a_change_asks_at_its_next_round() -> None:
+    robot = Robot()
+    assert asks(robot, 2) == 1
+    assert asks(robot, 1, edge2=0.5) == 1
+    assert asks(robot, 1, edge2=0.5) == 0
+
+
+def test_a_robot_asks_in_every_round_while_another_candidate_leads() -> None:
+    robot = Robot(owner_cpu=3.0)
+    for _ in range(3):
+        robot.now = robot.decider.next_deadline()
+        robot.profiles({"edge1": 3.0})
+        assert of(robot.round(edge1=0.25), AskUtilities)
+        assert robot.outcome() is not Outcome.STAY
+
+
+def test_a_robot_asks_when_it_is_called_when_a_node_goes_and_after_a_silence() -> None:
+    robot = Robot()
+    assert asks(robot, 2) == 1
+    robot.paper("robot2", "edge2")
+    assert asks(robot, 1) == 1, "called to a vote"
+    assert asks(robot, 1) == 0
+    robot.states = {**robot.states, "edge2": PeerState.SUSPECT}
+    assert asks(robot, 1) == 1, "another node's state"
+    assert asks(robot, 1) == 0
+    robot.value = replace(robot.value, revision=6)
+    assert asks(robot, 1) == 1, "another revision"
+    robot.now = robot.decider.next_deadline()
+    robot.rounds.hurry(robot.now)
+    robot.tick()
+    robot.tick(GATHER_S)
+    assert robot.task.silent == ("robot2", "robot3")
+    assert asks(robot, 1) == 1, "nobody has answered"
+
+
 def test_late_foreign_doubled_and_forged_answers_do_not_count() -> None:
     robot = Robot()
     assert not robot.hear("robot2", 1), "nothing was asked yet"
