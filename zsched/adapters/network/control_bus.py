@@ -137,7 +137,9 @@ class ControlBus:
             "beat": self._publisher(session, keys.beat(node), zenoh.Priority.REAL_TIME),
             "beat_in_turn": self._publisher(session, keys.beat_in_turn(node), zenoh.Priority.REAL_TIME),
             "profile": self._publisher(session, keys.profile(node), zenoh.Priority.INTERACTIVE_LOW),
-            "profile_in_turn": self._publisher(session, keys.profile_in_turn(node), zenoh.Priority.INTERACTIVE_LOW),
+            "profile_in_turn": self._publisher(
+                session, keys.profile_in_turn(node), zenoh.Priority.REAL_TIME, is_express=False
+            ),
             "proposal": self._publisher(session, keys.proposal(node), zenoh.Priority.INTERACTIVE_HIGH),
             "allocation": self._publisher(session, keys.allocation(node), zenoh.Priority.INTERACTIVE_HIGH),
         }
@@ -186,12 +188,18 @@ class ControlBus:
         while ring is not None and (sample := ring.handler.try_recv()) is not None:
             yield self._event(sample)
 
-    def _publisher(self, session: zenoh.Session, key: str, priority: zenoh.Priority) -> zenoh.Publisher:
+    def _publisher(
+        self, session: zenoh.Session, key: str, priority: zenoh.Priority, *, is_express: bool = True
+    ) -> zenoh.Publisher:
+        """One that is not express waits up to 1 ms for others of its priority, and shares their packet.
+
+        So does a profile in turn, which leaves just before a beat.
+        """
         return session.declare_publisher(
             key,
             congestion_control=zenoh.CongestionControl.DROP,
             priority=priority,
-            express=True,  # small and rare: not worth a batch's delay
+            express=is_express,  # small and rare: not worth a batch's delay
             allowed_destination=zenoh.Locality.REMOTE,
         )
 

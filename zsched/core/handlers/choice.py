@@ -31,6 +31,7 @@ def publish_profile(node: Stages, todo: ToDo, now: float) -> None:
         echoes=node.round_trips.echoes(now),
         relay=node.relay_ends.told(now),
         renewals=node.renewing.told,
+        beats_now=todo.must_beat or now >= node.beat_at,
     )
     if profile is None:
         return

@@ -270,6 +270,17 @@ def test_sent_every_publish_period_and_numbered() -> None:
     assert {(profile.node, profile.incarnation) for _, profile in sent} == {("edge1", 3)}
 
 
+def test_a_profile_that_is_nearly_due_goes_with_a_beat() -> None:
+    profiler = make_profiler()
+    profiler.absorb(device(), (), now=0.0)
+    taken(profiler, 0.0)
+    almost = TIMING.publish_s - 0.4 * TIMING.beat_s
+    assert profiler.publishable(READY, is_draining=False, now=almost) is None
+    early = TIMING.publish_s - 0.6 * TIMING.beat_s
+    assert profiler.publishable(READY, is_draining=False, now=early, beats_now=True) is None
+    assert profiler.publishable(READY, is_draining=False, now=almost, beats_now=True) is not None
+
+
 RAW = replace(TIMING, smoothing_s=0.0)
 
 
