@@ -11,10 +11,13 @@ a table.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 from zsched.core.values.model import MAX_COUNTER, NAME, NodeId, TaskId
 
 ROOT = "@zsched"
+KEPT_KEYS = 512
+"""Keys whose parts are remembered, the newest."""
 MAX_DIGITS = len(str(MAX_COUNTER))
 END_CHUNK = "@zsched/end"
 """Suffix of the in-band end markers behind a stream's last sample, and the start markers: ``{to}/@zsched/end``."""
@@ -32,8 +35,12 @@ class ParsedKey:
     rest: tuple[str, ...]
 
 
+@lru_cache(maxsize=KEPT_KEYS)
 def parse(key: str) -> ParsedKey | None:
-    """Take a control key apart; ``None`` when it is not one of ours or a name in it is malformed."""
+    """Take a control key apart; ``None`` when it is not one of ours or a name in it is malformed.
+
+    At rest the same few keys come again and again.
+    """
     chunks = key.split("/")
     if len(chunks) < 4 or chunks[0] != ROOT:
         return None

@@ -127,7 +127,7 @@ class Numbers:
     def changed(self) -> FleetValue | None:
         """The learnt fleet value; ``None`` while it is the one that every node makes of its file."""
         value = self.value
-        return None if value is None or value.electorate.is_founding else value
+        return None if value is None or value.is_founding else value
 
     @property
     def state(self) -> RegisterState[FleetValue] | None:

@@ -82,12 +82,16 @@ class Electorate:
     @property
     def is_founding(self) -> bool:
         """Whether these are a fleet file's electors, which no change has touched; nodes compare their files then."""
-        return self.number <= 1 and all(one.joining == 0 for one in self.electors)
+        return _is_founding(self.number, self.electors)
 
     @property
     def names(self) -> tuple[NodeId, ...]:
         """The electors' names."""
         return tuple(one.name for one in self.electors)
+
+
+def _is_founding(number: int, electors: tuple[Elector, ...]) -> bool:
+    return number <= 1 and all(one.joining == 0 for one in electors)
 
 
 def electorate_of(names: Iterable[NodeId]) -> Electorate:
@@ -149,6 +153,11 @@ class FleetValue:
     def electorate(self) -> Electorate:
         """With whom rounds under this value count."""
         return Electorate(generation_id=self.generation_id, number=self.number, electors=self.electors)
+
+    @property
+    def is_founding(self) -> bool:
+        """Whether its electorate is one that no change has touched (`Electorate.is_founding`)."""
+        return _is_founding(self.number, self.electors)
 
     def creation(self, task: TaskId) -> Creation | None:
         """The creation of ``task``; ``None``: the document does not list it."""
