@@ -157,6 +157,26 @@ class SetDocument:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SetAway:
+    """Change: which robots are away, and do not count in votes."""
+
+    base_revision: int
+    away: tuple[NodeId, ...]
+    """Sorted."""
+    reason: str = "robots are away, or back"
+
+    def fault(self, read: FleetValue) -> str:
+        """Why this change cannot be made now; empty: it can."""
+        return "" if read.document else "no document is agreed yet"
+
+    def apply(self, read: FleetValue) -> FleetValue:
+        """The value with these robots away; electors, number and ``settled`` stay."""
+        if self.fault(read) or self.away == read.away:
+            return read
+        return replace(read, revision=read.revision + 1, away=self.away)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Settle:
     """Change: these electors hold all that was chosen before them (`zsched.core.electorate.settling`)."""
 
@@ -176,7 +196,7 @@ class Settle:
         return replace(read, revision=read.revision + 1, settled=True, guard_lease_s=read.lease_s)
 
 
-FleetChange = AdoptDocument | AddElector | RemoveElector | SetLease | SetDocument | Settle
+FleetChange = AdoptDocument | AddElector | RemoveElector | SetLease | SetDocument | SetAway | Settle
 
 
 def _unsettled(read: FleetValue) -> str:

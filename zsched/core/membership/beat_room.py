@@ -14,7 +14,7 @@ from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import Beat, Grant
 
 MAX_BEAT_BYTES = 16 * 1024
-FRAME_BYTES = 640
+FRAME_BYTES = 704
 """Room for the frame, the names of the fields and the fields with one value."""
 _NUMBER = 9
 _GRANT = 1 + sum(1 + len(name) for name in ("task", "owner", "incarnation", "epoch", "number")) + 3 * _NUMBER
@@ -39,19 +39,19 @@ def beat_bytes(beat: Beat) -> int:
 
 
 def _names_bytes(beat: Beat) -> int:
-    return sum(map(_text, beat.suspects)) + sum(map(_text, beat.twins))
+    return sum(_text(name) for names in (beat.suspects, beat.twins, beat.gone, beat.away) for name in names)
 
 
 def most_bytes(fleet: Fleet) -> int:
     """How many bytes a beat of this fleet takes at most in the long run.
 
     The worst case: all tasks are learnt, an elector echoes every exclusive one and has released all itself, and every
-    peer is suspect (or some names live twice).
+    peer is suspect (or some names live twice), gone as an elector and away as a robot.
     """
     longest = max((len(node.name) for node in fleet.nodes), default=0)
     learnt = sum(1 + _text(task.name) + 2 * _NUMBER for task in fleet.tasks)
     grants = sum(2 * (_GRANT + _text(task.name) + 2 + longest) for task in fleet.tasks if task.exclusive)
-    return FRAME_BYTES + learnt + grants + sum(_text(node.name) for node in fleet.nodes)
+    return FRAME_BYTES + learnt + grants + 3 * sum(_text(node.name) for node in fleet.nodes)
 
 
 @dataclass(slots=True)
@@ -63,7 +63,7 @@ class BeatRoom:
     def fit(self, beat: Beat) -> tuple[Beat, int]:
         """The beat as it is sent, and how many of its parts wait for the next ones.
 
-        The suspects are always in it: a node that is missing there counts as heard.
+        Names of nodes are always in it: a node that is missing among the suspects counts as heard.
         """
         if beat_bytes(beat) <= MAX_BEAT_BYTES:
             return beat, 0

@@ -126,6 +126,8 @@ class FleetValue:
     """Hash of the document's content; empty: each node goes by its own fleet file."""
     parent_id: str = ""
     """Generation from which this one was recovered; empty: from none."""
+    away: tuple[NodeId, ...] = ()
+    """Sorted: robots that do not count in votes, because the electors have not heard them for long."""
 
     def __post_init__(self) -> None:
         check_name("fleet.fleet", self.fleet)
@@ -137,6 +139,7 @@ class FleetValue:
         check_range("fleet.guard_lease_s", self.guard_lease_s, self.lease_s, MAX_LEASE_S)
         _check_sorted("fleet.electors", [one.name for one in self.electors])
         _check_sorted("fleet.tasks", [one.task for one in self.tasks])
+        _check_sorted("fleet.away", list(self.away))
         if not self.electors:
             raise ValueError("fleet.electors: a fleet has at least one elector")
         if any(one.joining > self.number for one in self.electors):

@@ -629,6 +629,12 @@ class Beat:
     """Names with two daemons, as this node hears them; the daemons themselves ask about it."""
     lacks_state_file: bool = False
     """With `has_lost_state`: there is no file at all, so `zsched init` may only have been forgotten."""
+    disk: str = ""
+    """Id of the disk with which this node may elect; empty: it may not."""
+    gone: tuple[NodeId, ...] = ()
+    """Electors that this elector takes for gone (`zsched.core.electorate.pilot`)."""
+    away: tuple[NodeId, ...] = ()
+    """Robots that this elector takes for away."""
 
     def __post_init__(self) -> None:
         check_name("beat.node", self.node)

@@ -46,6 +46,11 @@ def full(tasks: int, length: int = 63) -> Beat:
         has_lost_state=True,
         votes=most,
         electorate=f"{'e' * 16}/{most}",
+        number=most,
+        fleet_revision=most,
+        disk="d" * 16,
+        gone=ROBOTS,
+        away=ROBOTS,
     )
 
 
@@ -82,10 +87,11 @@ def test_every_part_of_a_beat_that_is_too_large_is_sent_in_turn_and_suspects_alw
     assert len(said) == 4 * tasks
 
 
-@pytest.mark.parametrize("kind", ["learnt", "released", "asked_to_leave", "echoes", "suspects"])
+@pytest.mark.parametrize("kind", ["learnt", "released", "asked_to_leave", "echoes", "suspects", "gone", "away"])
 def test_one_part_more_takes_as_many_bytes_as_are_reckoned_for_it(kind: str) -> None:
     """Numbers and names are as long as they may be; 17 and 18 of each, for the length of a list changes at 16."""
-    beat = replace(full(18), suspects=tuple(map(name, range(18))))
+    names = tuple(map(name, range(18)))
+    beat = replace(full(18), suspects=names, gone=names, away=names)
     fewer = replace(beat, **{kind: getattr(beat, kind)[:-1]})
     assert beat_bytes(beat) - beat_bytes(fewer) == encoded(beat) - encoded(fewer)
 
@@ -104,7 +110,8 @@ def beats_of(big: Fleet) -> Beat:
     names = tuple(task.name for task in big.tasks if task.exclusive)
     grants = tuple(Grant(task=one, owner=longest, incarnation=most, epoch=most, number=most) for one in names)
     learnt = tuple((task.name, most, most) for task in big.tasks)
-    return replace(full(0), learnt=learnt, echoes=grants, released=grants, suspects=tuple(n.name for n in big.nodes))
+    nodes = tuple(node.name for node in big.nodes)
+    return replace(full(0), learnt=learnt, echoes=grants, released=grants, suspects=nodes, gone=nodes, away=nodes)
 
 
 def test_the_most_that_a_fleet_s_beats_take_is_reckoned_from_its_names() -> None:
@@ -114,9 +121,9 @@ def test_the_most_that_a_fleet_s_beats_take_is_reckoned_from_its_names() -> None
     mixed = replace(big, nodes=nodes, tasks=(*big.tasks, plain))
     for one in (big, mixed, replace(big, tasks=())):
         assert most_bytes(one) == beat_bytes(beats_of(one))
-    assert most_bytes(replace(big, tasks=(), nodes=())) == FRAME_BYTES == 640
+    assert most_bytes(replace(big, tasks=(), nodes=())) == FRAME_BYTES == 704
     nobody, somebody = (replace(big, nodes=nodes) for nodes in ((), big.nodes[:1]))
-    assert most_bytes(somebody) - most_bytes(nobody) == (2 * len(big.tasks) + 1) * len(ROBOTS[0]) + 2
+    assert most_bytes(somebody) - most_bytes(nobody) == (2 * len(big.tasks) + 3) * len(ROBOTS[0]) + 3 * 2
 
 
 # --- in turn ---------------------------------------------------------------------------------------------------------
@@ -127,7 +134,9 @@ def sized(room: int, *sizes: int) -> Beat:
     left = MAX_BEAT_BYTES - FRAME_BYTES - room - sum(sizes)
     parts = [OVER + MIN_NAME for _ in range(left // (OVER + MIN_NAME))]
     parts[-1] += left - sum(parts)
-    return replace(full(0), suspects=(), learnt=tuple(("x" * (size - OVER), 1, 1) for size in (*parts, *sizes)))
+    return replace(
+        full(0), suspects=(), gone=(), away=(), learnt=tuple(("x" * (size - OVER), 1, 1) for size in (*parts, *sizes))
+    )
 
 
 OVER, MIN_NAME = 1 + 2 + 2 * 9, 4
