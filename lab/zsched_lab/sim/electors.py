@@ -26,7 +26,7 @@ from zsched_lab.sim.chosen import Chosen
 BALLOT_S: Final = 0.3
 STAGGER_S: Final = 0.03
 FLEET: Final = "swarm"
-_TUNING: Final = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
+TUNING: Final = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
 
 TaskQuestion = Prepare | Accept
 Answer = Promise | Accepted | Refused
@@ -201,21 +201,24 @@ class Machines:
         )
 
     def _register(self, machine: Machine, creation: Creation, stored: RegisterState | None) -> TaskRegister:
-        start = creation.start
-        initial = Allocation(task=creation.task, revision=start, epoch=start, owner=None, tuning=_TUNING)
         return TaskRegister(
             me=machine.name,
             incarnation=machine.disk.incarnation,
             electors=(),
             electorate="",
             is_elector=False,
-            initial=initial,
+            initial=self.first_value(creation),
             state=stored or RegisterState(task=creation.task, creation=creation.number),
             ballot_s=BALLOT_S,
             stagger_s=STAGGER_S,
             rng=self.rng,
             disk=machine.disk.id,
         )
+
+    def first_value(self, creation: Creation) -> Allocation:
+        """What a task's blank register holds."""
+        start = creation.start
+        return Allocation(task=creation.task, revision=start, epoch=start, owner=None, tuning=TUNING)
 
     def stop(self, machine: Machine) -> None:
         """It crashes, or dies: what is not on its disk is gone."""
