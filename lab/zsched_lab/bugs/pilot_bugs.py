@@ -1,0 +1,83 @@
+"""The bugs of electors by themselves: one for each rule without which healthy electors go, or a fleet stands still.
+
+Knows: which text of which module each bug replaces, and which tests may find it. Does not know: how it is planted.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from zsched_lab.bugs.core_bugs import Bug
+
+PILOT: Final = "zsched.core.electorate.pilot"
+_TESTS: Final = ("tests/sim/test_pilot.py", "tests/unit/core/electorate/test_pilot.py")
+
+
+def _bug(name: str, *changes: tuple[str, str]) -> Bug:
+    return Bug(name=name, module=PILOT, changes=changes, tests=_TESTS, has_schedules=False)
+
+
+PILOT_BUGS: tuple[Bug, ...] = (
+    _bug(
+        "another disk of an elector's name is the elector's end",
+        (
+            "        if seat is not None and _answers(seat, word):\n            self._seats[seat] = now\n",
+            (
+                "        if seat is not None:\n"
+                "            self._seats[seat] = now if _answers(seat, word) else -math.inf\n"
+            ),
+        ),
+    ),
+    _bug(
+        "an elector is known by its name alone",
+        (
+            'return word.disk != "" and seat.is_held_by(word.node, word.disk)',
+            'return word.disk != "" and seat.name == word.node',
+        ),
+    ),
+    _bug(
+        "one elector's view removes another", ("if len(opinions[name]) >= needed), None)", "if opinions[name]), None)")
+    ),
+    _bug(
+        "an elector that has slept believes its clock",
+        ("            self._listens_since = now\n", "            pass\n"),
+    ),
+    _bug("an opinion of long ago counts", ("now - peer.at < course.silence_s and _answers", "_answers")),
+    _bug("an opinion under another number counts", ("if peer.word.is_current else []", "")),
+    _bug("an elector is added without room", ("if len(alive) < majority(count + 1):", "if not alive:")),
+    _bug(
+        "electors are added before the dead are removed",
+        (
+            "        if lost is not None and lost.change is not None:\n            return lost\n",
+            (
+                "        added = self._addable(value, course, now)\n"
+                "        if added.change is not None:\n"
+                "            return added\n"
+                "        if lost is not None and lost.change is not None:\n"
+                "            return lost\n"
+            ),
+        ),
+    ),
+    _bug("a candidate is added that comes and goes", ("now - peer.since >= STEADY * course.silence_s", "True")),
+    _bug("a candidate is added that is behind", ("if is_steady and peer.word.is_current:", "if is_steady:")),
+    _bug(
+        "a candidate is steady over two disks",
+        ("if peer is None or peer.word.disk != word.disk or now", "if peer is None or now"),
+    ),
+    _bug("three become two without a spare", ("if count == 3 and not self._fit", "if count == 0 and not self._fit")),
+    _bug(
+        "a leaver goes before the others are settled",
+        ("return value.settled and value.electorate", "return value.electorate"),
+    ),
+    _bug("electors that the operator has named are replaced", ("if not course.is_auto:", "if not course.members:")),
+    _bug("the electors become an even number", ("return count - 1 + count % 2", "return count")),
+    _bug("one elector's view sends a robot away", ("if count >= needed or (name", "if count or (name")),
+    _bug(
+        "one elector's view calls a robot back",
+        ("is_back = len(lists) - count >= needed", "is_back = len(lists) > count"),
+    ),
+    _bug(
+        "an elector that has just started calls back whoever is away",
+        ("        if name in value.away:\n", "        if name in value.away and peer is not None:\n"),
+    ),
+)
