@@ -28,6 +28,8 @@ __all__ = ["CheckResult", "Fault", "check_bytes", "check_file", "load_fleet", "r
 
 MORE = "note: more may follow once these are mended: what hangs on a faulty part cannot be judged"
 _SEEDS = 2
+_PLAIN = ("relay_orphan_s", "shared_memory", "replace_s", "away_s")
+"""Keys of the fleet file that are fields of `Fleet` as they stand."""
 """How many nodes are seeds when the file names none: one may be down."""
 
 
@@ -125,11 +127,17 @@ def _fleet(section: Section, folder: Path, size: int, out: Collector) -> Fleet |
         nodes=tuple(sorted(cast.nodes, key=lambda node: node.name)),
         tasks=tuple(sorted(tasks, key=lambda task: task.name)),
         electors=electors,
+        is_auto=not section.get("electorate"),
         seeds=seeds,
         zenoh_config=zenoh_config,
-        **{name: section.get(name) for name in ("relay_orphan_s", "shared_memory") if name in section.values},
+        **{name: section.get(name) for name in _PLAIN if name in section.values},
     )
     _check_size(size, section.where("tasks"), out)
+    if fleet.away_s < fleet.replace_s:
+        message = f"away_s is {fleet.away_s:g} s, and an elector is gone after {fleet.replace_s:g} s (replace_s)"
+        hint = f"away_s: {fleet.replace_s:g} or more"
+        out.error(section.where("away_s" if "away_s" in section.values else "replace_s"), message, hint)
+        return None
     _check_beats(fleet, section.where("tasks"), out)
     return fleet
 
@@ -205,7 +213,7 @@ def _can_be_dialled(node: NodeSpec) -> bool:
 def _electors(section: Section, cast: Cast, out: Collector) -> tuple[NodeId, ...]:
     robots = cast.of_kind(NodeKind.ROBOT)
     given = section.get("electorate")
-    electors = robots if given is None else select(given, cast, out)
+    electors = select(given, cast, out) if given else robots
     place = section.where("electorate") if given is not None else cast.place
     if not robots and cast.is_whole:
         out.error(cast.place, "the fleet has no robot: nobody would vote", "give at least one node `kind: robot`")

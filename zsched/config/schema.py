@@ -331,7 +331,12 @@ FLEET: Final = Record(
         ),
         "nodes": Field(MapOf(NAME_BLOCK, NODE), "The machines.", required=True),
         "tasks": Field(MapOf(NAME_BLOCK, TASK), "What must run somewhere, and its streams."),
-        "electorate": Field(_NODES, "Who stores the allocations and agrees on them.", default="the robots"),
+        "electorate": Field(
+            Forms(word=Choice({"auto": ()}), listing=_NAMES, mapping=SELECTOR),
+            "Who stores the allocations and agrees on them; `auto`: the robots at first, and who follows an elector "
+            "that is gone is agreed.",
+            default="`auto`",
+        ),
         "zenoh": Field(
             Record(
                 "a zenoh section",

@@ -356,6 +356,31 @@ def test_electorate_may_name_edges() -> None:
     assert fleet.voters == ("robot1", "robot2", "robot3")
 
 
+@pytest.mark.parametrize(
+    ("said", "is_auto", "electors"),
+    [
+        ("", True, ("robot1", "robot2", "robot3")),
+        ("electorate: auto\n", True, ("robot1", "robot2", "robot3")),
+        ("electorate: {kind: edge}\n", False, ("edge1", "edge2")),
+        ("electorate: [robot1, robot2, robot3]\n", False, ("robot1", "robot2", "robot3")),
+    ],
+)
+def test_electors_that_nobody_names_are_replaced_by_themselves(
+    said: str, is_auto: bool, electors: tuple[str, ...]
+) -> None:
+    fleet = fleet_of(GOOD + said)
+    assert (fleet.is_auto, fleet.electors) == (is_auto, electors)
+
+
+def test_the_times_of_electors_and_robots_that_are_not_heard() -> None:
+    fleet = fleet_of(GOOD + "replace_s: 3\naway_s: 3.5\n")
+    assert (fleet.replace_s, fleet.away_s) == (3.0, 3.5)
+    assert (fleet_of(GOOD).replace_s, fleet_of(GOOD).away_s) == (10.0, 60.0)
+    report = check(GOOD + "replace_s: 3\naway_s: 2.5\n").report()
+    assert "away_s is 2.5 s, and an elector is gone after 3 s (replace_s)" in report
+    assert "hint: away_s: 3 or more" in report
+
+
 def test_few_electors_are_advised_by_warning_only() -> None:
     one = check(swapped("tasks:", "electorate: [robot1]\ntasks:"))
     assert one.fleet is not None

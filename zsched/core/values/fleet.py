@@ -283,7 +283,20 @@ class Fleet:
     tasks: tuple[TaskSpec, ...]
     """Sorted by name."""
     electors: tuple[NodeId, ...]
-    """Sorted; the acceptors of the register (default: the robots)."""
+    """Sorted; the acceptors of the register (default: the robots), until the fleet has agreed others."""
+    is_auto: bool = False
+    """Whether electors are replaced by themselves (`electorate: auto`, or none named) once a document is agreed."""
+    replace_s: float = key(
+        10.0,
+        "An elector that is not heard for so long is replaced, where the electors are not named.",
+        Range(1, 3600, "s"),
+    )
+    away_s: float = key(
+        60.0,
+        "A robot that the electors have not heard for so long does not count in votes until it is heard again; "
+        "at least `replace_s`.",
+        Range(1, 604800, "s"),
+    )
     seeds: tuple[NodeId, ...] = ()
     zenoh_config: str = ""
     """Path of a zenoh JSON5 file, passed through untouched; empty: none."""
