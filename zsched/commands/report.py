@@ -76,6 +76,7 @@ def render_status(status: Json, width: int, color: bool, at: float | None = None
     page.lines.append("")
     node_rows(page, shown, "PROFILE")
     _gateway(page, shown["nodes"])
+    _electors(page, shown["quorum"])
     for task in shown["tasks"]:
         page.lines.append("")
         _task(page, shown, task)
@@ -112,6 +113,18 @@ def header(page: Page, status: Json) -> None:
     for extra in (*revision, f"up {span(status['up_s'])}", f"zsched {status['version']}"):
         parts += [extra] if len(" · ".join([*parts, extra])) <= room else []
     page.row((" · ".join(parts), room, "bold"), (health, len(health), style))
+
+
+def _electors(page: Page, quorum: Json) -> None:
+    """Who elects once a change of the fleet was agreed, which robots do not vote, and what the pilot waits for."""
+    if not quorum.get("number"):
+        return
+    page.lines.append("")
+    told = [f"{', '.join(quorum['names'])} (number {quorum['number']})"]
+    told += [f"robots that do not vote: {', '.join(quorum['away'])}"] if quorum["away"] else []
+    page.row(("ELECTORS", page.indent - 1, "stage"), ("; ".join(told), page.width, ""))
+    if quorum["pilot"]:
+        page.row((quorum["pilot"], page.width, "dim"), indent=page.indent)
 
 
 # --- PROFILE, GATEWAY ------------------------------------------------------------------------------------------------

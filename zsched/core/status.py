@@ -131,7 +131,7 @@ def _problems(node: Stages, quorum: QuorumStatus, now: float) -> tuple[str, ...]
             "With one more away nothing is decided. "
             + "; ".join(_why_silent(node, name, now) or _why_refused(node, name) for name in missing)
         )
-    voters = node.fleet.voters
+    voters = node.agreement.voters
     silent = [name for name in voters if node.membership.state(name) is not PeerState.ALIVE]
     needed = majority(len(voters))
     if quorum.ok and len(voters) - len(silent) < needed:
@@ -217,7 +217,7 @@ def _can_answer(node: Stages, name: NodeId) -> bool:
 
 
 def _quorum(node: Stages) -> QuorumStatus:
-    electors = node.fleet.electors
+    electors, value = node.fleet.electors, node.agreement.fleet_value
     stateless = [name for name in electors if _has_lost_state(node, name)]
     alive = [name for name in electors if _can_answer(node, name)]
     needed = majority(len(electors))
@@ -232,6 +232,11 @@ def _quorum(node: Stages) -> QuorumStatus:
         stateless=tuple(sorted(stateless)),
         voted=tuple(sorted(node.agreement.voted)),
         apart=tuple(sorted(node.agreement.apart)),
+        names=electors,
+        number=node.agreement.number,
+        generation=node.agreement.generation or 0,
+        pilot=node.agreement.helm.reason,
+        away=() if value is None else value.away,
     )
 
 

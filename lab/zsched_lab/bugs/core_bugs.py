@@ -625,7 +625,7 @@ MEMBERSHIP_BUGS = (
     _bug(
         "restored state votes on",
         AGREEMENT,
-        "self._lose(self.witness.on_answer(learnt), todo)",
+        'self._lose(why if self._is_of_our_seat(learnt) else "", todo)',
         "pass",
         _RESTORED,
         2,

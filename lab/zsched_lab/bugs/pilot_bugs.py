@@ -7,10 +7,15 @@ from __future__ import annotations
 
 from typing import Final
 
-from zsched_lab.bugs.core_bugs import Bug
+from zsched_lab.bugs.core_bugs import AGREEMENT, Bug
 
 PILOT: Final = "zsched.core.electorate.pilot"
+HELM: Final = "zsched.core.electorate.helm"
 _TESTS: Final = ("tests/sim/test_pilot.py", "tests/unit/core/electorate/test_pilot.py")
+
+
+def _node_bug(name: str, module: str, *changes: tuple[str, str]) -> Bug:
+    return Bug(name=name, module=module, changes=changes, tests=("tests/sim/test_pilot_nodes.py",), has_schedules=False)
 
 
 def _bug(name: str, *changes: tuple[str, str]) -> Bug:
@@ -79,5 +84,33 @@ PILOT_BUGS: tuple[Bug, ...] = (
     _bug(
         "an elector that has just started calls back whoever is away",
         ("        if name in value.away:\n", "        if name in value.away and peer is not None:\n"),
+    ),
+    _node_bug(
+        "an elector that lost its disk is never one again",
+        AGREEMENT,
+        ("if self._lost and self._numbers.roll is not None and", "if False and self._numbers.roll is not None and"),
+    ),
+    _node_bug(
+        "votes of an old seat are held against the new one",
+        AGREEMENT,
+        ("                self.witness.seen.pop(name, None)\n", ""),
+    ),
+    _node_bug(
+        "robots that are away count in votes",
+        HELM,
+        ("tuple(name for name in fleet.voters if name not in away) or fleet.voters", "fleet.voters or away"),
+    ),
+    _node_bug(
+        "a node that starts counts the robots of its document",
+        "zsched.core.node",
+        ("        documents.count_voters(self)\n", ""),
+    ),
+    _node_bug(
+        "rounds go by the electors of the file",
+        "zsched.core.handlers.documents",
+        (
+            "node.rounds.count_with(voters, node.agreement.electors)",
+            "node.rounds.count_with(voters, node.rounds.electors)",
+        ),
     ),
 )

@@ -222,7 +222,7 @@ class Pilot:
         if leaver is not None:
             if count == 1:
                 return _none(f"{leaver} is the last elector, and stays")
-            return _remove(value, leaver, f"{leaver} leaves")
+            return _remove(value, leaver, "it leaves")
         opinions = {name: self._who_miss(name, value, course, now) for name in names}
         needed = majority(count)
         lost = next((name for name in names if len(opinions[name]) >= needed), None)
@@ -231,7 +231,7 @@ class Pilot:
             return _none(f"{'; '.join(doubted)}: {needed} electors must say so") if doubted else None
         if count == 3 and not self._fit(value, course, now, instead=lost):
             return _none(f"{lost} is gone, and no node is fit to follow it: two electors are no better than three")
-        return _remove(value, lost, f"{lost} is gone for {', '.join(opinions[lost])}")
+        return _remove(value, lost, f"gone for {', '.join(opinions[lost])}")
 
     def _who_miss(self, name: NodeId, value: FleetValue, course: Course, now: float) -> list[NodeId]:
         """The electors that take this one for gone."""
@@ -283,7 +283,7 @@ class Pilot:
         if len(alive) < majority(count + 1):
             return _none(f"no room for {fit[0]}: {len(alive)} of then {count + 1} electors are sure to answer")
         name = fit[0]
-        reason = f"{name} has been heard without a break for {now - self._peers[name].since:.0f} s"
+        reason = f"{name} becomes an elector: heard without a break for {now - self._peers[name].since:.0f} s"
         disk = self._peers[name].word.disk
         change = AddElector(base_revision=value.revision, name=name, disk=disk, reason=reason)
         return Advice(change=change, reason=reason)
@@ -322,7 +322,8 @@ def _none(reason: str) -> Advice:
     return Advice(change=None, reason=reason)
 
 
-def _remove(value: FleetValue, name: NodeId, reason: str) -> Advice:
+def _remove(value: FleetValue, name: NodeId, why: str) -> Advice:
+    reason = f"{name} is removed as an elector: {why}"
     return Advice(change=RemoveElector(base_revision=value.revision, name=name, reason=reason), reason=reason)
 
 
@@ -330,4 +331,4 @@ def _change_text(before: Iterable[NodeId], after: Iterable[NodeId]) -> str:
     gone, back = sorted(set(after) - set(before)), sorted(set(before) - set(after))
     parts = [f"{', '.join(gone)} away"] if gone else []
     parts += [f"{', '.join(back)} back"] if back else []
-    return "; ".join(parts)
+    return f"robots that do not vote: {'; '.join(parts)}"

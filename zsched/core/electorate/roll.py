@@ -161,6 +161,11 @@ class Roll:
         for register in self._registers.values():
             register.stop_electing()
 
+    def may_elect_again(self, todo: ToDo) -> None:
+        """This node may be added as an elector again: it has no seat, and what it lost belonged to an old one."""
+        self._may_elect = True
+        todo.must_persist = True
+
     def admission(self, question: Prepare | Accept | Accept[FleetValue], asker: NodeId, todo: ToDo) -> Admission:
         """Whether a question to a task's register, or to the fleet register, may be put to it.
 

@@ -34,6 +34,8 @@ class Tenure:
     exclusive: tuple[TaskId, ...] = ()
     """The tasks whose workers need a lease: by this node's file, or for everybody."""
     clock: ClockDoubt = field(default_factory=ClockDoubt)
+    voters: tuple[NodeId, ...] = field(init=False)
+    """The robots that count: without a majority of them this node is cut off."""
     _alone_since: dict[TaskId, float] = field(default_factory=dict)
     _local: tuple[TaskId, ...] = field(init=False)
 
@@ -45,6 +47,7 @@ class Tenure:
         self.fleet = fleet
         self._note_leased()
         self._alone_since = {task: at for task, at in self._alone_since.items() if task in self.executors}
+        self.voters = self.fleet.voters
         self._local = tuple(task.name for task in self.fleet.tasks if task.on_isolation is OnIsolation.LOCAL)
 
     @property
@@ -132,7 +135,7 @@ class Tenure:
         """Work alone exactly while cut off from the owner and from a quorum."""
         if not self._local:
             return
-        voters = self.fleet.voters
+        voters = self.voters
         heard = sum(membership.state(name) is PeerState.ALIVE for name in voters)
         is_cut_off = heard < majority(len(voters))
         for name in self._local:

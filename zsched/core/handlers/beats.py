@@ -28,6 +28,7 @@ def send_beat(node: Stages, todo: ToDo, now: float) -> None:
         _complain(node, now)
     node.membership.fade_lag_factor()
     parts = node.agreement.leases.on_sent(node.beat_sequence, now)
+    gone, away = node.agreement.helm.opinion(node.agreement.disk, now)
     beat = Beat(
         node=node.me,
         incarnation=node.incarnation,
@@ -49,10 +50,14 @@ def send_beat(node: Stages, todo: ToDo, now: float) -> None:
         electorate=node.agreement.electorate if node.agreement.is_elector else "",
         twins=node.namesakes.names(now),
         lacks_state_file=node.me in node.agreement.electors and node.lacks_state_file,
+        disk=node.agreement.disk,
+        gone=gone,
+        away=away,
     )
     node.loop_lag_s = 0.0
     node.beat_at = now + node.fleet.timing.beat_s
     todo.add(do.PublishBeat(beat=_fitting(node, beat), is_news=is_news))
+    node.agreement.helm.tick(todo, now)
     _seal(node, todo, now)
     _hear_leases(node, beat, todo, now, is_newest=True)
     if node.introductions.is_due(now, is_missing=node.membership.misses_anybody):
@@ -110,6 +115,8 @@ def _on_beat(node: Stages, event: ev.BeatReceived, todo: ToDo, now: float) -> No
         if node.identity.must_ask(beat.node, now):
             _ask(node, beat.node, todo)
     node.agreement.compare(beat, todo, now)
+    if node.membership.is_newest(beat.node):
+        node.agreement.hear_pilot(beat, now)
     if beat.has_lost_state:
         node.stateless.add(beat.node)
     elif node.stateless:

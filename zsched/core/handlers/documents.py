@@ -23,6 +23,15 @@ def take_effect(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
     follow(node, fleet, todo, is_agreed=True)
     adopt(node, fleet, todo, now)
     compare_file(node)
+    count_voters(node)
+
+
+def count_voters(node: Stages) -> None:
+    """Votes and rounds go by the robots that are not away, and by the electors that are agreed."""
+    voters = node.agreement.voters
+    node.votes.count_with(voters)
+    node.rounds.count_with(voters, node.agreement.electors)
+    node.tenure.voters = voters
 
 
 def _on_asked(node: Stages, event: ev.FleetAsked, todo: ToDo, now: float) -> None:

@@ -116,6 +116,9 @@ class Rounds:
     def _adopt(self, fleet: Fleet, now: float) -> None:
         self._fleet = fleet
         self.is_voter = self._me in fleet.voters
+        self.voters = fleet.voters
+        """The robots that count: a majority of them must have been heard."""
+        self.electors = fleet.electors
         kept = self.tasks
         self.tasks = {
             spec.name: TaskRound(spec=spec, judge=Judge(spec=spec), settled_at=now)
@@ -130,6 +133,11 @@ class Rounds:
         self._kept: Answers | None = None
         self._must_ask = True
         """Something has happened since the last gather that may need a decision."""
+
+    def count_with(self, voters: tuple[NodeId, ...], electors: tuple[NodeId, ...]) -> None:
+        """These robots and electors count from now on."""
+        self.voters, self.electors = voters, electors
+        self._must_ask = True
 
     # --- time ----------------------------------------------------------------------------------------------------
 
@@ -205,7 +213,7 @@ class Rounds:
         self._round_at = now + timing.decide_s * (0.9 + 0.2 * self._rng.random())
         self._number += 1
         own = self.vectors(values, states, now)
-        expected = [name for name in self._fleet.voters if name != self._me and states[name] is PeerState.ALIVE]
+        expected = [name for name in self.voters if name != self._me and states[name] is PeerState.ALIVE]
         answered = self._kept if self._rests(own.vectors, states, now) else None
         self._gather = _Gather(
             number=self._number,
@@ -258,9 +266,9 @@ class Rounds:
                 voter: vector
                 for voter, all_vectors in sorted(gathered.vectors.items())
                 for vector in all_vectors
-                if vector.task == name
+                if vector.task == name and voter in self.voters
             }
-            task.silent = tuple(voter for voter in self._fleet.voters if voter not in vectors)
+            task.silent = tuple(voter for voter in self.voters if voter not in vectors)
             proposal = self._judge(task, tuple(vectors.values()), values[name], states, todo, now)
             if proposal is not None:
                 yield proposal
@@ -325,11 +333,11 @@ class Rounds:
             now=now,
             rules=task.rules,
             allocation=allocation,
-            voters=self._fleet.voters,
-            present=tuple([voter for voter in self._fleet.voters if states[voter] is not PeerState.GONE]),
+            voters=self.voters,
+            present=tuple([voter for voter in self.voters if states[voter] is not PeerState.GONE]),
             vectors=vectors,
-            electors=self._fleet.electors,
-            electors_heard=tuple([one for one in self._fleet.electors if states[one] is not PeerState.GONE]),
+            electors=self.electors,
+            electors_heard=tuple([one for one in self.electors if states[one] is not PeerState.GONE]),
             settled_for_s=now - task.settled_at,
             owner_state=PeerState.GONE if owner is None else states.get(owner, PeerState.GONE),
             owner_profile=profile,

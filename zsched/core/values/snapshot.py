@@ -126,6 +126,16 @@ class QuorumStatus:
     """Electors that have lost their state, as they say themselves; also of those that are not alive any more."""
     apart: tuple[NodeId, ...] = ()
     """Electors of another generation, or with other electors in their file: they and this node refuse each other."""
+    names: tuple[NodeId, ...] = ()
+    """The electors, sorted."""
+    number: int = 0
+    """Of the agreed electors; 0: the fleet file's are in force."""
+    generation: int = 0
+    """Of the answering node's state."""
+    pilot: str = ""
+    """What this elector does about electors and robots that are not heard, or why it does nothing; empty: it rests."""
+    away: tuple[NodeId, ...] = ()
+    """Robots that do not count in votes, because the electors have not heard them for long."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

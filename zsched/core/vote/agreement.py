@@ -16,12 +16,13 @@ from types import MappingProxyType
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.electorate.changes import FleetChange
+from zsched.core.electorate.helm import Helm, voters
 from zsched.core.electorate.numbers import Numbers
 from zsched.core.electorate.orders import Orders
 from zsched.core.todo import ToDo
 from zsched.core.values.change import Change, Ended, MoveOwner, Retune, RoundOutcome
 from zsched.core.values.durable import DurableState
-from zsched.core.values.electorate import CREATION_STEP, FleetValue
+from zsched.core.values.electorate import CREATION_STEP, Elector, FleetValue
 from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.messages import (
     Accepted,
@@ -151,6 +152,7 @@ class Agreement:
             stored=stored,
         )
         self.orders = Orders(self._numbers)
+        self.helm = Helm(self._numbers, me, stagger_s=2 * fleet.timing.ballot_s, now=now)
         self.at_start = ToDo()
         """What the first batch must do: fetch a document that is missing."""
         if self.generation is not None:
@@ -171,6 +173,9 @@ class Agreement:
             granted_s=0.0 if durable is None else durable.lease_s,
         )
         self._parked: dict[tuple[TaskId, NodeId], tuple[ev.AcceptAsked, float]] = {}
+        first = self._numbers.value
+        self._seats = {} if first is None else {seat.name: seat for seat in first.electors}
+        """{name: the seat to which what is remembered of an elector belongs}."""
         self._count_anew(self.at_start)
         self._seen: list[RegisterState] = []
         """The registers' states from which `values` and `accepted` were made."""
@@ -510,9 +515,21 @@ class Agreement:
         return self._numbers.value
 
     @property
+    def voters(self) -> tuple[NodeId, ...]:
+        """The robots that count in votes."""
+        return voters(self._fleet, self._numbers.changed)
+
+    @property
     def disk(self) -> str:
-        """Id of the disk with which this node may be an elector; empty: it has no state."""
-        return self._numbers.disk
+        """Id of the disk with which this node may elect; empty: it has no state, or one that is lost or disputed."""
+        durable = self._durable
+        return "" if durable is None or self._disputed or self._lost else durable.disk
+
+    def hear_pilot(self, beat: Beat, now: float) -> None:
+        """What a peer's newest beat says of electors and robots."""
+        terms = beat.lease_terms.partition(",")[0]  # behind it a clock is in doubt
+        is_current = beat.number == self.number and terms == self.leases.terms.partition(",")[0]
+        self.helm.hear(beat, now, is_current=is_current)
 
     @property
     def number(self) -> int:
@@ -536,6 +553,7 @@ class Agreement:
                 if refused is not None:
                     todo.add(do.AnswerElection(request=event.request, answer=refused))
         self.witness.electors = self.electors
+        self._forget_seats(value, todo)
         self.is_elector = roll.is_elector
         self.leases.count_with(
             self.electors,
@@ -544,6 +562,26 @@ class Agreement:
             lease_s=value.lease_s,
             standing=self.standing() if self.is_elector else {},
         )
+
+    def _forget_seats(self, value: FleetValue, todo: ToDo) -> None:
+        """What is remembered of an elector belongs to its seat; so does the loss of this node's own state."""
+        names = {*self._seats, *value.electorate.names}
+        seats = {name: seat for name in sorted(names) if (seat := value.electorate.seat(name)) is not None}
+        for name in sorted(names):
+            if self._seats.get(name) != seats.get(name):
+                self.witness.seen.pop(name, None)
+                self.voted.discard(name)
+        self._seats = seats
+        if self._lost and self._numbers.roll is not None and self._numbers.roll.seat is None:
+            self._lost = ""  # as any other member it begins blank
+            self._problems.pop("state", None)
+            self._numbers.roll.may_elect_again(todo)
+
+    def _is_of_our_seat(self, learnt: Learnt) -> bool:
+        """Whether a peer that speaks of this node's votes knows it by the seat that it has."""
+        ours = self._numbers.value
+        told = learnt.fleet.electorate.seat(self._me) if learnt.fleet is not None else Elector(name=self._me)
+        return ours is not None and (ours.electorate.seat(self._me) or Elector(name=self._me)) == told
 
     def _is_its_own(self, ballot: Ballot, asker: NodeId) -> bool:
         return ballot.node == asker and asker in self._nodes
@@ -578,7 +616,8 @@ class Agreement:
             return
         if learnt.fleet is not None and self._numbers.learn(learnt.fleet, learnt.node, todo, now):
             self._count_anew(todo)
-        self._lose(self.witness.on_answer(learnt), todo)
+        why = self.witness.on_answer(learnt)
+        self._lose(why if self._is_of_our_seat(learnt) else "", todo)
         if learnt.has_voted and learnt.node in self.electors and learnt.node not in self.voted:
             self.voted.add(learnt.node)
             todo.must_persist |= self._durable is not None

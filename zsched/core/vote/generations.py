@@ -80,7 +80,12 @@ def way_out(generation: int) -> str:
 
 
 def generation_of(answer: Snapshot) -> int:
-    """The generation of a node, from the revision in its status: generation G starts at G * 2^32."""
+    """The generation of a node, as its status says.
+
+    While no document is agreed it follows from the revisions: generation G starts at G * 2^32.
+    """
+    if answer.quorum.number:
+        return answer.quorum.generation
     return max((task.revision for task in answer.tasks), default=0) // GENERATION_STEP
 
 
@@ -107,6 +112,8 @@ def objection(
     newest = max(map(generation_of, answers), default=0)
     current = [answer for answer in answers if generation_of(answer) == newest]
     knows = next((answer.node for answer in current if node in answer.quorum.voted), None)
+    if any(answer.quorum.number and node not in answer.quorum.names for answer in current):
+        knows = None  # its seat went with its disk, and a new disk is another member
     if newest >= generation and knows is not None:
         return (
             f"{knows} knows {node} as an elector that has voted; a blank state would let it vote twice. Without a "

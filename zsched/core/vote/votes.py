@@ -37,6 +37,11 @@ class Votes:
         """When a commit is due or an open vote ends; infinity when neither."""
         return min((voting.next_deadline() for voting in self.tasks.values()), default=math.inf)
 
+    def count_with(self, voters: tuple[NodeId, ...]) -> None:
+        """These robots vote from now on."""
+        for voting in self.tasks.values():
+            voting.count_with(voters)
+
     @property
     def is_idle(self) -> bool:
         """Whether no vote is open."""

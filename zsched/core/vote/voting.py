@@ -72,6 +72,10 @@ class Voting:
         else:
             self.called_at, self._first_call_at = now, None
 
+    def count_with(self, voters: tuple[NodeId, ...]) -> None:
+        """These robots vote from now on."""
+        self._voters = voters
+
     # --- proposals -----------------------------------------------------------------------------------------------
 
     def absorb(self, proposal: Proposal, allocation: Allocation, now: float) -> bool:

@@ -1,0 +1,139 @@
+"""Whole nodes replace their electors by themselves, and count the robots that are there."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from support.fleets import fleet_of, tuning_of
+from zsched.core import events as ev
+from zsched.core.status import build_snapshot
+from zsched.core.values.electorate import FleetValue
+from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec
+from zsched.core.values.messages import ChangeFleet
+from zsched.core.values.model import NodeId
+from zsched_lab.sim.simulator import Simulator
+
+TASK = "merge"
+ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2", "edge3")
+REPLACE_S, AWAY_S = 2.0, 5.0
+
+
+def fleet(electors: tuple[NodeId, ...], robots: tuple[NodeId, ...] = ROBOTS) -> Fleet:
+    task = TaskSpec(
+        name=TASK,
+        candidates=(*EDGES, *robots),
+        tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0),
+        worker=WorkerSpec(command=("true",)),
+        exclusive=True,
+    )
+    plain = fleet_of(task, of=sorted(EDGES + robots), electors=electors)
+    return replace(plain, is_auto=True, replace_s=REPLACE_S, away_s=AWAY_S)
+
+
+class Play:
+    """A fleet whose document is agreed, so that its pilots work."""
+
+    def __init__(self, agreed: Fleet, seed: int = 1) -> None:
+        self.sim = Simulator(fleet=agreed, seed=seed)
+        self.sim.documents.judge_from(agreed, 0)
+        self.sim.start()
+        command = ChangeFleet(document=self.sim.documents.write(agreed))
+        assert self.sim.run_until(lambda: not self.sim.unsettled(), 20), self.sim.unsettled()
+        self.sim.deliver(self.sim.machines[agreed.electors[0]], ev.FleetCommanded(request=1, command=command))
+        assert self.sim.run_until(lambda: all(value.document and value.settled for value in self.values()), 20)
+
+    def values(self) -> list[FleetValue]:
+        found = [self.sim.node(name).agreement.fleet_value for name in self.sim.running()]
+        return [value for value in found if value is not None]
+
+    def electors(self) -> tuple[NodeId, ...]:
+        return max(self.values(), key=lambda value: value.revision).electorate.names
+
+    def reaches(self, wanted: int | tuple[NodeId, ...], seconds: float = 60.0) -> None:
+        """Wait until these, or so many, elect, all of them run, and every running node knows that they are settled."""
+
+        def is_so() -> bool:
+            running = self.sim.running()
+            return all(
+                value.settled
+                and wanted in (value.electorate.names, len(value.electors))
+                and set(value.electorate.names) <= set(running)
+                for value in self.values()
+            )
+
+        assert self.sim.run_until(is_so, seconds), self.values()
+
+    def owner_is_alive(self, seconds: float = 20.0) -> None:
+        """Wait until the task's owner, as every running node knows it, runs."""
+        assert self.sim.run_until(lambda: not self.sim.unsettled(), seconds), self.sim.unsettled()
+        assert self.sim.agreed(TASK) in self.sim.running()
+
+
+def test_electors_die_one_after_another_and_are_replaced() -> None:
+    play = Play(fleet(("edge1", "robot1", "robot2")))
+    play.reaches(5)
+    for left in (5, 4, 3):
+        play.sim.crash(play.electors()[0])
+        play.reaches(left)
+        play.owner_is_alive()
+    assert set(play.electors()) == set(play.sim.running()), "all others are dead"
+    play.sim.crash(play.electors()[0])
+    play.owner_is_alive()
+    assert not play.sim.run_until(lambda: len(play.electors()) != 3, 3 * REPLACE_S)
+    quorum = build_snapshot(play.sim.node(play.sim.running()[0]), play.sim.now).quorum
+    assert quorum.names == play.electors()
+    assert quorum.pilot.endswith("is gone, and no node is fit to follow it: two electors are no better than three")
+
+
+def test_an_elector_that_has_lost_its_disk_is_replaced_and_the_log_says_why() -> None:
+    play = Play(fleet(("edge1", "edge2", "robot1"), robots=("robot1",)))
+    play.sim.crash("edge2")
+    machine = play.sim.machines["edge2"]
+    play.sim.initialise(machine)
+    play.sim.start("edge2")
+    assert play.sim.run_until(lambda: "state" in play.sim.node("edge2").agreement.problems, REPLACE_S)
+    play.reaches(("edge1", "edge3", "robot1"))
+    assert play.sim.run_until(lambda: not play.sim.node("edge2").agreement.problems, 5), "that seat is gone"
+    play.sim.crash("edge3")
+    play.reaches(("edge1", "edge2", "robot1"))
+    state = machine.disk.read()
+    assert state is not None
+    assert {one.name: one.disk for one in play.values()[0].electors}["edge2"] == state.disk
+    assert not state.lost
+    told = "\n".join(play.sim.stories)
+    assert "edge2 is removed as an elector: gone for edge1, robot1, on revision " in told
+    assert "edge3 becomes an elector: heard without a break for " in told
+    robot = [story for story in play.sim.stories if " robot1 vote number " in story]
+    assert any("edge3 is no elector any more (electors: edge1, robot1)" in story for story in robot)
+
+
+def test_robots_that_are_away_for_long_do_not_count_and_the_rest_decides() -> None:
+    robots = ("robot1", "robot2", "robot3", "robot4", "robot5")
+    play = Play(replace(fleet(EDGES, robots=robots), is_auto=False))
+    for name in robots[:3]:
+        play.sim.crash(name)
+    seen: list[tuple[str, ...]] = []
+
+    def planned_moves_stop() -> bool:
+        seen.append(build_snapshot(play.sim.node("robot5"), play.sim.now).problems)
+        return any(problem.startswith("no planned moves") for problem in seen[-1])
+
+    assert play.sim.run_until(planned_moves_stop, 5), "three of five robots are silent, and count still"
+    assert play.sim.run_until(lambda: all(value.away == robots[:3] for value in play.values()), 3 * AWAY_S)
+    assert not planned_moves_stop(), seen[-1]
+    assert play.sim.node("robot5").rounds.voters == robots[3:]
+    play.owner_is_alive()
+    play.sim.start("robot2")
+    assert play.sim.run_until(lambda: all(value.away == ("robot1", "robot3") for value in play.values()), AWAY_S)
+    assert play.sim.node("robot2").rounds.voters == ("robot2", *robots[3:]), "it has learnt so itself"
+
+
+def test_a_robot_that_comes_back_into_its_document_counts_from_its_start() -> None:
+    robots = ("robot1", "robot2", "robot3")
+    play = Play(replace(fleet(EDGES, robots=robots), is_auto=False))
+    play.sim.crash("robot1")
+    assert play.sim.run_until(lambda: all(value.away == ("robot1",) for value in play.values()), 3 * AWAY_S)
+    play.sim.crash("robot2")
+    play.sim.start("robot2")
+    assert play.sim.run_until(lambda: "robot2" in play.sim.running(), 5)
+    assert play.sim.node("robot2").rounds.voters == ("robot2", "robot3"), "its disk says who is away"
