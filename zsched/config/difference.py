@@ -207,6 +207,13 @@ def _verdicts(old: Fleet, new: Fleet, owners: Mapping[TaskId, NodeId | None]) ->
         yield _restart(EVERY_DAEMON, "zenoh", before, after)
     if old.relay_orphan_s != new.relay_orphan_s:
         yield _restart(EVERY_DAEMON, "relay_orphan_s", old.relay_orphan_s, new.relay_orphan_s)
+    for name in ("replace_s", "away_s"):
+        if getattr(old, name) != getattr(new, name):
+            yield _set(AT_ONCE, name, getattr(old, name), getattr(new, name))
+    if old.is_auto is not new.is_auto:
+        text = "electors that are gone are replaced by themselves" if new.is_auto else "electors are replaced no more"
+        words = ["auto" if fleet.is_auto else "named" for fleet in (old, new)]
+        yield _set(replace(AT_ONCE, text=text), "electorate", *words)
     if old.shared_memory is not new.shared_memory:
         yield _restart(EVERY_DAEMON, "shared_memory", old.shared_memory, new.shared_memory)
 

@@ -174,7 +174,7 @@ def test_electors_change_only_where_the_file_names_them_or_has_them_no_more() ->
     ]
     named = f"{new}electorate: [edge2, robot1, robot2]\n"
     found = difference(fleet_of(TEXT), fleet_of(named), (TEXT, named), {}, agreed)
-    told = "electors change: edge2 becomes one, edge1 is none any more"
+    told = "electors change: edge2 becomes one, edge1 is none any more; electors are replaced no more"
     assert [(one.path, one.consequence) for one in found][1:] == [("electorate", told)]
     assert wanted_electors(agreed, fleet_of(named), named) == ("edge2", "robot1", "robot2")
     assert wanted_electors(("gone", "robot1"), fleet_of(TEXT), TEXT) == ("robot1",)
