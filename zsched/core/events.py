@@ -19,7 +19,9 @@ from zsched.core.values.messages import (
     ExplainTask,
     FleetAnswer,
     FleetQuestion,
+    HoldTask,
     Learnt,
+    MoveTask,
     Prepare,
     Promise,
     ReadFleet,
@@ -28,6 +30,7 @@ from zsched.core.values.messages import (
     RestartTask,
     RetryTask,
     SetWeights,
+    TuneTask,
     Utilities,
 )
 from zsched.core.values.model import (
@@ -394,6 +397,30 @@ class WeightsCommanded:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class MoveCommanded:
+    """An operator hands a task over to another node."""
+
+    request: int
+    command: MoveTask
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HoldCommanded:
+    """An operator pauses or pins a task, or ends that."""
+
+    request: int
+    command: HoldTask
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TuneCommanded:
+    """An operator changes a task's tuning."""
+
+    request: int
+    command: TuneTask
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RetryCommanded:
     """An operator orders that failures are forgotten."""
 
@@ -520,6 +547,9 @@ Event = (
     | RelayChanged
     | StatusAsked
     | WeightsCommanded
+    | MoveCommanded
+    | HoldCommanded
+    | TuneCommanded
     | RetryCommanded
     | ExplanationAsked
     | RestartCommanded
@@ -543,6 +573,12 @@ def commanded(request: int, command: Command) -> Event:
         return RetryCommanded(request=request, command=command)
     if isinstance(command, RestartTask):
         return RestartCommanded(request=request, command=command)
+    if isinstance(command, MoveTask):
+        return MoveCommanded(request=request, command=command)
+    if isinstance(command, HoldTask):
+        return HoldCommanded(request=request, command=command)
+    if isinstance(command, TuneTask):
+        return TuneCommanded(request=request, command=command)
     if isinstance(command, ReadLines):
         return LinesAsked(request=request, command=command)
     if isinstance(command, ChangeFleet):

@@ -16,7 +16,7 @@ from typing import Any, Final
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.handlers import beats, choice, documents, fleet, operators, work
+from zsched.core.handlers import beats, choice, documents, fleet, operators, orders, work
 from zsched.core.stages import Handler, Stages
 from zsched.core.todo import ToDo
 from zsched.core.values.change import MoveOwner
@@ -30,6 +30,7 @@ _HANDLERS: Final[Mapping[type[Any], Handler]] = {
     **operators.HANDLERS,
     **documents.HANDLERS,
     **fleet.HANDLERS,
+    **orders.HANDLERS,
 }
 _OFTEN_QUIET: Final = frozenset(
     {
@@ -134,6 +135,7 @@ class Node(Stages):
             self.rounds.next_deadline(),
             self.votes.next_deadline(),
             self.agreement.next_deadline(),
+            self.expiry.next_deadline(),
             self.tenure.next_deadline(now),
         )
         for executor in self.executors.values():
@@ -175,6 +177,9 @@ class Node(Stages):
         for task, retune in () if self.retuning.is_idle else self.retuning.due(self.values(), now):
             if not self.registers[task].is_busy:
                 self.agreement.propose(task, retune, todo, now)
+        if now >= self.expiry.next_deadline():
+            for task, ending in self.expiry.due(self.values(), now):
+                self.agreement.propose(task, ending, todo, now)
         if now >= self.agreement.next_deadline():
             self.agreement.tick(todo, now)
 

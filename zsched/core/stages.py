@@ -42,6 +42,7 @@ from zsched.core.values.fleet import Fleet, TaskSpec, fleet_hash
 from zsched.core.values.model import Allocation, NodeId, NodeKind, PeerState, Profile, TaskId
 from zsched.core.values.plan import StreamCount
 from zsched.core.vote.agreement import Agreement
+from zsched.core.vote.expiry import Expiry
 from zsched.core.vote.retuning import Retuning
 from zsched.core.vote.votes import Votes
 
@@ -140,6 +141,7 @@ class Stages:
         )
         self.registers = self.agreement.registers
         self.retuning = Retuning(me)
+        self.expiry = Expiry(rank=[node.name for node in fleet.nodes].index(me))
         # EXECUTOR, ROUTE
         self.executors = {
             task.name: Executor(spec=task, me=me, has_streams=self.kind is NodeKind.ROBOT) for task in fleet.tasks

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from zsched.core.executor.handover import Executor, Phase
+from zsched.core.scheduler.judge import by
 from zsched.core.scheduler.rounds import TaskRound
 from zsched.core.scheduler.scoring import joined
 from zsched.core.stages import Stages, Unready
@@ -20,7 +21,9 @@ from zsched.core.values.model import (
     RESTARTING,
     Allocation,
     NodeId,
+    Pause,
     PeerState,
+    Pin,
     TaskId,
     WorkerLoad,
     WorkerState,
@@ -31,6 +34,7 @@ from zsched.core.values.quorum import majority
 from zsched.core.values.snapshot import (
     SCHEMA,
     DecisionStatus,
+    HoldStatus,
     NodeStatus,
     PastAllocation,
     QuorumStatus,
@@ -289,6 +293,9 @@ def _task_status(node: Stages, spec: TaskSpec, now: float) -> TaskStatus:
         decision=_decision(standing, now),
         vote=_vote(node.votes.tasks[spec.name], now),
         problems=tuple(_task_problems(node, spec, value, now)),
+        pause=_hold(node, value, "pause", now),
+        pin=_hold(node, value, "pin", now),
+        file_tuning=spec.tuning,
         streams=tuple(
             _with_rate(_with_keys(_with_age(count, node.dropped, now), routes.get(count.stream)), node, now)
             for count in node.stream_counts
@@ -301,9 +308,27 @@ def _task_status(node: Stages, spec: TaskSpec, now: float) -> TaskStatus:
                 owner=past.value.owner,
                 age_s=now - past.at,
                 reason=past.reason,
+                by="" if past.value.asked is None else past.value.asked.by,
             )
             for past in node.history[spec.name]
         ),
+    )
+
+
+def _hold(node: Stages, value: Allocation, kind: str, now: float) -> HoldStatus | None:
+    """The task's pause or pin; one of an older program has no author."""
+    order: Pause | Pin | None = value.pause if kind == "pause" else value.pin
+    is_held = value.paused if kind == "pause" else value.pinned
+    if not is_held:
+        return None
+    since = node.expiry.since(value.task, kind)
+    return HoldStatus(
+        by="" if order is None else order.asked.by,
+        reason="" if order is None else order.asked.reason,
+        known_s=now - (node.started_at if since is None else since),
+        for_s=None if order is None else order.for_s,
+        node=value.home if kind == "pin" else None,
+        is_hard=value.is_bound and kind == "pin",
     )
 
 
@@ -317,6 +342,11 @@ def _task_problems(node: Stages, task: TaskSpec, value: Allocation, now: float) 
     executor, owner = node.executors[task.name], value.owner
     if differs := node.sealing.problem(task, value):
         yield differs
+    if value.paused:
+        yield (
+            f"paused by {by(value.pause)}: nothing moves it by itself, and a dead owner is not replaced; "
+            f"`zsched resume {task.name}`"
+        )
     if executor.is_local:
         yield f"cut off from {owner}: this robot works alone, degraded"
     is_owner_ready = True

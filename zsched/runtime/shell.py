@@ -45,15 +45,19 @@ from zsched.core.values.messages import (
     CommandResult,
     ExplainTask,
     FleetTold,
+    Hold,
+    HoldTask,
+    MoveTask,
     ReadFleet,
     ReadLines,
     RestartTask,
     RetryTask,
     SetWeights,
+    TuneTask,
     WorkerLines,
     fleet_question,
 )
-from zsched.core.values.model import MAX_REASON, NAME, NodeId, TaskId
+from zsched.core.values.model import MAX_ASKER, MAX_REASON, NAME, Asked, NodeId, TaskId, Tuning
 from zsched.core.values.snapshot import Snapshot
 from zsched.errors import AdapterError, WireError
 from zsched.runtime.crew import Crew
@@ -190,13 +194,58 @@ class Desk:
 
 
 def _weights_of(request: dict[str, Any]) -> SetWeights:
-    base = request.get("base_revision")
-    if base is not None and type(base) is not int:
-        raise ValueError(f"base_revision: expected a whole number, not {base!r:.80}")
+    base = _whole(request, "base_revision")
     cpu, memory, network = (float(request[name]) for name in ("cpu", "memory", "network"))
     if not all(map(math.isfinite, (cpu, memory, network))):
         raise ValueError("expected finite numbers")
     return SetWeights(task=str(request["task"]), cpu=cpu, memory=memory, network=network, base_revision=base)
+
+
+def _asked_of(request: dict[str, Any]) -> Asked:
+    return Asked(by=str(request["by"])[:MAX_ASKER], reason=str(request.get("reason") or ""))
+
+
+def _whole(request: dict[str, Any], name: str) -> int | None:
+    number = request.get(name)
+    if number is not None and type(number) is not int:
+        raise ValueError(f"{name}: expected a whole number, not {number!r:.80}")
+    return number
+
+
+def _move_of(request: dict[str, Any]) -> MoveTask:
+    origin = request.get("origin")
+    return MoveTask(
+        task=str(request["task"]),
+        node=str(request["target"]),
+        asked=_asked_of(request),
+        origin=None if origin is None else str(origin),
+        base_revision=_whole(request, "base_revision"),
+        is_plan=bool(request.get("plan")),
+    )
+
+
+def _hold_of(request: dict[str, Any]) -> HoldTask:
+    for_s = request.get("for_s")
+    return HoldTask(
+        task=str(request["task"]),
+        hold=Hold(str(request["hold"])),
+        asked=_asked_of(request),
+        node=str(request.get("target") or ""),
+        is_hard=bool(request.get("hard")),
+        for_s=None if for_s is None else float(for_s),
+        base_revision=_whole(request, "base_revision"),
+    )
+
+
+def _tune_of(request: dict[str, Any]) -> TuneTask:
+    try:
+        tuning = wire.from_plain(request["tuning"], Tuning)
+    except WireError as error:
+        raise ValueError(f"tuning: {error}") from error
+    base = _whole(request, "base_revision")
+    if base is None:
+        raise KeyError("base_revision")
+    return TuneTask(task=str(request["task"]), tuning=tuning, base_revision=base, asked=_asked_of(request))
 
 
 def _retry_of(request: dict[str, Any]) -> RetryTask:
@@ -245,6 +294,9 @@ def _fleet_of(request: dict[str, Any]) -> ReadFleet:
 
 _COMMANDS: dict[str, Callable[[dict[str, Any]], Command]] = {
     "weights": _weights_of,
+    "move": _move_of,
+    "hold": _hold_of,
+    "tune": _tune_of,
     "retry": _retry_of,
     "explain": _explain_of,
     "restart": _restart_of,

@@ -95,6 +95,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "max_pending": (1, 256),
     "speed": (0.001, 1000.0),
     "deadline_ms": (1.0, 3.6e6),
+    "for_s": (1.0, model.MAX_FOR_S),
 }
 
 

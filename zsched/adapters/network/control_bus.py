@@ -21,13 +21,12 @@ from zsched.core import events as ev
 from zsched.core.events import commanded
 from zsched.core.values.decision import Explanation
 from zsched.core.values.messages import (
+    COMMANDS,
     Accept,
     Accepted,
     AskDocument,
-    ChangeFleet,
     Command,
     CommandResult,
-    ExplainTask,
     FleetAnswer,
     FleetQuestion,
     FleetTold,
@@ -37,9 +36,6 @@ from zsched.core.values.messages import (
     ReadFleet,
     ReadLines,
     Refused,
-    RestartTask,
-    RetryTask,
-    SetWeights,
     Utilities,
     WorkerLines,
 )
@@ -67,7 +63,6 @@ _PUTS: dict[str, type[Beat | Profile | Proposal | Learnt]] = {
     "proposal": Proposal,
     "allocation": Learnt,
 }
-_COMMANDS = (SetWeights, RetryTask, ExplainTask, RestartTask, ReadLines, ChangeFleet, ReadFleet)
 _QUESTIONS = frozenset({"utility", "register", "allocation", "document", "status", "command"})
 
 
@@ -297,7 +292,7 @@ class ControlBus:
         if kind == "status":
             return ev.StatusAsked(request=self._questions.keep(query, keys.status(node, asker)))
         if kind == "command":
-            command: Any = wire.decode(payload, *_COMMANDS)
+            command: Any = wire.decode(payload, *COMMANDS)
             return commanded(self._questions.keep(query, keys.command(node, asker)), command)
         raise WireError("key", "unknown kind")
 

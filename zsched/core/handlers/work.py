@@ -15,7 +15,7 @@ from zsched.core.executor.workers import failed_workers
 from zsched.core.stages import Handler, PastValue, Stages, Unready
 from zsched.core.todo import ToDo
 from zsched.core.values.decision import Move
-from zsched.core.values.model import Allocation, NodeId, PeerState, TaskId, Weights, WorkerState
+from zsched.core.values.model import Allocation, NodeId, PeerState, TaskId, Weights, WorkerState, told_by
 from zsched.core.vote.register import FROM_A_PEER
 
 # --- learnt values ---------------------------------------------------------------------------------------------------
@@ -26,15 +26,18 @@ def carry_out(node: Stages, value: Allocation, reason: str, todo: ToDo, now: flo
     task, executor = value.task, node.executors[value.task]
     is_new_epoch = value.epoch > executor.epoch
     move = _move_of(node, value, reason) if is_new_epoch else None
-    reason = reason if move is None else move.reason
+    reason = _reason_of(value, reason, is_new_epoch=is_new_epoch) if move is None else move.reason
     node.history[task].append(PastValue(value=value, at=now, reason=reason))
     if is_new_epoch:
         left = executor.owner
         failed, drained = _has_failed(node, task, left, now), node.was_draining(left, now)
-        node.rounds.on_moved(task, left, has_failed=failed, was_draining=drained, now=now)
+        is_ordered = value.asked is not None
+        node.rounds.on_moved(task, left, has_failed=failed, was_draining=drained, is_ordered=is_ordered, now=now)
+    node.expiry.note(value, now)
     node.votes.on_learnt(task)
     node.rounds.on_learnt(task, is_new_epoch=is_new_epoch, now=now)
     text = f"learnt revision {value.revision}: owner {value.owner}, weights {_told(value.tuning.weights)}"
+    text += "" if value.asked is None else f", {reason}"
     todo.add(do.RecordStory(stage="vote", text=text, task=task, epoch=value.epoch, move=move))
     executor.execute(value, todo, now)
     node.tenure.hold(value, node.beat_sequence + 1)
@@ -57,9 +60,23 @@ def _move_of(node: Stages, value: Allocation, reason: str) -> Move:
         revision=value.revision,
         left=node.executors[value.task].owner,
         owner=value.owner,
-        reason=wanted[0] if wanted and reason == FROM_A_PEER else reason,
+        reason=wanted[0] if wanted and reason == FROM_A_PEER else _reason_of(value, reason, is_new_epoch=True),
         votes=tuple((proposal.voter, proposal.candidate) for proposal in votes),
     )
+
+
+def _reason_of(value: Allocation, reason: str, *, is_new_epoch: bool) -> str:
+    """Why the value is what it is; a node that did not commit an operator's order tells it from the value."""
+    if value.asked is None or reason != FROM_A_PEER:
+        return reason
+    who = told_by(value.asked)
+    if is_new_epoch:
+        return f"moved by {who}"
+    if value.pause is not None and value.pause.revision == value.revision:
+        return f"paused by {who}"
+    if value.pin is not None and value.pin.revision == value.revision:
+        return f"pinned to {value.pin.node} by {who}"
+    return f"changed by {who}"
 
 
 def _has_failed(node: Stages, task: TaskId, owner: NodeId | None, now: float) -> bool:

@@ -50,12 +50,21 @@ class Damping:
         points = tuple((node, points, at) for node, (points, at) in sorted(self._points.items()))
         return DampingMemory(points=points, moves=tuple(self._moves))
 
-    def note_move(self, left: NodeId | None, *, has_failed: bool, was_draining: bool = False, now: float) -> None:
+    def note_move(
+        self,
+        left: NodeId | None,
+        *,
+        has_failed: bool,
+        was_draining: bool = False,
+        is_ordered: bool = False,
+        now: float,
+    ) -> None:
         """An epoch was learnt: ``left`` is the owner before (``None``: the first placement, which is no move).
 
         A node that drained was told to: that says nothing against it, however soon, and though it is gone by now.
+        An operator's move counts neither against the node that was left nor in the cap.
         """
-        if left is not None:
+        if left is not None and not is_ordered:
             if has_failed and not was_draining:
                 gained = 2.0 + float(now - self._owner_since < PROBATION_S)
                 self._points[left] = (self.points(left, now) + gained, now)

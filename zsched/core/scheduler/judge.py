@@ -1,7 +1,7 @@
 """SCHEDULER, second half: from a standing to a proposal, with stickiness.
 
-Knows: bonus, patience, cool-down, escapes. Does not know: how utilities were computed or travel, who else
-proposes what, how anything is committed.
+Knows: bonus, patience, cool-down, escapes, an operator's pause and pin. Does not know: how utilities were computed or
+travel, who else proposes what, how anything is committed.
 
 `Judge` keeps the little memory that stickiness needs, per task, and turns a `Standing` into a `Judgement`: a candidate
 to propose, or the owner, always with the reason.
@@ -22,11 +22,14 @@ from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.model import (
     Allocation,
     NodeId,
+    Pause,
     PeerState,
+    Pin,
     Profile,
     Renewal,
     ScoreForm,
     WorkerState,
+    told_by,
     told_of_worker,
 )
 
@@ -74,6 +77,9 @@ class Judge:
     seen_first_at: float | None = None
     """When a first candidate could be scored (a task that nobody owns waits for the others)."""
 
+    fit_since: float | None = None
+    """Since when the node could have the task to which it is pinned, and which has not got it."""
+
     out: AbstractSet[NodeId] = frozenset()
     """The candidates that a first placement does not wait for: they cannot have the task."""
 
@@ -84,7 +90,7 @@ class Judge:
 
     def reset(self, *, is_new_owner: bool = False) -> None:
         """A vote was lost or the value changed: what staying has cost counts from nothing again."""
-        self.unscored_since, self.spent = None, 0.0
+        self.unscored_since, self.spent, self.fit_since = None, 0.0, None
         if is_new_owner:
             self.not_ready_since = None
 
@@ -97,6 +103,7 @@ class Judge:
             spent=self.spent,
             spent_at=self.spent_at,
             seen_first_at=self.seen_first_at,
+            fit_since=self.fit_since,
             players=players,
             watched_at=watched_at,
         )
@@ -105,6 +112,7 @@ class Judge:
         """Remember that, and nothing else."""
         self.unscored_since, self.not_ready_since = memory.unscored_since, memory.not_ready_since
         self.spent, self.spent_at, self.seen_first_at = memory.spent, memory.spent_at, memory.seen_first_at
+        self.fit_since = memory.fit_since
         self.learnt = LearntPatience()
         self.learnt.recall(memory.players, memory.watched_at)
 
@@ -142,10 +150,16 @@ class Judge:
             for name, value in standing.aggregates.items()
             if escape is None or name != owner
         }
-        winner = pick(scored, owner)
+        home = allocation.home
+        if allocation.is_bound:
+            scored = {name: value for name, value in scored.items() if name in (home, owner)}
+        self._watch_home(home in scored and home != owner, now)
+        winner = home if home is not None and home in scored else pick(scored, owner)
         if winner is None:
             self.unscored_since = None
-            return Judgement(outcome=Outcome.NONE, candidate=owner, aggregate=0.0, reason="no candidate can have it")
+            why = f"{home} cannot have it, and it is pinned there (hard)" if allocation.is_bound else ""
+            reason = why or "no candidate can have it"
+            return Judgement(outcome=Outcome.NONE, candidate=owner, aggregate=0.0, reason=reason)
         self._spend(scored, owner, now)
         outcome, reason = self._outcome(winner, scored, allocation, settled_for_s, escape, is_called, now)
         cap = None if damping is None or owner is None else self._cap(damping, is_escape=escape is not None, now=now)
@@ -160,6 +174,13 @@ class Judge:
             is_escape=escape is not None and outcome is Outcome.PROPOSE,
             aggregates=scored,
         )
+
+    def _watch_home(self, is_fit: bool, now: float) -> None:
+        """Note since when the node could have the task to which it is pinned."""
+        if not is_fit:
+            self.fit_since = None
+        elif self.fit_since is None:
+            self.fit_since = now
 
     def _spend(self, scored: Mapping[NodeId, float], owner: NodeId | None, now: float) -> None:
         """Add up the lead over the owner with its bonus, over time (`zsched.core.scheduler.patience.spend`)."""
@@ -189,12 +210,16 @@ class Judge:
         now: float,
     ) -> tuple[Outcome, str]:
         owner, tuning = allocation.owner, allocation.tuning
-        if allocation.paused or allocation.pinned:
-            return Outcome.STAY, "paused by the operator" if allocation.paused else "pinned by the operator"
+        if allocation.paused:
+            return Outcome.STAY, f"paused by {by(allocation.pause)}"
         if owner is None:
+            if winner == allocation.home:
+                return Outcome.PROPOSE, f"first placement: pinned to {winner} by {by(allocation.pin)}"
             return self._initial(winner, scored, is_called=is_called, now=now)
         if escape is not None:
             return Outcome.PROPOSE, escape
+        if allocation.home is not None:
+            return self._pinned(winner, allocation, settled_for_s, is_called, now)
         if winner == owner:
             return Outcome.STAY, "nobody better"
         lead = scored[winner] - scored.get(owner, 0.0)
@@ -212,6 +237,22 @@ class Judge:
             return Outcome.WAIT, f"{why}; staying has cost {self.spent:.3f} of {self.patience:g}"
         return Outcome.PROPOSE, f"{why}; staying has cost {self.patience:g}"
 
+    def _pinned(
+        self, winner: NodeId, allocation: Allocation, settled_for_s: float, is_called: bool, now: float
+    ) -> tuple[Outcome, str]:
+        """No voluntary moves; but the task goes to the node it is pinned to, once that is fit for the cool-down."""
+        home, owner = allocation.home, allocation.owner
+        told = f"pinned to {home} by {by(allocation.pin)}"
+        if home == owner:
+            return Outcome.STAY, told
+        if winner != home:
+            return Outcome.STAY, f"{told}, which cannot have it now"
+        if is_called:
+            return Outcome.PROPOSE, told
+        fit_s = min(0.0 if self.fit_since is None else now - self.fit_since, settled_for_s)
+        told = f"{told}, fit for {fit_s:.1f} of {allocation.tuning.cool_down_s:g} s"
+        return (Outcome.PROPOSE if fit_s >= allocation.tuning.cool_down_s else Outcome.WAIT), told
+
     def _initial(
         self, winner: NodeId, scored: Mapping[NodeId, float], *, is_called: bool, now: float
     ) -> tuple[Outcome, str]:
@@ -222,6 +263,11 @@ class Judge:
         if missing and waited < INITIAL_SETTLE_S and not is_called:  # who calls has waited for all of us
             return Outcome.WAIT, f"first placement waits for {', '.join(missing)}"
         return Outcome.PROPOSE, f"first placement: {winner} has the highest utility"
+
+
+def by(order: Pause | Pin | None) -> str:
+    """Who has given an order, with the reason."""
+    return "the operator" if order is None else told_by(order.asked)
 
 
 def escape_reason(
@@ -284,7 +330,7 @@ def escape_ahead(
 
     With ``has_other`` (somebody else can have the task) it says when the owner will be left.
     """
-    is_held = allocation.paused or allocation.pinned
+    is_held = allocation.paused or allocation.is_bound
     if profile is None or is_held or not _is_told(spec, profile):
         return ""
     load = profile.worker(spec.name)

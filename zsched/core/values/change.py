@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Protocol, TypeVar
 
-from zsched.core.values.model import Allocation, NodeId, TaskId, Tuning
+from zsched.core.values.model import Allocation, Asked, NodeId, Pause, Pin, TaskId, Tuning, told_by
 
 _Value = TypeVar("_Value")
 
@@ -37,12 +37,17 @@ class MoveOwner:
     base_revision: int
     owner: NodeId
     reason: str
+    asked: Asked | None = None
+    """The operator who ordered it; ``None``: the robots have voted for it."""
+    request: int | None = None
+    """The operator's open question about this change."""
 
     def apply(self, read: Allocation) -> Allocation:
         """The new value, with another owner, epoch and revision; for the present owner the value as read."""
         if self.owner == read.owner:
             return read
-        return replace(read, revision=read.revision + 1, epoch=read.epoch + 1, owner=self.owner)
+        revision, epoch = read.revision + 1, read.epoch + 1
+        return replace(read, revision=revision, epoch=epoch, owner=self.owner, asked=self.asked)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,17 +58,49 @@ class Retune:
     tuning: Tuning
     request: int | None = None
     """The operator's open question about this change."""
+    asked: Asked | None = None
 
     @property
     def reason(self) -> str:
         """Why the value is what it is, once this is committed."""
+        if self.asked is not None:
+            return f"retuned by {told_by(self.asked)}"
         return "its tuning in the fleet file has changed" if self.request is None else "retuned by an operator"
 
     def apply(self, read: Allocation) -> Allocation:
         """The new value, with another tuning and revision; for the present tuning the value as read."""
         if self.tuning == read.tuning:
             return read
-        return replace(read, revision=read.revision + 1, tuning=self.tuning)
+        return replace(read, revision=read.revision + 1, tuning=self.tuning, asked=self.asked)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetHold:
+    """Change: both of an operator's lasting orders about the task, its pause and its pin; ``None`` ends one."""
+
+    base_revision: int
+    pause: Pause | None
+    pin: Pin | None
+    reason: str
+    asked: Asked | None = None
+    """``None``: an order's time was over."""
+    request: int | None = None
+    """The operator's open question about this change."""
+
+    def apply(self, read: Allocation) -> Allocation:
+        """The new value, with other orders and revision; owner and epoch stay. For the present orders as read."""
+        pinned, paused = self.pin is not None, self.pause is not None
+        if (self.pin, self.pause, pinned, paused) == (read.pin, read.pause, read.pinned, read.paused):
+            return read
+        return replace(
+            read,
+            revision=read.revision + 1,
+            pin=self.pin,
+            pause=self.pause,
+            pinned=pinned,
+            paused=paused,
+            asked=self.asked,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,10 +117,12 @@ class SetLeased:
 
     def apply(self, read: Allocation) -> Allocation:
         """The new value; touches this field and the revision only."""
-        return read if read.leased is self.leased else replace(read, revision=read.revision + 1, leased=self.leased)
+        if read.leased is self.leased:
+            return read
+        return replace(read, revision=read.revision + 1, leased=self.leased, asked=None)
 
 
-Change = MoveOwner | Retune | SetLeased
+Change = MoveOwner | Retune | SetHold | SetLeased
 
 
 class RoundOutcome(StrEnum):

@@ -49,6 +49,7 @@ class JudgeMemory:
     spent: float = 0.0
     spent_at: float | None = None
     seen_first_at: float | None = None
+    fit_since: float | None = None
     players: tuple[PlayerMemory, ...] = ()
     watched_at: float | None = None
 

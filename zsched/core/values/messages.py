@@ -7,20 +7,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Generic
+from typing import Generic, get_args
 
 from zsched.core.values.document import Document
 from zsched.core.values.electorate import FleetValue, check_id
 from zsched.core.values.model import (
+    MAX_FOR_S,
     Acceptance,
     Allocation,
+    Asked,
     Ballot,
     NodeId,
     TaskId,
+    Tuning,
     UtilityVector,
     V,
     check_counter,
     check_name,
+    check_range,
 )
 
 
@@ -335,7 +339,80 @@ class ReadFleet:
     """Tell the document itself, too: it may be large."""
 
 
-Command = SetWeights | RetryTask | ExplainTask | RestartTask | ReadLines | ChangeFleet | ReadFleet
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MoveTask:
+    """Operator command: hand a task over to a candidate, through the register."""
+
+    task: TaskId
+    node: NodeId
+    asked: Asked
+    origin: NodeId | None = None
+    """Only while this node is the owner."""
+    base_revision: int | None = None
+    is_plan: bool = False
+    """Only say whether it could be done."""
+
+    def __post_init__(self) -> None:
+        check_name("move.task", self.task)
+        check_name("move.node", self.node)
+
+
+class Hold(StrEnum):
+    """An operator's lasting order about a task, or the end of one."""
+
+    PAUSE = "pause"
+    RESUME = "resume"
+    PIN = "pin"
+    UNPIN = "unpin"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HoldTask:
+    """Operator command: give a lasting order about a task, or end it, through the register."""
+
+    task: TaskId
+    hold: Hold
+    asked: Asked
+    node: NodeId = ""
+    """Where a task is pinned; empty: to its owner."""
+    is_hard: bool = False
+    for_s: float | None = None
+    base_revision: int | None = None
+
+    def __post_init__(self) -> None:
+        check_name("hold.task", self.task)
+        if self.node:
+            check_name("hold.node", self.node)
+        check_range("hold.for_s", self.for_s, 1.0, MAX_FOR_S)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TuneTask:
+    """Operator command: another tuning of a task, made of that of ``base_revision``, through the register."""
+
+    task: TaskId
+    tuning: Tuning
+    base_revision: int
+    asked: Asked
+
+    def __post_init__(self) -> None:
+        check_name("tune.task", self.task)
+        check_counter("tune.base_revision", self.base_revision)
+
+
+Command = (
+    SetWeights
+    | RetryTask
+    | ExplainTask
+    | RestartTask
+    | ReadLines
+    | MoveTask
+    | HoldTask
+    | TuneTask
+    | ChangeFleet
+    | ReadFleet
+)
+COMMANDS: tuple[type, ...] = get_args(Command)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -32,6 +32,10 @@ MAX_JOBS_HZ, MAX_JOB_S = 1e6, 1e6
 """Bounds that no machine or link exceeds: a larger figure is a fault of its sender."""
 MAX_REASON = 400
 """Characters of a worker's reason: it travels with every profile."""
+MAX_ASKER, MAX_ASKED = 96, 200
+"""Characters of an operator's name and reason: they travel with every ballot of a task."""
+MAX_FOR_S = 366 * 86400.0
+"""An operator's order lasts at most so long, or until it is taken back."""
 
 
 def as_reason(text: str, longest: int = MAX_REASON) -> str:
@@ -133,6 +137,64 @@ class Tuning:
         check_range("deadline_ms", self.deadline_ms, MIN_DEADLINE_MS, MAX_DEADLINE_MS)
         check_range("bonus", self.bonus, 0.0, 1.0)
         check_range("cool_down_s", self.cool_down_s, 0.0, 86400.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Asked:
+    """Who ordered a change, and why; ``by`` is user@node as that node told it, for people."""
+
+    by: str
+    reason: str = ""
+
+    def __post_init__(self) -> None:
+        _check_text("asked.by", self.by, MAX_ASKER)
+        _check_text("asked.reason", self.reason, MAX_ASKED)
+
+
+def told_by(asked: Asked) -> str:
+    """Who has ordered something, with the reason.
+
+    >>> told_by(Asked(by="ada@robot1", reason="new battery"))
+    'ada@robot1 (new battery)'
+    """
+    return f"{asked.by} ({asked.reason})" if asked.reason else asked.by
+
+
+def _check_text(field: str, text: str, longest: int) -> None:
+    if len(text) > longest:
+        raise ValueError(f"{field}: {len(text)} characters, at most {longest}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pause:
+    """An operator's order: nothing moves the task but a `move`, and a dead owner is not replaced."""
+
+    asked: Asked
+    revision: int
+    """Of the allocation that brought it: nodes count its age from when they learnt that."""
+    for_s: float | None = None
+    """Seconds until it ends by itself; ``None``: never."""
+
+    def __post_init__(self) -> None:
+        check_counter("pause.revision", self.revision)
+        check_range("pause.for_s", self.for_s, 1.0, MAX_FOR_S)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pin:
+    """An operator's order: the task belongs on ``node`` and moves for an escape only, or (hard) for nothing."""
+
+    node: NodeId
+    asked: Asked
+    revision: int
+    is_hard: bool = False
+    """No other node ever gets the task."""
+    for_s: float | None = None
+
+    def __post_init__(self) -> None:
+        check_name("pin.node", self.node)
+        check_counter("pin.revision", self.revision)
+        check_range("pin.for_s", self.for_s, 1.0, MAX_FOR_S)
 
 
 # --- PROFILE ---------------------------------------------------------------------------------------------------------
@@ -482,9 +544,27 @@ class Allocation:
     owner: NodeId | None
     tuning: Tuning
     pinned: bool = False
+    """Whether `pin` is in force: so much of it an older program knows, and moves nothing then."""
     paused: bool = False
+    """Whether `pause` is, likewise; without that its author is not known."""
     leased: bool = False
     """The task is exclusive for every node, whatever its file says: none works without a lease."""
+    pin: Pin | None = None
+    pause: Pause | None = None
+    asked: Asked | None = None
+    """Who ordered the change that led to this revision; ``None``: the fleet's own decision."""
+
+    @property
+    def home(self) -> NodeId | None:
+        """The node to which the task is pinned; ``None``: to none."""
+        if not self.pinned:
+            return None
+        return self.owner if self.pin is None else self.pin.node
+
+    @property
+    def is_bound(self) -> bool:
+        """Whether no other node than `home` may get the task."""
+        return self.pinned and self.pin is not None and self.pin.is_hard
 
     def __post_init__(self) -> None:
         check_name("allocation.task", self.task)

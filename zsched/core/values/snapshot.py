@@ -73,6 +73,23 @@ class VoteStatus:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class HoldStatus:
+    """An operator's pause or pin of a task, as the answering node knows it."""
+
+    by: str
+    """user@node."""
+    reason: str
+    known_s: float
+    """Seconds since the answering node learnt it, or since it started."""
+    for_s: float | None = None
+    """How long it lasts; ``None``: until it is taken back."""
+    node: NodeId | None = None
+    """A pin: where the task belongs."""
+    is_hard: bool = False
+    """A pin: no other node gets the task."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PastAllocation:
     """One allocation that this node has learnt since it started."""
 
@@ -81,6 +98,8 @@ class PastAllocation:
     owner: NodeId | None
     age_s: float
     reason: str
+    by: str = ""
+    """The operator who ordered it, user@node; empty: the fleet decided it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,6 +126,11 @@ class TaskStatus:
     """Utility seconds that staying may cost."""
     round_trips: tuple[tuple[NodeId, float], ...] = ()
     """(node, seconds from the answering node to it and back), of a task with a deadline."""
+    pause: HoldStatus | None = None
+    """Nothing moves the task but an operator's move; ``None``: it is not paused."""
+    pin: HoldStatus | None = None
+    file_tuning: Tuning | None = None
+    """The tuning that the answering node's fleet file gives it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

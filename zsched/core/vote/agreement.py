@@ -20,7 +20,7 @@ from zsched.core.electorate.helm import Helm, voters
 from zsched.core.electorate.numbers import Numbers
 from zsched.core.electorate.orders import Orders
 from zsched.core.todo import ToDo
-from zsched.core.values.change import Change, Ended, MoveOwner, Retune, RoundOutcome
+from zsched.core.values.change import Change, Ended, MoveOwner, Retune, RoundOutcome, SetLeased
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import CREATION_STEP, Elector, FleetValue
 from zsched.core.values.fleet import Fleet, TaskSpec
@@ -64,10 +64,10 @@ PREPARE_BURST = 40.0
 PARK_SHARE = 0.8
 """An accept that a lease forbids waits for this part of a ballot's deadline for the release; then it is refused."""
 
-_RETUNED = {
+_ENDED = {
     RoundOutcome.COMMITTED: (CommandOutcome.OK, "committed by a majority of the electors"),
     RoundOutcome.CONFLICT: (CommandOutcome.CONFLICT, "another change came first; look and try again"),
-    RoundOutcome.UNCHANGED: (CommandOutcome.UNCHANGED, "these are the weights in force"),
+    RoundOutcome.UNCHANGED: (CommandOutcome.UNCHANGED, "it is so already"),
     RoundOutcome.NO_QUORUM: (CommandOutcome.NO_QUORUM, "no majority of the electors answered"),
     RoundOutcome.UNKNOWN: (CommandOutcome.UNKNOWN, "the electors fell silent; `zsched status` tells"),
 }
@@ -776,7 +776,7 @@ class Agreement:
             detail = f"revision is {value.revision}, not {command.base_revision}"
             _refuse(request, CommandOutcome.CONFLICT, detail, todo)
         elif weights == value.tuning.weights:
-            _refuse(request, CommandOutcome.UNCHANGED, _RETUNED[RoundOutcome.UNCHANGED][1], todo)
+            _refuse(request, CommandOutcome.UNCHANGED, _ENDED[RoundOutcome.UNCHANGED][1], todo)
         else:
             tuning = replace(value.tuning, weights=weights)
             change = Retune(base_revision=value.revision, tuning=tuning, request=request)
@@ -813,8 +813,8 @@ class Agreement:
         if isinstance(change, MoveOwner):
             text = f"move to {change.owner} on revision {change.base_revision}: {outcome}"
             todo.add(do.RecordStory(stage="vote", text=text, task=task, epoch=value.epoch))
-        elif isinstance(change, Retune) and change.request is not None:
-            kind, detail = _RETUNED[outcome]
+        if not isinstance(change, SetLeased) and change.request is not None:
+            kind, detail = _ENDED[outcome]
             result = CommandResult(outcome=kind, detail=f"{task}: {detail}", revision=value.revision)
             todo.add(do.AnswerCommand(request=change.request, result=result))
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from zsched.core.instructions import SendAccept, SendPrepare
 from zsched.core.todo import ToDo
-from zsched.core.values.change import MoveOwner, Retune, Rewrite, RoundOutcome, SetLeased
+from zsched.core.values.change import MoveOwner, Retune, Rewrite, RoundOutcome, SetHold, SetLeased
 from zsched.core.values.messages import Accept, Prepare
 from zsched.core.values.model import Allocation
 from zsched.core.vote.register import Register
@@ -43,5 +43,5 @@ class TaskRegister(Register[Allocation]):
         todo.learnt.append((value, why))
 
     def _end(self, change: Rewrite[Allocation], outcome: RoundOutcome, todo: ToDo) -> None:
-        assert isinstance(change, MoveOwner | Retune | SetLeased)
+        assert isinstance(change, MoveOwner | Retune | SetHold | SetLeased)
         todo.end(self.state.task, change, outcome)

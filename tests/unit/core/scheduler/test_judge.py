@@ -24,7 +24,10 @@ from zsched.core.scheduler.scoring import Standing, compare
 from zsched.core.values.fleet import TaskSpec, WorkerSpec
 from zsched.core.values.model import (
     Allocation,
+    Asked,
+    Pause,
     PeerState,
+    Pin,
     Profile,
     WorkerState,
 )
@@ -271,15 +274,99 @@ def test_first_placement_waits_a_little_for_those_that_are_still_starting() -> N
 # --- the operator --------------------------------------------------------------------------------------------------
 
 
+ADA = Asked(by="ada@robot1", reason="new battery")
+PAUSE = Pause(asked=ADA, revision=5)
+
+
+def pinned_to(node: str, *, owner: str | None = "edge1", is_hard: bool = False, is_paused: bool = False) -> Allocation:
+    pin = Pin(node=node, asked=ADA, revision=5, is_hard=is_hard)
+    pause = PAUSE if is_paused else None
+    return allocation_of(5, owner, tuning=TUNING, pinned=True, pin=pin, paused=is_paused, pause=pause)
+
+
 @pytest.mark.parametrize("escape", [None, "edge1 is gone"])
 @pytest.mark.parametrize("called", [True, False])
-@pytest.mark.parametrize("word", ["paused", "pinned"])
-def test_paused_or_pinned_tasks_stay_whatever_happens(word: str, escape: str | None, *, called: bool) -> None:
-    agreed = allocation(paused=word == "paused", pinned=word == "pinned")
+def test_a_paused_task_stays_whatever_happens(escape: str | None, *, called: bool) -> None:
+    agreed = replace(allocation(paused=True), pause=PAUSE)
     judgement = judged(Judge(spec=SPEC), BETTER, 0.0, escape=escape, called=called, agreed=agreed)
 
     assert (judgement.outcome, judgement.candidate, judgement.is_escape) == (Outcome.STAY, "edge1", False)
-    assert judgement.reason == f"{word} by the operator"
+    assert judgement.reason == "paused by ada@robot1 (new battery)"
+    held = judged(Judge(spec=SPEC), BETTER, 0.0, escape=escape, agreed=pinned_to("edge2", is_paused=True))
+    assert held.outcome is Outcome.STAY, "a pause comes before a pin"
+
+
+def test_a_paused_task_without_an_owner_gets_none() -> None:
+    judgement = judged(Judge(spec=SPEC), BETTER, 0.0, called=True, agreed=allocation(None, paused=True))
+    assert (judgement.outcome, judgement.candidate) == (Outcome.STAY, None)
+
+
+@pytest.mark.parametrize("called", [True, False])
+@pytest.mark.parametrize("agreed", [pinned_to("edge1"), allocation(pinned=True)])
+def test_a_pinned_task_does_not_move_of_its_own_will_but_it_escapes(agreed: Allocation, *, called: bool) -> None:
+    judge = Judge(spec=SPEC)
+    stays = [judged(judge, BETTER, float(second), called=called, agreed=agreed) for second in range(60)]
+    assert {(judgement.outcome, judgement.candidate) for judgement in stays} == {(Outcome.STAY, "edge1")}
+    assert stays[0].reason.startswith("pinned to edge1 by ")
+    flees = judged(judge, BETTER, 60.0, escape="edge1 is gone", called=called, agreed=agreed)
+    assert (flees.outcome, flees.candidate, flees.is_escape) == (Outcome.PROPOSE, "edge2", True)
+
+
+def test_the_pinned_node_gets_the_task_back_once_it_is_fit_for_the_cool_down() -> None:
+    judge, agreed = Judge(spec=SPEC), pinned_to("edge2")
+    away = judged(judge, {"edge1": 0.5, "edge3": 0.9}, 0.0, agreed=agreed)
+    assert (away.outcome, away.reason) == (
+        Outcome.STAY,
+        "pinned to edge2 by ada@robot1 (new battery), which cannot have it now",
+    )
+    worse = {"edge1": 0.9, "edge2": 0.1, "edge3": 1.0}
+    cool_down_s = TUNING.cool_down_s
+    assert judged(judge, worse, 10.0, agreed=agreed).outcome is Outcome.WAIT
+    waiting = judged(judge, worse, 10.0 + cool_down_s - 0.1, agreed=agreed)
+    assert (waiting.outcome, waiting.candidate) == (Outcome.WAIT, "edge1")
+    assert judged(judge, {"edge1": 0.5}, 10.0 + cool_down_s, agreed=agreed).outcome is Outcome.STAY, "not fit"
+    assert judged(judge, worse, 11.0 + cool_down_s, agreed=agreed).outcome is Outcome.WAIT, "counted anew"
+    back = judged(judge, worse, 11.0 + 2 * cool_down_s, agreed=agreed)
+    assert (back.outcome, back.candidate, back.is_escape) == (Outcome.PROPOSE, "edge2", False)
+    too_soon = judged(judge, worse, 11.0 + 2 * cool_down_s, settled=cool_down_s - 1.0, agreed=agreed)
+    assert too_soon.outcome is Outcome.WAIT, "it has just been moved"
+    again = Judge(spec=SPEC)
+    again.recall(judge.memory())
+    assert judged(again, worse, 11.0 + 2 * cool_down_s, agreed=agreed) == back
+
+
+def test_a_vote_that_is_called_sends_a_pinned_task_home_and_nowhere_else() -> None:
+    assert judged(Judge(spec=SPEC), BETTER, 0.0, called=True, agreed=pinned_to("edge2")).candidate == "edge2"
+    away = judged(Judge(spec=SPEC), BETTER, 0.0, called=True, agreed=pinned_to("edge3"))
+    assert (away.outcome, away.candidate) == (Outcome.STAY, "edge1")
+
+
+def test_an_escape_prefers_the_node_that_the_task_is_pinned_to() -> None:
+    three = {"edge1": 0.5, "edge2": 0.1, "edge3": 0.9}
+    home = judged(Judge(spec=SPEC), three, 0.0, escape="edge1 is gone", agreed=pinned_to("edge2"))
+    assert (home.outcome, home.candidate, home.is_escape) == (Outcome.PROPOSE, "edge2", True)
+
+
+@pytest.mark.parametrize("escape", [None, "edge1 is gone"])
+@pytest.mark.parametrize("owner", ["edge1", "edge3", None])
+@pytest.mark.parametrize("called", [True, False])
+def test_a_hard_pin_never_brings_another_owner(owner: str | None, escape: str | None, *, called: bool) -> None:
+    escape = escape if owner == "edge1" else None
+    for home, fit in (("edge1", {"edge2": 0.9, "edge3": 0.5}), ("edge2", {"edge1": 0.5, "edge3": 0.5})):
+        judge, agreed = Judge(spec=SPEC), pinned_to(home, owner=owner, is_hard=True)
+        for second in range(60):
+            judgement = judged(judge, fit, float(second), escape=escape, called=called, agreed=agreed)
+            assert judgement.candidate in (home, owner), judgement
+    nobody = judged(Judge(spec=SPEC), {"edge3": 0.5}, 0.0, agreed=pinned_to("edge2", owner=None, is_hard=True))
+    assert nobody.reason == "edge2 cannot have it, and it is pinned there (hard)"
+
+
+def test_a_pinned_task_without_an_owner_goes_to_its_node_at_once() -> None:
+    fit = {"edge1": 0.1, "edge2": 0.9}
+    home = judged(Judge(spec=SPEC), fit, 0.0, agreed=pinned_to("edge1", owner=None))
+    assert (home.outcome, home.candidate) == (Outcome.PROPOSE, "edge1")
+    other = judged(Judge(spec=SPEC), {"edge2": 0.9}, 0.0, agreed=pinned_to("edge1", owner=None))
+    assert (other.outcome, other.candidate) == (Outcome.WAIT, None)
 
 
 # --- escape_reason -------------------------------------------------------------------------------------------------
@@ -327,7 +414,7 @@ def test_an_owner_that_is_not_ready_is_only_said_to_be_left_when_somebody_else_c
     assert stays == "the worker on edge1 is starting; nobody else can have the task"
 
 
-@pytest.mark.parametrize("held", [allocation(paused=True), allocation(pinned=True)])
+@pytest.mark.parametrize("held", [allocation(paused=True), pinned_to("edge1", is_hard=True)])
 def test_an_owner_that_is_held_is_not_said_to_be_left(held: Allocation) -> None:
     starting = profile(state=WorkerState.STARTING)
     assert not escape_ahead(SPEC, held, starting, 0.0, has_other=True)

@@ -588,8 +588,12 @@ def test_while_an_owner_s_worker_is_not_ready_the_decision_says_when_it_will_be_
     assert said == f"nobody better; edge1 will be left in {left_s:.0f} s, for its worker is starting: no token yet"
     robot.value = replace(robot.value, pinned=True)
     robot.round()
-    assert robot.task.judgement.reason == "pinned by the operator", "it will not be left"
-    robot.value = replace(robot.value, pinned=False)
+    told = robot.task.judgement.reason
+    assert told.startswith("pinned to edge1 by the operator; edge1 will be left in "), "a pin does not keep it there"
+    robot.value = replace(robot.value, pinned=False, paused=True)
+    robot.round()
+    assert robot.task.judgement.reason == "paused by the operator", "it will not be left"
+    robot.value = replace(robot.value, paused=False)
     robot.profiles({})
     robot.round()
     assert robot.task.judgement.reason == "nobody better"

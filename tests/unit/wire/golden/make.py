@@ -24,6 +24,7 @@ _TUNING = model.Tuning(weights=_WEIGHTS, bonus=0.125, cool_down_s=7.0, aggregate
 _VALUE = model.Allocation(
     task="map_merge", revision=7, epoch=4, owner="edge1", tuning=_TUNING, pinned=True, paused=True
 )
+_ASKED = model.Asked(by="ada@robot1", reason="new battery")
 _BALLOT = model.Ballot(counter=12, node="robot1", incarnation=3)
 _ACCEPTANCE = model.Acceptance(ballot=_BALLOT, value=_VALUE)
 _WORKER = model.WorkerLoad(task="map_merge", state=model.WorkerState.READY, cpu_cores=0.5, memory_mb=200.0)
@@ -188,6 +189,19 @@ SAMPLES: dict[str, object] = {
     ),
     "learnt": messages.Learnt(node="robot2", values=(_VALUE,)),
     "set_weights": messages.SetWeights(task="map_merge", cpu=0.5, memory=0.25, network=0.25, base_revision=7),
+    "move_task": messages.MoveTask(
+        task="map_merge", node="edge1", asked=_ASKED, origin="edge2", base_revision=7, is_plan=True
+    ),
+    "hold_task": messages.HoldTask(
+        task="map_merge",
+        hold=messages.Hold.PIN,
+        asked=_ASKED,
+        node="edge1",
+        is_hard=True,
+        for_s=7200.0,
+        base_revision=7,
+    ),
+    "tune_task": messages.TuneTask(task="map_merge", tuning=_TUNING, base_revision=7, asked=_ASKED),
     "retry_task": messages.RetryTask(task="map_merge", node="edge1"),
     "explain_task": messages.ExplainTask(task="map_merge"),
     "explanation": decision.Explanation(

@@ -1,0 +1,236 @@
+"""Operators' orders at the door of one node that is its fleet's only elector: what is agreed, and what is refused."""
+
+from __future__ import annotations
+
+from collections import deque
+from random import Random
+
+import pytest
+
+from support.ballots import ballot_of
+from support.beats import beat_of
+from support.fleets import fleet_of, tuning_of
+from support.profiles import load_of, profile_of
+from support.states import state_of
+from zsched.core import events as ev
+from zsched.core import instructions as do
+from zsched.core.node import Node
+from zsched.core.status import build_snapshot
+from zsched.core.values.fleet import TaskSpec, WorkerSpec, electorate_hash
+from zsched.core.values.messages import CommandOutcome, CommandResult, Hold, HoldTask, Learnt, MoveTask, TuneTask
+from zsched.core.values.model import Acceptance, Allocation, Asked, DeviceSample, RegisterState, WorkerState
+
+ADA = Asked(by="ada@robot1", reason="new battery")
+EDGES = ("edge1", "edge2", "edge3")
+TUNING = tuning_of()
+FLEET = fleet_of(
+    TaskSpec(name="merge", candidates=EDGES, tuning=TUNING, worker=WorkerSpec(command=("merge",))),
+    of=(*EDGES, "robot1"),
+    electors=("robot1",),
+)
+SAMPLE = DeviceSample(cpu_cores=4.0, cpu_used_cores=1.0, memory_mb=4000.0, memory_used_mb=1000.0)
+
+
+class Lone:
+    """A node whose questions to the electors come back to itself at once."""
+
+    def __init__(self, owner: str | None = "edge1", **holds: object) -> None:
+        self.now = 100.0
+        learnt = Allocation(task="merge", revision=5, epoch=3, owner=owner, tuning=TUNING, **holds)  # type: ignore[arg-type]
+        electorate = electorate_hash(FLEET)
+        held = Acceptance(ballot=ballot_of(1), value=learnt)
+        register = RegisterState(task="merge", promised=held.ballot, accepted=held, learnt=learnt)
+        self.node = Node(
+            fleet=FLEET,
+            me="robot1",
+            durable=state_of("robot1", register, electorate=electorate),
+            incarnation=7,
+            electorate=electorate,
+            rng=Random(1),
+            now=self.now,
+        )
+        self.done: list[do.Instruction] = []
+        self._carry(self.node.start(self.now))
+        for name in EDGES:
+            self.hear(name)
+            # who starts asks all others what they remember of it
+            self.tell(ev.LearntReceived(learnt=Learnt(node=name, values=()), is_answer=True))
+        self.tell(ev.ProfileSampled(device=SAMPLE))
+        self.wait(1.0)
+
+    def hear(
+        self, name: str, *, state: WorkerState = WorkerState.READY, draining: bool = False, number: int = 1
+    ) -> None:
+        self.tell(ev.BeatReceived(beat=beat_of(name, incarnation=3, sequence=number)))
+        profile = profile_of(name, incarnation=3, sequence=number, workers=(load_of(state=state),), draining=draining)
+        self.tell(ev.ProfileReceived(profile=profile))
+
+    def tell(self, event: ev.Event) -> None:
+        self._carry(self.node.handle(event, self.now))
+
+    def wait(self, seconds: float) -> None:
+        until = self.now + seconds
+        while (due := self.node.next_deadline()) <= until:
+            self.now = max(due, self.now)
+            self.tell(ev.DeadlineReached())
+        self.now = until
+
+    def _carry(self, batch: tuple[do.Instruction, ...]) -> None:
+        waiting = deque(batch)
+        while waiting:
+            one = waiting.popleft()
+            self.done.append(one)
+            event: ev.Event
+            if isinstance(one, do.SendPrepare):
+                event = ev.PrepareAsked(request=1, asker="robot1", prepare=one.prepare)
+            elif isinstance(one, do.SendAccept):
+                event = ev.AcceptAsked(request=1, asker="robot1", accept=one.accept)
+            elif isinstance(one, do.AnswerElection):
+                event = ev.ElectorAnswered(answer=one.answer)
+            else:
+                continue
+            waiting.extend(self.node.handle(event, self.now))
+
+    def ask(self, event: ev.Event) -> CommandResult:
+        self.tell(event)
+        answers = [one.result for one in self.done if isinstance(one, do.AnswerCommand) and one.request == 42]
+        self.done.clear()
+        assert len(answers) == 1
+        return answers[0]
+
+    def move(
+        self, node: str, *, origin: str | None = None, base: int | None = None, plan: bool = False
+    ) -> CommandResult:
+        command = MoveTask(task="merge", node=node, asked=ADA, origin=origin, base_revision=base, is_plan=plan)
+        return self.ask(ev.MoveCommanded(request=42, command=command))
+
+    def hold(self, hold: Hold, node: str = "", *, hard: bool = False, for_s: float | None = None) -> CommandResult:
+        command = HoldTask(task="merge", hold=hold, asked=ADA, node=node, is_hard=hard, for_s=for_s)
+        return self.ask(ev.HoldCommanded(request=42, command=command))
+
+    @property
+    def value(self) -> Allocation:
+        return self.node.registers["merge"].value
+
+
+def test_a_move_is_agreed_without_a_vote_and_says_who_ordered_it() -> None:
+    lone = Lone()
+    result = lone.move("edge2", origin="edge1", base=lone.value.revision)
+    assert (result.outcome, result.revision) == (CommandOutcome.OK, 6)
+    assert (lone.value.owner, lone.value.epoch, lone.value.asked, lone.value.pinned) == ("edge2", 4, ADA, False)
+    past = build_snapshot(lone.node, lone.now).tasks[0].history[-1]
+    assert (past.owner, past.reason, past.by) == ("edge2", "moved by ada@robot1 (new battery)", "ada@robot1")
+    assert lone.node.rounds.tasks["merge"].damping.memory().moves == (), "damping does not count it"
+
+
+def test_a_plan_moves_nothing() -> None:
+    lone = Lone()
+    assert lone.move("edge2", plan=True).outcome is CommandOutcome.OK
+    assert lone.move("edge1", plan=True).outcome is CommandOutcome.UNCHANGED
+    assert lone.value.revision == 5
+
+
+@pytest.mark.parametrize(
+    ("target", "outcome", "says"),
+    [
+        ("edge1", CommandOutcome.UNCHANGED, "so already"),
+        ("robot1", CommandOutcome.INVALID, "no candidate; there are edge1, edge2, edge3"),
+        ("edge9", CommandOutcome.INVALID, "no candidate"),
+    ],
+)
+def test_a_move_to_no_candidate_or_to_the_owner_is_not_made(target: str, outcome: CommandOutcome, says: str) -> None:
+    lone = Lone()
+    result = lone.move(target)
+    assert (result.outcome, lone.value.revision) == (outcome, 5)
+    assert says in result.detail
+
+
+@pytest.mark.parametrize(
+    ("state", "is_draining", "says"),
+    [
+        (WorkerState.FAILED, False, "edge2 cannot have it: worker failed"),
+        (WorkerState.STARTING, False, "edge2 cannot have it: worker starting"),
+        (WorkerState.READY, True, "edge2 cannot have it: draining"),
+    ],
+)
+def test_a_move_to_a_node_that_cannot_have_the_task_is_refused_with_the_reason(
+    state: WorkerState, says: str, *, is_draining: bool
+) -> None:
+    lone = Lone()
+    lone.hear("edge2", state=state, draining=is_draining, number=2)
+    result = lone.move("edge2")
+    assert (result.outcome, result.detail, lone.value.revision) == (CommandOutcome.INVALID, says, 5)
+
+
+def test_a_move_to_a_node_that_is_gone_is_refused() -> None:
+    lone = Lone()
+    for number in range(2, 12):
+        for name in ("edge1", "edge3"):
+            lone.hear(name, number=number)
+        lone.wait(0.5)
+    assert lone.move("edge2").detail == "edge2 cannot have it: it is gone"
+
+
+def test_an_order_for_another_revision_or_owner_is_a_conflict() -> None:
+    lone = Lone()
+    assert lone.move("edge2", base=4).outcome is CommandOutcome.CONFLICT
+    assert lone.move("edge2", origin="edge3").detail == "its owner is edge1, not edge3"
+
+
+def test_a_paused_task_still_moves_by_order_and_is_loud_in_the_status() -> None:
+    lone = Lone()
+    assert lone.hold(Hold.PAUSE, for_s=7200.0).outcome is CommandOutcome.OK
+    lone.wait(1.0)
+    task = build_snapshot(lone.node, lone.now).tasks[0]
+    assert task.pause is not None
+    assert (task.pause.by, task.pause.reason, task.pause.for_s, task.pause.known_s) == (
+        "ada@robot1",
+        "new battery",
+        7200.0,
+        1.0,
+    )
+    (problem,) = [problem for problem in task.problems if "paused" in problem]
+    assert problem.startswith("paused by ada@robot1 (new battery): nothing moves it by itself, and a dead owner")
+    lone.hear("edge2", number=2)
+    assert lone.move("edge2").outcome is CommandOutcome.OK
+    assert (lone.value.owner, lone.value.paused) == ("edge2", True)
+    assert lone.hold(Hold.RESUME).outcome is CommandOutcome.OK
+    assert (lone.value.paused, lone.value.pause) == (False, None)
+    assert lone.hold(Hold.RESUME).outcome is CommandOutcome.UNCHANGED
+
+
+def test_a_pause_ends_by_itself_when_its_time_is_over() -> None:
+    lone = Lone()
+    lone.hold(Hold.PAUSE, for_s=60.0)
+    lone.wait(59.0)
+    assert lone.value.paused
+    lone.wait(10.0)
+    assert not lone.value.paused
+    assert lone.node.history["merge"][-1].reason == "the time of its pause is over"
+
+
+def test_a_pin_is_to_the_owner_or_to_a_candidate_and_a_move_elsewhere_is_refused() -> None:
+    lone = Lone()
+    assert lone.hold(Hold.PIN).outcome is CommandOutcome.OK
+    assert lone.value.home == "edge1"
+    assert "unpin merge" in lone.move("edge2").detail
+    assert lone.hold(Hold.PIN, "edge3", hard=True).outcome is CommandOutcome.OK
+    assert (lone.value.home, lone.value.is_bound, lone.value.owner) == ("edge3", True, "edge1")
+    assert lone.move("edge3").outcome is CommandOutcome.OK, "to its place it may be moved"
+    assert lone.hold(Hold.PIN, "robot1").outcome is CommandOutcome.INVALID
+    assert lone.hold(Hold.UNPIN).outcome is CommandOutcome.OK
+    assert lone.value.home is None
+    assert lone.hold(Hold.UNPIN).outcome is CommandOutcome.UNCHANGED
+    assert Lone(owner=None, paused=True).hold(Hold.PIN).detail == "it has no owner: name the node to pin it to"
+
+
+def test_a_tuning_is_agreed_for_the_revision_that_it_was_made_of() -> None:
+    lone, wanted = Lone(), tuning_of(bonus=0.3)
+    command = TuneTask(task="merge", tuning=wanted, base_revision=5, asked=ADA)
+    assert lone.ask(ev.TuneCommanded(request=42, command=command)).outcome is CommandOutcome.OK
+    assert (lone.value.tuning, lone.value.epoch) == (wanted, 3)
+    assert lone.ask(ev.TuneCommanded(request=42, command=command)).outcome is CommandOutcome.CONFLICT
+    again = TuneTask(task="merge", tuning=wanted, base_revision=6, asked=ADA)
+    assert lone.ask(ev.TuneCommanded(request=42, command=again)).outcome is CommandOutcome.UNCHANGED
+    unknown = TuneTask(task="mergee", tuning=wanted, base_revision=6, asked=ADA)
+    assert lone.ask(ev.TuneCommanded(request=42, command=unknown)).outcome is CommandOutcome.INVALID
