@@ -32,6 +32,7 @@ from zsched.commands.fleet_verbs import (
     node_app,
     task_app,
 )
+from zsched.commands.order_verbs import add_order_verbs
 from zsched.commands.program import Program
 from zsched.commands.stream_verbs import stream_app
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE
@@ -441,6 +442,9 @@ def weights(
         raise CliError(EXIT_USAGE, "--connect only asks: change weights on a machine of the fleet")
     wanted = parse_weights(pairs)
     raise typer.Exit(change_weights(find_door(runtime_dir, node), task, wanted, revision, is_json=json_))
+
+
+add_order_verbs(app)
 
 
 @app.command(cls=Verb)

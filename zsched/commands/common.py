@@ -23,6 +23,8 @@ Json = dict[str, Any]
 NAMED_OTHERWISE: Final = {
     "events": "event",
     **dict.fromkeys(("task.add", "task.remove", "node.add", "node.remove", "node.forget"), "apply"),
+    "tune": "tuning",
+    **dict.fromkeys(("pin", "unpin", "pause", "resume"), "task"),
 }
 SCHEMAS: Final = Path(__file__).parents[1] / "schemas"
 """A JSON Schema per kind of output and major version."""

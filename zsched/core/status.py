@@ -296,6 +296,7 @@ def _task_status(node: Stages, spec: TaskSpec, now: float) -> TaskStatus:
         pause=_hold(node, value, "pause", now),
         pin=_hold(node, value, "pin", now),
         file_tuning=spec.tuning,
+        switched_s=executor.switched_s,
         streams=tuple(
             _with_rate(_with_keys(_with_age(count, node.dropped, now), routes.get(count.stream)), node, now)
             for count in node.stream_counts

@@ -104,6 +104,8 @@ class Executor:
     """The predecessors, the oldest first."""
     _role_deadline: float = math.inf
     started_at: float = 0.0
+    switched_s: float | None = None
+    """How long the newest move took here, from learning of it to the flip; ``None``: not flipped yet."""
 
     def __post_init__(self) -> None:
         self.role = Role(task=self.spec.name, role=WorkerRole.IDLE)
@@ -219,6 +221,7 @@ class Executor:
         self._end_local(todo)  # the local slot closes before a committed owner's opens
         before = None if self._is_owner_gone else self.owner
         self.epoch, self.owner, self.started_at, self._is_owner_gone = allocation.epoch, allocation.owner, now, False
+        self.switched_s = None
         self._change_role(allocation, before, todo, now)
         self._prepare(allocation.owner, todo)
 
@@ -370,7 +373,7 @@ class Executor:
         """The relay switched every stream to the slot of ``epoch``."""
         if epoch != self.epoch or self.phase is not Phase.FLIPPING:
             return
-        took_s = now - self.started_at
+        took_s = self.switched_s = now - self.started_at
         done = f"flipped to {self.owner} in {took_s * 1000:.0f} ms, {replayed} kept values replayed"
         if not self._old:
             self._go(Phase.SETTLED, RoutePhase.CLOSE, done, todo, took_s)

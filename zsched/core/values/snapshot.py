@@ -131,6 +131,8 @@ class TaskStatus:
     pin: HoldStatus | None = None
     file_tuning: Tuning | None = None
     """The tuning that the answering node's fleet file gives it."""
+    switched_s: float | None = None
+    """How long this robot's streams took to switch to the owner; ``None``: they have not yet, or it is an edge."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,0 +1,240 @@
+"""The verbs for orders: what is shown before they act, who is asked, what a daemon is told, exit codes and JSON."""
+
+from __future__ import annotations
+
+import copy
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from support.schemas import faults
+from zsched.adapters.host.operator_socket import Json, OperatorSocket
+from zsched.cli import app
+from zsched.commands.common import CliError
+from zsched.commands.orders import KEYS, tuned, user_name
+
+STATUS = json.loads((Path(__file__).parent / "recorded_status" / "healthy.json").read_text())
+TUNING: Json = {
+    "weights": {"cpu": 0.5, "memory": 0.5, "network": 0.0},
+    "bonus": 0.1,
+    "cool_down_s": 10.0,
+    "aggregate": "mean",
+    "score": "service",
+    "deadline_ms": None,
+}
+
+
+def task(name: str, owner: str) -> Json:
+    found = copy.deepcopy(STATUS["tasks"][0])
+    more = {"name": name, "owner": owner, "owner_state": "alive", "revision": 7, "phase": "settled", "streams": []}
+    return {**found, **more, "tuning": TUNING, "file_tuning": TUNING, "pause": None, "pin": None, "switched_s": 0.086}
+
+
+def node(name: str, kind: str) -> Json:
+    worker = {"task": "echo", "state": "ready"}
+    return {"name": name, "kind": kind, "state": "alive", "draining": False, "workers": [worker]}
+
+
+class Daemon:
+    """Answers as a daemon whose register takes every order."""
+
+    def __init__(self, folder: Path) -> None:
+        nodes = [node("edge1", "edge"), node("edge2", "edge"), node("robot1", "robot")]
+        self.status: Json = {**STATUS, "fleet": "lab", "node": "robot1", "nodes": nodes}
+        self.status["tasks"] = [task("echo", "edge1"), task("merge", "edge2")]
+        self.orders: list[Json] = []
+        self.outcome = "ok"
+        self.socket = OperatorSocket(folder / "robot1.sock", self.answer)
+
+    def answer(self, request: Json) -> Json:
+        if request["verb"] == "status":
+            return copy.deepcopy(self.status)
+        one = next(one for one in self.status["tasks"] if one["name"] == request["task"])
+        outcome = self.outcome
+        if not request.get("plan"):
+            self.orders.append(request)
+            if outcome == "ok":
+                self._take(one, request)
+        elif request["target"] == one["owner"]:
+            outcome = "unchanged"
+        return {"outcome": outcome, "detail": f"{one['name']}: as told", "revision": one["revision"]}
+
+    def _take(self, one: Json, request: Json) -> None:
+        one["revision"] += 1
+        if request["verb"] == "move":
+            one["owner"] = request["target"]
+            one["epoch"] += 1
+        elif request["verb"] == "hold":
+            kind = "pause" if request["hold"] in ("pause", "resume") else "pin"
+            held = {"by": request["by"], "reason": request["reason"], "known_s": 3.0, "for_s": request["for_s"]}
+            held |= {"node": request["target"] or one["owner"], "is_hard": request["hard"]}
+            one[kind] = held if request["hold"] == kind else None
+
+
+@pytest.fixture
+def daemon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Daemon]:
+    monkeypatch.setenv("ZSCHED_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.delenv("ZSCHED_NODE", raising=False)
+    running = Daemon(tmp_path)
+    running.socket.open()
+    yield running
+    running.socket.close()
+
+
+def run(*words: str) -> Result:
+    return CliRunner().invoke(app, list(words))
+
+
+@pytest.mark.parametrize(
+    "words", [("pause", "echo"), ("pin", "echo"), ("move", "echo", "edge2"), ("tune", "echo", "bonus=0.3")]
+)
+def test_off_a_terminal_an_order_is_shown_and_not_given(daemon: Daemon, words: tuple[str, ...]) -> None:
+    result = run(*words)
+    assert (result.exit_code, daemon.orders) == (2, [])
+    assert result.stdout.splitlines()[0].split() == ["TASK", "WHAT", "NOW", "AFTER"]
+    assert "nobody can be asked here; to do it: zsched " in result.stderr
+    assert result.stderr.rstrip().endswith("--yes")
+
+
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        (("pause", "echo"), 10),
+        (("resume", "echo"), 0),
+        (("pin", "echo", "edge2", "--hard"), 10),
+        (("unpin", "echo"), 0),
+        (("move", "echo", "edge2"), 10),
+        (("move", "echo", "edge1"), 0),
+        (("tune", "echo", "bonus=0.3"), 10),
+        (("tune", "echo", "bonus=0.1"), 0),
+    ],
+)
+def test_a_plan_exits_with_10_when_something_would_change_and_gives_no_order(
+    daemon: Daemon, words: tuple[str, ...], code: int
+) -> None:
+    assert (run(*words, "--plan").exit_code, daemon.orders) == (code, [])
+    planned = run(*words, "--plan", "--json")
+    assert (planned.exit_code, faults(json.loads(planned.stdout)), daemon.orders) == (code, [], [])
+
+
+def test_a_pause_carries_who_why_and_how_long_and_is_listed(daemon: Daemon) -> None:
+    result = run("pause", "echo", "-m", "new lens", "--for", "2h", "--yes")
+    assert result.exit_code == 0, result.output
+    (order,) = daemon.orders
+    assert (order["hold"], order["reason"], order["for_s"], order["base_revision"]) == ("pause", "new lens", 7200.0, 7)
+    assert re.fullmatch(r"[^@]+@robot1", order["by"])
+    listed = run("pause")
+    assert listed.stdout == f"echo: paused, for 2h00m, {order['by']}: new lens, known for 3.0s\n"
+    assert run("pin").stdout == "no task is pinned\n"
+    body = json.loads(run("pause", "--json").stdout)
+    assert (faults(body), [one["task"] for one in body["tasks"]]) == ([], ["echo"])
+    maint = run("maint").stdout.splitlines()
+    assert maint[1].split()[:2] == ["echo", "pause"]
+    assert faults(json.loads(run("maint", "--json").stdout)) == []
+
+
+def test_all_pauses_every_task_and_resume_ends_it(daemon: Daemon) -> None:
+    assert run("pause", "--all", "--yes").exit_code == 0
+    assert [order["task"] for order in daemon.orders] == ["echo", "merge"]
+    body = json.loads(run("resume", "--all", "--yes", "--json").stdout)
+    assert (faults(body), [one["pause"] for one in body["tasks"]]) == ([], [None, None])
+    assert run("resume").exit_code == 2
+
+
+def test_a_pin_names_its_node_and_says_when_it_is_hard(daemon: Daemon) -> None:
+    assert run("pin", "echo", "edge2", "--hard", "--yes").exit_code == 0
+    assert (daemon.orders[0]["target"], daemon.orders[0]["hard"]) == ("edge2", True)
+    assert run("pin").stdout.startswith("echo: edge2 (hard), ")
+    assert run("pin", "echo", "egde2").exit_code == 2
+
+
+def test_a_move_waits_until_the_streams_have_settled_and_tells_what_was_measured(daemon: Daemon) -> None:
+    result = run("move", "echo", "edge2", "--from", "edge1", "-m", "lens", "--yes")
+    assert result.exit_code == 0, result.output
+    lines = result.stdout.splitlines()
+    assert lines[2] == "It is agreed. Ctrl-C ends the watching, not the move."
+    assert lines[3] == "echo: settled on edge2, streams switched in 86 ms, lost 0, doubled 0"
+    assert (daemon.orders[0]["origin"], daemon.orders[0]["target"]) == ("edge1", "edge2")
+    body = json.loads(run("move", "echo", "edge1", "--yes", "--json").stdout)
+    assert (faults(body), body["settled"], body["lost"], body["from"]) == ([], True, 0, "edge2")
+    body = json.loads(run("move", "echo", "edge2", "--yes", "--json", "--detach").stdout)
+    assert (faults(body), body["settled"], body["lost"]) == ([], False, None)
+
+
+def test_a_move_that_does_not_settle_in_time_exits_with_5(daemon: Daemon) -> None:
+    daemon.status["tasks"][0]["phase"] = "preparing"
+    result = run("move", "echo", "edge2", "--timeout", "0", "--yes")
+    assert (result.exit_code, len(daemon.orders)) == (5, 1)
+    assert "not settled after" in result.stdout
+
+
+@pytest.mark.parametrize(("outcome", "code"), [("conflict", 1), ("no_quorum", 4), ("invalid", 1), ("unknown", 5)])
+def test_an_order_that_is_not_agreed_says_so(daemon: Daemon, outcome: str, code: int) -> None:
+    daemon.outcome = outcome
+    for words in (("pause", "echo"), ("move", "echo", "edge2"), ("tune", "echo", "bonus=0.3")):
+        result = run(*words, "--yes")
+        assert (result.exit_code, outcome.replace("_", " ") in result.stderr) == (code, True), result.output
+
+
+def test_a_tuning_is_shown_changed_and_set_back_to_the_file(daemon: Daemon) -> None:
+    assert run("tune", "echo", "bonus=0.3", "cool_down_s=5", "--yes").exit_code == 0
+    told = daemon.orders[0]["tuning"]
+    assert (told["bonus"], told["cool_down_s"], told["weights"]["cpu"]) == (0.3, 5.0, 0.5)
+    daemon.status["tasks"][0]["tuning"] = {**TUNING, "bonus": 0.3}
+    assert "bonus=0.3 (file: 0.1)" in run("tune", "echo").stdout
+    body = json.loads(run("tune", "--json").stdout)
+    assert (faults(body), len(body["tasks"])) == ([], 2)
+    body = json.loads(run("tune", "echo", "bonus=null", "--yes", "--json").stdout)
+    assert (faults(body), body["tasks"][0]["tuning"]["bonus"]) == ([], 0.1)
+
+
+@pytest.mark.parametrize(
+    ("pair", "says"),
+    [
+        ("bonus", "is no setting"),
+        ("bonnus=1", "did you mean bonus?"),
+        ("bonus=much", "not a number"),
+        ("bonus=2", "bonus: 2.0 is not in [0, 1]"),
+        ("score=best", "one of paper, service"),
+        ("cpu=0.9", "the sum is 1.4, not 1"),
+        ("deadline_ms=0", "deadline_ms: 0.0"),
+    ],
+)
+def test_a_setting_that_cannot_be_is_refused_before_anybody_is_asked(daemon: Daemon, pair: str, says: str) -> None:
+    result = run("tune", "echo", pair, "--yes")
+    assert (result.exit_code, daemon.orders) == (2, [])
+    assert says in result.stderr, result.stderr
+
+
+def test_every_setting_can_be_set_back() -> None:
+    other = {**TUNING, "weights": {"cpu": 1.0, "memory": 0.0, "network": 0.0}, "bonus": 0.9, "score": "paper"}
+    assert tuned(other, TUNING, [f"{key}=null" for key in KEYS]) == TUNING
+    with pytest.raises(CliError, match="given twice"):
+        tuned(other, TUNING, ["bonus=1", "bonus=0"])
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("pause", "ecko", "--yes"),
+        ("pause", "echo", "--all", "--yes"),
+        ("pause", "echo", "--for", "soon", "--yes"),
+        ("pause", "echo", "--for", "0.5s", "--yes"),
+        ("pause", "echo", "-m", "x" * 201, "--yes"),
+        ("pause", "--all", "--revision", "7", "--yes"),
+        ("move", "echo", "edge9", "--yes"),
+    ],
+)
+def test_what_cannot_be_meant_is_a_usage_error(daemon: Daemon, words: tuple[str, ...]) -> None:
+    assert (run(*words).exit_code, daemon.orders) == (2, [])
+
+
+def test_who_gives_an_order_under_sudo_is_the_one_who_called_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.getuid", lambda: 0)
+    assert user_name({"SUDO_USER": "ada"}) == "ada"
+    monkeypatch.setattr("os.getuid", lambda: 4_000_000)
+    assert user_name({"SUDO_USER": "ada"}) == "4000000"

@@ -1,0 +1,224 @@
+"""The verbs by which an operator gives orders: arguments in, exit code out.
+
+Knows: options. Does not know: how anything is done (`zsched.commands.orders`, imported by the verb that runs).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from zsched.commands.common import CliError, Verb
+from zsched.exits import EXIT_USAGE
+
+if TYPE_CHECKING:
+    from zsched.commands.orders import OrderView
+
+TaskArgument = Annotated[str, typer.Argument(metavar="TASK", help="A task of the fleet file.")]
+TasksArgument = Annotated[list[str] | None, typer.Argument(metavar="[TASK]...", help="Tasks of the fleet file.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="JSON, with its schema; --json=1: of that version.")]
+AskedOption = Annotated[
+    str | None, typer.Option("--node", "-n", metavar="NAME", help="Ask this node, here or anywhere in the fleet.")
+]
+RuntimeOption = Annotated[
+    Path | None,
+    typer.Option("--runtime-dir", metavar="DIR", help="Operator sockets. [ZSCHED_RUNTIME_DIR, else /run/zsched]"),
+]
+ReasonOption = Annotated[
+    str, typer.Option("--reason", "-m", metavar="TEXT", help="Why; status and history of every node show it.")
+]
+YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask; needed where there is no terminal.")]
+PlanOption = Annotated[bool, typer.Option("--plan", help="Only show it: exit 10 when something would change, else 0.")]
+RevisionOption = Annotated[
+    int | None, typer.Option("--revision", min=0, metavar="N", help="Only if this is still the task's revision.")
+]
+ForOption = Annotated[
+    str | None, typer.Option("--for", metavar="DURATION", help="End it by itself: 90s, 10m, 2h, 1d. [until taken back]")
+]
+AllOption = Annotated[bool, typer.Option("--all", help="Every task.")]
+
+
+def add_order_verbs(app: typer.Typer) -> None:
+    """Add the verbs to the program."""
+    verbs: tuple[Callable[..., None], ...] = (move, pin, unpin, pause, resume, tune, maint)
+    for verb in verbs:
+        app.command(cls=Verb)(verb)
+
+
+def move(
+    task: TaskArgument,
+    to: Annotated[str, typer.Argument(metavar="NODE", help="A candidate of the task.")],
+    origin: Annotated[str | None, typer.Option("--from", metavar="NODE", help="Only if this is the owner.")] = None,
+    detach: Annotated[bool, typer.Option("--detach", help="Do not wait until the streams have settled.")] = False,
+    timeout: Annotated[float, typer.Option(min=0.0, max=3600.0, metavar="S", help="Seconds to wait.")] = 30.0,
+    reason: ReasonOption = "",
+    revision: RevisionOption = None,
+    plan: PlanOption = False,
+    yes: YesOption = False,
+    json_: JsonOption = False,
+    node: AskedOption = None,
+    runtime_dir: RuntimeOption = None,
+) -> None:
+    """Hand a task over to a node, and wait until its streams have settled there.
+
+    It does not pin: the fleet may move the task again when it has reason to. Exits with 5 when it has not settled in
+    time; it goes on all the same.
+    """
+    from zsched.commands.orders import MoveOrder  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.orders import move as give  # noqa: PLC0415 - as above
+
+    view = _view(node, runtime_dir, reason, revision, None, json_=json_, yes=yes, plan=plan)
+    order = MoveOrder(task=task, node=to, origin=origin, is_detached=detach, timeout_s=timeout)
+    raise typer.Exit(give(view, order))
+
+
+def pin(
+    task: Annotated[str | None, typer.Argument(metavar="[TASK]", help="A task; without it: list the pins.")] = None,
+    to: Annotated[str | None, typer.Argument(metavar="[NODE]", help="Where it belongs. [its owner]")] = None,
+    hard: Annotated[bool, typer.Option("--hard", help="No other node ever gets it, though this one be dead.")] = False,
+    for_: ForOption = None,
+    reason: ReasonOption = "",
+    revision: RevisionOption = None,
+    plan: PlanOption = False,
+    yes: YesOption = False,
+    json_: JsonOption = False,
+    node: AskedOption = None,
+    runtime_dir: RuntimeOption = None,
+) -> None:
+    """Keep a task on a node: it moves for an escape only, and comes back when that node is fit again.
+
+    Without a task it lists the pins.
+    """
+    view = _view(node, runtime_dir, reason, revision, for_, json_=json_, yes=yes, plan=plan)
+    _hold(view, "pin", [task] if task else [], to, is_hard=hard)
+
+
+def unpin(
+    task: TaskArgument,
+    reason: ReasonOption = "",
+    revision: RevisionOption = None,
+    plan: PlanOption = False,
+    yes: YesOption = False,
+    json_: JsonOption = False,
+    node: AskedOption = None,
+    runtime_dir: RuntimeOption = None,
+) -> None:
+    """End a task's pin: the fleet places it again."""
+    _hold(_view(node, runtime_dir, reason, revision, None, json_=json_, yes=yes, plan=plan), "unpin", [task])
+
+
+def pause(
+    tasks: TasksArgument = None,
+    all_: AllOption = False,
+    for_: ForOption = None,
+    reason: ReasonOption = "",
+    revision: RevisionOption = None,
+    plan: PlanOption = False,
+    yes: YesOption = False,
+    json_: JsonOption = False,
+    node: AskedOption = None,
+    runtime_dir: RuntimeOption = None,
+) -> None:
+    """Let nothing move tasks but `zsched move`: a dead owner is not replaced.
+
+    Without a task it lists the pauses.
+    """
+    view = _view(node, runtime_dir, reason, revision, for_, json_=json_, yes=yes, plan=plan)
+    _hold(view, "pause", tasks or [], is_all=all_)
+
+
+def resume(
+    tasks: TasksArgument = None,
+    all_: AllOption = False,
+    reason: ReasonOption = "",
+    revision: RevisionOption = None,
+    plan: PlanOption = False,
+    yes: YesOption = False,
+    json_: JsonOption = False,
+    node: AskedOption = None,
+    runtime_dir: RuntimeOption = None,
+) -> None:
+    """End the pause of tasks."""
+    view = _view(node, runtime_dir, reason, revision, None, json_=json_, yes=yes, plan=plan)
+    _hold(view, "resume", tasks or [], is_all=all_)
+
+
+def tune(
+    task: Annotated[str | None, typer.Argument(metavar="[TASK]", help="A task; without it: show all.")] = None,
+    pairs: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[KEY=VALUE]...",
+            help="cpu, memory, network (weights), bonus, cool_down_s, deadline_ms, aggregate, score; null: the file's.",
+        ),
+    ] = None,
+    reason: ReasonOption = "",
+    revision: RevisionOption = None,
+    plan: PlanOption = False,
+    yes: YesOption = False,
+    json_: JsonOption = False,
+    node: AskedOption = None,
+    runtime_dir: RuntimeOption = None,
+) -> None:
+    """Show a task's tuning, or change it on the whole running fleet.
+
+    A change is agreed like an allocation: it holds for every robot, or for none (exit 4 without a quorum).
+    """
+    from zsched.commands.orders import tune as give  # noqa: PLC0415 - each verb imports what it needs
+
+    view = _view(node, runtime_dir, reason, revision, None, json_=json_, yes=yes, plan=plan)
+    raise typer.Exit(give(view, task, pairs or []))
+
+
+def maint(json_: JsonOption = False, node: AskedOption = None, runtime_dir: RuntimeOption = None) -> None:
+    """List every order in force: pauses and pins, with who gave them and why, and the nodes that stop."""
+    from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.orders import maint as show  # noqa: PLC0415 - as above
+
+    raise typer.Exit(show(find_door(runtime_dir, node), is_json=json_))
+
+
+def _view(
+    node: str | None,
+    runtime_dir: Path | None,
+    reason: str,
+    revision: int | None,
+    for_: str | None,
+    *,
+    json_: bool,
+    yes: bool,
+    plan: bool,
+) -> OrderView:
+    from zsched.commands.ask import find_door  # noqa: PLC0415 - as above
+    from zsched.commands.history import duration_s  # noqa: PLC0415 - as above
+    from zsched.commands.orders import OrderView  # noqa: PLC0415 - as above
+
+    for_s = None if for_ is None else duration_s(for_)
+    return OrderView(
+        door=find_door(runtime_dir, node),
+        is_json=json_,
+        is_yes=yes,
+        is_plan=plan,
+        reason=reason,
+        revision=revision,
+        for_s=for_s,
+    )
+
+
+def _hold(
+    view: OrderView,
+    verb: str,
+    tasks: list[str],
+    node: str | None = None,
+    *,
+    is_hard: bool = False,
+    is_all: bool = False,
+) -> None:
+    from zsched.commands.orders import HoldOrder, hold  # noqa: PLC0415 - as above
+
+    if tasks and is_all:
+        raise CliError(EXIT_USAGE, "--all goes without tasks")
+    raise typer.Exit(hold(view, HoldOrder(hold=verb, node=node, is_hard=is_hard), tasks, is_all=is_all))

@@ -1,0 +1,590 @@
+"""`zsched move`, `pin`, `pause`, `tune` and `maint`: shows what an order changes, asks, gives it, and says what came.
+
+Knows: how an order is shown before and after, who gives it, outcomes as exit codes. Does not know: how a change is
+agreed, what a task does by it.
+"""
+
+from __future__ import annotations
+
+import os
+import pwd
+import shlex
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from zsched.clock import monotonic_s
+from zsched.commands.ask import Door, ask_door
+from zsched.commands.common import CliError, Json, nearest, print_json
+from zsched.commands.page import harmless, span
+from zsched.commands.report import millis
+from zsched.commands.wait import Condition, missing
+from zsched.core.values.model import MAX_ASKED, MAX_FOR_S, Aggregate, ScoreForm, Tuning, Weights
+from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE, EXIT_WOULD_CHANGE
+
+MOVE_SCHEMA: Final = "zsched.move/1"
+TASK_SCHEMA: Final = "zsched.task/1"
+TUNING_SCHEMA: Final = "zsched.tuning/1"
+MAINT_SCHEMA: Final = "zsched.maint/1"
+PAUSE_S: Final = 0.2
+"""Between two looks at a move."""
+CODES: Final = {
+    "ok": EXIT_OK,
+    "unchanged": EXIT_OK,
+    "conflict": EXIT_FAILED,
+    "no_quorum": EXIT_DEGRADED,
+    "invalid": EXIT_FAILED,
+    "unknown": EXIT_TIMED_OUT,
+}
+ADVICE: Final = {
+    "conflict": "; look at `zsched status`, then try again",
+    "no_quorum": "; nothing was changed, and `zsched status` shows which electors are away",
+    "unknown": "; it may or may not have been agreed: `zsched status` shows which",
+}
+NOTHING: Final = "-"
+Row = tuple[str, str, str, str]
+"""(task, what, before, after)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OrderView:
+    """Whom to ask, and what the operator has said beside the order itself."""
+
+    door: Door
+    is_json: bool = False
+    is_yes: bool = False
+    is_plan: bool = False
+    reason: str = ""
+    revision: int | None = None
+    for_s: float | None = None
+
+    @property
+    def asked(self) -> Json:
+        """Who gives the order, as a request carries it."""
+        return {"by": f"{user_name()}@{self.door.socket.stem}", "reason": self.reason}
+
+
+def user_name(env: Mapping[str, str] = os.environ) -> str:
+    """Who runs this program; under sudo the one who called it.
+
+    >>> user_name({"SUDO_USER": "ada"}) if os.getuid() == 0 else "ada"
+    'ada'
+    """
+    uid = os.getuid()
+    if uid == 0 and env.get("SUDO_USER"):
+        return env["SUDO_USER"]
+    try:
+        return pwd.getpwuid(uid).pw_name
+    except KeyError:
+        return str(uid)
+
+
+def check_said(view: OrderView) -> None:
+    """Refuse a reason or a duration that no order can carry.
+
+    Raises:
+        CliError: one is too long.
+    """
+    if len(view.reason) > MAX_ASKED:
+        raise CliError(EXIT_USAGE, f"--reason: {len(view.reason)} characters, at most {MAX_ASKED}")
+    if view.for_s is not None and not 1.0 <= view.for_s <= MAX_FOR_S:
+        raise CliError(EXIT_USAGE, f"--for: {span(view.for_s)} is not from 1s to 366d")
+
+
+# --- pause, resume, pin, unpin ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HoldOrder:
+    """A pause or a pin, or the end of one: ``hold`` is the verb."""
+
+    hold: str
+    node: str | None = None
+    is_hard: bool = False
+
+
+def hold(view: OrderView, order: HoldOrder, names: Sequence[str], *, is_all: bool) -> int:
+    """Give a lasting order about tasks, or list those that are in force; returns the exit code.
+
+    Raises:
+        CliError: nobody answers, there is no such task, it was not agreed to, or an order was not agreed.
+    """
+    check_said(view)
+    status = _status(view.door)
+    known = {str(task["name"]): task for task in status["tasks"]}
+    chosen = list(known) if is_all else list(dict.fromkeys(names))
+    for name in chosen:
+        _check_name(status, "task", name, list(known))
+    if order.node is not None:
+        _check_name(status, "node", order.node, [str(node["name"]) for node in status["nodes"]])
+    if not chosen:
+        return _list_holds(view, order.hold, list(known.values()))
+    if view.revision is not None and len(chosen) > 1:
+        raise CliError(EXIT_USAGE, "--revision goes with one task")
+    rows = [_hold_row(view, order, known[name]) for name in chosen]
+    changing = [row[0] for row in rows if row[2] != row[3]]
+    plans = [
+        {**_held(known[row[0]]), "outcome": "planned" if row[0] in changing else "unchanged", "detail": row[3]}
+        for row in rows
+    ]
+    body = {"schema": TASK_SCHEMA, "tasks": plans}
+    code = _begin(view, rows, body, is_change=bool(changing), warning=_warning(order))
+    if code is not None:
+        return code
+    results = {name: _give_hold(view, order, known[name]) for name in changing}
+    after = {str(task["name"]): task for task in _status(view.door)["tasks"]}
+    if view.is_json:
+        tasks = [{**_held(after[name]), **results.get(name, {"outcome": "unchanged", "detail": ""})} for name in chosen]
+        print_json({"schema": TASK_SCHEMA, "tasks": tasks})
+        return max([CODES.get(str(result["outcome"]), EXIT_FAILED) for result in results.values()], default=EXIT_OK)
+    return _tell_results(results)
+
+
+def _warning(order: HoldOrder) -> str:
+    if order.hold == "pause":
+        return "A dead owner will not be replaced."
+    return "Without that node nobody does the task." if order.is_hard else ""
+
+
+def _give_hold(view: OrderView, order: HoldOrder, task: Json) -> Json:
+    request = {
+        "verb": "hold",
+        "hold": order.hold,
+        "task": task["name"],
+        "target": order.node,
+        "hard": order.is_hard,
+        "for_s": view.for_s,
+        "base_revision": task["revision"] if view.revision is None else view.revision,
+        **view.asked,
+    }
+    return ask_door(view.door, request)
+
+
+def _hold_row(view: OrderView, order: HoldOrder, task: Json) -> Row:
+    kind = "pause" if order.hold in ("pause", "resume") else "pin"
+    before = told_hold(kind, task.get(kind))
+    if order.hold in ("resume", "unpin"):
+        after = NOTHING
+    else:
+        wanted = {
+            "node": (order.node or task["owner"]) if kind == "pin" else None,
+            "is_hard": order.is_hard,
+            "by": view.asked["by"],
+            "reason": view.reason,
+            "for_s": view.for_s,
+        }
+        after = told_hold(kind, wanted)
+    return str(task["name"]), kind, before, after
+
+
+def told_hold(kind: str, order: Json | None) -> str:
+    """An order in a few words, without its age.
+
+    >>> told_hold("pin", {"node": "edge1", "is_hard": True, "by": "ada@robot1", "reason": "lens", "for_s": 7200.0})
+    'edge1 (hard), for 2h00m, ada@robot1: lens'
+    """
+    if order is None:
+        return NOTHING
+    words = [f"{order['node'] or 'its owner'}{' (hard)' if order['is_hard'] else ''}"] if kind == "pin" else ["paused"]
+    words += [] if order["for_s"] is None else [f"for {span(order['for_s'])}"]
+    who = order["by"] or "an unknown operator"
+    words.append(f"{who}: {order['reason']}" if order["reason"] else who)
+    return ", ".join(words)
+
+
+def _held(task: Json) -> Json:
+    return {key: task.get(key) for key in ("owner", "revision", "pause", "pin")} | {"task": task["name"]}
+
+
+def _list_holds(view: OrderView, verb: str, tasks: Sequence[Json]) -> int:
+    """The orders of one kind that are in force."""
+    if verb in ("resume", "unpin"):
+        raise CliError(EXIT_USAGE, f"name a task, or --all: `zsched {verb} TASK`")
+    held = [task for task in tasks if task.get(verb) is not None]
+    if view.is_json:
+        print_json({"schema": TASK_SCHEMA, "tasks": [_held(task) for task in held]})
+        return EXIT_OK
+    if not held:
+        sys.stdout.write(f"no task is {verb}{'ned' if verb == 'pin' else 'd'}\n")
+    for task in held:
+        age = span(task[verb]["known_s"])
+        sys.stdout.write(f"{harmless(str(task['name']))}: {harmless(told_hold(verb, task[verb]))}, known for {age}\n")
+    return EXIT_OK
+
+
+# --- move ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MoveOrder:
+    """A handover to a named node."""
+
+    task: str
+    node: str
+    origin: str | None = None
+    is_detached: bool = False
+    timeout_s: float = 30.0
+
+
+def move(view: OrderView, order: MoveOrder) -> int:
+    """Hand a task over and wait until its streams have settled; returns the exit code.
+
+    Raises:
+        CliError: nobody answers, there is no such task or node, or the move is refused.
+    """
+    check_said(view)
+    status = _status(view.door)
+    known = {str(task["name"]): task for task in status["tasks"]}
+    _check_name(status, "task", order.task, list(known))
+    _check_name(status, "node", order.node, [str(node["name"]) for node in status["nodes"]])
+    task = known[order.task]
+    request = {
+        "verb": "move",
+        "task": order.task,
+        "target": order.node,
+        "origin": order.origin,
+        "base_revision": task["revision"] if view.revision is None else view.revision,
+        **view.asked,
+    }
+    plan = ask_door(view.door, {**request, "plan": True})
+    if plan["outcome"] not in ("ok", "unchanged"):
+        raise _refused(order.task, plan)
+    row = (order.task, "owner", str(task["owner"] or "nobody"), order.node)
+    body: Json = {"schema": MOVE_SCHEMA, "task": order.task, "from": task["owner"], "to": order.node, "epoch": None}
+    body |= {"revision": task["revision"], "settled": False, "switched_s": None, "lost": None, "doubled": None}
+    code = _begin(view, [row], {**body, "missing": []}, is_change=plan["outcome"] == "ok")
+    if code is not None:
+        return code
+    before = _counts(_robots(view.door, status), order.task)
+    result = ask_door(view.door, request)
+    if result["outcome"] not in ("ok", "unchanged"):
+        raise _refused(order.task, result)
+    watch = not order.is_detached
+    if watch and not view.is_json:
+        sys.stdout.write("It is agreed. Ctrl-C ends the watching, not the move.\n")
+        sys.stdout.flush()
+    found, lacks = _watch(view.door, order, int(result["revision"])) if watch else ({}, [])
+    return _tell_move(view, order, str(task["owner"] or ""), result, before, found, lacks)
+
+
+def _watch(door: Door, order: MoveOrder, revision: int) -> tuple[dict[str, Json], list[str]]:
+    """Every robot's status once the move is over, and what is missing when it is not in time."""
+    began = monotonic_s()
+    while True:
+        first = _status(door)
+        found = _robots(door, first)
+        task = next(task for task in first["tasks"] if task["name"] == order.task)
+        statuses = {str(first["node"]): first, **found}
+        lacks = missing(Condition(kind="settled", task=order.task), statuses)
+        if task["revision"] < revision:
+            lacks.append(f"{order.task}: {first['node']} has not learnt revision {revision}")
+        if not lacks or monotonic_s() - began >= order.timeout_s:
+            return found, lacks
+        time.sleep(PAUSE_S)
+
+
+def _robots(door: Door, status: Json) -> dict[str, Json]:
+    """The statuses of all robots that are alive."""
+    alive = [str(node["name"]) for node in status["nodes"] if node["kind"] == "robot" and node["state"] == "alive"]
+    return {name: status if name == status["node"] else _status(door.to(name)) for name in alive}
+
+
+def _counts(statuses: Mapping[str, Json], name: str) -> dict[str, int]:
+    """What hops of the task's streams have lost and doubled so far, over all robots."""
+    streams = [
+        stream
+        for status in statuses.values()
+        for task in status["tasks"]
+        if task["name"] == name
+        for stream in task["streams"]
+    ]
+    return {key: sum(int(stream[key]) for stream in streams) for key in ("lost", "doubled")}
+
+
+def _tell_move(
+    view: OrderView,
+    order: MoveOrder,
+    left: str,
+    result: Json,
+    before: Mapping[str, int],
+    found: Mapping[str, Json],
+    lacks: Sequence[str],
+) -> int:
+    tasks = [task for status in found.values() for task in status["tasks"] if task["name"] == order.task]
+    switched = [task["switched_s"] for task in tasks if task.get("switched_s") is not None]
+    switched_s = max(switched, default=None)
+    after = _counts(found, order.task)
+    more: dict[str, Any] = {key: max(after[key] - before[key], 0) if found else None for key in before}
+    epoch = max([int(task["epoch"]) for task in tasks], default=None)
+    if view.is_json:
+        body = {"schema": MOVE_SCHEMA, "task": order.task, "from": left or None, "to": order.node, "epoch": epoch}
+        body |= {"revision": result["revision"], "settled": bool(found) and not lacks, "switched_s": switched_s}
+        print_json({**body, **more, "missing": list(lacks)})
+    elif not found:
+        sys.stdout.write(
+            f"{order.task}: revision {result['revision']} is agreed; `zsched wait --for settled={order.task}`\n"
+        )
+    elif lacks:
+        sys.stdout.write(f"{order.task}: not settled after {span(order.timeout_s)}\n")
+        sys.stdout.writelines(f"  {harmless(lack)}\n" for lack in lacks)
+    else:
+        took = "" if switched_s is None else f", streams switched in {millis(switched_s)}"
+        told = f"{order.task}: settled on {order.node}{took}, lost {more['lost']}, doubled {more['doubled']}\n"
+        sys.stdout.write(told)
+    return EXIT_TIMED_OUT if lacks else EXIT_OK
+
+
+# --- tune ------------------------------------------------------------------------------------------------------------
+
+_NUMBERS: Final = ("bonus", "cool_down_s", "deadline_ms")
+_WORDS: Final[Mapping[str, type[Aggregate | ScoreForm]]] = {"aggregate": Aggregate, "score": ScoreForm}
+WEIGHTS: Final = ("cpu", "memory", "network")
+KEYS: Final = (*WEIGHTS, *_NUMBERS, *_WORDS)
+
+
+def tuned(before: Json, file: Json, pairs: Sequence[str]) -> dict[str, Any]:
+    """A tuning, as JSON values, after ``key=value`` words; ``key=null`` is the file's value.
+
+    >>> base = {"weights": {"cpu": 0.5, "memory": 0.5, "network": 0.0}, "bonus": 0.1}
+    >>> tuned(base, base, ["bonus=0.2"])["bonus"]
+    0.2
+
+    Raises:
+        CliError: a word is no such pair, or the key or its value is unknown.
+    """
+    after = {**before, "weights": dict(before["weights"])}
+    seen = set[str]()
+    for pair in pairs:
+        key, equals, text = pair.partition("=")
+        key = key.removeprefix("weights.")
+        if not equals:
+            raise CliError(EXIT_USAGE, f"{pair!r} is no setting; write it like bonus=0.2, or bonus=null")
+        if key not in KEYS:
+            raise CliError(EXIT_USAGE, f"{pair!r}: there is no setting {key!r}{nearest(key, KEYS)}")
+        if key in seen:
+            raise CliError(EXIT_USAGE, f"{pair!r}: {key} is given twice; give it once")
+        seen.add(key)
+        place, source = (after["weights"], file["weights"]) if key in WEIGHTS else (after, file)
+        place[key] = source[key] if text == "null" else _setting(pair, key, text)
+    return after
+
+
+def _setting(pair: str, key: str, text: str) -> Any:
+    try:
+        return str(_WORDS[key](text)) if key in _WORDS else float(text)
+    except ValueError:
+        kind = f"one of {', '.join(list(_WORDS[key]))}" if key in _WORDS else "a number"
+        raise CliError(EXIT_USAGE, f"{pair!r}: {text!r} is not {kind}") from None
+
+
+def tune(view: OrderView, name: str | None, pairs: Sequence[str]) -> int:
+    """Show tunings, or change one on the whole running fleet; returns the exit code.
+
+    Raises:
+        CliError: nobody answers, there is no such task or setting, or the change was not agreed.
+    """
+    check_said(view)
+    status = _status(view.door)
+    known = {str(task["name"]): task for task in status["tasks"]}
+    if name is not None:
+        _check_name(status, "task", name, list(known))
+    if name is None or not pairs:
+        return _list_tunings(view, [known[name]] if name is not None else list(known.values()))
+    task = known[name]
+    after = tuned(task["tuning"], _file_tuning(task), pairs)
+    tuning = _checked(after)
+    flat_before, flat_after = _flat(task["tuning"]), _flat(after)
+    rows = [
+        (name, key, _figure(flat_before[key]), _figure(flat_after[key]))
+        for key in KEYS
+        if flat_before[key] != flat_after[key]
+    ]
+    told = {"task": name, "revision": task["revision"], "tuning": flat_after, "file": _flat(_file_tuning(task))}
+    planned = {**told, "outcome": "planned" if rows else "unchanged", "detail": ""}
+    code = _begin(view, rows, {"schema": TUNING_SCHEMA, "tasks": [planned]}, is_change=bool(rows))
+    if code is not None:
+        return code
+    base = task["revision"] if view.revision is None else view.revision
+    request = {"verb": "tune", "task": name, "tuning": tuning, "base_revision": base, **view.asked}
+    result = ask_door(view.door, request)
+    if view.is_json:
+        print_json({"schema": TUNING_SCHEMA, "tasks": [{**told, **result}]})
+        return CODES.get(str(result["outcome"]), EXIT_FAILED)
+    return _tell_results({name: result})
+
+
+def _checked(after: Json) -> Json:
+    """The tuning as a request carries it.
+
+    Raises:
+        CliError: a figure is out of range, or the weights' sum is not 1.
+    """
+    from zsched.wire.codec import as_plain  # noqa: PLC0415 - the other orders need no codec
+
+    try:
+        deadline_ms = after.get("deadline_ms")
+        tuning = Tuning(
+            weights=Weights(**after["weights"]),
+            bonus=after["bonus"],
+            cool_down_s=after["cool_down_s"],
+            aggregate=Aggregate(after["aggregate"]),
+            score=ScoreForm(after["score"]),
+            deadline_ms=deadline_ms,
+        )
+    except ValueError as error:
+        raise CliError(EXIT_USAGE, f"{error}; nothing was changed") from None
+    if tuning.deadline_ms is not None and tuning.score is ScoreForm.PAPER:
+        raise CliError(EXIT_USAGE, "the paper's score knows no deadlines: score=service, or deadline_ms=null")
+    body: Json = as_plain(tuning)
+    return body
+
+
+def _file_tuning(task: Json) -> Json:
+    """The fleet file's tuning; a daemon of an older program does not tell it."""
+    found: Json = task.get("file_tuning") or task["tuning"]
+    return found
+
+
+def _flat(tuning: Json) -> Json:
+    return {key: tuning["weights"][key] if key in WEIGHTS else tuning.get(key) for key in KEYS}
+
+
+def _figure(value: Any) -> str:
+    return "none" if value is None else f"{value:g}" if isinstance(value, float | int) else str(value)
+
+
+def _list_tunings(view: OrderView, tasks: Sequence[Json]) -> int:
+    if view.is_json:
+        found = [
+            {
+                "task": task["name"],
+                "revision": task["revision"],
+                "tuning": _flat(task["tuning"]),
+                "file": _flat(_file_tuning(task)),
+            }
+            for task in tasks
+        ]
+        print_json({"schema": TUNING_SCHEMA, "tasks": found})
+        return EXIT_OK
+    for task in tasks:
+        now, file = _flat(task["tuning"]), _flat(_file_tuning(task))
+        words = [f"{key}={_figure(now[key])}{_differs(now[key], file[key])}" for key in KEYS]
+        sys.stdout.write(f"{harmless(str(task['name']))} (revision {task['revision']}): {' '.join(words)}\n")
+    return EXIT_OK
+
+
+def _differs(now: Any, file: Any) -> str:
+    return "" if now == file else f" (file: {_figure(file)})"
+
+
+# --- maint -----------------------------------------------------------------------------------------------------------
+
+
+def maint(door: Door, *, is_json: bool) -> int:
+    """List every order that is in force, and every node that drains; returns the exit code.
+
+    Raises:
+        CliError: nobody answers.
+    """
+    status = _status(door)
+    found = [
+        {"kind": kind, "subject": task["name"], **task[kind]}
+        for task in status["tasks"]
+        for kind in ("pause", "pin")
+        if task.get(kind) is not None
+    ]
+    stopping = [str(node["name"]) for node in status["nodes"] if node["draining"] and node["state"] == "alive"]
+    if is_json:
+        print_json({"schema": MAINT_SCHEMA, "node": status["node"], "orders": found, "stopping": stopping})
+        return EXIT_OK
+    rows = [
+        (
+            str(order["subject"]),
+            str(order["kind"]),
+            told_hold(str(order["kind"]), order),
+            f"known for {span(order['known_s'])}",
+        )
+        for order in found
+    ]
+    rows += [(name, "stopping", "hands its tasks over and takes none", "") for name in stopping]
+    if not rows:
+        sys.stdout.write(f"no order is in force, as {status['node']} knows\n")
+    _table(("WHAT", "KIND", "ORDER", "SINCE"), rows)
+    return EXIT_OK
+
+
+# --- what they share -------------------------------------------------------------------------------------------------
+
+
+def _status(door: Door) -> Json:
+    return ask_door(door, {"verb": "status"})
+
+
+def _check_name(status: Json, kind: str, name: str, known: Sequence[str]) -> None:
+    if name not in known:
+        raise CliError(EXIT_USAGE, f"fleet {status['fleet']} has no {kind} {name!r}{nearest(name, known)}")
+
+
+def _begin(view: OrderView, rows: Sequence[Row], plan: Json, *, is_change: bool, warning: str = "") -> int | None:
+    """Show before and after (``plan``, as JSON), and ask; the exit code when nothing is to be done now, else ``None``.
+
+    Raises:
+        CliError: off a terminal, without --yes.
+    """
+    if not view.is_json:
+        _table(("TASK", "WHAT", "NOW", "AFTER"), rows)
+    if view.is_plan:
+        if view.is_json:
+            print_json(plan)
+        return EXIT_WOULD_CHANGE if is_change else EXIT_OK
+    if not is_change:
+        if not view.is_json:
+            sys.stdout.write("Nothing would change.\n")
+            return EXIT_OK
+        return None
+    if view.is_yes:
+        return None
+    if not sys.stdin.isatty() or view.is_json:
+        command = shlex.join(["zsched", *sys.argv[1:], "--yes"])
+        raise CliError(EXIT_USAGE, f"nothing was done, for nobody can be asked here; to do it: {command}")
+    sys.stdout.write(f"{warning}{' ' if warning else ''}Do it? [y/N] ")
+    sys.stdout.flush()
+    if sys.stdin.readline().strip().lower() not in ("y", "yes"):
+        sys.stdout.write("Nothing was done.\n")
+        return EXIT_FAILED
+    return None
+
+
+def _table(titles: Row, rows: Sequence[Row]) -> None:
+    if not rows:
+        return
+    shown = [titles, *[tuple(harmless(cell) for cell in row) for row in rows]]
+    widths = [max(len(row[column]) for row in shown) for column in range(len(titles))]
+    for row in shown:
+        cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
+        sys.stdout.write("  ".join(cells).rstrip() + "\n")
+
+
+def _refused(task: str, result: Json) -> CliError:
+    outcome, detail = str(result["outcome"]), str(result["detail"]).removeprefix(f"{task}: ")
+    text = f"{task}: {outcome.replace('_', ' ')}: {detail}{ADVICE.get(outcome, '')}"
+    return CliError(CODES.get(outcome, EXIT_FAILED), text)
+
+
+def _tell_results(results: Mapping[str, Json]) -> int:
+    """Print what became of each; the worst exit code.
+
+    Raises:
+        CliError: the only order was not agreed.
+    """
+    codes = [EXIT_OK]
+    for name, result in results.items():
+        code = CODES.get(str(result["outcome"]), EXIT_FAILED)
+        codes.append(code)
+        if code != EXIT_OK and len(results) == 1:
+            raise _refused(name, result)
+        word = "agreed" if result["outcome"] == "ok" else str(_refused(name, result)).removeprefix(f"{name}: ")
+        sys.stdout.write(f"{name}: {harmless(word)} (revision {result['revision']})\n")
+    return max(codes)
