@@ -36,18 +36,31 @@ from zsched.core.values.messages import (
     CommandOutcome,
     CommandResult,
     FleetTold,
+    Hold,
+    HoldTask,
     Learnt,
+    MoveTask,
     Prepare,
     ReadLines,
     SetWeights,
+    TuneTask,
     Utilities,
 )
-from zsched.core.values.model import Acceptance, WorkerState
+from zsched.core.values.model import Acceptance, Asked, Tuning, Weights, WorkerState
 from zsched.core.values.plan import Role, RoutePhase, RoutePlan, WorkerRole
 from zsched.errors import AdapterError, WireError
 from zsched.runtime import shell as shell_module
 from zsched.runtime.library import Library
-from zsched.runtime.shell import INBOX_LIMIT, LOCAL_REQUESTS_FROM, PROBLEM_TTL_S, WAITING_LIMIT, Desk, Inbox, Shell
+from zsched.runtime.shell import (
+    INBOX_LIMIT,
+    LOCAL_REQUESTS_FROM,
+    PROBLEM_TTL_S,
+    WAITING_LIMIT,
+    Desk,
+    Inbox,
+    Shell,
+    command_of,
+)
 from zsched.wire.codec import document_hash
 
 BALLOT = ballot_of()
@@ -329,13 +342,40 @@ def test_relays_other_reports_are_events_as_they_are(house: House) -> None:
 # --- the desk --------------------------------------------------------------------------------------------------------
 
 
+TUNING = {"weights": {"cpu": 1.0, "memory": 0.0, "network": 0.0}, "bonus": 0.3}
+
+
+def test_an_order_becomes_the_event_that_says_all_of_it() -> None:
+    asked = Asked(by="ada@robot1", reason="lens")
+    order = {"task": "merge", "by": "ada@robot1", "reason": "lens", "base_revision": 3}
+    move = command_of({**order, "verb": "move", "target": "edge1", "origin": "edge2", "plan": True})
+    assert move == MoveTask(task="merge", node="edge1", asked=asked, origin="edge2", base_revision=3, is_plan=True)
+    pin = command_of({**order, "verb": "hold", "hold": "pin", "target": "edge1", "hard": True, "for_s": 60})
+    assert pin == HoldTask(
+        task="merge", hold=Hold.PIN, asked=asked, node="edge1", is_hard=True, for_s=60.0, base_revision=3
+    )
+    tuned = command_of({**order, "verb": "tune", "tuning": TUNING})
+    wanted = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0), bonus=0.3)
+    assert tuned == TuneTask(task="merge", tuning=wanted, base_revision=3, asked=asked)
+    kinds = [type(ev.commanded(1, command)) for command in (move, pin, tuned)]
+    assert kinds == [ev.MoveCommanded, ev.HoldCommanded, ev.TuneCommanded]
+
+
 def test_desk_refuses_what_is_no_request(house: House) -> None:
     weights = {"verb": "weights", "task": "merge", "cpu": 1, "memory": 0, "network": 0}
+    order = {"task": "merge", "by": "ada@robot1"}
     for request, says in (
         (
             {"verb": "fly"},
-            "unknown verb 'fly'; known: access, change, explain, fleet, lines, log, restart, retry, status, weights",
+            "unknown verb 'fly'; known: access, change, explain, fleet, hold, lines, log, move, restart, ",
         ),
+        ({"verb": "move", "task": "merge", "target": "edge1"}, "move: 'by' is missing"),
+        ({**order, "verb": "move"}, "move: 'target' is missing"),
+        ({**order, "verb": "hold", "hold": "stop"}, "hold: 'stop' is not a valid Hold"),
+        ({**order, "verb": "hold", "hold": "pause", "for_s": 0.5}, "hold: hold.for_s: 0.5 is not in [1, "),
+        ({**order, "verb": "hold", "hold": "pause", "reason": "x" * 201}, "hold: asked.reason: 201 characters"),
+        ({**order, "verb": "tune", "tuning": {"weights": 1}, "base_revision": 3}, "tune: tuning: "),
+        ({**order, "verb": "tune", "tuning": TUNING}, "tune: 'base_revision' is missing"),
         ({"verb": "retry"}, "retry: 'task' is missing"),
         ({"verb": "restart"}, "restart: 'task' is missing"),
         ({"verb": "lines", "task": "merge", "after": "1"}, "lines: after: expected a whole number, not '1'"),
