@@ -125,7 +125,7 @@ class Invariants:
         key = (machine.key, value.task)
         self.newest[key] = max(self.newest.get(key, 0), value.revision)
         if value.revision % GENERATION_STEP:  # a generation's first value was made by the operator, nobody chose it
-            detail = f"{value.tuning} {value.pinned} {value.paused}"
+            detail = f"{value.tuning} {value.pin} {value.pause} {value.asked}"
             self.take(
                 Learnt(
                     at=now,
@@ -138,6 +138,10 @@ class Invariants:
                 )
             )
         self.told.setdefault((value.task, value.revision), value)
+        for revision in (value.revision - 1, value.revision):
+            before, after = self.told.get((value.task, revision)), self.told.get((value.task, revision + 1))
+            if before is not None and after is not None:
+                _check_orders(before, after)
 
     # --- what a batch says -------------------------------------------------------------------------------------------
 
@@ -294,6 +298,18 @@ class Invariants:
         machine.woken_at = now if machine.wakes == 0 else machine.woken_at
         if machine.wakes > MAX_WAKES:
             raise InvariantError(f"{machine.key}: woken {machine.wakes} times within 10 ms, its loop spins")
+
+
+def _check_orders(before: Allocation, after: Allocation) -> None:
+    """What an operator's orders allow between two revisions that follow each other."""
+    if before.owner == after.owner:
+        return
+    if before.paused and after.asked is None:
+        raise InvariantError(f"{after.task} was paused and moved by itself from {before.owner} to {after.owner}")
+    if before.is_bound and after.owner != before.home:
+        raise InvariantError(f"{after.task} is pinned to {before.home} (hard) and moved to {after.owner}")
+    if before.pinned and after.asked is not None and after.owner != before.home:
+        raise InvariantError(f"{after.task} is pinned to {before.home} and was moved by order to {after.owner}")
 
 
 def _keeps_state(machine: Machine) -> bool:

@@ -24,6 +24,7 @@ from zsched_lab.sim.disk_faults import DiskFaults
 from zsched_lab.sim.link_faults import SMALL_DELAY_S, LinkFaults
 from zsched_lab.sim.links import Pair
 from zsched_lab.sim.network import Weather
+from zsched_lab.sim.orders import Orders
 from zsched_lab.sim.parts import Machine
 from zsched_lab.sim.rest import AT_MOST_S
 from zsched_lab.sim.rollout import Rollouts
@@ -107,6 +108,7 @@ class Stage:
     scene: Scene = field(init=False)
     _links: LinkFaults = field(init=False)
     _rollouts: Rollouts = field(init=False)
+    _orders: Orders = field(init=False)
     _carriers: dict[str, Carry] = field(init=False)
     _busy: dict[NodeId, float] = field(default_factory=dict)
     _rng: Random = field(init=False)
@@ -130,6 +132,7 @@ class Stage:
         self.scene = Scene(plan=plan, sim=self.sim, rng=self._rng, fleet=plan.fleet, generation=plan.generation)
         self._links, self._rollouts = LinkFaults(self.scene), Rollouts(self.scene)
         tables = (self._links.table(), DiskFaults(self.scene).table(), self._rollouts.table(), self._table())
+        self._orders = Orders(self.sim)
         self._carriers = {kind: carry for table in tables for kind, carry in table.items()}
 
     def play(self, keep: frozenset[int] | None, calm_at: float) -> float:
@@ -184,6 +187,8 @@ class Stage:
             if machine.key != missing:
                 sim.start(machine.key)
         sim.later(AFTERMATH_S, self._start_again, missing)
+        if scene.done["order"]:
+            self._orders.take_back()
 
     def _start_again(self, missing: NodeId | None) -> None:
         """A twin's last beat may still have made the node stand down whose name it had: the operator starts it."""
@@ -399,6 +404,7 @@ class Stage:
             "worker": self._worker,
             "absence": self._absence,
             "retune": self._retune,
+            "order": lambda fault: self._orders.give(fault.nodes[0], fault.size),
             "load": self._set_load,
             "drain": self._drain,
         }

@@ -20,6 +20,7 @@ from zsched_lab.sim.clocks import clock_faults, suspensions
 from zsched_lab.sim.files import CHANGES, RELOADED
 from zsched_lab.sim.foreign import absences, with_foreign_workers
 from zsched_lab.sim.many import with_many_tasks
+from zsched_lab.sim.orders import order_faults
 
 SECONDS = 30.0
 """Virtual seconds of one schedule: faults in the first half, then quiet."""
@@ -93,6 +94,8 @@ def plan(seed: int, *, nodes: int | None = None, seconds: float = SECONDS, kinds
     fleet = with_foreign_workers(others, fleet)
     for at, name, away_s in absences(others, fleet, until):
         faults += (Fault(at=at, kind="absence", nodes=(name,), seconds=away_s),)
+    for at, name, size in order_faults(Random(f"orders {seed}"), fleet, until):
+        faults += (Fault(at=at, kind="order", nodes=(name,), size=size),)
     faults = tuple(sorted(faults, key=lambda fault: (fault.at, fault.kind, fault.nodes)))
     return Plan(seed=seed, fleet=fleet, faults=faults, seconds=seconds, generation=generation)
 
