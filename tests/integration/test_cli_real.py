@@ -292,6 +292,46 @@ def test_any_node_of_the_fleet_can_be_asked_through_the_one_here(tmp_path: Path)
         assert "robot1" in nowhere.stderr
 
 
+def test_a_paused_task_is_moved_by_order_and_every_node_says_who_did_it(tmp_path: Path) -> None:
+    edge1, edge2, robot = sorted(sites(tmp_path, robots=1, edges=2), key=lambda site: site.node)
+    with contextlib.ExitStack() as stack:
+        for site in (robot, edge1, edge2):
+            assert site.zsched("init").returncode == 0
+            stack.enter_context(site.up())
+        assert robot.zsched("wait", "--for", "settled=echo", "--timeout", f"{UP_S:g}").returncode == 0
+        owner = robot.status()["tasks"][0]["owner"]
+        there = edge1 if owner == edge2.node else edge2
+        end = time.monotonic() + UP_S
+        while (plan := robot.zsched("move", "echo", there.node, "--plan")).returncode != 10:
+            assert time.monotonic() < end, plan.stderr  # its worker is still starting
+        paused = there.zsched("pause", "echo", "-m", "new lens", "--yes")
+        assert paused.returncode == 0, paused.stderr
+        moved = robot.zsched("move", "echo", there.node, "--from", owner, "-m", "by hand", "--yes", "--json")
+        assert moved.returncode == 0, moved.stderr
+        body = json.loads(moved.stdout)
+        assert (body["from"], body["to"], body["settled"], body["lost"], body["doubled"]) == (
+            owner,
+            there.node,
+            True,
+            0,
+            0,
+        )
+        assert body["switched_s"] is not None
+        for site in (robot, edge1, edge2):
+            end = time.monotonic() + UP_S
+            while (task := site.status()["tasks"][0])["owner"] != there.node:
+                assert time.monotonic() < end, task
+            assert task["history"][-1]["by"].endswith("@robot1")
+            assert task["pause"]["reason"] == "new lens"
+            (move,) = json.loads(site.zsched("history", "echo", "--json").stdout)["moves"][-1:]
+            assert move["reason"].startswith("moved by ")
+            assert move["reason"].endswith("@robot1 (by hand)")
+        assert there.zsched("maint").stdout.splitlines()[1].split()[:2] == ["echo", "pause"]
+        resumed = robot.zsched("resume", "echo", "--yes")
+        assert resumed.returncode == 0, resumed.stderr
+        assert robot.zsched("pause").stdout == "no task is paused\n"
+
+
 # --- why, and what was ------------------------------------------------------------------------------------------------
 
 

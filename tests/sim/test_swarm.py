@@ -48,6 +48,7 @@ def test_plans_have_every_fault_every_size_and_every_kind_of_task() -> None:
         "clock_jump",
         "load",
         "reload",
+        "order",
         "slew",
         "suspend",
     } | set(LATER) - {"fsync"}

@@ -29,7 +29,8 @@ def task_rows(page: Page, status: Json, at: float | None) -> None:
     """Titles and a line per task; ``at``: now, for wall times beside ages."""
     tasks: list[Json] = status["tasks"]
     task_room = min(max([10, *(len(task["name"]) for task in tasks)]), 20)
-    owner_room = min(max([6, *(len(task["owner"] or "") for task in tasks)]), 20)
+    names = [len(task["owner"] or "nobody") + (0 if task.get("pin") is None else 6) for task in tasks]
+    owner_room = min(max([6, *names]), 20)
     columns = (task_room, owner_room, 8, 14 if at is not None else 6, 9, -7, -7, page.width)
     page.row(*((t, w, "dim" if i else "stage") for i, (t, w) in enumerate(zip(TITLES, columns, strict=True))))
     for task in tasks:
@@ -43,7 +44,7 @@ def _cells(task: Json, at: float | None) -> list[Cell]:
     dropped, is_new = _dropped(task)
     return [
         (task["name"], "bold"),
-        (owner or "nobody", "bold" if owner else "red"),
+        ((owner or "nobody") + ("" if task.get("pin") is None else " (pin)"), "bold" if owner else "red"),
         (state, STATE_STYLES.get(state, "red")),
         (since, ""),
         (str(task["phase"]), "" if task["phase"] in ("idle", "settled") else "yellow"),

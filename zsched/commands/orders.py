@@ -19,7 +19,7 @@ from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, nearest, print_json
 from zsched.commands.page import harmless, span
-from zsched.commands.report import millis
+from zsched.commands.report import millis, told_hold
 from zsched.commands.wait import Condition, missing
 from zsched.core.values.model import MAX_ASKED, MAX_FOR_S, Aggregate, ScoreForm, Tuning, Weights
 from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE, EXIT_WOULD_CHANGE
@@ -164,7 +164,7 @@ def _give_hold(view: OrderView, order: HoldOrder, task: Json) -> Json:
 
 def _hold_row(view: OrderView, order: HoldOrder, task: Json) -> Row:
     kind = "pause" if order.hold in ("pause", "resume") else "pin"
-    before = told_hold(kind, task.get(kind))
+    before = _told(kind, task.get(kind))
     if order.hold in ("resume", "unpin"):
         after = NOTHING
     else:
@@ -175,23 +175,12 @@ def _hold_row(view: OrderView, order: HoldOrder, task: Json) -> Row:
             "reason": view.reason,
             "for_s": view.for_s,
         }
-        after = told_hold(kind, wanted)
+        after = _told(kind, wanted)
     return str(task["name"]), kind, before, after
 
 
-def told_hold(kind: str, order: Json | None) -> str:
-    """An order in a few words, without its age.
-
-    >>> told_hold("pin", {"node": "edge1", "is_hard": True, "by": "ada@robot1", "reason": "lens", "for_s": 7200.0})
-    'edge1 (hard), for 2h00m, ada@robot1: lens'
-    """
-    if order is None:
-        return NOTHING
-    words = [f"{order['node'] or 'its owner'}{' (hard)' if order['is_hard'] else ''}"] if kind == "pin" else ["paused"]
-    words += [] if order["for_s"] is None else [f"for {span(order['for_s'])}"]
-    who = order["by"] or "an unknown operator"
-    words.append(f"{who}: {order['reason']}" if order["reason"] else who)
-    return ", ".join(words)
+def _told(kind: str, order: Json | None) -> str:
+    return NOTHING if order is None else told_hold(kind, order)
 
 
 def _held(task: Json) -> Json:

@@ -248,13 +248,28 @@ def _task(page: Page, status: Json, task: Json) -> None:
         known = [] if since_s is None else [(f"known here for {span(since_s)}{page.since(since_s)}", "")]
         parts = [(f"{owner} owns it", "bold"), *known, (state, STATE_STYLES.get(state, "red"))]
     counts = [(f"epoch {task['epoch']}", ""), (f"revision {task['revision']}", "")]
-    page.block(f"TASK {task['name']}", *parts, *counts)
+    pin = task.get("pin")  # a later field of the schema's major version
+    held = [] if pin is None else [(f"pinned to {told_hold('pin', pin)}", "yellow")]
+    page.block(f"TASK {task['name']}", *parts, *counts, *held)
     _work(page, status, task)
     _scheduler(page, status, task)
     _vote(page, task, has_quorum=status["quorum"]["ok"])
     is_quiet = task["phase"] in ("idle", "settled")
     page.block("EXECUTOR", (str(task["phase"]), "" if is_quiet else "yellow"))
     _route(page, status, task)
+
+
+def told_hold(kind: str, order: Json) -> str:
+    """A pause or a pin in a few words, without its age.
+
+    >>> told_hold("pin", {"node": "edge1", "is_hard": True, "by": "ada@robot1", "reason": "lens", "for_s": 7200.0})
+    'edge1 (hard), for 2h00m, ada@robot1: lens'
+    """
+    words = [f"{order['node'] or 'its owner'}{' (hard)' if order['is_hard'] else ''}"] if kind == "pin" else ["paused"]
+    words += [] if order["for_s"] is None else [f"for {span(order['for_s'])}"]
+    who = order["by"] or "an unknown operator"
+    words.append(f"{who}: {order['reason']}" if order["reason"] else who)
+    return ", ".join(words)
 
 
 def _work(page: Page, status: Json, task: Json) -> None:

@@ -47,6 +47,8 @@ BELIEF = "zsched.core.vote.belief"
 AGREEMENT, MEMBERSHIP, NODE = "zsched.core.vote.agreement", "zsched.core.membership.peers", "zsched.core.node"
 VOTE, VOTING = "zsched.core.vote.tally", "zsched.core.vote.voting"
 DECISION, ROUNDS = "zsched.core.scheduler.decision", "zsched.core.scheduler.rounds"
+ORDERS, EXPIRY = "zsched.core.handlers.orders", "zsched.core.vote.expiry"
+DAMPING = "zsched.core.scheduler.damping"
 SCHEDULER, SCORING, EXECUTOR = (
     "zsched.core.scheduler.judge",
     "zsched.core.scheduler.scoring",
@@ -81,6 +83,8 @@ _ROUNDS = (
 )
 _SCHEDULER = ("tests/unit/core/scheduler/test_judge.py", "tests/unit/core/scheduler/test_scoring.py", "tests/paper")
 _EXECUTOR = ("tests/unit/core/executor/test_handover.py",)
+_ORDERS = ("tests/unit/core/handlers/test_orders.py",)
+_EXPIRY = ("tests/unit/core/vote/test_expiry.py",)
 
 
 def _bug(name: str, module: str, old: str, new: str, tests: tuple[str, ...] = (), seed: int | None = None) -> Bug:
@@ -170,8 +174,8 @@ REGISTER_BUGS = (
     _bug(
         "a retune raises the epoch",
         CHANGE,
-        "return replace(read, revision=read.revision + 1, tuning=self.tuning)",
-        "return replace(read, revision=read.revision + 1, epoch=read.epoch + 1, tuning=self.tuning)",
+        "return replace(read, revision=read.revision + 1, tuning=self.tuning, asked",
+        "return replace(read, revision=read.revision + 1, epoch=read.epoch + 1, tuning=self.tuning, asked",
         _REGISTER,
         seed=15,
     ),
@@ -874,4 +878,87 @@ HANDOVER_BUGS = (
     ),
 )
 
-CORE_BUGS: tuple[Bug, ...] = (*REGISTER_BUGS, *LEASE_BUGS, *MEMBERSHIP_BUGS, *VOTE_BUGS, *HANDOVER_BUGS)
+ORDER_BUGS = (
+    _bug(
+        "a paused task escapes",
+        SCHEDULER,
+        "        if allocation.paused:\n            return Outcome.STAY",
+        "        if allocation.paused and escape is None:\n            return Outcome.STAY",
+        _SCHEDULER,
+        seed=1,
+    ),
+    _bug(
+        "a hard pin gives way",
+        SCHEDULER,
+        "        if allocation.is_bound:\n            scored",
+        "        if allocation.is_bound and owner is None:\n            scored",
+        _SCHEDULER,
+        seed=7,
+    ),
+    _bug(
+        "a pin keeps an owner that is gone",
+        SCHEDULER,
+        "        if escape is not None:\n            return Outcome.PROPOSE, escape",
+        "        if escape is not None and allocation.home is None:\n            return Outcome.PROPOSE, escape",
+        _SCHEDULER,
+    ),
+    _bug(
+        "a pinned task goes home without the cool-down",
+        SCHEDULER,
+        "if fit_s >= allocation.tuning.cool_down_s else Outcome.WAIT",
+        "if fit_s >= 0.0 else Outcome.WAIT",
+        _SCHEDULER,
+    ),
+    _bug(
+        "an order moves a pinned task elsewhere",
+        ORDERS,
+        "if value.home is not None and target != value.home:",
+        "if value.home is not None and target == value.home:",
+        _ORDERS,
+    ),
+    _bug(
+        "an order for an older revision is taken",
+        ORDERS,
+        "if base_revision not in (None, revision):",
+        "if base_revision is not None and base_revision > revision:",
+        _ORDERS,
+    ),
+    _bug(
+        "an ordered move counts in damping",
+        DAMPING,
+        "if left is not None and not is_ordered:",
+        "if left is not None:",
+        _ORDERS,
+    ),
+    _bug(
+        "an order never ends by itself",
+        EXPIRY,
+        "return for_s is not None and since is not None and now >= since + for_s",
+        "return for_s is not None and since is None",
+        _EXPIRY,
+    ),
+    _bug(
+        "a newer revision makes an order young again",
+        EXPIRY,
+        "{key: before.get(key, now) for key in held}",
+        "dict.fromkeys(held, now)",
+        _EXPIRY,
+    ),
+    _bug(
+        "a change of orders raises the epoch",
+        CHANGE,
+        "            revision=read.revision + 1,\n            pin=self.pin,",
+        "            revision=read.revision + 1,\n            epoch=read.epoch + 1,\n            pin=self.pin,",
+        _ORDERS,
+        seed=1,
+    ),
+)
+
+CORE_BUGS: tuple[Bug, ...] = (
+    *REGISTER_BUGS,
+    *LEASE_BUGS,
+    *MEMBERSHIP_BUGS,
+    *VOTE_BUGS,
+    *HANDOVER_BUGS,
+    *ORDER_BUGS,
+)

@@ -14,8 +14,10 @@ from typer.testing import CliRunner, Result
 from support.schemas import faults
 from zsched.adapters.host.operator_socket import Json, OperatorSocket
 from zsched.cli import app
+from zsched.commands.brief import render_brief
 from zsched.commands.common import CliError
 from zsched.commands.orders import KEYS, tuned, user_name
+from zsched.commands.report import render_status
 
 STATUS = json.loads((Path(__file__).parent / "recorded_status" / "healthy.json").read_text())
 TUNING: Json = {
@@ -149,6 +151,8 @@ def test_a_pin_names_its_node_and_says_when_it_is_hard(daemon: Daemon) -> None:
     assert run("pin", "echo", "edge2", "--hard", "--yes").exit_code == 0
     assert (daemon.orders[0]["target"], daemon.orders[0]["hard"]) == ("edge2", True)
     assert run("pin").stdout.startswith("echo: edge2 (hard), ")
+    shown = [render(daemon.status, 100, color=False) for render in (render_brief, render_status)]
+    assert ["edge1 (pin)" in shown[0], "pinned to edge2 (hard), " in " ".join(shown[1].split())] == [True, True]
     assert run("pin", "echo", "egde2").exit_code == 2
 
 

@@ -211,7 +211,7 @@ def test_a_pause_ends_by_itself_when_its_time_is_over() -> None:
 def test_a_pin_is_to_the_owner_or_to_a_candidate_and_a_move_elsewhere_is_refused() -> None:
     lone = Lone()
     assert lone.hold(Hold.PIN).outcome is CommandOutcome.OK
-    assert lone.value().home == "edge1"
+    assert (lone.value().home, lone.value().epoch) == ("edge1", 3)
     assert "unpin merge" in lone.move("edge2").detail
     assert lone.hold(Hold.PIN, "edge3", hard=True).outcome is CommandOutcome.OK
     assert (lone.value().home, lone.value().is_bound, lone.value().owner) == ("edge3", True, "edge1")
