@@ -37,8 +37,9 @@ def task(name: str, owner: str) -> Json:
 
 
 def node(name: str, kind: str) -> Json:
-    worker = {"task": "echo", "state": "ready"}
-    return {"name": name, "kind": kind, "state": "alive", "draining": False, "workers": [worker]}
+    recorded = STATUS["nodes"][0]
+    worker = {**recorded["workers"][0], "task": "echo", "state": "ready"}
+    return {**recorded, "name": name, "kind": kind, "state": "alive", "draining": False, "workers": [worker]}
 
 
 class Daemon:
