@@ -14,6 +14,7 @@ from zsched.commands.ask import Door
 from zsched.commands.common import CliError, Json
 from zsched.commands.history import read_log
 from zsched.commands.status import ask_status
+from zsched.exits import EXIT_OK
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,6 +27,8 @@ class News:
     """``None``: nobody answered."""
     why: str = ""
     """Why nobody answered."""
+    code: int = EXIT_OK
+    """The exit code that tells so."""
     entries: tuple[Json, ...] = ()
     """Lines of the decision log since the question before, the newest last; ``at`` is the node's clock."""
 
@@ -57,7 +60,7 @@ class Feed:
             status = ask_status(door)
             return News(at=at, status=status, entries=self._entries(door))
         except CliError as error:
-            return News(at=at, status=None, why=str(error))
+            return News(at=at, status=None, why=str(error), code=error.code)
 
     def _entries(self, door: Door) -> tuple[Json, ...]:
         """Of another machine there is no log: it lies on that machine."""

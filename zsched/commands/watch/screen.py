@@ -27,7 +27,7 @@ from zsched.commands.status import code_of
 from zsched.commands.watch.feed import Feed, News
 from zsched.commands.watch.past import Past
 from zsched.commands.watch.top import MIN_HEIGHT, MIN_WIDTH, Frame, render_top
-from zsched.exits import EXIT_OK, EXIT_UNREACHABLE, EXIT_USAGE
+from zsched.exits import EXIT_OK, EXIT_USAGE
 from zsched.guard import guarded
 
 ENTER, LEAVE = "\x1b[?1049h\x1b[?25l", "\x1b[?25h\x1b[?1049l"
@@ -59,7 +59,7 @@ def top(view: TopView, *, is_once: bool) -> int:
     feed.door()
     first = feed.ask()
     if first.status is None:
-        raise CliError(EXIT_UNREACHABLE, first.why)
+        raise CliError(first.code, first.why)
     past.take(first)
     if not is_once and not (sys.stdin.isatty() and sys.stdout.isatty()):
         raise CliError(
