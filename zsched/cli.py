@@ -339,6 +339,43 @@ def web(
 
 
 @app.command(cls=Verb)
+def record(
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="A new file, as run.mcap.")],
+    for_: Annotated[
+        str | None, typer.Option("--for", metavar="DURATION", help="So long: 90s, 10m, 2h. [until Ctrl-C]")
+    ] = None,
+    interval: Annotated[float, typer.Option(min=0.1, max=3600.0, metavar="S", help="Seconds between two.")] = 1.0,
+    map_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--map", metavar="KEY", help="A key whose samples are maps (OccupancyGrid, CDR) is recorded, too."
+        ),
+    ] = None,
+    node: AskedOption = None,
+    runtime_dir: RuntimeOption = None,
+    connect: ConnectOption = None,
+) -> None:
+    """Record what the fleet does as MCAP, for Foxglove: owners, utilities, moves, streams, events, maps.
+
+    Needs the extra mcap. Maps on ROS topics are found by their type.
+    """
+    from zsched.commands.history import duration_s  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.watch.record import RecordView  # noqa: PLC0415 - as above
+    from zsched.commands.watch.record import record as write  # noqa: PLC0415 - as above
+
+    view = RecordView(
+        runtime_dir=runtime_dir,
+        node=node,
+        connect=connect,
+        file=output,
+        interval_s=interval,
+        for_s=None if for_ is None else duration_s(for_),
+        maps=tuple(map_ or ()),
+    )
+    raise typer.Exit(write(view))
+
+
+@app.command(cls=Verb)
 def explain(
     task: Annotated[str, typer.Argument(metavar="TASK", help="A task of the fleet file.")],
     plan: Annotated[

@@ -13,13 +13,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import zenoh
+from rosbags.typesys import Stores, get_typestore
 
+from support.mcap_files import read_mcap
 from support.waiting import between
+from zsched.tasks.map_merge.cdr import encode_grid
+from zsched.tasks.map_merge.grid import Grid
 from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
 HZ, SIZE = 50.0, 1000
+GRID = Grid(data=np.arange(12, dtype=np.int8).reshape(3, 4), resolution=0.05)
 VERB_S = 30.0
 
 
@@ -59,6 +65,7 @@ def _publish(session: zenoh.Session, halt: threading.Event) -> None:
     due = time.monotonic()
     while not halt.is_set():
         publisher.put(bytes(SIZE), attachment=b"seven b", encoding="application/x")
+        session.put("robot1/map", encode_grid(GRID))
         due += 1 / HZ
         time.sleep(max(0.0, due - time.monotonic()))
 
@@ -144,3 +151,26 @@ def test_ctrl_c_ends_a_window_at_once(site: Site) -> None:
             assert process.wait(60) == 0
         finally:
             process.kill()
+
+
+def test_a_recording_holds_maps_as_they_came(site: Site, tmp_path: Path) -> None:
+    """Read back without the library that wrote it; ROS 2's message by an implementation of its own."""
+    file = tmp_path / "run.mcap"
+    command = [sys.executable, "-m", "zsched.cli", "record", "-o", str(file), "--for", "1.5s", "--interval", "0.5"]
+    done = subprocess.run(
+        [*command, "--map", "robot1/map", "--node", "robot1", "--runtime-dir", str(site.runtime)],
+        capture_output=True,
+        text=True,
+        timeout=VERB_S,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    messages = read_mcap(file)
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    maps: list[Any] = [store.deserialize_cdr(data, kind) for topic, kind, _, data in messages if topic == "/robot1/map"]
+    assert len(maps) > 0.3 * HZ
+    for one in maps:
+        assert (one.info.width, one.info.height, list(one.data)) == (4, 3, list(range(12)))
+    owners = {json.loads(data)["owner"] for topic, _, _, data in messages if topic == "/zsched/tasks/echo"}
+    assert owners == {"edge1"}
+    assert sum(topic == "/zsched/streams/echo/in/0" for topic, *_ in messages) >= 3

@@ -75,6 +75,7 @@ OUTSIDE: Final[dict[str, str]] = {
     "msgpack": r"wire\.codec",
     "ruamel": r"config\.(reader|editing)",
     "typer": r"cli|commands\..+",
+    "mcap": r"commands\.watch\.record",  # an extra
 }
 
 

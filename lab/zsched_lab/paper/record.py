@@ -30,6 +30,7 @@ from mcap.writer import Writer
 
 from zsched.adapters.machine.cgroup import CgroupTree, CpuQuota, MemoryQuota
 from zsched.clock import monotonic_s
+from zsched.commands.watch.tracks import GRID_DEFINITION
 from zsched.core.values.model import NodeId
 from zsched.tasks.map_merge.cdr import CdrError, decode_grid
 from zsched_lab.fleet.application import connect
@@ -38,41 +39,6 @@ from zsched_lab.fleet.signals import StopFlag
 PRECEDENCE = 10
 """How much more of a contended CPU goes to what has no quota than to a node."""
 STREAMS = ("map", "global_map", "map_merge/status")
-OCCUPANCY_GRID = """std_msgs/Header header
-nav_msgs/MapMetaData info
-int8[] data
-================================================================================
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-================================================================================
-MSG: nav_msgs/MapMetaData
-builtin_interfaces/Time map_load_time
-float32 resolution
-uint32 width
-uint32 height
-geometry_msgs/Pose origin
-================================================================================
-MSG: geometry_msgs/Pose
-geometry_msgs/Point position
-geometry_msgs/Quaternion orientation
-================================================================================
-MSG: geometry_msgs/Point
-float64 x
-float64 y
-float64 z
-================================================================================
-MSG: geometry_msgs/Quaternion
-float64 x
-float64 y
-float64 z
-float64 w
-================================================================================
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-"""
-"""nav_msgs/msg/OccupancyGrid as ros2msg."""
 
 
 # --- accounting ------------------------------------------------------------------------------------------------------
@@ -214,7 +180,7 @@ class StreamFile:
     def __init__(self, stream: IO[bytes]) -> None:
         self._writer = Writer(stream)
         self._writer.start(profile="ros2", library="zsched")
-        self._grid = self._writer.register_schema("nav_msgs/msg/OccupancyGrid", "ros2msg", OCCUPANCY_GRID.encode())
+        self._grid = self._writer.register_schema("nav_msgs/msg/OccupancyGrid", "ros2msg", GRID_DEFINITION.encode())
         self._json = self._writer.register_schema("zsched/Status", "jsonschema", b'{"type": "object"}')
         self._channels: dict[str, tuple[int, int]] = {}
 

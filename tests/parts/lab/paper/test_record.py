@@ -19,6 +19,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from support.waiting import free_endpoint, until
 from zsched.adapters.machine.cgroup import LimitedGroup
+from zsched.commands.watch.tracks import GRID_DEFINITION
 from zsched.tasks.map_merge.cdr import encode_grid
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid
@@ -28,7 +29,6 @@ from zsched_lab.fleet.limits import LimitKind, NodeLimits
 from zsched_lab.fleet.signals import StopFlag
 from zsched_lab.paper.load import Loads, Window
 from zsched_lab.paper.record import (
-    OCCUPANCY_GRID,
     PRECEDENCE,
     Heard,
     HostGauge,
@@ -83,7 +83,7 @@ def test_the_schema_is_that_of_ros() -> None:
         lines = (line.partition("#")[0].split() for line in definition.splitlines())
         return {" ".join(words) for words in lines if words and not words[0].startswith(("=", "MSG"))}
 
-    assert fields(OCCUPANCY_GRID) == fields(text)
+    assert fields(GRID_DEFINITION) == fields(text)
 
 
 def test_the_recorder_hears_what_a_robot_sends_and_ends_whole(tmp_path: Path) -> None:

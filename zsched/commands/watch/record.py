@@ -1,0 +1,188 @@
+"""`zsched record`: writes what a fleet does into an MCAP file, for Foxglove and every other reader of MCAP.
+
+Knows: the file, intervals, the tap on maps, signals. Does not know: topics, schemas
+(`zsched.commands.watch.tracks`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import signal
+import sys
+import threading
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO, Final
+
+from zsched.clock import monotonic_s, wall_s
+from zsched.commands.ask import Door, ask_door, find_door
+from zsched.commands.common import CliError, Json
+from zsched.commands.page import harmless, size
+from zsched.commands.watch import tracks
+from zsched.commands.watch.feed import Feed
+from zsched.core.route import keyexpr
+from zsched.errors import AdapterError
+from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_UNREACHABLE, EXIT_USAGE
+
+if TYPE_CHECKING:
+    from mcap.writer import Writer
+
+    from zsched.adapters.network.stream_tap import StreamTap
+
+LIBRARY: Final = "zsched"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordView:
+    """Whom to ask and what to write."""
+
+    runtime_dir: Path | None
+    node: str | None
+    connect: str | None
+    file: Path
+    interval_s: float
+    for_s: float | None
+    """So long; ``None``: until Ctrl-C."""
+    maps: tuple[str, ...] = ()
+    """Key expressions whose samples are maps, besides those that say so by their ROS type."""
+
+
+def record(view: RecordView) -> int:
+    """Record until Ctrl-C, SIGTERM, or the time is over; returns the exit code.
+
+    Raises:
+        CliError: nobody answers (3), the file is there already or cannot be written (1), a key is none (2), or the
+            library that writes is not installed (1).
+    """
+    for key in view.maps:
+        if (fault := keyexpr.fault(key)) is not None:
+            raise CliError(EXIT_USAGE, f"--map: {key!r} is no key expression: {fault}")
+    if view.maps and view.connect is not None:
+        raise CliError(EXIT_USAGE, "--map joins the data network of a daemon here; --connect only asks")
+    feed = Feed(lambda: find_door(view.runtime_dir, view.node, connect=view.connect))
+    door = feed.door()
+    first = feed.ask()
+    if first.status is None:
+        raise CliError(first.code, first.why)
+    ended = threading.Event()
+    with contextlib.ExitStack() as stack:
+        tap = stack.enter_context(_tapped(door, first.status, view))
+        tape = stack.enter_context(_taped(view.file))
+        for number in (signal.SIGINT, signal.SIGTERM):
+            before = signal.signal(number, lambda _number, _frame: ended.set())
+            stack.callback(signal.signal, number, before)
+        end = float("inf") if view.for_s is None else monotonic_s() + view.for_s
+        news = replace(first, entries=())  # the log of before is no part of the recording
+        while True:
+            if news.status is not None:
+                for message in tracks.of_status(news.status, news.at):
+                    tape.put(message)
+            for entry in news.entries:
+                for message in tracks.of_entry(entry):
+                    tape.put(message)
+            _wait(min(monotonic_s() + view.interval_s, end), tap, tape, ended)
+            if ended.is_set() or monotonic_s() >= end:
+                break
+            news = feed.ask()
+            if news.status is None:
+                sys.stderr.write(f"zsched record: {harmless(news.why)}; asking again\n")
+    told = f"{view.file}: {tape.messages} messages of {len(tape.topics)} topics, {size(view.file.stat().st_size)}"
+    missed = f"; {tap.missed} maps came faster than they could be written" if tap is not None and tap.missed else ""
+    sys.stderr.write(f"{told}{missed}\n")
+    return EXIT_OK
+
+
+def _wait(until: float, tap: StreamTap | None, tape: Tape, ended: threading.Event) -> None:
+    """Write maps as they come, until then."""
+    if tap is None:
+        ended.wait(max(until - monotonic_s(), 0.0))
+        return
+    while not ended.is_set() and (now := monotonic_s()) < until:
+        for sample in tap.until(min(now + 0.2, until)):
+            if sample.kind == "put" and sample.side == "fleet":
+                tape.put_map(sample.key, sample.payload.to_bytes(), wall_s() - (monotonic_s() - sample.at))
+
+
+@contextlib.contextmanager
+def _tapped(door: Door, status: Json, view: RecordView) -> Iterator[StreamTap | None]:
+    """A tap on the keys that carry maps; ``None`` where there are none, or no daemon here leads to them."""
+    keys = () if door.endpoint else (*tracks.map_keys(status), *view.maps)
+    if not keys:
+        yield None
+        return
+    asked = {} if door.node is None else {"node": door.node}
+    access = ask_door(Door(socket=door.socket), {"verb": "access", **asked})
+    from zsched.adapters.network.stream_tap import StreamTap  # noqa: PLC0415 - loads zenoh, which only maps need
+
+    try:
+        tap = StreamTap({"fleet": access["sides"]["fleet"]}, keys)
+    except AdapterError as error:
+        raise CliError(EXIT_UNREACHABLE, f"the maps cannot be listened to: {error}") from error
+    with tap:
+        yield tap
+
+
+# --- the file --------------------------------------------------------------------------------------------------------
+
+
+class Tape:
+    """An MCAP file while it is written."""
+
+    def __init__(self, writer: Writer) -> None:
+        self._writer = writer
+        self._schemas: dict[str, int] = {}
+        self.topics: dict[str, int] = {}
+        self._numbers: Counter[str] = Counter()
+
+    @property
+    def messages(self) -> int:
+        """So many have been written."""
+        return self._numbers.total()
+
+    def put(self, message: tracks.Message) -> None:
+        """Write a message of zsched's own."""
+        text = tracks.status_schema() if message.schema == tracks.STATUS else tracks.JSON_SCHEMAS[message.schema]
+        self._put(
+            message.topic, message.schema, "jsonschema", text, "json", json.dumps(message.body).encode(), message.at_ns
+        )
+
+    def put_map(self, key: str, data: bytes, at: float) -> None:
+        """Write a map as its publisher has sent it; ``at``: seconds since 1970."""
+        topic, stamp = tracks.topic_of(key), tracks.nanoseconds(at)
+        self._put(topic, tracks.GRID, "ros2msg", tracks.GRID_DEFINITION, "cdr", data, stamp)
+
+    def _put(self, topic: str, schema: str, kind: str, definition: str, encoding: str, data: bytes, at_ns: int) -> None:
+        if topic not in self.topics:
+            if schema not in self._schemas:
+                self._schemas[schema] = self._writer.register_schema(schema, kind, definition.encode())
+            self.topics[topic] = self._writer.register_channel(topic, encoding, self._schemas[schema])
+        self._numbers[topic] += 1
+        self._writer.add_message(self.topics[topic], at_ns, data, at_ns, self._numbers[topic])
+
+
+@contextlib.contextmanager
+def _taped(path: Path) -> Iterator[Tape]:
+    """A new file; what has been written is whole when the block ends, however it ends."""
+    try:
+        from mcap.writer import Writer  # noqa: PLC0415 - an extra
+    except ImportError as error:
+        raise CliError(EXIT_FAILED, "MCAP cannot be written here: install the extra, pip install '.[mcap]'") from error
+    try:
+        file: BinaryIO = path.open("xb")
+    except FileExistsError as error:
+        raise CliError(EXIT_FAILED, f"{path} is there already: name a new file") from error
+    except OSError as error:
+        raise CliError(EXIT_FAILED, f"{path} cannot be written: {error.strerror}; see its folder") from error
+    with file:
+        writer = Writer(file)
+        writer.start(profile="", library=LIBRARY)
+        try:
+            yield Tape(writer)
+        except OSError as error:
+            raise CliError(EXIT_FAILED, f"{path} cannot be written any more: {error.strerror}") from error
+        finally:
+            with contextlib.suppress(OSError):
+                writer.finish()  # type: ignore[no-untyped-call]
