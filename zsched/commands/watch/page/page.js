@@ -99,7 +99,7 @@ function topology(status) {
       isNarrow && owned.length ? null : s("text", { class: "dim small", x: 12, y: 51 }, `CPU ${percent(node.cpu_ratio)}`),
       s("text", { class: "strong", x: wide - 10, y: 52, "text-anchor": "end" }, owned.length > 2 ? `${owned.length} tasks` : owned.join(", "))));
   }
-  return s("svg", { viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": "nodes, their links in dBm, and which tasks they own" }, wires, labels, boxes);
+  return s("svg", { viewBox: `-1 0 ${width + 2} ${height}`, role: "img", "aria-label": "nodes, their links in dBm, and which tasks they own" }, wires, labels, boxes);
 }
 
 // --- tasks -----------------------------------------------------------------------------------------------------------
