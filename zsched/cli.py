@@ -376,6 +376,36 @@ def record(
 
 
 @app.command(cls=Verb)
+def trace(
+    otlp: Annotated[
+        str, typer.Option("--otlp", metavar="URL", help="An OpenTelemetry collector (OTLP over HTTP).")
+    ] = "http://127.0.0.1:4318",
+    since: Annotated[
+        str | None, typer.Option("--since", metavar="AGE", help="Also moves not older: 90s, 10m, 2h, 1d.")
+    ] = None,
+    once: Annotated[bool, typer.Option("--once", help="Only what the decision log holds, then end.")] = False,
+    node: HereOption = None,
+    runtime_dir: RuntimeOption = None,
+) -> None:
+    """Send a trace span for each move in this machine's decision log to an OpenTelemetry collector.
+
+    Needs the extra trace. Exits with 1 when the collector refused one.
+    """
+    from zsched.commands.history import duration_s  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.watch.trace import TraceView  # noqa: PLC0415 - as above
+    from zsched.commands.watch.trace import trace as send  # noqa: PLC0415 - as above
+
+    view = TraceView(
+        runtime_dir=runtime_dir,
+        node=node,
+        url=otlp,
+        since_s=None if since is None else duration_s(since),
+        is_once=once,
+    )
+    raise typer.Exit(send(view))
+
+
+@app.command(cls=Verb)
 def explain(
     task: Annotated[str, typer.Argument(metavar="TASK", help="A task of the fleet file.")],
     plan: Annotated[

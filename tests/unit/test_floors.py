@@ -76,6 +76,7 @@ OUTSIDE: Final[dict[str, str]] = {
     "ruamel": r"config\.(reader|editing)",
     "typer": r"cli|commands\..+",
     "mcap": r"commands\.watch\.record",  # an extra
+    "opentelemetry": r"commands\.watch\.trace",  # likewise
 }
 
 

@@ -1,0 +1,139 @@
+"""`zsched trace` against a real collector's protocol: what arrives is decoded by OpenTelemetry's own definitions."""
+
+from __future__ import annotations
+
+import contextlib
+import http.server
+import json
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import ExportTraceServiceRequest
+from typer.testing import CliRunner, Result
+
+from zsched.adapters.host.operator_socket import OperatorSocket
+from zsched.cli import app
+from zsched.clock import wall_s
+from zsched.commands.watch.spans import trace_id
+
+STATUS: dict[str, Any] = json.loads(
+    (Path(__file__).parents[3] / "unit/commands/watch/recorded/fleet.json").read_text(encoding="utf-8")
+)
+
+
+class Collector:
+    """Takes spans over HTTP and keeps them."""
+
+    def __init__(self) -> None:
+        self.taken: list[Any] = []
+        self.code = 200
+        collector = self
+
+        class Handler(http.server.BaseHTTPRequestHandler):
+            def do_POST(self) -> None:
+                data = self.rfile.read(int(self.headers["Content-Length"]))
+                assert self.path == "/v1/traces"
+                assert self.headers["Content-Type"] == "application/x-protobuf"
+                if collector.code == 200:
+                    collector.taken.append(ExportTraceServiceRequest.FromString(data))
+                self.send_response(collector.code)
+                self.send_header("Content-Length", "0")
+                self.end_headers()
+
+            def log_message(self, format: str, *args: Any) -> None:  # noqa: A002
+                pass
+
+        self._server = http.server.HTTPServer(("127.0.0.1", 0), Handler)
+        self.url = f"http://127.0.0.1:{self._server.server_port}"
+        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.05,))
+        self._thread.start()
+
+    def close(self) -> None:
+        self._server.shutdown()
+        self._thread.join()
+        self._server.server_close()
+
+
+@pytest.fixture
+def collector() -> Iterator[Collector]:
+    with contextlib.closing(Collector()) as made:
+        yield made
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A daemon whose log holds an old move, and one of just now."""
+    monkeypatch.setenv("ZSCHED_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.delenv("ZSCHED_NODE", raising=False)
+    now = wall_s()
+    lines = [*move(now - 9000.0, 4, "edge1"), *move(now - 1.0, 5, "edge2")]
+    page = {"node": "robot1", "now": now, "entries": lines, "cursor": "1", "more": False}
+    daemon = OperatorSocket(tmp_path / "robot1.sock", lambda asked: STATUS if asked["verb"] == "status" else page)
+    daemon.open()
+    yield tmp_path
+    daemon.close()
+
+
+def move(at: float, epoch: int, owner: str) -> list[dict[str, Any]]:
+    told = {"epoch": epoch, "revision": epoch, "left": "edge3", "owner": owner, "reason": "edge3 is gone", "votes": []}
+    head = {"node": "robot1", "life": 7, "task": "echo"}
+    return [
+        {"at": at, "stage": "scheduler", "text": f"propose {owner}: edge3 is gone", "epoch": epoch - 1, **head},
+        {"at": at + 0.05, "stage": "vote", "text": "learnt", "epoch": epoch, "move": told, **head},
+        {
+            "at": at + 0.125,
+            "stage": "executor",
+            "text": f"flipped to {owner} in 75 ms",
+            "epoch": epoch,
+            "took_s": 0.075,
+            **head,
+        },
+    ]
+
+
+def run(collector: Collector, *arguments: str) -> Result:
+    return CliRunner().invoke(app, ["trace", "--otlp", collector.url, "--once", *arguments])
+
+
+def test_a_collector_gets_one_span_for_each_move(collector: Collector, folder: Path) -> None:
+    assert folder.exists()
+    done = run(collector, "--since", "1m")
+    assert (done.exit_code, done.stderr) == (0, "1 spans sent, 0 refused\n")
+    (request,) = collector.taken
+    (resource,) = request.resource_spans
+    about = {one.key: one.value.string_value for one in resource.resource.attributes}
+    assert (
+        about.items()
+        >= {"service.name": "zsched", "service.namespace": "testbed", "service.instance.id": "robot1"}.items()
+    )
+    (span,) = resource.scope_spans[0].spans
+    assert (span.name, int.from_bytes(span.trace_id, "big")) == ("move echo", trace_id("testbed", "echo", 5))
+    assert span.end_time_unix_nano - span.start_time_unix_nano == pytest.approx(125e6, abs=2e3)
+    told = {one.key: one.value for one in span.attributes}
+    assert (told["zsched.from"].string_value, told["zsched.to"].string_value) == ("edge3", "edge2")
+    assert (told["zsched.epoch"].int_value, told["zsched.switched_s"].double_value) == (5, 0.075)
+    assert [event.name.split()[0] for event in span.events] == ["propose", "learnt", "flipped"]
+
+
+def test_older_moves_are_sent_when_they_are_asked_for(collector: Collector, folder: Path) -> None:
+    assert folder.exists()
+    assert run(collector, "--since", "1d").stderr == "2 spans sent, 0 refused\n"
+    assert len(collector.taken) == 2
+
+
+def test_spans_that_nobody_takes_are_counted(collector: Collector, folder: Path) -> None:
+    assert folder.exists()
+    collector.code = 400
+    done = run(collector, "--since", "1m")
+    assert (done.exit_code, "0 spans sent, 1 refused" in done.stderr) == (1, True)
+
+
+def test_without_the_library_it_says_what_to_install(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert folder.exists()
+    monkeypatch.setitem(sys.modules, "opentelemetry.sdk.trace", None)
+    refused = CliRunner().invoke(app, ["trace", "--once"])
+    assert (refused.exit_code, "install the extra" in refused.stderr) == (1, True)

@@ -1,0 +1,144 @@
+"""`zsched trace`: sends a span for each move to an OpenTelemetry collector (OTLP over HTTP).
+
+Knows: the feed, OpenTelemetry's SDK, signals. Does not know: what belongs to a move (`zsched.commands.watch.spans`).
+"""
+
+from __future__ import annotations
+
+import secrets
+import signal
+import sys
+import threading
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from zsched.clock import wall_s
+from zsched.commands.ask import find_door
+from zsched.commands.common import CliError
+from zsched.commands.page import harmless
+from zsched.commands.watch.feed import Feed
+from zsched.commands.watch.spans import Moves, Span, trace_id
+from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE
+
+if TYPE_CHECKING:
+    from opentelemetry.sdk.trace import TracerProvider
+
+PERIOD_S: Final = 1.0
+SEND_S: Final = 5.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TraceView:
+    """Whose log is read, and where spans go."""
+
+    runtime_dir: Path | None
+    node: str | None
+    url: str
+    """A collector, as http://127.0.0.1:4318."""
+    since_s: float | None
+    """Also moves that are not older; ``None``: from now on."""
+    is_once: bool
+    """End with the log's last line."""
+
+
+def trace(view: TraceView) -> int:
+    """Send spans until Ctrl-C or SIGTERM; returns the exit code.
+
+    Raises:
+        CliError: nobody answers (3), another machine's log is meant (2), or the library that sends is not there (1).
+    """
+    feed = Feed(lambda: find_door(view.runtime_dir, view.node))
+    if feed.door().node is not None:
+        raise CliError(EXIT_USAGE, f"the log of {view.node} lies on its machine: ask there")
+    news = feed.ask()
+    if news.status is None:
+        raise CliError(news.code, news.why)
+    sender, moves, ended = Sender(view.url, news.status["fleet"], news.status["node"]), Moves(), threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda _number, _frame: ended.set())
+    oldest = news.at - (view.since_s or 0.0)
+    sender.send(span for span in moves.take(news.entries) if span.end >= oldest)
+    while not view.is_once and not ended.wait(PERIOD_S):
+        news = feed.ask()
+        if news.status is None:
+            sys.stderr.write(f"zsched trace: {harmless(news.why)}; asking again\n")
+        sender.send((*moves.take(news.entries), *moves.overdue(wall_s())))
+    if view.is_once:
+        sender.send(span for span in moves.rest() if span.end >= oldest)
+    sys.stderr.write(f"{sender.sent} spans sent, {sender.refused} refused\n")
+    return EXIT_FAILED if sender.refused else EXIT_OK
+
+
+class Sender:
+    """Makes OpenTelemetry's spans of ours and sends each at once."""
+
+    def __init__(self, url: str, fleet: str, node: str) -> None:
+        """``url``: of the collector.
+
+        Raises:
+            CliError: the library is not installed.
+        """
+        try:
+            from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter  # noqa: PLC0415 - an extra
+            from opentelemetry.sdk.resources import Resource  # noqa: PLC0415 - as above
+            from opentelemetry.sdk.trace import TracerProvider  # noqa: PLC0415 - as above
+            from opentelemetry.sdk.trace.id_generator import IdGenerator  # noqa: PLC0415 - as above
+        except ImportError as error:
+            raise CliError(
+                EXIT_FAILED, "OpenTelemetry is not installed here: install the extra, pip install '.[trace]'"
+            ) from error
+
+        class Named(IdGenerator):
+            """Gives a move's trace its name."""
+
+            trace = 1
+
+            def generate_trace_id(self) -> int:
+                return self.trace
+
+            def generate_span_id(self) -> int:
+                return secrets.randbits(64) or 1
+
+        self._fleet, self._names = fleet, Named()
+        self._exporter = OTLPSpanExporter(endpoint=f"{url.rstrip('/')}/v1/traces", timeout=SEND_S)
+        about = {"service.name": "zsched", "service.namespace": fleet, "service.instance.id": node}
+        self._provider: TracerProvider = TracerProvider(
+            resource=Resource.create(about), id_generator=self._names, shutdown_on_exit=False
+        )
+        self.sent = self.refused = 0
+
+    def send(self, spans: Iterable[Span]) -> None:
+        """Send each; what no collector takes is counted, not kept."""
+        from opentelemetry.sdk.trace import ReadableSpan  # noqa: PLC0415 - an extra
+        from opentelemetry.sdk.trace.export import SpanExportResult  # noqa: PLC0415 - as above
+
+        tracer = self._provider.get_tracer("zsched")
+        for span in spans:
+            self._names.trace = trace_id(self._fleet, span.task, span.epoch)
+            made = tracer.start_span(f"move {span.task}", start_time=_ns(span.begin), attributes=_attributes(span))
+            for at, stage, text in span.lines:
+                made.add_event(text, {"zsched.stage": stage}, timestamp=_ns(at))
+            made.end(end_time=_ns(span.end))
+            assert isinstance(made, ReadableSpan)
+            is_taken = self._exporter.export([made]) is SpanExportResult.SUCCESS
+            self.sent += is_taken
+            self.refused += not is_taken
+
+
+def _attributes(span: Span) -> dict[str, str | int | float]:
+    told: dict[str, str | int | float | None] = {
+        "zsched.task": span.task,
+        "zsched.epoch": span.epoch,
+        "zsched.from": span.left,
+        "zsched.to": span.owner,
+        "zsched.reason": span.reason,
+        "zsched.node": span.node,
+        "zsched.switched_s": span.switched_s,
+    }
+    return {name: value for name, value in told.items() if value is not None}
+
+
+def _ns(at: float) -> int:
+    return round(at * 1e6) * 1000
