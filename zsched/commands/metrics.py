@@ -1,7 +1,8 @@
 """`zsched metrics`: a status as Prometheus text (version 0.0.4), on stdout or in a file for node_exporter.
 
 Names follow Prometheus' conventions: a unit as suffix, ``_total`` for what only rises. Epochs and revisions are gauges:
-a new generation sets them anew. Nothing listens: a file is written by a timer of the operator's.
+a new generation sets them anew. Nothing listens here: a file is written by a timer of the operator's, and
+`zsched web` answers with the same text.
 
 Knows: names, labels, the format, atomic writing. Does not know: what a figure means for a decision.
 """
