@@ -31,7 +31,7 @@ def task_rows(page: Page, status: Json, at: float | None) -> None:
     task_room = min(max([10, *(len(task["name"]) for task in tasks)]), 20)
     names = [len(task["owner"] or "nobody") + (0 if task.get("pin") is None else 6) for task in tasks]
     owner_room = min(max([6, *names]), 20)
-    columns = (task_room, owner_room, 8, 14 if at is not None else 6, 9, -7, -7, page.width)
+    columns = (task_room, owner_room, 8, 15 if at is not None else 6, 9, -7, -7, page.width)
     page.row(*((t, w, "dim" if i else "stage") for i, (t, w) in enumerate(zip(TITLES, columns, strict=True))))
     for task in tasks:
         cells = _cells(task, at)
