@@ -115,7 +115,9 @@ class Granter:
         self._last = Grant(
             task=self.task, owner=beat.node, incarnation=beat.incarnation, epoch=epoch, number=beat.sequence
         )
-        self._granted_at, self._hold_s = now, hold_s(self.lease_s)
+        # What was granted before, maybe by a longer lease, ends when it would have ended.
+        self._hold_s = max(hold_s(self.lease_s), self._granted_at + self._hold_s - now)
+        self._granted_at = now
         return is_new
 
     def _is_held(self, beat: Beat, now: float) -> bool:

@@ -379,6 +379,15 @@ def test_lease_shortened_a_grant_of_before_is_guarded_with_its_own_length() -> N
     assert elector.may_accept("merge", "robot3", 20.0 + hold_s(L / 10))
 
 
+def test_lease_shortened_a_later_grant_does_not_end_an_earlier_longer_one() -> None:
+    elector = leases()
+    assert elector.on_beat(beat(0), OWNERS, 10.0)
+    renumbered(elector, lease_s=L / 10)
+    elector.on_beat(beat(2, sequence=7), OWNERS, 10.1)
+    assert not elector.may_accept("merge", "robot3", 10.0 + hold_s(L) - 0.01)
+    assert elector.may_accept("merge", "robot3", 10.0 + hold_s(L))
+
+
 def test_task_removed_and_added_grants_are_remembered_by_name() -> None:
     elector = leases()
     assert elector.on_beat(beat(0), OWNERS, 10.0)
