@@ -61,8 +61,8 @@ class Invariants:
     """{(task, revision): the one value}."""
     newest: dict[tuple[str, TaskId], int] = field(default_factory=dict)
     """{(machine, task): the newest revision that it ever learnt}."""
-    ballots: dict[tuple[TaskId, Ballot], tuple[str, Allocation | None]] = field(default_factory=dict)
-    """{(task, ballot): (whose it is, what it carries)}."""
+    ballots: dict[tuple[tuple[TaskId, int], Ballot], tuple[str, Allocation | None]] = field(default_factory=dict)
+    """{((task, creation), ballot): (whose it is, what it carries)}."""
     _counted: dict[str, int] = field(default_factory=dict)
     """{machine: the revision of its newest fleet value}."""
     _floors: dict[str, dict[TaskId, Ballot]] = field(default_factory=dict)
@@ -108,6 +108,8 @@ class Invariants:
             known = old.get(register.task)
             if known is register:
                 continue
+            if known is not None and known.creation != register.creation:
+                known = None  # the task has left the document and come back: its register is another one
             self._floors.setdefault(machine.key, {})[register.task] = NO_BALLOT if known is None else known.promised
             if known is not None and register.promised < known.promised:
                 raise InvariantError(f"{machine.key} promised {register.promised} after {known.promised}")
@@ -161,9 +163,10 @@ class Invariants:
                 for value in learnt.values:
                     self._check_told(machine, value.task, value.revision)
             case do.SendPrepare(prepare=prepare):
-                self._check_ballot(machine, prepare.task, prepare.ballot, None)
+                self._check_ballot(machine, (prepare.task, prepare.creation), prepare.ballot, None)
             case do.SendAccept(accept=accept):
-                self._check_ballot(machine, accept.task, accept.acceptance.ballot, accept.acceptance.value)
+                name, held = (accept.task, accept.creation), accept.acceptance
+                self._check_ballot(machine, name, held.ballot, held.value)
             case do.PublishProposal(proposal=proposal) if not proposal.is_escape:
                 self._check_cap(machine, proposal)
             case do.SetRole(role=role) if role.role is WorkerRole.ACTIVE:
@@ -201,13 +204,16 @@ class Invariants:
         floor = self._floors.get(machine.key, {}).get(answer.task)
         if floor is None or answer.ballot < floor:
             raise InvariantError(f"{machine.key} accepted below what it had promised: {answer}")
-        value = self.ballots.get((answer.task, answer.ballot), ("", None))[1]
+        name = answer.task, self._register(machine, answer.task).creation
+        value = self.ballots.get((name, answer.ballot), ("", None))[1]
         if value is not None:
             ballot = str(Acceptance(ballot=answer.ballot, value=value))
             stored = Stored(at=now, node=machine.key, task=answer.task, revision=value.revision, ballot=ballot)
             self.take(stored)
 
-    def _check_ballot(self, machine: Machine, task: TaskId, ballot: Ballot, value: Allocation | None) -> None:
+    def _check_ballot(
+        self, machine: Machine, task: tuple[TaskId, int], ballot: Ballot, value: Allocation | None
+    ) -> None:
         """No two lives use one ballot, and it carries one value only."""
         life = f"{machine.key} life {machine.life}"
         first, carried = self.ballots.setdefault((task, ballot), (life, value))

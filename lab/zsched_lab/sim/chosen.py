@@ -44,6 +44,8 @@ class Chosen:
         self._held: dict[tuple[Name, Ballot], set[tuple[NodeId, str]]] = {}
         """{(register, ballot): (name, disk) of every machine that has had it on disk}."""
         self._newest: dict[Name, int] = {}
+        self._newest_ballot: dict[Name, tuple[int, Ballot]] = {}
+        """{register: (number, ballot) of the newest choice}."""
         self._done: set[tuple[Name, Ballot]] = set()
         self.begin(first, ())
 
@@ -116,14 +118,16 @@ class Chosen:
             self._choose(name, held.value)
 
     def _is_late(self, key: tuple[Name, Ballot], value: Value) -> bool:
-        """Whether the value that ended a number is chosen once more under that number, in a later ballot.
+        """Whether a value that was chosen before is chosen once more, in a ballot below that of the newest choice.
 
-        The fleet register begins anew under each number, so nothing of the later numbers falls behind it.
+        Who proposed the newer one has read it, so nothing is forgotten. The fleet register begins anew under each
+        number: there a later ballot of an earlier number is below, too.
         """
-        if not isinstance(value, FleetValue):
-            return False
-        is_known = self.values[key[0]].get(value.revision) == value
-        return is_known and self._numbers[key] < value.number and key[0] in self._newest
+        name, ballot = key
+        newest = self._newest_ballot.setdefault(name, (0, NO_BALLOT))
+        is_below = (self._numbers[key], ballot) < newest
+        self._newest_ballot[name] = max(newest, (self._numbers[key], ballot))
+        return is_below and self.values.get(name, {}).get(value.revision) == value
 
     def _choose(self, name: Name, value: Value) -> None:
         known = self.values.setdefault(name, {})

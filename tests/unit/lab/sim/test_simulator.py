@@ -209,7 +209,7 @@ def test_two_acceptances_in_one_write_are_two_and_an_older_one_after_that_is_fou
     first = replace(state.promised, counter=state.promised.counter + 1)
     second = replace(first, counter=first.counter + 1)
     accepted = Acceptance(ballot=first, value=allocation_of(state.accepted.value.revision + 1, "edge2", 2))
-    sim.invariants.ballots["merge", first] = ("robot2 life 1", accepted.value)
+    sim.invariants.ballots[("merge", 0), first] = ("robot2 life 1", accepted.value)
 
     def answer(ballot: Ballot) -> None:
         said = Accepted(elector="robot1", task="merge", ballot=ballot)
