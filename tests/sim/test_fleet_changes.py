@@ -8,10 +8,12 @@ import pytest
 
 from support.fleets import fleet_of, tuning_of
 from zsched.core import events as ev
+from zsched.core.electorate.documents import Documents
 from zsched.core.values.document import Document
 from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec
 from zsched.core.values.messages import ChangeFleet, CommandOutcome, CommandResult
 from zsched.core.values.model import NodeId
+from zsched_lab.sim import fleets
 from zsched_lab.sim.simulator import Simulator
 
 TASK = "merge"
@@ -185,3 +187,21 @@ def test_an_elector_without_the_document_accepts_nothing_until_it_has_fetched_it
     play.adopt()
     for machine in play.sim.machines.values():
         assert len(machine.disk.documents) == 1
+
+
+# --- schedules -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("block", range(3))
+def test_no_schedule_of_changes_under_faults_breaks_what_must_hold(block: int) -> None:
+    assert [found for seed in range(5 * block, 5 * block + 5) if (found := fleets.play(seed)[0])] == []
+
+
+def test_the_command_plays_and_counts(capsys: pytest.CaptureFixture[str]) -> None:
+    assert fleets.main(["--seeds", "1", "--first", "3"]) == 0
+    assert "1 schedules, 0 violations" in capsys.readouterr().out
+
+
+def test_a_schedule_finds_an_elector_that_answers_without_the_document(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Documents, "holds", lambda _self, _value: True)
+    assert fleets.play(0)[0]
