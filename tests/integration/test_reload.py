@@ -106,7 +106,7 @@ def test_tasks_weights_and_commands_change_while_a_reliable_stream_runs(tmp_path
             assert [len(lives) for lives in worker_lives(bed).values()] == [1, 1, 0], "no worker was started again"
 
             # another command: standby first, then a move, then the owner of before
-            owner = bed.owner("robot1")
+            owner = bed.wait(lambda: bed.owner("robot1"), 60, "the owner")
             tree["tasks"][TASK]["worker"]["env"] = {"ANOTHER": "1"}
             reload(bed, tree)
             bed.wait(lambda: [len(one) for one in worker_lives(bed).values()] == [2, 2, 0], 90, "each worker runs anew")

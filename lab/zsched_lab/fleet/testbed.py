@@ -211,7 +211,10 @@ class Testbed:
         Raises:
             AdapterError: it does not answer.
         """
-        return ask(places.socket_path(self.folder, node), {"verb": "status"}, timeout_s)
+        answer = ask(places.socket_path(self.folder, node), {"verb": "status"}, timeout_s)
+        if "error" in answer:
+            raise AdapterError(str(answer["error"]))
+        return answer
 
     def task(self, node: NodeId) -> Json:
         """The first task's block in one daemon's status."""
