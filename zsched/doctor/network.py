@@ -20,12 +20,12 @@ from typing import Final
 
 from zsched.clock import wall_ns
 from zsched.core.values.fleet import NodeSpec, dial_endpoint
-from zsched.doctor.certificate import validities
 from zsched.doctor.model import Result, Scene, counted, failed, joined, passed, skipped, warned
 from zsched.errors import ConfigError
 from zsched.files import read_regular
 from zsched.procfs import names, read_file
 from zsched.runtime.tls import PLAIN, operator_json5, plain_text_problem, protocol_of
+from zsched.sessions.certificate import validities
 from zsched.sessions.config import tls_files
 
 RESOLVE_S: Final = 5.0

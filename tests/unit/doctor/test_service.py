@@ -14,8 +14,8 @@ import pytest
 from support.certificates import make_tls
 from support.clinic import FLEET, assert_finds, run, scene_of
 from zsched.doctor import network
-from zsched.doctor.certificate import validities
 from zsched.doctor.model import Scene, Verdict
+from zsched.sessions.certificate import validities
 
 ROOT = Path(__file__).parents[3]
 FAIL, WARN, PASS, SKIP = Verdict.FAIL, Verdict.WARN, Verdict.PASS, Verdict.SKIP
