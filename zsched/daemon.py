@@ -42,7 +42,7 @@ from zsched.core.node import Node
 from zsched.core.route.route import outputs_of, watch_for
 from zsched.core.status import status_line
 from zsched.core.values.durable import DurableState
-from zsched.core.values.fleet import Fleet, dial_endpoint, electorate_hash, fleet_hash, runs_worker
+from zsched.core.values.fleet import Fleet, WorkerLink, dial_endpoint, electorate_hash, fleet_hash, runs_worker
 from zsched.core.values.model import NodeId, NodeKind, TaskId
 from zsched.errors import AdapterError, ConfigError, NameTakenError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_NAME_TAKEN, EXIT_OK
@@ -52,12 +52,14 @@ from zsched.ipc.takeover import Door
 from zsched.log_limit import limit_handlers
 from zsched.runtime import tls as daemon_tls
 from zsched.runtime.access import StreamAccess, joins_at
+from zsched.runtime.access_rules import Side
 from zsched.runtime.descriptors import take_descriptors
 from zsched.runtime.endpoints import DATA_PORT, Endpoints, claim_port, endpoints_for, free_port, is_here
 from zsched.runtime.leaving import Leaving
 from zsched.runtime.library import Library
 from zsched.runtime.memory import shared_memory_objection
 from zsched.runtime.sampler import Sampler
+from zsched.runtime.secured import digest_of, require_own
 from zsched.runtime.sessions import SessionsRead
 from zsched.runtime.shell import Desk, Inbox, Shell
 from zsched.sessions import config as zenoh_config
@@ -214,8 +216,10 @@ class Daemon:
 
     def _read_settings(self) -> None:
         """What hangs on the fleet in force, and is the same for as long as the process lives."""
-        self._operator_json5 = daemon_tls.operator_json5(self._fleet)
-        self._protocol = daemon_tls.protocol_of(self._fleet, self._operator_json5)
+        self._protocol = daemon_tls.protocol_of(self._fleet, daemon_tls.operator_json5(self._fleet))
+        self._texts = {side: daemon_tls.session_text(self._fleet, side) for side in Side}
+        if self._fleet.security is not None:
+            require_own(self._fleet, self._fleet.security, self._spec.name)
         self._memory_objection = shared_memory_objection(self._fleet, self._spec)
 
     def _data_port(self, stack: contextlib.ExitStack) -> int:
@@ -234,7 +238,6 @@ class Daemon:
         """Open the adapters; each is closed by ``stack`` in the reverse order."""
         zenoh_log.capture(os.environ)
         fleet, me = self._fleet, self._spec.name
-        operator_json5 = self._operator_json5
         bus = ControlBus(
             fleet=fleet.name,
             node=me,
@@ -243,14 +246,14 @@ class Daemon:
                 listen=points.control_listen,
                 connect=points.control_connect,
                 timing=fleet.timing,
-                operator_json5=operator_json5,
+                operator_json5=self._texts[Side.CONTROL],
                 dials_by_gossip=points.control_by_gossip,
             ),
             post=self._inbox.post,
             is_voter=self._spec.kind is NodeKind.ROBOT,
             hears_all_beats_at_once=any(task.exclusive for task in fleet.tasks),
         )
-        access = StreamAccess(fleet, me, points.worker_connect[:1], operator_json5)
+        access = StreamAccess(fleet, me, points.worker_connect[:1], self._texts[Side.VISIT])
         decisions = DecisionLog(
             self._options.state_dir,
             me,
@@ -270,8 +273,8 @@ class Daemon:
         stack.callback(self._library.close)
         decisions.start()
         stack.callback(decisions.close)
-        shell.relay = relay = self._relay(shell, incarnation, points, operator_json5)
-        shell.crew.supervisor = supervisor = self._supervisor(stack, shell, incarnation, points, operator_json5)
+        shell.relay = relay = self._relay(shell, incarnation, points)
+        shell.crew.supervisor = supervisor = self._supervisor(stack, shell, incarnation, points)
         shell.crew.begin()
         for watch in filter(None, (watch_for(fleet, task, me) for task in fleet.tasks)):
             relay.watch(watch)
@@ -283,13 +286,14 @@ class Daemon:
         stack.callback(sampler.stop)
         return shell
 
-    def _relay(self, shell: Shell, incarnation: int, points: Endpoints, operator_json5: str) -> RelayHandle:
+    def _relay(self, shell: Shell, incarnation: int, points: Endpoints) -> RelayHandle:
         fleet = self._fleet
+        certificate = "" if fleet.security is None else f"/{digest_of(fleet.security)}"
         bequest = Bequest(
             door=self._door,
             orphan_s=fleet.relay_orphan_s,
             incarnation=incarnation,
-            digest=fleet_hash(fleet),
+            digest=f"{fleet_hash(fleet)}{certificate}",  # a relay listens with the certificate that it began with
             listen=points.data_listen[0],
         )
         return RelayHandle(
@@ -300,7 +304,7 @@ class Daemon:
                 connect=points.data_connect,
                 timing=fleet.timing,
                 shared_memory=self._memory_objection == "",
-                operator_json5=operator_json5,
+                operator_json5=self._texts[Side.DATA],
                 dials_by_gossip=points.data_by_gossip,
             ),
             on_report=shell.on_report,
@@ -311,7 +315,7 @@ class Daemon:
         )
 
     def _supervisor(
-        self, stack: contextlib.ExitStack, shell: Shell, incarnation: int, points: Endpoints, operator_json5: str
+        self, stack: contextlib.ExitStack, shell: Shell, incarnation: int, points: Endpoints
     ) -> WorkerSupervisor:
         fleet, me = self._fleet, self._spec.name
         mine = {task.name: task.worker for task in fleet.tasks if runs_worker(task, me, self._spec.kind)}
@@ -336,7 +340,7 @@ class Daemon:
                 timing=fleet.timing,
                 link=spec.link,
                 shared_memory=self._memory_objection == "",
-                operator_json5=operator_json5,
+                operator_json5=self._texts[Side.VISIT if spec.link is WorkerLink.CLIENT else Side.DATA],
                 dials_by_gossip=points.worker_by_gossip,
             )
             try:

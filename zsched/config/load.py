@@ -15,6 +15,7 @@ from zsched.config.blocks import Located, Section
 from zsched.config.nodes import Cast, read_nodes, select, warn_missing
 from zsched.config.reader import MAX_FILE_BYTES, Collector, Fault, Place, nearest, read_yaml, render_all
 from zsched.config.schema import FLEET
+from zsched.config.security import read_security
 from zsched.config.tasks import read_tasks
 from zsched.config.timing import WIFI, timing_faults
 from zsched.core.membership.beat_room import MAX_BEAT_BYTES, most_bytes
@@ -116,6 +117,7 @@ def _fleet(section: Section, folder: Path, out: Collector) -> Fleet | None:
     electors = _electors(section, cast, out)
     tasks = read_tasks(section, cast, out)
     zenoh_config = _zenoh_config(section, folder, out)
+    security = read_security(section, cast, folder, out)
     if out.count:
         return None
     fleet = Fleet(
@@ -126,6 +128,7 @@ def _fleet(section: Section, folder: Path, out: Collector) -> Fleet | None:
         electors=electors,
         seeds=seeds,
         zenoh_config=zenoh_config,
+        security=security,
         **{name: section.get(name) for name in ("relay_orphan_s", "shared_memory") if name in section.values},
     )
     _check_beats(fleet, section.where("tasks"), out)
