@@ -32,6 +32,7 @@ from zsched.commands.fleet_verbs import (
     node_app,
     task_app,
 )
+from zsched.commands.pki_verbs import pki_app
 from zsched.commands.program import Program
 from zsched.commands.stream_verbs import stream_app
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE
@@ -60,6 +61,7 @@ app = typer.Typer(
 app.add_typer(stream_app)
 for group in (fleet_app, task_app, node_app):
     app.add_typer(group)
+app.add_typer(pki_app)
 metrics_app = typer.Typer(
     name="metrics", cls=Verbs, help="Figures for Prometheus.", no_args_is_help=True, rich_markup_mode=None
 )
