@@ -44,6 +44,7 @@ from zsched.core.status import status_line
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet, WorkerLink, dial_endpoint, electorate_hash, fleet_hash, runs_worker
 from zsched.core.values.model import NodeId, NodeKind, TaskId
+from zsched.core.values.snapshot import Exposure
 from zsched.errors import AdapterError, ConfigError, NameTakenError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_NAME_TAKEN, EXIT_OK
 from zsched.files import write_regular
@@ -52,7 +53,7 @@ from zsched.ipc.takeover import Door
 from zsched.log_limit import limit_handlers
 from zsched.runtime import tls as daemon_tls
 from zsched.runtime.access import StreamAccess, joins_at
-from zsched.runtime.access_rules import Side
+from zsched.runtime.access_rules import Side, common_names_of
 from zsched.runtime.descriptors import take_descriptors
 from zsched.runtime.endpoints import DATA_PORT, Endpoints, claim_port, endpoints_for, free_port, is_here
 from zsched.runtime.leaving import Leaving
@@ -156,6 +157,7 @@ class Daemon:
                 node.problems["shared_memory"] = f"shared memory is off here: {self._memory_objection}"
             if plain_text := daemon_tls.plain_text_problem(self._spec, self._protocol):
                 node.problems["tls"] = plain_text
+            node.security = self._exposure(points)
             gc.freeze()  # what lives until the end need not be looked at again
             self._loop(node, shell)
         return EXIT_OK
@@ -214,6 +216,14 @@ class Daemon:
             self._read_settings()
             log.info("document in force revision=%d document=%s", value.revision, value.document)
 
+    def _exposure(self, points: Endpoints) -> Exposure:
+        found = daemon_tls.exposure(self._fleet, self._protocol, (*points.control_listen, *points.data_listen))
+        if found is Exposure.OPEN:
+            log.warning(
+                "not_secured: whoever reaches this network reads and changes everything; see docs/guide/secure.md"
+            )
+        return found
+
     def _read_settings(self) -> None:
         """What hangs on the fleet in force, and is the same for as long as the process lives."""
         self._protocol = daemon_tls.protocol_of(self._fleet, daemon_tls.operator_json5(self._fleet))
@@ -250,6 +260,7 @@ class Daemon:
                 dials_by_gossip=points.control_by_gossip,
             ),
             post=self._inbox.post,
+            members=None if fleet.security is None else common_names_of(fleet, fleet.security),
             is_voter=self._spec.kind is NodeKind.ROBOT,
             hears_all_beats_at_once=any(task.exclusive for task in fleet.tasks),
         )

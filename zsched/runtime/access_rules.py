@@ -75,6 +75,12 @@ def access_control(fleet: Fleet, security: Security, side: Side) -> Json:
     }
 
 
+def common_names_of(fleet: Fleet, security: Security) -> frozenset[str]:
+    """The common name of every certificate that is let in."""
+    holders = _holders(fleet, security, Side.CONTROL)
+    return frozenset(name for _, names, _ in holders for name in names)
+
+
 Rule = tuple[str, tuple[str, ...], list[str]]
 """(flow, messages, keys)."""
 

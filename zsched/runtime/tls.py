@@ -7,10 +7,12 @@ Where TLS is set up, nothing of ours listens in plain text: what the fleet file 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
 from zsched.core.values.fleet import Fleet, NodeSpec
+from zsched.core.values.snapshot import Exposure
 from zsched.errors import ConfigError
 from zsched.files import read_regular
 from zsched.runtime.access_rules import Side
@@ -81,6 +83,21 @@ def protocol_of(fleet: Fleet, text: str) -> str:
             "sessions listen; set them under transport/link/tls in the file that `zenoh: {config: ...}` names"
         )
     return "tls"
+
+
+def exposure(fleet: Fleet, protocol: str, listens: Iterable[str]) -> Exposure:
+    """Who is let in to the sessions of a node that listens with ``protocol``, or as the file says, at ``listens``."""
+    if fleet.security is not None:
+        return Exposure.SECURED
+    plain = [end for end in listens if _scheme(end) not in ENCRYPTED]
+    if protocol != PLAIN and not plain:
+        return Exposure.ENCRYPTED
+    return Exposure.LOCAL if all(_is_loopback(end) for end in plain) else Exposure.OPEN
+
+
+def _is_loopback(endpoint: str) -> bool:
+    host = endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
+    return host in ("localhost", "::1") or host.startswith("127.")
 
 
 def plain_text_problem(me: NodeSpec, protocol: str) -> str | None:
