@@ -439,10 +439,12 @@ def weights(
             raise CliError(EXIT_USAGE, "--revision goes with new weights, e.g. cpu=0.6 memory=0.4")
         show_weights(find_door(runtime_dir, node, connect=connect), task, is_json=json_)
         return
-    if connect is not None:
-        raise CliError(EXIT_USAGE, "--connect only asks: change weights on a machine of the fleet")
+    if connect is not None and not connect.startswith(("tls/", "quic/")):
+        raise CliError(EXIT_USAGE, "--connect only asks without a certificate: write tls/NODE, or run this on a node")
     wanted = parse_weights(pairs)
-    raise typer.Exit(change_weights(find_door(runtime_dir, node), task, wanted, revision, is_json=json_))
+    raise typer.Exit(
+        change_weights(find_door(runtime_dir, node, connect=connect), task, wanted, revision, is_json=json_)
+    )
 
 
 @app.command(cls=Verb)

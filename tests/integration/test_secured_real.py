@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,13 +16,11 @@ import zenoh
 
 from support.authorities import install, make_authority
 from zsched.adapters.host.operator_socket import ask
-from zsched.adapters.network.fleet_client import FleetClient
 from zsched.config.load import load_fleet
 from zsched.core.values.certificates import Role
-from zsched.core.values.messages import CommandOutcome, CommandResult, SetWeights
-from zsched.errors import AdapterError
+from zsched.pki.authority import opened
 from zsched.runtime.access_rules import Side
-from zsched.runtime.tls import asker_in, session_text
+from zsched.runtime.tls import session_text
 from zsched.sessions.config import client_config
 from zsched_lab.fleet.testbed import TASK, Json, Testbed, echo_fleet
 
@@ -71,28 +70,19 @@ def zsched(bed: Testbed, node: str, *words: str) -> subprocess.CompletedProcess[
 
 def test_an_operator_commands_from_elsewhere_and_a_guest_only_looks(bed: Testbed) -> None:
     endpoint = bed.fleet.node("robot1").listen_control
-    change = SetWeights(task=TASK, cpu=0.25, memory=0.75, network=0.0)
     for name, more, node in (("ana", [], "robot1"), ("screen", ["--node", "edge2"], "edge2")):
         seen = zsched(bed, name, "status", "--connect", endpoint, "--json", *more)
         assert seen.returncode == 0, seen.stderr
         assert json.loads(seen.stdout)["node"] == node
+    assert bed.status("robot1")["security"] == "secured"
     before = bed.task("robot1")["tuning"]
 
-    def command(name: str) -> CommandResult:
-        fleet = load_fleet(bed.folder / name / "fleet.yaml")
-        config = client_config(connect=(endpoint,), operator_json5=session_text(fleet, Side.VISIT), patience_s=5.0)
-        client = FleetClient(endpoint, config, asker_in(fleet, ""), fleet.name)
-        try:
-            answer = client.ask("robot1", change)
-        finally:
-            client.close()
-        assert isinstance(answer, CommandResult)
-        return answer
-
-    with pytest.raises(AdapterError, match="did not answer"):
-        command("screen")
+    change = ["weights", TASK, "cpu=0.25", "memory=0.75", "--connect", endpoint]
+    refused = zsched(bed, "screen", *change)
+    assert "did not answer" in refused.stderr, refused.stderr
     assert bed.task("robot1")["tuning"] == before
-    assert command("ana").outcome is CommandOutcome.OK
+    done = zsched(bed, "ana", *change)
+    assert done.returncode == 0, done.stderr
     bed.wait(
         lambda: bed.task("robot2")["tuning"]["weights"]["memory"] == 0.75, 60, "the new weights at the other robot"
     )
@@ -121,3 +111,18 @@ def test_streams_run_and_move_and_tools_find_their_certificates(bed: Testbed) ->
     shutil.rmtree(bed.folder / "robot2")
     refused = zsched(bed, "robot2", "init", "--state-dir", str(bed.folder / "robot2"))
     assert "knows robot2 as an elector that has voted" in refused.stderr, refused.stderr
+
+
+def test_a_link_that_belongs_to_nobody_is_counted_and_named(bed: Testbed) -> None:
+    with opened(bed.folder / "authority", bed.fleet.name) as authority:
+        install(authority, bed.folder / "mallory" / "pki", "mallory", Role.GUEST)
+    fleet = load_fleet(bed.folder / "screen" / "fleet.yaml")
+    assert fleet.security is not None
+    stranger = replace(fleet, security=replace(fleet.security, folder=str(bed.folder / "mallory" / "pki")))
+    endpoint = bed.fleet.node("robot1").listen_control
+    config = client_config(connect=(endpoint,), operator_json5=session_text(stranger, Side.VISIT), patience_s=5.0)
+    with zenoh.open(zenoh.Config.from_json5(config)):
+        bed.wait(
+            lambda: bed.status("robot1")["counters"].get("dropped_link_stranger"), 60, "the stranger to be counted"
+        )
+    assert "certificate='mallory.guest.testbed.zsched.internal'" in bed.log("robot1")
