@@ -359,6 +359,30 @@ def test_an_operator_commands_in_its_own_name(fresh: Yard) -> None:
 # --- what is let in --------------------------------------------------------------------------------------------------
 
 
+def test_between_two_authorities_certificates_of_both_are_let_in(fresh: Yard, tmp_path: Path) -> None:
+    """A machine whose ``ca.pem`` is the one of a rotation; its own certificate is still of the former authority."""
+    authority = make_authority(tmp_path / "authority", "yard")
+    for name in ("robot1", "robot2"):
+        install(authority, fresh.folder / f"turning {name}", name)
+    authority.rotate(b"", datetime.now(UTC))
+    install(authority, fresh.folder / "turned edge1", "edge1")
+    (fresh.folder / "turning robot1" / "ca.pem").write_bytes(authority.trusted)
+    (fresh.folder / "fleet.yaml").write_text(FLEET.replace("FOLDER", "turning robot1"))
+    fleet = check_file(fresh.folder / "fleet.yaml").fleet
+    assert fleet is not None
+    endpoint = free_endpoint().replace("tcp/", "tls/")
+    text = zenoh_config.control_config(listen=(endpoint,), connect=(), operator_json5=session_text(fleet, Side.CONTROL))
+    with zenoh.open(zenoh.Config.from_json5(text)) as session:
+        victim = Victim(session, endpoint)
+        for holder in ("turning robot2", "turned edge1"):
+            bundle = str(fresh.folder / "turning robot1" / "ca.pem")
+            with fresh.session(victim, fresh.tls(holder, root_ca_certificate=bundle)):
+                assert victim.links() == {f"{holder.split()[1]}.yard.zsched.internal"}
+            until_alone(victim)
+        with pytest.raises(zenoh.ZError), fresh.session(victim, fresh.tls("robot2"), patience_s=REFUSED_S):
+            pass
+
+
 def test_a_p256_key_is_let_in_like_any_other(fresh: Yard) -> None:
     key = ec.generate_private_key(ec.SECP256R1())
     request = (
