@@ -83,6 +83,8 @@ def test_an_operator_commands_from_elsewhere_and_a_guest_only_looks(bed: Testbed
     assert bed.task("robot1")["tuning"] == before
     done = zsched(bed, "ana", *change)
     assert done.returncode == 0, done.stderr
+    assert "command=SetWeights from=ana" in bed.log("robot1")
+    assert "from=screen" not in bed.log("robot1")
     bed.wait(
         lambda: bed.task("robot2")["tuning"]["weights"]["memory"] == 0.75, 60, "the new weights at the other robot"
     )

@@ -82,7 +82,7 @@ def test_a_node_puts_under_its_own_control_keys_only(key: Any) -> None:
 
 
 def test_a_node_asks_and_answers_in_its_own_name() -> None:
-    for question in (KEYS.register, KEYS.utility, KEYS.learnt, KEYS.status, KEYS.command):
+    for question in (KEYS.register, KEYS.utility, KEYS.learnt, KEYS.document, KEYS.status, KEYS.command):
         assert may(Side.CONTROL, "robot1", "ingress", "query", question("edge1", "robot1"))
         assert may(Side.CONTROL, "robot1", "ingress", "query", question("*", "robot1"))
         assert may(Side.CONTROL, "robot1", "ingress", "reply", question("robot1", "edge1"))

@@ -299,6 +299,8 @@ class ControlBus:
             return ev.StatusAsked(request=self._questions.keep(query, keys.status(node, asker)))
         if kind == "command":
             command: Any = wire.decode(payload, *_COMMANDS)
+            if not isinstance(command, ExplainTask | ReadLines):
+                log.info("command=%s from=%s", type(command).__name__, asker)
             return commanded(self._questions.keep(query, keys.command(node, asker)), command)
         raise WireError("key", "unknown kind")
 
