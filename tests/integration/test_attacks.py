@@ -51,6 +51,8 @@ KEYS = Keyspace("yard")
 REFUSED_S = 0.4
 """Who is let in is so within some milliseconds; zenoh tries again until this time is over."""
 ANSWER_S = 0.5
+SHORT_S = 3
+"""So long a certificate lives that shall end: long enough for a handshake on a busy machine."""
 
 
 @dataclass
@@ -354,6 +356,23 @@ def test_an_operator_commands_in_its_own_name(fresh: Yard) -> None:
         session.put(KEYS.beat("ana"), b"")
     assert set(fresh.control.asked) == {KEYS.command("robot1", "ana")}
     assert not fresh.control.heard
+
+
+# --- certificates that end -------------------------------------------------------------------------------------------
+
+
+def test_a_link_ends_with_its_certificate(fresh: Yard) -> None:
+    life = timedelta(days=30)
+    issued = fresh.authority.renew("robot2", None, b"", b"", datetime.now(UTC) - life + timedelta(seconds=SHORT_S))
+    folder = fresh.folder / "short"
+    folder.mkdir()
+    (folder / "certificate.pem").write_bytes(issued.certificate)
+    (folder / "key.pem").write_bytes((fresh.folder / "robot2" / "key.pem").read_bytes())
+    with fresh.session(fresh.control, fresh.tls("short")):
+        assert fresh.control.links() == {"robot2.yard.zsched.internal"}
+        until_alone(fresh.control)
+    with pytest.raises(zenoh.ZError), fresh.session(fresh.control, fresh.tls("short"), patience_s=REFUSED_S):
+        pass
 
 
 # --- what is let in --------------------------------------------------------------------------------------------------
