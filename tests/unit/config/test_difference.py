@@ -228,3 +228,21 @@ def test_no_field_of_a_fleet_changes_unnoticed() -> None:
         found = difference(old, new, (TEXT, TEXT))
         assert found, [one.name for one in fields(old) if getattr(old, one.name) != getattr(new, one.name)]
         assert all(one.effect is not Effect.NOTHING for one in found)
+
+
+def test_what_a_secured_fleet_lets_in_follows_from_its_daemons_next_start() -> None:
+    plain = TEXT.replace("tcp/", "tls/")
+    secured = f"{plain}\nsecurity: {{}}\n"
+    anew = "every daemon must be restarted"
+    assert told(secured, plain)[0][3] == anew
+    assert told(f"{plain}\nsecurity: {{revoked: [robot1]}}\n", secured) == [
+        ("security.revoked", None, "[robot1]", anew)
+    ]
+    node = with_(
+        "  robot1: {kind: robot, wifi: wlan0}", "  robot1: {kind: robot, wifi: wlan0}\n  robot9: {kind: robot}", secured
+    )
+    assert any(f"{anew}, for the access rules" in one[3] for one in told(node, secured) if one[0] == "nodes.robot9")
+    without = node.replace("\nsecurity: {}\n", "\n")
+    assert not any("access rules" in one[3] for one in told(without, plain))
+    task = secured.replace("tasks:\n", f"tasks:\n{EXCLUSIVE}", 1)
+    assert any("access rules" in one[3] for one in told(task, secured) if one[0] == "tasks.pick")
