@@ -299,7 +299,7 @@ class ControlBus:
             return ev.StatusAsked(request=self._questions.keep(query, keys.status(node, asker)))
         if kind == "command":
             command: Any = wire.decode(payload, *_COMMANDS)
-            if not isinstance(command, ExplainTask | ReadLines):
+            if not isinstance(command, ExplainTask | ReadLines | ReadFleet):
                 log.info("command=%s from=%s", type(command).__name__, asker)
             return commanded(self._questions.keep(query, keys.command(node, asker)), command)
         raise WireError("key", "unknown kind")
