@@ -33,6 +33,7 @@ from zsched.commands.fleet_verbs import (
     task_app,
 )
 from zsched.commands.order_verbs import add_order_verbs
+from zsched.commands.pki_verbs import pki_app
 from zsched.commands.program import Program
 from zsched.commands.stream_verbs import stream_app
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE
@@ -61,6 +62,7 @@ app = typer.Typer(
 app.add_typer(stream_app)
 for group in (fleet_app, task_app, node_app):
     app.add_typer(group)
+app.add_typer(pki_app)
 metrics_app = typer.Typer(
     name="metrics", cls=Verbs, help="Figures for Prometheus.", no_args_is_help=True, rich_markup_mode=None
 )
@@ -505,10 +507,12 @@ def weights(
             raise CliError(EXIT_USAGE, "--revision goes with new weights, e.g. cpu=0.6 memory=0.4")
         show_weights(find_door(runtime_dir, node, connect=connect), task, is_json=json_)
         return
-    if connect is not None:
-        raise CliError(EXIT_USAGE, "--connect only asks: change weights on a machine of the fleet")
+    if connect is not None and not connect.startswith(("tls/", "quic/")):
+        raise CliError(EXIT_USAGE, "--connect only asks without a certificate: write tls/NODE, or run this on a node")
     wanted = parse_weights(pairs)
-    raise typer.Exit(change_weights(find_door(runtime_dir, node), task, wanted, revision, is_json=json_))
+    raise typer.Exit(
+        change_weights(find_door(runtime_dir, node, connect=connect), task, wanted, revision, is_json=json_)
+    )
 
 
 add_order_verbs(app)

@@ -40,8 +40,9 @@ from zsched.core.electorate.numbers import in_force
 from zsched.core.node import Node
 from zsched.core.status import status_line
 from zsched.core.values.durable import DurableState
-from zsched.core.values.fleet import Fleet, dial_endpoint, electorate_hash, fleet_hash
+from zsched.core.values.fleet import Fleet, WorkerLink, dial_endpoint, electorate_hash, fleet_hash
 from zsched.core.values.model import NodeId, NodeKind
+from zsched.core.values.snapshot import Exposure
 from zsched.errors import AdapterError, ConfigError, NameTakenError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_NAME_TAKEN, EXIT_OK
 from zsched.guard import on_failure
@@ -49,6 +50,7 @@ from zsched.ipc.takeover import Door
 from zsched.log_limit import limit_handlers
 from zsched.runtime import tls as daemon_tls
 from zsched.runtime.access import StreamAccess, joins_at
+from zsched.runtime.access_rules import Side, common_names_of
 from zsched.runtime.adoption import Adoption
 from zsched.runtime.descriptors import take_descriptors
 from zsched.runtime.endpoints import DATA_PORT, Endpoints, claim_port, endpoints_for, free_port, is_here
@@ -58,6 +60,7 @@ from zsched.runtime.memory import shared_memory_objection
 from zsched.runtime.recipes import Recipes
 from zsched.runtime.reload import Reload
 from zsched.runtime.sampler import Sampler
+from zsched.runtime.secured import digest_of, require_own
 from zsched.runtime.sessions import SessionsRead
 from zsched.runtime.shell import Desk, Inbox, Shell
 from zsched.sessions import config as zenoh_config
@@ -156,6 +159,7 @@ class Daemon:
                 node.problems["shared_memory"] = f"shared memory is off here: {self._memory_objection}"
             if plain_text := daemon_tls.plain_text_problem(self._spec, self._protocol):
                 node.problems["tls"] = plain_text
+            node.security = self._exposure(points)
             gc.freeze()  # what lives until the end need not be looked at again
             self._loop(node, shell)
         return EXIT_OK
@@ -214,10 +218,20 @@ class Daemon:
             self._read_settings()
             log.info("document in force revision=%d document=%s", value.revision, value.document)
 
+    def _exposure(self, points: Endpoints) -> Exposure:
+        found = daemon_tls.exposure(self._fleet, self._protocol, (*points.control_listen, *points.data_listen))
+        if found is Exposure.OPEN:
+            log.warning(
+                "not_secured: whoever reaches this network reads and changes everything; see docs/guide/secure.md"
+            )
+        return found
+
     def _read_settings(self) -> None:
         """What hangs on the fleet in force, and is the same for as long as the process lives."""
-        self._operator_json5 = daemon_tls.operator_json5(self._fleet)
-        self._protocol = daemon_tls.protocol_of(self._fleet, self._operator_json5)
+        self._protocol = daemon_tls.protocol_of(self._fleet, daemon_tls.operator_json5(self._fleet))
+        self._texts = {side: daemon_tls.session_text(self._fleet, side) for side in Side}
+        if self._fleet.security is not None:
+            require_own(self._fleet, self._fleet.security, self._spec.name)
         self._memory_objection = shared_memory_objection(self._fleet, self._spec)
 
     def _data_port(self, stack: contextlib.ExitStack) -> int:
@@ -236,7 +250,6 @@ class Daemon:
         """Open the adapters; each is closed by ``stack`` in the reverse order."""
         zenoh_log.capture(os.environ)
         fleet, me = self._fleet, self._spec.name
-        operator_json5 = self._operator_json5
         bus = ControlBus(
             fleet=fleet.name,
             node=me,
@@ -245,14 +258,15 @@ class Daemon:
                 listen=points.control_listen,
                 connect=points.control_connect,
                 timing=fleet.timing,
-                operator_json5=operator_json5,
+                operator_json5=self._texts[Side.CONTROL],
                 dials_by_gossip=points.control_by_gossip,
             ),
             post=self._inbox.post,
+            members=None if fleet.security is None else common_names_of(fleet, fleet.security),
             is_voter=self._spec.kind is NodeKind.ROBOT,
             hears_all_beats_at_once=any(task.exclusive for task in fleet.tasks),
         )
-        access = StreamAccess(fleet, me, points.worker_connect[:1], operator_json5)
+        access = StreamAccess(fleet, me, points.worker_connect[:1], self._texts[Side.VISIT])
         decisions = DecisionLog(
             self._options.state_dir,
             me,
@@ -272,8 +286,8 @@ class Daemon:
         stack.callback(self._library.close)
         decisions.start()
         stack.callback(decisions.close)
-        shell.relay = relay = self._relay(shell, incarnation, points, operator_json5)
-        shell.crew.supervisor = supervisor = self._supervisor(stack, shell, incarnation, points, operator_json5)
+        shell.relay = relay = self._relay(shell, incarnation, points)
+        shell.crew.supervisor = supervisor = self._supervisor(stack, shell, incarnation, points)
         shell.crew.begin()
         sampler = Sampler(self._spec, fleet.timing.sample_s, self._options.state_dir, shell, self._inbox)
         adoption = Adoption(
@@ -299,13 +313,14 @@ class Daemon:
         stack.callback(sampler.stop)
         return shell
 
-    def _relay(self, shell: Shell, incarnation: int, points: Endpoints, operator_json5: str) -> RelayHandle:
+    def _relay(self, shell: Shell, incarnation: int, points: Endpoints) -> RelayHandle:
         fleet = self._fleet
+        certificate = "" if fleet.security is None else f"/{digest_of(fleet.security)}"
         bequest = Bequest(
             door=self._door,
             orphan_s=fleet.relay_orphan_s,
             incarnation=incarnation,
-            digest=fleet_hash(fleet),
+            digest=f"{fleet_hash(fleet)}{certificate}",  # a relay listens with the certificate that it began with
             listen=points.data_listen[0],
         )
         return RelayHandle(
@@ -316,7 +331,7 @@ class Daemon:
                 connect=points.data_connect,
                 timing=fleet.timing,
                 shared_memory=self._memory_objection == "",
-                operator_json5=operator_json5,
+                operator_json5=self._texts[Side.DATA],
                 dials_by_gossip=points.data_by_gossip,
             ),
             on_report=shell.on_report,
@@ -327,7 +342,7 @@ class Daemon:
         )
 
     def _supervisor(
-        self, stack: contextlib.ExitStack, shell: Shell, incarnation: int, points: Endpoints, operator_json5: str
+        self, stack: contextlib.ExitStack, shell: Shell, incarnation: int, points: Endpoints
     ) -> WorkerSupervisor:
         fleet, me = self._fleet, self._spec.name
         recipes = self._recipes = Recipes(
@@ -335,7 +350,10 @@ class Daemon:
             self._options.runtime_dir,
             SessionsRead(self._options.state_dir),
             shared_memory=self._memory_objection == "",
-            operator_json5=operator_json5,
+            operator_json5={
+                WorkerLink.PEER: self._texts[Side.DATA],
+                WorkerLink.CLIENT: self._texts[Side.VISIT],
+            },
         )
         stack.callback(recipes.close)
         recipes.adopt(fleet, points.worker_connect, dials_by_gossip=points.worker_by_gossip)

@@ -36,6 +36,15 @@ def runtime_folder(given: Path | None, env: Mapping[str, str]) -> Path:
     return _folder(given, env, "ZSCHED_RUNTIME_DIR", "RUNTIME_DIRECTORY", Path("/run/zsched"), "XDG_RUNTIME_DIR")
 
 
+def authority_folder(given: Path | None, env: Mapping[str, str], fleet: str) -> Path:
+    """Where a fleet's authority lies: the argument, ``ZSCHED_AUTHORITY``, or below the user's own data."""
+    if given is not None:
+        return given
+    if env.get("ZSCHED_AUTHORITY"):
+        return Path(env["ZSCHED_AUTHORITY"])
+    return Path(env.get("XDG_DATA_HOME") or Path.home() / ".local" / "share") / "zsched" / "authority" / fleet
+
+
 def _folder(given: Path | None, env: Mapping[str, str], own: str, systemd: str, system: Path, xdg: str) -> Path:
     if given is not None:
         return given

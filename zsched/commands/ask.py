@@ -209,25 +209,39 @@ def _client(endpoint: str) -> FleetClient:
     from zsched.adapters.network.fleet_client import FleetClient  # noqa: PLC0415 - loads zenoh
     from zsched.sessions.config import client_config  # noqa: PLC0415 - as above
 
-    asker = places.node_name(None, os.environ)
-    config = client_config(connect=(endpoint,), operator_json5=_operator_json5(endpoint), patience_s=CONNECT_S)
-    client = FleetClient(endpoint, config, asker if NAME.fullmatch(asker) else "operator")
+    visit = _visit(endpoint)
+    config = client_config(connect=(endpoint,), operator_json5=visit.text, patience_s=CONNECT_S)
+    client = FleetClient(endpoint, config, visit.asker, visit.fleet)
     atexit.register(client.close)
     return client
 
 
-def _operator_json5(endpoint: str) -> str:
-    """The zenoh file (certificates) that the fleet file names, where the endpoint is a secured one.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Visit:
+    """How a tool comes to a fleet: its session's settings, in whose name it asks, and which fleet (``*``: any)."""
+
+    text: str
+    asker: str
+    fleet: str
+
+
+def _visit(endpoint: str) -> _Visit:
+    """With the certificates that the fleet file of this machine names, where the endpoint is a secured one.
 
     Raises:
-        ConfigError: there is no such fleet file.
+        ConfigError: there is no such fleet file, or no certificate.
     """
+    name = places.node_name(None, os.environ)
+    asker = name if NAME.fullmatch(name) else "operator"
     if endpoint.startswith("tcp/"):
-        return ""
+        return _Visit(text="", asker=asker, fleet="*")
     from zsched.config.load import load_fleet  # noqa: PLC0415 - ruamel.yaml is slow to import
-    from zsched.runtime.tls import operator_json5  # noqa: PLC0415 - as above
+    from zsched.runtime.access_rules import Side  # noqa: PLC0415 - as above
+    from zsched.runtime.tls import asker_in, session_text  # noqa: PLC0415 - as above
 
-    return operator_json5(load_fleet(places.config_path(None, os.environ)))
+    fleet = load_fleet(places.config_path(None, os.environ))
+    text = session_text(fleet, Side.VISIT)
+    return _Visit(text=text, asker=asker_in(fleet, asker), fleet=fleet.name if fleet.security is not None else "*")
 
 
 def _unanswered(door: Door, error: AdapterError) -> CliError:

@@ -27,7 +27,8 @@ from zsched.core.values.model import NodeId
 from zsched.core.values.snapshot import Snapshot
 from zsched.errors import WireError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_UNREACHABLE, EXIT_USAGE
-from zsched.runtime.tls import operator_json5
+from zsched.runtime.access_rules import Side
+from zsched.runtime.tls import asker_in, session_text
 from zsched.sessions import config as zenoh_config
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import Keyspace
@@ -95,8 +96,8 @@ def ping_node(
 
 def _ways(fleet: Fleet, me: NodeId, question: Question) -> Iterator[Way]:
     """The node's own addresses, measured at the same time."""
-    spec, keys, text = fleet.node(question.node), Keyspace(fleet.name), operator_json5(fleet)
-    selectors = {CONTROL: keys.status(spec.name, me), DATA: keys.role(spec.name, "*")}
+    spec, keys, text = fleet.node(question.node), Keyspace(fleet.name), session_text(fleet, Side.VISIT)
+    selectors = {CONTROL: keys.status(spec.name, asker_in(fleet, me)), DATA: keys.role(spec.name, "*")}
     dialled = [(name, endpoint) for name, endpoint in _addresses(spec) if endpoint]
 
     def measured(one: tuple[str, str]) -> Way:

@@ -25,6 +25,8 @@ JOBS_OVER_S = 10.0
 """What a profile says of jobs that is so old is history, too."""
 CAUSES = (NEVER_INITIALISED, "nothing can be agreed")
 """How the problems begin from which others follow: they come first."""
+WORDS_OF_SECURITY = {"secured": "secured", "encrypted": "TLS", "open": "NOT SECURED"}
+"""What the first line says of a node's sessions; of one that only its own machine reaches nothing."""
 NO_ANSWER_TO = 100
 """After so many inputs without one output, ever, the key of the output is doubted."""
 STATE_STYLES = {"alive": "green", "ready": "green"} | dict.fromkeys(
@@ -108,6 +110,8 @@ def header(page: Page, status: Json) -> None:
     role = roles.get(quorum["this_node"], ", " + quorum["this_node"].replace("_", " "))
     parts = [f"fleet {status['fleet']}", f"{status['node']} ({status['kind']}{role})"]
     parts.append(f"quorum {quorum['alive']} of {quorum['electors']}, needs {quorum['needed']}")
+    security = WORDS_OF_SECURITY.get(status.get("security", ""))  # a later field of the schema's major version
+    parts += [security] if security else []
     room = page.width - len(health) - 1
     revision = [f"revision {status['fleet_revision']}"] if status.get("document") else []
     for extra in (*revision, f"up {span(status['up_s'])}", f"zsched {status['version']}"):

@@ -202,6 +202,7 @@ def _verdicts(old: Fleet, new: Fleet, owners: Mapping[TaskId, NodeId | None]) ->
     yield from _sessions(old, new)
     if old.seeds != new.seeds:
         yield _restart("every daemon dials them from its next start on", "seeds", old.seeds, new.seeds)
+    yield from _access(old, new)
     before, after = (fleet.zenoh_config.rpartition("/")[2] for fleet in (old, new))
     if before != after:
         yield _restart(EVERY_DAEMON, "zenoh", before, after)
@@ -250,6 +251,26 @@ def _sessions(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
     for name in come:
         for verdict in (_renewed(task) for task in new.tasks if task.name in tasks):
             yield replace(verdict, text=f"{verdict.text}, to dial {name}", paths=(f"nodes.{name}",))
+
+
+def _access(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
+    """Sessions of a secured fleet let in by rules that were made when they opened."""
+    before, after = (
+        None if one is None else replace(one, folder=one.folder.rpartition("/")[2])
+        for one in (old.security, new.security)
+    )
+    if before != after:
+        yield _restart(EVERY_DAEMON, "security", _plain(before), _plain(after))
+    if before is None or after is None:
+        return
+    names, tasks = ({node.name for node in old.nodes}, {task.name: (task.rules, task.candidates) for task in old.tasks})
+    rested = _Verdict(effect=Effect.RESTART, text=f"{EVERY_DAEMON}, for the access rules")
+    for node in new.nodes:
+        if node.name not in names:
+            yield replace(rested, paths=(f"nodes.{node.name}",))
+    for task in new.tasks:
+        if tasks.get(task.name) != (task.rules, task.candidates):
+            yield replace(rested, paths=(f"tasks.{task.name}",))
 
 
 def _addresses(fleet: Fleet) -> dict[NodeId, str]:

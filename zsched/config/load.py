@@ -15,6 +15,7 @@ from zsched.config.blocks import Located, Section
 from zsched.config.nodes import Cast, read_nodes, select, warn_missing
 from zsched.config.reader import MAX_FILE_BYTES, Collector, Fault, Place, nearest, read_yaml, render_all
 from zsched.config.schema import FLEET
+from zsched.config.security import read_security
 from zsched.config.tasks import read_tasks
 from zsched.config.timing import WIFI, timing_faults
 from zsched.core.membership.beat_room import MAX_BEAT_BYTES, most_bytes
@@ -119,6 +120,7 @@ def _fleet(section: Section, folder: Path, size: int, out: Collector) -> Fleet |
     electors = _electors(section, cast, out)
     tasks = read_tasks(section, cast, out)
     zenoh_config = _zenoh_config(section, folder, out)
+    security = read_security(section, cast, folder, out)
     if out.count:
         return None
     fleet = Fleet(
@@ -130,6 +132,7 @@ def _fleet(section: Section, folder: Path, size: int, out: Collector) -> Fleet |
         is_auto=not section.get("electorate"),
         seeds=seeds,
         zenoh_config=zenoh_config,
+        security=security,
         **{name: section.get(name) for name in _PLAIN if name in section.values},
     )
     _check_size(size, section.where("tasks"), out)

@@ -30,6 +30,7 @@ from zsched.config.keys import keys
 from zsched.config.ros2 import ros2_record
 from zsched.config.timing import PROFILES
 from zsched.core.scheduler.patience import CHOICES
+from zsched.core.values.certificates import parse_label
 from zsched.core.values.fleet import (
     DEFAULT_BONUS,
     DEFAULT_COOL_DOWN_S,
@@ -58,6 +59,7 @@ from zsched.core.values.model import (
 )
 from zsched.core.values.plan import ServiceSettings, StreamSettings
 
+PKI_FOLDER: Final = "pki"
 _HOST_PORT: Final = ("tcp", "udp", "tls", "quic", "ws")
 _WITH_PATH: Final = ("unixsock-stream", "unixpipe", "serial", "vsock")
 _HOST: Final = re.compile(r"(?!-)[A-Za-z0-9_-]{1,63}(?:\.(?!-)[A-Za-z0-9_-]{1,63})*\.?")
@@ -111,6 +113,9 @@ _INTERFACE_NAME: Final = Text("a network interface", _matches(_INTERFACE, "1 to 
 _LABEL: Final = Text("a label", lambda text: None if text and len(text) <= 63 else "1 to 63 characters")
 _LABELS: Final = MapOf(_LABEL, _LABEL)
 _NAMES: Final = ListOf(Here(NAME_BLOCK), least=1)
+_LABEL_OF_KEY: Final = Text(
+    "a certificate's name", lambda text: None if parse_label(text) else "for example robot1, robot1.k2, ana.operator"
+)
 _TEMPLATE: Final = Text("a key template", _text_fault)
 
 
@@ -321,6 +326,23 @@ TIMING: Final = Record(
     },
 )
 
+SECURITY: Final = Record(
+    "a security section",
+    {
+        "folder": Field(
+            _FILE,
+            "Folder of `certificate.pem`, `key.pem` and `ca.pem`, relative to the fleet file.",
+            default=f"`{PKI_FOLDER}`",
+        ),
+        "operators": Field(_NAMES, "People and tools that may give commands, besides the nodes."),
+        "guests": Field(_NAMES, "People and tools that read status and streams, and nothing else."),
+        "revoked": Field(
+            ListOf(Here(_LABEL_OF_KEY), least=1),
+            "Keys that are not let in, as `zsched pki revoke` names them.",
+        ),
+    },
+)
+
 FLEET: Final = Record(
     "the fleet file",
     {
@@ -344,6 +366,7 @@ FLEET: Final = Record(
             ),
             "Settings of zenoh itself.",
         ),
+        "security": Field(SECURITY, "Certificates of the fleet's own authority: only its members are let in."),
         **keys(Fleet),
     },
 )

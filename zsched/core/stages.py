@@ -113,6 +113,8 @@ class Stages:
         """Hash of what that file says; once a document is agreed, the node does not go by the file."""
         self.joins_at: tuple[str, ...] = ()
         """Where applications on this machine join its streams, for the status."""
+        self.security = ""
+        """Who is let in to this node's sessions, for the status (`Exposure`)."""
         self.counters: Counter[str] = Counter()
         self.problems: dict[str, str] = {}
         self.is_draining = False

@@ -75,6 +75,7 @@ def build_snapshot(node: Stages, now: float) -> Snapshot:
         joins_at=node.joins_at,
         counters=tuple(sorted((node.counters + node.agreement.counters).items())),
         frames_dropped_s=None if node.frames_dropped_at is None else now - node.frames_dropped_at,
+        security=node.security,
         problems=(
             *node.namesakes.problems(now),
             *_problems(node, quorum, now),

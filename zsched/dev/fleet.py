@@ -72,7 +72,7 @@ def on_loopback(
         assert isinstance(tasks, reader.Mapping)
         new = {task: _with_command(_entry(tasks, task), command) for task, command in commands.items()}
         changes["tasks"] = _changed(tasks, new)
-    text = _text(_changed(_without(root, ("zenoh",)), changes))
+    text = _text(_changed(_without(root, ("security", "zenoh")), changes))
     result = check_bytes(text.encode(), str(file))
     if result.fleet is None:
         told = "; ".join(f"{fault.message}; {fault.hint}" for fault in result.faults)
@@ -104,6 +104,8 @@ def _left_out(root: reader.Mapping) -> list[str]:
         found.append(f"local sides listen themselves, with no router beside them ({', '.join(local)})")
     if _entry(root, "zenoh") is not None:
         found.append("no settings of zenoh's own (`zenoh:`), so no certificates")
+    if _entry(root, "security") is not None:
+        found.append("no certificates (`security:`): whoever is on this machine is let in")
     return found
 
 

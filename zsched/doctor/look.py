@@ -23,7 +23,8 @@ from zsched.core.values.model import NodeId
 from zsched.doctor.fleet import differs
 from zsched.doctor.model import Json, Scene
 from zsched.errors import AdapterError, ConfigError
-from zsched.runtime.tls import operator_json5
+from zsched.runtime.access_rules import Side
+from zsched.runtime.tls import asker_in, session_text
 from zsched.sessions import config as zenoh_config
 
 ASK_S: Final = 5.0
@@ -134,7 +135,7 @@ def _directly(fleet: Fleet, asker: NodeId, missing: list[NodeId]) -> list[Json]:
     specs = [spec for spec in fleet.nodes if spec.name in missing and spec.listen_control]
     endpoints = [end for spec in specs if (end := dial_endpoint(spec.listen_control, spec.host))]
     try:
-        text = operator_json5(fleet)
+        text, asker = session_text(fleet, Side.VISIT), asker_in(fleet, asker)
         configs = [
             zenoh_config.client_config(connect=(endpoint,), timing=fleet.timing, operator_json5=text)
             for endpoint in endpoints

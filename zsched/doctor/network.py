@@ -1,4 +1,4 @@
-"""Checks of addresses, ports and certificates, as far as this machine can see them.
+"""Checks of addresses and ports, as far as this machine can see them.
 
 Knows: names and addresses of the fleet file, who listens here, connections. Does not know: what nodes say of each other
 (`zsched.doctor.fleet`).
@@ -14,27 +14,18 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures import TimeoutError as LateError
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Final
 
-from zsched.clock import wall_ns
 from zsched.core.values.fleet import NodeSpec, dial_endpoint
-from zsched.doctor.certificate import validities
 from zsched.doctor.model import Result, Scene, counted, failed, joined, passed, skipped, warned
-from zsched.errors import ConfigError
-from zsched.files import read_regular
 from zsched.procfs import names, read_file
-from zsched.runtime.tls import PLAIN, operator_json5, plain_text_problem, protocol_of
-from zsched.sessions.config import tls_files
 
 RESOLVE_S: Final = 5.0
 CONNECT_S: Final = 2.0
 LISTENS: Final = "0A"
 """The state of a listening socket in /proc/net/tcp."""
 OURS: Final = ("zsched.daemon", "zsched.relay")
-SOON: Final = timedelta(days=30)
-MAX_BYTES: Final = 1 << 20
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -213,53 +204,3 @@ def _why_not(address: Address) -> str:
     except (OSError, UnicodeError) as error:
         return str(getattr(error, "strerror", None) or error)
     return ""
-
-
-# --- TLS -------------------------------------------------------------------------------------------------------------
-
-
-def nothing_in_plain_text(scene: Scene) -> Result:
-    """Whether, with TLS, this node listens with TLS only."""
-    try:
-        protocol = protocol_of(scene.fleet, operator_json5(scene.fleet))
-    except ConfigError as error:
-        return failed(str(error), fix="mend the file that the fleet file names under `zenoh: {config: ...}`")
-    if protocol == PLAIN:
-        return skipped("TLS is not set up")
-    problem = plain_text_problem(scene.me, protocol)
-    if problem is not None:
-        return failed(problem, fix="write tls/ in place of tcp/ in its `listen:`")
-    return passed(f"everything of {scene.node} listens with {protocol}")
-
-
-def certificates_last(scene: Scene, now: datetime | None = None) -> Result:
-    """Whether the certificates of this machine are valid, and for the next 30 days."""
-    try:
-        files = tls_files(operator_json5(scene.fleet))
-    except (ConfigError, ValueError) as error:
-        return failed(str(error), fix="mend the file that the fleet file names under `zenoh: {config: ...}`")
-    if not files:
-        return skipped("the operator's zenoh file names no certificates")
-    now = now or datetime.fromtimestamp(wall_ns() / 1e9, UTC)
-    return joined((_certificate(name, Path(path), now) for name, path in sorted(files.items())), passed())
-
-
-def _certificate(name: str, path: Path, now: datetime) -> Result:
-    fix = f"renew {path} ({name}), then restart the daemon"
-    try:
-        content = read_regular(path, MAX_BYTES)
-        if "key" in name:
-            return passed(f"{path} can be read")
-        begins, ends = (
-            pick(times) for pick, times in zip((max, min), zip(*validities(content), strict=True), strict=True)
-        )
-    except PermissionError:
-        return skipped(f"{path} may not be read by user {os.geteuid()}: run the doctor as root")
-    except (OSError, ValueError) as error:
-        return failed(f"{path}: {getattr(error, 'strerror', None) or error}", fix=fix)
-    told = f"{path} is valid from {begins:%Y-%m-%d} to {ends:%Y-%m-%d}"
-    if now > ends:
-        return failed(f"{told}: it has ended", fix=fix)
-    if now < begins:
-        return failed(f"{told}: it has not begun", fix=f"is this machine's clock right (timedatectl)? Else {fix}")
-    return warned(f"{told}: {(ends - now).days} days are left", fix=fix) if ends - now < SOON else passed(told)

@@ -16,6 +16,7 @@ from typing import Final
 
 from zsched.core.values.fleet import runs_worker
 from zsched.doctor.model import Result, Scene, failed, joined, passed, skipped, warned
+from zsched.runtime.secured import CERTIFICATE, KEY, TRUSTED
 
 UNIT: Final = "zsched.service"
 RUNNING: Final = Path("/run/systemd/system")
@@ -68,6 +69,7 @@ def can_see_its_files(scene: Scene) -> Result:
     found = [*_program(scene, Path(command[0]), hides_homes=hides_homes)]
     for path in _files(scene, command):
         found += _file(scene, path, hides_homes=hides_homes, is_nameless=is_nameless)
+    found += _key(scene, settings, is_nameless=is_nameless)
     return joined(found, passed(f"{unit}: the service sees {command[0]} and all files that it needs"))
 
 
@@ -105,6 +107,19 @@ def _files(scene: Scene, command: list[str]) -> Iterator[Path]:
     yield from (Path(path) for path in given)
     if scene.fleet.zenoh_config:
         yield Path(scene.fleet.zenoh_config)
+    if scene.fleet.security is not None:
+        yield from (Path(scene.fleet.security.folder, name) for name in (CERTIFICATE, TRUSTED))
+
+
+def _key(scene: Scene, settings: Settings, *, is_nameless: bool) -> Iterator[Result]:
+    """Of a secured fleet: the key, which a user without a name gets from systemd."""
+    security = scene.fleet.security
+    handed = [value for name, value in settings if name == "LoadCredential"]
+    if security is None or not is_nameless or any(one.startswith(f"{KEY}:") for one in handed):
+        return
+    path = Path(security.folder, KEY)
+    fix = f"systemctl edit zsched: [Service] LoadCredential={KEY}:{path} (docs/guide/secure.md)"
+    yield failed(f"{path} is not handed over to the service's user, which has no name", fix=fix)
 
 
 def _file(scene: Scene, path: Path, *, hides_homes: bool, is_nameless: bool) -> Iterator[Result]:

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from importlib.metadata import EntryPoint, entry_points
 from typing import Final
 
-from zsched.doctor import daemon, fleet, fleet_file, machine, network, service, state, streams, workers
+from zsched.doctor import daemon, fleet, fleet_file, machine, network, security, service, state, streams, workers
 from zsched.doctor.model import Check, Needs, Result, Scene, Verdict, failed, skipped
 
 GROUP: Final = "zsched.checks"
@@ -85,8 +85,14 @@ CHECKS: Final[tuple[Check, ...]] = (
         run=network.own_addresses_answer,
         needs=Needs.STATUS,
     ),
-    Check(name="tls.plain_text", asks="With TLS, is nothing in plain text?", run=network.nothing_in_plain_text),
-    Check(name="tls.certificates", asks="Are its certificates valid for 30 days?", run=network.certificates_last),
+    Check(name="tls.plain_text", asks="With TLS, is nothing in plain text?", run=security.nothing_in_plain_text),
+    Check(
+        name="tls.certificates",
+        asks="Are its certificates its own, and far from their end?",
+        run=security.certificates_last,
+    ),
+    Check(name="tls.key", asks="Does nobody but its owner read its key?", run=security.keys_are_private),
+    Check(name="tls.open", asks="Is it closed to the internet, or secured?", run=security.is_not_open_to_everybody),
     Check(name="worker.command", asks="Are its workers' programs there?", run=workers.commands_are_there),
     Check(name="worker.imports", asks="Do they find what they import?", run=workers.packages_are_there),
     Check(name="worker.state", asks="Are its workers well?", run=workers.run_well, needs=Needs.STATUS),

@@ -19,7 +19,8 @@ from zsched.core.values.snapshot import Snapshot
 from zsched.core.vote.belief import MAX_GENERATION
 from zsched.core.vote.generations import blank_state, objection
 from zsched.errors import AdapterError
-from zsched.runtime.tls import operator_json5, protocol_of
+from zsched.runtime.access_rules import Side
+from zsched.runtime.tls import asker_in, operator_json5, protocol_of, session_text
 from zsched.sessions import config as zenoh_config
 
 
@@ -111,13 +112,13 @@ def _is_there(folder: Path) -> bool:
 def _ask(fleet: Fleet, node: NodeId) -> Heard:
     others = [spec for spec in fleet.nodes if spec.name != node and spec.listen_control]
     endpoints = tuple(filter(None, (dial_endpoint(spec.listen_control, spec.host) for spec in others)))
-    text = operator_json5(fleet)
-    protocol_of(fleet, text)  # with TLS that cannot work nobody would answer
+    text = session_text(fleet, Side.VISIT)
+    protocol_of(fleet, operator_json5(fleet))  # with TLS that cannot work nobody would answer
     configs = [
         zenoh_config.client_config(connect=(endpoint,), timing=fleet.timing, operator_json5=text)
         for endpoint in endpoints
     ]
-    answers = ask_fleet(fleet.name, node, configs)
+    answers = ask_fleet(fleet.name, asker_in(fleet, node), configs)
     return Heard(asked=len(endpoints), answers=tuple(answer for answer in answers if answer.node != node))
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from zsched.core.route.route import outputs_of
-from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec, runs_worker
+from zsched.core.values.fleet import Fleet, TaskSpec, WorkerLink, WorkerSpec, runs_worker
 from zsched.core.values.model import NodeId, TaskId
 from zsched.errors import AdapterError
 from zsched.files import write_regular
@@ -36,9 +36,18 @@ class Recipes:
     """The recipes of one node's workers."""
 
     def __init__(
-        self, me: NodeId, folder: Path, read: SessionsRead, *, shared_memory: bool, operator_json5: str
+        self,
+        me: NodeId,
+        folder: Path,
+        read: SessionsRead,
+        *,
+        shared_memory: bool,
+        operator_json5: Mapping[WorkerLink, str],
     ) -> None:
-        """``folder``: where the session files go; ``read``: of workers that somebody else starts."""
+        """``folder``: where the session files go; ``read``: of workers that somebody else starts.
+
+        ``operator_json5``: {how a worker joins: the settings of zenoh that every such session has}.
+        """
         self._me, self._folder, self.read = me, folder, read
         self._shared_memory, self._operator_json5 = shared_memory, operator_json5
         self._made = _Made(specs={}, sessions={}, environments={})
@@ -81,7 +90,7 @@ class Recipes:
                 timing=fleet.timing,
                 link=task.worker.link,
                 shared_memory=self._shared_memory,
-                operator_json5=self._operator_json5,
+                operator_json5=self._operator_json5[task.worker.link],
                 dials_by_gossip=dials_by_gossip,
             )
             for task in mine

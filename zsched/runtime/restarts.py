@@ -11,11 +11,13 @@ from collections.abc import Iterator
 
 from zsched.core.values.fleet import Fleet, NodeSpec
 from zsched.core.values.model import NodeId
+from zsched.runtime.access_rules import Side, access_control
 from zsched.runtime.endpoints import Endpoints, endpoints_for
 from zsched.sessions.config import pool_threads
 
 _FIELDS = (
     ("zenoh_config", "`zenoh: {config}`"),
+    ("security", "`security`"),
     ("shared_memory", "`shared_memory`"),
     ("relay_orphan_s", "`relay_orphan_s`"),
 )
@@ -31,7 +33,7 @@ def restarts(old: Fleet, new: Fleet, me: NodeId, *, is_agreed: bool = False) -> 
         me: the node.
         is_agreed: electors and leases of ``new`` are those in force.
     """
-    return (*(() if is_agreed else _agreed(old, new)), *_made(old, new, me), *_links(old, new, me))
+    return (*(() if is_agreed else _agreed(old, new)), *_made(old, new, me), *_rules(old, new), *_links(old, new, me))
 
 
 def _agreed(old: Fleet, new: Fleet) -> Iterator[str]:
@@ -58,6 +60,15 @@ def _made(old: Fleet, new: Fleet, me: NodeId) -> Iterator[str]:
     threads = pool_threads(len(new.nodes), len(new.tasks))
     if threads > pool_threads(len(old.nodes), len(old.tasks)):
         yield f"so many links need {threads} threads in zenoh's pools, which are made at the start"
+
+
+def _rules(old: Fleet, new: Fleet) -> Iterator[str]:
+    """Whom the open sessions of a secured fleet would have to let in, and do not."""
+    security = new.security
+    if security is None or security != old.security:
+        return
+    if any(access_control(old, security, side) != access_control(new, security, side) for side in Side):
+        yield "the access rules are for other nodes or streams: open sessions keep those that they were opened with"
 
 
 def _links(old: Fleet, new: Fleet, me: NodeId) -> Iterator[str]:

@@ -1,18 +1,22 @@
-"""Decides whether a fleet's sessions are encrypted, by the operator's zenoh file and the fleet's endpoints.
+"""Decides whether a fleet's sessions are encrypted: by its `security:` section, or the operator's zenoh file.
 
-Knows: which of zenoh's settings make TLS. Does not know: certificates, sessions.
+Knows: which of zenoh's settings make TLS. Does not know: certificates (`zsched.runtime.secured`), sessions.
 
 Where TLS is set up, nothing of ours listens in plain text: what the fleet file does not say, we choose alike.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
 from zsched.core.values.fleet import Fleet, NodeSpec
+from zsched.core.values.snapshot import Exposure
 from zsched.errors import ConfigError
 from zsched.files import read_regular
+from zsched.runtime.access_rules import Side
+from zsched.runtime.secured import identity_of, secured_text
 from zsched.sessions import config as zenoh_config
 
 MAX_BYTES: Final = 1 << 20
@@ -38,6 +42,25 @@ def operator_json5(fleet: Fleet) -> str:
         ) from error
 
 
+def session_text(fleet: Fleet, side: Side) -> str:
+    """The zenoh configuration on which sessions of one kind are built: the operator's own, secured where the file says.
+
+    Raises:
+        ConfigError: the operator's file or this machine's certificate cannot be used.
+    """
+    text = operator_json5(fleet)
+    return text if fleet.security is None else secured_text(fleet, fleet.security, side, text)
+
+
+def asker_in(fleet: Fleet, name: str) -> str:
+    """In whose name a tool asks: a secured fleet takes questions only in that of the certificate.
+
+    Raises:
+        ConfigError: this machine's certificate cannot be used.
+    """
+    return name if fleet.security is None else identity_of(fleet, fleet.security).holder.name
+
+
 def protocol_of(fleet: Fleet, text: str) -> str:
     """What sessions listen with where the fleet file does not say: ``tls`` or ``tcp``; ``text``: the operator's file.
 
@@ -48,6 +71,8 @@ def protocol_of(fleet: Fleet, text: str) -> str:
         settings = zenoh_config.tls_settings(text)
     except ValueError as error:
         raise ConfigError(f"{fleet.zenoh_config}: {error}") from error
+    if fleet.security is not None:
+        return "tls"
     endpoints = [end for node in fleet.nodes for end in (node.listen_control, node.listen_data) if end]
     if not settings and not any(_scheme(end) in ENCRYPTED for end in endpoints):
         return PLAIN
@@ -58,6 +83,21 @@ def protocol_of(fleet: Fleet, text: str) -> str:
             "sessions listen; set them under transport/link/tls in the file that `zenoh: {config: ...}` names"
         )
     return "tls"
+
+
+def exposure(fleet: Fleet, protocol: str, listens: Iterable[str]) -> Exposure:
+    """Who is let in to the sessions of a node that listens with ``protocol``, or as the file says, at ``listens``."""
+    if fleet.security is not None:
+        return Exposure.SECURED
+    plain = [end for end in listens if _scheme(end) not in ENCRYPTED]
+    if protocol != PLAIN and not plain:
+        return Exposure.ENCRYPTED
+    return Exposure.LOCAL if all(_is_loopback(end) for end in plain) else Exposure.OPEN
+
+
+def _is_loopback(endpoint: str) -> bool:
+    host = endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
+    return host in ("localhost", "::1") or host.startswith("127.")
 
 
 def plain_text_problem(me: NodeSpec, protocol: str) -> str | None:

@@ -214,6 +214,44 @@ def tls_settings(operator_json5: str) -> frozenset[str]:
     return frozenset(name for name, value in (found or {}).items() if value is not None)
 
 
+def has_access_control(operator_json5: str) -> bool:
+    """Whether the operator's own text turns zenoh's access control on.
+
+    Raises:
+        ValueError: it is not a zenoh configuration.
+    """
+    if not operator_json5.strip():
+        return False
+    return bool((json.loads(_parsed(operator_json5).get_json("access_control")) or {}).get("enabled"))
+
+
+def secured(*, certificate: str, key: str, trusted: str, rules: Settings, operator_json5: str = "") -> str:
+    """The operator's text with TLS both ways and access control over it; the other three are paths, PEM.
+
+    Which address a certificate is for is not looked at: robots change theirs. A connecting session also trusts the
+    authorities of the public web, whatever ``trusted`` says; what lets in is ``rules``, by names that none of them
+    issues. No link outlives the certificate at its other end.
+
+    Raises:
+        ValueError: the operator's JSON5 is not a zenoh configuration.
+    """
+    settings: Settings = {
+        "transport/link/protocols": ["tls", "quic"],
+        "transport/link/tls": {
+            "root_ca_certificate": trusted,
+            "enable_mtls": True,
+            "verify_name_on_connect": False,
+            "close_link_on_expiration": True,
+            "listen_certificate": certificate,
+            "listen_private_key": key,
+            "connect_certificate": certificate,
+            "connect_private_key": key,
+        },
+        "access_control": rules,
+    }
+    return _render(settings, operator_json5)
+
+
 def tls_files(operator_json5: str) -> dict[str, str]:
     """{setting: path} of every certificate and key that the operator's own text names under ``transport/link/tls``.
 

@@ -135,8 +135,13 @@ class Testbed:
                     [*DAEMON, "--config", self.file, "--node", node, *self._folders(node)],
                     stdin=subprocess.DEVNULL,
                     stderr=log,
-                    env={**os.environ, "OMP_NUM_THREADS": "1"},
+                    env={**os.environ, "OMP_NUM_THREADS": "1", **self._credentials(node)},
                 )
+
+    def _credentials(self, node: NodeId) -> dict[str, str]:
+        """Of a secured fleet: where the node's key and certificates are, as systemd would hand them over."""
+        folder = self.folder / "pki" / node
+        return {"CREDENTIALS_DIRECTORY": str(folder)} if folder.is_dir() else {}
 
     def running(self) -> tuple[NodeId, ...]:
         """Whose daemons have been started and not stopped."""

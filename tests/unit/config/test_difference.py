@@ -233,3 +233,21 @@ def test_no_field_of_a_fleet_changes_unnoticed() -> None:
         waits = any(restarts(old, agreed, one.name) for one in new.nodes if one.kind is old.node(one.name).kind)
         is_told = any(one.effect in (Effect.RESTART, Effect.NODE) for one in found)
         assert is_told or not waits, "what a daemon cannot take over while it runs is told as that"
+
+
+def test_what_a_secured_fleet_lets_in_follows_from_its_daemons_next_start() -> None:
+    plain = TEXT.replace("tcp/", "tls/")
+    secured = f"{plain}\nsecurity: {{}}\n"
+    anew = "every daemon must be restarted"
+    assert told(secured, plain)[0][3] == anew
+    assert told(f"{plain}\nsecurity: {{revoked: [robot1]}}\n", secured) == [
+        ("security.revoked", None, "[robot1]", anew)
+    ]
+    node = with_(
+        "  robot1: {kind: robot, wifi: wlan0}", "  robot1: {kind: robot, wifi: wlan0}\n  robot9: {kind: robot}", secured
+    )
+    assert any(f"{anew}, for the access rules" in one[3] for one in told(node, secured) if one[0] == "nodes.robot9")
+    without = node.replace("\nsecurity: {}\n", "\n")
+    assert not any("access rules" in one[3] for one in told(without, plain))
+    task = secured.replace("tasks:\n", f"tasks:\n{EXCLUSIVE}", 1)
+    assert any("access rules" in one[3] for one in told(task, secured) if one[0] == "tasks.pick")

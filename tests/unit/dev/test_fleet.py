@@ -96,6 +96,14 @@ def test_quotes_numbers_and_a_fixed_signal_stay_as_they_are_meant(tmp_path: Path
     assert (before.shared_memory, fleet.shared_memory) == (SharedMemory.AUTO, SharedMemory.OFF)
 
 
+def test_a_secured_fleet_runs_here_without_certificates(tmp_path: Path) -> None:
+    file = written(tmp_path, f"{FILE.rstrip()}\nsecurity: {{operators: [ana]}}\n".replace("tcp/", "tls/"))
+    found, fleet = brought_here(file)
+    assert "no certificates (`security:`): whoever is on this machine is let in" in found.left_out
+    assert fleet.security is None
+    assert load_fleet(file).security is not None
+
+
 def test_a_worker_may_be_another_one_also_where_the_file_gives_none(tmp_path: Path) -> None:
     _, fleet = brought_here(written(tmp_path), shout=("python", "/home/me/my worker.py"))
     assert fleet.tasks[0].worker.command == ("python", "/home/me/my worker.py")

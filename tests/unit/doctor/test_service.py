@@ -11,11 +11,12 @@ from pathlib import Path
 
 import pytest
 
+from support.authorities import install, make_authority
 from support.certificates import make_tls
 from support.clinic import FLEET, assert_finds, run, scene_of
-from zsched.doctor import network
-from zsched.doctor.certificate import validities
+from zsched.doctor import security
 from zsched.doctor.model import Scene, Verdict
+from zsched.sessions.certificate import validities
 
 ROOT = Path(__file__).parents[3]
 FAIL, WARN, PASS, SKIP = Verdict.FAIL, Verdict.WARN, Verdict.PASS, Verdict.SKIP
@@ -83,6 +84,21 @@ def test_a_fleet_file_that_the_service_cannot_read_is_found(scene: Scene) -> Non
     assert_finds(run("unit.paths", scene), FAIL, "/etc/zsched/fleet.yaml, which is not there")
 
 
+def test_a_key_that_systemd_does_not_hand_over_is_found(scene: Scene, tmp_path: Path) -> None:
+    folder = scene.root / "etc/zsched/pki"
+    install(make_authority(tmp_path / "authority", "hall"), folder, "edge1")
+    text = FLEET.replace("fleet: hall", "fleet: hall\nsecurity: {folder: /etc/zsched/pki}").replace("tcp/", "tls/")
+    secured = replace(scene_of(tmp_path, text), root=scene.root)
+    key = "/etc/zsched/pki/key.pem"
+    assert_finds(run("unit.paths", secured), FAIL, f"{key} is not handed over")
+    drop_in = scene.root / "etc/systemd/system/zsched.service.d/key.conf"
+    drop_in.parent.mkdir()
+    drop_in.write_text(f"[Service]\nLoadCredential=key.pem:{key}\n")
+    assert run("unit.paths", secured).verdict is PASS
+    (folder / "ca.pem").unlink()
+    assert_finds(run("unit.paths", secured), FAIL, "ca.pem, which is not there")
+
+
 def test_a_worker_below_a_home_is_found(scene: Scene, tmp_path: Path) -> None:
     text = FLEET.replace("[python, -m, zsched.tasks.echo]", "[/home/somebody/worker]")
     homely = replace(scene_of(tmp_path, text), root=scene.root)
@@ -102,27 +118,90 @@ def secured(tmp_path: Path) -> Scene:
 
 def test_a_certificate_that_ends_soon_has_ended_or_has_not_begun_is_found(secured: Scene) -> None:
     now = datetime.now(UTC)
-    assert_finds(network.certificates_last(secured), WARN, "node.pem is valid", "days are left")
-    assert_finds(network.certificates_last(secured, now + timedelta(days=9)), FAIL, "it has ended")
-    assert_finds(network.certificates_last(secured, now - timedelta(days=9)), FAIL, "it has not begun")
+    assert_finds(security.certificates_last(secured), WARN, "node.pem is valid", "days are left")
+    assert_finds(security.certificates_last(secured, now + timedelta(days=9)), FAIL, "it has ended")
+    assert_finds(security.certificates_last(secured, now - timedelta(days=9)), FAIL, "it has not begun")
 
 
 def test_a_certificate_with_years_left_passes(secured: Scene, tmp_path: Path) -> None:
     made = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-keyout", "node.key", "-out", "node.pem"]
     subprocess.run([*made, "-days", "20000", "-subj", "/CN=x"], cwd=tmp_path, capture_output=True, check=True)
     shutil.copy(tmp_path / "node.pem", tmp_path / "ca.pem")
-    assert network.certificates_last(secured).verdict is PASS
+    assert security.certificates_last(secured).verdict is PASS
     ((begins, ends),) = validities((tmp_path / "node.pem").read_bytes())
     assert ends - begins == timedelta(days=20000)  # past 2049 the time has another form
 
 
 def test_a_certificate_that_is_missing_or_none_is_found(secured: Scene, tmp_path: Path) -> None:
     (tmp_path / "node.pem").write_text("-----BEGIN CERTIFICATE-----\nMAoG\n-----END CERTIFICATE-----\n")
-    assert_finds(network.certificates_last(secured), FAIL, "malformed")
+    assert_finds(security.certificates_last(secured), FAIL, "malformed")
     (tmp_path / "node.pem").write_text("something else")
-    assert_finds(network.certificates_last(secured), FAIL, "no certificate in it")
+    assert_finds(security.certificates_last(secured), FAIL, "no certificate in it")
     (tmp_path / "node.key").unlink()
-    assert_finds(network.certificates_last(secured), FAIL, "node.key: No such file")
+    assert_finds(security.certificates_last(secured), FAIL, "node.key: No such file")
+
+
+@pytest.fixture
+def own(tmp_path: Path) -> Scene:
+    """A fleet with an authority of its own."""
+    install(make_authority(tmp_path / "authority", "hall"), tmp_path / "pki", "edge1")
+    return scene_of(tmp_path, FLEET.replace("fleet: hall", "fleet: hall\nsecurity: {}").replace("tcp/", "tls/"))
+
+
+def test_the_fleets_own_certificates_are_told_of_a_week_before_they_end(own: Scene, tmp_path: Path) -> None:
+    now = datetime.now(UTC)
+    for name in ("tls.certificates", "tls.key", "tls.plain_text", "tls.open"):
+        assert run(name, own).verdict is PASS, run(name, own)
+    assert security.certificates_last(own, now + timedelta(days=22)).verdict is PASS
+    assert_finds(
+        security.certificates_last(own, now + timedelta(days=24)), WARN, "pki/certificate.pem", "5 days are left"
+    )
+    assert_finds(security.certificates_last(own, now + timedelta(days=31)), FAIL, "it has ended")
+    install(make_authority(tmp_path / "again", "hall"), tmp_path / "pki", "robot1")
+    assert_finds(run("tls.certificates", own), FAIL, "is robot1's, and this node is edge1")
+    (tmp_path / "pki" / "certificate.pem").unlink()
+    assert_finds(run("tls.certificates", own), FAIL, "certificate.pem: No such file")
+
+
+def test_a_key_that_others_may_read_is_found(own: Scene, secured: Scene, tmp_path: Path) -> None:
+    (tmp_path / "pki" / "key.pem").chmod(0o644)
+    assert_finds(run("tls.key", own), FAIL, "mode 0644: every user of this machine reads the key")
+    (tmp_path / "pki" / "key.pem").chmod(0o640)
+    assert_finds(run("tls.key", own), WARN, "its group reads the key")
+    (tmp_path / "node.key").chmod(0o604)
+    assert_finds(run("tls.key", secured), FAIL, "node.key")
+
+
+FIB = """\
+Local:
+  +-- 0.0.0.0/0 3 0 5
+     +-- 127.0.0.0/8 2 0 2
+        |-- 127.0.0.1
+           /32 host LOCAL
+     |-- {address}
+        /32 host LOCAL
+        |-- 10.255.255.255
+           /32 link BROADCAST
+"""
+
+
+def test_a_session_without_certificates_at_a_public_address_is_found(tmp_path: Path) -> None:
+    scene = scene_of(tmp_path, root=tmp_path)
+    fib = tmp_path / "proc" / "net" / "fib_trie"
+    fib.parent.mkdir(parents=True)
+    for address, verdict, said in (
+        ("10.0.0.7", PASS, "whoever is in its private network"),
+        ("93.184.216.34", FAIL, "tcp/0.0.0.0:21257 at 93.184.216.34"),
+        ("127.0.0.2", PASS, "only for this machine"),
+    ):
+        fib.write_text(FIB.format(address=address))
+        result = run("tls.open", scene)
+        assert (result.verdict, said in result.evidence[0]) == (verdict, True), result
+    fib.write_text(FIB.format(address="127.0.0.2"))
+    addressed = scene_of(
+        tmp_path, FLEET.replace("control: tcp/0.0.0.0:21257", "control: 'tcp/[2001:4860::1]:7'"), root=tmp_path
+    )
+    assert_finds(run("tls.open", addressed), FAIL, "2001:4860::1")
 
 
 def test_plain_text_beside_tls_is_found(secured: Scene, tmp_path: Path) -> None:

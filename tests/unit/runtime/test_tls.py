@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from zsched.core.values.fleet import Fleet, NodeSpec, Timing
+from zsched.core.values.fleet import Fleet, NodeSpec, Security, Timing
 from zsched.core.values.model import NodeKind
+from zsched.core.values.snapshot import Exposure
 from zsched.errors import ConfigError
-from zsched.runtime.tls import operator_json5, plain_text_problem, protocol_of
+from zsched.runtime.tls import exposure, operator_json5, plain_text_problem, protocol_of
 
 FILE = "/etc/zsched/zenoh.json5"
 WHOLE = """{transport: {link: {tls: {root_ca_certificate: "a", listen_certificate: "b", listen_private_key: "c"}}}}"""
@@ -60,6 +61,21 @@ def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"gone\.json5: cannot be read: No such file"):
         operator_json5(replace(fleet(), zenoh_config=str(tmp_path / "gone.json5")))
     assert operator_json5(replace(fleet(), zenoh_config="")) == ""
+
+
+@pytest.mark.parametrize(
+    ("protocol", "listens", "found"),
+    [
+        ("tcp", ["tcp/0.0.0.0:1", "tcp/127.0.0.1:2"], Exposure.OPEN),
+        ("tcp", ["tcp/127.1.2.3:1", "tcp/[::1]:2"], Exposure.LOCAL),
+        ("tcp", ["tcp/[::]:1"], Exposure.OPEN),
+        ("tls", ["tls/0.0.0.0:1", "quic/0.0.0.0:2"], Exposure.ENCRYPTED),
+        ("tls", ["tls/0.0.0.0:1", "tcp/0.0.0.0:2"], Exposure.OPEN),
+    ],
+)
+def test_who_is_let_in_is_told_by_where_it_listens(protocol: str, listens: list[str], found: Exposure) -> None:
+    assert exposure(fleet(), protocol, listens) is found
+    assert exposure(replace(fleet(), security=Security(folder="pki")), protocol, listens) is Exposure.SECURED
 
 
 def test_plain_text_that_the_file_asks_for_is_a_problem_only_beside_tls() -> None:

@@ -27,6 +27,7 @@ from zsched.core.values.messages import (
     AskDocument,
     Command,
     CommandResult,
+    ExplainTask,
     FleetAnswer,
     FleetQuestion,
     FleetTold,
@@ -97,13 +98,18 @@ class ControlBus:
         incarnation: int,
         zenoh_config: str,
         post: Post,
+        members: frozenset[str] | None = None,
         is_voter: bool = True,
         hears_all_beats_at_once: bool = True,
     ) -> None:
-        """``is_voter``: peers gather utilities here. Periodic frames are posted at once, or wait for `waiting`."""
+        """``members``: the names of certificates that belong to the fleet, ``None`` where none are asked for.
+
+        A link of another name says nothing that zenoh would let in; it is counted and logged. ``is_voter``: peers
+        gather utilities here. Periodic frames are posted at once, or wait for `waiting`.
+        """
         self._is_voter, self._hears_all_at_once = is_voter, hears_all_beats_at_once
         self._ring: zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]] | None = None
-        self._keys = Keyspace(fleet)
+        self._keys, self._members = Keyspace(fleet), members
         self._node, self._incarnation = node, incarnation
         self._config = zenoh_config
         self._introducer = Introducer(zenoh_config)
@@ -141,6 +147,7 @@ class ControlBus:
         token = keys.alive(node, self._incarnation)
         # The token goes last: who sees it may ask, and must find the queryable.
         self._kept = [
+            *self._watch_links(session),
             session.declare_subscriber(keys.all_puts(), tolerant(self._on_sample, "put")),
             *self._hear_in_turn(session),
             *(session.declare_queryable(key, tolerant(self._on_query, "question")) for key in self._questions_to_us()),
@@ -149,6 +156,12 @@ class ControlBus:
             ),
             session.liveliness().declare_token(token),
         ]
+
+    def _watch_links(self, session: zenoh.Session) -> list[Any]:
+        """Look at the certificate of every link, where certificates are asked for: one more thread."""
+        if self._members is None:
+            return []
+        return [session.info.declare_link_events_listener(tolerant(self._on_link, "link"), history=True)]
 
     def _hear_in_turn(self, session: zenoh.Session) -> list[Any]:
         """Subscribe to periodic frames: thirty a second in a small fleet, too many to wake up for each."""
@@ -246,6 +259,14 @@ class ControlBus:
         owner, event = _event_of(value)
         return event if owner == key.owner else ev.FrameDropped(kind=key.kind, reason="foreign")
 
+    def _on_link(self, event: zenoh.LinkEvent) -> None:
+        """A frame's sender is held against the link's certificate by zenoh (access rules); here only who is linked."""
+        name = event.link.auth_identifier
+        if event.kind != zenoh.SampleKind.PUT or self._members is None or name in self._members:
+            return
+        log.warning("stranger certificate=%r address=%s: it may nothing here", name, event.link.dst)
+        self._post(ev.FrameDropped(kind="link", reason="stranger"))
+
     def _on_token(self, sample: zenoh.Sample) -> None:
         key = parse(str(sample.key_expr))
         incarnation = counter(key.rest[0]) if key is not None and len(key.rest) == 1 else None
@@ -293,6 +314,8 @@ class ControlBus:
             return ev.StatusAsked(request=self._questions.keep(query, keys.status(node, asker)))
         if kind == "command":
             command: Any = wire.decode(payload, *COMMANDS)
+            if not isinstance(command, ExplainTask | ReadLines | ReadFleet):
+                log.info("command=%s from=%s", type(command).__name__, asker)
             return commanded(self._questions.keep(query, keys.command(node, asker)), command)
         raise WireError("key", "unknown kind")
 

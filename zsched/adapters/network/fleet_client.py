@@ -35,14 +35,14 @@ ANY_FLEET = "*"
 class FleetClient:
     """One open session; safe to close twice."""
 
-    def __init__(self, endpoint: str, zenoh_config: str, asker: NodeId) -> None:
-        """Open the session.
+    def __init__(self, endpoint: str, zenoh_config: str, asker: NodeId, fleet: str = ANY_FLEET) -> None:
+        """Open the session. A secured fleet takes questions only by its name, and in that of the certificate.
 
         Raises:
             AdapterError: nobody takes the connection.
         """
         zenoh.init_log_from_env_or("off")
-        self._endpoint, self._asker, self._keys = endpoint, asker, Keyspace(ANY_FLEET)
+        self._endpoint, self._asker, self._keys = endpoint, asker, Keyspace(fleet)
         try:
             self._session = zenoh.open(zenoh.Config.from_json5(zenoh_config))
         except zenoh.ZError as error:

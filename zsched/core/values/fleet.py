@@ -273,6 +273,23 @@ class SharedMemory(StrEnum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Security:
+    """A fleet with certificates of its own authority: who is let in, besides its nodes.
+
+    Names of operators and guests are of the same form as nodes' and are no node's.
+    """
+
+    folder: str
+    """Path of this machine's certificate, its key, and what it trusts."""
+    operators: tuple[str, ...] = ()
+    """Sorted; they may give commands."""
+    guests: tuple[str, ...] = ()
+    """Sorted; they read status and streams."""
+    revoked: tuple[str, ...] = ()
+    """Sorted labels of keys that are not let in (`zsched.core.values.certificates`)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Fleet:
     """The whole fleet file, validated and with every name resolved."""
 
@@ -300,6 +317,8 @@ class Fleet:
     seeds: tuple[NodeId, ...] = ()
     zenoh_config: str = ""
     """Path of a zenoh JSON5 file, passed through untouched; empty: none."""
+    security: Security | None = None
+    """``None``: there is no `security:` section."""
     relay_orphan_s: float = key(
         10.0, "How long a relay carries the streams on when its daemon is gone; 0: not at all.", Range(0, 600, "s")
     )
@@ -379,7 +398,7 @@ def _digest(kind: str, value: object) -> str:
     return state.hexdigest()
 
 
-_PATHS = frozenset({("Fleet", "zenoh_config"), ("LinkSpec", "value")})
+_PATHS = frozenset({("Fleet", "zenoh_config"), ("LinkSpec", "value"), ("Security", "folder")})
 """Fields that may hold a path: relative to the fleet file, hence another one on every machine."""
 
 

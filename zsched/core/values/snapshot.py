@@ -9,11 +9,25 @@ Fields are only ever added within a major version of the schema. Times are ages 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 
 from zsched.core.values.model import Link, NodeId, TaskId, Tuning, Utility, WorkerLoad
 from zsched.core.values.plan import StreamCount
 
 SCHEMA = "zsched.status/1"
+
+
+class Exposure(StrEnum):
+    """Who can speak and listen in a node's sessions."""
+
+    SECURED = "secured"
+    """Holders of the fleet's certificates, each in its own name."""
+    ENCRYPTED = "encrypted"
+    """Whoever the operator's own zenoh file lets in."""
+    LOCAL = "local"
+    """Everybody on the node's machine."""
+    OPEN = "open"
+    """Everybody in the node's network."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -191,3 +205,5 @@ class Snapshot:
     problems: tuple[str, ...] = ()
     frames_dropped_s: float | None = None
     """Seconds since the newest invalid frame, ``None`` when none has come."""
+    security: str = ""
+    """How the answering node's sessions are let in to (`Exposure`); empty: an older version, which does not tell."""

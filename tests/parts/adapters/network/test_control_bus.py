@@ -71,7 +71,7 @@ COMMAND = SetWeights(task="merge", cpu=1.0, memory=0.0, network=0.0)
 class Peer:
     """One bus and the events it posted."""
 
-    def __init__(self, name: str, listen: str, hub: str | None, incarnation: int = 1, **options: bool) -> None:
+    def __init__(self, name: str, listen: str, hub: str | None, incarnation: int = 1, **options: Any) -> None:
         self.events: list[ev.Event] = []
         connect = () if hub is None else (hub,)
         config = control_config(listen=(listen,), connect=connect, timing=TIMING)

@@ -1,0 +1,418 @@
+"""A table of attacks on real sessions, opened as a secured fleet's daemons and relays open theirs.
+
+The victims are robot1's control session and edge1's data session; both listen to everything. Whoever attacks goes by no
+rules of its own. A frame of a member under its own key comes last: what was sent before it has been refused by then.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+
+from support.authorities import install, make_authority
+from support.waiting import free_endpoint, until
+from zsched.config.load import check_file
+from zsched.core.values.certificates import Role
+from zsched.pki.authority import Authority
+from zsched.runtime.access_rules import Side
+from zsched.runtime.tls import session_text
+from zsched.sessions import config as zenoh_config
+from zsched.wire.keyspace import Keyspace
+
+FLEET = """\
+fleet: yard
+nodes:
+  robot1: {kind: robot}
+  robot2: {kind: robot}
+  robot3: {kind: robot}
+  edge1: {kind: edge, host: 192.0.2.1, listen: {control: tls/0.0.0.0:7457, data: tls/0.0.0.0:7458}}
+tasks:
+  merge:
+    candidates: [edge1]
+    weights: {cpu: 0.5, memory: 0.5}
+    worker: {command: [python]}
+    inputs: [{from: "{robot}/in", to: "{target}/merge/{robot}/in"}]
+    outputs: [{from: "{target}/merge/{robot}/out", to: "{robot}/out"}]
+security: {folder: FOLDER, operators: [ana], guests: [screen], revoked: [robot3]}
+"""
+KEYS = Keyspace("yard")
+REFUSED_S = 0.4
+"""Who is let in is so within some milliseconds; zenoh tries again until this time is over."""
+ANSWER_S = 0.5
+SHORT_S = 3
+"""So long a certificate lives that shall end: long enough for a handshake on a busy machine."""
+
+
+@dataclass
+class Victim:
+    """One session of a member, with all that it hears."""
+
+    session: zenoh.Session
+    endpoint: str
+    heard: list[str] = field(default_factory=list)
+    """Keys of samples."""
+    asked: list[str] = field(default_factory=list)
+    tokens: list[str] = field(default_factory=list)
+
+    def listen(self) -> None:
+        def answer(query: zenoh.Query) -> None:
+            self.asked.append(str(query.key_expr))
+            with query:
+                query.reply(str(query.key_expr), b"secret")
+
+        for key in ("@zsched/yard/**", "**", "*/**/@zsched/**"):
+            self.session.declare_subscriber(key, lambda sample: self.heard.append(str(sample.key_expr)))
+        for key in ("@zsched/yard/*/robot1/*", "@zsched/yard/snapshot/edge1/*"):
+            self.session.declare_queryable(key, answer)
+        self.session.liveliness().declare_subscriber(
+            "@zsched/yard/**", lambda sample: self.tokens.append(str(sample.key_expr)), history=True
+        )
+
+    def links(self) -> set[str]:
+        """Certificates at the other ends."""
+        return {str(link.auth_identifier) for link in self.session.info.links()}
+
+
+@dataclass
+class Yard:
+    """The fleet: its authority, certificates, and the two victims."""
+
+    folder: Path
+    authority: Authority
+    control: Victim
+    data: Victim
+
+    def tls(self, holder: str, **more: Any) -> dict[str, Any]:
+        """TLS settings of who holds a certificate in a folder, and goes by no rules."""
+        folder = self.folder / holder
+        files = {"connect_certificate": "certificate.pem", "connect_private_key": "key.pem"}
+        own = {name: str(folder / file) for name, file in files.items()}
+        trusted = str(self.folder / "robot1" / "ca.pem")
+        return {"root_ca_certificate": trusted, "enable_mtls": True, "verify_name_on_connect": False, **own, **more}
+
+    @contextlib.contextmanager
+    def session(
+        self, victim: Victim, tls: dict[str, Any] | None, *, is_plain: bool = False, patience_s: float = 5.0
+    ) -> Iterator[zenoh.Session]:
+        """A client's session to a victim.
+
+        Raises:
+            zenoh.ZError: it is not let in.
+        """
+        endpoint = victim.endpoint.replace("tls/", "tcp/") if is_plain else victim.endpoint
+        config = json.loads(zenoh_config.client_config(connect=(endpoint,), patience_s=patience_s))
+        if tls is not None:
+            config["transport"]["link"]["tls"] = tls
+        with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as session:
+            yield session
+
+    @contextlib.contextmanager
+    def member(self, holder: str, victim: Victim) -> Iterator[zenoh.Session]:
+        """A peer's session, as a daemon has it, of who goes by no rules."""
+        config = json.loads(zenoh_config.control_config(listen=(), connect=(victim.endpoint,)))
+        config["transport"]["link"]["tls"] = self.tls(holder)
+        with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as session:
+            until(session.info.links, f"a link of {holder}")
+            yield session
+
+
+def reissue(authority: Authority, folder: Path, name: str) -> None:
+    """The next key of a name whose first one is revoked."""
+    authority.revoke(name, datetime.now(UTC))
+    install(authority, folder, name)
+
+
+@pytest.fixture(scope="module")
+def yard(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Yard]:
+    folder = tmp_path_factory.mktemp("yard")
+    authority = make_authority(folder / "authority", "yard")
+    for name in ("robot1", "robot2", "edge1", "robot3", "mallory"):
+        install(authority, folder / name, name)
+    reissue(authority, folder / "robot3.k2", "robot3")
+    install(authority, folder / "ana", "ana", Role.OPERATOR)
+    install(authority, folder / "screen", "screen", Role.GUEST)
+    install(make_authority(folder / "other authority", "yard"), folder / "other", "robot2")
+    (folder / "late").mkdir()
+    expired = authority.renew("robot2", None, b"", b"", datetime.now(UTC) - timedelta(days=31))
+    (folder / "late" / "certificate.pem").write_bytes(expired.certificate)
+    (folder / "late" / "key.pem").write_bytes((folder / "robot2" / "key.pem").read_bytes())
+    with contextlib.ExitStack() as stack:
+        victims = []
+        for name, side in (("robot1", Side.CONTROL), ("edge1", Side.DATA)):
+            (folder / "fleet.yaml").write_text(FLEET.replace("FOLDER", name))
+            fleet = check_file(folder / "fleet.yaml").fleet
+            assert fleet is not None
+            endpoint = free_endpoint().replace("tcp/", "tls/")
+            make = zenoh_config.control_config if side is Side.CONTROL else zenoh_config.data_config
+            text = make(listen=(endpoint,), connect=(), operator_json5=session_text(fleet, side))
+            session = stack.enter_context(zenoh.open(zenoh.Config.from_json5(text)))
+            victims.append(Victim(session, endpoint.partition("#")[0]))
+            victims[-1].listen()
+        yield Yard(folder, authority, *victims)
+
+
+def until_alone(victim: Victim) -> None:
+    """All that came by a link has been judged when the link has ended."""
+    until(lambda: not victim.session.info.links(), "the links to end")
+
+
+def note_keys(session: zenoh.Session, keys: list[str]) -> None:
+    """Note what others say on the control network."""
+    session.declare_subscriber(
+        "@zsched/yard/**", lambda sample: keys.append(str(sample.key_expr)), allowed_origin=zenoh.Locality.REMOTE
+    )
+
+
+@pytest.fixture
+def fresh(yard: Yard) -> Yard:
+    """The victims without what they have heard, and without the links of earlier attacks."""
+    for victim in (yard.control, yard.data):
+        until_alone(victim)
+        victim.heard.clear()
+        victim.asked.clear()
+        victim.tokens.clear()
+    return yard
+
+
+# --- strangers -------------------------------------------------------------------------------------------------------
+
+OUTSIDE: dict[str, Callable[[Yard], dict[str, Any] | None]] = {
+    "no certificate": lambda yard: {"root_ca_certificate": str(yard.folder / "robot1" / "ca.pem")},
+    "another authority": lambda yard: yard.tls("other"),
+    "expired": lambda yard: yard.tls("late"),
+}
+
+
+@pytest.mark.parametrize("attack", OUTSIDE)
+@pytest.mark.parametrize("which", ["control", "data"])
+def test_who_has_no_valid_certificate_gets_no_link(fresh: Yard, attack: str, which: str) -> None:
+    victim: Victim = getattr(fresh, which)
+    with pytest.raises(zenoh.ZError), fresh.session(victim, OUTSIDE[attack](fresh), patience_s=REFUSED_S):
+        pass
+    assert not victim.links()
+
+
+def test_plain_text_gets_no_link(fresh: Yard) -> None:
+    for victim in (fresh.control, fresh.data):
+        with pytest.raises(zenoh.ZError), fresh.session(victim, None, is_plain=True, patience_s=REFUSED_S):
+            pass
+
+
+@pytest.mark.parametrize("stranger", ["mallory", "robot3"])
+@pytest.mark.parametrize("which", ["control", "data"])
+def test_a_certificate_that_the_file_does_not_let_in_speaks_and_hears_nothing(
+    fresh: Yard, stranger: str, which: str
+) -> None:
+    """``mallory`` is certified and no node; the key ``robot3`` is revoked, and ``robot3.k2`` is let in."""
+    victim: Victim = getattr(fresh, which)
+    got: dict[str, list[str]] = {stranger: [], "robot3.k2": []}
+    said = {}
+    for who, keys in got.items():
+        with fresh.member(who, victim) as session:
+            name = who.partition(".")[0]
+            note_keys(session, keys)
+            session.liveliness().declare_token(KEYS.alive(name, 1))
+            session.put(KEYS.beat(name), b"")
+            session.put(f"edge1/merge/{name}/in", b"")
+            said[who] = [reply.ok for reply in session.get(KEYS.status("robot1", name), timeout=ANSWER_S)]
+            victim.session.put(KEYS.beat("robot1"), b"", allowed_destination=zenoh.Locality.REMOTE)
+            if who == "robot3.k2":
+                until(lambda: KEYS.beat("robot3") in victim.heard, "the member's own beat")
+                until(lambda: got["robot3.k2"], "the victim's beat at the member")
+        until_alone(victim)
+    assert not got[stranger]
+    assert not said[stranger]
+    assert {key.split("/")[3] if key.startswith("@") else key.split("/")[2] for key in victim.heard} == {"robot3"}
+    assert victim.heard.count(KEYS.beat("robot3")) == 1, "the revoked key has sent one, too"
+    assert len(victim.tokens) == 2, "the token of the member came and went"
+
+
+# --- members that speak for others -----------------------------------------------------------------------------------
+
+FORGED_PUTS = {
+    "control": {
+        "beat": KEYS.beat("edge1"),
+        "periodic beat": KEYS.beat_in_turn("edge1"),
+        "profile": KEYS.profile("edge1"),
+        "proposal": KEYS.proposal("robot1"),
+        "learnt values": KEYS.allocation("edge1"),
+    },
+    "data": {
+        "input": "edge1/merge/robot1/in",
+        "end marker": "edge1/merge/robot1/in/@zsched/end",
+        "output": "edge1/merge/robot1/out",
+        "answer sent again": "edge1/merge/robot1/out/@zsched/again/abc",
+        "role": KEYS.role("edge1", "merge"),
+        "acknowledgement": KEYS.ack("edge1", "merge", 1, "abc"),
+        "receipt": KEYS.received("robot1", "abc", "def"),
+        "trouble": KEYS.trouble("edge1", "merge", 1),
+    },
+}
+OWN = {"control": KEYS.beat("robot2"), "data": "edge1/merge/robot2/in"}
+
+
+@pytest.mark.parametrize("which", FORGED_PUTS)
+def test_a_member_that_speaks_for_another_is_not_heard(fresh: Yard, which: str) -> None:
+    victim: Victim = getattr(fresh, which)
+    with fresh.member("robot2", victim) as session:
+        for key in FORGED_PUTS[which].values():
+            session.put(key, b"forged", congestion_control=zenoh.CongestionControl.BLOCK)
+            session.delete(key, congestion_control=zenoh.CongestionControl.BLOCK)
+        for key in (KEYS.alive("edge1", 9), KEYS.worker("edge1", "merge", 9), f"{KEYS.role('edge1', 'merge')}/9"):
+            session.liveliness().declare_token(key)
+        own = session.liveliness().declare_token(KEYS.alive("robot2", 1))
+        until(lambda: KEYS.alive("robot2", 1) in victim.tokens, "its own token")
+        session.put(OWN[which], b"own")
+        until(lambda: OWN[which] in victim.heard, "its own frame")
+        own.undeclare()
+    assert victim.heard == [OWN[which]]
+    assert set(victim.tokens) == {KEYS.alive("robot2", 1)}
+
+
+@pytest.mark.parametrize("question", [KEYS.register, KEYS.learnt, KEYS.command, KEYS.utility])
+def test_a_member_that_asks_in_anothers_name_is_not_answered(fresh: Yard, question: Callable[[str, str], str]) -> None:
+    with fresh.member("robot2", fresh.control) as session:
+        assert not list(session.get(question("robot1", "edge1"), timeout=ANSWER_S))
+        until(lambda: list(session.get(question("robot1", "robot2"), timeout=ANSWER_S)), "its own question's answer")
+    assert set(fresh.control.asked) == {question("robot1", "robot2")}
+
+
+def test_a_member_that_answers_for_another_is_not_believed(fresh: Yard) -> None:
+    """A promise in an elector's name, and a worker's state in the owner's."""
+    for victim, own, forged, asked in (
+        (
+            fresh.control,
+            KEYS.register("robot2", "robot1"),
+            KEYS.register("edge1", "robot1"),
+            KEYS.register("*", "robot1"),
+        ),
+        (fresh.data, KEYS.snapshot("robot2", "merge"), KEYS.snapshot("edge1", "more"), KEYS.snapshot("*", "*")),
+    ):
+        with fresh.member("robot2", victim) as session:
+
+            def answer(query: zenoh.Query, own: str = own, forged: str = forged) -> None:
+                with query:
+                    query.reply(forged, b"forged")
+                    query.reply(own, b"own")
+
+            session.declare_queryable(asked, answer)
+            session.declare_queryable(own, answer)
+            victims = victim
+
+            def answers(victims: Victim = victims, asked: str = asked) -> set[str]:
+                replies = victims.session.get(
+                    asked,
+                    consolidation=zenoh.ConsolidationMode.NONE,
+                    timeout=ANSWER_S,
+                    target=zenoh.QueryTarget.ALL,
+                    allowed_destination=zenoh.Locality.REMOTE,
+                )
+                return {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
+
+            assert until(answers, "the member's own answer") == {own}
+
+
+# --- guests and operators --------------------------------------------------------------------------------------------
+
+
+def test_a_guest_reads_status_and_streams_and_commands_nothing(fresh: Yard) -> None:
+    with fresh.session(fresh.control, fresh.tls("screen")) as session:
+        until(lambda: list(session.get(KEYS.status("robot1", "screen"), timeout=ANSWER_S)), "the status")
+        for key in (KEYS.command("robot1", "screen"), KEYS.command("robot1", "ana"), KEYS.register("robot1", "screen")):
+            assert not list(session.get(key, timeout=ANSWER_S))
+        session.put(KEYS.beat("screen"), b"")
+    assert set(fresh.control.asked) == {KEYS.status("robot1", "screen")}
+    got = threading.Event()
+    with fresh.session(fresh.data, fresh.tls("screen")) as session:
+        session.declare_subscriber("robot1/out", lambda _: got.set())
+        session.put("edge1/merge/robot1/in", b"forged")
+        assert not list(session.get(KEYS.snapshot("edge1", "merge"), timeout=ANSWER_S))
+
+        def reads() -> bool:
+            fresh.data.session.put("robot1/out", b"")
+            return got.wait(0.02)
+
+        until(reads, "the stream at the guest")
+    assert "edge1/merge/robot1/in" not in fresh.data.heard
+    assert not fresh.control.heard
+
+
+def test_an_operator_commands_in_its_own_name(fresh: Yard) -> None:
+    with fresh.session(fresh.control, fresh.tls("ana")) as session:
+        until(lambda: list(session.get(KEYS.command("robot1", "ana"), timeout=ANSWER_S)), "the command's answer")
+        assert not list(session.get(KEYS.command("robot1", "robot2"), timeout=ANSWER_S))
+        session.put(KEYS.beat("ana"), b"")
+    assert set(fresh.control.asked) == {KEYS.command("robot1", "ana")}
+    assert not fresh.control.heard
+
+
+# --- certificates that end -------------------------------------------------------------------------------------------
+
+
+def test_a_link_ends_with_its_certificate(fresh: Yard) -> None:
+    life = timedelta(days=30)
+    issued = fresh.authority.renew("robot2", None, b"", b"", datetime.now(UTC) - life + timedelta(seconds=SHORT_S))
+    folder = fresh.folder / "short"
+    folder.mkdir()
+    (folder / "certificate.pem").write_bytes(issued.certificate)
+    (folder / "key.pem").write_bytes((fresh.folder / "robot2" / "key.pem").read_bytes())
+    with fresh.session(fresh.control, fresh.tls("short")):
+        assert fresh.control.links() == {"robot2.yard.zsched.internal"}
+        until_alone(fresh.control)
+    with pytest.raises(zenoh.ZError), fresh.session(fresh.control, fresh.tls("short"), patience_s=REFUSED_S):
+        pass
+
+
+# --- what is let in --------------------------------------------------------------------------------------------------
+
+
+def test_between_two_authorities_certificates_of_both_are_let_in(fresh: Yard, tmp_path: Path) -> None:
+    """A machine whose ``ca.pem`` is the one of a rotation; its own certificate is still of the former authority."""
+    authority = make_authority(tmp_path / "authority", "yard")
+    for name in ("robot1", "robot2"):
+        install(authority, fresh.folder / f"turning {name}", name)
+    authority.rotate(b"", datetime.now(UTC))
+    install(authority, fresh.folder / "turned edge1", "edge1")
+    (fresh.folder / "turning robot1" / "ca.pem").write_bytes(authority.trusted)
+    (fresh.folder / "fleet.yaml").write_text(FLEET.replace("FOLDER", "turning robot1"))
+    fleet = check_file(fresh.folder / "fleet.yaml").fleet
+    assert fleet is not None
+    endpoint = free_endpoint().replace("tcp/", "tls/")
+    text = zenoh_config.control_config(listen=(endpoint,), connect=(), operator_json5=session_text(fleet, Side.CONTROL))
+    with zenoh.open(zenoh.Config.from_json5(text)) as session:
+        victim = Victim(session, endpoint)
+        for holder in ("turning robot2", "turned edge1"):
+            bundle = str(fresh.folder / "turning robot1" / "ca.pem")
+            with fresh.session(victim, fresh.tls(holder, root_ca_certificate=bundle)):
+                assert victim.links() == {f"{holder.split()[1]}.yard.zsched.internal"}
+            until_alone(victim)
+        with pytest.raises(zenoh.ZError), fresh.session(victim, fresh.tls("robot2"), patience_s=REFUSED_S):
+            pass
+
+
+def test_a_p256_key_is_let_in_like_any_other(fresh: Yard) -> None:
+    key = ec.generate_private_key(ec.SECP256R1())
+    request = (
+        x509.CertificateSigningRequestBuilder().subject_name(x509.Name([])).sign(key, hashes.SHA256())
+    ).public_bytes(serialization.Encoding.PEM)
+    folder = fresh.folder / "p256"
+    folder.mkdir()
+    issued = fresh.authority.renew("robot2", None, request, b"", datetime.now(UTC))
+    (folder / "certificate.pem").write_bytes(issued.certificate)
+    (folder / "key.pem").write_bytes(
+        key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
+    )
+    with fresh.member("p256", fresh.control):
+        assert fresh.control.links() == {"robot2.yard.zsched.internal"}

@@ -1,0 +1,119 @@
+"""`zsched pki`: what each verb writes, prints and refuses."""
+
+from __future__ import annotations
+
+import json
+import stat
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from support.schemas import faults
+from zsched.cli import app
+from zsched.sessions.certificate import common_names
+
+FLEET = """\
+fleet: yard
+nodes:
+  robot1: {kind: robot, host: 192.0.2.1, listen: {control: tls/0.0.0.0:7457, data: tls/0.0.0.0:7458}}
+  robot2: {kind: robot}
+security: {operators: [ana]}
+"""
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    (tmp_path / "fleet.yaml").write_text(FLEET)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("ZSCHED_CONFIG", str(tmp_path / "fleet.yaml"))
+    monkeypatch.setenv("ZSCHED_AUTHORITY", str(tmp_path / "authority"))
+    monkeypatch.delenv("ZSCHED_AUTHORITY_PASSPHRASE", raising=False)
+    return tmp_path
+
+
+def pki(*words: str, code: int = 0, told: str | None = None) -> Result:
+    result = CliRunner().invoke(app, ["pki", *words], input=told)
+    assert result.exit_code == code, result.output
+    return result
+
+
+def test_init_says_where_the_key_lies_and_how_to_take_it_offline(here: Path) -> None:
+    said = pki("init").stdout
+    assert f"its key is {here}/authority/ca-1.key (not locked: --passphrase does that)" in said
+    assert "To take it offline, move the whole folder" in said
+    assert "next: `zsched pki issue robot1`" in said
+    assert "holds an authority" in pki("init", code=1).stderr
+
+
+def test_issue_writes_three_files_of_which_only_the_key_is_secret(here: Path) -> None:
+    pki("init")
+    said = pki("issue", "robot1").stdout
+    assert "sudo install -m 600 robot1/key.pem /etc/zsched/pki/" in said
+    modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in (here / "robot1").iterdir()}
+    assert modes == {"key.pem": 0o600, "certificate.pem": 0o644, "ca.pem": 0o644}
+    assert common_names((here / "robot1" / "certificate.pem").read_bytes()) == ("robot1.yard.zsched.internal",)
+    pki("issue", "ana", "--role", "operator", "--out", "laptop")
+    assert common_names((here / "laptop" / "certificate.pem").read_bytes()) == ("ana.operator.yard.zsched.internal",)
+
+
+def test_names_that_the_fleet_file_does_not_fit_are_refused_or_told(here: Path) -> None:
+    pki("init")
+    assert "did you mean robot1?; for people: --role operator" in pki("issue", "robt1", code=2).stderr
+    assert "'robot1' is a node" in pki("issue", "robot1", "--role", "guest", code=2).stderr
+    assert "is no name" in pki("issue", "Ana", "--role", "guest", code=2).stderr
+    assert "write bob under `security: {guests: [...]}`" in pki("issue", "bob", "--role", "guest").stdout
+    assert "there is no authority" in pki("show", "--authority", str(here / "none"), code=1).stderr
+
+
+def test_a_locked_key_asks_for_its_passphrase(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pki("init", "--passphrase", told="open sesame\nopen sesame\n")
+    assert "the passphrase is wrong" in pki("issue", "robot1", code=1, told="open\n").stderr
+    monkeypatch.setenv("ZSCHED_AUTHORITY_PASSPHRASE", "open sesame")
+    pki("issue", "robot1")
+    assert (here / "robot1" / "key.pem").exists()
+
+
+def test_show_tells_every_key_and_its_json_is_of_the_schema(here: Path) -> None:
+    pki("init")
+    pki("issue", "robot1")
+    pki("issue", "ana", "--role", "operator")
+    pki("revoke", "robot1")
+    said = pki("show").stdout
+    assert f"authority 1 of fleet yard in {here}/authority\n" in said
+    assert [line.split()[::4] for line in said.splitlines()[1:]] == [["ana.operator", "valid"], ["robot1", "revoked"]]
+    body = json.loads(pki("show", "--json").stdout)
+    assert not list(faults(body))
+    assert [(one["name"], one["role"], one["key"], one["state"]) for one in body["certificates"]] == [
+        ("ana.operator", "operator", 1, "valid"),
+        ("robot1", "node", 1, "revoked"),
+    ]
+
+
+def test_revoke_says_which_line_keeps_the_key_out_and_the_next_key_has_a_number(here: Path) -> None:
+    pki("init")
+    pki("issue", "robot1")
+    assert "`security: {revoked: [robot1]}`" in pki("revoke", "robot1").stdout
+    assert "robot1.k2" in pki("issue", "robot1").stdout
+    assert (here / "robot1.k2" / "key.pem").exists()
+    assert "no certificate 'robot3'" in pki("revoke", "robot3", code=1).stderr
+
+
+def test_renew_takes_what_is_due_or_one_by_name_and_makes_no_key(here: Path) -> None:
+    pki("init")
+    pki("issue", "robot1", "--out", "first")
+    assert pki("renew").stdout == "no certificate is due\n"
+    assert "--csr and --out go with a NAME" in pki("renew", "--out", "x", code=2).stderr
+    pki("renew", "robot1")
+    assert sorted(path.name for path in (here / "robot1").iterdir()) == ["ca.pem", "certificate.pem"]
+
+
+def test_a_rotation_ends_once_everything_is_renewed(here: Path) -> None:
+    pki("init")
+    pki("issue", "robot1")
+    assert "zsched pki rotate --finish" in pki("rotate").stdout
+    assert "signed the certificates of robot1" in pki("rotate", "--finish", code=1).stderr
+    assert "robot1: certificate.pem" in pki("renew").stdout
+    assert (here / "robot1" / "ca.pem").read_text().count("BEGIN CERTIFICATE") == 2
+    pki("rotate", "--finish")
+    assert (here / "authority" / "ca.pem").read_text().count("BEGIN CERTIFICATE") == 1

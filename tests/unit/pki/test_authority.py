@@ -1,0 +1,229 @@
+"""The fleet's authority: what it issues, renews, revokes and rotates, and what its folder looks like."""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+import subprocess
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.asymmetric import rsa
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from zsched.core.values.certificates import Role
+from zsched.errors import AdapterError
+from zsched.pki import certificates as made
+from zsched.pki.authority import RECORD, TRUSTED, Authority, create, key_name, opened
+from zsched.pki.files import write_whole
+
+NOW = datetime(2026, 11, 23, 12, tzinfo=UTC)
+FLEET = "yard"
+
+
+@pytest.fixture
+def authority(tmp_path: Path) -> Authority:
+    return create(tmp_path / "authority", FLEET, b"", NOW)
+
+
+def issue(authority: Authority, name: str = "robot1", role: Role = Role.NODE, request: bytes = b"") -> bytes:
+    return authority.issue(name, role, ["192.0.2.11", "robot1.lan"], request, b"", NOW).certificate
+
+
+def request_of(key: made.PrivateKey | rsa.RSAPrivateKey) -> bytes:
+    builder = x509.CertificateSigningRequestBuilder().subject_name(
+        x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "whoever.asks")])
+    )
+    if isinstance(key, rsa.RSAPrivateKey):
+        from cryptography.hazmat.primitives import hashes
+
+        return builder.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
+    return builder.sign(key, None).public_bytes(serialization.Encoding.PEM)
+
+
+def test_a_certificate_names_its_holder_its_role_and_where_it_is_dialled(authority: Authority) -> None:
+    certificate = x509.load_pem_x509_certificate(issue(authority))
+    subject = {one.oid: one.value for one in certificate.subject}
+    assert subject[NameOID.COMMON_NAME] == "robot1.yard.zsched.internal"
+    assert subject[NameOID.ORGANIZATIONAL_UNIT_NAME] == "node"
+    names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert names.get_values_for_type(x509.DNSName) == ["robot1.yard.zsched.internal", "localhost", "robot1.lan"]
+    assert [str(one) for one in names.get_values_for_type(x509.IPAddress)] == ["127.0.0.1", "192.0.2.11"]
+    usage = certificate.extensions.get_extension_for_class(x509.KeyUsage)
+    assert usage.critical
+    assert usage.value.digital_signature
+    assert not usage.value.key_cert_sign
+    purposes = certificate.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
+    assert set(purposes) == {ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH}
+    assert not certificate.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
+    assert certificate.not_valid_after_utc - NOW == timedelta(days=30)
+
+
+def test_the_authority_signs_end_entities_only_and_its_signature_holds(authority: Authority) -> None:
+    own = x509.load_pem_x509_certificate(authority.trusted)
+    limits = own.extensions.get_extension_for_class(x509.BasicConstraints)
+    assert (limits.critical, limits.value.ca, limits.value.path_length) == (True, True, 0)
+    x509.load_pem_x509_certificate(issue(authority)).verify_directly_issued_by(own)
+
+
+def test_the_key_is_the_owners_alone_and_no_part_of_a_file_is_left(authority: Authority) -> None:
+    issue(authority)
+    modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in authority.folder.iterdir()}
+    assert modes == {key_name(1): 0o600, TRUSTED: 0o644, RECORD: 0o644}
+    assert stat.S_IMODE(authority.folder.stat().st_mode) == 0o700
+
+
+def test_a_file_that_cannot_be_written_whole_is_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "key.pem"
+    write_whole(path, b"old", 0o600)
+
+    def refuse(_descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", refuse)
+    with pytest.raises(OSError, match="No space"):
+        write_whole(path, b"new", 0o600)
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_passphrase_locks_the_key_and_a_wrong_one_is_said_to_be(tmp_path: Path) -> None:
+    authority = create(tmp_path / "authority", FLEET, b"correct", NOW)
+    assert authority.is_locked
+    assert b"ENCRYPTED" in authority.key_path.read_bytes()
+    with pytest.raises(AdapterError, match="the passphrase is wrong"):
+        authority.issue("robot1", Role.NODE, [], b"", b"wrong", NOW)
+    assert not authority.record.entries
+    assert authority.issue("robot1", Role.NODE, [], b"", b"correct", NOW).key
+
+
+def test_a_request_keeps_the_key_where_it_was_made_and_its_name_does_not_count(authority: Authority) -> None:
+    key = made.new_key()
+    issued = authority.issue("robot1", Role.NODE, [], request_of(key), b"", NOW)
+    assert issued.key == b""
+    certificate = x509.load_pem_x509_certificate(issued.certificate)
+    assert certificate.public_key() == key.public_key()
+    assert "whoever" not in certificate.subject.rfc4514_string()
+
+
+def test_requests_that_are_none_or_of_a_weak_kind_are_refused(authority: Authority) -> None:
+    weak = request_of(rsa.generate_private_key(65537, 2048))
+    whole = request_of(made.new_key())
+    forged = x509.load_pem_x509_csr(whole).public_bytes(serialization.Encoding.DER)
+    forged = forged[:-1] + bytes([forged[-1] ^ 1])
+    pem = x509.load_der_x509_csr(forged).public_bytes(serialization.Encoding.PEM)
+    for request, why in (
+        (b"nothing", "no certificate request"),
+        (weak, "neither Ed25519 nor P-256"),
+        (pem, "not by the"),
+    ):
+        with pytest.raises(AdapterError, match=f"the certificate request: .*{why}"):
+            issue(authority, request=request)
+    assert not authority.record.entries
+
+
+def test_openssls_request_is_taken(authority: Authority, tmp_path: Path) -> None:
+    words = ["openssl", "req", "-new", "-newkey", "ed25519", "-nodes", "-subj", "/CN=robot1"]
+    done = subprocess.run(
+        [*words, "-keyout", "key.pem", "-out", "robot1.csr"], cwd=tmp_path, capture_output=True, check=False, timeout=30
+    )
+    assert done.returncode == 0, done.stderr
+    assert issue(authority, request=(tmp_path / "robot1.csr").read_bytes())
+
+
+def test_two_holders_never_share_a_key(authority: Authority) -> None:
+    request = request_of(made.new_key())
+    issue(authority, request=request)
+    with pytest.raises(AdapterError, match="that key is robot1's and in use"):
+        issue(authority, "robot2", request=request)
+    authority.revoke("robot1", NOW)
+    with pytest.raises(AdapterError, match="that key is robot1's and revoked"):
+        issue(authority, request=request)
+
+
+def test_a_renewal_keeps_key_number_and_hosts_and_a_new_key_has_the_next_number(authority: Authority) -> None:
+    first = x509.load_pem_x509_certificate(issue(authority))
+    with pytest.raises(AdapterError, match="`zsched pki renew robot1` keeps its key"):
+        issue(authority)
+    later = NOW + timedelta(days=20)
+    renewed = authority.renew("robot1", None, b"", b"", later)
+    second = x509.load_pem_x509_certificate(renewed.certificate)
+    assert second.public_key() == first.public_key()
+    assert second.not_valid_after_utc - later == timedelta(days=30)
+    assert renewed.entry.hosts == ("192.0.2.11", "robot1.lan")
+    authority.revoke("robot1", NOW)
+    with pytest.raises(AdapterError, match="the key of robot1 is revoked"):
+        authority.renew("robot1", None, b"", b"", later)
+    third = x509.load_pem_x509_certificate(issue(authority))
+    assert "CN=robot1.k2.yard.zsched.internal" in third.subject.rfc4514_string()
+    assert third.public_key() != first.public_key()
+
+
+def test_an_entry_is_due_after_two_thirds_of_its_life(authority: Authority) -> None:
+    issue(authority)
+    (entry,) = authority.record.entries
+    begun = int(NOW.timestamp())
+    assert not entry.is_due(begun + 19 * 86400, 1)
+    assert entry.is_due(begun + 21 * 86400, 1)
+    assert entry.is_due(begun, 2)
+
+
+def test_a_rotation_trusts_both_until_no_certificate_is_of_the_former(authority: Authority) -> None:
+    issue(authority)
+    issue(authority, "ana", Role.OPERATOR)
+    issue(authority, "gone")
+    authority.revoke("gone", NOW)
+    authority.rotate(b"", NOW)
+    with pytest.raises(AdapterError, match="not finished"):
+        authority.rotate(b"", NOW)
+    first, second = x509.load_pem_x509_certificates(authority.trusted)
+    assert {one.label for one in authority.finish()} == {"robot1", "ana.operator"}
+    for label in ("robot1", "ana.operator"):
+        renewed = authority.renew(label, None, b"", b"", NOW)
+        x509.load_pem_x509_certificate(renewed.certificate).verify_directly_issued_by(first)
+    assert authority.finish() == ()
+    assert x509.load_pem_x509_certificates(authority.trusted) == [first]
+    assert first != second
+    assert not (authority.folder / key_name(1)).exists()
+    with pytest.raises(AdapterError, match="no rotation"):
+        authority.finish()
+
+
+def test_what_was_done_is_there_when_it_is_opened_again(authority: Authority) -> None:
+    issue(authority)
+    authority.revoke("robot1", NOW)
+    with opened(authority.folder, FLEET) as again:
+        assert again.record == authority.record
+    body = json.loads((authority.folder / RECORD).read_text())
+    assert [(one["label"], one["revoked"]) for one in body["entries"]] == [("robot1", int(NOW.timestamp()))]
+
+
+def test_a_folder_that_is_none_another_fleets_or_damaged_is_refused(authority: Authority, tmp_path: Path) -> None:
+    with pytest.raises(AdapterError, match=r"there is no authority in .*; `zsched pki init`"), opened(tmp_path, FLEET):
+        pass
+    with pytest.raises(AdapterError, match="of fleet yard, not of field"), opened(authority.folder, "field"):
+        pass
+    with pytest.raises(AdapterError, match="holds an authority"):
+        create(authority.folder, FLEET, b"", NOW)
+    authority.key_path.unlink()
+    with pytest.raises(AdapterError, match="is not there: is it offline"):
+        issue(authority)
+    (authority.folder / RECORD).write_text("{}")
+    with pytest.raises(AdapterError, match="is damaged"), opened(authority.folder, FLEET):
+        pass
+
+
+def test_names_that_no_certificate_holds_are_refused(authority: Authority) -> None:
+    with pytest.raises(AdapterError, match="a certificate's name has at most 64; give the node"):
+        issue(authority, "r" * 50)
+
+
+def test_a_key_of_another_authority_is_refused(authority: Authority, tmp_path: Path) -> None:
+    other = create(tmp_path / "other", FLEET, b"", NOW)
+    authority.key_path.write_bytes(other.key_path.read_bytes())
+    with pytest.raises(AdapterError, match="is not the key of"):
+        issue(authority)

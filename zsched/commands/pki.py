@@ -1,0 +1,355 @@
+"""`zsched pki`: makes the fleet's authority and its certificates, and says where each file goes.
+
+Knows: folders, what an operator does next. Does not know: how certificates are made (`zsched.pki`), who is let in.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import typer
+
+from zsched import paths as places
+from zsched.clock import wall_ns
+from zsched.commands.common import CliError, Json, nearest, print_json
+from zsched.config.load import load_fleet
+from zsched.core.values.certificates import Role, parse_label
+from zsched.core.values.fleet import Fleet
+from zsched.core.values.model import NAME
+from zsched.errors import AdapterError
+from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE
+from zsched.files import read_regular
+from zsched.runtime.secured import CERTIFICATE, KEY, TRUSTED
+
+if TYPE_CHECKING:
+    from zsched.pki.authority import Authority, Entry, Issued  # imports cryptography
+
+SCHEMA: Final = "zsched.pki.show/1"
+PASSPHRASE: Final = "ZSCHED_AUTHORITY_PASSPHRASE"
+MAX_BYTES: Final = 1 << 20
+DUE, REVOKED, ENDED, VALID = "due", "revoked", "ended", "valid"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Where:
+    """The fleet file and the authority's folder, as they were given."""
+
+    config: Path | None
+    authority: Path | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Office:
+    """Which fleet's authority, and where it is."""
+
+    fleet: Fleet
+    folder: Path
+
+
+def init(where: Where, *, asks_passphrase: bool) -> int:
+    """Make the authority of the fleet in the fleet file.
+
+    Raises:
+        CliError: the package cryptography is missing.
+        AdapterError: there is an authority already, or the folder cannot be written.
+    """
+    _need_cryptography()
+    from zsched.pki.authority import create  # noqa: PLC0415 - imports cryptography
+
+    office = _office(where)
+    secret = _new_passphrase() if asks_passphrase else os.environ.get(PASSPHRASE, "").encode()
+    authority = create(office.folder, office.fleet.name, secret, _now())
+    lock = "locked with the passphrase" if secret else "not locked: --passphrase does that"
+    first = office.fleet.nodes[0].name
+    _say(
+        f"{office.folder}: authority of fleet {office.fleet.name}\n"
+        f"its key is {authority.key_path} ({lock}); no node needs it. To take it offline, move the whole folder to a "
+        "stick, and name it with --authority DIR when you issue, renew or revoke",
+        ""
+        if office.fleet.security is not None
+        else "next: write `security: {}` and tls/ in place of tcp/ into the fleet file",
+        f"next: `zsched pki issue {first}`, and so for every node",
+    )
+    return EXIT_OK
+
+
+def issue(where: Where, name: str, role: Role, request: Path | None, out: Path | None) -> int:
+    """Make the first certificate of a node, an operator or a guest.
+
+    Raises:
+        CliError: the fleet file knows no such node, or a node of that name.
+        AdapterError: the holder has a certificate already, or a file is not usable.
+    """
+    with _opened(where) as (office, authority):
+        hosts = _check_name(office.fleet, name, role)
+        issued = authority.issue(name, role, hosts, _request(request), _passphrase(authority), _now())
+        folder = out or Path(issued.entry.label)
+        _write(folder, issued)
+    files = f"{CERTIFICATE}, {TRUSTED}" + (f", {KEY}" if issued.key else "")
+    _say(f"{folder}: {files} of {issued.entry.label}, until {_day(issued.entry)}")
+    _say(_how_to_install(folder, role, has_key=bool(issued.key)), _lacking(office.fleet, name, role))
+    return EXIT_OK
+
+
+def renew(where: Where, label: str | None, request: Path | None, out: Path | None) -> int:
+    """Make a new certificate for the key of one label, or (``None``) for every key whose certificate is due.
+
+    Raises:
+        CliError: --csr or --out without a name.
+        AdapterError: there is no such key, it is revoked, or a file is not usable.
+    """
+    if label is None and (request is not None or out is not None):
+        raise CliError(EXIT_USAGE, "--csr and --out go with a NAME")
+    with _opened(where) as (office, authority):
+        secret = _passphrase(authority)
+        now = int(_now().timestamp())
+        live = [one for one in authority.record.entries if one.revoked is None]
+        labels = [one.label for one in live if one.is_due(now, authority.record.number)] if label is None else [label]
+        hosts = {node.name: (node.host,) if node.host else () for node in office.fleet.nodes}
+        for one in labels:
+            holder = parse_label(one)
+            named = hosts.get(holder.name) if holder is not None and holder.role is Role.NODE else None
+            issued = authority.renew(one, named, _request(request), secret, _now())
+            folder = out or Path(one)
+            _write(folder, issued)
+            _say(f"{folder}: {CERTIFICATE}, {TRUSTED} of {one}, until {_day(issued.entry)}")
+    if labels:
+        _say("next: put both files beside its key, then restart its daemon: its streams stop for that moment")
+    else:
+        _say("no certificate is due")
+    return EXIT_OK
+
+
+def show(where: Where, *, is_json: bool) -> int:
+    """Tell of the authority and of every key that it has certified."""
+    with _opened(where) as (office, authority):
+        body = _as_json(office, authority)
+    if is_json:
+        print_json(body)
+        return EXIT_OK
+    lines = [
+        f"authority {body['authority']} of fleet {body['fleet']} in {body['folder']}"
+        + (", key locked" if body["locked"] else "")
+        + (" (a rotation is not finished: the former one is trusted, too)" if body["rotating"] else "")
+    ]
+    width = max((len(one["name"]) for one in body["certificates"]), default=0)
+    lines += [
+        f"{one['name']:<{width}}  {one['role']:<8}  until {one['until'][:10]}  {one['state']}"
+        for one in body["certificates"]
+    ]
+    _say(*lines)
+    return EXIT_OK
+
+
+def revoke(where: Where, label: str) -> int:
+    """Mark a key as revoked, and say what takes effect.
+
+    Raises:
+        AdapterError: there is no such key.
+    """
+    with _opened(where) as (office, authority):
+        entry = authority.revoke(label, _now())
+        security = office.fleet.security
+        revoked = sorted({*(security.revoked if security else ()), label})
+    name, role = entry.holder.name, entry.holder.role
+    _say(
+        f"{label} is revoked: its key is never certified again",
+        f"it is let in until every node goes by a fleet file with `security: {{revoked: [{', '.join(revoked)}]}}`, "
+        "or without the name: change the file everywhere, then restart one daemon after another, electors last",
+        f"`zsched pki issue {name}{'' if role is Role.NODE else f' --role {role}'}` makes a new key for the name",
+    )
+    return EXIT_OK
+
+
+def rotate(where: Where, *, is_end: bool) -> int:
+    """Begin with a new authority, or (``is_end``) stop trusting the former one.
+
+    Raises:
+        AdapterError: a rotation is under way, or there is none.
+        CliError: certificates of the former authority are left.
+    """
+    with _opened(where) as (_, authority):
+        if not is_end:
+            authority.rotate(_passphrase(authority), _now())
+            _say(
+                f"authority {authority.record.number} signs from now on; the former one is trusted until the end",
+                f"1. put {authority.folder / TRUSTED} on every machine as {TRUSTED}, restart one daemon after another",
+                "2. `zsched pki renew`: put every new certificate in its place, restart again",
+                f"3. `zsched pki rotate --finish`; put {TRUSTED} on every machine once more, and restart",
+            )
+            return EXIT_OK
+        left = authority.finish()
+        if left:
+            names = ", ".join(one.label for one in left)
+            raise CliError(
+                EXIT_FAILED, f"the former authority has signed the certificates of {names}: `zsched pki renew` first"
+            )
+        _say(
+            "the former authority is not trusted any more, and its key is deleted",
+            f"next: put {authority.folder / TRUSTED} on every machine as {TRUSTED}, restart one daemon after another",
+        )
+    return EXIT_OK
+
+
+# --- parts -----------------------------------------------------------------------------------------------------------
+
+
+def _need_cryptography() -> None:
+    try:
+        import zsched.pki.certificates  # noqa: F401, PLC0415 - the package is an extra
+    except ModuleNotFoundError as error:
+        raise CliError(
+            EXIT_FAILED, f"the package {error.name} is missing: pip install 'zsched[pki]' (no node needs it, only you)"
+        ) from error
+
+
+def _office(where: Where) -> _Office:
+    fleet = load_fleet(places.config_path(where.config, os.environ))
+    return _Office(fleet=fleet, folder=places.authority_folder(where.authority, os.environ, fleet.name))
+
+
+@contextmanager
+def _opened(where: Where) -> Iterator[tuple[_Office, Authority]]:
+    _need_cryptography()
+    from zsched.pki.authority import opened  # noqa: PLC0415 - imports cryptography
+
+    office = _office(where)
+    with opened(office.folder, office.fleet.name) as authority:
+        yield office, authority
+
+
+def _check_name(fleet: Fleet, name: str, role: Role) -> tuple[str, ...]:
+    """At which addresses the holder is dialled, by the fleet file."""
+    if not NAME.fullmatch(name):
+        raise CliError(EXIT_USAGE, f"{name!r} is no name: lower-case letters, digits, '-' and '_', at most 63")
+    nodes = {node.name: node for node in fleet.nodes}
+    if role is Role.NODE and name not in nodes:
+        hint = nearest(name, sorted(nodes))
+        raise CliError(EXIT_USAGE, f"fleet {fleet.name} has no node {name!r}{hint}; for people: --role operator")
+    if role is not Role.NODE and name in nodes:
+        raise CliError(EXIT_USAGE, f"{name!r} is a node; give people and tools names of their own")
+    return (nodes[name].host,) if role is Role.NODE and nodes[name].host else ()
+
+
+def _lacking(fleet: Fleet, name: str, role: Role) -> str:
+    """What the fleet file lacks for this holder to be let in; empty: nothing."""
+    security = fleet.security
+    if security is None:
+        return "next: write a `security:` section into the fleet file; without it no certificate is asked for"
+    named = {Role.NODE: [name], Role.OPERATOR: security.operators, Role.GUEST: security.guests}[role]
+    return "" if name in named else f"next: write {name} under `security: {{{role}s: [...]}}` of every fleet file"
+
+
+def _how_to_install(folder: Path, role: Role, *, has_key: bool) -> str:
+    if role is not Role.NODE:
+        return (
+            "next: bring that folder to the machine as `pki`, beside its fleet file; `zsched status --connect tls/NODE`"
+        )
+    if not has_key:
+        return f"next, on the node: sudo install -m 644 {folder}/*.pem /etc/zsched/pki/ (its key lies there already)"
+    return (
+        "next: bring that folder to the node, and there:\n"
+        "  sudo install -d -m 755 /etc/zsched/pki\n"
+        f"  sudo install -m 644 {folder}/{CERTIFICATE} {folder}/{TRUSTED} /etc/zsched/pki/\n"
+        f"  sudo install -m 600 {folder}/{KEY} /etc/zsched/pki/ && rm -r {folder}\n"
+        "then delete the folder here, too"
+    )
+
+
+def _write(folder: Path, issued: Issued) -> None:
+    from zsched.pki.files import PRIVATE, PUBLIC, make_folder, write_whole  # noqa: PLC0415 - as above
+
+    try:
+        make_folder(folder)
+        if issued.key:  # first: a certificate without its key would look complete
+            write_whole(folder / KEY, issued.key, PRIVATE)
+        write_whole(folder / TRUSTED, issued.trusted, PUBLIC)
+        write_whole(folder / CERTIFICATE, issued.certificate, PUBLIC)
+    except OSError as error:
+        raise AdapterError(
+            f"{folder}: cannot be written: {error.strerror}; the authority has recorded {issued.entry.label}: "
+            f"`zsched pki revoke {issued.entry.label}`, then again"
+            if issued.key
+            else f"{folder}: cannot be written: {error.strerror}"
+        ) from error
+
+
+def _request(path: Path | None) -> bytes:
+    if path is None:
+        return b""
+    try:
+        return read_regular(path, MAX_BYTES) or b"-"
+    except OSError as error:
+        raise AdapterError(f"{path}: cannot be read: {error.strerror}") from error
+
+
+def _passphrase(authority: Authority) -> bytes:
+    if not authority.is_locked:
+        return b""
+    if PASSPHRASE in os.environ:
+        return os.environ[PASSPHRASE].encode()
+    text: str = typer.prompt(f"Passphrase of {authority.key_path}", hide_input=True, err=True)
+    return text.encode()
+
+
+def _new_passphrase() -> bytes:
+    if os.environ.get(PASSPHRASE):
+        return os.environ[PASSPHRASE].encode()
+    text: str = typer.prompt("Passphrase of the new key", hide_input=True, confirmation_prompt=True, err=True)
+    return text.encode()
+
+
+def _as_json(office: _Office, authority: Authority) -> Json:
+    now, record = _now(), authority.record
+    return {
+        "schema": SCHEMA,
+        "fleet": record.fleet,
+        "folder": str(office.folder),
+        "authority": record.number,
+        "rotating": authority.is_rotating,
+        "locked": authority.key_path.exists() and authority.is_locked,
+        "certificates": [
+            {
+                "name": one.label,
+                "role": str(one.holder.role),
+                "key": one.holder.key,
+                "fingerprint": one.fingerprint,
+                "issued": _iso(one.issued),
+                "until": _iso(one.until),
+                "revoked": None if one.revoked is None else _iso(one.revoked),
+                "state": _state(one, int(now.timestamp()), record.number),
+            }
+            for one in record.entries
+        ],
+    }
+
+
+def _state(entry: Entry, now: int, number: int) -> str:
+    if entry.revoked is not None:
+        return REVOKED
+    if now > entry.until:
+        return ENDED
+    return DUE if entry.is_due(now, number) else VALID
+
+
+def _iso(seconds: int) -> str:
+    return datetime.fromtimestamp(seconds, UTC).isoformat().replace("+00:00", "Z")
+
+
+def _day(entry: Entry) -> str:
+    return _iso(entry.until)[:10]
+
+
+def _now() -> datetime:
+    return datetime.fromtimestamp(wall_ns() / 1e9, UTC)
+
+
+def _say(*lines: str) -> None:
+    sys.stdout.write("".join(f"{line}\n" for line in lines if line))

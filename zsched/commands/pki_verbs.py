@@ -1,0 +1,116 @@
+"""The verbs below `zsched pki`: arguments in, exit code out.
+
+Knows: options. Does not know: how anything is done (`zsched.commands.pki`, imported by the verb that runs).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from zsched.commands.common import Verb, Verbs
+from zsched.core.values.certificates import Role
+
+pki_app = typer.Typer(
+    name="pki",
+    cls=Verbs,
+    help="The fleet's authority and its certificates.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+
+ConfigOption = Annotated[
+    Path | None,
+    typer.Option("--config", "-c", metavar="FILE", help="Fleet file. [ZSCHED_CONFIG, else /etc/zsched/fleet.yaml]"),
+]
+AuthorityOption = Annotated[
+    Path | None,
+    typer.Option("--authority", metavar="DIR", help="Its folder. [ZSCHED_AUTHORITY, else below ~/.local/share/zsched]"),
+]
+RequestOption = Annotated[
+    Path | None,
+    typer.Option("--csr", metavar="FILE", help="A certificate request: the key stays where it was made."),
+]
+OutOption = Annotated[Path | None, typer.Option("--out", "-o", metavar="DIR", help="Where the files go. [./NAME]")]
+LabelArgument = Annotated[str, typer.Argument(metavar="NAME", help="As `zsched pki show` names it: robot1, robot1.k2.")]
+
+
+@pki_app.command(cls=Verb)
+def init(
+    config: ConfigOption = None,
+    authority: AuthorityOption = None,
+    passphrase: Annotated[
+        bool, typer.Option("--passphrase", help="Lock its key. [ZSCHED_AUTHORITY_PASSPHRASE, else it asks]")
+    ] = False,
+) -> None:
+    """Make the fleet's authority: a key that signs certificates, on this machine only."""
+    from zsched.commands import pki  # noqa: PLC0415 - each verb imports what it needs
+
+    raise typer.Exit(pki.init(pki.Where(config=config, authority=authority), asks_passphrase=passphrase))
+
+
+@pki_app.command(cls=Verb)
+def issue(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="A node of the fleet file, or a person or tool.")],
+    role: Annotated[Role, typer.Option("--role", help="What NAME is.")] = Role.NODE,
+    csr: RequestOption = None,
+    out: OutOption = None,
+    config: ConfigOption = None,
+    authority: AuthorityOption = None,
+) -> None:
+    """Make the key and the first certificate of a node, an operator or a guest; it lasts 30 days.
+
+    Nodes may do what zsched does. An operator may also give commands from a machine that is no node. A guest reads
+    status and streams.
+    """
+    from zsched.commands import pki  # noqa: PLC0415 - each verb imports what it needs
+
+    raise typer.Exit(pki.issue(pki.Where(config=config, authority=authority), name, role, csr, out))
+
+
+@pki_app.command(cls=Verb)
+def show(
+    config: ConfigOption = None,
+    authority: AuthorityOption = None,
+    json_: Annotated[bool, typer.Option("--json", help="JSON, with its schema; --json=1: of that version.")] = False,
+) -> None:
+    """List every key that was certified: until when, and whether it is due, revoked or ended."""
+    from zsched.commands import pki  # noqa: PLC0415 - each verb imports what it needs
+
+    raise typer.Exit(pki.show(pki.Where(config=config, authority=authority), is_json=json_))
+
+
+@pki_app.command(cls=Verb)
+def renew(
+    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Only this one. [all that are due]")] = None,
+    csr: RequestOption = None,
+    out: OutOption = None,
+    config: ConfigOption = None,
+    authority: AuthorityOption = None,
+) -> None:
+    """Make new certificates for keys that have one. A certificate is due after two thirds of its life."""
+    from zsched.commands import pki  # noqa: PLC0415 - each verb imports what it needs
+
+    raise typer.Exit(pki.renew(pki.Where(config=config, authority=authority), name, csr, out))
+
+
+@pki_app.command(cls=Verb)
+def revoke(name: LabelArgument, config: ConfigOption = None, authority: AuthorityOption = None) -> None:
+    """Never certify a key again, and say which line of the fleet file keeps it out."""
+    from zsched.commands import pki  # noqa: PLC0415 - each verb imports what it needs
+
+    raise typer.Exit(pki.revoke(pki.Where(config=config, authority=authority), name))
+
+
+@pki_app.command(cls=Verb)
+def rotate(
+    finish: Annotated[bool, typer.Option("--finish", help="Stop trusting the former authority.")] = False,
+    config: ConfigOption = None,
+    authority: AuthorityOption = None,
+) -> None:
+    """Begin with a new authority. Both are trusted until --finish, which waits for every certificate to be renewed."""
+    from zsched.commands import pki  # noqa: PLC0415 - each verb imports what it needs
+
+    raise typer.Exit(pki.rotate(pki.Where(config=config, authority=authority), is_end=finish))

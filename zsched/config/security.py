@@ -1,0 +1,86 @@
+"""Decides what the `security:` section of a fleet file says: where certificates lie, and who is let in besides nodes.
+
+Knows: how names and endpoints relate to it. Does not know: certificates, zenoh's rules.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from zsched.config.blocks import Located, Section
+from zsched.config.nodes import Cast
+from zsched.config.reader import Collector
+from zsched.config.schema import PKI_FOLDER
+from zsched.core.values.certificates import MAX_COMMON_NAME, Holder, Role, parse_label
+from zsched.core.values.fleet import Security
+
+ENCRYPTED = ("tls/", "quic/")
+
+
+def read_security(section: Section, cast: Cast, folder: Path, out: Collector) -> Security | None:
+    """The section, with what is wrong with it reported; ``None``: there is none."""
+    given: Section | None = section.get("security")
+    if given is None:
+        return None
+    operators = _names(given, "operators", cast, out)
+    guests = _names(given, "guests", cast, out)
+    for name in sorted(set(operators) & set(guests)):
+        out.error(given.where("guests"), f"{name!r} is an operator, too", "an operator may do all that a guest may")
+    fleet = section.get("fleet", "")
+    holders = [
+        *(Holder(name=node) for node in cast.names),
+        *(Holder(name=name, role=Role.OPERATOR) for name in operators),
+        *(Holder(name=name, role=Role.GUEST) for name in guests),
+    ]
+    for holder in holders:
+        name = holder.common_name(fleet)
+        if len(name) > MAX_COMMON_NAME:
+            message = (
+                f"the certificate's name {name} has {len(name)} characters, at most {MAX_COMMON_NAME} are possible"
+            )
+            out.error(given.place, message, f"shorter names: {holder.name!r}, or the fleet's, {fleet!r}")
+    _check_endpoints(section, given, out)
+    return Security(
+        folder=str(folder / given.get("folder", PKI_FOLDER)),
+        operators=operators,
+        guests=guests,
+        revoked=_revoked(given, {(one.name, one.role) for one in holders}, out),
+    )
+
+
+def _names(given: Section, key: str, cast: Cast, out: Collector) -> tuple[str, ...]:
+    found: tuple[Located[str], ...] = given.get(key, ())
+    seen: set[str] = set()
+    for one in found:
+        if one.value in cast.names:
+            out.error(
+                one.place, f"{one.value!r} is a node", "nodes may give commands anyway; give people names of their own"
+            )
+        elif one.value in seen:
+            out.error(one.place, f"{one.value!r} is there twice")
+        seen.add(one.value)
+    return tuple(sorted(seen))
+
+
+def _revoked(given: Section, known: set[tuple[str, Role]], out: Collector) -> tuple[str, ...]:
+    found: tuple[Located[str], ...] = given.get("revoked", ())
+    for one in found:
+        holder = parse_label(one.value)
+        if holder is not None and (holder.name, holder.role) not in known:
+            message = f"{one.value!r} is a key of nobody in this file"
+            out.warn(one.place, message, "who is not in the file is not let in: the line may go")
+    return tuple(sorted({one.value for one in found}))
+
+
+def _check_endpoints(section: Section, given: Section, out: Collector) -> None:
+    """A secured node listens with TLS only: what is written otherwise is a mistake of either section."""
+    nodes: dict[str, Located[Section | None]] = section.get("nodes", {})
+    for entry in nodes.values():
+        listen: Section | None = entry.value.get("listen") if entry.value is not None else None
+        for kind in ("control", "data") if listen is not None else ():
+            assert listen is not None
+            endpoint = listen.get(kind, "")
+            if endpoint and not endpoint.startswith(ENCRYPTED):
+                plain, _, address = endpoint.partition("/")
+                message = f"{plain}/ is plain text, and the fleet is secured (line {given.place.line})"
+                out.error(listen.where(kind), message, f"tls/{address}")

@@ -1,0 +1,200 @@
+"""Checks of a fleet's certificates and of sessions that are open to others, as far as this machine can see them.
+
+Knows: the files of the `security:` section and of the operator's zenoh file, this machine's addresses. Does not know:
+what other machines have.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+import re
+import stat
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Final
+
+from zsched.clock import wall_ns
+from zsched.core.values.fleet import Security
+from zsched.doctor.model import Result, Scene, failed, joined, passed, skipped, warned
+from zsched.errors import ConfigError
+from zsched.files import read_regular
+from zsched.runtime.secured import files_of, require_own
+from zsched.runtime.tls import ENCRYPTED, PLAIN, operator_json5, plain_text_problem, protocol_of
+from zsched.sessions.certificate import validities
+from zsched.sessions.config import tls_files
+
+SOON: Final = timedelta(days=30)
+"""Of certificates that somebody else issues."""
+OWN_SOON: Final = timedelta(days=7)
+"""Of the fleet's own, which live for 30 days and are due after 20."""
+MAX_BYTES: Final = 1 << 20
+MEND: Final = "mend the file that the fleet file names under `zenoh: {config: ...}`"
+FIB: Final = "/proc/net/fib_trie"
+"""The kernel's routes: after a line with an address one that calls it ``host LOCAL`` if it is this machine's."""
+IF_INET6: Final = "/proc/net/if_inet6"
+
+Address = ipaddress.IPv4Address | ipaddress.IPv6Address
+
+
+def nothing_in_plain_text(scene: Scene) -> Result:
+    """Whether, with TLS, this node listens with TLS only."""
+    try:
+        protocol = protocol_of(scene.fleet, operator_json5(scene.fleet))
+    except ConfigError as error:
+        return failed(str(error), fix=MEND)
+    if protocol == PLAIN:
+        return skipped("TLS is not set up")
+    problem = plain_text_problem(scene.me, protocol)
+    if problem is not None:
+        return failed(problem, fix="write tls/ in place of tcp/ in its `listen:`")
+    return passed(f"everything of {scene.node} listens with {protocol}")
+
+
+# --- certificates ----------------------------------------------------------------------------------------------------
+
+
+def certificates_last(scene: Scene, now: datetime | None = None) -> Result:
+    """Whether the certificates of this machine are valid, also for some time to come, and its own."""
+    now = now or datetime.fromtimestamp(wall_ns() / 1e9, UTC)
+    security = scene.fleet.security
+    try:
+        files = _named_files(scene)
+    except (ConfigError, ValueError) as error:
+        return failed(str(error), fix=MEND)
+    if not files:
+        return skipped("the fleet has no certificates: no `security:` section, none in the operator's zenoh file")
+    soon = SOON if security is None else OWN_SOON
+    found = [_certificate(name, Path(path), now, soon) for name, path in sorted(files.items())]
+    if security is not None:
+        found += _own(scene, security)
+    return joined(found, passed())
+
+
+def _named_files(scene: Scene) -> dict[str, str]:
+    """{what it is: path} of every certificate and key of this machine."""
+    security = scene.fleet.security
+    if security is None:
+        return tls_files(operator_json5(scene.fleet))
+    files = files_of(security)
+    return {"certificate": str(files.certificate), "key": str(files.key), "authority": str(files.trusted)}
+
+
+def _own(scene: Scene, security: Security) -> list[Result]:
+    """A fault when the certificate is another holder's, or for a revoked key."""
+    try:
+        require_own(scene.fleet, security, scene.node)
+    except ConfigError as error:
+        return [failed(str(error), fix=f"zsched pki issue {scene.node}")]
+    return []
+
+
+def _certificate(name: str, path: Path, now: datetime, soon: timedelta) -> Result:
+    fix = f"renew {path} ({name}), then restart the daemon"
+    try:
+        content = read_regular(path, MAX_BYTES)
+        if "key" in name:
+            return passed(f"{path} can be read")
+        begins, ends = (
+            pick(times) for pick, times in zip((max, min), zip(*validities(content), strict=True), strict=True)
+        )
+    except PermissionError:
+        return skipped(f"{path} may not be read by user {os.geteuid()}: run the doctor as root")
+    except (OSError, ValueError) as error:
+        return failed(f"{path}: {getattr(error, 'strerror', None) or error}", fix=fix)
+    told = f"{path} is valid from {begins:%Y-%m-%d} to {ends:%Y-%m-%d}"
+    if now > ends:
+        return failed(f"{told}: it has ended", fix=fix)
+    if now < begins:
+        return failed(f"{told}: it has not begun", fix=f"is this machine's clock right (timedatectl)? Else {fix}")
+    return warned(f"{told}: {(ends - now).days} days are left", fix=fix) if ends - now < soon else passed(told)
+
+
+def keys_are_private(scene: Scene) -> Result:
+    """Whether nobody but its owner reads this machine's key."""
+    try:
+        keys = sorted({path for name, path in _named_files(scene).items() if "key" in name})
+    except (ConfigError, ValueError) as error:
+        return failed(str(error), fix=MEND)
+    if not keys:
+        return skipped("this machine has no key")
+    return joined((_key(Path(path)) for path in keys), passed())
+
+
+def _key(path: Path) -> Result:
+    try:
+        found = path.stat()
+    except OSError as error:
+        return skipped(f"{path}: {error.strerror}")  # `tls.certificates` says more
+    mode = stat.S_IMODE(found.st_mode)
+    told = f"{path} belongs to user {found.st_uid}, mode {mode:04o}"
+    if not mode & (stat.S_IRWXG | stat.S_IRWXO):
+        return passed(told)
+    fix = f"sudo chmod 600 {path}; the unit gets it by LoadCredential= (docs/guide/secure.md)"
+    if mode & stat.S_IRWXO:
+        return failed(f"{told}: every user of this machine reads the key", fix=f"{fix}; who read it has it: revoke it")
+    return warned(f"{told}: its group reads the key", fix=fix)
+
+
+# --- open sessions ---------------------------------------------------------------------------------------------------
+
+
+def is_not_open_to_everybody(scene: Scene) -> Result:
+    """Whether no session without certificates listens at a public address."""
+    try:
+        protocol = protocol_of(scene.fleet, operator_json5(scene.fleet))
+    except ConfigError as error:
+        return failed(str(error), fix=MEND)
+    listens = (scene.me.listen_control, scene.me.listen_data)
+    plain = [end for end in (given or f"{protocol}/0.0.0.0:0" for given in listens) if not end.startswith(ENCRYPTED)]
+    if not plain:
+        return passed("whoever connects needs a certificate")
+    found = [(end, address) for end in plain for address in _addresses(scene, end)]
+    public = [f"{end} at {address}" for end, address in found if address.is_global]
+    fix = "secure the fleet (docs/guide/secure.md), or let it listen at a private address only"
+    if public:
+        return failed(f"anybody in the internet may read and change everything: {', '.join(public)}", fix=fix)
+    if all(address.is_loopback for _, address in found):
+        return passed("without certificates, and only for this machine")
+    return passed("without certificates: whoever is in its private network may read and change everything")
+
+
+def _addresses(scene: Scene, endpoint: str) -> Iterator[Address]:
+    """The addresses of this machine at which an endpoint takes connections; none of a host name."""
+    host = endpoint.partition("/")[2].partition("?")[0].partition("#")[0].rpartition(":")[0].strip("[]")
+    try:
+        address = ipaddress.ip_address(host)
+    except ValueError:
+        return
+    if not address.is_unspecified:
+        yield address
+        return
+    yield from _ipv4(scene)
+    if address.version == 6:
+        yield from _ipv6(scene)
+
+
+def _ipv4(scene: Scene) -> Iterator[Address]:
+    seen: set[Address] = set()
+    last = ""
+    for line in _lines(scene, FIB):
+        if match := re.search(r"\|-- (\S+)", line):
+            last = match[1]
+        elif "host LOCAL" in line and last:
+            address = ipaddress.ip_address(last)
+            if address not in seen:
+                seen.add(address)
+                yield address
+
+
+def _ipv6(scene: Scene) -> Iterator[Address]:
+    for line in _lines(scene, IF_INET6):
+        yield ipaddress.IPv6Address(int(line.split()[0], 16))
+
+
+def _lines(scene: Scene, path: str) -> list[str]:
+    try:
+        return scene.at(path).read_text(encoding="ascii", errors="replace").splitlines()
+    except OSError:
+        return []

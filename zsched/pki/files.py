@@ -1,0 +1,68 @@
+"""Writes keys, certificates and records so that each is whole, or as it was before.
+
+Knows: modes, owners, rename. Does not know: what is in the files.
+
+A file belongs to the owner of its folder: root, who writes into somebody's folder, leaves no file there that its owner
+cannot read.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+from pathlib import Path
+from typing import Final
+
+PUBLIC: Final = 0o644
+PRIVATE: Final = 0o600
+"""Of keys."""
+PRIVATE_FOLDER: Final = 0o700
+
+
+def make_folder(path: Path) -> None:
+    """A folder that only its owner may look into; one that is there stays as it is.
+
+    Raises:
+        OSError: it cannot be made.
+    """
+    missing = [one for one in (path, *path.parents) if not one.exists()]
+    path.mkdir(mode=PRIVATE_FOLDER, parents=True, exist_ok=True)
+    for one in reversed(missing):
+        _give(one, one.parent)
+
+
+def write_whole(path: Path, content: bytes, mode: int) -> None:
+    """Replace a file by one with ``content`` and ``mode``; nobody ever sees a part of it, or the key with another mode.
+
+    Raises:
+        OSError: it cannot be written; the file is as it was.
+    """
+    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW, mode)
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            os.fchmod(file.fileno(), mode)
+            _give(part, path.parent)
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        part.rename(path)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+    _sync(path.parent)
+
+
+def _give(path: Path, folder: Path) -> None:
+    """Hand a file over to its folder's owner (root only)."""
+    if os.geteuid() == 0:
+        owner = folder.stat()
+        os.chown(path, owner.st_uid, owner.st_gid)
+
+
+def _sync(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

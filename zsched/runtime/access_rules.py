@@ -1,0 +1,188 @@
+"""Decides which certificate may say what on a session of a secured fleet: zenoh's access control, from the fleet file.
+
+Knows: the fleet's nodes, operators and guests, the control keys, the stream rules. Does not know: certificates' files.
+
+Everything is denied that no rule allows: a rule that denies a narrow key does not stop the subscriber of a wider one.
+zenoh applies the rules at each link, by the common name of the certificate at its other end. So a node speaks under its
+own keys only, whatever its frames say. ``**`` matches no chunk that begins with ``@``, so such chunks are named.
+
+Members may read everything of the fleet. What the rules hold apart is who speaks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from enum import StrEnum
+from typing import Any, Final
+
+from zsched.core.route.templates import widened
+from zsched.core.values.certificates import Role, accepted
+from zsched.core.values.fleet import Fleet, NodeSpec, Security, StreamRule, TaskSpec, runs_worker
+from zsched.core.values.model import NodeKind
+from zsched.core.values.plan import Direction, RosGraph
+from zsched.wire.keyspace import ROOT, Keyspace
+
+Json = dict[str, Any]
+
+SPEAK: Final = ("put", "delete", "reply", "declare_queryable", "liveliness_token")
+ASK: Final = ("query",)
+LISTEN: Final = ("declare_subscriber", "declare_liveliness_subscriber", "liveliness_query")
+GET: Final = ("put", "delete", "reply", "liveliness_token")
+"""What a reader is sent."""
+ALL: Final = (*SPEAK, *ASK, *LISTEN)
+ANYTHING: Final = "**"
+ADVANCED: Final = "@adv"
+"""The chunk of the caches and tokens of zenoh's advanced publishers."""
+GRAPH: Final = ("@ros2_lv/**", "@/*/@ros2_lv/**")
+"""ROS 2 graph tokens of rmw_zenoh and of the ros2dds bridge (`zsched.core.route.ros2`)."""
+
+
+class Side(StrEnum):
+    """The kind of session that the rules are for."""
+
+    CONTROL = "control"
+    DATA = "data"
+    """Of a relay, and of a worker that is a peer."""
+    VISIT = "visit"
+    """A client's: what comes by its one link, a member has passed on."""
+
+
+def access_control(fleet: Fleet, security: Security, side: Side) -> Json:
+    """The value of zenoh's ``access_control`` for a session of ``fleet``."""
+    rules: list[Json] = []
+    policies: list[Json] = []
+    subjects: list[Json] = []
+    for subject, names, own in _holders(fleet, security, side):
+        subjects.append({"id": subject, "cert_common_names": names})
+        for number, (flow, messages, keys) in enumerate(own):
+            name = f"{subject} {number}"
+            rules.append(
+                {
+                    "id": name,
+                    "permission": "allow",
+                    "flows": [flow],
+                    "messages": list(messages),
+                    "key_exprs": list(dict.fromkeys(keys)),
+                }
+            )
+            policies.append({"subjects": [subject], "rules": [name]})
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": rules,
+        "subjects": subjects,
+        "policies": policies,
+    }
+
+
+def common_names_of(fleet: Fleet, security: Security) -> frozenset[str]:
+    """The common name of every certificate that is let in."""
+    holders = _holders(fleet, security, Side.CONTROL)
+    return frozenset(name for _, names, _ in holders for name in names)
+
+
+Rule = tuple[str, tuple[str, ...], list[str]]
+"""(flow, messages, keys)."""
+
+
+def _holders(fleet: Fleet, security: Security, side: Side) -> Iterator[tuple[str, list[str], list[Rule]]]:
+    """(id, common names, rules) of everybody who is let in."""
+
+    def names(name: str, role: Role) -> list[str]:
+        return [one.common_name(fleet.name) for one in accepted(name, role, security.revoked)]
+
+    for node in fleet.nodes:
+        yield f"node {node.name}", names(node.name, Role.NODE), list(_node_rules(fleet, node, side))
+    for role, people in ((Role.OPERATOR, security.operators), (Role.GUEST, security.guests)):
+        for name in people if side is not Side.VISIT else ():
+            yield f"{role} {name}", names(name, role), list(_visitor_rules(fleet, name, role, side))
+
+
+def _node_rules(fleet: Fleet, node: NodeSpec, side: Side) -> Iterator[Rule]:
+    keys, everything = Keyspace(fleet.name), _everything(fleet)
+    if side is Side.VISIT:
+        yield "ingress", ALL, everything
+        yield "egress", ALL, everything
+        return
+    own = f"{keys.all_puts().removesuffix('*/*')}*/{node.name}/**"
+    if side is Side.CONTROL:
+        # The last: a node passes on the questions of those that hang on it (`zsched status --connect`).
+        asked = [keys.all_questions("*").removesuffix("*") + node.name, keys.status("*", "*")]
+        yield "ingress", SPEAK, [own]
+    else:
+        speaks, asks = _stream_keys(fleet, node)
+        asked = [*_with_suffixes(asks), keys.role("*", "*"), keys.snapshot("*", "*")]
+        yield "ingress", SPEAK, [own, *_with_suffixes(speaks), *_graph(fleet)]
+    yield "ingress", ASK, asked
+    yield "ingress", LISTEN, everything
+    yield "egress", ALL, everything
+
+
+def _visitor_rules(fleet: Fleet, name: str, role: Role, side: Side) -> Iterator[Rule]:
+    keys = Keyspace(fleet.name)
+    if side is Side.CONTROL:
+        asked = [keys.status("*", name)] + ([keys.command("*", name)] if role is Role.OPERATOR else [])
+        yield "ingress", ASK, asked
+        yield "egress", ("reply",), asked
+        return
+    readable = [ANYTHING, f"{ANYTHING}/{ADVANCED}/{ANYTHING}"]
+    yield "ingress", (*LISTEN, *ASK), [readable[1], *GRAPH]
+    yield "ingress", LISTEN, readable
+    yield "egress", GET, [*readable, *GRAPH]
+    yield "ingress", ASK, [keys.role("*", "*")]  # `zsched ping`
+    yield "egress", ("reply",), [keys.role("*", "*")]
+
+
+# --- keys ------------------------------------------------------------------------------------------------------------
+
+
+def _everything(fleet: Fleet) -> list[str]:
+    return [
+        f"{ROOT}/{fleet.name}/{ANYTHING}",
+        ANYTHING,
+        f"{ANYTHING}/{ROOT}/{ANYTHING}",
+        f"{ANYTHING}/{ADVANCED}/{ANYTHING}",
+        *GRAPH,
+    ]
+
+
+def _graph(fleet: Fleet) -> tuple[str, ...]:
+    has_graph = any(rule.settings.graph is not RosGraph.NONE for task in fleet.tasks for rule in task.rules)
+    return GRAPH if has_graph else ()
+
+
+def _with_suffixes(keys: Iterable[str]) -> Iterator[str]:
+    """The keys, and what zsched and zenoh's advanced publishers put behind them."""
+    for key in keys:
+        yield key
+        yield f"{key}/{ROOT}/{ANYTHING}"
+        yield f"{key}/{ADVANCED}/{ANYTHING}"
+
+
+def _stream_keys(fleet: Fleet, node: NodeSpec) -> tuple[list[str], list[str]]:
+    """(keys of streams under which a node speaks, keys that it may ask), by the fleet's rules."""
+    speaks: list[str] = []
+    asks: list[str] = []
+    for task in fleet.tasks:
+        for rule in task.rules:
+            spoken, asked = _keys_of(task, rule, node)
+            speaks += spoken
+            asks += asked
+    return list(dict.fromkeys(speaks)), list(dict.fromkeys(asks))
+
+
+def _keys_of(task: TaskSpec, rule: StreamRule, node: NodeSpec) -> tuple[list[str], list[str]]:
+    here = {"robot": node.name, "node": node.name, "task": task.name}
+    there = {"target": node.name, "task": task.name}
+    inner = rule.to_template if rule.direction is not Direction.OUTPUT else rule.from_template
+    outer = rule.from_template if rule.direction is not Direction.OUTPUT else rule.to_template
+    speaks: list[str] = []
+    asks: list[str] = []
+    if node.kind is NodeKind.ROBOT:
+        speaks.append(widened(outer, **here))
+        asks += [widened(outer, **here), widened(inner, **here)]
+        if rule.direction is Direction.INPUT:
+            speaks.append(widened(inner, **here))
+    if rule.direction is not Direction.INPUT and runs_worker(task, node.name, node.kind):
+        speaks.append(widened(inner, **there))
+    return speaks, asks

@@ -1,0 +1,145 @@
+"""Decides what a secured fleet's sessions are opened with, and whether this machine's certificate is the right one.
+
+Knows: the three files of the `security:` section, and what must stand in the certificate. Does not know: how they are
+made (`zsched.pki`, which is never imported here), which keys a holder may use (`zsched.runtime.access_rules`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Final
+
+from zsched.core.values.certificates import Holder, Role, accepted, parse_common_name
+from zsched.core.values.fleet import Fleet, Security
+from zsched.errors import ConfigError
+from zsched.files import owner_of, read_regular
+from zsched.runtime.access_rules import Side, access_control
+from zsched.sessions import config as zenoh_config
+from zsched.sessions.certificate import common_names, validities
+
+CERTIFICATE, KEY, TRUSTED = "certificate.pem", "key.pem", "ca.pem"
+MAX_BYTES: Final = 1 << 20
+CREDENTIALS: Final = "CREDENTIALS_DIRECTORY"
+"""Where systemd puts what `LoadCredential=` names: the key, which nobody but root reads where it lies."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Identity:
+    """What this machine's certificate says."""
+
+    holder: Holder
+    begins: datetime
+    ends: datetime
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Files:
+    """Where this machine's three files are."""
+
+    certificate: Path
+    key: Path
+    trusted: Path
+
+
+def files_of(security: Security, env: Mapping[str, str] = os.environ) -> Files:
+    """The files of a `security:` section; of each the one that systemd handed over, where there is one."""
+    handed = Path(env[CREDENTIALS]) if env.get(CREDENTIALS) else None
+
+    def place(name: str) -> Path:
+        if handed is not None and (handed / name).exists():
+            return handed / name
+        return Path(security.folder) / name
+
+    return Files(certificate=place(CERTIFICATE), key=place(KEY), trusted=place(TRUSTED))
+
+
+def secured_text(fleet: Fleet, security: Security, side: Side, operator_json5: str) -> str:
+    """The zenoh configuration on which a session of a secured fleet is built; over the operator's own.
+
+    Raises:
+        ConfigError: a file is missing or cannot be read, or the operator's file has TLS or access control of its own.
+    """
+    try:
+        if zenoh_config.tls_settings(operator_json5) or zenoh_config.has_access_control(operator_json5):
+            raise ConfigError(
+                f"{fleet.zenoh_config}: it sets TLS or access control, and the fleet file has a `security:` section, "
+                "which makes both; keep one of them"
+            )
+    except ValueError as error:
+        raise ConfigError(f"{fleet.zenoh_config}: {error}") from error
+    files = files_of(security)
+    for path in (files.certificate, files.key, files.trusted):
+        _read(path)
+    rules = access_control(fleet, security, side)
+    return zenoh_config.secured(
+        certificate=str(files.certificate),
+        key=str(files.key),
+        trusted=str(files.trusted),
+        rules=rules,
+        operator_json5=operator_json5,
+    )
+
+
+def identity_of(fleet: Fleet, security: Security) -> Identity:
+    """Whom this machine's certificate names.
+
+    Raises:
+        ConfigError: it cannot be read, or is no certificate of this fleet.
+    """
+    path = files_of(security).certificate
+    pem = _read(path)
+    try:
+        (name, *_), ((begins, ends), *_) = common_names(pem), validities(pem)
+    except ValueError as error:
+        raise ConfigError(f"{path}: {error}; `zsched pki issue` makes one") from error
+    holder = parse_common_name(name, fleet.name)
+    if holder is None:
+        raise ConfigError(
+            f"{path} names {name!r}, which is no name in fleet {fleet.name}; `zsched pki issue` makes one"
+        )
+    return Identity(holder=holder, begins=begins, ends=ends)
+
+
+def require_own(fleet: Fleet, security: Security, node: str) -> None:
+    """Refuse to run as ``node`` with a certificate that the others would not take for it.
+
+    Raises:
+        ConfigError: it names somebody else, or a revoked key.
+    """
+    path, holder = files_of(security).certificate, identity_of(fleet, security).holder
+    if (holder.name, holder.role) != (node, Role.NODE):
+        raise ConfigError(
+            f"{path} is {holder.label}'s, and this node is {node}: each node has a certificate of its own"
+        )
+    if holder not in accepted(node, Role.NODE, security.revoked):
+        raise ConfigError(
+            f"{path} is for the key {holder.label}, which `security: revoked` does not let in; "
+            f"`zsched pki issue {node}` makes a new one"
+        )
+
+
+def digest_of(security: Security) -> str:
+    """16 hex digits over this machine's certificate and what it trusts: a listener reads both only when it begins."""
+    files = files_of(security)
+    state = hashlib.blake2s(digest_size=8)
+    for path in (files.certificate, files.trusted):
+        state.update(_read(path))
+    return state.hexdigest()
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return read_regular(path, MAX_BYTES)
+    except PermissionError as error:
+        hint = f"{owner_of(path)}; run as root, or hand it over by LoadCredential= (docs/guide/secure.md)"
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}; {hint}") from error
+    except OSError as error:
+        raise ConfigError(
+            f"{path}: cannot be read: {error.strerror}; the fleet file has a `security:` section, so this machine "
+            "needs its certificate: `zsched pki issue` makes it (docs/guide/secure.md)"
+        ) from error
