@@ -118,6 +118,9 @@ def test_a_robot_that_has_forgotten_or_missed_a_failure_judges_as_the_others_do(
     sim.start(owner)
     assert sim.run_until(lambda: min(scores(sim, owner)) > 0.0, 20), scores(sim, owner)
     sim.run(2.0)
+    for voter in VOTERS:  # at rest a robot judges by the others' last answers, which are up to a profile's life old
+        sim.node(voter).rounds.hurry(sim.now)
+    sim.run(0.7)
     held = [sim.node(voter).rounds.tasks["merge"].damping.penalty(owner, sim.now) for voter in VOTERS]
     assert held[0] < held[2] - 0.1  # what each remembers differs ...
     assert max(scores(sim, owner)) - min(scores(sim, owner)) < 1 / 256  # ... and what each makes of it does not
