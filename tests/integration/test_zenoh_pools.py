@@ -45,13 +45,14 @@ def environment(pid: int) -> dict[str, str]:
 def test_a_daemon_gives_itself_its_relay_and_its_workers_a_thread_for_every_link(bed: Testbed) -> None:
     """Of the daemon and the relay the threads themselves are counted: what they set is in no environment of theirs."""
     count = pool_threads(NODES, TASKS)
-    pools = {"rx": count + TX_THREADS, "tx": 0, "net": 0, "acc": 0}
-    assert has_threads(bed.pid("edge1"), **pools)
+    assert count >= TX_THREADS + 2, "or a relay that sets nothing could not be told from one that does"
+    assert has_threads(bed.pid("edge1"), rx=count, tx=TX_THREADS, net=count, acc=count)
     relay = bed.relay_pid("edge1")
     assert relay is not None
-    assert has_threads(relay, **pools)
+    assert environment(relay)["ZENOH_RUNTIME"] == runtime_pools(NODES, TASKS), "its daemon's, until it sets its own:"
+    assert has_threads(relay, rx=count, tx=count, net=count, acc=1)
     workers = descendants_running(bed.pid("edge1"), "zsched.tasks.echo")
     assert workers
     for worker in workers:
         assert environment(worker)["ZENOH_RUNTIME"] == runtime_pools(NODES, TASKS)
-        assert has_threads(worker, **pools)
+        assert has_threads(worker, rx=count, net=count)  # nobody dials it: no `acc`

@@ -38,7 +38,6 @@ ACCEPT_TIMEOUT_S: Final = 1.0
 RELAY_START_S: Final = 10.0
 """A worker that is started together with its relay, on a busy machine, waits so long for it."""
 TX_THREADS: Final = 4
-"""Threads of zenoh's pool beyond one for every link."""
 DEFAULT_TIMING: Final = Timing()
 
 Settings = dict[str, Any]
@@ -281,20 +280,25 @@ def pool_threads(nodes: int, tasks: int = 0) -> int:
 def runtime_pools(nodes: int, tasks: int = 0) -> str:
     """The value of ``ZENOH_RUNTIME`` for a process with links to so many nodes (zenoh reads it once).
 
-    zenoh's tasks that receive, transmit, close links and shake hands share one pool: with a pool each, every packet
-    wakes twice as many threads (decision 0049). Closing a link that is dead one way holds a thread for zenoh's
-    SO_LINGER, 10 s, and a stalled target holds one that transmits: so there is one for every link, and `TX_THREADS`.
+    ``net`` closes links and dials, ``acc`` shakes hands with who dials us; both have one thread by default. Closing a
+    link that is dead one way holds a thread for zenoh's SO_LINGER, 10 s, in which no other link came or went.
     """
-    return relay_pools(pool_threads(nodes, tasks))
+    threads = pool_threads(nodes, tasks)
+    return _pools(rx=threads, tx=TX_THREADS, net=threads, acc=threads)
 
 
 def relay_pools(threads: int) -> str:
-    """The value of ``ZENOH_RUNTIME`` for a relay: one thread for each of ``threads`` links, and `TX_THREADS`.
+    """The value of ``ZENOH_RUNTIME`` for a relay: ``threads`` that receive, transmit, and close links, each.
 
-    One stalled target holds one thread that transmits, and later the one that closes its link (docs/decisions/0016).
+    One stalled target holds one thread that transmits, and later the one that closes its link. ``net`` has as many as
+    ``rx``, because a socket is read by the pool that opened it: ``net`` also receives on every link that this process
+    has dialled (docs/decisions/0016).
     """
-    shared = ", ".join(f"{pool}: (handover: rx)" for pool in ("tx", "net", "acc"))
-    return f"(rx: (worker_threads: {threads + TX_THREADS}), {shared})"
+    return _pools(rx=threads, tx=threads, net=threads)
+
+
+def _pools(**threads: int) -> str:
+    return f"({', '.join(f'{name}: (worker_threads: {count})' for name, count in threads.items())})"
 
 
 # --- parts -----------------------------------------------------------------------------------------------------------

@@ -306,10 +306,10 @@ STREAM_BUGS = (
         ("tests/parts/sessions/test_stalled_links.py::test_a_relay_ends_the_link_of_a_frozen_worker_behind_its_put",),
     ),
     _bug(
-        "a node's processes read, transmit and close links with a single thread",
+        "a relay closes links, and reads those it has dialled, with a single thread",
         "zsched.sessions.config",
-        "threads + TX_THREADS}), {shared}",
-        "1}), {shared}",
+        "return _pools(rx=threads, tx=threads, net=threads)",
+        "return _pools(rx=threads, tx=threads)",
         ("tests/unit/sessions/test_config.py", "tests/integration/test_zenoh_pools.py"),
     ),
     _bug(
@@ -317,6 +317,13 @@ STREAM_BUGS = (
         "zsched.daemon",
         'os.environ.setdefault(\n                "ZENOH_RUNTIME",',
         'os.environ.setdefault(\n                "ZENOH_RUNTIME_UNREAD",',
+        ("tests/integration/test_zenoh_pools.py",),
+    ),
+    _bug(
+        "a relay has the threads that its daemon has",
+        "zsched.relay.__main__",
+        'os.environ["ZENOH_RUNTIME"] = relay_pools(arguments.threads)',
+        "relay_pools(arguments.threads)",
         ("tests/integration/test_zenoh_pools.py",),
     ),
     _bug(

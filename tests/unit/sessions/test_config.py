@@ -126,8 +126,13 @@ def test_an_operators_file_that_is_none_is_refused_in_words() -> None:
 def test_a_process_has_a_receive_thread_for_every_link_that_may_fall_silent_at_once() -> None:
     assert [pool_threads(nodes) for nodes in (1, 6, 48, 1000)] == [4, 8, 50, 64]
     assert [pool_threads(5, tasks) for tasks in (0, 1, 3)] == [7, 12, 22], "a relay, and a worker per task, on each"
-    pools = "(rx: (worker_threads: 12), tx: (handover: rx), net: (handover: rx), acc: (handover: rx))"
-    assert runtime_pools(6) == relay_pools(8) == pools, "one pool, or each packet wakes twice as many threads"
+    pools = "(rx: (worker_threads: 8), tx: (worker_threads: 4), net: (worker_threads: 8), acc: (worker_threads: 8))"
+    assert runtime_pools(6) == pools
+
+
+def test_a_relay_reads_the_links_that_it_has_dialled_with_as_many_threads_as_those_that_dial_it() -> None:
+    """zenoh gives a socket to the pool that opened it: ``net`` where we dial, ``rx`` where we are dialled."""
+    assert relay_pools(7) == "(rx: (worker_threads: 7), tx: (worker_threads: 7), net: (worker_threads: 7))"
 
 
 def test_control_sessions_that_know_every_address_do_not_dial_by_gossip() -> None:
