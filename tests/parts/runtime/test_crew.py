@@ -276,6 +276,7 @@ def test_a_worker_whose_token_is_at_another_key_is_told_both(house: House) -> No
 
 
 def test_who_has_to_start_a_worker_with_a_token_is_told_its_key(house: House) -> None:
+    house.crew.sessions = {"alone": Path("edge1-alone.zenoh.json5")}
     house.crew.begin()
     assert "`ready: matching`" in house.reasons("alone")[0]
     assert "worker/edge1/alone/NUMBER" in house.reasons("alone")[0]
