@@ -224,14 +224,20 @@ class Invariants:
         self.ballots[task, ballot] = (life, value or carried)
 
     def _check_cap(self, machine: Machine, proposal: Proposal) -> None:
-        """Who has seen a minute's planned moves in this life proposes no further one: counted from what it learnt."""
+        """Who has seen a minute's planned moves in this life proposes no further one: counted from what it learnt.
+
+        An operator's moves are not counted: by what a node learns, the order (`Allocation.asked`) is part of the value.
+        """
         node = machine.node
         assert node is not None
         task = node.rounds.tasks[proposal.task]
         if node.registers[proposal.task].value.owner in (None, proposal.candidate):
             return
         moves = sum(
-            new.value.epoch > old.value.epoch and old.value.owner is not None and task.judged_at - new.at <= WINDOW_S
+            new.value.epoch > old.value.epoch
+            and old.value.owner is not None
+            and new.value.asked is None
+            and task.judged_at - new.at <= WINDOW_S
             for old, new in pairwise(node.history[proposal.task])
         )
         planned = moves - task.damping.moves_within(WINDOW_S, task.judged_at, escapes=True)
