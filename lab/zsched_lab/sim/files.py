@@ -132,9 +132,15 @@ def _other_command(rng: Random, fleet: Fleet) -> Fleet:
 
 
 def _other_times(rng: Random, fleet: Fleet) -> Fleet:
-    """Other clocks, with the same length of leases: that one needs a restart of all."""
-    changed = _other_timing(rng, fleet)
-    return replace(changed, timing=replace(changed.timing, lease_s=fleet.timing.lease_s))
+    """Other times, with the same length of leases: that one needs a restart of all, and bounds beats and silence."""
+    timing = fleet.timing
+    times = replace(
+        timing,
+        beat_s=timing.beat_s * rng.choice((0.5, 0.75, 1.0)),
+        suspect_s=timing.suspect_s * rng.choice((1.0, 1.5, 2.0)),
+        decide_s=timing.decide_s * rng.choice((1.0, 1.5)),
+    )
+    return replace(fleet, timing=times)
 
 
 RELOADED: dict[str, Change] = {
