@@ -39,6 +39,7 @@ from zsched.core import events as ev
 from zsched.core.electorate.numbers import in_force
 from zsched.core.node import Node
 from zsched.core.status import status_line
+from zsched.core.values.document import Flag
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet, WorkerLink, dial_endpoint, electorate_hash, fleet_hash
 from zsched.core.values.model import NodeId, NodeKind
@@ -115,6 +116,8 @@ class Daemon:
         )
         self._stored: dict[str, Fleet] = {}
         """{hash: what it says} of the documents that the state names."""
+        self._flags: dict[str, tuple[Flag, ...]] = {}
+        """{hash: its flags} of the same documents."""
         self._in_file = fleet_hash(self._fleet)
         self._read_settings()
 
@@ -144,6 +147,7 @@ class Daemon:
                 now=monotonic_s(),
                 version=__version__,
                 stored=self._stored,
+                flags=self._flags,
             )
             node.solitude.dialled = points.control_connect
             node.solitude.dialled_at = dial_endpoint(self._spec.listen_control, self._spec.host)
@@ -208,7 +212,7 @@ class Daemon:
             if content is None:
                 continue
             try:
-                self._stored[document] = self._library.read(content)
+                self._stored[document], self._flags[document] = self._library.read(content), content.flags
             except ConfigError as error:
                 log.warning("document unusable document=%s why=%s", document, error)
         fleet = self._stored.get(value.document)

@@ -16,7 +16,7 @@ from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.electorate.changes import AdoptDocument
 from zsched.core.electorate.founding import founded
-from zsched.core.values.document import Document, Text
+from zsched.core.values.document import Document, Flag, FlagKind, Text
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet, OnIsolation, Standby, StreamRule, TaskSpec, WorkerSpec, electorate_hash
 from zsched.core.values.messages import (
@@ -115,6 +115,10 @@ def _some_task(rng: Random, name: str, nodes: tuple[str, ...]) -> TaskSpec:
     )
 
 
+FLAGS = (
+    Flag(kind=FlagKind.DRAIN, subject="edge1", for_s=1.0, revision=2),
+    Flag(kind=FlagKind.INELIGIBLE, subject="edge2"),
+)
 FOUNDING = founded(FLEET.name, 0, FLEET.electors)
 
 
@@ -364,7 +368,7 @@ class Storm:
         request = None if order is None else order.request
         if self.rng.random() < 0.1:
             return ev.DocumentRefused(document=name, reason="no", request=request)
-        return ev.DocumentStored(document=name, fleet=FLEET, request=request)
+        return ev.DocumentStored(document=name, fleet=FLEET, flags=FLAGS, request=request)
 
     def fleet_asked(self) -> ev.Event:
         asker = self.name()

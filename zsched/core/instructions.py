@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from zsched.core.values.decision import Decision, Explanation, Move
-from zsched.core.values.document import Document
+from zsched.core.values.document import Document, Flag
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet
@@ -312,6 +312,17 @@ class StoreDocument:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class AmendDocument:
+    """Write the stored document with this hash once more, with other flags.
+
+    `DocumentStored` comes back, without a request. If the document is not stored here any more, nothing comes back.
+    """
+
+    document: str
+    flags: tuple[Flag, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FetchDocument:
     """Fetch the document with this hash from one of the peers, in this order; check it and write it.
 
@@ -363,6 +374,7 @@ Instruction = (
     | AskElectors
     | AnswerFleet
     | StoreDocument
+    | AmendDocument
     | FetchDocument
     | AnswerDocument
     | AnswerFleetRead

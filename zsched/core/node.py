@@ -136,6 +136,7 @@ class Node(Stages):
             self.votes.next_deadline(),
             self.agreement.next_deadline(),
             self.expiry.next_deadline(),
+            self.flags.next_deadline(),
             self.tenure.next_deadline(now),
         )
         for executor in self.executors.values():
@@ -173,13 +174,18 @@ class Node(Stages):
         if not self.votes.is_idle:
             self.votes.count(self.values(), self.membership.states(), todo, now)
         for task, change in self.votes.due_commits(now):
-            self.agreement.propose(task, change, todo, now)
+            if change.owner in self.flags.closed:  # since the vote
+                self.votes.on_commit_ended(task)
+            else:
+                self.agreement.propose(task, change, todo, now)
         for task, retune in () if self.retuning.is_idle else self.retuning.due(self.values(), now):
             if not self.registers[task].is_busy:
                 self.agreement.propose(task, retune, todo, now)
         if now >= self.expiry.next_deadline():
             for task, ending in self.expiry.due(self.values(), now):
                 self.agreement.propose(task, ending, todo, now)
+        if now >= self.flags.next_deadline():
+            self.agreement.orders.end_flags(self.flags.due(now), todo)
         if now >= self.agreement.next_deadline():
             self.agreement.tick(todo, now)
 

@@ -33,10 +33,12 @@ from zsched.core.membership.solitude import Solitude
 from zsched.core.profile.profile import Profiler
 from zsched.core.profile.relay_ends import RelayEnds
 from zsched.core.route.rates import StreamRates
+from zsched.core.scheduler.flags import NodeFlags
 from zsched.core.scheduler.probation import Probation
 from zsched.core.scheduler.rounds import Rounds
 from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts
 from zsched.core.todo import ToDo
+from zsched.core.values.document import Flag
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet, TaskSpec, fleet_hash
 from zsched.core.values.model import Allocation, NodeId, NodeKind, PeerState, Profile, TaskId
@@ -80,6 +82,7 @@ class Stages:
         now: monotonic seconds.
         version: of the program, for status.
         stored: {hash: what it says} of the documents on this node's disk that its state names.
+        flags: {hash: its flags} of those of them that have any.
     """
 
     def __init__(
@@ -94,6 +97,7 @@ class Stages:
         now: float,
         version: str = "",
         stored: Mapping[str, Fleet] = MappingProxyType({}),
+        flags: Mapping[str, tuple[Flag, ...]] = MappingProxyType({}),
     ) -> None:
         self.fleet, self.me, self.version = fleet, me, version
         self.kind = fleet.node(me).kind
@@ -130,7 +134,10 @@ class Stages:
         # SCHEDULER, VOTE
         self.votes = Votes(fleet, me)
         self.probation = Probation(fleet)
-        self.rounds = Rounds(fleet, me, self.gateway, self.votes.tasks, rng, now, self._doubts, self.round_trips)
+        self.flags = NodeFlags(rank=[node.name for node in fleet.nodes].index(me))
+        self.rounds = Rounds(
+            fleet, me, self.gateway, self.votes.tasks, rng, now, self._doubts, self.round_trips, self.flags
+        )
         self.agreement = Agreement(
             fleet=fleet,
             me=me,
@@ -140,10 +147,12 @@ class Stages:
             rng=rng,
             now=now,
             stored=stored,
+            flags=flags,
         )
         self.registers = self.agreement.registers
         self.retuning = Retuning(me)
-        self.expiry = Expiry(rank=[node.name for node in fleet.nodes].index(me))
+        self.expiry = Expiry(rank=self.flags.rank)
+        self.flags.take(self.agreement.flags, now)
         # EXECUTOR, ROUTE
         self.executors = {
             task.name: Executor(spec=task, me=me, has_streams=self.kind is NodeKind.ROBOT) for task in fleet.tasks
@@ -193,7 +202,7 @@ class Stages:
         return tuple(name for name, value in self.values().items() if value.owner == self.me)
 
     def movable(self, now: float) -> tuple[TaskId, ...]:
-        """What of it another candidate could take, as far as is known: one that lives and does not drain itself."""
+        """What of it another candidate could take, as far as is known: one that lives and that nothing keeps out."""
         return tuple(
             name
             for name in self.owned()
@@ -202,7 +211,7 @@ class Stages:
 
     def _can_take(self, node: NodeId, now: float) -> bool:
         is_there = node != self.me and self.membership.state(node) is PeerState.ALIVE
-        return is_there and not self.was_draining(node, now)
+        return is_there and node not in self.flags.closed and not self.was_draining(node, now)
 
     def was_draining(self, node: NodeId | None, now: float) -> bool:
         """Whether an owner was told to stop, by the last that was heard of it."""
@@ -218,8 +227,9 @@ class Stages:
         return tuple(name for name in sorted(self.renewing.told) if name in self.executors)
 
     def heard_candidates(self, spec: TaskSpec, now: float) -> Mapping[NodeId, Profile]:
-        """{candidate: its fresh profile} of the living ones, this node left out."""
-        living = [name for name in spec.candidates if self.membership.state(name) is PeerState.ALIVE]
+        """{candidate: its fresh profile} of the living ones, this node left out, and those that take nothing new."""
+        able = [name for name in spec.candidates if name not in self.flags.closed]
+        living = [name for name in able if self.membership.state(name) is PeerState.ALIVE]
         profiles = ((name, self.gateway.fresh(name, now)) for name in living if name != self.me)
         return {name: profile for name, profile in profiles if profile is not None}
 

@@ -15,6 +15,7 @@ from zsched.core.scheduler.rounds import TaskRound
 from zsched.core.scheduler.scoring import joined
 from zsched.core.stages import Stages, Unready
 from zsched.core.values.decision import Explanation
+from zsched.core.values.document import Flag
 from zsched.core.values.fleet import NodeSpec, TaskSpec
 from zsched.core.values.model import (
     NEVER_INITIALISED,
@@ -34,6 +35,7 @@ from zsched.core.values.quorum import majority
 from zsched.core.values.snapshot import (
     SCHEMA,
     DecisionStatus,
+    FlagStatus,
     HoldStatus,
     NodeStatus,
     PastAllocation,
@@ -248,9 +250,12 @@ def _quorum(node: Stages) -> QuorumStatus:
 def _node_status(node: Stages, spec: NodeSpec, now: float) -> NodeStatus:
     state = node.membership.state(spec.name)
     incarnation = node.incarnation if spec.name == node.me else node.membership.incarnation(spec.name)
+    flags = tuple(_flag_status(node, flag, now) for flag in node.flags.flags if flag.subject == spec.name)
     data = node.gateway.newest(spec.name, now)
     if data is None:
-        return NodeStatus(name=spec.name, kind=spec.kind.value, state=state.value, age_s=None, incarnation=incarnation)
+        return NodeStatus(
+            name=spec.name, kind=spec.kind.value, state=state.value, age_s=None, incarnation=incarnation, flags=flags
+        )
     profile = data.profile
     cpu, memory = profile.cpu_used_cores, profile.memory_used_mb
     return NodeStatus(
@@ -270,6 +275,18 @@ def _node_status(node: Stages, spec: NodeSpec, now: float) -> NodeStatus:
         draining=profile.draining,
         speed=profile.speed,
         cpu_pressure=profile.cpu_pressure,
+        flags=flags,
+    )
+
+
+def _flag_status(node: Stages, flag: Flag, now: float) -> FlagStatus:
+    since = node.flags.since(flag)
+    return FlagStatus(
+        kind=flag.kind.value,
+        by=flag.by,
+        reason=flag.reason,
+        known_s=now - (node.started_at if since is None else since),
+        for_s=flag.for_s,
     )
 
 

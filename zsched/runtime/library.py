@@ -11,6 +11,7 @@ import logging
 import queue
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from zsched.adapters.host.document_store import DocumentStore
@@ -32,6 +33,7 @@ RECENT = 8
 MAX_FAULT = 400
 
 Fetch = Callable[[NodeId, str, float], bytes | None]
+Order = do.StoreDocument | do.AmendDocument | do.FetchDocument | do.KeepDocuments
 log = logging.getLogger("zsched.library")
 
 
@@ -45,9 +47,7 @@ class Library:
         self._fleet, self._node, self._config, self._post = fleet, node, config, post
         self.store = DocumentStore(state_dir)
         self.fetch: Fetch = lambda _peer, _document, _deadline_s: None
-        self._orders: queue.SimpleQueue[do.StoreDocument | do.FetchDocument | do.KeepDocuments | None] = (
-            queue.SimpleQueue()
-        )
+        self._orders: queue.SimpleQueue[Order | None] = queue.SimpleQueue()
         self._wanted: set[str] = set()
         """Hashes whose fetch waits or is under way: once is enough."""
         self._recent: deque[str] = deque(maxlen=RECENT)
@@ -75,7 +75,7 @@ class Library:
         """
         return read_document(content, self._fleet, self._node, self._config)
 
-    def order(self, order: do.StoreDocument | do.FetchDocument | do.KeepDocuments) -> None:
+    def order(self, order: Order) -> None:
         """Enqueue; an event tells what became of it."""
         if isinstance(order, do.FetchDocument):
             if order.document in self._wanted:
@@ -90,9 +90,17 @@ class Library:
             elif isinstance(order, do.FetchDocument):
                 self._bring(order)
                 self._wanted.discard(order.document)
+            elif isinstance(order, do.AmendDocument):
+                self._amend(order)
             else:
                 self._kept = order.documents
                 self._tidy()
+
+    def _amend(self, order: do.AmendDocument) -> None:
+        """Write a stored document once more, with other flags."""
+        content = self.store.load(order.document)
+        if content is not None:
+            self._accept(replace(content, flags=order.flags), None)
 
     def _tidy(self) -> None:
         """Delete what nobody needs; a peer can only make this node store a few documents more."""

@@ -436,7 +436,7 @@ class Shell:
                 bus.ask_fleet(fleet_question(question), deadline_s)
             case do.AnswerFleet(request=request, answer=fleet_answer):
                 bus.answer(request, fleet_answer)
-            case do.StoreDocument() | do.FetchDocument() | do.KeepDocuments():
+            case do.StoreDocument() | do.AmendDocument() | do.FetchDocument() | do.KeepDocuments():
                 self._documents().order(instruction)
             case do.AnswerFleetRead(request=request, told=told, with_document=with_document):
                 self._answer_operator(request, self._with_document(told) if with_document else told)

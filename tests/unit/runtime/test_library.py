@@ -11,7 +11,7 @@ import pytest
 from zsched.adapters.host.document_store import DocumentStore
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.values.document import Document, Text
+from zsched.core.values.document import Document, Flag, FlagKind, Text
 from zsched.core.values.model import NodeId
 from zsched.runtime.library import RECENT, Library
 from zsched.wire.codec import document_hash, encode
@@ -130,3 +130,16 @@ def test_what_the_state_names_is_kept_and_peers_fill_no_disk(desk: Desk) -> None
         desk.next()
     assert desk.store.load(first.document) == document()
     assert len(list(desk.store.folder.iterdir())) == RECENT + 1
+
+
+def test_a_stored_document_is_written_once_more_with_other_flags(desk: Desk) -> None:
+    desk.library.order(do.StoreDocument(request=7, content=document()))
+    desk.next()
+    flags = (Flag(kind=FlagKind.DRAIN, subject="edge1"),)
+    desk.library.order(do.AmendDocument(document="0a" * 16, flags=flags))  # nobody has it: nothing comes back
+    desk.library.order(do.AmendDocument(document=document_hash(document()), flags=flags))
+    event = desk.next()
+    assert isinstance(event, ev.DocumentStored)
+    assert (event.flags, event.request) == (flags, None)
+    amended = Document(text=document().text, flags=flags)
+    assert (event.document, desk.store.load(event.document)) == (document_hash(amended), amended)

@@ -11,9 +11,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 
 from zsched.core import instructions as do
 from zsched.core.todo import ToDo
+from zsched.core.values.document import Flag
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId
@@ -32,10 +34,14 @@ class Documents:
     Args:
         me: this node.
         stored: {hash: what it says} of those that the state names.
+        flags: {hash: its flags} of those of them that have any.
     """
 
-    def __init__(self, me: NodeId, stored: Mapping[str, Fleet]) -> None:
+    def __init__(
+        self, me: NodeId, stored: Mapping[str, Fleet], flags: Mapping[str, tuple[Flag, ...]] = MappingProxyType({})
+    ) -> None:
         self._me = me
+        self._flags = dict(flags)
         self._fleets: dict[str, Fleet] = dict(stored)
         """The newest last."""
         self._wanted: dict[str, list[NodeId]] = {}
@@ -52,6 +58,10 @@ class Documents:
     def fleet(self, document: str) -> Fleet | None:
         """What a stored document says."""
         return self._fleets.get(document)
+
+    def flags(self, document: str) -> tuple[Flag, ...]:
+        """What operators have said of nodes, by a stored document; nothing if it is not stored here."""
+        return self._flags.get(document, ())
 
     def next_deadline(self) -> float:
         """When `tick` has something to do."""
@@ -84,12 +94,12 @@ class Documents:
         self._wanted.pop(document, None)
         self._ask_at.pop(document, None)
 
-    def on_stored(self, document: str, fleet: Fleet) -> None:
+    def on_stored(self, document: str, fleet: Fleet, flags: tuple[Flag, ...] = ()) -> None:
         """A document is on disk, and valid."""
         self._forget(document)
         self.refused.pop(document, None)
         self._fleets.pop(document, None)
-        self._fleets[document] = fleet
+        self._fleets[document], self._flags[document] = fleet, flags
         self._drop_old()
 
     def on_refused(self, document: str, reason: str) -> None:
@@ -108,3 +118,4 @@ class Documents:
         others = [document for document in self._fleets if document not in self._kept]
         for document in others[:-RECENT]:
             del self._fleets[document]
+            self._flags.pop(document, None)

@@ -11,6 +11,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from random import Random
+from types import MappingProxyType
 
 from zsched.core import instructions as do
 from zsched.core.electorate.changes import AddElector, AdoptDocument, FleetChange, SetDocument
@@ -20,6 +21,7 @@ from zsched.core.electorate.roll import Admission, Roll
 from zsched.core.todo import ToDo
 from zsched.core.values.adoption import obstacle
 from zsched.core.values.change import Rewrite
+from zsched.core.values.document import Flag
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import Creation, FleetValue
 from zsched.core.values.fleet import Fleet
@@ -39,6 +41,7 @@ class Numbers:
         registers: its tasks' registers, which the roll renumbers.
         rng: for back-off.
         stored: {hash: what it says} of the documents on this node's disk that its state names.
+        flags: {hash: its flags} of those of them that have any.
     """
 
     def __init__(
@@ -51,12 +54,13 @@ class Numbers:
         registers: dict[TaskId, TaskRegister],
         rng: Random,
         stored: Mapping[str, Fleet],
+        flags: Mapping[str, tuple[Flag, ...]] = MappingProxyType({}),
     ) -> None:
         self._fleet, self._me, self._incarnation = fleet, me, incarnation
         self._registers, self._rng = registers, rng
         self.disk = "" if durable is None else durable.disk
         self._stored = None if durable is None else durable.fleet_register
-        self.documents = Documents(me, stored)
+        self.documents = Documents(me, stored, flags)
         self.roll: Roll | None = None
         self._before = ""
         """The document that was in force before this one: it is kept, too."""
@@ -268,10 +272,16 @@ class Numbers:
         peers = tuple(dict.fromkeys((*first, *others)))
         self.documents.want(value, peers, todo, now)
 
-    def on_stored(self, document: str, fleet: Fleet, todo: ToDo, now: float) -> bool:
+    @property
+    def flags(self) -> tuple[Flag, ...]:
+        """What operators have said of nodes, by the document in force; nothing while it is not stored here."""
+        value = self.value
+        return () if value is None else self.documents.flags(value.document)
+
+    def on_stored(self, document: str, fleet: Fleet, todo: ToDo, now: float, *, flags: tuple[Flag, ...] = ()) -> bool:
         """A document is on disk, and valid; whether this node goes by another fleet from now on."""
         was_missing = self.roll is not None and not self.documents.holds(self.roll.value)
-        self.documents.on_stored(document, fleet)
+        self.documents.on_stored(document, fleet, flags)
         if self.roll is None:
             return False
         before = self.value

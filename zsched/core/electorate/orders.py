@@ -16,6 +16,7 @@ from zsched.core.electorate.changes import AddElector, AdoptDocument, FleetChang
 from zsched.core.electorate.numbers import Numbers
 from zsched.core.todo import ToDo
 from zsched.core.values.change import Rewrite, RoundOutcome
+from zsched.core.values.document import Flag
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import ChangeFleet, CommandOutcome, CommandResult
@@ -39,6 +40,8 @@ class Orders:
         self._storing: dict[int, ChangeFleet] = {}
         """{request: its command} while the document is checked and written."""
         self._running: list[tuple[FleetChange, int]] = []
+        self._ending: tuple[int, tuple[Flag, ...]] | None = None
+        """(revision, the flags that stay) while the document is written without those whose time is over."""
 
     def take(self, event: ev.FleetCommanded, todo: ToDo, now: float) -> None:
         """An operator gives a command."""
@@ -63,10 +66,12 @@ class Orders:
             self._propose(request, _explained(gone, command), todo, now)
 
     def on_stored(self, event: ev.DocumentStored, todo: ToDo, now: float) -> None:
-        """The document of a command is on disk: propose it."""
-        command = None if event.request is None else self._storing.pop(event.request, None)
-        value = self._numbers.value
-        if command is None or event.request is None or value is None or command.base_revision is None:
+        """The document of a command is on disk, or one without the flags whose time is over: propose it."""
+        if event.request is None:
+            self._end_flags(event, todo, now)
+            return
+        command, value = self._storing.pop(event.request, None), self._numbers.value
+        if command is None or value is None or command.base_revision is None:
             return
         change = document_change(value, event.document, event.fleet, base_revision=command.base_revision)
         self._propose(event.request, _explained(change, command), todo, now)
@@ -75,6 +80,21 @@ class Orders:
         """The document of a command is not valid here, or the disk refused it."""
         if event.request is not None and self._storing.pop(event.request, None) is not None:
             self._answer(event.request, CommandOutcome.INVALID, event.reason, todo)
+
+    def end_flags(self, flags: tuple[Flag, ...], todo: ToDo) -> None:
+        """The time of some flags is over: agree a document that has only ``flags``."""
+        value = self._numbers.value
+        if value is not None and value.document:
+            self._ending = value.revision, flags
+            todo.add(do.AmendDocument(document=value.document, flags=flags))
+
+    def _end_flags(self, event: ev.DocumentStored, todo: ToDo, now: float) -> None:
+        ending, value = self._ending, self._numbers.value
+        if ending is None or value is None or ending != (value.revision, event.flags):
+            return
+        self._ending = None
+        change = document_change(value, event.document, event.fleet)
+        self._numbers.propose(replace(change, reason="the time of a drain or of its like is over"), todo, now)
 
     def _propose(self, request: int, change: FleetChange, todo: ToDo, now: float) -> None:
         fault = self._numbers.propose(change, todo, now)

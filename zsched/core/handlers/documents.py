@@ -24,6 +24,14 @@ def take_effect(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
     adopt(node, fleet, todo, now)
     compare_file(node)
     count_voters(node)
+    take_flags(node, todo, now)
+
+
+def take_flags(node: Stages, todo: ToDo, now: float) -> None:
+    """Go by the flags of the document in force."""
+    for text in node.flags.take(node.agreement.flags, now):
+        todo.add(do.RecordStory(stage="membership", text=text))
+        todo.must_decide = True
 
 
 def count_voters(node: Stages) -> None:

@@ -70,6 +70,9 @@ def _no_place(node: Stages, task: TaskId, target: NodeId) -> Refusal | None:
 
 def _unfit(node: Stages, value: Allocation, target: NodeId, now: float) -> str:
     """Why a candidate cannot have the task by what this node knows of it; empty: it can."""
+    if target in node.flags.closed:
+        closed = node.flags.closed[target]
+        return f"it is {closed}" if target in node.flags.drained else f"it {closed}"
     state = node.membership.state(target)
     if target != node.me and state is not PeerState.ALIVE:
         return f"it is {state}" if state is not PeerState.UNKNOWN else "it was never heard"

@@ -31,7 +31,7 @@ def carry_out(node: Stages, value: Allocation, reason: str, todo: ToDo, now: flo
     if is_new_epoch:
         left = executor.owner
         failed, drained = _has_failed(node, task, left, now), node.was_draining(left, now)
-        is_ordered = value.asked is not None
+        is_ordered = value.asked is not None or left in node.flags.drained
         node.rounds.on_moved(task, left, has_failed=failed, was_draining=drained, is_ordered=is_ordered, now=now)
     node.expiry.note(value, now)
     node.votes.on_learnt(task)

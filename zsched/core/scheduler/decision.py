@@ -28,6 +28,8 @@ class Decided:
     judgement: Judgement
     escape: str | None
     """Why the owner is to be left at once."""
+    leaving: str | None
+    """Why the owner is to be left, by an escape or by an operator's drain."""
     needed: int
     """How many robots' utilities this decision needs."""
     spent: float
@@ -40,7 +42,8 @@ class Decided:
 def decide(judge: Judge, damping: Damping, figures: Figures) -> Decided:
     """Judge by ``figures``; ``judge`` and ``damping`` hold the memory of which the figures have a copy."""
     allocation = figures.allocation
-    standing = compare(judge.spec, allocation, {vector.voter: vector for vector in figures.vectors})
+    compared = compare(judge.spec, allocation, {vector.voter: vector for vector in figures.vectors})
+    standing = _keep_out(compared, figures)
     escape = _escape(judge, standing, figures)
     needed = _robots_needed(figures, is_escape=escape is not None)
     if standing.voters_heard < needed:
@@ -53,6 +56,7 @@ def decide(judge: Judge, damping: Damping, figures: Figures) -> Decided:
             allocation,
             settled_for_s=figures.settled_for_s,
             escape=escape,
+            drained=figures.drained,
             is_called=figures.is_called,
             now=figures.now,
             damping=damping,
@@ -70,6 +74,7 @@ def decide(judge: Judge, damping: Damping, figures: Figures) -> Decided:
         standing=standing,
         judgement=judgement,
         escape=escape,
+        leaving=escape or (f"{allocation.owner} is {figures.drained}" if figures.drained else None),
         needed=needed,
         spent=judge.spent,
         patience=judge.patience,
@@ -124,6 +129,18 @@ def verdict_of(judgement: Judgement) -> Verdict:
         reason=judgement.reason,
         is_escape=judgement.is_escape,
         aggregates=tuple(sorted(judgement.aggregates.items())),
+    )
+
+
+def _keep_out(standing: Standing, figures: Figures) -> Standing:
+    """The standing without the candidates that take nothing new; an owner among them keeps what it has."""
+    closed = {name: why for name, why in figures.closed if name != figures.allocation.owner}
+    if not closed:
+        return standing
+    return replace(
+        standing,
+        aggregates={name: value for name, value in standing.aggregates.items() if name not in closed},
+        vetoed={**standing.vetoed, **{name: why for name, why in closed.items() if name in figures.rules.candidates}},
     )
 
 

@@ -175,7 +175,7 @@ def _sums(decision: Decision, again: Decided) -> tuple[CandidateSum, ...]:
     needs = {need.candidate: need for need in decision.needs}
     found = []
     for name in figures.rules.candidates:
-        is_left = name == owner and again.escape is not None
+        is_left = name == owner and again.leaving is not None
         joint = standing.aggregates.get(name)
         bonus = tuning.bonus if name == owner and not is_left else 0.0
         penalty, need = penalties.get(name, 0.0), needs.get(name)
@@ -188,7 +188,7 @@ def _sums(decision: Decision, again: Decided) -> tuple[CandidateSum, ...]:
                 bonus=bonus,
                 penalty=penalty,
                 total=None if is_out or joint is None else max(joint + bonus - penalty, 0.0),
-                why_not=again.escape or "" if is_left else standing.vetoed.get(name, ""),
+                why_not=again.leaving or "" if is_left else standing.vetoed.get(name, ""),
                 need_cpu_cores=None if need is None else need.cpu_cores,
                 need_memory_mb=None if need is None else need.memory_mb,
                 robots=tuple(_views(name, standing)),
@@ -229,13 +229,13 @@ def _changes(figures: Figures, verdict: Verdict, again: Decided, sums: tuple[Can
         yield f"{again.needed} robots must tell their utilities, {heard} did"
         return
     allocation = figures.allocation
-    if allocation.paused or allocation.pinned:
+    if allocation.paused or (allocation.pinned and (allocation.is_bound or again.leaving is None)):
         yield f"an operator must end that the task is {'paused' if allocation.paused else 'pinned'}"
     others = [one for one in sums if not one.is_owner]
     owner = next((one for one in sums if one.is_owner), None)
     if not any(one.total is not None for one in others):
         yield "another candidate must be able to have the task"
-    elif allocation.owner is not None and again.escape is None and owner is not None and owner.total is not None:
+    elif allocation.owner is not None and again.leaving is None and owner is not None and owner.total is not None:
         yield from _leads(figures, again, owner, [one for one in others if one.total is not None])
     elif verdict.outcome == Outcome.WAIT:
         yield f"what holds it back must end: {verdict.reason}"

@@ -126,6 +126,7 @@ class Judge:
         is_called: bool,
         now: float,
         damping: Damping | None = None,
+        drained: str = "",
     ) -> Judgement:
         """Decide by one standing.
 
@@ -138,17 +139,20 @@ class Judge:
             now: monotonic seconds.
             damping: the task's record of moves, for the cap and the penalties (those that other robots remember, in
                 ``standing``, count as well); ``None``: neither.
+            drained: why the owner hands the task over, by an operator's order; empty: it need not.
         """
         owner = allocation.owner
         if self.spec.learns_patience:
             tuning = allocation.tuning
             self.learnt.watch(standing.aggregates, tuning.bonus, tuning.cool_down_s, now)
-        bonus = allocation.tuning.bonus if escape is None else 0.0
+        is_drain = escape is None and bool(drained)
+        leaving = f"{owner} is {drained}" if is_drain else escape
+        bonus = allocation.tuning.bonus if leaving is None else 0.0
         penalties = {} if damping is None else joined((damping.penalties(now), standing.penalties))
         scored = {
             name: max(value + (bonus if name == owner else 0.0) - penalties.get(name, 0.0), 0.0)
             for name, value in standing.aggregates.items()
-            if escape is None or name != owner
+            if leaving is None or name != owner
         }
         home = allocation.home
         if allocation.is_bound:
@@ -157,12 +161,14 @@ class Judge:
         winner = home if home is not None and home in scored else pick(scored, owner)
         if winner is None:
             self.unscored_since = None
-            why = f"{home} cannot have it, and it is pinned there (hard)" if allocation.is_bound else ""
-            reason = why or "no candidate can have it"
+            reason = _nobody(allocation, f"{leaving}; it keeps the task, for " if is_drain else "")
             return Judgement(outcome=Outcome.NONE, candidate=owner, aggregate=0.0, reason=reason)
-        self._spend(scored, owner, now)
-        outcome, reason = self._outcome(winner, scored, allocation, settled_for_s, escape, is_called, now)
-        cap = None if damping is None or owner is None else self._cap(damping, is_escape=escape is not None, now=now)
+        if not is_drain:
+            self._spend(scored, owner, now)
+        outcome, reason = self._outcome(winner, scored, allocation, settled_for_s, leaving, is_called, now)
+        cap = None
+        if damping is not None and owner is not None and not is_drain:
+            cap = self._cap(damping, is_escape=escape is not None, now=now)
         if outcome is Outcome.PROPOSE and cap is not None:
             outcome, reason = Outcome.WAIT, f"{reason}; {cap}"
         chosen = winner if outcome is Outcome.PROPOSE else owner
@@ -205,7 +211,7 @@ class Judge:
         scored: Mapping[NodeId, float],
         allocation: Allocation,
         settled_for_s: float,
-        escape: str | None,
+        leaving: str | None,
         is_called: bool,
         now: float,
     ) -> tuple[Outcome, str]:
@@ -216,8 +222,8 @@ class Judge:
             if winner == allocation.home:
                 return Outcome.PROPOSE, f"first placement: pinned to {winner} by {by(allocation.pin)}"
             return self._initial(winner, scored, is_called=is_called, now=now)
-        if escape is not None:
-            return Outcome.PROPOSE, escape
+        if leaving is not None:
+            return Outcome.PROPOSE, leaving
         if allocation.home is not None:
             return self._pinned(winner, allocation, settled_for_s, is_called, now)
         if winner == owner:
@@ -263,6 +269,16 @@ class Judge:
         if missing and waited < INITIAL_SETTLE_S and not is_called:  # who calls has waited for all of us
             return Outcome.WAIT, f"first placement waits for {', '.join(missing)}"
         return Outcome.PROPOSE, f"first placement: {winner} has the highest utility"
+
+
+def _nobody(allocation: Allocation, why: str) -> str:
+    """Why nobody is proposed, after ``why``."""
+    home = allocation.home
+    if not allocation.is_bound:
+        return f"{why}no other candidate can have it" if why else "no candidate can have it"
+    if why and home == allocation.owner:
+        return f"{why}it is pinned there (hard)"
+    return f"{why}{home} cannot have it, and it is pinned there (hard)"
 
 
 def by(order: Pause | Pin | None) -> str:

@@ -22,6 +22,7 @@ from zsched.core.gateway.round_trips import RoundTrips
 from zsched.core.instructions import AskUtilities, RecordStory
 from zsched.core.scheduler.damping import Damping
 from zsched.core.scheduler.decision import decide, rules_of, verdict_of
+from zsched.core.scheduler.flags import NodeFlags
 from zsched.core.scheduler.judge import Judge, Judgement, Outcome
 from zsched.core.scheduler.rest import Answers, is_like
 from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts, Standing, book, is_out, score
@@ -94,7 +95,9 @@ class Rounds:
         now: float,
         doubts: Callable[[TaskSpec, float], Doubts] = lambda _spec, _now: NO_DOUBTS,
         round_trips: RoundTrips | None = None,
+        flags: NodeFlags | None = None,
     ) -> None:
+        self._flags = flags or NodeFlags(rank=0)
         self._me, self._gateway, self._turns, self._rng = me, gateway, turns, rng
         self._doubts = doubts
         self._round_trips = round_trips or RoundTrips(me)
@@ -311,9 +314,10 @@ class Rounds:
         )
 
     def _out(self, spec: TaskSpec, now: float) -> tuple[NodeId, ...]:
-        """The candidates that say themselves that they cannot have the task now: they are not waited for."""
+        """The candidates that say themselves, or of which an operator says, that they cannot have the task now."""
         profiles = ((name, self._gateway.fresh(name, now)) for name in spec.candidates)
-        return tuple([name for name, profile in profiles if profile is not None and is_out(spec, profile)])
+        told = tuple([name for name, profile in profiles if profile is not None and is_out(spec, profile)])
+        return (*told, *(name for name in spec.candidates if name in self._flags.closed and name not in told))
 
     def _figures(
         self,
@@ -345,6 +349,8 @@ class Rounds:
             is_called_escape=task.is_called_escape,
             out=self._out(task.spec, now) if owner is None else (),
             first=who_moves_first(self._turns, name, is_called=is_called, now=now),
+            closed=tuple(sorted(self._flags.closed.items())),
+            drained="" if owner is None else self._flags.drained.get(owner, ""),
             judge=task.judge.memory(),
             damping=task.damping.memory(),
         )

@@ -92,6 +92,10 @@ class Figures:
     """Candidates that a first placement does not wait for."""
     first: TaskId | None = None
     """The other task that moves first."""
+    closed: tuple[tuple[NodeId, str], ...] = ()
+    """(candidate, why it takes nothing new), by operators' flags; sorted."""
+    drained: str = ""
+    """Why the owner hands the task over, by an operator's flag; empty: it need not."""
     judge: JudgeMemory = JudgeMemory()
     damping: DampingMemory = DampingMemory()
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import NewType
 
-from zsched.core.values.model import MAX_REASON, check_name, check_range
+from zsched.core.values.model import MAX_REASON, NodeId, check_counter, check_name, check_range
 
 Text = NewType("Text", str)
 """A string that may be longer than any other on the wire: at most `MAX_DOCUMENT_BYTES` in UTF-8."""
@@ -32,16 +32,19 @@ class Flag:
     """One thing that an operator has said of a node, until it is taken back or its time is over."""
 
     kind: FlagKind
-    subject: str
+    subject: NodeId
     """The node."""
     reason: str = ""
     by: str = ""
     """The operator, as the program that set the flag names the person."""
     for_s: float | None = None
     """How long it lasts, in seconds; ``None``: until it is taken back."""
+    revision: int = 0
+    """Of the fleet value that brought it: nodes count its age from when they learnt that."""
 
     def __post_init__(self) -> None:
         check_name("flag.subject", self.subject)
+        check_counter("flag.revision", self.revision)
         check_range("flag.for_s", self.for_s, 0.0, MAX_FLAG_S)
         for what in ("reason", "by"):
             if len(getattr(self, what)) > MAX_REASON:

@@ -31,6 +31,21 @@ class Exposure(StrEnum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class FlagStatus:
+    """What an operator has said of a node, as the answering node knows it."""
+
+    kind: str
+    """``drain`` or ``ineligible``."""
+    by: str
+    """user@node."""
+    reason: str
+    known_s: float
+    """Seconds since the answering node learnt it, or since it started."""
+    for_s: float | None = None
+    """How long it lasts; ``None``: until it is taken back."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class NodeStatus:
     """One node as the answering node sees it; ratios in [0, 1], ``None`` when not measured."""
 
@@ -53,6 +68,8 @@ class NodeStatus:
     """How fast one of its cores is."""
     cpu_pressure: float | None = None
     """Share of the time in which some process lacked a CPU (PSI)."""
+    flags: tuple[FlagStatus, ...] = ()
+    """An operator's drain of it, and whether it may get tasks; ``draining`` is the order to stop, of its own daemon."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

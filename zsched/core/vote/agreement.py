@@ -21,6 +21,7 @@ from zsched.core.electorate.numbers import Numbers
 from zsched.core.electorate.orders import Orders
 from zsched.core.todo import ToDo
 from zsched.core.values.change import Change, Ended, MoveOwner, Retune, RoundOutcome, SetLeased
+from zsched.core.values.document import Flag
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import CREATION_STEP, Elector, FleetValue
 from zsched.core.values.fleet import Fleet, TaskSpec
@@ -85,6 +86,7 @@ class Agreement:
         rng: for back-off.
         now: monotonic seconds.
         stored: {hash: what it says} of the documents on this node's disk that its state names.
+        flags: {hash: its flags} of those of them that have any.
     """
 
     def __init__(
@@ -98,6 +100,7 @@ class Agreement:
         rng: Random,
         now: float,
         stored: Mapping[str, Fleet] = MappingProxyType({}),
+        flags: Mapping[str, tuple[Flag, ...]] = MappingProxyType({}),
     ) -> None:
         self._fleet, self._me = fleet, me
         self._nodes = frozenset(node.name for node in fleet.nodes)
@@ -150,6 +153,7 @@ class Agreement:
             registers=self.registers,
             rng=rng,
             stored=stored,
+            flags=flags,
         )
         self.orders = Orders(self._numbers)
         self.helm = Helm(self._numbers, me, stagger_s=2 * fleet.timing.ballot_s, now=now)
@@ -401,7 +405,7 @@ class Agreement:
         if obstacle := self._numbers.obstacle(event.fleet):
             self.on_refused(ev.DocumentRefused(document=event.document, reason=obstacle, request=event.request), todo)
             return
-        if self._numbers.on_stored(event.document, event.fleet, todo, now):
+        if self._numbers.on_stored(event.document, event.fleet, todo, now, flags=event.flags):
             self._count_anew(todo)
         self.orders.on_stored(event, todo, now)
 
@@ -502,6 +506,11 @@ class Agreement:
         """What the agreed document says; ``None``: none is agreed, or it is not stored here."""
         value = self._numbers.changed
         return None if value is None else self._numbers.documents.fleet(value.document)
+
+    @property
+    def flags(self) -> tuple[Flag, ...]:
+        """What operators have said of nodes, by the agreed document."""
+        return self._numbers.flags
 
     @property
     def document_hash(self) -> str:

@@ -17,7 +17,7 @@ from zsched.core.electorate.founding import founded
 from zsched.core.electorate.numbers import in_force
 from zsched.core.todo import ToDo
 from zsched.core.values.change import RoundOutcome
-from zsched.core.values.document import Document, Text
+from zsched.core.values.document import Document, Flag, FlagKind, Text
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet, TaskSpec
@@ -48,7 +48,11 @@ ADOPTED = replace(ADOPT.apply(FIRST), settled=True)
 BALLOT = Ballot(counter=5, node="robot2", incarnation=9)
 
 
-def make(value: FleetValue | None = None, stored: dict[str, Fleet] | None = None) -> Agreement:
+def make(
+    value: FleetValue | None = None,
+    stored: dict[str, Fleet] | None = None,
+    flags: dict[str, tuple[Flag, ...]] | None = None,
+) -> Agreement:
     state = DurableState(
         fleet=FLEET.name,
         node="robot1",
@@ -68,6 +72,7 @@ def make(value: FleetValue | None = None, stored: dict[str, Fleet] | None = None
         rng=Random(1),
         now=100.0,
         stored=stored or {},
+        flags=flags or {},
     )
     for name in NAMES:
         agreement.witness.on_answer(Learnt(node=name, values=()))
@@ -325,3 +330,32 @@ def test_a_refusal_s_fleet_value_waits_for_its_document() -> None:
     todo = agreed(agreement.on_fleet_answer, ev.FleetAnswered(answer=FleetAnswer(refused=refused)), 100.1)
     assert [one.document for one in of(todo, do.FetchDocument)] == ["0e"]
     assert agreement.fleet_value == ADOPTED
+
+
+# --- flags whose time is over ----------------------------------------------------------------------------------------
+
+STAYS = (Flag(kind=FlagKind.INELIGIBLE, subject="robot3", revision=3),)
+
+
+def test_the_document_without_a_flag_whose_time_is_over_is_written_then_proposed() -> None:
+    agreement = make(ADOPTED, {"0d": FLEET})
+    agreement.orders.end_flags(STAYS, todo := ToDo())
+    assert todo.send == [do.AmendDocument(document="0d", flags=STAYS)]
+    foreign = ev.DocumentStored(document="0e", fleet=FLEET)
+    assert of(agreed(agreement.on_stored, foreign, 100.1), do.AskElectors) == [], "another one, of a peer"
+    event = ev.DocumentStored(document="0f", fleet=FLEET, flags=STAYS)
+    (ask,) = of(agreed(agreement.on_stored, event, 100.2), do.AskElectors)
+    assert isinstance(ask.question, Prepare)
+    assert of(agreed(agreement.on_stored, event, 100.3), do.AskElectors) == [], "it is proposed once"
+    assert of(agreed(agreement.on_stored, event, 100.3), do.AnswerCommand) == []
+
+
+def test_without_an_agreed_document_there_is_no_flag_to_end() -> None:
+    make().orders.end_flags((), todo := ToDo())
+    assert todo.send == []
+
+
+def test_a_state_s_document_brings_its_flags() -> None:
+    agreement = make(ADOPTED, {"0d": FLEET}, {"0d": STAYS})
+    assert agreement.flags == STAYS
+    assert make().flags == ()

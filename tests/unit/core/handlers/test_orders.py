@@ -16,9 +16,11 @@ from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.node import Node
 from zsched.core.status import build_snapshot
+from zsched.core.values.document import Flag, FlagKind
 from zsched.core.values.fleet import TaskSpec, WorkerSpec, electorate_hash
 from zsched.core.values.messages import CommandOutcome, CommandResult, Hold, HoldTask, Learnt, MoveTask, TuneTask
 from zsched.core.values.model import Acceptance, Allocation, Asked, DeviceSample, RegisterState, WorkerState
+from zsched.core.values.snapshot import FlagStatus
 
 ADA = Asked(by="ada@robot1", reason="new battery")
 EDGES = ("edge1", "edge2", "edge3")
@@ -233,3 +235,30 @@ def test_a_tuning_is_agreed_for_the_revision_that_it_was_made_of() -> None:
     assert lone.ask(ev.TuneCommanded(request=42, command=again)).outcome is CommandOutcome.UNCHANGED
     unknown = TuneTask(task="mergee", tuning=wanted, base_revision=6, asked=ADA)
     assert lone.ask(ev.TuneCommanded(request=42, command=unknown)).outcome is CommandOutcome.INVALID
+
+
+# --- flags -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "why"),
+    [(FlagKind.DRAIN, "it is drained by ada@robot1"), (FlagKind.INELIGIBLE, "it takes nothing new, by")],
+)
+def test_a_flagged_node_gets_no_task_by_an_order(kind: FlagKind, why: str) -> None:
+    lone = Lone()
+    lone.node.flags.take((Flag(kind=kind, subject="edge2", by="ada@robot1"),), lone.now)
+    refused = lone.move("edge2")
+    assert refused.outcome is CommandOutcome.INVALID
+    assert f"edge2 cannot have it: {why}" in refused.detail
+    assert lone.move("edge3").outcome is CommandOutcome.OK
+
+
+def test_a_status_tells_flags_with_their_age() -> None:
+    lone = Lone()
+    flag = Flag(kind=FlagKind.DRAIN, subject="edge2", by="ada@robot1", reason="new fan", for_s=60.0)
+    lone.node.flags.take((flag,), lone.now)
+    nodes = {one.name: one for one in build_snapshot(lone.node, lone.now + 5.0).nodes}
+    assert nodes["edge2"].flags == (
+        FlagStatus(kind="drain", by="ada@robot1", reason="new fan", known_s=5.0, for_s=60.0),
+    )
+    assert nodes["edge1"].flags == ()

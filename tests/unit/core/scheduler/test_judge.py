@@ -10,6 +10,7 @@ from support.allocations import allocation_of
 from support.fleets import tuning_of
 from support.profiles import load_of, profile_of
 from support.proposals import vector_of
+from zsched.core.scheduler.damping import Damping
 from zsched.core.scheduler.judge import (
     INITIAL_SETTLE_S,
     UNSCORED_S,
@@ -63,6 +64,8 @@ def judged(
     escape: str | None = None,
     called: bool = False,
     agreed: Allocation | None = None,
+    drained: str = "",
+    damping: Damping | None = None,
 ) -> Judgement:
     return judge.judge(
         standing(aggregates),
@@ -71,6 +74,8 @@ def judged(
         escape=escape,
         is_called=called,
         now=now,
+        drained=drained,
+        damping=damping,
     )
 
 
@@ -540,3 +545,67 @@ def test_a_vote_that_was_lost_is_paid_for_anew_and_a_gap_in_the_judgements_is_no
     judge = Judge(spec=PATIENT)
     assert judged(judge, slight, 100.0).outcome is Outcome.WAIT
     assert judged(judge, slight, 900.0).outcome is Outcome.WAIT, "nobody looked for so long"
+
+
+# --- an operator's drain ---------------------------------------------------------------------------------------------
+
+DRAIN = "drained by ada@robot1 (new fan)"
+WORSE = {"edge1": 0.9, "edge2": 0.2}
+
+
+@pytest.mark.parametrize("agreed", [allocation(), pinned_to("edge1"), pinned_to("edge3")])
+def test_a_drained_owner_is_left_for_a_worse_one_at_once_and_planned(agreed: Allocation) -> None:
+    """Neither bonus, patience, cool-down, cap nor pin holds it."""
+    damping = Damping()
+    for number in range(10):
+        damping.note_move("edge3", has_failed=False, now=99.0 + number / 10)
+    left = judged(Judge(spec=SPEC), WORSE, 100.0, settled=0.0, agreed=agreed, drained=DRAIN, damping=damping)
+    assert (left.outcome, left.candidate, left.is_escape) == (Outcome.PROPOSE, "edge2", False)
+    assert left.reason == f"edge1 is {DRAIN}"
+
+
+def test_a_drained_owner_goes_to_the_node_that_the_task_is_pinned_to() -> None:
+    three = {"edge1": 0.9, "edge2": 0.2, "edge3": 0.5}
+    assert judged(Judge(spec=SPEC), three, 0.0, drained=DRAIN, agreed=pinned_to("edge2")).candidate == "edge2"
+    assert judged(Judge(spec=SPEC), three, 0.0, drained=DRAIN).candidate == "edge3"
+    bound = judged(Judge(spec=SPEC), three, 0.0, drained=DRAIN, agreed=pinned_to("edge2", is_hard=True))
+    assert bound.candidate == "edge2"
+
+
+@pytest.mark.parametrize(
+    ("aggregates", "agreed", "why"),
+    [
+        ({"edge1": 0.5}, allocation(), "no other candidate can have it"),
+        (BETTER, pinned_to("edge1", is_hard=True), "it is pinned there (hard)"),
+        (BETTER, pinned_to("edge3", is_hard=True), "edge3 cannot have it, and it is pinned there (hard)"),
+    ],
+)
+def test_a_drained_owner_keeps_what_nobody_else_may_have(
+    aggregates: Mapping[str, float], agreed: Allocation, why: str
+) -> None:
+    kept = judged(Judge(spec=SPEC), aggregates, 0.0, drained=DRAIN, agreed=agreed)
+    assert (kept.outcome, kept.candidate) == (Outcome.NONE, "edge1")
+    assert kept.reason == f"edge1 is {DRAIN}; it keeps the task, for {why}"
+
+
+def test_a_paused_task_is_not_moved_by_a_drain() -> None:
+    agreed = replace(allocation(paused=True), pause=Pause(asked=ADA, revision=5))
+    held = judged(Judge(spec=SPEC), BETTER, 0.0, drained=DRAIN, agreed=agreed)
+    assert (held.outcome, held.candidate) == (Outcome.STAY, "edge1")
+
+
+def test_an_escape_from_a_drained_owner_stays_an_escape() -> None:
+    left = judged(Judge(spec=SPEC), WORSE, 0.0, drained=DRAIN, escape="edge1 is gone")
+    assert (left.outcome, left.candidate, left.is_escape, left.reason) == (
+        Outcome.PROPOSE,
+        "edge2",
+        True,
+        "edge1 is gone",
+    )
+
+
+def test_what_staying_costs_at_a_drained_owner_does_not_count_after_the_drain() -> None:
+    judge = Judge(spec=SPEC)
+    for number in range(20):
+        judged(judge, BETTER, float(number), drained=DRAIN)
+    assert judged(judge, BETTER, 20.0).outcome is Outcome.WAIT
