@@ -16,6 +16,7 @@ from zsched.core.executor.handover import Phase
 from zsched.core.scheduler.damping import ESCAPES_PER_MINUTE, WINDOW_S
 from zsched.core.scheduler.decision import decide_again, verdict_of
 from zsched.core.values.decision import Decision
+from zsched.core.values.document import FlagKind
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import Accepted, Promise
@@ -41,6 +42,8 @@ FORGED = -1
 """The number of a question that a stranger asks, or in another one's name: a yes to it is a violation."""
 _SAYS_NOTHING = frozenset({do.AskUtilities, do.AnswerUtilities, do.PublishProfile, do.AskLearnt, do.RecordStory})
 """Half of what leaves: it claims nothing that must be on a disk."""
+DRAINED = " is drained by "
+"""In the reason of a move that an operator's drain has caused: no cap counts it."""
 MAX_WAKES = 50
 """So often in a row a node may want to be woken without time passing."""
 
@@ -167,8 +170,10 @@ class Invariants:
             case do.SendAccept(accept=accept):
                 name, held = (accept.task, accept.creation), accept.acceptance
                 self._check_ballot(machine, name, held.ballot, held.value)
-            case do.PublishProposal(proposal=proposal) if not proposal.is_escape:
-                self._check_cap(machine, proposal)
+            case do.PublishProposal(proposal=proposal):
+                _check_flags(machine, proposal)
+                if not proposal.is_escape:
+                    self._check_cap(machine, proposal)
             case do.SetRole(role=role) if role.role is WorkerRole.ACTIVE:
                 self._check_epoch(machine, role.task, role.epoch)
             case _:
@@ -231,7 +236,9 @@ class Invariants:
         node = machine.node
         assert node is not None
         task = node.rounds.tasks[proposal.task]
-        if node.registers[proposal.task].value.owner in (None, proposal.candidate):
+        owner = node.registers[proposal.task].value.owner
+        drained = {flag.subject for flag in node.agreement.flags if flag.kind is FlagKind.DRAIN}
+        if owner in (None, proposal.candidate, *drained):
             return
         moves = sum(
             new.value.epoch > old.value.epoch
@@ -239,6 +246,7 @@ class Invariants:
             and new.value.asked is None
             and task.judged_at - new.at <= WINDOW_S
             for old, new in pairwise(node.history[proposal.task])
+            if DRAINED not in new.reason
         )
         planned = moves - task.damping.moves_within(WINDOW_S, task.judged_at, escapes=True)
         if planned >= task.spec.max_moves_per_minute:
@@ -310,6 +318,15 @@ class Invariants:
         machine.woken_at = now if machine.wakes == 0 else machine.woken_at
         if machine.wakes > MAX_WAKES:
             raise InvariantError(f"{machine.key}: woken {machine.wakes} times within 10 ms, its loop spins")
+
+
+def _check_flags(machine: Machine, proposal: Proposal) -> None:
+    """Nobody proposes to give a task to a node of which its document says that it takes nothing new."""
+    node = machine.node
+    assert node is not None
+    owner, flags = node.registers[proposal.task].value.owner, node.agreement.flags
+    if proposal.candidate != owner and proposal.candidate in {flag.subject for flag in flags}:
+        raise InvariantError(f"{machine.key} proposes {proposal.candidate}, which takes nothing new: {flags}")
 
 
 def _check_orders(before: Allocation, after: Allocation) -> None:

@@ -13,7 +13,7 @@ from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.electorate.founding import founded
 from zsched.core.electorate.numbers import in_force
-from zsched.core.values.document import Document, Text
+from zsched.core.values.document import Document, Flag, Text
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId, RegisterState
@@ -22,6 +22,9 @@ from zsched_lab.sim.chosen import Chosen
 from zsched_lab.sim.network import Message
 from zsched_lab.sim.parts import Machine
 
+FlagsOf = dict[str, tuple[Flag, ...]]
+"""{hash of a document: its flags}."""
+Instruction = do.StoreDocument | do.AmendDocument | do.FetchDocument | do.KeepDocuments
 STORE_S = (0.005, 0.05, 0.4)
 """How long checking and writing a document takes."""
 
@@ -53,18 +56,21 @@ class Documents:
         self.says: dict[str, Fleet] = {}
         """{hash: what the document says}."""
         self._texts: dict[str, Fleet] = {}
+        self.contents: dict[str, Document] = {}
+        """{hash: the document}."""
         self.unfit: set[tuple[str, str]] = set()
         """(machine, hash): not valid there."""
         self.judge: Chosen | None = None
         """It judges what is chosen, if a test asks for it; schedules with generations do without."""
 
-    def write(self, fleet: Fleet) -> Document:
+    def write(self, fleet: Fleet, flags: tuple[Flag, ...] = ()) -> Document:
         """A document that says this."""
         known = next((text for text, said in self._texts.items() if said == fleet), None)
         text = known or f"document {len(self._texts)}"
         self._texts[text] = fleet
-        content = Document(text=Text(text))
-        self.says[wire.document_hash(content)] = fleet
+        content = Document(text=Text(text), flags=flags)
+        name = wire.document_hash(content)
+        self.says[name], self.contents[name] = fleet, content
         return content
 
     def judge_from(self, fleet: Fleet, generation: int) -> None:
@@ -92,20 +98,25 @@ class Documents:
                 assert value.document in machine.disk.documents, f"{machine.key} has no document of {value}"
         self.judge.on_disk(machine.name, state.disk, held, state.registers)
 
-    def at_start(self, machine: Machine, state: DurableState | None) -> tuple[Fleet, dict[str, Fleet]]:
-        """What a starting node goes by, and the documents that its state names."""
+    def at_start(self, machine: Machine, state: DurableState | None) -> tuple[Fleet, dict[str, Fleet], FlagsOf]:
+        """What a starting node goes by, the documents that its state names, and their flags."""
         register = None if state is None else state.fleet_register
         if register is None or register.learnt is None:
-            return machine.fleet, {}
+            return machine.fleet, {}, {}
         named = [register.learnt.document, "" if register.accepted is None else register.accepted.value.document]
         stored = {one: self.says[one] for one in named if one in machine.disk.documents}
         document = stored.get(register.learnt.document)
-        return machine.fleet if document is None else in_force(document, register.learnt), stored
+        flags = {one: self.contents[one].flags for one in stored}
+        return machine.fleet if document is None else in_force(document, register.learnt), stored, flags
 
-    def do(self, machine: Machine, instruction: do.StoreDocument | do.FetchDocument | do.KeepDocuments) -> None:
+    def do(self, machine: Machine, instruction: Instruction) -> None:
         """Carry out what concerns documents."""
         if isinstance(instruction, do.StoreDocument):
             self._store(machine, wire.document_hash(instruction.content), instruction.request)
+        elif isinstance(instruction, do.AmendDocument):
+            if instruction.document in machine.disk.documents:
+                amended = self.write(self.says[instruction.document], instruction.flags)
+                self._store(machine, wire.document_hash(amended), None)
         elif isinstance(instruction, do.KeepDocuments):
             self._keep(machine, instruction.documents)
         else:
@@ -134,8 +145,8 @@ class Documents:
             return
         if document not in machine.disk.documents:
             machine.disk.documents.append(document)
-        fleet = self.says[document]
-        self._sim.deliver(machine, ev.DocumentStored(document=document, fleet=fleet, request=request))
+        fleet, flags = self.says[document], self.contents[document].flags
+        self._sim.deliver(machine, ev.DocumentStored(document=document, fleet=fleet, flags=flags, request=request))
 
     @staticmethod
     def _keep(machine: Machine, documents: Iterable[str]) -> None:
@@ -146,5 +157,4 @@ class Documents:
         """What a machine answers who asks for a document."""
         if document not in machine.disk.documents:
             return None
-        text = next(text for text, fleet in self._texts.items() if fleet == self.says[document])
-        return Document(text=Text(text))
+        return self.contents[document]

@@ -203,7 +203,7 @@ class Simulator(Links):
         is_agreed = state is not None and _has_changed(state)
         if state is not None and ((state.electorate != electorate and not is_agreed) or self._is_refused(machine)):
             state = None
-        fleet, stored = self.documents.at_start(machine, state)
+        fleet, stored, flags = self.documents.at_start(machine, state)
         # No two machines' clocks agree to the millisecond, not even where power comes back to all of them at once.
         wall_count = self.wall_count + (machine.key != machine.name)
         if state is not None:
@@ -223,6 +223,7 @@ class Simulator(Links):
             rng=Random(self.rng.random()),
             now=local,
             stored=stored,
+            flags=flags,
         )
         machine.node.by_file = fleet_hash(machine.fleet)
         self.memory.on_started(machine, state)
@@ -380,7 +381,7 @@ class Simulator(Links):
                 if fleet_vote.refused is None:
                     self.memory.on_vote(me)
                 self._answer(request, fleet_vote)
-            case do.StoreDocument() | do.FetchDocument() | do.KeepDocuments():
+            case do.StoreDocument() | do.AmendDocument() | do.FetchDocument() | do.KeepDocuments():
                 self.documents.do(me, instruction)
             case do.AnswerDocument(request=request, document=document):
                 content = self.documents.content(me, document)
