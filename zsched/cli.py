@@ -22,6 +22,7 @@ import typer
 
 from zsched.commands.common import CliError, Json, Verb, Verbs, print_json
 from zsched.commands.example import Example, write_example
+from zsched.commands.flag_verbs import add_flag_verbs
 from zsched.commands.fleet_verbs import (
     AcceptOption,
     PlanOption,
@@ -516,6 +517,7 @@ def weights(
 
 
 add_order_verbs(app)
+add_flag_verbs(app)
 
 
 @app.command(cls=Verb)

@@ -349,7 +349,7 @@ def _steps(door: Door, plan: Plan) -> Iterator[Json]:
     leave = [name for name in go if name not in nodes]
     yield from ({"remove_elector": name} for name in leave)
     if plan.text != plan.held.text:
-        yield {"text": plan.text, "flags": plan.held.flags}
+        yield {"text": plan.text, "flags": [flag for flag in plan.held.flags if flag["subject"] in nodes]}
     yield from ({"add_elector": name, "disk": disks[name]} for name in come)
     yield from ({"remove_elector": name} for name in go if name not in leave)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 from zsched.commands.page import DROPS_OVER_S, Cell, Page, clock_time, span
-from zsched.commands.report import STATE_STYLES, header, node_rows, per_second, printable, troubles
+from zsched.commands.report import STATE_STYLES, flag_rows, header, node_rows, per_second, printable, troubles
 
 Json = dict[str, Any]
 
@@ -20,6 +20,7 @@ def render_brief(status: Json, width: int, color: bool, at: float | None = None)
     page, shown = Page(width, color, at), printable(status)
     header(page, shown)
     node_rows(page, shown, "NODE")
+    flag_rows(page, shown)
     task_rows(page, shown, at)
     troubles(page, shown)
     return "\n".join(page.lines) + "\n"

@@ -25,6 +25,7 @@ NAMED_OTHERWISE: Final = {
     **dict.fromkeys(("task.add", "task.remove", "node.add", "node.remove", "node.forget"), "apply"),
     "tune": "tuning",
     **dict.fromkeys(("pin", "unpin", "pause", "resume"), "task"),
+    **dict.fromkeys(("undrain", "eligible"), "drain"),
 }
 SCHEMAS: Final = Path(__file__).parents[1] / "schemas"
 """A JSON Schema per kind of output and major version."""

@@ -82,5 +82,5 @@ def _check_may_go(held: InForce, status: Json, node: str, *, is_lost: bool) -> N
     if is_lost and state in HERE:
         raise CliError(EXIT_FAILED, f"{node} is {state}: zsched node remove {node}")
     if state in HERE and owned:
-        advice = f"stop its daemon (`systemctl stop zsched` on {node}): it hands them over first"
+        advice = f"`zsched drain {node}` first: it hands them over, and gets nothing new"
         raise CliError(EXIT_FAILED, f"{node} is {state} and owns {', '.join(owned)}; {advice}")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import pwd
 import shlex
+import socket
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -19,9 +20,9 @@ from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, nearest, print_json
 from zsched.commands.page import harmless, span
-from zsched.commands.report import millis, told_hold
+from zsched.commands.report import FLAGS, millis, told_flag, told_hold
 from zsched.commands.wait import Condition, missing
-from zsched.core.values.model import MAX_ASKED, MAX_FOR_S, Aggregate, ScoreForm, Tuning, Weights
+from zsched.core.values.model import MAX_ASKED, MAX_ASKER, MAX_FOR_S, Aggregate, ScoreForm, Tuning, Weights
 from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE, EXIT_WOULD_CHANGE
 
 MOVE_SCHEMA: Final = "zsched.move/1"
@@ -63,7 +64,8 @@ class OrderView:
     @property
     def asked(self) -> Json:
         """Who gives the order, as a request carries it."""
-        return {"by": f"{user_name()}@{self.door.socket.stem}", "reason": self.reason}
+        place = self.door.socket.stem or socket.gethostname()  # no daemon of this machine is asked
+        return {"by": f"{user_name()}@{place}"[:MAX_ASKER], "reason": self.reason}
 
 
 def user_name(env: Mapping[str, str] = os.environ) -> str:
@@ -130,7 +132,7 @@ def hold(view: OrderView, order: HoldOrder, names: Sequence[str], *, is_all: boo
         for row in rows
     ]
     body = {"schema": TASK_SCHEMA, "tasks": plans}
-    code = _begin(view, rows, body, is_change=bool(changing), warning=_warning(order))
+    code = begin(view, rows, body, is_change=bool(changing), warning=_warning(order))
     if code is not None:
         return code
     results = {name: _give_hold(view, order, known[name]) for name in changing}
@@ -243,7 +245,7 @@ def move(view: OrderView, order: MoveOrder) -> int:
     row = (order.task, "owner", str(task["owner"] or "nobody"), order.node)
     body: Json = {"schema": MOVE_SCHEMA, "task": order.task, "from": task["owner"], "to": order.node, "epoch": None}
     body |= {"revision": task["revision"], "settled": False, "switched_s": None, "lost": None, "doubled": None}
-    code = _begin(view, [row], {**body, "missing": []}, is_change=plan["outcome"] == "ok")
+    code = begin(view, [row], {**body, "missing": []}, is_change=plan["outcome"] == "ok")
     if code is not None:
         return code
     before = _counts(_robots(view.door, status), order.task)
@@ -392,7 +394,7 @@ def tune(view: OrderView, name: str | None, pairs: Sequence[str]) -> int:
     ]
     told = {"task": name, "revision": task["revision"], "tuning": flat_after, "file": _flat(_file_tuning(task))}
     planned = {**told, "outcome": "planned" if rows else "unchanged", "detail": ""}
-    code = _begin(view, rows, {"schema": TUNING_SCHEMA, "tasks": [planned]}, is_change=bool(rows))
+    code = begin(view, rows, {"schema": TUNING_SCHEMA, "tasks": [planned]}, is_change=bool(rows))
     if code is not None:
         return code
     base = task["revision"] if view.revision is None else view.revision
@@ -472,7 +474,7 @@ def _differs(now: Any, file: Any) -> str:
 
 
 def maint(door: Door, *, is_json: bool) -> int:
-    """List every order that is in force, and every node that drains; returns the exit code.
+    """List every order that is in force, of tasks and of nodes, and every node that stops; returns the exit code.
 
     Raises:
         CliError: nobody answers.
@@ -484,6 +486,11 @@ def maint(door: Door, *, is_json: bool) -> int:
         for kind in ("pause", "pin")
         if task.get(kind) is not None
     ]
+    found += [
+        {"kind": flag["kind"], "subject": node["name"], "node": None, "is_hard": False, **flag}
+        for node in status["nodes"]
+        for flag in node.get("flags", ())
+    ]
     stopping = [str(node["name"]) for node in status["nodes"] if node["draining"] and node["state"] == "alive"]
     if is_json:
         print_json({"schema": MAINT_SCHEMA, "node": status["node"], "orders": found, "stopping": stopping})
@@ -492,7 +499,7 @@ def maint(door: Door, *, is_json: bool) -> int:
         (
             str(order["subject"]),
             str(order["kind"]),
-            told_hold(str(order["kind"]), order),
+            told_flag(order) if order["kind"] in FLAGS else told_hold(str(order["kind"]), order),
             f"known for {span(order['known_s'])}",
         )
         for order in found
@@ -516,17 +523,26 @@ def _check_name(status: Json, kind: str, name: str, known: Sequence[str]) -> Non
         raise CliError(EXIT_USAGE, f"fleet {status['fleet']} has no {kind} {name!r}{nearest(name, known)}")
 
 
-def _begin(view: OrderView, rows: Sequence[Row], plan: Json, *, is_change: bool, warning: str = "") -> int | None:
+def begin(
+    view: OrderView,
+    rows: Sequence[Row],
+    plan: Json,
+    *,
+    is_change: bool,
+    warning: str = "",
+    titles: Row = ("TASK", "WHAT", "NOW", "AFTER"),
+    is_line: bool = False,
+) -> int | None:
     """Show before and after (``plan``, as JSON), and ask; the exit code when nothing is to be done now, else ``None``.
 
     Raises:
         CliError: off a terminal, without --yes.
     """
     if not view.is_json:
-        _table(("TASK", "WHAT", "NOW", "AFTER"), rows)
+        _table(titles, rows)
     if view.is_plan:
         if view.is_json:
-            print_json(plan)
+            print_json(plan, is_line=is_line)
         return EXIT_WOULD_CHANGE if is_change else EXIT_OK
     if not is_change:
         if not view.is_json:

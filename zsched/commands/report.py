@@ -7,7 +7,7 @@ core, so that `zsched status` starts quickly.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Final
 
 from zsched.commands.page import Cell, Page, cut, memory, none_for, since_drop, size, span
 from zsched.core.values.model import NEVER_INITIALISED, RESTARTING, WAS_READY, WorkerState, told_of_worker
@@ -30,7 +30,7 @@ WORDS_OF_SECURITY = {"secured": "secured", "encrypted": "TLS", "open": "NOT SECU
 NO_ANSWER_TO = 100
 """After so many inputs without one output, ever, the key of the output is doubted."""
 STATE_STYLES = {"alive": "green", "ready": "green"} | dict.fromkeys(
-    ("draining", "starting", RESTARTING, "stopped", "suspect", "unknown"), "yellow"
+    ("draining", "drained", "no new", "starting", RESTARTING, "stopped", "suspect", "unknown"), "yellow"
 )
 """All others are red."""
 
@@ -77,6 +77,7 @@ def render_status(status: Json, width: int, color: bool, at: float | None = None
     header(page, shown)
     page.lines.append("")
     node_rows(page, shown, "PROFILE")
+    flag_rows(page, shown)
     _gateway(page, shown["nodes"])
     _electors(page, shown["quorum"])
     for task in shown["tasks"]:
@@ -154,8 +155,30 @@ def node_rows(page: Page, status: Json, title: str) -> None:
         page.row(*((text, width, style) for (text, style), width in zip(texts, columns, strict=True)))
 
 
+def flag_rows(page: Page, status: Json) -> None:
+    """A line for each thing that operators have said of nodes."""
+    for node in status["nodes"]:
+        for flag in node.get("flags", ()):  # a later field of the schema's major version
+            text = f"{node['name']}: {told_flag(flag)}, known for {span(flag['known_s'])}"
+            page.row((text, page.width, "yellow"))
+
+
+def state_word(node: Json) -> str:
+    """A node's state; of a living one what keeps tasks from it.
+
+    >>> state_word({"state": "alive", "draining": False, "flags": [{"kind": "ineligible"}, {"kind": "drain"}]})
+    'drained'
+    """
+    kinds = [flag["kind"] for flag in node.get("flags", ())]
+    if node["state"] != "alive":
+        return str(node["state"])
+    if node["draining"]:
+        return "draining"
+    return "drained" if "drain" in kinds else "no new" if kinds else "alive"
+
+
 def _node_cells(node: Json, bar: int, *, is_me: bool, is_wide: bool) -> list[tuple[str, str]]:
-    state = "draining" if node["draining"] and node["state"] == "alive" else node["state"]
+    state = state_word(node)
     cpu, cores = node["cpu_ratio"], node["cpu_cores"]
     level = "" if cpu is None else "red" if cpu >= FULL else "yellow" if cpu >= BUSY else "green"
     filled = 0 if cpu is None else round(cpu * bar)
@@ -273,6 +296,23 @@ def told_hold(kind: str, order: Json) -> str:
     words += [] if order["for_s"] is None else [f"for {span(order['for_s'])}"]
     who = order["by"] or "an unknown operator"
     words.append(f"{who}: {order['reason']}" if order["reason"] else who)
+    return ", ".join(words)
+
+
+FLAGS: Final = {"drain": "drained", "ineligible": "gets nothing new"}
+"""{kind of a flag: the same in words}."""
+
+
+def told_flag(flag: Json) -> str:
+    """A flag of a node in a few words, without its age; ``flag``: of a status, or of a document.
+
+    >>> told_flag({"kind": "drain", "by": "ada@robot1", "reason": "new fan", "for_s": 7200.0})
+    'drained, for 2h00m, ada@robot1: new fan'
+    """
+    words = [FLAGS[str(flag["kind"])]]
+    words += [] if flag.get("for_s") is None else [f"for {span(flag['for_s'])}"]
+    who, reason = flag.get("by") or "an unknown operator", flag.get("reason")
+    words.append(f"{who}: {reason}" if reason else str(who))
     return ", ".join(words)
 
 

@@ -6,6 +6,8 @@ Knows: the status of one node. Does not know: what other nodes say.
 from __future__ import annotations
 
 from zsched import __version__
+from zsched.core.scheduler.flags import told_flag
+from zsched.core.values.document import Flag, FlagKind
 from zsched.doctor.model import Json, Result, Scene, failed, joined, passed, skipped, warned
 
 
@@ -53,6 +55,29 @@ def sees_no_problem(scene: Scene) -> Result:
     if not own and not tasks:
         return passed(f"{scene.node} names no problem")
     return warned(*own, *tasks, fix="each line says what to do; zsched status shows them, too")
+
+
+def nodes_get_tasks(scene: Scene) -> Result:
+    """Whether no operator keeps tasks from a node, and each task has a candidate that may get it."""
+    status = scene.status
+    flags = [(str(node["name"]), flag) for node in status["nodes"] for flag in node.get("flags", ())]
+    closed = {name for name, _ in flags}
+    found = []
+    for task in status["tasks"]:
+        if closed.issuperset(task["candidates"]):
+            told = f"{task['name']}: no candidate may get it any more; when its owner ends, nobody does it"
+            found.append(failed(told, fix="zsched undrain, or zsched eligible NODE on, for one of its candidates"))
+    lines = [f"{name} {_told(name, flag)}, known here for {flag['known_s']:.0f} s" for name, flag in flags]
+    if lines:
+        fix = "where the work is done: zsched undrain NODE, zsched eligible NODE on"
+        found.append(warned(*lines, fix=fix))
+    return joined(found, passed("every node may get tasks"))
+
+
+def _told(name: str, flag: Json) -> str:
+    kind = FlagKind(flag["kind"])
+    told = told_flag(Flag(kind=kind, subject=name, by=flag["by"], reason=flag["reason"]))
+    return f"is {told}" if kind is FlagKind.DRAIN else told
 
 
 def tasks_have_owners(scene: Scene) -> Result:

@@ -54,6 +54,12 @@ CHECKS: Final[tuple[Check, ...]] = (
         run=daemon.tasks_have_owners,
         needs=Needs.STATUS,
     ),
+    Check(
+        name="node.flags",
+        asks="May every node get tasks?",
+        run=daemon.nodes_get_tasks,
+        needs=Needs.STATUS,
+    ),
     Check(name="clock.rate", asks="Does the clock run true?", run=machine.clock_runs_true),
     Check(name="machine.descriptors", asks="May the daemon open enough files?", run=machine.has_descriptors),
     Check(

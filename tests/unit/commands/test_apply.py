@@ -324,7 +324,7 @@ def file_of(tmp_path: Path, text: str, fragment: Path) -> Path:
 def test_a_node_may_go_that_is_no_last_elector_and_owns_nothing_while_it_lives(node: Node) -> None:
     owner = run("node", "remove", "robot1", "--yes")
     assert owner.exit_code == 1
-    assert "robot1 is alive and owns merge; stop its daemon" in owner.stderr
+    assert "robot1 is alive and owns merge; `zsched drain robot1` first" in owner.stderr
     assert "robot2 is alive: zsched node remove robot2" in run("node", "forget", "robot2", "--yes").stderr
     accepted = ("--accept", "remove-node", "--accept", "change-electors")
     assert run("node", "remove", "robot2", "--yes", *accepted[:2]).exit_code == 1
@@ -332,6 +332,7 @@ def test_a_node_may_go_that_is_no_last_elector_and_owns_nothing_while_it_lives(n
     assert done.exit_code == 0, done.stderr
     assert [sorted({"remove_elector", "text"} & set(one)) for one in node.changes] == [["remove_elector"], ["text"]]
     assert "electorate: [robot1, edge1]" in node.text
+    assert node.changes[-1]["flags"] == [], "what operators said of it goes with it"
     node.electors = ["edge1"]
     last = run("node", "remove", "edge1", "--yes")
     assert "edge1 is the last elector: without it nothing can be agreed; add another elector first" in last.stderr

@@ -155,6 +155,20 @@ def test_a_task_without_an_owner_and_a_lost_quorum_are_found(tmp_path: Path) -> 
     assert_finds(run("task.owners", answer(scene, tasks=[{**task, "owner_state": "gone"}])), FAIL, "edge1 is gone")
 
 
+def test_a_node_that_gets_nothing_new_is_told_and_a_task_without_a_candidate_is_a_fault(tmp_path: Path) -> None:
+    scene = scene_of(tmp_path)
+    assert run("node.flags", scene).verdict is PASS
+    flag = {"kind": "drain", "by": "ada@robot1", "reason": "new fan", "known_s": 90.0, "for_s": None}
+
+    def flagged(name: str) -> Scene:
+        nodes = [{**one, "flags": [flag] if one["name"] == name else []} for one in scene.status["nodes"]]
+        return answer(scene, nodes=nodes)
+
+    told = "robot1 is drained by ada@robot1 (new fan), known here for 90 s"
+    assert_finds(run("node.flags", flagged("robot1")), WARN, told)
+    assert_finds(run("node.flags", flagged("edge1")), FAIL, "merge: no candidate may get it", "edge1 is drained by ada")
+
+
 def test_a_worker_that_failed_is_found(tmp_path: Path) -> None:
     scene = scene_of(tmp_path)
     assert run("worker.state", scene).verdict is PASS

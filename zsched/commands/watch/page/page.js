@@ -53,6 +53,11 @@ const level = (ratio) => (ratio === null || ratio === undefined ? "dim" : ratio 
 const radio = (dbm) => (dbm >= -65 ? "good" : dbm >= -75 ? "warn" : "bad");
 const colour = (node) => Math.max(state.now.status.nodes.findIndex((one) => one.name === node), 0) % 8;
 const roomOf = (id, least, most) => Math.min(Math.max(byId(id).clientWidth, least), most);  // pixels, so that letters keep their size
+const stateWord = (node) => {
+  const kinds = (node.flags || []).map((flag) => flag.kind);
+  if (node.state !== "alive" || node.draining) return node.state === "alive" ? "draining" : node.state;
+  return kinds.includes("drain") ? "drained" : kinds.length ? "no new" : "alive";
+};
 const isAway = (node) => node.state === "gone" || node.state === "unknown";
 
 // --- topology --------------------------------------------------------------------------------------------------------
@@ -86,8 +91,8 @@ function topology(status) {
     const owned = status.tasks.filter((task) => task.owner === node.name).map((task) => task.name);
     const common = node.links.find((link) => link.peer === null);
     const way = !common ? "" : common.rssi_dbm === null ? common.source : `${common.rssi_dbm.toFixed(0)}${isNarrow ? "" : " dBm"}`;
-    const stateName = node.draining && node.state === "alive" ? "draining" : node.state;
-    const mark = node.state === "alive" ? (node.draining ? "warn" : "good") : node.state === "suspect" ? "warn" : "bad";
+    const stateName = stateWord(node);
+    const mark = node.state === "alive" ? (stateName === "alive" ? "good" : "warn") : node.state === "suspect" ? "warn" : "bad";
     const bar = wide - 24;
     boxes.push(s("g", { transform: `translate(${x} ${y})` },
       s("rect", { class: `box${owned.length ? " owner" : ""}${isAway(node) ? " away" : ""}`, width: wide, height: high, rx: 8 }),
@@ -238,7 +243,7 @@ function nodes(status) {
   return table(["node", "kind", "state", "age", "CPU", "cores", "memory", "link", "workers"], status.nodes.map((node) => {
     const common = node.links.find((link) => link.peer === null) || node.links[0];
     const way = !common ? "-" : common.rssi_dbm === null ? common.source : `${common.rssi_dbm.toFixed(0)} dBm`;
-    return [node.name + (node.name === status.node ? " *" : ""), node.kind, node.draining && node.state === "alive" ? "draining" : node.state, span(node.age_s), percent(node.cpu_ratio),
+    return [node.name + (node.name === status.node ? " *" : ""), node.kind, stateWord(node), span(node.age_s), percent(node.cpu_ratio),
       node.cpu_cores === null ? "-" : `${number(node.cpu_used_cores, 2)} of ${node.cpu_cores}`, percent(node.memory_ratio), way,
       node.workers.map((worker) => `${worker.task} ${worker.state}`).join(", ") || "-"];
   }), [3, 4, 5, 6]);

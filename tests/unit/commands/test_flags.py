@@ -1,0 +1,253 @@
+"""`zsched drain`, `undrain`, `eligible`: what they show and ask, what a daemon is told, how a drain is watched."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from support.schemas import faults
+from zsched.adapters.host.operator_socket import Json, OperatorSocket
+from zsched.cli import app
+from zsched.commands import flags as verbs
+from zsched.commands.brief import render_brief
+from zsched.commands.report import render_status
+
+STATUS = json.loads((Path(__file__).parent / "recorded_status" / "healthy.json").read_text())
+TEXT = "fleet: lab\n"
+NODES = ("edge1", "edge2", "robot1")
+
+
+def task(name: str, owner: str) -> Json:
+    found = copy.deepcopy(STATUS["tasks"][0])
+    more = {"name": name, "owner": owner, "owner_state": "alive", "phase": "settled", "candidates": ["edge1", "edge2"]}
+    decision = {**found["decision"], "reason": "nobody better", "vetoed": {"edge2": "worker failed"}}
+    return {**found, **more, "streams": [], "pause": None, "pin": None, "switched_s": 0.086, "decision": decision}
+
+
+def node(name: str, kind: str) -> Json:
+    recorded = STATUS["nodes"][0]
+    workers = [{**recorded["workers"][0], "task": one, "state": "ready"} for one in ("echo", "merge")]
+    return {
+        **recorded,
+        "name": name,
+        "kind": kind,
+        "state": "alive",
+        "draining": False,
+        "workers": workers,
+        "flags": [],
+    }
+
+
+class Daemon:
+    """Answers as three daemons of a fleet with a document; after each look at a status `step` happens."""
+
+    def __init__(self, folder: Path) -> None:
+        nodes = [node(name, "robot" if name == "robot1" else "edge") for name in NODES]
+        self.status: Json = {**STATUS, "fleet": "lab", "node": "robot1", "nodes": nodes, "fleet_revision": 4}
+        self.status["tasks"] = [task("echo", "edge1"), task("merge", "edge1")]
+        self.flags: list[Json] = []
+        self.document = "ab" * 16
+        self.changes: list[Json] = []
+        self.outcome = "ok"
+        self.step: Callable[[], None] = lambda: None
+        self.socket = OperatorSocket(folder / "robot1.sock", self.answer)
+
+    def answer(self, request: Json) -> Json:
+        if request["verb"] == "status":
+            body = copy.deepcopy(self.status)
+            if request.get("node", "robot1") == "robot1":
+                self.step()
+            return {**body, "node": request.get("node", "robot1")}
+        if request["verb"] == "fleet":
+            body = {"node": "robot1", "fleet": "lab", "revision": self.status["fleet_revision"], "number": 2}
+            told = {"settled": True, "electors": [], "document": self.document, "text": TEXT, "flags": self.flags}
+            return {**body, **told}
+        assert request["verb"] == "change"
+        self.changes.append(request)
+        if self.outcome == "ok":
+            self.status["fleet_revision"] += 1
+            self.set_flags(request["flags"])
+        return {"outcome": self.outcome, "detail": "as told", "revision": self.status["fleet_revision"]}
+
+    def set_flags(self, flags: list[Json]) -> None:
+        self.flags = flags
+        for one in self.status["nodes"]:
+            kept = [flag for flag in flags if flag["subject"] == one["name"]]
+            keys = ("kind", "by", "reason", "for_s")
+            one["flags"] = [{**{key: flag[key] for key in keys}, "known_s": 3.0} for flag in kept]
+
+    def own(self, name: str, owner: str) -> None:
+        next(one for one in self.status["tasks"] if one["name"] == name)["owner"] = owner
+
+
+@pytest.fixture
+def daemon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Daemon]:
+    monkeypatch.setenv("ZSCHED_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.delenv("ZSCHED_NODE", raising=False)
+    monkeypatch.setattr(verbs, "PAUSE_S", 0.001)
+    running = Daemon(tmp_path)
+    running.socket.open()
+    yield running
+    running.socket.close()
+
+
+def run(*words: str) -> Result:
+    return CliRunner().invoke(app, list(words))
+
+
+def events(*words: str) -> list[Json]:
+    """The NDJSON of a command, each line by its schema."""
+    result = run(*words, "--json")
+    found = [json.loads(line) for line in result.stdout.splitlines()]
+    assert [fault for one in found for fault in faults(one)] == []
+    return found
+
+
+@pytest.mark.parametrize("words", [("drain", "edge1"), ("eligible", "edge1", "off")])
+def test_off_a_terminal_nothing_is_done_and_the_command_is_printed(daemon: Daemon, words: tuple[str, ...]) -> None:
+    result = run(*words)
+    assert (result.exit_code, daemon.changes) == (2, [])
+    assert result.stdout.splitlines()[0].split() == ["WHAT", "KIND", "NOW", "AFTER"]
+    assert "to do it: zsched " in result.stderr
+
+
+def test_a_plan_shows_the_nodes_and_what_becomes_of_their_tasks(daemon: Daemon) -> None:
+    daemon.status["tasks"][1]["pin"] = {"node": "edge1", "is_hard": True, "by": "a", "reason": "", "for_s": None}
+    result = run("drain", "edge1", "--plan", "-m", "new fan", "--for", "2h")
+    assert result.exit_code == 10
+    lines = [line.split(None, 3) for line in result.stdout.splitlines()]
+    assert lines[1][:3] == ["edge1", "drain", "-"]
+    assert lines[1][3].startswith("drained, for 2h00m, ")
+    assert lines[1][3].endswith("@robot1: new fan")
+    assert lines[2] == ["echo", "owner", "edge1", "one of edge2"]
+    assert lines[3] == ["merge", "owner", "edge1", "stays: it is pinned to edge1 (hard)"]
+    (planned,) = events("drain", "edge1", "--plan")
+    assert (planned["event"], planned["nodes"], planned["tasks"]) == ("planned", ["edge1"], ["echo", "merge"])
+    assert daemon.changes == []
+
+
+def test_several_nodes_are_flagged_by_one_change_that_keeps_the_other_flags(daemon: Daemon) -> None:
+    other = {"kind": "ineligible", "subject": "robot1", "by": "b", "reason": "", "for_s": None, "revision": 2}
+    daemon.flags = [other]
+    result = run("drain", "edge2", "edge1", "--yes", "--detach", "-m", "hall", "--accept", "no-other-candidate")
+    assert (result.exit_code, len(daemon.changes)) == (0, 1), result.stderr
+    (change,) = daemon.changes
+    assert (change["base_revision"], change["text"]) == (4, TEXT)
+    assert [(flag["subject"], flag["kind"], flag["revision"]) for flag in change["flags"]] == [
+        ("edge1", "drain", 5),
+        ("edge2", "drain", 5),
+        ("robot1", "ineligible", 2),
+    ]
+    assert change["reason"].startswith("drain edge2, edge1, by ")
+    assert change["reason"].endswith("@robot1: hall")
+
+
+def test_a_task_without_a_candidate_is_a_danger_that_is_accepted_by_name(daemon: Daemon) -> None:
+    result = run("drain", "edge1", "edge2", "--yes")
+    assert (result.exit_code, daemon.changes) == (1, [])
+    assert "no-other-candidate: echo, merge: no candidate may get it any more" in result.stderr
+    assert run("drain", "edge1", "--accept", "all", "--yes").exit_code == 2
+
+
+def test_it_is_watched_until_the_node_is_empty_and_every_move_is_told(daemon: Daemon) -> None:
+    moves = iter(("", "echo", "merge"))
+
+    def step() -> None:
+        if daemon.changes and (name := next(moves, "")):
+            daemon.own(name, "edge2")
+
+    daemon.step = step
+    found = events("drain", "edge1", "--yes")
+    assert [one["event"] for one in found] == ["agreed", "moved", "moved", "empty"]
+    assert [(one["task"], one["node"], one["to"], one["lost"], one["switched_s"]) for one in found[1:3]] == [
+        ("echo", "edge1", "edge2", 0, 0.086),
+        ("merge", "edge1", "edge2", 0, 0.086),
+    ]
+    daemon.own("echo", "edge1")
+    again = run("drain", "edge1", "--yes", "--deadline", "0s")
+    assert "It is so already. Ctrl-C ends the watching, not the drain." in again.stdout
+    assert len(daemon.changes) == 1, "who gives it again only watches"
+
+
+def test_at_the_deadline_it_says_what_is_missing_and_the_drain_stays(
+    daemon: Daemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(verbs, "STAYS_S", 0.1)
+    result = run("drain", "edge1", "--yes", "--deadline", "1s")
+    assert result.exit_code == 5
+    assert "echo stays on edge1: nobody better (edge2: worker failed)" in result.stdout
+    assert "edge1: not empty after 1" in result.stdout
+    assert "  merge is owned by edge1" in result.stdout
+    assert daemon.flags[0]["subject"] == "edge1"
+
+
+def test_with_force_the_deadline_does_not_count(daemon: Daemon) -> None:
+    looks = iter(range(40))
+
+    def step() -> None:
+        if daemon.changes and next(looks, 40) == 20:
+            daemon.own("echo", "edge2")
+            daemon.own("merge", "edge2")
+
+    daemon.step = step
+    assert run("drain", "edge1", "--yes", "--force", "--deadline", "0s").exit_code == 0
+
+
+def test_a_fleet_without_an_agreed_document_says_what_to_do(daemon: Daemon) -> None:
+    daemon.document = ""
+    result = run("drain", "edge1", "--yes")
+    assert (result.exit_code, daemon.changes) == (1, [])
+    assert "has no document yet; agree one: zsched apply" in result.stderr
+
+
+def test_an_overtaken_revision_and_an_unknown_node_are_refused(daemon: Daemon) -> None:
+    assert "revision 3 is overtaken" in run("drain", "edge1", "--yes", "--revision", "3").stderr
+    wrong = run("drain", "edge9", "--yes")
+    assert (wrong.exit_code, daemon.changes) == (2, [])
+    assert "did you mean edge" in wrong.stderr
+
+
+def test_undrain_takes_only_the_drain_back_and_says_what_is_left(daemon: Daemon) -> None:
+    said = {"by": "ada@robot1", "reason": "", "for_s": None, "revision": 2, "subject": "edge1"}
+    daemon.set_flags([{"kind": "drain", **said}, {"kind": "ineligible", **said}])
+    result = run("undrain", "edge1", "--yes")
+    assert result.exit_code == 0
+    assert "edge1 still gets nothing new: `zsched eligible edge1 on`" in result.stdout
+    assert [flag["kind"] for flag in daemon.flags] == ["ineligible"]
+    assert run("eligible", "edge1", "on", "--yes").exit_code == 0
+    assert daemon.flags == []
+    assert run("undrain", "edge1", "--yes").stdout.endswith("Nothing would change.\n")
+    assert [one["event"] for one in events("undrain", "edge1", "--yes")] == ["unchanged"]
+
+
+def test_the_verbs_list_and_every_page_shows_the_flags(daemon: Daemon) -> None:
+    assert run("drain").stdout == "no node is drained, as robot1 knows\n"
+    said = {"by": "ada@robot1", "reason": "new fan", "for_s": 60.0, "revision": 2}
+    daemon.set_flags(
+        [{"kind": "drain", "subject": "edge1", **said}, {"kind": "ineligible", "subject": "edge2", **said}]
+    )
+    told = "drained, for 1m00s, ada@robot1: new fan"
+    assert run("drain").stdout == f"edge1: {told}, known for 3.0s\n"
+    assert run("eligible").stdout.startswith("edge2: gets nothing new, for 1m00s, ada@robot1")
+    (listed,) = events("drain")
+    assert (listed["node"], listed["by"], listed["for_s"]) == ("edge1", "ada@robot1", 60.0)
+    assert f"edge1  drain       {told}" in run("maint").stdout
+    orders = json.loads(run("maint", "--json").stdout)["orders"]
+    assert [(order["kind"], order["subject"]) for order in orders] == [("drain", "edge1"), ("ineligible", "edge2")]
+    assert faults(json.loads(run("maint", "--json").stdout)) == []
+    for page in (render_brief(daemon.status, 100, color=False), render_status(daemon.status, 100, color=False)):
+        assert f"edge1: {told}, known for 3.0s" in page
+        assert " drained " in page
+        assert " no new " in page
+
+
+def test_a_word_that_is_neither_on_nor_off_and_a_self_elsewhere_are_refused(daemon: Daemon) -> None:
+    assert run("eligible", "edge1", "yes").exit_code == 2
+    assert run("drain", "--self", "--node", "robot1").exit_code == 2
+    assert run("drain", "--self", "--plan").stdout.splitlines()[1].split()[:2] == ["robot1", "drain"]
+    assert daemon.changes == []

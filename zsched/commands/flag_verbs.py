@@ -1,0 +1,142 @@
+"""The verbs by which an operator flags nodes: arguments in, exit code out.
+
+Knows: options. Does not know: how anything is done (`zsched.commands.flags`, imported by the verb that runs).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from zsched.commands.common import CliError, Verb
+from zsched.commands.fleet_verbs import AcceptOption, ConnectOption, PlanOption, RevisionOption
+from zsched.commands.order_verbs import AskedOption, ForOption, JsonOption, ReasonOption, RuntimeOption, YesOption
+from zsched.exits import EXIT_USAGE
+
+if TYPE_CHECKING:
+    from zsched.commands.orders import OrderView
+
+NodesArgument = Annotated[list[str] | None, typer.Argument(metavar="[NODE]...", help="Nodes of the fleet.")]
+
+
+def add_flag_verbs(app: typer.Typer) -> None:
+    """Add the verbs to the program."""
+    verbs: tuple[Callable[..., None], ...] = (drain, undrain, eligible)
+    for verb in verbs:
+        app.command(cls=Verb)(verb)
+
+
+def drain(
+    nodes: NodesArgument = None,
+    self_: Annotated[bool, typer.Option("--self", help="The node that is asked.")] = False,
+    for_: ForOption = None,
+    deadline: Annotated[
+        str, typer.Option("--deadline", metavar="DURATION", help="So long it is watched: 90s, 10m, 2h.")
+    ] = "10m",
+    force: Annotated[
+        bool, typer.Option("--force", help="Ignore the deadline: watch until the nodes are empty.")
+    ] = False,
+    detach: Annotated[bool, typer.Option("--detach", help="Do not watch it.")] = False,
+    accept: AcceptOption = None,
+    reason: ReasonOption = "",
+    revision: RevisionOption = None,
+    plan: PlanOption = False,
+    yes: YesOption = False,
+    json_: JsonOption = False,
+    node: AskedOption = None,
+    runtime_dir: RuntimeOption = None,
+    connect: ConnectOption = None,
+) -> None:
+    """Empty nodes: they get nothing new, and their tasks move away one after another, also pinned ones (not --hard).
+
+    Watches until each node owns nothing and its old slots are closed. The nodes stay drained, over restarts, until
+    `zsched undrain`. A task that nobody else can have stays. Without nodes it lists the drained ones. Exits with 5 at
+    the deadline; the drain goes on all the same.
+    """
+    from zsched.commands.flags import DrainOrder  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.flags import drain as give  # noqa: PLC0415 - as above
+    from zsched.commands.history import duration_s  # noqa: PLC0415 - as above
+
+    if self_ and (node is not None or connect is not None):
+        raise CliError(EXIT_USAGE, "--self is the node of this machine: name the node instead")
+    order = DrainOrder(
+        nodes=tuple(nodes or ()),
+        is_self=self_,
+        is_detached=detach,
+        deadline_s=None if force else duration_s(deadline),
+        accepted=tuple(accept or ()),
+    )
+    view = _view(node, runtime_dir, connect, reason, revision, for_, json_=json_, yes=yes, plan=plan)
+    raise typer.Exit(give(view, order))
+
+
+def undrain(
+    nodes: Annotated[list[str], typer.Argument(metavar="NODE...", help="Nodes of the fleet.")],
+    reason: ReasonOption = "",
+    revision: RevisionOption = None,
+    plan: PlanOption = False,
+    yes: YesOption = False,
+    json_: JsonOption = False,
+    node: AskedOption = None,
+    runtime_dir: RuntimeOption = None,
+    connect: ConnectOption = None,
+) -> None:
+    """End the drain of nodes: they may get tasks again, when the fleet finds them better."""
+    from zsched.commands.flags import undrain as give  # noqa: PLC0415 - each verb imports what it needs
+
+    view = _view(node, runtime_dir, connect, reason, revision, None, json_=json_, yes=yes, plan=plan)
+    raise typer.Exit(give(view, nodes))
+
+
+def eligible(
+    name: Annotated[str | None, typer.Argument(metavar="[NODE]", help="A node; without it: list.")] = None,
+    word: Annotated[str | None, typer.Argument(metavar="[on|off]", help="off: nothing new.")] = None,
+    for_: ForOption = None,
+    accept: AcceptOption = None,
+    reason: ReasonOption = "",
+    revision: RevisionOption = None,
+    plan: PlanOption = False,
+    yes: YesOption = False,
+    json_: JsonOption = False,
+    node: AskedOption = None,
+    runtime_dir: RuntimeOption = None,
+    connect: ConnectOption = None,
+) -> None:
+    """Keep new tasks from a node (off), or let it get tasks again (on). What it owns stays there.
+
+    Without a node it lists those that get nothing new.
+    """
+    from zsched.commands.flags import eligible as give  # noqa: PLC0415 - each verb imports what it needs
+
+    view = _view(node, runtime_dir, connect, reason, revision, for_, json_=json_, yes=yes, plan=plan)
+    raise typer.Exit(give(view, name, word, tuple(accept or ())))
+
+
+def _view(
+    node: str | None,
+    runtime_dir: Path | None,
+    connect: str | None,
+    reason: str,
+    revision: int | None,
+    for_: str | None,
+    *,
+    json_: bool,
+    yes: bool,
+    plan: bool,
+) -> OrderView:
+    from zsched.commands.ask import find_door  # noqa: PLC0415 - as above
+    from zsched.commands.history import duration_s  # noqa: PLC0415 - as above
+    from zsched.commands.orders import OrderView  # noqa: PLC0415 - as above
+
+    return OrderView(
+        door=find_door(runtime_dir, node, connect=connect),
+        is_json=json_,
+        is_yes=yes,
+        is_plan=plan,
+        reason=reason,
+        revision=revision,
+        for_s=None if for_ is None else duration_s(for_),
+    )

@@ -1,0 +1,393 @@
+"""`zsched drain`, `undrain` and `eligible`: shows what a flag changes, has it agreed, and watches a node become empty.
+
+Knows: how flags are shown before and after, the danger in one, when a node is empty. Does not know: how a document is
+agreed (`zsched.commands.document`), what a robot makes of a flag (`zsched.core.scheduler.flags`).
+"""
+
+from __future__ import annotations
+
+import shlex
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from zsched.clock import monotonic_s
+from zsched.commands.ask import Door, ask_door
+from zsched.commands.common import CliError, Json, nearest, print_json
+from zsched.commands.document import InForce, change, document_text, in_force
+from zsched.commands.orders import OrderView, begin, check_said
+from zsched.commands.page import harmless, span
+from zsched.commands.report import millis, told_flag
+from zsched.commands.wait import Condition, missing
+from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE
+
+SCHEMA: Final = "zsched.drain/1"
+DRAIN, INELIGIBLE = "drain", "ineligible"
+PAUSE_S: Final = 0.2
+"""Between two looks at a node that is drained."""
+STAYS_S: Final = 3.0
+"""A task that has not left after so long is told, with the reason; again when the reason changes."""
+NO_OTHER: Final = "no-other-candidate"
+"""The danger: a task would have no candidate left that may get it."""
+NOTHING: Final = "-"
+TITLES: Final = ("WHAT", "KIND", "NOW", "AFTER")
+BLANK: Final[Json] = dict.fromkeys(
+    ("node", "task", "to", "by", "reason", "known_s", "for_s", "revision", "switched_s", "lost", "doubled")
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DrainOrder:
+    """Which nodes, and how their drain is watched."""
+
+    nodes: tuple[str, ...]
+    is_self: bool = False
+    is_detached: bool = False
+    deadline_s: float | None = 600.0
+    """``None``: wait until they are empty."""
+    accepted: tuple[str, ...] = ()
+    """Names of dangers."""
+
+
+@dataclass(slots=True)
+class _Watch:
+    """What has been told of a drain so far."""
+
+    view: OrderView
+    began: float
+    owners: dict[str, str]
+    """{task: the node that it is to leave}, of those that have not settled elsewhere yet."""
+    before: dict[str, Mapping[str, int]]
+    stays: dict[str, str] = field(default_factory=dict)
+    """{task: why it stays, as it was told last}."""
+    empty: set[str] = field(default_factory=set)
+
+    def tell(self, event: str, text: str, **more: Any) -> None:
+        tell(self.view, event, text, after_s=monotonic_s() - self.began, **more)
+
+
+def drain(view: OrderView, order: DrainOrder) -> int:
+    """Drain nodes and wait until they are empty, or list the drained ones; returns the exit code.
+
+    Raises:
+        CliError: nobody answers, there is no such node, no document is agreed, or the drain is not agreed.
+    """
+    check_said(view)
+    status = _status(view.door)
+    nodes = _chosen(status, order)
+    if not nodes:
+        return _list(view, status, DRAIN)
+    held = _held(view)
+    after = _with(view, held, DRAIN, nodes)
+    rows = [_row(status, name, DRAIN, after) for name in nodes] + list(_task_rows(status, nodes, after))
+    _check_dangers(order.accepted, status, after)
+    plan = _body("planned", nodes=nodes, revision=held.revision, tasks=[row[0] for row in rows if row[1] == "owner"])
+    is_change = after != held.flags
+    if is_change or view.is_plan:
+        code = begin(view, rows, plan, is_change=is_change, titles=TITLES, is_line=True)
+        if code is not None:
+            return code
+    found = {} if order.is_detached else _statuses(view.door, status, nodes)
+    before = {name: _counts(found, name) for name in _owned(status, nodes)}
+    revision = _commit(view, held, after, f"drain {', '.join(nodes)}")
+    what = "It is agreed" if is_change else "It is so already"
+    watch = "" if order.is_detached else ". Ctrl-C ends the watching, not the drain"
+    tell(view, "agreed", f"{what}{watch}.", after_s=0.0, nodes=nodes, revision=revision)
+    if order.is_detached:
+        return EXIT_OK
+    watching = _Watch(view=view, began=monotonic_s(), owners=_owned(status, nodes), before=before)
+    return _watch(watching, nodes, revision, order.deadline_s)
+
+
+def undrain(view: OrderView, nodes: Sequence[str]) -> int:
+    """End the drain of nodes; returns the exit code.
+
+    Raises:
+        CliError: as of `drain`.
+    """
+    return _set(view, DRAIN, tuple(dict.fromkeys(nodes)), is_on=False)
+
+
+def eligible(view: OrderView, node: str | None, word: str | None, accepted: tuple[str, ...]) -> int:
+    """Let a node get tasks, or nothing new; without a node list those that get nothing new; returns the exit code.
+
+    Raises:
+        CliError: as of `drain`, or the word is neither on nor off.
+    """
+    if node is None:
+        return _list(view, _status(view.door), INELIGIBLE)
+    if word not in ("on", "off"):
+        raise CliError(EXIT_USAGE, f"say on or off: `zsched eligible {node} off`")
+    return _set(view, INELIGIBLE, (node,), is_on=word == "off", accepted=accepted)
+
+
+def _set(view: OrderView, kind: str, nodes: tuple[str, ...], *, is_on: bool, accepted: tuple[str, ...] = ()) -> int:
+    check_said(view)
+    status = _status(view.door)
+    _check_nodes(status, nodes)
+    held = _held(view)
+    after = _with(view, held, kind, nodes) if is_on else _without(held, kind, nodes)
+    if is_on:
+        _check_dangers(accepted, status, after)
+    rows = [_row(status, name, kind, after) for name in nodes]
+    plan = _body("planned", nodes=nodes, revision=held.revision)
+    code = begin(view, rows, plan, is_change=after != held.flags, titles=TITLES, is_line=True)
+    if code is not None:
+        return code
+    if after == held.flags:
+        return tell(view, "unchanged", "Nothing would change.", nodes=nodes, revision=held.revision)
+    verb = "eligible off" if is_on else "undrain" if kind == DRAIN else "eligible on"
+    revision = _commit(view, held, after, f"{verb} {', '.join(nodes)}")
+    left = [name for name in nodes if not is_on and any(flag["subject"] == name for flag in after)]
+    more = "".join(f" {name} still gets nothing new: `zsched {_way_out(after, name)}`." for name in left)
+    return tell(view, "agreed", f"It is agreed.{more}", after_s=0.0, nodes=nodes, revision=revision)
+
+
+def _way_out(flags: Sequence[Json], name: str) -> str:
+    is_drained = any(flag["subject"] == name and flag["kind"] == DRAIN for flag in flags)
+    return f"undrain {name}" if is_drained else f"eligible {name} on"
+
+
+# --- what is shown ---------------------------------------------------------------------------------------------------
+
+
+def tell(view: OrderView, event: str, text: str, **more: Any) -> int:
+    """One thing that has happened: a line of text, or one of NDJSON."""
+    if view.is_json:
+        print_json(_body(event, **more), is_line=True)
+    else:
+        sys.stdout.write(harmless(text) + "\n")
+        sys.stdout.flush()
+    return EXIT_OK
+
+
+def _body(event: str, **more: Any) -> Json:
+    body = {"schema": SCHEMA, "event": event, "after_s": None, "nodes": [], "tasks": [], "missing": [], **BLANK}
+    return {**body, **more, "nodes": list(more.get("nodes", ()))}
+
+
+def _list(view: OrderView, status: Json, kind: str) -> int:
+    found = [
+        (str(node["name"]), flag) for node in status["nodes"] for flag in node.get("flags", ()) if flag["kind"] == kind
+    ]
+    if not found and not view.is_json:
+        word = "drained" if kind == DRAIN else "kept from getting tasks"
+        sys.stdout.write(f"no node is {word}, as {status['node']} knows\n")
+    for name, flag in found:
+        text = f"{name}: {told_flag(flag)}, known for {span(flag['known_s'])}"
+        told = {key: flag[key] for key in ("by", "reason", "known_s", "for_s")}
+        tell(view, "listed", text, node=name, nodes=[name], **told)
+    return EXIT_OK
+
+
+def _row(status: Json, name: str, kind: str, after: Sequence[Json]) -> tuple[str, str, str, str]:
+    node = next(node for node in status["nodes"] if node["name"] == name)
+    now = next((flag for flag in node.get("flags", ()) if flag["kind"] == kind), None)
+    then = next((flag for flag in after if flag["subject"] == name and flag["kind"] == kind), None)
+    before, later = (NOTHING if flag is None else told_flag(flag) for flag in (now, then))
+    return name, kind, before, later
+
+
+def _task_rows(status: Json, nodes: Sequence[str], after: Sequence[Json]) -> Iterator[tuple[str, str, str, str]]:
+    """What becomes of each task that the nodes own, as far as it can be told before."""
+    closed = {flag["subject"] for flag in after}
+    for task in status["tasks"]:
+        if task["owner"] in nodes:
+            others = [name for name in task["candidates"] if name not in closed]
+            pin, pause = task.get("pin"), task.get("pause")
+            if pause is not None:
+                then = "stays: it is paused"
+            elif pin is not None and pin["is_hard"] and pin["node"] in closed:
+                then = f"stays: it is pinned to {pin['node']} (hard)"
+            else:
+                then = f"one of {', '.join(others)}" if others else "stays: there is no other candidate"
+            yield str(task["name"]), "owner", str(task["owner"]), then
+
+
+# --- asking, and agreeing --------------------------------------------------------------------------------------------
+
+
+def _status(door: Door) -> Json:
+    return ask_door(door, {"verb": "status"})
+
+
+def _check_nodes(status: Json, names: Sequence[str]) -> None:
+    known = [str(node["name"]) for node in status["nodes"]]
+    for name in names:
+        if name not in known:
+            raise CliError(EXIT_USAGE, f"fleet {status['fleet']} has no node {name!r}{nearest(name, known)}")
+
+
+def _chosen(status: Json, order: DrainOrder) -> tuple[str, ...]:
+    own = (str(status["node"]),) if order.is_self else ()
+    nodes = tuple(dict.fromkeys((*own, *order.nodes)))
+    _check_nodes(status, nodes)
+    return nodes
+
+
+def _held(view: OrderView) -> InForce:
+    """The document in force, at the revision that the operator means.
+
+    Raises:
+        CliError: none is agreed, it is not here yet, or it was overtaken.
+    """
+    held = in_force(view.door)
+    document_text(held)
+    if view.revision is not None and view.revision != held.revision:
+        raise CliError(EXIT_FAILED, f"revision {view.revision} is overtaken: {held.fleet} has revision {held.revision}")
+    return held
+
+
+def _with(view: OrderView, held: InForce, kind: str, nodes: Sequence[str]) -> tuple[Json, ...]:
+    """The flags with this one of each node; one that a node has stays unless a reason or a duration is given."""
+    flags = list(held.flags)
+    for name in nodes:
+        known = next((flag for flag in flags if (flag["kind"], flag["subject"]) == (kind, name)), None)
+        if known is not None and not view.reason and view.for_s is None:
+            continue
+        flags = [flag for flag in flags if flag is not known]
+        said = {"kind": kind, "subject": name, **view.asked, "for_s": view.for_s, "revision": held.revision + 1}
+        flags.append(said)
+    return tuple(sorted(flags, key=lambda flag: (flag["subject"], flag["kind"])))
+
+
+def _without(held: InForce, kind: str, nodes: Sequence[str]) -> tuple[Json, ...]:
+    return tuple(flag for flag in held.flags if flag["kind"] != kind or flag["subject"] not in nodes)
+
+
+def _check_dangers(accepted: Sequence[str], status: Json, after: Sequence[Json]) -> None:
+    """Refuse to leave a task without a candidate that may get it, unless that is accepted by name."""
+    for name in accepted:
+        if name != NO_OTHER:
+            raise CliError(EXIT_USAGE, f"--accept: there is no danger {name!r}{nearest(name, (NO_OTHER,))}")
+    closed = {flag["subject"] for flag in after}
+    told = [str(task["name"]) for task in status["tasks"] if closed.issuperset(task["candidates"])]
+    if told and not accepted:
+        lines = (
+            f"  {NO_OTHER}: {', '.join(told)}: no candidate may get it any more; when its owner ends, nobody does it"
+        )
+        again = shlex.join(["zsched", *sys.argv[1:], "--accept", NO_OTHER])
+        raise CliError(EXIT_FAILED, f"nothing was changed; if this may be:\n{lines}\n{again}")
+
+
+def _commit(view: OrderView, held: InForce, flags: Sequence[Json], what: str) -> int:
+    """Have a document with these flags agreed; the revision that has them.
+
+    Raises:
+        CliError: it was not agreed.
+    """
+    if tuple(flags) == held.flags:
+        return held.revision
+    asked = view.asked
+    reason = f"{what}, by {asked['by']}" + (f": {asked['reason']}" if asked["reason"] else "")
+    text = {"text": held.text, "flags": list(flags), "base_revision": held.revision, "reason": reason}
+    answer = change(view.door, text)
+    return int(answer["revision"])
+
+
+# --- watching --------------------------------------------------------------------------------------------------------
+
+
+def _owned(status: Json, nodes: Sequence[str]) -> dict[str, str]:
+    return {str(task["name"]): str(task["owner"]) for task in status["tasks"] if task["owner"] in nodes}
+
+
+def _counts(found: Mapping[str, Json], name: str) -> Mapping[str, int]:
+    """What hops of a task's streams have lost and doubled so far, over all nodes that were asked."""
+    tasks = [task for status in found.values() for task in status["tasks"] if task["name"] == name]
+    streams = [stream for task in tasks for stream in task["streams"]]
+    return {key: sum(int(stream[key]) for stream in streams) for key in ("lost", "doubled")}
+
+
+def _watch(watch: _Watch, nodes: Sequence[str], revision: int, deadline_s: float | None) -> int:
+    """Look again and again until the nodes are empty, or the deadline has come."""
+    while True:
+        lacks = _look(watch, nodes, revision)
+        if not lacks:
+            return EXIT_OK
+        passed_s = monotonic_s() - watch.began
+        if deadline_s is not None and passed_s >= deadline_s:
+            left = [name for name in nodes if name not in watch.empty]
+            text = f"{', '.join(left)}: not empty after {span(passed_s)}; the drain stays in force"
+            watch.tell("deadline", "\n".join((text, *(f"  {lack}" for lack in lacks))), nodes=left, missing=lacks)
+            return EXIT_TIMED_OUT
+        time.sleep(PAUSE_S)
+
+
+def _look(watch: _Watch, nodes: Sequence[str], revision: int) -> list[str]:
+    """Tell what is new, and say what is missing yet; who does not answer now is asked again."""
+    try:
+        first = _status(watch.view.door)
+        found = _statuses(watch.view.door, first, nodes)
+    except CliError as error:
+        return [str(error)]
+    if int(first["fleet_revision"]) < revision:
+        return [f"{first['node']} has not learnt revision {revision} yet"]
+    _tell_moves(watch, found)
+    _tell_stays(watch, found)
+    lacks = []
+    for name in nodes:
+        missed = missing(Condition(kind="empty", node=name), found)
+        if not missed and name not in watch.empty:
+            watch.empty.add(name)
+            watch.tell("empty", f"{name}: empty, and gets nothing new until `zsched undrain {name}`", node=name)
+        lacks += missed
+    return lacks
+
+
+def _statuses(door: Door, first: Json, nodes: Sequence[str]) -> dict[str, Json]:
+    """The statuses of all robots and of the drained nodes that are alive; the first one is of the node at the door."""
+    wanted = [
+        str(node["name"])
+        for node in first["nodes"]
+        if node["state"] == "alive" and (node["kind"] == "robot" or node["name"] in nodes)
+    ]
+    found = {str(first["node"]): first}
+    for name in wanted:
+        if name not in found:
+            found[name] = _status(door.to(name))
+    return found
+
+
+def _tell_moves(watch: _Watch, found: Mapping[str, Json]) -> None:
+    """Tell the tasks that have settled elsewhere since the last look."""
+    first = next(iter(found.values()))
+    for task in first["tasks"]:
+        name = str(task["name"])
+        left = watch.owners.get(name)
+        if left is None or task["owner"] in (None, left) or missing(Condition(kind="settled", task=name), found):
+            continue
+        del watch.owners[name]
+        spans = [one["switched_s"] for status in found.values() for one in status["tasks"] if one["name"] == name]
+        switched_s = max((one for one in spans if one is not None), default=None)
+        took = "" if switched_s is None else f", streams switched in {millis(switched_s)}"
+        before, now = watch.before.get(name, {}), _counts(found, name)
+        more: Json = {key: max(now[key] - before.get(key, 0), 0) for key in now}
+        text = f"{name}: {left} -> {task['owner']}{took}, lost {more['lost']}, doubled {more['doubled']}"
+        watch.tell("moved", text, node=left, task=name, to=task["owner"], switched_s=switched_s, **more)
+
+
+def _tell_stays(watch: _Watch, found: Mapping[str, Json]) -> None:
+    """Tell the tasks that have not left, with the reason."""
+    if monotonic_s() - watch.began < STAYS_S:
+        return
+    first = next(iter(found.values()))
+    owners = {str(task["name"]): task["owner"] for task in first["tasks"]}
+    for name, node in watch.owners.items():
+        why = _why_it_stays(name, found)
+        if owners.get(name) == node and why and why != watch.stays.get(name):
+            watch.stays[name] = why
+            watch.tell("stays", f"{name} stays on {node}: {why}", node=node, task=name, reason=why)
+
+
+def _why_it_stays(name: str, found: Mapping[str, Json]) -> str:
+    """The last judgement of some robot, with what keeps the other candidates from the task."""
+    for status in found.values():
+        task = next(one for one in status["tasks"] if one["name"] == name)
+        if task["decision"] is not None:
+            vetoed = task["decision"]["vetoed"]
+            why = "; ".join(f"{other}: {veto}" for other, veto in vetoed.items() if other != task["owner"])
+            return f"{task['decision']['reason']}{f' ({why})' if why else ''}"
+    return ""
