@@ -898,8 +898,8 @@ ORDER_BUGS = (
     _bug(
         "a pin keeps an owner that is gone",
         SCHEDULER,
-        "        if escape is not None:\n            return Outcome.PROPOSE, escape",
-        "        if escape is not None and allocation.home is None:\n            return Outcome.PROPOSE, escape",
+        "        if leaving is not None:\n            return Outcome.PROPOSE, leaving",
+        "        if leaving is not None and allocation.home is None:\n            return Outcome.PROPOSE, leaving",
         _SCHEDULER,
     ),
     _bug(

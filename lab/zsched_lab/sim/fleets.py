@@ -19,6 +19,7 @@ from dataclasses import dataclass, field, replace
 from random import Random
 
 from zsched.core import events as ev
+from zsched.core.values.document import Flag, FlagKind
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.messages import ChangeFleet, CommandOutcome
@@ -32,6 +33,9 @@ FAULTS_S, REST_S = 25.0, 40.0
 ROBOTS = ("robot1", "robot2", "robot3", "robot4")
 EDGES = ("edge1", "edge2")
 STEPS = ("change", "change", "change", "kill", "kill", "power", "cut", "pause", "blackout", "document", "unfit", "lose")
+FLAGGED = 0.5
+"""So often a step of the faults is followed by an operator's order about nodes."""
+FLAG_S = (None, None, 3.0, 10.0)
 
 
 class ScheduleError(AssertionError):
@@ -50,9 +54,11 @@ class Schedule:
     lost: int = 0
     """Disks that were lost."""
     _number: int = 0
+    _says_flags: Random = field(init=False)
 
     def __post_init__(self) -> None:
         self.rng = Random(f"fleets {self.seed}")
+        self._says_flags = Random(f"flags {self.seed}")
         self.fleet = fleet_of(self.rng)
         self.sim = Simulator(fleet=self.fleet, seed=self.seed)
         self.sim.work.stop_s = (0.002, 0.02, 0.1, 0.4)
@@ -70,6 +76,8 @@ class Schedule:
         end = sim.now + FAULTS_S
         while sim.now < end:
             getattr(self, f"_{rng.choice(STEPS)}")()
+            if self._says_flags.random() < FLAGGED:
+                self._flag()
             sim.run(rng.choice((0.01, 0.1, 0.5, 2.0, 4.0)))
         self._calm()
         if not self._can_agree():
@@ -78,6 +86,8 @@ class Schedule:
         if not sim.run_until(self._is_at_rest, REST_S):
             raise ScheduleError(f"not at rest {REST_S:g} s after the faults: {self._why()}")
         self._change_once_more()
+        if not sim.run_until(lambda: not self._timed(), REST_S):
+            raise ScheduleError(f"flags whose time is over are still in force: {self._timed()}")
 
     # --- operators ---------------------------------------------------------------------------------------------------
 
@@ -118,8 +128,34 @@ class Schedule:
         )
         tasks = (first, *extra)
         said = replace(self.fleet, relay_orphan_s=float(self.rng.randint(1, 20)), timing=timing, tasks=tasks)
-        self._tell(ChangeFleet(document=self.sim.documents.write(said)))
+        self._tell(ChangeFleet(document=self.sim.documents.write(said, self._flags())))
         self.done["document"] += 1
+
+    def _flags(self) -> tuple[Flag, ...]:
+        """The flags of the newest document."""
+        value = self._newest()
+        content = None if value is None else self.sim.documents.contents.get(value.document)
+        return () if content is None else content.flags
+
+    def _flag(self) -> None:
+        """Nodes are drained, made ineligible, or neither any more; some node may always get tasks."""
+        value, rng = self._newest(), self._says_flags
+        said = None if value is None else self.sim.documents.says.get(value.document)
+        if value is None or said is None:
+            return
+        names = sorted(self.sim.machines)
+        kind, chosen = rng.choice(list(FlagKind)), set(rng.sample(names, rng.randint(1, len(names) - 1)))
+        kept = [flag for flag in self._flags() if flag.kind is not kind or flag.subject not in chosen]
+        for_s, revision = rng.choice(FLAG_S), value.revision + 1
+        made = [Flag(kind=kind, subject=name, for_s=for_s, revision=revision) for name in sorted(chosen)]
+        flags = tuple(kept) if rng.random() < 0.4 else (*kept, *made)
+        if {flag.subject for flag in flags} != set(names):
+            content = self.sim.documents.write(said, flags)
+            self._tell(ChangeFleet(document=content, base_revision=value.revision))
+            self.done["flags"] += 1
+
+    def _timed(self) -> tuple[Flag, ...]:
+        return tuple(flag for flag in self._flags() if flag.for_s is not None)
 
     def _unfit(self) -> None:
         """Some document is not valid on one machine until the faults end."""
@@ -218,13 +254,26 @@ class Schedule:
         if not first.settled:
             return f"number {first.number} is not settled"
         said = self.sim.documents.says.get(first.document, self.fleet)
-        return unsettled(said, self.sim.machines, self.sim.work.working, self.sim.now)
+        why = unsettled(said, self.sim.machines, self.sim.work.working, self.sim.now)
+        return why or self._ill_flagged(said)
+
+    def _ill_flagged(self, said: Fleet) -> str:
+        """A node that goes by other flags than the document's, or a drained one that has not handed over."""
+        flags = self._flags()
+        drained = {flag.subject for flag in flags if flag.kind is FlagKind.DRAIN}
+        for name in self.sim.running():
+            node = self.sim.node(name)
+            if set(node.flags.drained) != drained or set(node.flags.closed) != {flag.subject for flag in flags}:
+                return f"{name} goes by {node.flags.closed}, the document says {flags}"
+        owners = {task.name: self.sim.agreed(task.name) for task in said.tasks}
+        kept = sorted(f"{task} on {owner}" for task, owner in owners.items() if owner in drained)
+        return f"not handed over: {', '.join(kept)}" if kept else ""
 
     def _change_once_more(self) -> None:
         """What is at rest can be changed again."""
-        command = ChangeFleet(document=self.sim.documents.write(replace(self.fleet, relay_orphan_s=99.0)))
-        outcome = None
+        said, outcome = replace(self.fleet, relay_orphan_s=99.0), None
         for _ in range(3):  # an operator's change of before may still come first
+            command = ChangeFleet(document=self.sim.documents.write(said, self._flags()))
             number = self._tell(command)
             if not self.sim.run_until(lambda number=number: self._outcome(number) is not None, REST_S):  # type: ignore[misc]
                 raise ScheduleError("no answer to a change at rest")

@@ -16,6 +16,7 @@ from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.node import Node
 from zsched.core.status import build_snapshot
+from zsched.core.values.change import MoveOwner
 from zsched.core.values.document import Flag, FlagKind
 from zsched.core.values.fleet import TaskSpec, WorkerSpec, electorate_hash
 from zsched.core.values.messages import CommandOutcome, CommandResult, Hold, HoldTask, Learnt, MoveTask, TuneTask
@@ -251,6 +252,18 @@ def test_a_flagged_node_gets_no_task_by_an_order(kind: FlagKind, why: str) -> No
     assert refused.outcome is CommandOutcome.INVALID
     assert f"edge2 cannot have it: {why}" in refused.detail
     assert lone.move("edge3").outcome is CommandOutcome.OK
+
+
+def test_what_was_voted_for_a_node_before_its_flag_was_known_is_not_proposed() -> None:
+    for flags, owner in (((), "edge2"), ((Flag(kind=FlagKind.DRAIN, subject="edge2"),), "edge1")):
+        lone = Lone()
+        voting = lone.node.votes.tasks["merge"]
+        base = lone.node.registers["merge"].value.revision
+        voting.commit, voting.commit_at = MoveOwner(base_revision=base, owner="edge2", reason="better"), lone.now
+        lone.node.flags.take(flags, lone.now)
+        lone.tell(ev.DeadlineReached())
+        assert lone.node.registers["merge"].value.owner == owner
+        assert voting.commit is None, "votes may be called again"
 
 
 def test_a_status_tells_flags_with_their_age() -> None:
