@@ -186,3 +186,22 @@ def test_without_another_candidate_or_a_robot_the_task_stays() -> None:
     assert (fewer.present, fewer.electors_heard) == (("robot1", "robot2"), ("robot1", "robot2"))
     assert [vector.voter for vector in fewer.vectors] == ["robot1", "robot2"]
     assert judged_again(decision, fewer).verdict.outcome == "stay"
+
+
+def test_an_operator_s_flags_stand_beside_the_sums() -> None:
+    decision = decision_of(
+        drained="drained by ada", closed=(("edge1", "drained by ada"), ("edge2", "takes nothing new, by ada"))
+    )
+    told = explained(decision)
+    check_sums(told, decision)
+    sums = {one.node: one for one in told.candidates}
+    assert (told.outcome, told.candidate, told.is_escape) == ("propose", "edge3", False)
+    assert (sums["edge1"].total, sums["edge1"].bonus, sums["edge1"].why_not) == (None, 0.0, "edge1 is drained by ada")
+    assert (sums["edge2"].total, sums["edge2"].why_not) == (None, "takes nothing new, by ada")
+    assert len(sums["edge2"].robots) == len(ROBOTS), "what they are worth is told all the same"
+    all_closed = decision_of(drained="drained by ada", closed=tuple((name, "drained by ada") for name in EDGES))
+    assert explained(all_closed).changes == (
+        "another candidate must be able to have the task",
+        "edge2 cannot have it: drained by ada",
+        "edge3 cannot have it: drained by ada",
+    )
