@@ -82,8 +82,9 @@ def drain(view: OrderView, order: DrainOrder) -> int:
     held = _held(view)
     after = _with(view, held, DRAIN, nodes)
     rows = [_row(status, name, DRAIN, after) for name in nodes] + list(_task_rows(status, nodes, after))
-    _check_dangers(order.accepted, status, after)
-    plan = _body("planned", nodes=nodes, revision=held.revision, tasks=[row[0] for row in rows if row[1] == "owner"])
+    danger = _check_dangers(view, order.accepted, status, held.flags, after)
+    owned = [row[0] for row in rows if row[1] == "owner"]
+    plan = _body("planned", nodes=nodes, revision=held.revision, tasks=owned, reason=danger)
     is_change = after != held.flags
     if is_change or view.is_plan:
         code = begin(view, rows, plan, is_change=is_change, titles=TITLES, is_line=True)
@@ -129,10 +130,9 @@ def _set(view: OrderView, kind: str, nodes: tuple[str, ...], *, is_on: bool, acc
     _check_nodes(status, nodes)
     held = _held(view)
     after = _with(view, held, kind, nodes) if is_on else _without(held, kind, nodes)
-    if is_on:
-        _check_dangers(accepted, status, after)
+    danger = _check_dangers(view, accepted, status, held.flags, after) if is_on else None
     rows = [_row(status, name, kind, after) for name in nodes]
-    plan = _body("planned", nodes=nodes, revision=held.revision)
+    plan = _body("planned", nodes=nodes, revision=held.revision, reason=danger)
     code = begin(view, rows, plan, is_change=after != held.flags, titles=TITLES, is_line=True)
     if code is not None:
         return code
@@ -257,19 +257,32 @@ def _without(held: InForce, kind: str, nodes: Sequence[str]) -> tuple[Json, ...]
     return tuple(flag for flag in held.flags if flag["kind"] != kind or flag["subject"] not in nodes)
 
 
-def _check_dangers(accepted: Sequence[str], status: Json, after: Sequence[Json]) -> None:
-    """Refuse to leave a task without a candidate that may get it, unless that is accepted by name."""
+def _check_dangers(
+    view: OrderView, accepted: Sequence[str], status: Json, before: Sequence[Json], after: Sequence[Json]
+) -> str | None:
+    """The danger that some task loses its last candidate that may get it, in words; a plan shows it.
+
+    Raises:
+        CliError: it is there, and is not accepted by name.
+    """
     for name in accepted:
         if name != NO_OTHER:
             raise CliError(EXIT_USAGE, f"--accept: there is no danger {name!r}{nearest(name, (NO_OTHER,))}")
-    closed = {flag["subject"] for flag in after}
-    told = [str(task["name"]) for task in status["tasks"] if closed.issuperset(task["candidates"])]
-    if told and not accepted:
-        lines = (
-            f"  {NO_OTHER}: {', '.join(told)}: no candidate may get it any more; when its owner ends, nobody does it"
-        )
+    was, closed = ({flag["subject"] for flag in flags} for flags in (before, after))
+    told = [
+        str(task["name"])
+        for task in status["tasks"]
+        if closed.issuperset(task["candidates"]) and not was.issuperset(task["candidates"])
+    ]
+    if not told:
+        return None
+    means = f"{NO_OTHER}: {', '.join(told)}: no candidate may get it any more; when its owner ends, nobody does it"
+    if view.is_plan and not view.is_json:
+        sys.stdout.write(harmless(means) + "\n")
+    if not view.is_plan and not accepted:
         again = shlex.join(["zsched", *sys.argv[1:], "--accept", NO_OTHER])
-        raise CliError(EXIT_FAILED, f"nothing was changed; if this may be:\n{lines}\n{again}")
+        raise CliError(EXIT_FAILED, f"nothing was changed; if this may be:\n  {means}\n{again}")
+    return means
 
 
 def _commit(view: OrderView, held: InForce, flags: Sequence[Json], what: str) -> int:

@@ -48,6 +48,7 @@ class Node:
         self.changes: list[Json] = []
         self.outcome = "ok"
         self.is_fetching = False
+        self.drained: list[str] = []
         self.refused = "nothing"
         """The kind of change that another operator has overtaken."""
 
@@ -56,7 +57,8 @@ class Node:
         if self.states[node] != "alive":
             return {"error": f"{node} did not answer within 3 s"}
         if verb == "status":
-            nodes = [{"name": name, "state": state} for name, state in self.states.items()]
+            flags = {name: [{"kind": "drain"}] for name in self.drained}
+            nodes = [{"name": one, "state": self.states[one], "flags": flags.get(one, [])} for one in self.states]
             digest = self.files.get(node, digest_of(self.text))
             tasks = [{"name": "merge", "owner": self.owner}]
             return {"fleet": "hall", "nodes": nodes, "tasks": tasks, "fleet_file": digest, "schema": "zsched.status/1"}
@@ -325,6 +327,9 @@ def test_a_node_may_go_that_is_no_last_elector_and_owns_nothing_while_it_lives(n
     owner = run("node", "remove", "robot1", "--yes")
     assert owner.exit_code == 1
     assert "robot1 is alive and owns merge; `zsched drain robot1` first" in owner.stderr
+    node.drained = ["robot1"]
+    drained = run("node", "remove", "robot1", "--yes")
+    assert "owns merge; it is drained: `zsched drain robot1` says what it waits for" in drained.stderr
     assert "robot2 is alive: zsched node remove robot2" in run("node", "forget", "robot2", "--yes").stderr
     accepted = ("--accept", "remove-node", "--accept", "change-electors")
     assert run("node", "remove", "robot2", "--yes", *accepted[:2]).exit_code == 1

@@ -152,6 +152,11 @@ def test_a_task_without_a_candidate_is_a_danger_that_is_accepted_by_name(daemon:
     assert (result.exit_code, daemon.changes) == (1, [])
     assert "no-other-candidate: echo, merge: no candidate may get it any more" in result.stderr
     assert run("drain", "edge1", "--accept", "all", "--yes").exit_code == 2
+    (planned,) = events("drain", "edge1", "edge2", "--plan")
+    assert planned["reason"].startswith("no-other-candidate: echo, merge: ")
+    said = {"by": "ada@robot1", "reason": "", "for_s": None, "revision": 2, "kind": "drain"}
+    daemon.set_flags([{"subject": name, **said} for name in ("edge1", "edge2")])
+    assert run("eligible", "robot1", "off", "--yes").exit_code == 0, "it was so before"
 
 
 def test_it_is_watched_until_the_node_is_empty_and_every_move_is_told(daemon: Daemon) -> None:
