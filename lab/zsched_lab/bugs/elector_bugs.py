@@ -218,6 +218,11 @@ ELECTOR_BUGS: tuple[Bug, ...] = (
         ("beat.lease_terms == self.terms and beat.number == self.number", "beat.lease_terms == self.terms"),
     ),
     _numbers_bug(
+        "a longer lease counts from a beat of the number before",
+        LEASE,
+        ("self.first_number = max(self.first_number, self._sent[-1][0] + 1)", "self.first_number += 0"),
+    ),
+    _numbers_bug(
         "a change of the electors ends the owner's lease",
         LEASE,
         ("        self._kept_until = self.lease_until()\n", ""),

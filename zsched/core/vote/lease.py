@@ -253,8 +253,14 @@ class Holder:
         return self._kept_until if at is None else max(self._kept_until, at + self.lease_s)
 
     def count_with(self, electors: tuple[NodeId, ...], lease_s: float) -> None:
-        """Count echoes of other electors from now on; what is held by the old ones runs to its end."""
+        """Count echoes of other electors from now on; what is held by the old ones runs to its end.
+
+        Only of beats that are sent from now on: a grant of an earlier beat is guarded with the length of before, though
+        its elector may echo it under the new terms.
+        """
         self._kept_until = self.lease_until()
+        if self._sent:
+            self.first_number = max(self.first_number, self._sent[-1][0] + 1)
         self.electors, self.lease_s = electors, lease_s
         self._echoed.clear()
 

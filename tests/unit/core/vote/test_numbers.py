@@ -388,6 +388,18 @@ def test_lease_shortened_a_later_grant_does_not_end_an_earlier_longer_one() -> N
     assert elector.may_accept("merge", "robot3", 10.0 + hold_s(L))
 
 
+def test_lease_lengthened_a_beat_of_before_holds_no_longer_than_its_grant_is_guarded() -> None:
+    """Electors may echo what they granted under the number before; they guard it with the shorter length."""
+    one = renumbered(holder(), lease_s=10 * L)
+    for name in ("robot2", "robot3"):
+        one.on_beat(replace(beat(2, name, 6), echoes=echoes(name, "robot1", 5)), {}, 10.2)
+    assert one.until("merge") == 10.0 + L
+    one.on_sent(6, 10.3)
+    for name in ("robot2", "robot3"):
+        one.on_beat(replace(beat(2, name, 7), echoes=echoes(name, "robot1", 6)), {}, 10.4)
+    assert one.until("merge") == 10.3 + 10 * L
+
+
 def test_task_removed_and_added_grants_are_remembered_by_name() -> None:
     elector = leases()
     assert elector.on_beat(beat(0), OWNERS, 10.0)
