@@ -317,6 +317,7 @@ def test_a_paused_task_is_moved_by_order_and_every_node_says_who_did_it(tmp_path
             0,
         )
         assert body["switched_s"] is not None
+        assert body["gap_s"] is None, "nothing flows"
         for site in (robot, edge1, edge2):
             end = time.monotonic() + UP_S
             while (task := site.status()["tasks"][0])["owner"] != there.node:

@@ -126,6 +126,11 @@ def moves_of(entries: Iterable[Json], now: float, task: str | None) -> Iterator[
     """The changes of owner among a log's entries, as ``zsched.history/1`` has them; ``now``: the node's wall clock."""
     entries = list(entries)
     took = {(entry["task"], entry["epoch"], entry["life"]): entry["took_s"] for entry in entries if "took_s" in entry}
+    gaps: dict[tuple[str, int], float] = {}
+    for entry in entries:
+        if "gap_s" in entry:
+            key = (entry["task"], entry["epoch"])
+            gaps[key] = max(entry["gap_s"], gaps.get(key, 0.0))
     for entry in entries:
         move = entry.get("move")
         if move is None or task not in (None, entry["task"]):
@@ -141,6 +146,7 @@ def moves_of(entries: Iterable[Json], now: float, task: str | None) -> Iterator[
             "reason": move["reason"],
             "votes": dict(move.get("votes", ())),
             "switched_s": took.get((entry["task"], move["epoch"], entry["life"])),
+            "gap_s": gaps.get((entry["task"], move["epoch"])),
         }
 
 
@@ -150,6 +156,7 @@ def _move_line(move: Json) -> str:
         camps.setdefault(choice, []).append(voter)
     votes = "; ".join(f"{', '.join(voters)} for {choice}" for choice, voters in camps.items())
     switched = "" if move["switched_s"] is None else f", streams switched in {millis(move['switched_s'])}"
+    switched += "" if move["gap_s"] is None else f", no answer for {millis(move['gap_s'])}"
     where = f"{move['from'] or 'nobody'} -> {move['to'] or 'nobody'}"
     head = f"{span(move['age_s']):>6} ago  {move['at']}  {move['task']} epoch {move['epoch']}  {where}"
     return f"{head}: {move['reason']}{f' ({votes})' if votes else ''}{switched}\n"

@@ -31,6 +31,8 @@ TUNING_SCHEMA: Final = "zsched.tuning/1"
 MAINT_SCHEMA: Final = "zsched.maint/1"
 PAUSE_S: Final = 0.2
 """Between two looks at a move."""
+GAP_S: Final = 3.0
+"""How long a settled move is watched for the new owner's first answers; the relays count once a second."""
 CODES: Final = {
     "ok": EXIT_OK,
     "unchanged": EXIT_OK,
@@ -244,7 +246,8 @@ def move(view: OrderView, order: MoveOrder) -> int:
         raise _refused(order.task, plan)
     row = (order.task, "owner", str(task["owner"] or "nobody"), order.node)
     body: Json = {"schema": MOVE_SCHEMA, "task": order.task, "from": task["owner"], "to": order.node, "epoch": None}
-    body |= {"revision": task["revision"], "settled": False, "switched_s": None, "lost": None, "doubled": None}
+    body |= {"revision": task["revision"], "settled": False, "switched_s": None, "gap_s": None}
+    body |= {"lost": None, "doubled": None}
     code = begin(view, [row], {**body, "missing": []}, is_change=plan["outcome"] == "ok")
     if code is not None:
         return code
@@ -262,18 +265,32 @@ def move(view: OrderView, order: MoveOrder) -> int:
 
 def _watch(door: Door, order: MoveOrder, revision: int) -> tuple[dict[str, Json], list[str]]:
     """Every robot's status once the move is over, and what is missing when it is not in time."""
-    began = monotonic_s()
+    began, settled_at = monotonic_s(), None
     while True:
         first = _status(door)
         found = _robots(door, first)
+        now = monotonic_s()
         task = next(task for task in first["tasks"] if task["name"] == order.task)
         statuses = {str(first["node"]): first, **found}
         lacks = missing(Condition(kind="settled", task=order.task), statuses)
         if task["revision"] < revision:
             lacks.append(f"{order.task}: {first['node']} has not learnt revision {revision}")
-        if not lacks or monotonic_s() - began >= order.timeout_s:
+        settled_at = (settled_at or now) if not lacks else None
+        is_measured = settled_at is not None and (not unmeasured(found, order.task) or now - settled_at >= GAP_S)
+        if is_measured or now - began >= order.timeout_s:
             return found, lacks
         time.sleep(PAUSE_S)
+
+
+def unmeasured(statuses: Mapping[str, Json], name: str) -> list[str]:
+    """The robots at which answers flow, and the new owner's first one is not told yet."""
+    found = []
+    for node, status in statuses.items():
+        task = next(one for one in status["tasks"] if one["name"] == name)
+        flows = [stream for stream in task["streams"] if stream.get("gap_s") is not None]
+        if flows and task.get("gap_s") is None:
+            found.append(node)
+    return found
 
 
 def _robots(door: Door, status: Json) -> dict[str, Json]:
@@ -306,12 +323,14 @@ def _tell_move(
     tasks = [task for status in found.values() for task in status["tasks"] if task["name"] == order.task]
     switched = [task["switched_s"] for task in tasks if task.get("switched_s") is not None]
     switched_s = max(switched, default=None)
+    gap_s = max([task["gap_s"] for task in tasks if task.get("gap_s") is not None], default=None)
     after = _counts(found, order.task)
     more: dict[str, Any] = {key: max(after[key] - before[key], 0) if found else None for key in before}
     epoch = max([int(task["epoch"]) for task in tasks], default=None)
     if view.is_json:
         body = {"schema": MOVE_SCHEMA, "task": order.task, "from": left or None, "to": order.node, "epoch": epoch}
         body |= {"revision": result["revision"], "settled": bool(found) and not lacks, "switched_s": switched_s}
+        body |= {"gap_s": gap_s}
         print_json({**body, **more, "missing": list(lacks)})
     elif not found:
         sys.stdout.write(
@@ -322,6 +341,7 @@ def _tell_move(
         sys.stdout.writelines(f"  {harmless(lack)}\n" for lack in lacks)
     else:
         took = "" if switched_s is None else f", streams switched in {millis(switched_s)}"
+        took += "" if gap_s is None else f", no answer for at most {millis(gap_s)}"
         told = f"{order.task}: settled on {order.node}{took}, lost {more['lost']}, doubled {more['doubled']}\n"
         sys.stdout.write(told)
     return EXIT_TIMED_OUT if lacks else EXIT_OK

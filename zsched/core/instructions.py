@@ -266,6 +266,9 @@ class RecordStory:
     """With it, this is a change of owner."""
     took_s: float | None = None
     """With it, this node's streams have switched to the owner of ``epoch``, so long after it learnt the value."""
+    gap_s: float | None = None
+    """With it, one of this node's output streams was without an answer for so long, until the owner of ``epoch``
+    answered."""
 
 
 # --- of the fleet register -------------------------------------------------------------------------------------------

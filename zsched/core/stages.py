@@ -32,6 +32,7 @@ from zsched.core.membership.relink import Introductions
 from zsched.core.membership.solitude import Solitude
 from zsched.core.profile.profile import Profiler
 from zsched.core.profile.relay_ends import RelayEnds
+from zsched.core.route.gaps import StreamGaps
 from zsched.core.route.rates import StreamRates
 from zsched.core.scheduler.flags import NodeFlags
 from zsched.core.scheduler.probation import Probation
@@ -167,6 +168,7 @@ class Stages:
         self.dropped: dict[str, tuple[int, float]] = {}
         """{stream: (how many samples it has dropped, when that last rose)}."""
         self.rates = StreamRates()
+        self.gaps = StreamGaps()
         self.frames_dropped_at: float | None = None
         """When the newest invalid frame came."""
         self.unready: dict[TaskId, Unready] = {}

@@ -315,8 +315,9 @@ def _task_status(node: Stages, spec: TaskSpec, now: float) -> TaskStatus:
         pin=_hold(node, value, "pin", now),
         file_tuning=spec.tuning,
         switched_s=executor.switched_s,
+        gap_s=_move_gap(node, executor),
         streams=tuple(
-            _with_rate(_with_keys(_with_age(count, node.dropped, now), routes.get(count.stream)), node, now)
+            _with_flow(_with_keys(_with_age(count, node.dropped, now), routes.get(count.stream)), node, now)
             for count in node.stream_counts
             if count.stream.startswith(prefix)
         ),
@@ -434,9 +435,19 @@ def _with_keys(count: StreamCount, route: Route | None) -> StreamCount:
     return count if route is None else replace(count, from_expr=route.from_expr, to_expr=route.to_expr)
 
 
-def _with_rate(count: StreamCount, node: Stages, now: float) -> StreamCount:
-    rate = node.rates.of(count.stream, now)
+def _with_flow(count: StreamCount, node: Stages, now: float) -> StreamCount:
+    """How fast it flows, and its longest gap."""
+    rate, gap_s = node.rates.of(count.stream, now), node.gaps.of(count.stream, now)
+    count = replace(count, gap_s=gap_s) if gap_s != count.gap_s else count
     return count if rate is None else replace(count, hz=rate[0], bytes_per_s=rate[1])
+
+
+def _move_gap(node: Stages, executor: Executor) -> float | None:
+    """How long this robot's applications had no answer at the newest move."""
+    prefix = f"{executor.spec.name}/"
+    counts = [count for count in node.stream_counts if count.stream.startswith(prefix)]
+    gaps = [count.move_gap_s for count in counts if count.move_gap_s is not None and count.move_epoch == executor.epoch]
+    return max(gaps, default=None)
 
 
 def _decision(standing: TaskRound, now: float) -> DecisionStatus | None:

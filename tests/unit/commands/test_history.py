@@ -64,7 +64,7 @@ class Pages:
             raise CliError(EXIT_UNREACHABLE, "no daemon")
         first = int(request["cursor"] or 0)
         page = self.entries[first : first + 2]
-        wanted = [one for one in page if not request["moves"] or "move" in one or "took_s" in one]
+        wanted = [one for one in page if not request["moves"] or "move" in one or "took_s" in one or "gap_s" in one]
         at = first + len(page)
         return {"node": "robot1", "now": NOW, "entries": wanted, "cursor": str(at), "more": at < len(self.entries)}
 
@@ -76,6 +76,8 @@ def pages(monkeypatch: pytest.MonkeyPatch) -> Pages:
         entry("learnt", 90.0, move=MOVE),
         entry("judged", 80.0),
         entry("flipped", 70.0, took_s=0.086),
+        entry("answered", 69.0, gap_s=0.12),
+        entry("answered", 68.0, gap_s=0.3),
         entry("learnt \x1b[2J", 60.0, task="other", move={**MOVE, "left": None, "votes": []}),
     )
     monkeypatch.setattr(verb, "ask_door", made.ask)
@@ -95,7 +97,7 @@ def test_moves_are_told_with_age_wall_time_votes_and_how_long_the_streams_took(
     assert capsys.readouterr().out.splitlines() == [
         (
             " 1m30s ago  2026-09-21T14:11:50.000Z  merge epoch 2  edge1 -> edge2: edge1 is gone "
-            "(robot1, robot2 for edge2; robot3 for edge1), streams switched in 86 ms"
+            "(robot1, robot2 for edge2; robot3 for edge1), streams switched in 86 ms, no answer for 300 ms"
         ),
         " 1m00s ago  2026-09-21T14:12:20.000Z  other epoch 2  nobody -> edge2: edge1 is gone",
     ]
@@ -121,6 +123,7 @@ def test_moves_of_one_task_as_json(capsys: pytest.CaptureFixture[str]) -> None:
                 "reason": "edge1 is gone",
                 "votes": {"robot1": "edge2", "robot2": "edge2", "robot3": "edge1"},
                 "switched_s": 0.086,
+                "gap_s": 0.3,
             }
         ],
     }
@@ -134,11 +137,14 @@ def test_events_of_one_task_and_of_the_last_time(capsys: pytest.CaptureFixture[s
     assert capsys.readouterr().out.splitlines() == [
         "2026-09-21T14:12:00.000Z vote       task=merge epoch=2 judged",
         "2026-09-21T14:12:10.000Z vote       task=merge epoch=2 flipped",
+        "2026-09-21T14:12:11.000Z vote       task=merge epoch=2 answered",
+        "2026-09-21T14:12:12.000Z vote       task=merge epoch=2 answered",
     ]
     assert events(HERE, view(is_json=True)) == 0
     found = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert [faults({"schema": "zsched.event/1", **one}) for one in found] == [[]] * len(found)
-    assert [one["text"] for one in found] == ["a peer came", "learnt", "judged", "flipped", "learnt \x1b[2J"]
+    told = ["a peer came", "learnt", "judged", "flipped", "answered", "answered", "learnt \x1b[2J"]
+    assert [one["text"] for one in found] == told
     assert events(HERE, view()) == 0
     assert "\x1b" not in capsys.readouterr().out
 

@@ -56,6 +56,7 @@ class Entry:
     epoch: int = 0
     move: Move | None = None
     took_s: float | None = None
+    gap_s: float | None = None
     decision: Decision | None = None
     """Last, for readers that do without it."""
 
@@ -135,6 +136,7 @@ class DecisionLog:
             epoch=story.epoch,
             move=story.move,
             took_s=story.took_s,
+            gap_s=story.gap_s,
             decision=story.decision,
         )
         return json.dumps(as_plain(entry), separators=(",", ":")).encode() + b"\n"
@@ -176,7 +178,7 @@ def _parsed(line: bytes) -> Json | None:
 
 
 def _is_of_move(line: bytes) -> bool:
-    return b',"move":' in line or b',"took_s":' in line
+    return any(mark in line for mark in (b',"move":', b',"took_s":', b',"gap_s":'))
 
 
 def without_figures(line: bytes) -> bytes:

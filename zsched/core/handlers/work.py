@@ -16,6 +16,7 @@ from zsched.core.stages import Handler, PastValue, Stages, Unready
 from zsched.core.todo import ToDo
 from zsched.core.values.decision import Move
 from zsched.core.values.model import Allocation, NodeId, PeerState, TaskId, Weights, WorkerState, told_by
+from zsched.core.values.plan import StreamCount
 from zsched.core.vote.register import FROM_A_PEER
 
 # --- learnt values ---------------------------------------------------------------------------------------------------
@@ -162,14 +163,26 @@ def _on_role_ended(node: Stages, event: ev.RoleEnded, todo: ToDo, _now: float) -
     todo.must_beat |= node.agreement.leases.on_stopped(event.task, event.epoch, node.beat_sequence)
 
 
-def _on_counted(node: Stages, event: ev.StreamsCounted, _todo: ToDo, now: float) -> None:
+def _on_counted(node: Stages, event: ev.StreamsCounted, todo: ToDo, now: float) -> None:
     node.stream_counts = event.counts
     for count in event.counts:
         dropped = sum(number for _, number in count.drops)
         if dropped and node.dropped.get(count.stream, (0, 0.0))[0] != dropped:
             node.dropped[count.stream] = (dropped, now)
     node.rates.absorb(event.counts, now)
+    for count in node.gaps.absorb(event.counts, now):
+        _tell_gap(node, count, todo)
     node.hangs.absorb(event.counts, node.executors, now)
+
+
+def _tell_gap(node: Stages, count: StreamCount, todo: ToDo) -> None:
+    """A new owner's first answer has passed: how long this robot's applications had none."""
+    task = count.stream.partition("/")[0]
+    if task not in node.executors or count.move_gap_s is None:
+        return
+    text = f"{count.stream}: {count.move_gap_s * 1000:.0f} ms between the last answer of one owner and the next one's"
+    epoch, gap_s = count.move_epoch, count.move_gap_s
+    todo.add(do.RecordStory(stage="route", text=text, task=task, epoch=epoch, gap_s=gap_s))
 
 
 def _on_relay(node: Stages, event: ev.RelayChanged, _todo: ToDo, now: float) -> None:

@@ -214,6 +214,13 @@ class StreamCount:
     answer_s: float | None = None
     """Outputs: mean seconds from inputs to their answers since the count before, network included. An answer without
     its input's timestamp counts since the newest input before it: a lower bound."""
+    gap_s: float | None = None
+    """Outputs: the longest time between two answers that passed, since the count before; ``None``: no two have passed.
+    The status tells the longest of the last seconds (`zsched.core.route.gaps`)."""
+    move_gap_s: float | None = None
+    """Outputs: seconds between the last answer of the owner before and the first one of `move_epoch`."""
+    move_epoch: int = 0
+    """Outputs: the newest epoch whose owner has answered after another one's; 0: there was none."""
     from_expr: str = ""
     """Filled in by the status: the keys of the newest slot, empty while the task has no owner."""
     to_expr: str = ""

@@ -164,6 +164,9 @@ class TaskStatus:
     """The tuning that the answering node's fleet file gives it."""
     switched_s: float | None = None
     """How long this robot's streams took to switch to the owner; ``None``: they have not yet, or it is an edge."""
+    gap_s: float | None = None
+    """The longest time, over this robot's output streams, between the last answer of the owner before and the first
+    one of this owner; ``None``: this owner has not answered yet, no other one answered before, or it is an edge."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

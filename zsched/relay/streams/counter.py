@@ -27,6 +27,11 @@ class StreamCounter:
         self.unsent = 0
         self._answers = 0
         self._answers_s = 0.0
+        self._passed_at: float | None = None
+        self._passed_epoch = 0
+        self._gap_s: float | None = None
+        self._move_gap_s: float | None = None
+        self._move_epoch = 0
 
     def seen(self, size: int) -> None:
         """A sample of ``size`` bytes came in."""
@@ -39,6 +44,22 @@ class StreamCounter:
         if took_s is not None:
             self._answers += 1
             self._answers_s += took_s
+
+    def passed(self, epoch: int, now: float) -> None:
+        """An answer of the owner of ``epoch`` went on to the applications at ``now`` (monotonic seconds)."""
+        before = self._passed_at
+        if before is not None:
+            gap_s = max(0.0, now - before)
+            if self._gap_s is None or gap_s > self._gap_s:
+                self._gap_s = gap_s
+            if epoch > self._passed_epoch:
+                self._move_gap_s, self._move_epoch = gap_s, epoch
+        self._passed_at, self._passed_epoch = now, max(epoch, self._passed_epoch)
+
+    @property
+    def last_seen(self) -> float:
+        """When the newest sample came in (monotonic seconds); now, before the first."""
+        return monotonic_s() if self._last_seen is None else self._last_seen
 
     def dropped(self, reason: str, count: int = 1) -> None:
         """``count`` samples did not go on, because of ``reason``."""
@@ -58,6 +79,7 @@ class StreamCounter:
         age = None if self._last_seen is None else round(max(0.0, monotonic_s() - self._last_seen), 3)
         answer_s = round(self._answers_s / self._answers, 4) if self._answers else None
         self._answers, self._answers_s = 0, 0.0
+        gap_s, self._gap_s = self._gap_s, None
         return StreamCount(
             stream=self.stream,
             messages=self._messages,
@@ -75,4 +97,7 @@ class StreamCounter:
             unsent=self.unsent,
             unconfirmed=said.unconfirmed,
             answer_s=answer_s,
+            gap_s=None if gap_s is None else round(gap_s, 4),
+            move_gap_s=None if self._move_gap_s is None else round(self._move_gap_s, 4),
+            move_epoch=self._move_epoch,
         )

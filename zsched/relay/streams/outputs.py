@@ -266,6 +266,7 @@ class OutputStream:
             if self._pace is None or not self._is_latest:
                 return
             for sample in self._pace.overdue(monotonic_s()):
+                self._note_passed(monotonic_s())
                 self._counter.dropped(*self._outlet.send(sample))
 
     def count(self) -> StreamCount:
@@ -392,9 +393,14 @@ class OutputStream:
             self._stamps[sample.timestamp] = None
             if len(self._stamps) > MAX_STAMPS:
                 self._stamps.popitem(last=False)
+        self._note_passed(monotonic_s() if size is None else self._counter.last_seen)
         reason, dropped = self._outlet.send(sample, None, size)
         if dropped:
             self._counter.dropped(reason, dropped)
+
+    def _note_passed(self, now: float) -> None:
+        if self._carrier is not None:
+            self._counter.passed(self._carrier.epoch, now)
 
     def _end(self, sample: Sample) -> None:
         """An end marker came (zenoh's callback thread: note it, wake the task, nothing else)."""

@@ -407,6 +407,9 @@ def test_with_all_the_new_owner_waits_for_the_old_ones_last(bench: Bench) -> Non
     move.put(move.new, "new 2")
     assert move.is_through("old 1", "old 2", "new 1", "new 2")
     assert drops(move.stream) == {}
+    counted = move.stream.count()
+    assert counted.move_epoch == 2
+    assert counted.move_gap_s is not None
 
 
 def test_an_end_whose_samples_were_dropped_counts_after_a_grace_time(bench: Bench) -> None:
