@@ -486,7 +486,9 @@ def weights(
     task: Annotated[str, typer.Argument(metavar="TASK", help="A task of the fleet file.")],
     pairs: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[NAME=NUMBER]", help="New weights: cpu, memory, network; left out is 0, the sum is 1."),
+        typer.Argument(
+            metavar="[NAME=NUMBER]", help="New weights: cpu, memory, network, gauges; left out is 0, the sum is 1."
+        ),
     ] = None,
     revision: Annotated[
         int | None, typer.Option("--revision", min=0, metavar="N", help="Only if this is still the task's revision.")

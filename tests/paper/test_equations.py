@@ -191,7 +191,7 @@ def test_constraint_weights_lie_in_zero_to_one() -> None:
     """Constraint of Eq. 6: omega in [0...1]."""
     for bad in ({"cpu": 1.2, "memory": -0.2, "network": 0.0}, {"cpu": -0.1, "memory": 0.6, "network": 0.5}):
         with pytest.raises(ValueError, match="weights"):
-            Weights(**bad)
+            Weights(**bad, gauges=())
 
 
 def test_constraint_weights_sum_to_one() -> None:

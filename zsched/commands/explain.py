@@ -14,9 +14,11 @@ from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, nearest, print_json
 from zsched.commands.page import Cell, Page, memory, span
 from zsched.commands.report import printable
+from zsched.commands.weights import shares
 from zsched.core.report import plain
 from zsched.core.scheduler.explain import explained, judged_again, without
 from zsched.core.values.decision import Decision, Explanation
+from zsched.core.values.model import PAPER_METRICS
 from zsched.errors import WireError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
 from zsched.wire.codec import from_plain
@@ -161,7 +163,7 @@ def _judgement(page: Page, title: str, body: Json) -> None:
 
 def _tuning(page: Page, body: Json) -> None:
     tuning = body["tuning"]
-    weights = " ".join(f"{name} {value:g}" for name, value in tuning["weights"].items())
+    weights = " ".join(f"{name} {value:g}" for name, value in shares(tuning["weights"]).items())
     deadline = [] if tuning["deadline_ms"] is None else [(f"deadline {tuning['deadline_ms']:g} ms", "")]
     page.block(
         "TUNING",
@@ -199,16 +201,18 @@ def _vote(page: Page, body: Json) -> None:
 def _candidates(page: Page, body: Json) -> None:
     robots = [view["robot"] for one in body["candidates"] for view in one["robots"]]
     first = min(max([9, *map(len, robots), *(len(one["node"]) for one in body["candidates"])]), 20)
-    columns = (first, first, -7, -7, -7, -8, page.width)
-    titles = ("CANDIDATE", "robot", "cpu", "mem", "net", "utility", "")
-    page.row(*zip(titles, columns, ("stage", *["dim"] * 6), strict=True))
+    gauges = [name for name in shares(body["tuning"]["weights"]) if name not in PAPER_METRICS]
+    columns = (first, first, -7, -7, -7, *(-max(len(name), 7) for name in gauges), -8, page.width)
+    titles = ("CANDIDATE", "robot", "cpu", "mem", "net", *gauges, "utility", "")
+    page.row(*zip(titles, columns, ("stage", *["dim"] * (len(columns) - 1)), strict=True))
     for one in body["candidates"]:
         for number, view in enumerate(one["robots"]):
             name = "" if number else one["node"]
             note = view["refused"] or ("" if view["reachable"] else "does not reach it")
-            terms = [_number(view[term]) for term in ("cpu", "memory", "network", "utility")]
-            cells = (name, view["robot"], *terms, note)
-            styles = ("bold" if one["is_owner"] else "", "", "", "", "", "", "red")
+            terms = [_number(view[term]) for term in PAPER_METRICS]
+            terms += [_number(view["gauges"].get(gauge)) for gauge in gauges]
+            cells = (name, view["robot"], *terms, _number(view["utility"]), note)
+            styles = ("bold" if one["is_owner"] else "", *[""] * (len(columns) - 2), "red")
             page.row(*zip(cells, columns, styles, strict=True))
         if not one["robots"]:
             page.row((one["node"], first, "bold" if one["is_owner"] else ""))

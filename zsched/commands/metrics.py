@@ -80,6 +80,9 @@ def _of_nodes(nodes: list[Json]) -> Iterator[Family]:
     yield "zsched_node_cpu_used_cores", "gauge", "Cores in use.", _each(nodes, "cpu_used_cores")
     yield "zsched_node_memory_bytes", "gauge", "Memory.", _each(nodes, "memory_mb", MIB)
     yield "zsched_node_memory_used_bytes", "gauge", "Memory in use.", _each(nodes, "memory_used_mb", MIB)
+    readings = [(n["name"], name, value) for n in nodes for name, value in n.get("gauges", {}).items()]
+    told = [({"node": node, "gauge": name}, value) for node, name, value in readings]
+    yield "zsched_node_gauge", "gauge", "GPU in use and battery as ratios, temperature in Celsius.", told
     links = [(n["name"], link) for n in nodes for link in n["links"] if link["rssi_dbm"] is not None]
     signals = [({"node": name, "peer": link["peer"] or ""}, link["rssi_dbm"]) for name, link in links]
     yield "zsched_link_rssi_dbm", "gauge", "Signal of a radio link; peer is empty where it is to all.", signals

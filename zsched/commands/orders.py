@@ -22,6 +22,7 @@ from zsched.commands.common import CliError, Json, nearest, print_json
 from zsched.commands.page import harmless, span
 from zsched.commands.report import FLAGS, millis, told_flag, told_hold
 from zsched.commands.wait import Condition, missing
+from zsched.commands.weights import NAMES, shares
 from zsched.core.values.model import MAX_ASKED, MAX_ASKER, MAX_FOR_S, Aggregate, ScoreForm, Tuning, Weights
 from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE, EXIT_WOULD_CHANGE
 
@@ -351,7 +352,7 @@ def _tell_move(
 
 _NUMBERS: Final = ("bonus", "cool_down_s", "deadline_ms")
 _WORDS: Final[Mapping[str, type[Aggregate | ScoreForm]]] = {"aggregate": Aggregate, "score": ScoreForm}
-WEIGHTS: Final = ("cpu", "memory", "network")
+WEIGHTS: Final = NAMES
 KEYS: Final = (*WEIGHTS, *_NUMBERS, *_WORDS)
 
 
@@ -365,7 +366,8 @@ def tuned(before: Json, file: Json, pairs: Sequence[str]) -> dict[str, Any]:
     Raises:
         CliError: a word is no such pair, or the key or its value is unknown.
     """
-    after = {**before, "weights": dict(before["weights"])}
+    after = {**before, "weights": shares(before["weights"])}
+    by_file = shares(file["weights"])
     seen = set[str]()
     for pair in pairs:
         key, equals, text = pair.partition("=")
@@ -377,8 +379,10 @@ def tuned(before: Json, file: Json, pairs: Sequence[str]) -> dict[str, Any]:
         if key in seen:
             raise CliError(EXIT_USAGE, f"{pair!r}: {key} is given twice; give it once")
         seen.add(key)
-        place, source = (after["weights"], file["weights"]) if key in WEIGHTS else (after, file)
-        place[key] = source[key] if text == "null" else _setting(pair, key, text)
+        place, source = (after["weights"], by_file) if key in WEIGHTS else (after, file)
+        default = source.get(key, 0.0) if key in WEIGHTS else source[key]
+        place[key] = default if text == "null" else _setting(pair, key, text)
+    after["weights"] = shares(after["weights"])
     return after
 
 
@@ -408,9 +412,9 @@ def tune(view: OrderView, name: str | None, pairs: Sequence[str]) -> int:
     tuning = _checked(after)
     flat_before, flat_after = _flat(task["tuning"]), _flat(after)
     rows = [
-        (name, key, _figure(flat_before[key]), _figure(flat_after[key]))
+        (name, key, _figure(flat_before.get(key, 0.0)), _figure(flat_after.get(key, 0.0)))
         for key in KEYS
-        if flat_before[key] != flat_after[key]
+        if flat_before.get(key, 0.0) != flat_after.get(key, 0.0)
     ]
     told = {"task": name, "revision": task["revision"], "tuning": flat_after, "file": _flat(_file_tuning(task))}
     planned = {**told, "outcome": "planned" if rows else "unchanged", "detail": ""}
@@ -437,7 +441,7 @@ def _checked(after: Json) -> Json:
     try:
         deadline_ms = after.get("deadline_ms")
         tuning = Tuning(
-            weights=Weights(**after["weights"]),
+            weights=Weights.of(after["weights"]),
             bonus=after["bonus"],
             cool_down_s=after["cool_down_s"],
             aggregate=Aggregate(after["aggregate"]),
@@ -459,7 +463,8 @@ def _file_tuning(task: Json) -> Json:
 
 
 def _flat(tuning: Json) -> Json:
-    return {key: tuning["weights"][key] if key in WEIGHTS else tuning.get(key) for key in KEYS}
+    """Every setting; of the gauges' weights those above 0."""
+    return {**shares(tuning["weights"]), **{key: tuning.get(key) for key in KEYS if key not in WEIGHTS}}
 
 
 def _figure(value: Any) -> str:
@@ -481,7 +486,11 @@ def _list_tunings(view: OrderView, tasks: Sequence[Json]) -> int:
         return EXIT_OK
     for task in tasks:
         now, file = _flat(task["tuning"]), _flat(_file_tuning(task))
-        words = [f"{key}={_figure(now[key])}{_differs(now[key], file[key])}" for key in KEYS]
+        words = [
+            f"{key}={_figure(now.get(key, 0.0))}{_differs(now.get(key, 0.0), file.get(key, 0.0))}"
+            for key in KEYS
+            if key in now or key in file
+        ]
         sys.stdout.write(f"{harmless(str(task['name']))} (revision {task['revision']}): {' '.join(words)}\n")
     return EXIT_OK
 

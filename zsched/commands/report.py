@@ -10,6 +10,8 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from zsched.commands.page import Cell, Page, cut, memory, none_for, since_drop, size, span
+from zsched.commands.weights import shares
+from zsched.core.values.gauges import BY_NAME
 from zsched.core.values.model import NEVER_INITIALISED, RESTARTING, WAS_READY, WorkerState, told_of_worker
 
 Json = dict[str, Any]
@@ -78,6 +80,7 @@ def render_status(status: Json, width: int, color: bool, at: float | None = None
     page.lines.append("")
     node_rows(page, shown, "PROFILE")
     flag_rows(page, shown)
+    _gauges(page, shown["nodes"])
     _gateway(page, shown["nodes"])
     _electors(page, shown["quorum"])
     for task in shown["tasks"]:
@@ -175,6 +178,23 @@ def state_word(node: Json) -> str:
     if node["draining"]:
         return "draining"
     return "drained" if "drain" in kinds else "no new" if kinds else "alive"
+
+
+def _gauges(page: Page, nodes: Sequence[Json]) -> None:
+    """The gauges of those nodes that measure any."""
+    told = [(node["name"], node.get("gauges") or {}) for node in nodes]  # a later field of the schema's major version
+    rows = [
+        (" ".join((name, *(f"{gauge} {_reading(gauge, value)}" for gauge, value in gauges.items()))), "")
+        for name, gauges in told
+        if gauges
+    ]
+    if rows:
+        page.block("GAUGES", *rows)
+
+
+def _reading(gauge: str, value: float) -> str:
+    """As its gauge shows it; a newer daemon may know others."""
+    return BY_NAME[gauge].shown(value) if gauge in BY_NAME else f"{value:g}"
 
 
 def _node_cells(node: Json, bar: int, *, is_me: bool, is_wide: bool) -> list[tuple[str, str]]:
@@ -357,7 +377,7 @@ def millis(seconds: float) -> str:
 
 def _scheduler(page: Page, status: Json, task: Json) -> None:
     tuning, decision = task["tuning"], task["decision"]
-    weights = " ".join(f"{name} {value:g}" for name, value in tuning["weights"].items())
+    weights = " ".join(f"{name} {value:g}" for name, value in shares(tuning["weights"]).items())
     patience = task.get("patience")  # a later field of the schema's major version
     page.block(
         "SCHEDULER",

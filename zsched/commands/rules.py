@@ -13,6 +13,7 @@ from zsched.core.scheduler.links import FORESEE_MOST_DB
 from zsched.core.scheduler.patience import CHOICES, FIRST_PATIENCE, spend
 from zsched.core.scheduler.utility import NEARLY_FULL
 from zsched.core.values.fleet import PairReading, TaskSpec, Timing
+from zsched.core.values.gauges import BY_NAME
 from zsched.core.values.model import ScoreForm
 
 LEADS = (0.5, 0.1)
@@ -42,7 +43,7 @@ def _worth(spec: TaskSpec) -> Iterator[str]:
     """What a machine is worth to the task."""
     tuning, weights = spec.tuning, spec.tuning.weights
     is_service = tuning.score is ScoreForm.SERVICE
-    shares = ", ".join(f"{name} {getattr(weights, name):g}" for name in ("cpu", "memory", "network"))
+    shares = ", ".join(f"{name} {weight:g}" for name, weight in weights.shares)
     worth = "the share of its work that it gets done there" if is_service else "what is left free there (Eq. 1 and 2)"
     yield f"a machine is worth {worth} (score: {tuning.score}); weights: {shares}"
     if tuning.deadline_ms is not None:
@@ -55,6 +56,11 @@ def _worth(spec: TaskSpec) -> Iterator[str]:
         yield f"a machine that it leaves less than {floor} of the memory free {less} (memory_floor_ratio)"
     else:
         yield f"an owner with less than {floor} of its memory free is left at once (memory_floor_ratio)"
+    for name, limit in spec.gauge_limits:
+        gauge = BY_NAME[name]
+        side, unknown = ("below" if gauge.is_floor else "above"), ("refused" if gauge.is_needed else "taken")
+        told = f"a machine with {gauge.says} {side} {gauge.shown(limit)} is left, or not taken (limits.{name})"
+        yield f"{told}; one where it is not measured is {unknown}"
     reach = f"a candidate counts that {_REACH[spec.reach.value]} (reach)"
     yield f"{reach}; the robots' {tuning.aggregate} decides (aggregate)"
 

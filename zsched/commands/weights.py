@@ -11,10 +11,12 @@ from collections.abc import Iterable
 
 from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, nearest, print_json
+from zsched.core.values.gauges import BY_NAME
+from zsched.core.values.model import PAPER_METRICS
 from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE
 
 SCHEMA = "zsched.weights/1"
-NAMES = ("cpu", "memory", "network")
+NAMES = (*PAPER_METRICS, *BY_NAME)
 SUM_TOLERANCE = 1e-6
 """As `zsched.core.values.model.Weights`."""
 
@@ -35,7 +37,7 @@ ADVICE = {
 
 
 def parse_weights(pairs: Iterable[str]) -> dict[str, float]:
-    """All three weights out of ``name=number`` words; what is left out is 0.
+    """The weights out of ``name=number`` words; what is left out is 0, and of the gauges only what has a weight.
 
     >>> parse_weights(["cpu=0.6", "memory=0.4"])
     {'cpu': 0.6, 'memory': 0.4, 'network': 0.0}
@@ -55,10 +57,20 @@ def parse_weights(pairs: Iterable[str]) -> dict[str, float]:
         found[name] = _number(pair, text)
     total = math.fsum(found.values())
     if not math.isclose(total, 1.0, abs_tol=SUM_TOLERANCE):
-        left_out = [name for name in NAMES if name not in found]
+        left_out = [name for name in PAPER_METRICS if name not in found]
         zeros = f" ({', '.join(left_out)} left out: 0)" if left_out else ""
         raise CliError(EXIT_USAGE, f"the weights' sum is {total:g}{zeros}, not 1; change one of them")
-    return {name: found.get(name, 0.0) for name in NAMES}
+    return shares(found)
+
+
+def shares(weights: Json) -> dict[str, float]:
+    """``{metric: weight}`` of a status' weights, or of some: the paper's three, and the gauges that have one.
+
+    >>> shares({"cpu": 0.7, "memory": 0.0, "network": 0.0, "gauges": {"gpu": 0.3}})
+    {'cpu': 0.7, 'memory': 0.0, 'network': 0.0, 'gpu': 0.3}
+    """
+    found = {**weights, **weights.get("gauges", {})}  # a later field of the schema's major version
+    return {name: found.get(name, 0.0) for name in NAMES if name in PAPER_METRICS or found.get(name)}
 
 
 def show_weights(door: Door, task: str, *, is_json: bool) -> None:
@@ -72,7 +84,7 @@ def show_weights(door: Door, task: str, *, is_json: bool) -> None:
     if task not in tasks:
         raise CliError(EXIT_USAGE, f"fleet {status['fleet']} has no task {task!r}{nearest(task, list(tasks))}")
     found = tasks[task]
-    _print(task, found["tuning"]["weights"], found["revision"], is_json=is_json, more={})
+    _print(task, shares(found["tuning"]["weights"]), found["revision"], is_json=is_json, more={})
 
 
 def change_weights(door: Door, task: str, wanted: dict[str, float], revision: int | None, *, is_json: bool) -> int:
@@ -105,7 +117,7 @@ def _print(task: str, weights: dict[str, float], revision: int | None, *, is_jso
     if is_json:
         print_json({"schema": SCHEMA, "task": task, "weights": weights, "revision": revision, **more})
         return
-    text = " ".join(f"{name}={weights[name]:g}" for name in NAMES)
+    text = " ".join(f"{name}={weight:g}" for name, weight in weights.items())
     notes = [f"revision {revision}"] if revision is not None else []
     notes += ["unchanged"] if more.get("outcome") == "unchanged" else []
     note = f" ({', '.join(notes)})" if notes else ""

@@ -21,7 +21,7 @@ from zsched.config.rows import rows
 from zsched.core.route.route import outputs_of
 from zsched.core.route.templates import named_rules
 from zsched.core.values.fleet import Fleet, NodeSpec, StreamRule, TaskSpec, WorkerSpec, dial_endpoint, runs_worker
-from zsched.core.values.model import NodeId, NodeKind, TaskId
+from zsched.core.values.model import NodeId, NodeKind, TaskId, Weights
 
 EVERY_DAEMON: Final = "every daemon must be restarted"
 
@@ -347,7 +347,13 @@ def _task(old: TaskSpec, new: TaskSpec, fleets: tuple[Fleet, Fleet], owner: Node
     yield from _rules(old, new)
 
 
-_OWN_KEYS: Final = {"demand": "demand", "limits": "link", "on_isolation": "on_isolation", "drain_s": "drain_s"}
+_OWN_KEYS: Final = {
+    "demand": "demand",
+    "limits": "link",
+    "gauge_limits": "limits",
+    "on_isolation": "on_isolation",
+    "drain_s": "drain_s",
+}
 """Fields of a task that one key of the task makes, and that nothing else follows from."""
 
 
@@ -434,6 +440,8 @@ def _restart(text: str, path: str, before: object, after: object) -> _Verdict:
 
 def _plain(value: Any) -> Any:
     """A record as the file writes it."""
+    if isinstance(value, Weights):
+        return "{" + ", ".join(f"{name}: {weight:g}" for name, weight in value.shares) + "}"
     if hasattr(value, "__dataclass_fields__"):
         pairs = ((one.name, getattr(value, one.name)) for one in fields(value))
         return "{" + ", ".join(f"{name}: {_text(held)}" for name, held in pairs) + "}"
@@ -446,5 +454,5 @@ def _text(value: object) -> str | None:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, tuple):
-        return ", ".join(" ".join(item) if isinstance(item, tuple) else str(item) for item in value)
+        return ", ".join(" ".join(map(str, item)) if isinstance(item, tuple) else str(item) for item in value)
     return f"{value:g}" if isinstance(value, float) else str(value)

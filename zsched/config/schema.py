@@ -47,6 +47,7 @@ from zsched.core.values.fleet import (
     Timing,
     WorkerSpec,
 )
+from zsched.core.values.gauges import GAUGES, Gauge
 from zsched.core.values.model import (
     MAX_DEADLINE_MS,
     MIN_DEADLINE_MS,
@@ -182,13 +183,33 @@ SELECTOR: Final = Record(
 _NODES: Final = Forms(listing=_NAMES, mapping=SELECTOR)
 
 _SHARE: Final = Number(0, 1)
+
+
+def _weight_told(gauge: Gauge) -> str:
+    unknown = "cannot have the task" if gauge.is_needed else "counts 1"
+    best, worst = gauge.shown(gauge.best), gauge.shown(gauge.worst)
+    return f"Weight of {gauge.says}: {best} is worth 1, {worst} nothing. A node without it {unknown}."
+
+
+def _limit_told(gauge: Gauge) -> str:
+    beyond, inside = ("below", "above") if gauge.is_floor else ("above", "below")
+    back = f"{gauge.margin * 100:g} %" if not gauge.unit else f"{gauge.margin:g} {gauge.unit}"
+    return f"Limit of {gauge.says}. The owner is left {beyond} it; a node becomes a candidate {back} {inside} it."
+
+
 WEIGHTS: Final = Record(
     "the weights section",
     {
-        "cpu": Field(_SHARE, "Weight of free CPU (Eq. 1). The three weights sum to 1.", default="`0`"),
+        "cpu": Field(_SHARE, "Weight of free CPU (Eq. 1). All weights sum to 1.", default="`0`"),
         "memory": Field(_SHARE, "Weight of free memory (Eq. 2).", default="`0`"),
         "network": Field(_SHARE, "Weight of the radio link (Eq. 3).", default="`0`"),
+        **{gauge.name: Field(_SHARE, _weight_told(gauge), default="`0`") for gauge in GAUGES},
     },
+)
+
+LIMITS: Final = Record(
+    "a limits section",
+    {gauge.name: Field(Number(gauge.low, gauge.high, gauge.unit), _limit_told(gauge)) for gauge in GAUGES},
 )
 
 DEMAND: Final = Record("a demand", keys(Demand))
@@ -303,9 +324,10 @@ TASK: Final = Record(
         "candidates": Field(_NODES, "The nodes that may own the task: names, or a selection.", required=True),
         "weights": Field(
             WEIGHTS,
-            "How much CPU, memory and network count in a candidate's score (Eq. 4); their sum is 1.",
+            "How much CPU, memory, network and gauges count in a candidate's score (Eq. 4); their sum is 1.",
             required=True,
         ),
+        "limits": Field(LIMITS, "How far a candidate's gauges may go."),
         "demand": Field(DEMAND, "What the task needs, before it was ever measured."),
         "scheduling": Field(SCHEDULING, "When a better candidate is worth a move."),
         "link": Field(LINK_LIMITS, "The limits of Eq. 3."),

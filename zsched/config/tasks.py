@@ -39,7 +39,8 @@ from zsched.core.values.fleet import (
     TaskSpec,
     WorkerSpec,
 )
-from zsched.core.values.model import NodeKind, Objective, ScoreForm, Tuning, Weights
+from zsched.core.values.gauges import BY_NAME
+from zsched.core.values.model import PAPER_METRICS, NodeKind, Objective, ScoreForm, Tuning, Weights
 from zsched.core.values.plan import (
     Direction,
     HandoverRule,
@@ -96,12 +97,14 @@ def _task(
     scheduling: Section | None = given.get("scheduling")
     more = {} if scheduling is None else _of(scheduling, *_OF_THE_TASK)
     demand: Section | None = given.get("demand")
+    gauge_limits: Section | None = given.get("limits")
     task = TaskSpec(
         name=name,
         candidates=candidates or _ANY_CANDIDATES,
         tuning=tuning or _ANY_TUNING,
         demand=(demand.build(Demand, out) if demand is not None else None) or Demand(),
         limits=limits,
+        gauge_limits=() if gauge_limits is None else tuple(sorted(gauge_limits.values.items())),
         worker=worker,
         rules=tuple(stream.value for stream in streams),
         patience=_patience(scheduling, (tuning or _ANY_TUNING).weights),
@@ -138,8 +141,9 @@ def _tuning(given: Section, out: Collector) -> Tuning | None:
     weights_given: Section | None = given.get("weights")
     if weights_given is None:
         return None
-    shares = dict.fromkeys(("cpu", "memory", "network"), 0.0)
-    weights = weights_given.build(Weights, out, **{**shares, **weights_given.values})
+    gauges = tuple((name, weights_given.values[name]) for name in sorted(BY_NAME) if weights_given.get(name))
+    three = {name: weights_given.get(name, 0.0) for name in PAPER_METRICS}
+    weights = weights_given.build(Weights, out, **three, gauges=gauges)
     if weights is None:
         return None
     scheduling: Section | None = given.get("scheduling")

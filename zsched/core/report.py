@@ -53,10 +53,15 @@ def _stream(count: StreamCount) -> Json:
     return {**plain(count), "drops": dict(count.drops)}
 
 
+def _plain_field(name: str, value: Any) -> Any:
+    """Pairs of a gauge and a number become an object."""
+    return dict(value) if name == "gauges" else plain(value)
+
+
 def plain(value: Any) -> Any:
     """A frozen value as JSON values, field by field."""
     if is_dataclass(value) and not isinstance(value, type):
-        return {field.name: plain(getattr(value, field.name)) for field in fields(value)}
+        return {field.name: _plain_field(field.name, getattr(value, field.name)) for field in fields(value)}
     if isinstance(value, tuple):
         return [plain(item) for item in value]
     if isinstance(value, Enum):

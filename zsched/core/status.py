@@ -17,6 +17,7 @@ from zsched.core.stages import Stages, Unready
 from zsched.core.values.decision import Explanation
 from zsched.core.values.document import Flag
 from zsched.core.values.fleet import NodeSpec, TaskSpec
+from zsched.core.values.gauges import possible
 from zsched.core.values.model import (
     NEVER_INITIALISED,
     RESTARTING,
@@ -276,6 +277,7 @@ def _node_status(node: Stages, spec: NodeSpec, now: float) -> NodeStatus:
         speed=profile.speed,
         cpu_pressure=profile.cpu_pressure,
         flags=flags,
+        gauges=possible(profile.gauges),
     )
 
 

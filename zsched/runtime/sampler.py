@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import logging
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 from zsched.adapters.machine import core_speed
 from zsched.adapters.machine.device_profiler import DeviceProfiler
+from zsched.adapters.machine.gauges import GaugeWatch
 from zsched.adapters.radio.network_profiler import readers_for
-from zsched.clock import ClockWatch
+from zsched.clock import ClockWatch, monotonic_s
 from zsched.core import events as ev
 from zsched.core.values.fleet import NodeSpec
 from zsched.core.vote.clocks import is_bad
@@ -28,7 +30,7 @@ class Sampler:
     def __init__(self, spec: NodeSpec, period_s: float, state_dir: Path, shell: Shell, inbox: Inbox) -> None:
         self._links, self._readers = spec.links, readers_for(spec)
         self._state_dir = state_dir
-        self._device, self._clocks = DeviceProfiler(), ClockWatch()
+        self._device, self._clocks, self._gauges = DeviceProfiler(), ClockWatch(), GaugeWatch()
         self._period_s, self._shell, self._inbox = period_s, shell, inbox
         self._stop = threading.Event()
         self._problems: dict[str, str | None] = {}
@@ -36,6 +38,7 @@ class Sampler:
 
     def start(self) -> None:
         """Begin measuring."""
+        self._gauges.start()
         self._thread.start()
 
     def adopt(self, spec: NodeSpec, period_s: float) -> None:
@@ -47,6 +50,7 @@ class Sampler:
     def stop(self) -> None:
         """End measuring; the thread ends with its current reading."""
         self._stop.set()
+        self._gauges.stop()
         self._thread.join(timeout=0.5)
 
     def _run(self) -> None:
@@ -82,6 +86,7 @@ class Sampler:
         supervisor = self._shell.crew.supervisor
         states, pids = (supervisor.states(), supervisor.pids()) if supervisor is not None else ({}, {})
         device = self._device.sample({task: (state, pids.get(task)) for task, state in states.items()})
+        device = replace(device, gauges=self._gauges.newest(monotonic_s()))
         readers = self._readers
         links = tuple(reader.read() for reader in readers)
         self._inbox.post_quietly(ev.ProfileSampled(device=device, links=links))

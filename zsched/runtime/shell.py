@@ -39,6 +39,7 @@ from zsched.core.report import snapshot_json
 from zsched.core.values.decision import Explanation
 from zsched.core.values.document import Document, Flag, Text
 from zsched.core.values.fleet import Fleet
+from zsched.core.values.gauges import GAUGES
 from zsched.core.values.messages import (
     ChangeFleet,
     Command,
@@ -196,9 +197,17 @@ class Desk:
 def _weights_of(request: dict[str, Any]) -> SetWeights:
     base = _whole(request, "base_revision")
     cpu, memory, network = (float(request[name]) for name in ("cpu", "memory", "network"))
-    if not all(map(math.isfinite, (cpu, memory, network))):
+    gauges = tuple((gauge.name, float(request[gauge.name])) for gauge in GAUGES if request.get(gauge.name))
+    if not all(map(math.isfinite, (cpu, memory, network, *dict(gauges).values()))):
         raise ValueError("expected finite numbers")
-    return SetWeights(task=str(request["task"]), cpu=cpu, memory=memory, network=network, base_revision=base)
+    return SetWeights(
+        task=str(request["task"]),
+        cpu=cpu,
+        memory=memory,
+        network=network,
+        base_revision=base,
+        gauges=tuple(sorted(gauges)),
+    )
 
 
 def _asked_of(request: dict[str, Any]) -> Asked:

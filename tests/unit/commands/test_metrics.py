@@ -119,3 +119,10 @@ def test_a_place_that_cannot_be_written_is_said(folder: Path) -> None:
     result = CliRunner().invoke(app, ["metrics", "write", str(folder / "none" / "zsched.prom")])
     assert result.exit_code == 1
     assert "cannot be written: No such file or directory" in result.stderr
+
+
+def test_gauges_are_told_by_name() -> None:
+    status = recorded()
+    node = status["nodes"][0]
+    node["gauges"] = {"battery": 0.8}
+    assert values(metrics_text(status), "zsched_node_gauge") == {(node["name"], "battery"): 0.8}

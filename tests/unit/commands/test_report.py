@@ -493,3 +493,13 @@ def test_what_a_worker_says_of_its_jobs_is_shown_with_the_deadline_and_what_miss
     assert "· deadline 100 ms" in text
     owner["workers"][0]["jobs"] = None
     assert "JOBS" not in render_status(status, 120, color=False), "nothing is told"
+
+
+def test_gauges_stand_under_the_nodes_where_any_is_measured() -> None:
+    status = recorded("healthy")
+    assert "GAUGES" not in render_status(status, width=100, color=False)
+    status["nodes"][0]["gauges"] = {"battery": 0.843, "temperature_c": 51.2}
+    status["nodes"][1]["gauges"] = {"gpu": 0.3, "wind": 4.0}
+    (line,) = (row for row in render_status(status, width=100, color=False).splitlines() if row.startswith("GAUGES"))
+    names = [node["name"] for node in status["nodes"]]
+    assert f"{names[0]} battery 84 % temperature_c 51 °C · {names[1]} gpu 30 % wind 4" in line

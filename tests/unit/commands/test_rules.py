@@ -35,6 +35,7 @@ def test_every_setting_is_named_with_its_key() -> None:
         (replace(SPEC, learns_patience=True), "at first, 0.33 to 3.7 s by what it has learnt; by 0.1"),
         (replace(SPEC, tuning=replace(RADIO, bonus=0.2)), "; by 0.1 never"),
         (SPEC, "below -80 dBm (link.nu_dbm)"),
+        (replace(SPEC, gauge_limits=(("battery", 0.2),)), "the battery's charge below 20 % is left, or not taken"),
         (SPEC, "signals count as they are (link.foresee_s)"),
         (replace(SPEC, limits=LinkLimits(foresee_s=3.0)), "as they will be in 3 s, at most 6 dB away (link.foresee_s)"),
         (replace(SPEC, limits=LinkLimits(pair=PairReading.WEAKER)), "the weaker of the two ways counts"),

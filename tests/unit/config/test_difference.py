@@ -200,6 +200,8 @@ def differing(value: Any, *left_out: str) -> list[Any]:
             continue
         if isinstance(held, Weights):
             found.append(replace(value, weights=Weights(cpu=1.0, memory=0.0, network=0.0)))
+        elif one.name == "gauge_limits":
+            found.append(replace(value, gauge_limits=(("battery", 0.2),)))
         elif hasattr(held, "__dataclass_fields__"):
             found += [replace(value, **{one.name: inner}) for inner in differing(held)]
         elif held is not None:

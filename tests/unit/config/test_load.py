@@ -770,3 +770,24 @@ def test_importing_config_loads_neither_the_yaml_reader_nor_anything_heavy() -> 
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
     ).stdout
     assert not set(printed.split()) & {"ruamel", "pydantic", "numpy", "asyncio", "zenoh", "msgpack"}
+
+
+def test_gauges_have_weights_limits_and_a_demand() -> None:
+    text = GOOD.replace("weights: {cpu: 0.5, memory: 0.5, network: 0.0}", "weights: {cpu: 0.5, gpu: 0.3, battery: 0.2}")
+    text = text.replace("memory_mb: 250}", "memory_mb: 250, gpu: 0.4}\n    limits: {temperature_c: 85, battery: 0.2}")
+    (task,) = fleet_of(text).tasks
+    assert dict(task.tuning.weights.shares) == {"cpu": 0.5, "memory": 0.0, "network": 0.0, "gpu": 0.3, "battery": 0.2}
+    assert task.gauge_limits == (("battery", 0.2), ("temperature_c", 85.0))
+    assert task.demand.gpu == 0.4
+
+
+@pytest.mark.parametrize(
+    ("line", "said", "at"),
+    [
+        ("weights: {cpu: 0.5, gpu: 0.3}", "the sum is 0.8, not 1", "{cpu: 0.5, gpu"),
+        ("weights: {cpu: 1}\n    limits: {battery: 20}", "20 is not in the allowed range 0..1", "20}\n"),
+        ("weights: {cpu: 1}\n    limits: {temperature: 85}", "temperature", "temperature: 85"),
+    ],
+)
+def test_faults_of_weights_and_limits_are_shown_where_they_stand(line: str, said: str, at: str) -> None:
+    only_fault(GOOD.replace("weights: {cpu: 0.5, memory: 0.5, network: 0.0}", line), said, at)

@@ -91,7 +91,7 @@ def _has_failed(node: Stages, task: TaskId, owner: NodeId | None, now: float) ->
 
 
 def _told(weights: Weights) -> str:
-    return f"cpu={weights.cpu:g} memory={weights.memory:g} network={weights.network:g}"
+    return " ".join(f"{name}={weight:g}" for name, weight in weights.shares)
 
 
 # --- workers ---------------------------------------------------------------------------------------------------------

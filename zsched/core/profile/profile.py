@@ -19,6 +19,7 @@ from zsched.core.events import WorkerJobs
 from zsched.core.profile.jobs import JobMeter
 from zsched.core.profile.means import STALE_S, Ewma
 from zsched.core.values.fleet import Timing
+from zsched.core.values.gauges import possible
 from zsched.core.values.model import (
     MAX_BITRATE_MBPS,
     MAX_CPU_CORES,
@@ -32,6 +33,7 @@ from zsched.core.values.model import (
     LinkSource,
     NodeId,
     Profile,
+    Readings,
     Renewal,
     TaskId,
     TaskProgress,
@@ -45,6 +47,8 @@ JOB_SMOOTHING_S = 1.0
 """Least time constant for jobs: one or two in a sample are no rate."""
 JOB_CHANGE = 0.2
 """This change of the share of done jobs, or this relative change of time per job, sends a profile at once."""
+GAUGE_SMOOTHING_S = 2.0
+"""Least time constant of a gauge: a GPU's use jumps between 0 and 1 with every job."""
 RSSI_CHANGE_DB = 1.0
 RSSI_IMPOSSIBLE_ABOVE_DBM = -10.0
 RSSI_IMPOSSIBLE_BELOW_DBM = -100.0
@@ -111,6 +115,7 @@ class Profiler:
         self._memory = Ewma(timing.smoothing_s)
         self._pressure = Ewma(timing.smoothing_s)
         self._runnable = Ewma(timing.smoothing_s)
+        self._gauges: dict[str, Ewma] = {}
         self._signals: dict[NodeId | None, SignalFilter] = {}
         self._worker_cpu: dict[TaskId, Ewma] = {}
         self._worker_memory: dict[TaskId, Ewma] = {}
@@ -134,7 +139,7 @@ class Profiler:
             return
         for mean in (self._cpu, self._memory, self._pressure, self._runnable):
             mean.tau_s = timing.smoothing_s
-        for known in (self._signals, self._worker_cpu, self._worker_memory, self._jobs):
+        for known in (self._gauges, self._signals, self._worker_cpu, self._worker_memory, self._jobs):
             known.clear()
 
     def absorb(self, device: DeviceSample, links: tuple[LinkSample, ...], now: float) -> None:
@@ -146,10 +151,20 @@ class Profiler:
         _absorb_use(self._memory, self._worker_memory, device.memory_used_mb, worker_memory, MAX_MEMORY_MB, now)
         _absorb_known(self._pressure, device.cpu_pressure, 1.0, now)
         _absorb_known(self._runnable, device.runnable, MAX_RUNNABLE, now)
+        self._absorb_gauges(possible(device.gauges), now)
         self._links = tuple(self._link(sample, now) for sample in links)
         for meter in self._jobs.values():
             meter.look(now)
         self._workers = tuple(self._worker(load) for load in device.workers)
+
+    def _absorb_gauges(self, readings: Readings, now: float) -> None:
+        """Smooth each reading; a gauge without one has no mean, too."""
+        self._gauges = {
+            name: self._gauges.get(name) or Ewma(max(self._timing.smoothing_s, GAUGE_SMOOTHING_S))
+            for name, _ in readings
+        }
+        for name, reading in readings:
+            self._gauges[name].update(reading, now)
 
     def note_jobs(self, report: WorkerJobs, now: float) -> bool:
         """Take a worker's report of its jobs in; whether it is possible."""
@@ -268,7 +283,13 @@ class Profiler:
             speed=self._device.speed,
             cpu_pressure=self._pressure.value if is_measured else None,
             runnable=self._runnable.value if is_measured else None,
+            gauges=self._readings() if is_measured else (),
         )
+
+    def _readings(self) -> Readings:
+        """The means of all gauges, in as many digits as tell something."""
+        means = ((name, mean.value) for name, mean in self._gauges.items())
+        return tuple((name, round(value, 3)) for name, value in means if value is not None)
 
 
 def _signal_tau_s(timing: Timing) -> float:

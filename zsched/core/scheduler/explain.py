@@ -15,10 +15,10 @@ from dataclasses import dataclass, replace
 from zsched.core.scheduler.damping import WINDOW_S, Damping
 from zsched.core.scheduler.decision import Decided, decide_again, verdict_of
 from zsched.core.scheduler.judge import Outcome
-from zsched.core.scheduler.scoring import METRICS, Standing, joined, pick, rounded
+from zsched.core.scheduler.scoring import Standing, joined, pick, rounded
 from zsched.core.scheduler.utility import total_utility
 from zsched.core.values.decision import Decision, Figures, Verdict
-from zsched.core.values.model import Aggregate, NodeId, PeerState, Tuning, Utility, UtilityVector
+from zsched.core.values.model import Aggregate, NodeId, PeerState, Readings, Tuning, Utility, UtilityVector
 from zsched.core.values.quorum import majority
 
 _TIE = 1 / 512
@@ -35,6 +35,8 @@ class RobotView:
     cpu: float | None = None
     memory: float | None = None
     network: float | None = None
+    gauges: Readings = ()
+    """Of the gauges that the task weighs."""
     reachable: bool = True
     refused: str = ""
     """Why this robot did not score it; empty: it did."""
@@ -156,7 +158,7 @@ def utility_of(utility: Utility, tuning: Tuning) -> float | None:
     """A robot's utility made again from its terms; 0 for a candidate that it does not reach."""
     if not utility.reachable:
         return 0.0
-    measured = frozenset(name for name in METRICS if getattr(utility, name) is not None)
+    measured = frozenset(name for name, term in utility.terms.items() if term is not None)
     return total_utility(
         tuning.weights,
         cpu=utility.cpu,
@@ -164,6 +166,7 @@ def utility_of(utility: Utility, tuning: Tuning) -> float | None:
         network=utility.network,
         measured=measured,
         form=tuning.score,
+        gauges=dict(utility.gauges),
     )
 
 
@@ -212,6 +215,7 @@ def _views(name: NodeId, standing: Standing) -> Iterator[RobotView]:
                     cpu=one.cpu,
                     memory=one.memory,
                     network=one.network,
+                    gauges=one.gauges,
                     reachable=one.reachable,
                 )
 

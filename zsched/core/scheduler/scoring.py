@@ -26,6 +26,7 @@ from zsched.core.scheduler.utility import (
     total_utility,
 )
 from zsched.core.values.fleet import Demand, Reach, Standby, TaskSpec
+from zsched.core.values.gauges import BY_NAME, possible
 from zsched.core.values.model import (
     Aggregate,
     Allocation,
@@ -41,8 +42,6 @@ from zsched.core.values.model import (
 )
 from zsched.core.values.quorum import majority
 
-METRICS = ("cpu", "memory", "network")
-
 Bookings = Mapping[NodeId, tuple[TaskSpec, ...]]
 """{owner: its tasks}: of a task that has just come, profiles show nothing yet."""
 
@@ -57,11 +56,17 @@ def rounded(aggregate: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _Terms:
-    """Eq. 1-3 for one candidate; ``None`` where the metric is not measured."""
+    """Eq. 1-3 for one candidate; ``None`` where the metric is not measured. Of the gauges the weighed ones."""
 
     cpu: float | None
     memory: float | None
     network: float | None
+    gauges: Mapping[str, float]
+
+    def names(self) -> frozenset[str]:
+        """The measured metrics."""
+        three = {"cpu": self.cpu, "memory": self.memory, "network": self.network}
+        return frozenset((*(name for name, term in three.items() if term is not None), *self.gauges))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -140,10 +145,13 @@ def score(
         least = min(share, demand.cpu_cores)
         cpu = _cpu(spec, profile, demand, unseen, allocation.tuning, gateway.demands, network_s, least)
         memory = _memory(spec, profile, demand, unseen, form)
-        terms[candidate] = _Terms(cpu, memory, None if link is None else link.utility)
-    measured = frozenset(name for name in METRICS if any(getattr(t, name) is not None for t in terms.values()))
+        gauges = _gauges(spec, allocation, profile)
+        terms[candidate] = _Terms(cpu, memory, None if link is None else link.utility, gauges)
+    measured = frozenset[str]().union(*(term.names() for term in terms.values()))
     utilities = [Utility(candidate=name, value=0.0, reachable=False) for name in unreachable]
     for candidate, term in terms.items():
+        assumed = {name: 1.0 for name in sorted(measured - term.names()) if name in BY_NAME and _is_assumed(name)}
+        by_gauge = {**term.gauges, **assumed}
         value = total_utility(
             allocation.tuning.weights,
             cpu=term.cpu,
@@ -151,12 +159,20 @@ def score(
             network=term.network,
             measured=measured,
             form=form,
+            gauges=by_gauge,
         )
         if value is None:
             refused.append((candidate, "a weighted metric is not measured"))
             continue
         utilities.append(
-            Utility(candidate=candidate, value=value, cpu=term.cpu, memory=term.memory, network=term.network)
+            Utility(
+                candidate=candidate,
+                value=value,
+                cpu=term.cpu,
+                memory=term.memory,
+                network=term.network,
+                gauges=tuple(sorted(by_gauge.items())),
+            )
         )
     return UtilityVector(
         voter=voter,
@@ -225,7 +241,37 @@ def _refusal(spec: TaskSpec, allocation: Allocation, profile: Profile, demand: D
     used = _memory_use(profile, spec, demand, unseen)
     if used is not None and used > profile.memory_mb:
         return f"needs {demand.memory_mb:.0f} MiB, has {max(profile.memory_mb - used + demand.memory_mb, 0.0):.0f} free"
-    return ""
+    return _beyond_limits(spec, profile, is_owner=is_owner)
+
+
+def _beyond_limits(spec: TaskSpec, profile: Profile, *, is_owner: bool) -> str:
+    """Why the machine's gauges forbid the task; empty: they do not."""
+    readings = _readings(spec, profile, is_owner=is_owner) if spec.gauge_limits else {}
+    faults = (BY_NAME[name].fault(readings.get(name), limit, is_owner=is_owner) for name, limit in spec.gauge_limits)
+    return next((fault for fault in faults if fault), "")
+
+
+def _readings(spec: TaskSpec, profile: Profile, *, is_owner: bool) -> dict[str, float]:
+    """The node's gauges, predicted as if it had the task."""
+    readings = dict(possible(profile.gauges))
+    need = spec.demand.gpu
+    if need and "gpu" in readings:  # by the fleet file: no driver tells which process uses how much
+        readings["gpu"] = predicted_use(readings["gpu"], need if is_owner else 0.0, need)
+    return readings
+
+
+def _gauges(spec: TaskSpec, allocation: Allocation, profile: Profile) -> dict[str, float]:
+    """The terms of the weighed gauges that this node measures."""
+    weighed = {name for name, _ in allocation.tuning.weights.gauges}
+    if not weighed:
+        return {}
+    readings = _readings(spec, profile, is_owner=profile.node == allocation.owner)
+    return {name: BY_NAME[name].term(reading) for name, reading in readings.items() if name in weighed}
+
+
+def _is_assumed(name: str) -> bool:
+    """Whether a node without this gauge counts as if it had the best reading."""
+    return not BY_NAME[name].is_needed
 
 
 def _memory_use(profile: Profile, spec: TaskSpec, demand: Demand, unseen: Demand) -> float | None:

@@ -13,6 +13,7 @@ is never 0 before nothing is left, and multiplies.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 from zsched.core.values.model import ScoreForm, Weights
 
@@ -157,6 +158,9 @@ def network_utility(signal_dbm: float, nu_dbm: float, rho_dbm: float) -> float:
     return clamp((signal_dbm - nu_dbm) / (rho_dbm - nu_dbm))
 
 
+NO_GAUGES: Mapping[str, float] = {}
+
+
 def total_utility(
     weights: Weights,
     *,
@@ -165,6 +169,7 @@ def total_utility(
     network: float | None,
     measured: frozenset[str],
     form: ScoreForm = ScoreForm.PAPER,
+    gauges: Mapping[str, float] = NO_GAUGES,
 ) -> float | None:
     """Eq. 4, the weighted sum; weights of metrics that nobody measured are dropped and the rest renormalised.
 
@@ -177,8 +182,9 @@ def total_utility(
         cpu: eta, in [0, 1], or ``None`` when not measured here.
         memory: sigma, likewise.
         network: kappa, likewise.
-        measured: which of ``cpu``, ``memory``, ``network`` any candidate has.
+        measured: which of ``cpu``, ``memory``, ``network`` and the gauges any candidate has.
         form: sum or product.
+        gauges: the gauges' terms, likewise in [0, 1]; a gauge that is not there was not measured here.
 
     Returns:
         The utility in [0, 1]; ``None`` when a weighted metric that others have is missing here, or nothing is left.
@@ -187,9 +193,10 @@ def total_utility(
     >>> total_utility(w, cpu=0.8, memory=0.4, network=None, measured=frozenset({"cpu", "memory"}))
     0.6666666666666666
     """
-    terms = (("cpu", weights.cpu, cpu), ("memory", weights.memory, memory), ("network", weights.network, network))
+    terms = {"cpu": cpu, "memory": memory, "network": network, **gauges}
     weighed: list[tuple[float, float]] = []
-    for name, weight, term in terms:
+    for name, weight in weights.shares:
+        term = terms.get(name)
         if weight <= 0.0 or name not in measured:
             continue
         if term is None:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
 from functools import lru_cache
 
+from zsched.core.values.gauges import check_limits
 from zsched.core.values.limits import Range, check_ranges, key
 from zsched.core.values.model import (
     MAX_CPU_CORES,
@@ -24,6 +25,7 @@ from zsched.core.values.model import (
     LinkSource,
     NodeId,
     NodeKind,
+    Readings,
     ScoreForm,
     TaskId,
     Tuning,
@@ -124,10 +126,11 @@ class NodeSpec:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Demand:
-    """The task's least need, known before it was ever measured (cores, MiB)."""
+    """The task's least need, known before it was ever measured (cores, MiB, share of a GPU)."""
 
     cpu_cores: float = key(0.0, "CPU that the task needs at least.", Range(0, MAX_CPU_CORES, "cores"))
     memory_mb: float = key(0.0, "Memory that the task needs at least.", Range(0, MAX_MEMORY_MB, "MiB"))
+    gpu: float = key(0.0, "Share of a GPU that the task uses; it is not measured.", Range(0, 1))
 
     def __post_init__(self) -> None:
         check_ranges(self, "demand.")
@@ -214,6 +217,8 @@ class TaskSpec:
     tuning: Tuning
     demand: Demand = Demand()
     limits: LinkLimits = LinkLimits()
+    gauge_limits: Readings = ()
+    """Sorted; how far a candidate's gauges may go (`zsched.core.values.gauges`)."""
     reach: Reach = key(Reach.MAJORITY, "Who must reach a candidate.")
     memory_floor_ratio: float = key(
         0.05,
@@ -236,6 +241,9 @@ class TaskSpec:
     drain_s: float = key(2.0, "How long the old owner may finish what it has in work.", Range(0, 600, "s"))
     worker: WorkerSpec = WorkerSpec()
     rules: tuple[StreamRule, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_limits(self.gauge_limits)
 
     def first_value(self, start: int, *, is_new: bool = True) -> Allocation:
         """The first value of a generation, by this file; ``is_new``: no worker may still run by an earlier one."""
@@ -402,6 +410,10 @@ _PATHS = frozenset({("Fleet", "zenoh_config"), ("LinkSpec", "value"), ("Security
 """Fields that may hold a path: relative to the fleet file, hence another one on every machine."""
 
 
+_LATER = frozenset({("Weights", "gauges"), ("Demand", "gpu"), ("TaskSpec", "gauge_limits")})
+"""Fields that came later: left out where they say nothing, so that nodes of two versions see the same file."""
+
+
 def _canonical(value: object) -> Iterable[bytes]:
     """Length-prefixed by the caller, so that no two different values have the same parts."""
     if is_dataclass(value) and not isinstance(value, type):
@@ -409,6 +421,8 @@ def _canonical(value: object) -> Iterable[bytes]:
         yield kind.encode()
         for field in fields(value):
             held = getattr(value, field.name)
+            if (kind, field.name) in _LATER and held == field.default:
+                continue
             yield field.name.encode()
             yield from _canonical(held.rpartition("/")[2] if (kind, field.name) in _PATHS else held)
         return

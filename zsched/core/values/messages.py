@@ -18,6 +18,7 @@ from zsched.core.values.model import (
     Asked,
     Ballot,
     NodeId,
+    Readings,
     TaskId,
     Tuning,
     UtilityVector,
@@ -25,6 +26,7 @@ from zsched.core.values.model import (
     check_counter,
     check_name,
     check_range,
+    check_readings,
 )
 
 
@@ -249,9 +251,12 @@ class SetWeights:
     memory: float
     network: float
     base_revision: int | None = None
+    gauges: Readings = ()
+    """Weights of gauges."""
 
     def __post_init__(self) -> None:
         check_name("weights.task", self.task)
+        check_readings("weights", self.gauges, 0.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
@@ -20,6 +21,10 @@ NodeId = str
 """A node's name: ``[a-z0-9][a-z0-9_-]{0,62}``, unique in the fleet."""
 TaskId = str
 """A task's name, same alphabet."""
+GaugeName = str
+"""A gauge's name (`zsched.core.values.gauges`), same alphabet."""
+Readings = tuple[tuple[GaugeName, float], ...]
+"""One number for each of some gauges; a gauge that is not there was not measured."""
 
 NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}")
 MAX_COUNTER = 2**53
@@ -29,6 +34,7 @@ MIN_SPEED, MAX_SPEED = 0.001, 1000.0
 MAX_RUNNABLE = 1e6
 MAX_TREND_DB_S = 100.0
 MAX_JOBS_HZ, MAX_JOB_S = 1e6, 1e6
+MAX_GAUGES, MAX_READING = 16, 1e9
 """Bounds that no machine or link exceeds: a larger figure is a fault of its sender."""
 MAX_REASON = 400
 """Characters of a worker's reason: it travels with every profile."""
@@ -53,6 +59,18 @@ def check_range(field: str, value: float | None, low: float, high: float) -> Non
     """Raise `ValueError` unless ``low <= value <= high`` (``None``, "not measured", passes; NaN does not)."""
     if value is not None and not low <= value <= high:
         raise ValueError(f"{field}: {value!r} is not in [{low:g}, {high:g}]")
+
+
+def check_readings(field: str, readings: Readings, low: float = -MAX_READING, high: float = MAX_READING) -> None:
+    """Raise `ValueError` unless the gauges' names are names, no more than `MAX_GAUGES`, and their numbers in range.
+
+    A name may be unknown here: a peer's program may be newer.
+    """
+    if len(readings) > MAX_GAUGES:
+        raise ValueError(f"{field}: {len(readings)} gauges, at most {MAX_GAUGES}")
+    for name, number in readings:
+        check_name(field, name)
+        check_range(f"{field}.{name}", number, low, high)
 
 
 def check_counter(field: str, value: int) -> None:
@@ -89,23 +107,49 @@ class Objective(StrEnum):
     LATENCY = "latency"  # as many of them as possible done within a deadline
 
 
+PAPER_METRICS = ("cpu", "memory", "network")
+"""The metrics of Eq. 1 to 3; the others are gauges."""
+
+
 # --- what an operator sets -------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Weights:
-    """The weights of Eq. 4: each in [0, 1], their sum 1 (to 1e-6)."""
+    """The weights of Eq. 4 and of the gauges: each in [0, 1], their sum 1 (to 1e-6).
+
+    An older program reads no ``gauges``. It drops a frame with such weights, since the other weights' sum is not 1.
+    """
 
     cpu: float
     memory: float
     network: float
+    gauges: Readings = ()
+    """Sorted; only weights above 0."""
 
     def __post_init__(self) -> None:
         for field in ("cpu", "memory", "network"):
             check_range(f"weights.{field}", getattr(self, field), 0.0, 1.0)
-        total = self.cpu + self.memory + self.network
+        check_readings("weights", self.gauges, 0.0, 1.0)
+        total = self.cpu + self.memory + self.network + sum(weight for _, weight in self.gauges)
         if not math.isclose(total, 1.0, abs_tol=1e-6):
             raise ValueError(f"weights: the sum is {total:g}, not 1")
+
+    @classmethod
+    def of(cls, shares: Mapping[str, float]) -> Weights:
+        """The weights of ``{metric: weight}``; what is not the paper's is a gauge, and what is left out is 0.
+
+        Raises:
+            ValueError: a weight is out of range, or the sum is not 1.
+        """
+        three = {name: shares.get(name, 0.0) for name in PAPER_METRICS}
+        gauges = tuple((name, shares[name]) for name in sorted(shares) if name not in PAPER_METRICS and shares[name])
+        return cls(**three, gauges=gauges)
+
+    @property
+    def shares(self) -> tuple[tuple[str, float], ...]:
+        """Every metric with its weight: the paper's three, then the gauges."""
+        return (("cpu", self.cpu), ("memory", self.memory), ("network", self.network), *self.gauges)
 
 
 MIN_DEADLINE_MS, MAX_DEADLINE_MS = 1.0, 3.6e6
@@ -370,6 +414,8 @@ class DeviceSample:
     """Share of the time since the last sample in which some process wanted a CPU and had none; ``None``: not known."""
     runnable: float | None = None
     """Threads that run or wait to run now, without the profiler's own; ``None``: not known."""
+    gauges: Readings = ()
+    """The newest readings of its gauges, raw."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -432,6 +478,8 @@ class Profile:
     """Mean number of threads that run or wait to run: a full machine is shared with them; ``None``: unknown."""
     relay: str = ""
     """What is wrong with its relay (`zsched.core.profile.relay_ends`); at most `MAX_REASON` long; empty: nothing."""
+    gauges: Readings = ()
+    """Smoothed readings of its gauges (`zsched.core.values.gauges`)."""
 
     def __post_init__(self) -> None:
         check_name("profile.node", self.node)
@@ -446,6 +494,7 @@ class Profile:
         check_range("profile.runnable", self.runnable, 0.0, MAX_RUNNABLE)
         if len(self.relay) > MAX_REASON:
             raise ValueError(f"profile.relay: {len(self.relay)} characters, at most {MAX_REASON}")
+        check_readings("profile.gauges", self.gauges)
 
     def worker(self, task: TaskId) -> WorkerLoad | None:
         """The load of ``task``'s worker on this node, or ``None`` when the node runs none."""
@@ -473,6 +522,8 @@ class Utility:
     memory: float | None = None
     network: float | None = None
     reachable: bool = True
+    gauges: Readings = ()
+    """The terms of the gauges that the task weighs."""
 
     def __post_init__(self) -> None:
         check_name("utility.candidate", self.candidate)
@@ -480,6 +531,12 @@ class Utility:
         check_range("utility.cpu", self.cpu, 0.0, 1.0)
         check_range("utility.memory", self.memory, 0.0, 1.0)
         check_range("utility.network", self.network, 0.0, 1.0)
+        check_readings("utility.gauges", self.gauges, 0.0, 1.0)
+
+    @property
+    def terms(self) -> dict[str, float | None]:
+        """Every metric with its term: the paper's three, then the gauges."""
+        return {"cpu": self.cpu, "memory": self.memory, "network": self.network, **dict(self.gauges)}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

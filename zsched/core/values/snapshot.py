@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
-from zsched.core.values.model import Link, NodeId, TaskId, Tuning, Utility, WorkerLoad
+from zsched.core.values.model import Link, NodeId, Readings, TaskId, Tuning, Utility, WorkerLoad
 from zsched.core.values.plan import StreamCount
 
 SCHEMA = "zsched.status/1"
@@ -70,6 +70,8 @@ class NodeStatus:
     """Share of the time in which some process lacked a CPU (PSI)."""
     flags: tuple[FlagStatus, ...] = ()
     """An operator's drain of it, and whether it may get tasks; ``draining`` is the order to stop, of its own daemon."""
+    gauges: Readings = ()
+    """Of the measured ones: GPU in use and battery in [0, 1], temperature in °C."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -776,7 +776,7 @@ class Agreement:
             _refuse(request, CommandOutcome.INVALID, f"no task {command.task!r}; tasks: {known}", todo)
             return
         try:
-            weights = Weights(cpu=command.cpu, memory=command.memory, network=command.network)
+            weights = Weights(cpu=command.cpu, memory=command.memory, network=command.network, gauges=command.gauges)
         except ValueError as error:
             _refuse(request, CommandOutcome.INVALID, str(error), todo)
             return

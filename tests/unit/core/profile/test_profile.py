@@ -9,6 +9,7 @@ from support.profiles import load_of
 from zsched.core.events import WorkerJobs
 from zsched.core.profile.means import STALE_S, Ewma
 from zsched.core.profile.profile import (
+    GAUGE_SMOOTHING_S,
     RATIO_CHANGE,
     RSSI_CHANGE_DB,
     RSSI_OUTLIER_DB,
@@ -458,3 +459,26 @@ def test_every_share_of_time_is_a_pressure(pressure: float) -> None:
     profiler = make_profiler()
     profiler.absorb(replace(device(), cpu_pressure=pressure), (), now=0.0)
     assert taken(profiler, 0.0).cpu_pressure == pressure
+
+
+# --- gauges ----------------------------------------------------------------------------------------------------------
+
+
+def gauges_of(profiler: Profiler, now: float, *readings: tuple[str, float]) -> dict[str, float]:
+    profiler.absorb(replace(device(), gauges=readings), (), now)
+    return dict(taken(profiler, now).gauges)
+
+
+def test_gauges_are_smoothed_by_two_seconds_and_absent_ones_are_absent_at_once() -> None:
+    profiler = make_profiler()
+    assert gauges_of(profiler, 100.0, ("gpu", 0.0), ("battery", 0.8)) == {"gpu": 0.0, "battery": 0.8}
+    shown = gauges_of(profiler, 100.0 + GAUGE_SMOOTHING_S, ("gpu", 1.0))
+    assert shown == {"gpu": pytest.approx(1 - math.exp(-1.0), abs=1e-3)}
+    assert gauges_of(profiler, 105.0) == {}
+
+
+def test_impossible_and_unknown_readings_are_no_readings_and_old_ones_neither() -> None:
+    profiler = make_profiler()
+    assert gauges_of(profiler, 100.0, ("battery", 1.2), ("temperature_c", math.nan), ("wind", 3.0)) == {}
+    assert gauges_of(profiler, 101.0, ("battery", 0.5)) == {"battery": 0.5}
+    assert taken(profiler, 101.0 + STALE_S + 0.1).gauges == ()

@@ -10,11 +10,20 @@ import pytest
 
 from support.fleets import tuning_of
 from zsched.core.scheduler.decision import decide_again, verdict_of
-from zsched.core.scheduler.explain import Explained, explained, judged_again, owner_cpu_below, without
+from zsched.core.scheduler.explain import Explained, explained, judged_again, owner_cpu_below, utility_of, without
 from zsched.core.scheduler.scoring import pick
 from zsched.core.values.decision import DampingMemory, Decision, Figures, Need, Rules
 from zsched.core.values.fleet import Reach
-from zsched.core.values.model import Aggregate, Allocation, PeerState, ScoreForm, Tuning, Utility, UtilityVector
+from zsched.core.values.model import (
+    Aggregate,
+    Allocation,
+    PeerState,
+    ScoreForm,
+    Tuning,
+    Utility,
+    UtilityVector,
+    Weights,
+)
 
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2", "edge3")
 TUNING = replace(tuning_of(cpu=0.5, memory=0.3, network=0.2, bonus=0.05, cool_down_s=2.0), score=ScoreForm.SERVICE)
@@ -205,3 +214,38 @@ def test_an_operator_s_flags_stand_beside_the_sums() -> None:
         "edge2 cannot have it: drained by ada",
         "edge3 cannot have it: drained by ada",
     )
+
+
+# --- gauges ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("form", list(ScoreForm))
+def test_sums_add_up_with_gauges_too(form: ScoreForm) -> None:
+    weights = Weights.of({"cpu": 0.5, "memory": 0.2, "gpu": 0.2, "battery": 0.1})
+    tuning = replace(TUNING, weights=weights, score=form)
+    decision = decision_of(replace(tuning, weights=TUNING.weights))
+    gauges = {"edge1": 0.9, "edge2": 0.2, "edge3": 0.5}
+    vectors = []
+    for vector in decision.figures.vectors:
+        column = []
+        for one in vector.utilities:
+            told = replace(one, gauges=(("battery", 1.0), ("gpu", gauges[one.candidate])))
+            column.append(replace(told, value=utility_of(told, tuning) or 0.0))
+        vectors.append(replace(vector, utilities=tuple(column)))
+    figures = replace(
+        decision.figures,
+        vectors=tuple(vectors),
+        allocation=replace(decision.figures.allocation, tuning=tuning),
+    )
+    shown = explained(judged_again(decision, figures))
+    for candidate in shown.candidates:
+        for view in candidate.robots:
+            terms = {"cpu": view.cpu, "memory": view.memory, **dict(view.gauges)}
+            shares = {name: weight for name, weight in weights.shares if weight}
+            if form is ScoreForm.PAPER:
+                by_hand = sum(shares[name] * (terms[name] or 0.0) for name in shares)
+            else:
+                by_hand = math.prod((terms[name] or 0.0) ** (shares[name] / 0.5) for name in shares)
+            assert view.utility == pytest.approx(by_hand)
+        joint = statistics.fmean([view.utility or 0.0 for view in candidate.robots])
+        assert candidate.joint == pytest.approx(joint)

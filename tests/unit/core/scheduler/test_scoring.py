@@ -425,3 +425,72 @@ def test_a_candidate_that_was_refused_does_not_make_a_metric_measured() -> None:
     vector = scored(ROBOT, profile("edge1", links=()), profile("edge2", links=()), broken, agreed=allocation(HALVES))
 
     assert list(values(vector)) == ["edge1", "edge2"]
+
+
+# --- gauges ----------------------------------------------------------------------------------------------------------
+
+
+def gauged(node: str, **gauges: float) -> Profile:
+    return replace(profile(node), gauges=tuple(gauges.items()))
+
+
+def weighed(**shares: float) -> Allocation:
+    return allocation(Weights.of(shares))
+
+
+def terms_of(vector: UtilityVector) -> dict[str, dict[str, float]]:
+    return {one.candidate: dict(one.gauges) for one in vector.utilities}
+
+
+@pytest.mark.parametrize("form", list(ScoreForm))
+def test_a_weighed_gauge_is_a_term_like_the_others(form: ScoreForm) -> None:
+    agreed = weighed(cpu=0.5, battery=0.5)
+    agreed = replace(agreed, tuning=replace(agreed.tuning, score=form))
+    vector = scored(gauged("edge1", battery=0.3), gauged("edge2", battery=0.9), agreed=agreed)
+
+    assert terms_of(vector) == {"edge1": {"battery": 0.3}, "edge2": {"battery": 0.9}}
+    low, high = (one.value for one in vector.utilities)
+    assert high > low
+    plain = [one.value for one in scored(gauged("edge1", battery=0.3), gauged("edge2", battery=0.9)).utilities]
+    assert plain[0] == plain[1], "without a weight it counts nothing"
+
+
+def test_a_node_without_a_gpu_cannot_have_a_task_that_weighs_it_and_one_without_a_battery_counts_as_full() -> None:
+    vector = scored(gauged("edge1", gpu=0.5), gauged("edge2"), agreed=weighed(cpu=0.5, gpu=0.5))
+    assert dict(vector.refused)["edge2"] == "a weighted metric is not measured"
+
+    vector = scored(gauged("edge1", battery=0.5), gauged("edge2"), agreed=weighed(cpu=0.5, battery=0.5))
+    assert terms_of(vector) == {"edge1": {"battery": 0.5}, "edge2": {"battery": 1.0}}
+
+
+def test_a_gauge_that_nobody_measures_is_left_out() -> None:
+    with_weight = scored(gauged("edge1"), gauged("edge2"), agreed=weighed(cpu=0.5, gpu=0.3, battery=0.2))
+    assert [one.value for one in with_weight.utilities] == [one.value for one in scored(gauged("edge1")).utilities] * 2
+
+
+def test_a_demand_of_the_gpu_is_predicted_for_every_candidate_alike() -> None:
+    """The owner shows the task's use, an idle one does not: both are worth the same with the task."""
+    spec = replace(SPEC, demand=Demand(gpu=0.4))
+    vector = scored(gauged("edge1", gpu=0.4), gauged("edge2", gpu=0.0), spec=spec, agreed=weighed(cpu=0.5, gpu=0.5))
+    assert terms_of(vector) == {"edge1": {"gpu": 0.6}, "edge2": {"gpu": 0.6}}
+
+
+@pytest.mark.parametrize(
+    ("gauges", "why"),
+    [
+        ({"battery": 0.19}, "battery is at 19 %, limit 20 %"),
+        ({"battery": 0.2}, ""),
+        ({}, ""),
+        ({"temperature_c": 91.0}, "temperature_c is at 91 °C, limit 85 °C"),
+    ],
+)
+def test_limits_refuse_the_owner_too(gauges: dict[str, float], why: str) -> None:
+    spec = replace(SPEC, gauge_limits=(("battery", 0.2), ("temperature_c", 85.0)))
+    assert dict(scored(gauged("edge1", **gauges), spec=spec).refused).get("edge1", "") == why
+
+
+def test_a_node_comes_back_inside_the_margin_only() -> None:
+    spec = replace(SPEC, gauge_limits=(("battery", 0.2),))
+    vector = scored(gauged("edge2", battery=0.22), gauged("edge3", battery=0.25), spec=spec)
+    assert dict(vector.refused)["edge2"] == "battery is at 22 %, limit 20 %, back from 25 % on"
+    assert [one.candidate for one in vector.utilities] == ["edge3"]

@@ -1,0 +1,147 @@
+"""Fake sysfs trees read by the real readers; NVML by a small library that is compiled here."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import psutil
+import pytest
+
+from zsched.adapters.machine.gauges import GaugeWatch, battery, gpu, readers, temperature_c
+from zsched.clock import monotonic_s
+from zsched.core.profile.means import STALE_S
+
+NVML = """
+typedef struct { unsigned gpu, memory; } rates;
+static unsigned use[] = {80, 35, 90};
+int nvmlInit_v2(void) { return INIT; }
+int nvmlDeviceGetCount_v2(unsigned *count) { *count = 3; return 0; }
+int nvmlDeviceGetHandleByIndex_v2(unsigned index, void **device) { *device = use + index; return index == 2; }
+int nvmlDeviceGetUtilizationRates(void *device, rates *told) { told->gpu = *(unsigned *)device; return RATES; }
+"""
+
+
+def tree(root: Path, **files: str) -> Path:
+    """``a__b="text"`` becomes the file a/b."""
+    for name, text in files.items():
+        file = root / name.replace("__", "/")
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text)
+    return root
+
+
+def supply(root: Path, name: str, **files: str) -> None:
+    tree(root, **{f"sys__class__power_supply__{name}__{key}": f"{text}\n" for key, text in files.items()})
+
+
+def test_a_machine_without_any_gauge_measures_none(tmp_path: Path) -> None:
+    assert [reader.read() for reader in readers(tmp_path).values()] == [None, None, None]
+    assert GaugeWatch(tmp_path).look() == ()
+
+
+def test_a_battery_of_the_system_counts_and_a_mouse_does_not(tmp_path: Path) -> None:
+    supply(tmp_path, "AC", type="Mains", online="1")
+    supply(tmp_path, "hidpp_battery_0", type="Battery", scope="Device", capacity="5")
+    assert battery.Reader(tmp_path).read() is None
+    supply(tmp_path, "BAT0", type="Battery", capacity="84")
+    assert battery.Reader(tmp_path).read() == pytest.approx(0.84)
+    supply(tmp_path, "BAT1", type="Battery", energy_now="10000000", energy_full="50000000")
+    assert battery.Reader(tmp_path).read() == pytest.approx(0.52)
+
+
+def test_a_battery_whose_driver_says_nothing_or_nonsense_is_no_reading(tmp_path: Path) -> None:
+    supply(tmp_path, "BAT0", type="Battery", charge_now="12", charge_full="0")
+    assert battery.Reader(tmp_path).read() is None
+    supply(tmp_path, "BAT0", capacity="full")
+    assert battery.Reader(tmp_path).read() is None
+    supply(tmp_path, "BAT0", capacity="104")
+    assert battery.Reader(tmp_path).read() == 1.0
+
+
+def zone(root: Path, number: int, kind: str, temp: str) -> None:
+    tree(root, **{f"sys__class__thermal__thermal_zone{number}__{key}": text for key, text in {"type": kind}.items()})
+    tree(root, **{f"sys__class__thermal__thermal_zone{number}__temp": temp})
+
+
+def test_the_hottest_zone_counts_but_no_constant_and_none_that_is_off(tmp_path: Path) -> None:
+    zone(tmp_path, 0, "cpu-thermal", "51500\n")
+    zone(tmp_path, 1, "gpu-thermal", "-256000\n")
+    zone(tmp_path, 2, "PMIC-Die", "100000\n")
+    zone(tmp_path, 3, "iwlwifi_1", "\n")
+    tree(tmp_path, sys__class__hwmon__hwmon0__temp1_input="70000")
+    assert temperature_c.Reader(tmp_path).read() == 51.5
+
+
+def test_without_thermal_zones_the_hottest_of_hwmon_counts(tmp_path: Path) -> None:
+    tree(tmp_path, sys__class__hwmon__hwmon0__temp1_input="45000", sys__class__hwmon__hwmon1__temp2_input="62250")
+    assert temperature_c.Reader(tmp_path).read() == 62.25
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        "sys/devices/gpu.0/load",
+        "sys/devices/platform/gpu.0/load",
+        "sys/class/devfreq/17000000.gpu/device/load",
+        "sys/class/devfreq/17000000.ga10b/device/load",
+    ],
+)
+def test_a_jetson_tells_its_load_in_per_mille(tmp_path: Path, place: str) -> None:
+    tree(tmp_path, **{place.replace("/", "__"): "437\n"})
+    assert gpu.Reader(tmp_path).read() == pytest.approx(0.437)
+
+
+def test_of_two_radeons_the_freer_one_counts(tmp_path: Path) -> None:
+    tree(
+        tmp_path,
+        sys__class__drm__card0__device__gpu_busy_percent="90\n",
+        sys__class__drm__card1__device__gpu_busy_percent="12\n",
+    )
+    assert gpu.Reader(tmp_path).read() == pytest.approx(0.12)
+
+
+def library(folder: Path, init: int = 0, rates: int = 0) -> str:
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("no C compiler here to make a library that answers as NVML")
+    (folder / "nvml.c").write_text(NVML.replace("INIT", str(init)).replace("RATES", str(rates)))
+    made = folder / f"nvml{init}{rates}.so"
+    subprocess.run([compiler, "-shared", "-fPIC", "-o", made, folder / "nvml.c"], check=True)
+    return str(made)
+
+
+def test_nvml_is_asked_where_the_driver_is_and_a_gpu_that_fails_is_left_out(tmp_path: Path) -> None:
+    reader = gpu.Reader(tmp_path, library(tmp_path))
+    assert reader.read() is None, "without the driver the library is not even loaded"
+    tree(tmp_path, proc__driver__nvidia__version="NVRM\n")
+    assert reader.read() == pytest.approx(0.35)
+
+
+def test_nvml_that_is_not_there_does_not_start_or_tells_nothing_is_no_reading(tmp_path: Path) -> None:
+    tree(tmp_path, proc__driver__nvidia__version="NVRM\n")
+    with pytest.raises(OSError, match="no-such-library"):
+        gpu.Reader(tmp_path, "no-such-library.so.1").read()
+    with pytest.raises(OSError, match="error 9"):
+        gpu.Reader(tmp_path, library(tmp_path, init=9)).read()
+    assert gpu.Reader(tmp_path, library(tmp_path, rates=3)).read() is None, "a Jetson's NVML: not supported"
+    watch = GaugeWatch(tmp_path)
+    zone(tmp_path, 0, "cpu", "40000")
+    assert watch.look() == (("temperature_c", 40.0),), "one gauge that fails is one gauge that is not measured"
+
+
+def test_readings_of_a_thread_that_hangs_grow_old(tmp_path: Path) -> None:
+    zone(tmp_path, 0, "cpu", "40000")
+    watch = GaugeWatch(tmp_path)
+    assert watch.newest(monotonic_s()) == ()
+    found = watch.look()
+    assert watch.newest(monotonic_s()) == found != ()
+    assert watch.newest(monotonic_s() + STALE_S + 0.1) == ()
+
+
+def test_this_machine_as_psutil_sees_it() -> None:
+    charge, told = psutil.sensors_battery(), battery.Reader(Path("/")).read()
+    assert (charge is None) == (told is None)
+    if charge is not None and told is not None:
+        assert told == pytest.approx(charge.percent / 100.0, abs=0.02)

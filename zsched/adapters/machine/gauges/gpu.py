@@ -1,0 +1,78 @@
+"""The share of time in which the GPU worked: by sysfs (Jetson, amdgpu), or by the library of NVIDIA's driver (NVML).
+
+Knows: Jetson's ``load`` (per mille), amdgpu's ``gpu_busy_percent``, four functions of ``libnvidia-ml.so.1``. Of several
+GPUs the freest counts. Does not know: which process uses how much.
+
+On a Jetson NVML finds a GPU and answers "not supported", so sysfs goes first. NVML is called by ctypes: four calls need
+no bindings. The library is loaded only where the driver is.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from zsched.adapters.machine.gauges import number
+
+JETSON = (
+    "sys/devices/gpu.0/load",
+    "sys/devices/platform/gpu.0/load",
+    *(f"sys/class/devfreq/*{chip}/device/load" for chip in (".gpu", "gm20b", "gp10b", "gv11b", "ga10b")),
+)
+AMD = "sys/class/drm/card*/device/gpu_busy_percent"
+DRIVER = "proc/driver/nvidia/version"
+LIBRARY = "libnvidia-ml.so.1"
+
+
+class Reader:
+    """The freest GPU's use in [0, 1]."""
+
+    def __init__(self, root: Path, library: str = LIBRARY) -> None:
+        """Files below ``root``; NVML's ``library``."""
+        self._root, self._library = root, library
+        self._nvml: _Nvml | None = None
+
+    def read(self) -> float | None:
+        """``None`` without a GPU whose use is told."""
+        loads = [load / 1000.0 for file in self._found(*JETSON) if (load := number(file)) is not None]
+        loads += [busy / 100.0 for file in self._found(AMD) if (busy := number(file)) is not None]
+        if not loads and (self._root / DRIVER).exists():
+            self._nvml = self._nvml or _Nvml(self._library)
+            loads = self._nvml.loads()
+        return min(loads, default=None)
+
+    def _found(self, *patterns: str) -> list[Path]:
+        return [file for pattern in patterns for file in self._root.glob(pattern)]
+
+
+class _Nvml:
+    """NVML, from its library's start until the process ends."""
+
+    def __init__(self, library: str) -> None:
+        """Raises `OSError` when the library is not there or does not start."""
+        import ctypes  # noqa: PLC0415 - only where there is such a driver
+
+        class Rates(ctypes.Structure):
+            """``nvmlUtilization_t``: percent of the time."""
+
+            _fields_ = (("gpu", ctypes.c_uint), ("memory", ctypes.c_uint))
+
+        self._c: Any = ctypes
+        self._rates: Any = Rates
+        self._lib: Any = ctypes.CDLL(library)
+        code = self._lib.nvmlInit_v2()
+        if code:
+            raise OSError(f"NVML does not start: error {code}")
+
+    def loads(self) -> list[float]:
+        """Of every GPU that tells it."""
+        count, found = self._c.c_uint(), []
+        if self._lib.nvmlDeviceGetCount_v2(self._c.byref(count)):
+            return []
+        for index in range(count.value):
+            device, rates = self._c.c_void_p(), self._rates()
+            if self._lib.nvmlDeviceGetHandleByIndex_v2(self._c.c_uint(index), self._c.byref(device)):
+                continue
+            if not self._lib.nvmlDeviceGetUtilizationRates(device, self._c.byref(rates)):
+                found.append(rates.gpu / 100.0)
+        return found
