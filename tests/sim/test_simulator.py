@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from random import Random
 
 import pytest
@@ -202,3 +203,47 @@ def test_epochs_of_one_fleet_are_gapless_for_planned_moves() -> None:
         sim.run(3)
     epochs = sorted(epoch for _, epoch in sim.owners)
     assert all(b == a + 1 for a, b in itertools.pairwise(epochs))
+
+
+# --- limits of gauges ------------------------------------------------------------------------------------------------
+
+
+def limited(*limits: tuple[str, float], charge: dict[NodeId, float]) -> Simulator:
+    """A fleet whose machines have these batteries; the test changes them."""
+    whole = fleet(cool_down=2.0)
+    task = replace(whole.tasks[0], gauge_limits=limits)
+    sim = Simulator(
+        fleet=replace(whole, tasks=(task,)),
+        seed=1,
+        gauges=lambda node, _: (("battery", charge[node]),) if node in charge else (),
+    )
+    sim.start()
+    assert sim.run_until(lambda: settled(sim), 15), "\n".join(sim.stories)
+    return sim
+
+
+def test_a_battery_that_crosses_its_limit_moves_the_task_once_and_not_back_at_the_limit() -> None:
+    charge: dict[NodeId, float] = {}
+    sim = limited(("battery", 0.2), charge=charge)
+    first = sim.agreed(TASK)
+    assert first is not None
+    charge[first] = 0.3
+    sim.run(20)
+    assert sim.agreed(TASK) == first, "above its limit nothing moves it"
+    charge[first] = 0.19
+    assert sim.run_until(lambda: sim.agreed(TASK) not in (None, first), 15), "\n".join(sim.stories[-20:])
+    second, epochs = sim.agreed(TASK), len(sim.owners)
+    for step in range(40):  # a reading that jitters about the limit
+        charge[first] = 0.19 + 0.03 * (step % 2)
+        sim.run(1)
+    assert sim.agreed(TASK) == second
+    assert len(sim.owners) == epochs
+
+
+def test_where_every_machine_is_beyond_the_limit_the_task_stays_with_its_owner() -> None:
+    charge: dict[NodeId, float] = {}
+    sim = limited(("battery", 0.2), charge=charge)
+    owner = sim.agreed(TASK)
+    charge.update(dict.fromkeys(("edge1", "edge2", "edge3"), 0.1))
+    sim.run(30)
+    assert sim.agreed(TASK) == owner

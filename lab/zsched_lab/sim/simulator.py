@@ -20,7 +20,7 @@ from zsched.core.node import Node
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet, electorate_hash, fleet_hash
 from zsched.core.values.messages import FleetQuestion, Refused, fleet_question
-from zsched.core.values.model import Allocation, DeviceSample, NodeId, PeerState, TaskId
+from zsched.core.values.model import Allocation, DeviceSample, NodeId, PeerState, Readings, TaskId
 from zsched.core.values.plan import RoutePlan
 from zsched.core.vote.generations import blank_state
 from zsched.errors import InvariantError, WireError
@@ -37,6 +37,8 @@ from zsched_lab.sim.work import Work
 
 Load = Callable[[NodeId, float], tuple[float, float]]
 """(node, time) -> (CPU cores in use, MiB in use), the raw reading of the device profiler."""
+Gauges = Callable[[NodeId, float], Readings]
+"""(node, time) -> the raw readings of its gauges."""
 Cut = Callable[[NodeId, tuple[do.Instruction, ...]], int | None]
 """(node, batch) -> after how many instructions the node crashes; ``None``: it carries out all of them and lives."""
 Make = Callable[[Any], ev.Event]
@@ -55,6 +57,11 @@ def idle(_node: NodeId, _now: float) -> tuple[float, float]:
     return 1.0, 1000.0
 
 
+def without_gauges(_node: NodeId, _now: float) -> Readings:
+    """No machine measures any."""
+    return ()
+
+
 @dataclass(slots=True, kw_only=True)
 class Simulator(Links):
     """One fleet in one schedule. `run` until a time or a condition; faults in between."""
@@ -64,6 +71,7 @@ class Simulator(Links):
     generation: int = 0
     """The generation that the fleet begins with."""
     load: Load = idle
+    gauges: Gauges = without_gauges
     cut_batch: Cut | None = None
     broken_disks: set[NodeId] = field(default_factory=set)
     """Nodes that cannot write their state."""
@@ -246,7 +254,13 @@ class Simulator(Links):
         if machine.life != life or machine.node is None:
             return
         cpu, memory = self.load(machine.name, self.now)
-        sample = DeviceSample(cpu_cores=CORES, cpu_used_cores=cpu, memory_mb=MEMORY_MB, memory_used_mb=memory)
+        sample = DeviceSample(
+            cpu_cores=CORES,
+            cpu_used_cores=cpu,
+            memory_mb=MEMORY_MB,
+            memory_used_mb=memory,
+            gauges=self.gauges(machine.name, self.now),
+        )
         self.later(self.fleet.timing.sample_s, self._sample, machine, life)
         self.deliver(machine, ev.ProfileSampled(device=sample))
 
