@@ -271,7 +271,7 @@ def test_weights_change_on_the_running_fleet_for_every_robot(bed: Testbed) -> No
     assert answer["outcome"] == "ok", answer
 
     def everywhere() -> bool:
-        expected = {"cpu": 0.2, "memory": 0.7, "network": 0.1}
+        expected = {"cpu": 0.2, "memory": 0.7, "network": 0.1, "gauges": {}}
         return all(bed.task(node)["tuning"]["weights"] == expected for node in bed.names)
 
     bed.wait(everywhere, 60, "the weights everywhere")

@@ -155,7 +155,7 @@ def test_weights_are_agreed_shown_and_refused_on_an_old_revision(site: Site) -> 
     body = json.loads(changed.stdout)
     assert body["outcome"] == "ok"
     assert body["revision"] > before["revision"]
-    assert site.status()["tasks"][0]["tuning"]["weights"] == {"cpu": 0.6, "memory": 0.4, "network": 0.0}
+    assert site.status()["tasks"][0]["tuning"]["weights"] == {"cpu": 0.6, "memory": 0.4, "network": 0.0, "gauges": {}}
 
     again = site.zsched("weights", "echo", "cpu=0.6", "memory=0.4")
     assert (again.returncode, again.stdout) == (0, "echo: cpu=0.6 memory=0.4 network=0 (unchanged)\n")
