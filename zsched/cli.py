@@ -414,6 +414,13 @@ def explain(
     plan: Annotated[
         str | None, typer.Option("--plan", metavar="NODE=down", help="Reckon again without that node; 10: it moves.")
     ] = None,
+    at: Annotated[
+        str | None,
+        typer.Option("--at", metavar="EPOCH|AGE|TIME", help="The judgement before that, from this machine's log."),
+    ] = None,
+    robot: Annotated[
+        str | None, typer.Option("--robot", metavar="NAME", help="Only what this robot sees: its terms, whom it hears.")
+    ] = None,
     json_: JsonOption = False,
     node: AskedOption = None,
     runtime_dir: RuntimeOption = None,
@@ -422,20 +429,24 @@ def explain(
 ) -> None:
     """Show a robot's last judgement of a task with all its figures, and what would have to change for a move.
 
-    On an edge, which decides nothing, a robot is asked in its place.
+    On an edge, which decides nothing, a robot is asked in its place. With --at 12 it shows the judgement that came
+    before the move to epoch 12, and that move; with an age or a time, the one of that moment.
     """
     from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
     from zsched.commands.common import wants_color  # noqa: PLC0415 - as above
     from zsched.commands.explain import ExplainView  # noqa: PLC0415 - as above
     from zsched.commands.explain import explain as ask_why  # noqa: PLC0415 - as above
 
-    view = ExplainView(plan=plan, is_json=json_, is_colored=wants_color(no_color))
+    view = ExplainView(plan=plan, at=at, robot=robot, is_json=json_, is_colored=wants_color(no_color))
     raise typer.Exit(ask_why(find_door(runtime_dir, node, connect=connect), task, view))
 
 
 @app.command(cls=Verb)
 def history(
     task: Annotated[str | None, typer.Argument(metavar="[TASK]", help="Only its moves.")] = None,
+    about: Annotated[
+        str | None, typer.Option("--for", metavar="node/NAME", help="Only moves to this node or away from it.")
+    ] = None,
     json_: JsonOption = False,
     node: HereOption = None,
     runtime_dir: RuntimeOption = None,
@@ -443,26 +454,34 @@ def history(
     """Show every change of owner in the decision log: when, from where to where, why, and who voted for it."""
     from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
     from zsched.commands.history import history as show_moves  # noqa: PLC0415 - as above
+    from zsched.commands.history import subject_of  # noqa: PLC0415 - as above
 
-    raise typer.Exit(show_moves(find_door(runtime_dir, node), task, is_json=json_))
+    of_task, of_node = (None, None) if about is None else subject_of(about)
+    if task is not None and of_task not in (None, task):
+        raise CliError(EXIT_USAGE, f"{task} and --for {about} are two tasks; name one")
+    raise typer.Exit(show_moves(find_door(runtime_dir, node), task or of_task, about=of_node, is_json=json_))
 
 
 @app.command(cls=Verb)
 def events(
     follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on until Ctrl-C.")] = False,
     since: Annotated[str | None, typer.Option("--since", metavar="AGE", help="Not older: 90s, 10m, 2h, 1d.")] = None,
-    about: Annotated[str | None, typer.Option("--for", metavar="task/NAME", help="Only this task's.")] = None,
+    about: Annotated[
+        str | None, typer.Option("--for", metavar="task/NAME", help="Or node/NAME: only what is about it.")
+    ] = None,
     json_: Annotated[bool, typer.Option("--json", help="One JSON object per line.")] = False,
     node: HereOption = None,
     runtime_dir: RuntimeOption = None,
 ) -> None:
     """Show what the decision log tells: judgements that changed, votes, moves, steps of handovers, workers, peers."""
     from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
-    from zsched.commands.history import EventsView, duration_s, task_of  # noqa: PLC0415 - as above
+    from zsched.commands.history import EventsView, duration_s, subject_of  # noqa: PLC0415 - as above
     from zsched.commands.history import events as show_events  # noqa: PLC0415 - as above
 
+    of_task, of_node = (None, None) if about is None else subject_of(about)
     view = EventsView(
-        task=None if about is None else task_of(about),
+        task=of_task,
+        node=of_node,
         since_s=None if since is None else duration_s(since),
         is_following=follow,
         is_json=json_,

@@ -373,6 +373,12 @@ def test_a_move_is_explained_remembered_and_judged_again(tmp_path: Path) -> None
         assert [(move["from"], move["to"]) for move in moves][-1] == (owner, newest)
         assert f"{owner} is draining" in moves[-1]["reason"]
         assert moves[-1]["votes"] == {"robot1": newest}
+        past = json.loads(robot.zsched("explain", "echo", "--at", str(moves[-1]["epoch"]), "--json").stdout)
+        assert (past["outcome"], past["candidate"], past["made"]["to"]) == ("propose", newest, newest)
+        assert past["owner"] == owner
+        seen = robot.zsched("explain", "echo", "--robot", "robot1")
+        assert seen.returncode == 0, seen.stderr
+        assert "HEARS      robots robot1" in seen.stdout
         told = robot.zsched("events", "--for", "task/echo", "--since", "1h")
         assert f"propose {newest}: {owner} is draining" in told.stdout
         assert "settled on" in told.stdout or "flipped to" in told.stdout

@@ -1,22 +1,27 @@
 """`zsched explain`: the last judgement of a task with its sums, and what another one would take.
 
+With ``--at`` a judgement of the past, out of the decision log of the node that is asked.
+
 Knows: whom to ask, the text, the schema ``zsched.explain/1``. Does not know: how a sum comes about
-(`zsched.core.scheduler.explain`).
+(`zsched.core.scheduler.explain`), where a log lies (`zsched.adapters.host.decision_log`).
 """
 
 from __future__ import annotations
 
 import shutil
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 
 from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, nearest, print_json
+from zsched.commands.history import age_s_of, wall_text
 from zsched.commands.page import Cell, Page, memory, span
 from zsched.commands.report import printable
 from zsched.commands.weights import shares
 from zsched.core.report import plain
-from zsched.core.scheduler.explain import explained, judged_again, without
+from zsched.core.scheduler.explain import explained, judged_again, seen_by, without
 from zsched.core.values.decision import Decision, Explanation
 from zsched.core.values.model import PAPER_METRICS
 from zsched.errors import WireError
@@ -34,6 +39,10 @@ class ExplainView:
 
     plan: str | None
     """``NODE=down``: reckon again without that node."""
+    at: str | None = None
+    """An epoch, an age or a time: a judgement of the past."""
+    robot: str | None = None
+    """Only what this robot sees."""
     is_json: bool
     is_colored: bool
 
@@ -42,10 +51,15 @@ def explain(door: Door, task: str, view: ExplainView) -> int:
     """Print why a task is where it is; returns the exit code.
 
     Raises:
-        CliError: nobody answers, there is no such task or node, or no judgement yet.
+        CliError: nobody answers, there is no such task, node or epoch, or no judgement yet.
     """
     gone = None if view.plan is None else _planned(view.plan)
-    body, decision = explanation(door, task)
+    if view.at is not None:
+        body, decision = _past(door, task, _point_of(view.at))
+    else:
+        body, decision = explanation(door, task) if view.robot is None else _of_robot(door, task, view.robot)
+    if view.robot is not None:
+        body["robot"] = _sight(decision, view.robot, str(body["node"]))
     code = EXIT_OK
     if gone is not None:
         body["plan"] = _plan(decision, gone)
@@ -68,6 +82,127 @@ def explanation(door: Door, task: str) -> tuple[Json, Decision]:
     if answer.decision is None:
         raise CliError(EXIT_FAILED, f"{answer.node} has judged nothing of {task} yet; ask again in a second")
     return _body(answer, answer.decision), answer.decision
+
+
+def _of_robot(door: Door, task: str, robot: str) -> tuple[Json, Decision]:
+    """A robot's own judgement; where it does not answer, another one's, which knows what it has told."""
+    body, decision = explanation(door, task)
+    if body["node"] == robot or robot not in decision.figures.voters:
+        return body, decision
+    try:
+        return explanation(door.to(robot), task)
+    except CliError as error:
+        sys.stderr.write(f"zsched explain: {error}; this is what {body['node']} has heard of {robot}\n")
+        return body, decision
+
+
+def _sight(decision: Decision, robot: str, judge: str) -> Json:
+    """What the robot sees, as ``zsched.explain/1`` has it.
+
+    Raises:
+        CliError: it is no robot of the fleet.
+    """
+    robots = decision.figures.voters
+    if robot not in robots:
+        raise CliError(EXIT_USAGE, f"--robot: the fleet has no robot {robot!r}{nearest(robot, robots)}")
+    told: Json = plain(seen_by(decision, robot, judge))
+    return told
+
+
+# --- a judgement of the past -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Point:
+    """Which judgement of a log is meant: the one before an epoch, an age or a time."""
+
+    word: str
+    epoch: int | None = None
+    age_s: float | None = None
+    wall_s: float | None = None
+
+
+def _point_of(word: str) -> Point:
+    """What ``--at`` says: ``12``, ``10m``, ``2026-11-23T18:46:15Z``.
+
+    Raises:
+        CliError: it is none of them.
+    """
+    if word.isascii() and word.isdigit():
+        return Point(word=word, epoch=int(word))
+    age_s = age_s_of(word)
+    if age_s is not None:
+        return Point(word=word, age_s=age_s)
+    try:
+        moment = datetime.fromisoformat(word)
+    except ValueError:
+        forms = "an epoch (12), an age (90s, 10m, 2h, 1d) or a time (2026-11-23T18:46:15Z)"
+        raise CliError(EXIT_USAGE, f"--at {word}: expected {forms}; `zsched history` lists epochs and times") from None
+    return Point(word=word, wall_s=(moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp())
+
+
+def _past(door: Door, task: str, point: Point) -> tuple[Json, Decision]:
+    """The newest judgement before the point in the log of this machine's node, and the move that began the epoch.
+
+    Raises:
+        CliError: another machine's log is meant, or this one has no such epoch or judgement.
+    """
+    if door.node is not None or door.endpoint:
+        raise CliError(EXIT_USAGE, "--at reads the decision log, which lies on each robot: run it there")
+    answer = _ask(door, task)  # names an unknown task
+    node, now, entry, move = _search(door, task, point)
+    if entry is None:
+        edge = f"; {node} is an edge and decides nothing: ask on a robot" if answer.kind == "edge" else ""
+        when = f"before epoch {point.epoch}" if point.epoch is not None else f"until {point.word}"
+        raise CliError(EXIT_FAILED, f"the log of {node} has no judgement of {task} {when}{edge}")
+    try:
+        decision = from_plain(entry["decision"], Decision)
+    except WireError as error:
+        raise CliError(EXIT_FAILED, f"the log's judgement cannot be read ({error})") from error
+    told: Json = plain(explained(decision))
+    head = {"schema": SCHEMA, "node": node, "age_s": max(now - float(entry["at"]), 0.0)}
+    made = None if move is None else _move(move, now)
+    more = {"newest_revision": decision.figures.allocation.revision, "vote": None, "plan": None}
+    return {**head, **told, **more, "at": wall_text(entry["at"]), "made": made, "robot": None}, decision
+
+
+def _move(entry: Json, now: float) -> Json:
+    move = entry["move"]
+    where = {"epoch": move["epoch"], "revision": move["revision"], "from": move["left"], "to": move["owner"]}
+    when = {"at": wall_text(entry["at"]), "age_s": max(now - entry["at"], 0.0)}
+    return {**when, **where, "reason": move["reason"], "votes": dict(move.get("votes", ()))}
+
+
+def _search(door: Door, task: str, point: Point) -> tuple[str, float, Json | None, Json | None]:
+    """(node, its wall clock, the judgement's entry, the move's entry), page by page through the whole log."""
+    wish = {"task": task, "epoch": point.epoch, "until": point.wall_s}
+    if point.age_s is not None:
+        wish["until"] = float(ask_door(door, {"verb": "log", "judgement": wish})["now"]) - point.age_s
+    judgement: Json | None = None
+    move: Json | None = None
+    cursor = ""
+    epochs: list[int] = []
+    while True:
+        answer = ask_door(door, {"verb": "log", "judgement": wish, "cursor": cursor})
+        if "judgement" not in answer:
+            raise CliError(EXIT_FAILED, f"the daemon of {answer['node']} is older than --at; restart it")
+        judgement, move = answer["judgement"] or judgement, answer["move"] or move
+        epochs += answer["epochs"]
+        cursor = str(answer["cursor"])
+        if not answer["more"]:
+            break
+    if point.epoch is not None and move is None:
+        raise CliError(
+            EXIT_FAILED, f"the log of {answer['node']} has no move of {task} to epoch {point.epoch}{_known(epochs)}"
+        )
+    return str(answer["node"]), float(answer["now"]), judgement, move
+
+
+def _known(epochs: Sequence[int]) -> str:
+    return f"; it knows epochs {min(epochs)} to {max(epochs)}" if epochs else "; it knows no move of it"
+
+
+# --- the judgement of now --------------------------------------------------------------------------------------------
 
 
 def _planned(word: str) -> str:
@@ -108,7 +243,8 @@ def _body(answer: Explanation, decision: Decision) -> Json:
     vote = None if answer.vote is None else {**plain(answer.vote), "votes": dict(answer.vote.votes)}
     told: Json = plain(explained(decision))
     head = {"schema": SCHEMA, "node": answer.node, "age_s": answer.age_s}
-    return {**head, **told, "newest_revision": answer.allocation.revision, "vote": vote, "plan": None}
+    more = {"newest_revision": answer.allocation.revision, "vote": vote, "plan": None}
+    return {**head, **told, **more, "at": None, "made": None, "robot": None}
 
 
 def _plan(decision: Decision, gone: str) -> Json:
@@ -129,17 +265,24 @@ def render(body: Json, width: int, color: bool) -> str:
     """An explanation for people, in ``width`` columns."""
     shown = printable(body)
     page = Page(width, color)
-    page.row((f"task {shown['task']} · as {shown['node']} judged it {span(shown['age_s'])} ago", width, "bold"))
+    when = f" ({shown['at']})" if shown["at"] else ""
+    head = f"task {shown['task']} · as {shown['node']} judged it {span(shown['age_s'])} ago{when}"
+    page.row((head, width, "bold"))
     page.lines.append("")
     _judgement(page, "DECISION", shown)
+    _made(page, shown)
     _tuning(page, shown)
     _robots(page, shown)
-    _vote(page, shown)
+    if shown["at"] is None:
+        _vote(page, shown)
     page.lines.append("")
-    _candidates(page, shown)
-    if shown["margin"] is not None:
-        page.block("MARGIN", (f"{shown['margin']:.4f} between the first two", ""))
-    _changes(page, shown)
+    if shown["robot"] is not None:
+        _seen(page, shown)
+    else:
+        _candidates(page, shown)
+        if shown["margin"] is not None:
+            page.block("MARGIN", (f"{shown['margin']:.4f} between the first two", ""))
+        _changes(page, shown)
     if shown["plan"] is not None:
         plan = shown["plan"]
         page.lines.append("")
@@ -159,6 +302,61 @@ def _judgement(page: Page, title: str, body: Json) -> None:
     if body.get("newest_revision", body["revision"]) != body["revision"]:
         parts.append((f"the value has changed since: revision {body['newest_revision']}", "yellow"))
     page.block(title, *parts)
+
+
+def _made(page: Page, body: Json) -> None:
+    """The move that this judgement came before."""
+    move = body["made"]
+    if move is None:
+        return
+    votes = ", ".join(f"{voter} for {choice}" for voter, choice in move["votes"].items())
+    page.block(
+        "THEN",
+        (f"{move['from'] or 'nobody'} -> {move['to'] or 'nobody'}, epoch {move['epoch']}", "bold"),
+        (move["reason"], ""),
+        (votes or "no votes heard", "" if votes else "dim"),
+        (f"{span(move['age_s'])} ago ({move['at']})", "dim"),
+    )
+
+
+def _seen(page: Page, body: Json) -> None:
+    """One robot's terms of every candidate, and whom it hears."""
+    sight = body["robot"]
+    robot = sight["robot"]
+    if sight["is_own"]:
+        page.block("HEARS", *_heard(sight))
+    elif not sight["is_heard"]:
+        page.row((f"{body['node']} has no utilities of {robot}: its answer did not come in time", page.width, "yellow"))
+    first = min(max([9, *(len(one["node"]) for one in body["candidates"])]), 20)
+    columns = (first, -7, -7, -7, -8, page.width)
+    page.row(*zip(("CANDIDATE", "cpu", "mem", "net", "utility", ""), columns, ("stage", *["dim"] * 5), strict=True))
+    for one in body["candidates"]:
+        view = next((view for view in one["robots"] if view["robot"] == robot), None)
+        if view is None:
+            page.row((one["node"], first, ""), ("-", -7, "dim"))
+            continue
+        terms = [_number(view[term]) for term in ("cpu", "memory", "network", "utility")]
+        note = view["refused"] or ("" if view["reachable"] else f"{robot} does not reach it")
+        is_best = one["node"] == sight["best"]
+        note, style = (note, "red") if note else ("highest" if is_best else "", "green")
+        page.row(
+            *zip(
+                (one["node"], *terms, note), columns, ("bold" if one["is_owner"] else "", *[""] * 4, style), strict=True
+            )
+        )
+    page.block(
+        "ITS CHOICE",
+        (sight["best"] or "none", "bold"),
+        (f"the robots together: {body['outcome']} {body['candidate'] or ''}".rstrip(), ""),
+    )
+
+
+def _heard(sight: Json) -> list[Cell]:
+    parts: list[Cell] = [(f"robots {', '.join(sight['robots']) or 'none'}", "")]
+    parts += [(f"gone: {', '.join(sight['gone'])}", "yellow")] if sight["gone"] else []
+    parts.append((f"electors {', '.join(sight['electors']) or 'none'}", ""))
+    silent = sight["electors_silent"]
+    return [*parts, *([(f"electors not heard: {', '.join(silent)}", "yellow")] if silent else [])]
 
 
 def _tuning(page: Page, body: Json) -> None:

@@ -34,6 +34,8 @@ class EventsView:
     since_s: float | None
     is_following: bool
     is_json: bool
+    node: str | None = None
+    """Only lines that name this node."""
 
 
 def duration_s(text: str) -> float:
@@ -45,33 +47,43 @@ def duration_s(text: str) -> float:
     Raises:
         CliError: it is none.
     """
-    found = _DURATION.fullmatch(text)
-    if found is None:
+    seconds = age_s_of(text)
+    if seconds is None:
         raise CliError(EXIT_USAGE, f"{text!r} is no duration; write it like 90s, 10m, 2h or 1d")
-    return float(found[1]) * _UNITS[found[2]]
+    return seconds
 
 
-def task_of(word: str) -> str:
-    """The task of ``task/NAME``.
+def age_s_of(text: str) -> float | None:
+    """Seconds of a duration; ``None``: it is none."""
+    found = _DURATION.fullmatch(text)
+    return None if found is None else float(found[1]) * _UNITS[found[2]]
+
+
+def subject_of(word: str) -> tuple[str | None, str | None]:
+    """The (task, node) of ``task/NAME`` or ``node/NAME``; the one that is not meant is ``None``.
 
     Raises:
         CliError: it is another word.
     """
     kind, _, name = word.partition("/")
-    if kind != "task" or not name:
-        raise CliError(EXIT_USAGE, f"--for {word}: expected task/NAME")
-    return name
+    if kind not in ("task", "node") or not name:
+        raise CliError(EXIT_USAGE, f"--for {word}: expected task/NAME or node/NAME")
+    return (name, None) if kind == "task" else (None, name)
 
 
-def history(door: Door, task: str | None, *, is_json: bool) -> int:
-    """Print the moves that the log knows, the newest last; returns the exit code."""
+def history(door: Door, task: str | None, *, is_json: bool, about: str | None = None) -> int:
+    """Print the moves that the log knows, the newest last; returns the exit code.
+
+    ``about``: only moves to this node or away from it.
+    """
     node, now, entries, _ = read_log(door, is_moves=True)
-    moves = list(moves_of(entries, now, task))
+    moves = [move for move in moves_of(entries, now, task) if about in (None, move["from"], move["to"])]
     if is_json:
         print_json({"schema": SCHEMA, "node": node, "moves": moves})
         return EXIT_OK
     if not moves:
-        sys.stdout.write(f"no move{f' of {task}' if task else ''} in the log of {node}\n")
+        whose = (f" of {task}" if task else "") + (f" to {about} or away from it" if about else "")
+        sys.stdout.write(f"no move{whose} in the log of {node}\n")
     for move in moves:
         sys.stdout.write(_move_line(printable(move)))
     return EXIT_OK
@@ -109,7 +121,8 @@ def read_log(door: Door, *, is_moves: bool, cursor: str = "") -> tuple[str, floa
         CliError: nobody answers, or another machine's log is meant.
     """
     if door.node is not None:
-        raise CliError(EXIT_USAGE, f"the log of {door.node} lies on its machine: ask there")
+        instead = f"--for node/{door.node} shows what this machine's log tells of it"
+        raise CliError(EXIT_USAGE, f"the log of {door.node} lies on its machine: ask there; {instead}")
     found: list[Json] = []
     while True:
         answer = ask_door(door, {"verb": "log", "moves": is_moves, "cursor": cursor})
@@ -167,7 +180,7 @@ def _move_line(move: Json) -> str:
 
 def _print(entries: list[Json], view: EventsView) -> None:
     for entry in entries:
-        if view.task not in (None, entry.get("task", "")):
+        if view.task not in (None, entry.get("task", "")) or not (view.node is None or names(entry, view.node)):
             continue
         if view.is_json:
             print_json({**entry, "at": wall_text(entry["at"])}, is_line=True)
@@ -176,6 +189,13 @@ def _print(entries: list[Json], view: EventsView) -> None:
         where = f"task={shown['task']} epoch={shown.get('epoch', 0)} " if shown.get("task") else ""
         sys.stdout.write(f"{wall_text(entry['at'])} {shown['stage']:<10} {where}{shown['text']}\n")
     sys.stdout.flush()
+
+
+def names(entry: Json, node: str) -> bool:
+    """Whether a line tells of this node: its move comes or leaves there, or its text has the name as a whole word."""
+    move = entry.get("move") or {}
+    word = rf"(?<![a-z0-9_-]){re.escape(node)}(?![a-z0-9_-])"
+    return node in (move.get("left"), move.get("owner")) or re.search(word, str(entry.get("text", ""))) is not None
 
 
 def wall_text(at: float) -> str:

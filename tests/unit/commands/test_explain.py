@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from support.schemas import faults
+from zsched.adapters.host.decision_log import NAME, DecisionLog
 from zsched.commands import explain as verb
 from zsched.commands.ask import Door
 from zsched.commands.common import CliError
 from zsched.commands.explain import SCHEMA, ExplainView, explain
+from zsched.core.instructions import RecordStory
 from zsched.core.scheduler.decision import decide_again, verdict_of
-from zsched.core.values.decision import Decision, Explanation, Figures, Need, Rules
+from zsched.core.values.decision import Decision, Explanation, Figures, Move, Need, Rules
 from zsched.core.values.fleet import Reach
 from zsched.core.values.model import Allocation, PeerState, Tuning, Utility, UtilityVector, Weights
 from zsched.core.values.snapshot import VoteStatus
-from zsched.exits import EXIT_FAILED, EXIT_USAGE, EXIT_WOULD_CHANGE
+from zsched.exits import EXIT_FAILED, EXIT_UNREACHABLE, EXIT_USAGE, EXIT_WOULD_CHANGE
 from zsched.wire.codec import as_plain
 
 ROBOTS = ("robot1", "robot2", "robot3")
@@ -88,10 +91,17 @@ class Fleet:
         edge = Explanation(node="edge1", kind="edge", task="merge", allocation=VALUE, robots=ROBOTS)
         self.answers: dict[str | None, Any] = {"robot1": robot, None: robot, "edge1": edge}
         self.asked: list[str | None] = []
+        self.silent: set[str] = set()
+        self.log: DecisionLog | None = None
 
     def ask(self, door: Door, request: dict[str, Any], timeout_s: float = 5.0) -> dict[str, Any]:
         assert timeout_s > 0
         self.asked.append(door.node)
+        if request["verb"] == "log":
+            assert self.log is not None
+            return dict(json.loads(json.dumps(self.log.answer(request))))
+        if door.node in self.silent:
+            raise CliError(EXIT_UNREACHABLE, f"no daemon of {door.node}")
         if request["task"] != "merge":
             return {"outcome": "invalid", "detail": "no task 'merg'; there are merge"}
         return {"explanation": json.loads(json.dumps(as_plain(self.answers[door.node])))}
@@ -104,8 +114,8 @@ def fleet(monkeypatch: pytest.MonkeyPatch) -> Fleet:
     return made
 
 
-def asked(node: str | None = None, task: str = "merge", *, is_json: bool = False, plan: str | None = None) -> int:
-    view = ExplainView(plan=plan, is_json=is_json, is_colored=False)
+def asked(node: str | None = None, task: str = "merge", *, is_json: bool = False, **more: str | None) -> int:
+    view = ExplainView(plan=more.pop("plan", None), is_json=is_json, is_colored=False, **more)
     return explain(Door(socket=Path("s"), node=node), task, view)
 
 
@@ -199,3 +209,146 @@ def test_an_unknown_task_and_no_judgement_yet_are_refused(fleet: Fleet) -> None:
     with pytest.raises(CliError, match="has judged nothing of merge yet") as early:
         asked()
     assert early.value.code == EXIT_FAILED
+
+
+# --- what one robot sees ---------------------------------------------------------------------------------------------
+
+
+def test_a_robot_s_view_is_its_own_judgement_with_its_terms_and_whom_it_hears(
+    fleet: Fleet, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fleet.answers["robot2"] = replace(fleet.answers["robot1"], node="robot2")
+    assert asked(robot="robot2") == 0
+    text = capsys.readouterr().out
+    assert fleet.asked == [None, "robot2"]
+    assert "as robot2 judged it" in text
+    assert "HEARS      robots robot1, robot2, robot3 · electors robot1, robot2, robot3" in text
+    assert re.search(r"^edge1 +0.7500 +0.5000 +0.5000 +0.6250  ?highest", text, re.MULTILINE), text
+    assert re.search(r"^edge3 .*worker failed", text, re.MULTILINE), text
+    assert "ITS CHOICE" in text
+    assert "TO MOVE" not in text
+    assert asked(robot="robot2", is_json=True) == 0
+    body = json.loads(capsys.readouterr().out)
+    assert faults(body) == []
+    assert (body["robot"]["robot"], body["robot"]["best"], body["robot"]["is_own"]) == ("robot2", "edge1", True)
+
+
+def test_of_a_robot_that_does_not_answer_another_tells_what_it_heard(
+    fleet: Fleet, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fleet.silent = {"robot2", "robot3"}
+    assert asked(robot="robot2") == 0
+    captured = capsys.readouterr()
+    assert "what robot1 has heard of robot2" in captured.err
+    assert "HEARS" not in captured.out, "nobody knows whom it hears"
+    assert "0.6250" in captured.out
+    assert asked(robot="robot3") == 0
+    assert "robot1 has no utilities of robot3" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("fleet")
+def test_a_robot_that_is_none_is_refused_with_the_nearest() -> None:
+    with pytest.raises(CliError, match="did you mean robot") as refused:
+        asked(robot="robo2")
+    assert refused.value.code == EXIT_USAGE
+
+
+# --- a judgement of the past -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def past(fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Fleet:
+    """A log of two moves: at 1000 s and at 2000 s of the wall clock, each 1 s after its judgement."""
+    moments = iter([999.0, 999.5, 1000.0, 1500.0, 1999.0, 2000.0, 2050.0])
+    monkeypatch.setattr("zsched.adapters.host.decision_log.wall_s", lambda: next(moments, 2100.0))
+    fleet.log = DecisionLog(tmp_path, "robot1", 7, lambda _problem: None)
+    fleet.log.start()
+
+    def judged(epoch: int, owner: str, cpu: float, task: str = "merge") -> None:
+        assert fleet.log is not None
+        made = decision()
+        value = replace(VALUE, epoch=epoch, owner=owner, task=task)
+        vectors = tuple(
+            replace(
+                one,
+                utilities=tuple(
+                    replace(utility, cpu=cpu, value=0.5 * cpu + 0.15 + 0.1) if utility.candidate == owner else utility
+                    for utility in one.utilities
+                ),
+            )
+            for one in made.figures.vectors
+        )
+        figures = replace(made.figures, allocation=value, vectors=vectors)
+        again = replace(made, figures=figures, verdict=verdict_of(decide_again(figures).judgement))
+        fleet.log.put(RecordStory(stage="scheduler", text="judged", task=task, epoch=epoch, decision=again))
+
+    def moved(epoch: int, left: str, owner: str) -> None:
+        assert fleet.log is not None
+        move = Move(
+            epoch=epoch, revision=epoch + 1, left=left, owner=owner, reason="nearer", votes=(("robot1", owner),)
+        )
+        fleet.log.put(RecordStory(stage="vote", text="learnt", task="merge", epoch=epoch, move=move))
+
+    judged(3, "edge1", 0.11)
+    judged(3, "edge1", 0.99, task="other")
+    moved(4, "edge1", "edge2")
+    judged(4, "edge2", 0.22)
+    judged(4, "edge2", 0.33)
+    moved(5, "edge2", "edge1")
+    judged(5, "edge1", 0.44)
+    fleet.log.close()
+    return fleet
+
+
+def cpu_of_owner(body: dict[str, Any]) -> float:
+    return float(next(one for one in body["candidates"] if one["is_owner"])["robots"][0]["cpu"])
+
+
+@pytest.mark.usefixtures("past")
+def test_the_judgement_that_made_an_epoch_is_told_whole_with_its_move(capsys: pytest.CaptureFixture[str]) -> None:
+    for word, owner, cpu, made in (("4", "edge1", 0.11, 4), ("5", "edge2", 0.33, 5)):
+        assert asked(at=word, is_json=True) == 0
+        body = json.loads(capsys.readouterr().out)
+        assert faults(body) == []
+        assert (body["owner"], cpu_of_owner(body), body["made"]["epoch"]) == (owner, cpu, made)
+        for one in body["candidates"]:
+            if one["total"] is not None:
+                assert one["total"] == max(one["joint"] + one["bonus"] - one["penalty"], 0.0)
+    assert asked(at="5") == 0
+    text = capsys.readouterr().out
+    assert "judged it 1m41s ago (1970-01-01T00:33:19.000Z)" in text
+    assert "THEN       edge2 -> edge1, epoch 5 · nearer · robot1 for edge1" in text
+    assert "VOTE" not in text
+    assert asked(at="4", robot="robot2") == 0
+    assert "0.1100" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("past")
+def test_an_age_and_a_time_name_the_newest_judgement_until_then(capsys: pytest.CaptureFixture[str]) -> None:
+    for word, cpu in (("10s", 0.44), ("101s", 0.33), ("200s", 0.22), ("1970-01-01T00:25:00Z", 0.22)):
+        assert asked(at=word, is_json=True) == 0
+        body = json.loads(capsys.readouterr().out)
+        assert faults(body) == []
+        assert (cpu_of_owner(body), body["made"]) == (cpu, None), word
+
+
+def test_a_past_that_is_not_there_is_said_with_what_there_is(past: Fleet, tmp_path: Path) -> None:
+    refusals = {
+        "9": (EXIT_FAILED, "no move of merge to epoch 9; it knows epochs 4 to 5"),
+        "3": (EXIT_FAILED, "no move of merge to epoch 3"),
+        "1970-01-01T00:00:00Z": (EXIT_FAILED, "no judgement of merge until"),
+        "yesterday": (EXIT_USAGE, "an epoch .12., an age"),
+    }
+    for word, (code, text) in refusals.items():
+        with pytest.raises(CliError, match=text) as refused:
+            asked(at=word)
+        assert refused.value.code == code
+    with pytest.raises(CliError, match="lies on each robot") as elsewhere:
+        asked("robot1", at="4")
+    assert elsewhere.value.code == EXIT_USAGE
+    (tmp_path / NAME).unlink()
+    past.answers[None] = past.answers["edge1"]
+    with pytest.raises(CliError, match="no move of merge to epoch 4; it knows no move of it"):
+        asked(at="4")
+    with pytest.raises(CliError, match="is an edge and decides nothing: ask on a robot"):
+        asked(at="1h")

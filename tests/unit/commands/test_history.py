@@ -16,7 +16,7 @@ from zsched.cli import app
 from zsched.commands import history as verb
 from zsched.commands.ask import Door
 from zsched.commands.common import CliError
-from zsched.commands.history import EventsView, duration_s, events, history, task_of
+from zsched.commands.history import EventsView, duration_s, events, history, subject_of
 from zsched.core.instructions import RecordStory
 from zsched.core.scheduler.decision import decide_again, verdict_of
 from zsched.core.values.decision import Decision, Figures, Move, Rules
@@ -171,7 +171,7 @@ def test_who_follows_goes_on_where_it_was_and_outlasts_a_restart(
 
 
 def test_another_machine_s_log_is_refused(pages: Pages) -> None:
-    with pytest.raises(CliError, match="lies on its machine") as refused:
+    with pytest.raises(CliError, match="lies on its machine: ask there; --for node/robot2") as refused:
         history(Door(socket=Path("s"), node="robot2"), None, is_json=False)
     assert refused.value.code == EXIT_USAGE
     assert pages.asked == []
@@ -185,10 +185,34 @@ def test_what_is_no_duration_is_refused(word: str) -> None:
 
 def test_durations_and_the_word_for_a_task() -> None:
     assert [duration_s(word) for word in ("90s", "1.5m", "2h", "1d")] == [90.0, 90.0, 7200.0, 86400.0]
-    assert task_of("task/merge") == "merge"
-    for word in ("merge", "task/", "node/edge1"):
-        with pytest.raises(CliError, match="task/NAME"):
-            task_of(word)
+    assert subject_of("task/merge") == ("merge", None)
+    assert subject_of("node/edge1") == (None, "edge1")
+    for word in ("merge", "task/", "node/", "robot/robot1"):
+        with pytest.raises(CliError, match="task/NAME or node/NAME"):
+            subject_of(word)
+
+
+@pytest.mark.usefixtures("pages")
+def test_moves_of_one_node_are_those_that_came_to_it_or_left_it(capsys: pytest.CaptureFixture[str]) -> None:
+    assert history(HERE, None, about="edge1", is_json=True) == 0
+    assert [move["task"] for move in json.loads(capsys.readouterr().out)["moves"]] == ["merge"]
+    assert history(HERE, None, about="edge2", is_json=True) == 0
+    assert [move["task"] for move in json.loads(capsys.readouterr().out)["moves"]] == ["merge", "other"]
+    assert history(HERE, "merge", about="edge3", is_json=False) == 0
+    assert capsys.readouterr().out == "no move of merge to edge3 or away from it in the log of robot1\n"
+
+
+def test_events_of_one_node_name_it_as_a_whole_word(pages: Pages, capsys: pytest.CaptureFixture[str]) -> None:
+    pages.entries = [
+        entry("edge1 is gone", 9.0, task=""),
+        entry("edge11 is gone", 8.0, task=""),
+        entry("learnt", 7.0, move=MOVE),
+        entry("propose edge2: nothing [edge1=0.479 edge2=0.5]", 6.0),
+        entry("hedge1 and edge1-b", 5.0),
+    ]
+    assert events(HERE, view(node="edge1", is_json=True)) == 0
+    told = [json.loads(line)["text"] for line in capsys.readouterr().out.splitlines()]
+    assert told == ["edge1 is gone", "learnt", "propose edge2: nothing [edge1=0.479 edge2=0.5]"]
 
 
 # --- replay ----------------------------------------------------------------------------------------------------------

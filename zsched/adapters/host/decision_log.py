@@ -160,9 +160,16 @@ class DecisionLog:
     # --- reading (an operator's thread) ------------------------------------------------------------------------------
 
     def answer(self, request: Json) -> Json:
-        """A page of the log: ``cursor`` is where the page before ended, ``moves`` leaves out all but moves."""
-        cursor, is_moves = request.get("cursor"), bool(request.get("moves"))
+        """A page of the log: ``cursor`` is where the page before ended, ``moves`` leaves out all but moves.
+
+        With ``judgement`` (a ``task``, and an ``epoch`` or ``until``) no entries but the page's newest judgement before
+        that, whole, and the move to that epoch.
+        """
+        cursor, is_moves, wish = request.get("cursor"), bool(request.get("moves")), request.get("judgement")
         lines, cursor, has_more = read_page(self._folder, cursor if isinstance(cursor, str) else "")
+        if isinstance(wish, dict):
+            found = judged_before(lines, wish)
+            return {"node": self._node, "now": wall_s(), **found, "cursor": cursor, "more": has_more}
         wanted = [line for line in map(without_figures, lines) if not is_moves or _is_of_move(line)]
         entries = [entry for line in wanted if (entry := _parsed(line)) is not None]
         return {"node": self._node, "now": wall_s(), "entries": entries, "cursor": cursor, "more": has_more}
@@ -179,6 +186,30 @@ def _parsed(line: bytes) -> Json | None:
 
 def _is_of_move(line: bytes) -> bool:
     return any(mark in line for mark in (b',"move":', b',"took_s":', b',"gap_s":'))
+
+
+def judged_before(lines: list[bytes], wish: Json) -> Json:
+    """The newest judgement of ``wish["task"]`` in these lines that came before a point, and the move there.
+
+    The point is ``wish["epoch"]``, which a move began, or the wall time ``wish["until"]``. Either may be ``None``.
+    """
+    task, epoch, until = wish.get("task"), wish.get("epoch"), wish.get("until")
+    judgement, move, epochs = None, None, set()
+    for line in lines:
+        entry = _parsed(without_figures(line))
+        if entry is None or entry.get("task") != task:
+            continue
+        begun = entry["move"].get("epoch") if isinstance(entry.get("move"), dict) else None
+        if begun is not None:
+            epochs.add(begun)
+        is_early = entry["at"] <= until if isinstance(until, int | float) else True
+        if isinstance(epoch, int):
+            is_early = is_early and entry.get("epoch", 0) < epoch
+            move = entry if begun == epoch else move
+        if is_early and _BODY in line:
+            judgement = line
+    known = [min(epochs), max(epochs)] if epochs else []
+    return {"judgement": None if judgement is None else _parsed(judgement), "move": move, "epochs": known}
 
 
 def without_figures(line: bytes) -> bytes:

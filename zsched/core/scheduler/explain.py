@@ -92,6 +92,47 @@ class Explained:
     """What would have to change for a move."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sight:
+    """What one robot sees: its own terms, and whom it hears."""
+
+    robot: NodeId
+    is_heard: bool
+    """Whether its utilities are part of the judgement."""
+    best: NodeId | None
+    """The candidate to which it gives the highest utility; the owner where several have that."""
+    is_own: bool
+    """Whether the judgement is this robot's own; the fields below are of the node that judged."""
+    robots: tuple[NodeId, ...]
+    """Robots that are not gone."""
+    gone: tuple[NodeId, ...]
+    electors: tuple[NodeId, ...]
+    """Electors that are heard."""
+    electors_silent: tuple[NodeId, ...]
+
+
+def seen_by(decision: Decision, robot: NodeId, judge: NodeId) -> Sight:
+    """What ``robot`` sees, by the judgement that the node ``judge`` made."""
+    figures = decision.figures
+    standing = decide_again(figures).standing
+    own = {
+        one.candidate: one.value
+        for vector in standing.vectors
+        for one in vector.utilities
+        if vector.voter == robot and one.reachable
+    }
+    return Sight(
+        robot=robot,
+        is_heard=any(vector.voter == robot for vector in standing.vectors),
+        best=pick(own, figures.allocation.owner),
+        is_own=robot == judge,
+        robots=tuple(name for name in figures.voters if name in figures.present),
+        gone=tuple(name for name in figures.voters if name not in figures.present),
+        electors=figures.electors_heard,
+        electors_silent=tuple(name for name in figures.electors if name not in figures.electors_heard),
+    )
+
+
 def explained(decision: Decision) -> Explained:
     """The sums of a judgement."""
     figures, verdict = decision.figures, decision.verdict
