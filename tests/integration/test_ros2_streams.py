@@ -10,6 +10,7 @@ import contextlib
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import pytest
@@ -218,3 +219,61 @@ def test_a_service_is_asked_under_the_robots_name(rig: Rig) -> None:
     assert reply.ok.attachment is not None
     assert reply.ok.attachment.to_bytes() == mark
     assert asked == [f"0/edge1/merge/now/{TRIGGER}"]
+
+
+ACTION_FILE = FILE.replace(
+    """      inputs: [{topic: /map, worker_topic: "/{target}/merge/{robot}/map", class: latest}]
+      outputs: [{topic: /merged_map, worker_topic: "/{target}/merge/map", class: latest}]
+      services: [{service: /merge_now, type: std_srvs/srv/Trigger, worker_service: "/{target}/merge/now"}]
+""",
+    """      actions: [{action: /spin, type: nav2_msgs/action/Spin, worker_action: "/{target}/spin"}]
+""",
+)
+PARTS = {
+    "send_goal": "nav2_msgs::action::dds_::Spin_SendGoal_/TypeHashNotSupported",
+    "get_result": "nav2_msgs::action::dds_::Spin_GetResult_/TypeHashNotSupported",
+    "cancel_goal": "action_msgs::srv::dds_::CancelGoal_/TypeHashNotSupported",
+}
+
+
+def test_a_goals_result_is_asked_of_the_next_owner_when_the_first_one_goes() -> None:
+    """A ROS client would wait for ever: an error reply is no response. The next owner does not know the goal."""
+    with contextlib.ExitStack() as stack:
+        host = RosHost(stack, ACTION_FILE)
+        asked: dict[str, list[str]] = {"edge1": [], "edge2": []}
+        held: list[zenoh.Query] = []
+
+        def answer(owner: str, query: zenoh.Query) -> None:
+            asked[owner].append(str(query.key_expr).split("/")[4])
+            if owner == "edge1" and "/get_result/" in str(query.key_expr):
+                held.append(query)  # the goal is being worked at
+                return
+            with query:
+                query.reply(str(query.key_expr), owner.encode(), attachment=query.attachment)
+
+        for owner in asked:
+            session = opened(worker_config(connect=(host.seed,), shared_memory=False))
+            stack.callback(session.close)
+            for part, kind in PARTS.items():
+                key = f"0/{owner}/spin/_action/{part}/{kind}"
+                session.declare_queryable(key, partial(answer, owner), complete=True)
+        robot = opened(client_config(connect=(host.host,)))
+        stack.callback(robot.close)
+        host.move("edge1")
+
+        def ask(part: str) -> Any:
+            mark = encode_attachment(Attachment(sequence=1, stamp_ns=time.time_ns(), gid=bytes(16)))
+            key, all_complete = f"0/spin/_action/{part}/{PARTS[part]}", zenoh.QueryTarget.ALL_COMPLETE
+            return robot.get(key, target=all_complete, payload=b"goal", attachment=mark, timeout=20.0)
+
+        (sent,) = list(ask("send_goal"))
+        assert sent.ok is not None
+        assert sent.ok.payload.to_bytes() == b"edge1"
+        result = ask("get_result")
+        until(lambda: held, "the first owner has been asked for the result")
+        host.move("edge2")
+        (reply,) = list(result)
+        held.clear()
+        assert reply.ok is not None, reply.err
+        assert reply.ok.payload.to_bytes() == b"edge2"
+        assert asked == {"edge1": ["send_goal", "get_result"], "edge2": ["get_result"]}

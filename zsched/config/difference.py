@@ -389,7 +389,7 @@ def _worker(old: TaskSpec, new: TaskSpec, fleets: tuple[Fleet, Fleet]) -> Iterat
     if deadlines[0] != deadlines[1]:
         yield _set(_renewed(new), f"{path}.scheduling.deadline_ms", *deadlines)
     if any(outputs_of(old, name) != outputs_of(new, name) for name in homes):
-        yield replace(_renewed(new), paths=(f"{path}.outputs", f"{path}.ros2.outputs"))
+        yield replace(_renewed(new), paths=(f"{path}.outputs", f"{path}.ros2.outputs", f"{path}.ros2.actions"))
 
 
 def _renewed(task: TaskSpec) -> _Verdict:
@@ -415,7 +415,9 @@ def _rules(old: TaskSpec, new: TaskSpec) -> Iterator[_Verdict]:
             f"{_streams(names)} {verb}" for names, verb in ((come, "begin"), (go, "end"), (differ, "move")) if names
         ]
         if texts:
-            paths = (f"tasks.{old.name}.{key}", f"tasks.{old.name}.ros2.{key}")
+            task = f"tasks.{old.name}"
+            actions = () if word == "in" else (f"{task}.ros2.actions",)
+            paths = (f"{task}.{key}", f"{task}.ros2.{key}", *actions)
             yield _Verdict(effect=Effect.STREAMS, text="; ".join(texts), paths=paths)
 
 

@@ -4,7 +4,8 @@ Knows: the section's keys, how names become key templates. Does not know: YAML, 
 (`zsched.config.tasks` judges these like any other).
 
 Each entry names the robots' side (`topic`, `service`) and the worker's: either another ROS name (`worker_topic`: the
-worker is a ROS node) or a plain key (`worker_key`: it is a zenoh program).
+worker is a ROS node) or a plain key (`worker_key`: it is a zenoh program). An action is five such entries in one,
+between ROS nodes only.
 """
 
 from __future__ import annotations
@@ -13,16 +14,29 @@ from collections.abc import Iterator
 from functools import partial
 from typing import Final
 
-from zsched.config.blocks import Choice, Field, Here, ListOf, Located, Record, Section, Text, Whole
+from zsched.config.blocks import Choice, Field, Here, ListOf, Located, Number, Record, Section, Text, Whole
 from zsched.config.reader import Collector
-from zsched.core.route.ros2 import ANY, MAX_DOMAIN, hash_fault, name_fault, node_name_fault, ros_key, type_fault
-from zsched.core.route.templates import placeholders
+from zsched.core.route.ros2 import (
+    ACTION_PARTS,
+    ANY,
+    MAX_DOMAIN,
+    ActionPart,
+    action_type_fault,
+    hash_fault,
+    name_fault,
+    node_name_fault,
+    ros_key,
+    type_fault,
+)
+from zsched.core.route.templates import placeholders, template_fault
 from zsched.core.values.model import NodeId
-from zsched.core.values.plan import Direction, RosGraph
+from zsched.core.values.plan import Direction, RosGraph, StreamClass
 
 _BRIDGES: Final = {str(graph): graph for graph in (RosGraph.RMW_ZENOH, RosGraph.ROS2DDS)}
 _NAME: Final = Text("a ROS name", name_fault, 'for example "/{robot}/map"')
 _KEY: Final = Text("a key template", lambda text: None if len(text) <= 4096 else "it is too long")
+_MAX_TIMEOUT_S: Final = 3600.0
+"""Of a service (`zsched.core.values.plan.ServiceSettings`): a goal may work for so long before its result is there."""
 
 
 def ros2_record(rule: Record, service: Record) -> Record:
@@ -39,6 +53,31 @@ def ros2_record(rule: Record, service: Record) -> Record:
                 ListOf(_entry("a ROS topic", "topic", rule)), "Topics from the worker to the robots' nodes."
             ),
             "services": Field(ListOf(_entry("a ROS service", "service", service)), "Services that the worker offers."),
+            "actions": Field(
+                ListOf(_action(service)), "Actions that the worker offers: three services and two topics."
+            ),
+        },
+    )
+
+
+def _action(service: Record) -> Record:
+    rest = {name: item for name, item in service.items.items() if name not in ("from", "to")}
+    return Record(
+        "a ROS action",
+        {
+            "action": Field(Here(_NAME), "The name that the robot's nodes use; a template.", required=True),
+            "type": Field(
+                Here(Text("a ROS action type", action_type_fault)), "As `nav2_msgs/action/Spin`.", default="`any`"
+            ),
+            "worker_action": Field(
+                Here(_NAME), "The name that the worker uses, a ROS node; a template.", required=True
+            ),
+            "result_timeout_s": Field(
+                Number(0.05, _MAX_TIMEOUT_S, "s"),
+                "So long may a goal work: its result is asked for when it begins. `timeout_s` is of the other two.",
+                default=f"`{_MAX_TIMEOUT_S:g}`",
+            ),
+            **rest,
         },
     )
 
@@ -62,20 +101,64 @@ def _entry(what: str, word: str, plain: Record) -> Record:
 def ros2_rules(
     given: Section, robots: tuple[NodeId, ...], candidates: tuple[NodeId, ...], out: Collector
 ) -> Iterator[tuple[Direction, Section]]:
-    """Each entry as the section of a plain rule, in the order inputs, outputs, services."""
+    """Each entry as the section of a plain rule: inputs, outputs, services, and then the five of each action."""
     graph: RosGraph = given.get("bridge", RosGraph.RMW_ZENOH)
     if graph is RosGraph.ROS2DDS and "domain" in given.places:
         out.error(
             given.where("domain"), "the bridge's keys have no domain: the bridge itself belongs to one", "delete it"
         )
+    domain = given.get("domain", 0)
     for direction in Direction:
         word = "service" if direction is Direction.SERVICE else "topic"
         for entry in given.get(f"{direction}s", ()):
-            ends = _ends(entry, word, direction, graph, given.get("domain", 0), out)
+            ends = _ends(entry, word, direction, graph, domain, out)
             if ends is None:
                 continue
             _check_node_names(entry, word, robots, candidates, out)
             yield direction, _plain(entry, word, direction, graph, ends)
+    for entry in given.get("actions", ()):
+        if graph is RosGraph.ROS2DDS and "type" in entry.places:
+            out.error(entry.where("type"), "the bridge's keys have none", "delete it")
+        elif entry.is_whole and _is_named(entry, robots, candidates, out):
+            for part in ACTION_PARTS:
+                yield _part(entry, part, graph, domain)
+
+
+def _is_named(entry: Section, robots: tuple[NodeId, ...], candidates: tuple[NodeId, ...], out: Collector) -> bool:
+    """Whether both names of an action may stand in rules: judged once, not in each of its five."""
+    before = out.count
+    for field, side in (("action", "from"), ("worker_action", "to")):
+        held: Located[str] = entry.get(field)
+        problem = template_fault(held.value.removeprefix("/"), Direction.SERVICE, side)
+        if problem is not None:
+            out.error(held.place, f"{held.value!r}: {problem}")
+    _check_node_names(entry, "action", robots, candidates, out)
+    return out.count == before
+
+
+def _part(entry: Section, part: ActionPart, graph: RosGraph, domain: int) -> tuple[Direction, Section]:
+    """One of an action's five as the section of a plain rule.
+
+    Its result and the end of a goal may be asked for twice, so the next owner is asked when the old one has not
+    answered: it says that it does not know the goal. The status is latched (transient local, depth 1).
+    """
+    action_type = entry.get("type", Located(ANY, entry.place)).value
+
+    def end(held: Located[str]) -> Located[str]:
+        name = f"{held.value.rstrip('/')}/_action/{part.word}"
+        return Located(ros_key(graph, name, domain=domain, type_name=part.type_name(action_type)), held.place)
+
+    ends = end(entry.get("action")), end(entry.get("worker_action"))
+    direction = Direction.SERVICE if part.is_service else Direction.OUTPUT
+    rest = entry if part.is_service else Section(place=entry.place)
+    rule = _plain(rest, "action", direction, graph, ends)
+    if part.word == "status":
+        rule.values["class"] = StreamClass.LATEST
+    elif part.word == "get_result":
+        rule.values |= {"retry": True, "timeout_s": entry.get("result_timeout_s", _MAX_TIMEOUT_S)}
+    elif part.word == "cancel_goal":
+        rule.values["retry"] = True
+    return direction, rule
 
 
 def _ends(
@@ -137,7 +220,7 @@ def _plain(
     entry: Section, word: str, direction: Direction, graph: RosGraph, ends: tuple[Located[str], Located[str]]
 ) -> Section:
     source, goal = ends[::-1] if direction is Direction.OUTPUT else ends
-    own = (word, f"worker_{word}", "worker_key", "type", "hash")
+    own = (word, f"worker_{word}", "worker_key", "type", "hash", "result_timeout_s")
     values = {name: value for name, value in entry.values.items() if name not in own}
     places = {name: place for name, place in entry.places.items() if name not in own}
     values |= {"from": source, "to": goal, "graph": graph}

@@ -110,7 +110,7 @@ def test_robots_that_all_publish_map_need_their_local_sides() -> None:
         ('{topic: "/{robot}/m", worker_key: "{target}/{robot}", type: nav_msgs/Odometry}', "PACKAGE/msg/NAME", ""),
         (
             '{topic: "/{robot}/m", worker_key: "{target}/{robot}", type: a/action/B}',
-            "an action is made of services",
+            "an action goes under `actions:`",
             "",
         ),
         ('{topic: "/{robot}/m", worker_key: "{target}/{robot}", type: a/srv/B}', "the type of a service, this is", ""),
@@ -148,8 +148,11 @@ def test_all_topics_below_a_name_pass_whatever_their_types() -> None:
     assert rewrite(f"0/robot1/a/front/scan/{GRID}/{HASH}") == f"0/edge1/m/robot1/front/scan/{GRID}/{HASH}"
 
 
-def test_an_action_is_five_entries() -> None:
-    """Three services and two topics, by the names that ROS gives them."""
+ACTION = '{action: "/{robot}/spin", worker_action: "/{target}/spin", type: nav2_msgs/action/Spin}'
+
+
+def test_an_action_is_its_three_services_and_two_topics() -> None:
+    """The entry says what five entries say, by the names that ROS gives them."""
     entries = """ros2:
       inputs: []
       outputs:
@@ -160,7 +163,51 @@ def test_an_action_is_five_entries() -> None:
         - {service: "/{robot}/spin/_action/get_result", worker_service: "/{target}/spin/_action/get_result", type: nav2_msgs/action/Spin_GetResult}
         - {service: "/{robot}/spin/_action/cancel_goal", worker_service: "/{target}/spin/_action/cancel_goal", type: action_msgs/srv/CancelGoal}
 """  # noqa: E501 - one line per entry, as operators write it
-    assert len(fleet_of(entries).tasks[0].rules) == 5
+    long = fleet_of(entries).tasks[0].rules
+    short = fleet_of(f"ros2: {{actions: [{ACTION}]}}").tasks[0].rules
+    keys = [(rule.direction, rule.from_template, rule.to_template, rule.settings.graph) for rule in short]
+    assert keys == [(rule.direction, rule.from_template, rule.to_template, rule.settings.graph) for rule in long]
+
+
+def test_an_actions_settings_go_to_the_parts_that_want_them() -> None:
+    entry = f"{ACTION[:-1]}, timeout_s: 2, hold_s: 1, result_timeout_s: 60}}"
+    feedback, status, send, result, cancel = fleet_of(f"ros2: {{actions: [{entry}]}}").tasks[0].rules
+    assert (feedback.settings.stream_class, status.settings.stream_class) == (
+        StreamClass.BEST_EFFORT,
+        StreamClass.LATEST,
+    )
+    assert [(one.service.timeout_s, one.service.retry) for one in (send, result, cancel)] == [
+        (2, False),
+        (60, True),
+        (2, True),
+    ]
+    assert {one.service.hold_s for one in (send, result, cancel)} == {1}
+
+
+def test_an_action_of_any_type_and_one_of_a_bridge_have_keys() -> None:
+    entry = ACTION.replace(", type: nav2_msgs/action/Spin", "")
+    keys = [rule.to_template for rule in fleet_of(f"ros2: {{actions: [{entry}]}}").tasks[0].rules]
+    assert keys[0] == "0/{robot}/spin/_action/feedback/*/*"
+    assert keys[1] == "0/{robot}/spin/_action/status/action_msgs::msg::dds_::GoalStatusArray_/*"
+    bridged = fleet_of(f"ros2: {{bridge: ros2dds, actions: [{entry}]}}").tasks[0].rules
+    assert bridged[2].to_template == "{target}/spin/_action/send_goal"
+    assert "the bridge's keys have none" in faults(f"ros2: {{bridge: ros2dds, actions: [{ACTION}]}}")
+
+
+@pytest.mark.parametrize(
+    ("entry", "said"),
+    [
+        ('{action: "/{robot}/spin", worker_action: "/spin"}', "'/spin': it lacks {target}"),
+        ('{action: "/{robot}/spin"}', "lacks the key 'worker_action'"),
+        ('{action: "/{robot}/spin", worker_action: "/{target}/s", type: a/action/B_SendGoal}', "PACKAGE/action/NAME"),
+        ('{action: "/{robot}/spin", worker_action: "/{target}/s", type: a/srv/B}', "PACKAGE/action/NAME"),
+        ('{action: "/{robot}/spin", worker_action: "/{target}/s", class: latest}', "has no key 'class'"),
+    ],
+)
+def test_a_fault_of_an_action_is_told_once(entry: str, said: str) -> None:
+    report = faults(f"ros2: {{actions: [{entry}]}}")
+    assert said in report
+    assert report.count("error:") == 1
 
 
 def test_an_output_from_a_plain_key_needs_type_and_hash() -> None:

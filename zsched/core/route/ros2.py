@@ -37,6 +37,7 @@ _TYPE: Final = re.compile(
 )
 """An action brings three types of its own (its cancel service and status topic have types of `action_msgs`)."""
 _FEEDBACK: Final = "FeedbackMessage"
+_ACTION_TYPE: Final = re.compile(r"[a-z][a-z0-9_]*/action/[A-Z][A-Za-z0-9]*")
 _HASH: Final = re.compile(r"RIHS[0-9]{2}_[0-9a-f]{64}|TypeHashNotSupported")
 _RMW_KEY: Final = re.compile(
     r"[0-9]+/.+/([A-Za-z0-9_]+(::[A-Za-z0-9_]+)+|\*\*?)/(RIHS[^/]*|TypeHashNotSupported|\*\*?)"
@@ -50,6 +51,36 @@ class EndpointKind(StrEnum):
     SUBSCRIPTION = "MS"
     SERVICE = "SS"
     CLIENT = "SC"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ActionPart:
+    """One of the three services and two topics that a ROS action is made of."""
+
+    word: str
+    """Behind ``NAME/_action/``."""
+    is_service: bool
+    type_end: str = ""
+    """Behind the action's own type; empty: the type is ``common_type``."""
+    common_type: str = ""
+
+    def type_name(self, action_type: str) -> str:
+        """Its type, of an action of the type ``action_type`` (or ``any``).
+
+        >>> ACTION_PARTS[0].type_name("nav2_msgs/action/Spin")
+        'nav2_msgs/action/Spin_FeedbackMessage'
+        """
+        return self.common_type or (ANY if action_type == ANY else f"{action_type}_{self.type_end}")
+
+
+ACTION_PARTS: Final = (
+    ActionPart(word="feedback", is_service=False, type_end=_FEEDBACK),
+    ActionPart(word="status", is_service=False, common_type="action_msgs/msg/GoalStatusArray"),
+    ActionPart(word="send_goal", is_service=True, type_end="SendGoal"),
+    ActionPart(word="get_result", is_service=True, type_end="GetResult"),
+    ActionPart(word="cancel_goal", is_service=True, common_type="action_msgs/srv/CancelGoal"),
+)
+"""Topics first, which are the worker's outputs. Source: the design article "Actions" of ROS 2 (names, types)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,13 +136,25 @@ def type_fault(type_name: str, *, is_service: bool) -> str | None:
         return None
     if match is None:
         if "/action/" in type_name:
-            return "an action is made of services (NAME_SendGoal, NAME_GetResult) and a topic (NAME_FeedbackMessage)"
+            return "an action goes under `actions:`; its parts are NAME_SendGoal, NAME_GetResult, NAME_FeedbackMessage"
         return f"a type is PACKAGE/{'srv' if is_service else 'msg'}/NAME"
     is_of_service = match["kind"] == "srv" or (match["part"] is not None and match["part"] != _FEEDBACK)
     if is_of_service == is_service:
         return None
     ours, theirs = ("service", "topic") if is_service else ("topic", "service")
     return f"it is the type of a {theirs}, this is a {ours}"
+
+
+def action_type_fault(type_name: str) -> str | None:
+    """Why ``type_name`` is neither ``any`` nor the type of an action; ``None`` when it is.
+
+    >>> action_type_fault("nav2_msgs/action/Spin")
+    >>> action_type_fault("nav2_msgs/action/Spin_SendGoal")
+    'the type of an action is PACKAGE/action/NAME'
+    """
+    if type_name == ANY or _ACTION_TYPE.fullmatch(type_name) is not None:
+        return None
+    return "the type of an action is PACKAGE/action/NAME"
 
 
 def hash_fault(type_hash: str) -> str | None:
