@@ -171,7 +171,7 @@ def test_a_node_s_name_may_stand_in_a_ros_name_or_not(node: str, *, may: bool) -
 def test_types_and_hashes() -> None:
     for is_service in (False, True):
         assert type_fault("any", is_service=is_service) is None
-        assert "NAME_SendGoal" in (type_fault("a/action/B", is_service=is_service) or "")
+        assert "under `actions:`" in (type_fault("a/action/B", is_service=is_service) or "")
         assert type_fault("a/msg/B_SendGoal", is_service=is_service)
         assert type_fault("std_msgs/String", is_service=is_service)
 
@@ -210,6 +210,43 @@ def test_a_name_that_ends_in_two_asterisks_makes_a_canonical_key(type_name: str,
     assert hash_fault(STRING_HASH) is None
     assert hash_fault("TypeHashNotSupported") is None
     assert hash_fault("RIHS01_df")
+
+
+# caught from a live rmw_zenoh_cpp 0.1.8 (Humble): `ros2 topic pub /chatter`
+LIVE_TOKEN = (
+    "@ros2_lv/0/9ca0f8facf84ffb1e6bfa4f2500889f0/0/3/MP/%/%/_ros2cli_712/%chatter/"
+    "std_msgs::msg::dds_::String_/TypeHashNotSupported/"
+)
+LIVE_QOS = ":1:,1:,:,:,,"
+LIVE_ATTACHMENT = bytes.fromhex("d800000000000000" + "34dae10162f8c418" + "10" + "f07168d3856ce9f689254cbed6252151")
+
+
+@pytest.mark.parametrize("qos", [LIVE_QOS, "2::,1:,:,:,,", "2::,7:,:,:,,"])
+def test_a_live_publishers_token_is_read_and_told_on_with_its_qos(qos: str) -> None:
+    """In three forms of QoS: that of 0.1.8, and older ones."""
+    parsed = parse_token(LIVE_TOKEN + qos)
+    assert parsed is not None
+    key = "0/chatter/std_msgs::msg::dds_::String_/TypeHashNotSupported"
+    assert parsed == (
+        "9ca0f8facf84ffb1e6bfa4f2500889f0",
+        Endpoint(kind=EndpointKind.PUBLISHER, key=key, qos=qos),
+    )
+    ours = endpoint_token(RosGraph.RMW_ZENOH, parsed[1], zid="5eed", node="zsched_robot1", number=3)
+    assert ours == (LIVE_TOKEN + qos).replace(parsed[0], "5eed").replace("_ros2cli_712", "zsched_robot1")
+    assert includes(ros_key(RosGraph.RMW_ZENOH, "/chatter", domain=0), key)
+
+
+def test_what_we_announce_of_a_latched_topic_is_what_a_live_node_announces() -> None:
+    assert default_qos(is_latched=True, depth=1) == LIVE_QOS
+
+
+def test_a_live_publishers_attachment_is_read_and_written() -> None:
+    value = decode_attachment(LIVE_ATTACHMENT)
+    assert value is not None
+    assert value.sequence == 216
+    assert value.stamp_ns == 0x18C4F86201E1DA34
+    assert value.gid.hex() == "f07168d3856ce9f689254cbed6252151"
+    assert encode_attachment(value) == LIVE_ATTACHMENT
 
 
 # written out by hand from the design document: sequence 42, a stamp in ns, the length of the gid, the gid
