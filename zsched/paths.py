@@ -14,6 +14,19 @@ from pathlib import Path
 from zsched.core.values.model import NodeId
 
 SYSTEM_CONFIG = Path("/etc/zsched/fleet.yaml")
+SESSION_SUFFIX = ".zenoh.json5"
+"""Of a worker's session file, ``<node>-<task>`` before it; other files of the worker stand beside it."""
+PID_SUFFIX = ".pid"
+ENVIRONMENT_SUFFIX = ".env"
+
+
+def beside_session(session: Path, suffix: str) -> Path:
+    """Another file of the worker whose session file this is.
+
+    >>> beside_session(Path("/run/zsched/edge1-echo.zenoh.json5"), PID_SUFFIX).name
+    'edge1-echo.pid'
+    """
+    return session.with_name(session.name.removesuffix(SESSION_SUFFIX) + suffix)
 
 
 def config_path(given: Path | None, env: Mapping[str, str]) -> Path:

@@ -10,17 +10,16 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
-import subprocess
 import sysconfig
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from support.debian import NoDebianError, debian_root
+from support.machine import nspawn, overlaid
 from zsched_lab.fleet.loopback import free_endpoints
 
 HERE, REPO = Path(__file__).parent, Path(__file__).parents[2]
@@ -70,23 +69,6 @@ def debian() -> Path:
         return debian_root()
     except NoDebianError as error:
         pytest.skip(str(error))
-
-
-@contextmanager
-def overlaid(debian: Path, folder: Path) -> Iterator[Path]:
-    """A writable view of ``debian`` that forgets everything afterwards."""
-    upper, work, root = (folder / name for name in ("upper", "work", "root"))
-    for path in (upper, work, root):
-        path.mkdir()
-    options = f"lowerdir={debian},upperdir={upper},workdir={work}"
-    command = ["mount", "-t", "overlay", "overlay", "-o", options, str(root)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
-    if done.returncode != 0:
-        pytest.skip(f"cannot mount an overlay: {done.stderr.strip()}")
-    try:
-        yield root
-    finally:
-        subprocess.run(["umount", "--lazy", str(root)], timeout=20, check=True)
 
 
 def fleet_file() -> str:
@@ -148,15 +130,6 @@ def boot(debian: Path, folder: Path, start: str, expected: str, *, init: bool) -
         assert report.exists(), f"no report; nspawn said {done}:\n{console[-3000:]}"
         found: dict[str, Any] = json.loads(report.read_text())
     return found
-
-
-def nspawn(folder: Path, arguments: list[str], timeout_s: float) -> int:
-    """Run systemd-nspawn to its end, what it prints going to the folder's console.log; its exit status."""
-    with (folder / "console.log").open("ab") as console:
-        command = ["systemd-nspawn", *arguments]
-        return subprocess.run(
-            command, stdin=subprocess.DEVNULL, stdout=console, stderr=console, timeout=timeout_s, check=False
-        ).returncode
 
 
 def check_life(report: dict[str, Any], expected: str) -> None:

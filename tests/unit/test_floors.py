@@ -32,7 +32,7 @@ FLOORS: Final[tuple[tuple[str, int, str], ...]] = (
     (r"adapters\.(\w+)(?:\..+)?", 5, "adapters: \\1"),
     (r"adapters", 5, "adapters"),
     (r"(pki|relay|worker)(?:\..+)?", 5, "\\1"),
-    (r"runtime(\..+)?", 6, "runtime"),
+    (r"(drivers|runtime)(?:\..+)?", 6, "\\1"),
     (r"tasks(?:\.(\w+))?(?:\..+)?", 7, "tasks: \\1"),
     (r"examples(?:\.(\w+))?(?:\..+)?", 7, "tasks: example \\1"),  # programs that `zsched init --example` copies
     (r"daemon", 7, "daemon"),

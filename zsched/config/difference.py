@@ -15,6 +15,7 @@ from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 from typing import Any, Final
 
+from zsched.config.drivers import DRIVER_KEYS
 from zsched.config.reader import Mapping as Block
 from zsched.config.reader import Scalar, read_yaml
 from zsched.config.rows import rows
@@ -384,7 +385,9 @@ def _worker(old: TaskSpec, new: TaskSpec, fleets: tuple[Fleet, Fleet]) -> Iterat
         if before != after:
             verdict = _renewed(new) if one.name in _OF_A_PROCESS else AT_ONCE
             key = "ready" if one.name == "ready_when" else one.name
-            yield _set(verdict, f"{path}.worker.{key}", _plain(before), _plain(after))
+            told = _set(verdict, f"{path}.worker.{key}", _plain(before), _plain(after))
+            driven = (f"{path}.worker.{name}" for name in DRIVER_KEYS) if one.name == "command" else ()
+            yield replace(told, paths=(*told.paths, *driven))
     deadlines = old.tuning.deadline_ms, new.tuning.deadline_ms
     if deadlines[0] != deadlines[1]:
         yield _set(_renewed(new), f"{path}.scheduling.deadline_ms", *deadlines)

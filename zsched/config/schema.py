@@ -26,6 +26,7 @@ from zsched.config.blocks import (
     Removed,
     Text,
 )
+from zsched.config.drivers import DRIVER_KEYS
 from zsched.config.keys import keys
 from zsched.config.ros2 import ros2_record
 from zsched.config.timing import PROFILES
@@ -293,11 +294,14 @@ LINK_LIMITS: Final = Record(
 
 WORKER: Final = Record(
     "a worker",
-    keys(
-        WorkerSpec,
-        command=ListOf(Text("a word", _text_fault), least=1),
-        env=MapOf(Text("a variable", _matches(_ENV_NAME, "letters, digits and '_'")), _TEXT),
-    ),
+    {
+        **DRIVER_KEYS,
+        **keys(
+            WorkerSpec,
+            command=ListOf(Text("a word", _text_fault), least=1),
+            env=MapOf(Text("a variable", _matches(_ENV_NAME, "letters, digits and '_'")), _TEXT),
+        ),
+    },
 )
 
 RULE: Final = Record(

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from typing import Any, Final
 
 from zsched.config.blocks import Located, Section
+from zsched.config.drivers import command_of
 from zsched.config.nodes import Cast, select
 from zsched.config.reader import Collector, Place, nearest
 from zsched.config.ros2 import ros2_rules
@@ -221,11 +222,13 @@ def _worker(given: Section, out: Collector) -> WorkerSpec:
     for key, held in env.items():
         if key.startswith("ZSCHED_"):
             out.error(held.place, f"{key} is set by zsched itself", "choose another name")
-    if section.is_whole and section.get("standby") is Standby.COLD and not section.get("command"):
+    command = command_of(section, out)
+    words = {} if command is None else {"command": command}
+    if section.is_whole and section.get("standby") is Standby.COLD and not (command or section.get("command")):
         message = "a cold standby is started on the move, and this worker has no `command` to start it with"
         hint = "give its `command`, or delete `standby`: a worker that somebody else starts counts wherever it runs"
         out.error(section.where("standby"), message, hint)
-    return section.build(WorkerSpec, out, env=pairs, **ready) or WorkerSpec()
+    return section.build(WorkerSpec, out, env=pairs, **ready, **words) or WorkerSpec()
 
 
 def _check_exclusive(

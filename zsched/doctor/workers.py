@@ -10,16 +10,19 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
 from zsched.core.values.fleet import TaskSpec, runs_worker
 from zsched.doctor.model import Result, Scene, failed, joined, passed, skipped, warned
+from zsched.drivers import systemd
+from zsched.drivers.engine import Look
 
 IMPORT_S: Final = 60.0
 """numpy and OpenCV from an SD card take ten seconds and more."""
 PYTHON: Final = ("python", "python3")
+LOOKS: Final[Mapping[str, Callable[[Sequence[str], str, str], Look]]] = {"zsched.drivers.systemd": systemd.look}
 FINDER: Final = Path(__file__).with_name("imports.py")
 
 
@@ -108,6 +111,23 @@ def _script(words: list[str]) -> str | None:
     """The script, where one is named."""
     first = next(iter(words), "-")
     return first if first.endswith(".py") or "/" in first else None
+
+
+def engines_are_there(scene: Scene) -> Result:
+    """Whether what each worker's driver keeps (a unit, an image) is on this machine."""
+    found = [result for task in _mine(scene) if (result := _engine(scene.node, task)) is not None]
+    return joined(found, skipped("every worker here is a process of the daemon's, or somebody else's"))
+
+
+def _engine(node: str, task: TaskSpec) -> Result | None:
+    look = LOOKS.get(_module(list(task.worker.command[1:])) or "")
+    if look is None:
+        return None
+    seen = look(task.worker.command[3:], node, task.name)
+    told = f"{task.name}: {seen.told}"
+    if not seen.fix:
+        return passed(told)
+    return failed(told, fix=seen.fix) if seen.is_fatal else warned(told, fix=seen.fix)
 
 
 def run_well(scene: Scene) -> Result:

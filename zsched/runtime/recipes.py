@@ -17,6 +17,7 @@ from zsched.core.values.fleet import Fleet, TaskSpec, WorkerLink, WorkerSpec, ru
 from zsched.core.values.model import NodeId, TaskId
 from zsched.errors import AdapterError
 from zsched.files import write_regular
+from zsched.paths import ENVIRONMENT_SUFFIX, PID_SUFFIX, SESSION_SUFFIX, beside_session
 from zsched.runtime.sessions import SessionsRead
 from zsched.sessions import config as zenoh_config
 
@@ -99,7 +100,7 @@ class Recipes:
             if text != self._made.sessions.get(name):
                 self._write(name, text)
         for name in [name for name in self._made.specs if name not in sessions]:
-            self._path(name).unlink(missing_ok=True)
+            self._remove(name)
         for task in mine:
             if not task.worker.command:
                 self.read.begin(task.name, sessions[task.name])
@@ -112,12 +113,17 @@ class Recipes:
         )
 
     def close(self) -> None:
-        """Remove the session files."""
-        for path in self.paths.values():
-            path.unlink(missing_ok=True)
+        """Remove the session files, and those that a driver has left beside them when it had to be killed."""
+        for name in self._made.specs:
+            self._remove(name)
+
+    def _remove(self, task: TaskId) -> None:
+        path = self._path(task)
+        for one in (path, beside_session(path, ENVIRONMENT_SUFFIX), beside_session(path, PID_SUFFIX)):
+            one.unlink(missing_ok=True)
 
     def _path(self, task: TaskId) -> Path:
-        return self._folder / f"{self._me}-{task}.zenoh.json5"
+        return self._folder / f"{self._me}-{task}{SESSION_SUFFIX}"
 
     def _write(self, task: TaskId, text: str) -> None:
         path = self._path(task)

@@ -19,6 +19,7 @@ from zsched.core import events as ev
 from zsched.core.values.fleet import NodeSpec
 from zsched.core.vote.clocks import is_bad
 from zsched.guard import guarded
+from zsched.paths import PID_SUFFIX, beside_session
 from zsched.runtime.shell import Inbox, Shell
 
 log = logging.getLogger("zsched.daemon")
@@ -85,10 +86,30 @@ class Sampler:
     def _sample(self) -> None:
         supervisor = self._shell.crew.supervisor
         states, pids = (supervisor.states(), supervisor.pids()) if supervisor is not None else ({}, {})
-        device = self._device.sample({task: (state, pids.get(task)) for task, state in states.items()})
+        sessions = self._shell.crew.sessions
+        device = self._device.sample(
+            {task: (state, noted_pid(sessions.get(task), pids.get(task))) for task, state in states.items()}
+        )
         device = replace(device, gauges=self._gauges.newest(monotonic_s()))
         readers = self._readers
         links = tuple(reader.read() for reader in readers)
         self._inbox.post_quietly(ev.ProfileSampled(device=device, links=links))
         for index, reader in enumerate(readers):
             self._report(f"profile/link{index}", reader.problem)
+
+
+def noted_pid(session: Path | None, driver: int | None) -> int | None:
+    """The process whose load is the task's: the one that a worker's driver has noted, else the worker's own.
+
+    Args:
+        session: the worker's session file.
+        driver: the process that the daemon has started.
+    """
+    if session is None or driver is None:
+        return driver
+    try:
+        words = beside_session(session, PID_SUFFIX).read_text(encoding="ascii").split()
+    except (OSError, UnicodeDecodeError):
+        return driver
+    is_its = len(words) == 2 and words[1] == str(driver) and words[0].isdecimal()
+    return int(words[0]) if is_its else driver

@@ -1,0 +1,64 @@
+"""A worker's `driver:` becomes the command of that driver's program; a key of another driver is a fault."""
+
+from __future__ import annotations
+
+import pytest
+
+from zsched.config.load import CheckResult, check_bytes
+from zsched.core.values.fleet import WorkerSpec
+
+FILE = """\
+fleet: f
+nodes:
+  robot1: {kind: robot, wired: true, host: h, listen: {control: tcp/0.0.0.0:1, data: tcp/0.0.0.0:2}}
+  edge1: {kind: edge}
+tasks:
+  shout:
+    candidates: {kind: edge}
+    weights: {cpu: 1}
+    worker: WORKER
+    inputs: [{from: "{robot}/a", to: "{target}/{robot}/a"}]
+"""
+PROGRAM = ("python", "-m", "zsched.drivers.systemd")
+
+
+def check(worker: str) -> CheckResult:
+    return check_bytes(FILE.replace("WORKER", worker).encode())
+
+
+def worker_of(text: str) -> WorkerSpec:
+    result = check(text)
+    assert result.fleet is not None, result.report()
+    return result.fleet.tasks[0].worker
+
+
+def test_a_unit_is_a_command_of_the_drivers_program() -> None:
+    worker = worker_of("{driver: systemd, unit: shout@.service, env: {B: c, A: d}, standby: cold}")
+    assert worker.command == (*PROGRAM, "--unit", "shout@.service", "--env", "B", "--env", "A")
+    assert worker.env == (("A", "d"), ("B", "c"))
+
+
+def test_without_a_driver_the_command_is_the_operators() -> None:
+    assert worker_of("{command: [a, b]}") == worker_of("{driver: process, command: [a, b]}")
+    assert worker_of("{ready: matching}").command == ()
+
+
+@pytest.mark.parametrize(
+    ("worker", "said", "column"),
+    [
+        ("{driver: systemd}", "driver systemd needs the key 'unit'", 22),
+        ("{driver: systemd, unit: a.service, command: [a]}", "driver systemd has no 'command'", 57),
+        ("{unit: a.service}", "driver process has no 'unit'", 20),
+        ("{driver: systemd, unit: a.socket}", "'a.socket' is not a systemd service: NAME.service", 37),
+        ("{driver: systemd, unit: '../a.service'}", "is not a systemd service", 37),
+        ("{driver: systemd, unit: '@.service'}", "is not a systemd service", 37),
+        ("{driver: systemd, unit: '-f.service'}", "is not a systemd service", 37),
+        ("{driver: sysd, unit: a.service}", "did you mean 'systemd'?", 22),
+    ],
+)
+def test_a_fault_stands_at_its_key(worker: str, said: str, column: int) -> None:
+    result = check(worker)
+    assert result.fleet is None
+    report = result.report()
+    assert said in report
+    assert f"fleet.yaml:9:{column}: error" in report, report

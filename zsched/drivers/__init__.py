@@ -1,0 +1,1 @@
+"""Worker drivers: programs that have a systemd unit, a container or a ROS 2 node do a worker's work."""
