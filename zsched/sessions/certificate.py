@@ -1,7 +1,7 @@
-"""Reads of an X.509 certificate (RFC 5280, section 4.1) when it is valid and whom it names, and nothing else of it.
+"""Reads of an X.509 certificate (RFC 5280, section 4.1) when it is valid, whom it names, its key and its signature.
 
-Knows: PEM, as much DER as leads to both. Does not know: keys, signatures, what trusts what. A daemon reads its own
-certificate with this, for a library that reads all of one takes 16 MiB.
+Knows: PEM, as much DER as leads to these. Does not know: whether a signature is right, what trusts what. Daemons read
+certificates with this, for a library that reads all of one takes 16 MiB.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import binascii
 import re
 from collections.abc import Callable
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Final, TypeVar
 
@@ -18,6 +19,53 @@ PEM: Final = re.compile(rb"-----BEGIN CERTIFICATE-----(.*?)-----END CERTIFICATE-
 COMMON_NAME: Final = bytes((0x06, 0x03, 0x55, 0x04, 0x03))
 """The object identifier 2.5.4.3, as DER."""
 SEQUENCE, VERSION, UTC_TIME, GENERALIZED_TIME = 0x30, 0xA0, 0x17, 0x18
+BIT_STRING: Final = 0x03
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Parts:
+    """A certificate taken apart. What ``signed`` holds may be believed once the authority's signature over it is right.
+
+    ``key`` is the SubjectPublicKeyInfo (DER).
+    """
+
+    signed: bytes
+    signature: bytes
+    common_name: str
+    begins: datetime
+    ends: datetime
+    key: bytes
+
+
+def parts_of(der: bytes) -> Parts:
+    """A certificate (DER), taken apart.
+
+    Raises:
+        ValueError: it is malformed.
+    """
+    try:
+        body = _inside(der, SEQUENCE)[0]
+        bits = _inside(_after(_after(body)), BIT_STRING)[0]
+        begins, ends = _validity(der)
+        return Parts(
+            signed=_first(body),
+            signature=bits[1:],  # the first byte: how many bits of the last one are not used, here none
+            common_name=_common_name(der),
+            begins=begins,
+            ends=ends,
+            key=_first(_after(_after(_from_validity(der)))),
+        )
+    except IndexError as error:
+        raise ValueError(f"the certificate is malformed: {error}") from error
+
+
+def ders_of(pem: bytes) -> tuple[bytes, ...]:
+    """Every certificate of a PEM file as DER, in its order.
+
+    Raises:
+        ValueError: there is none, or one is no base64.
+    """
+    return _each(pem, bytes)
 
 
 def validities(pem: bytes) -> tuple[tuple[datetime, datetime], ...]:
@@ -91,6 +139,10 @@ def _inside(data: bytes, wanted: int) -> tuple[bytes, bytes]:
     if tag != wanted:
         raise IndexError(f"an element of kind {tag:#x} where {wanted:#x} belongs")
     return content, rest
+
+
+def _first(data: bytes) -> bytes:
+    return data[: len(data) - len(_after(data))]
 
 
 def _after(data: bytes) -> bytes:
