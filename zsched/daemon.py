@@ -31,6 +31,7 @@ from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.adapters.host.state_file import StateFile
 from zsched.adapters.host.systemd import Notifier, watchdog_interval_s
 from zsched.adapters.network.control_bus import ControlBus
+from zsched.adapters.network.limits import limit_for
 from zsched.adapters.relay.streams import SILENCE_S, Bequest, RelayHandle
 from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
 from zsched.clock import monotonic_s, wall_tenths
@@ -51,7 +52,7 @@ from zsched.ipc.takeover import Door
 from zsched.log_limit import limit_handlers
 from zsched.runtime import tls as daemon_tls
 from zsched.runtime.access import StreamAccess, joins_at
-from zsched.runtime.access_rules import Side, common_names_of
+from zsched.runtime.access_rules import Side, common_names_of, names_of
 from zsched.runtime.adoption import Adoption
 from zsched.runtime.descriptors import take_descriptors
 from zsched.runtime.endpoints import DATA_PORT, Endpoints, claim_port, endpoints_for, free_port, is_here
@@ -61,6 +62,7 @@ from zsched.runtime.memory import shared_memory_objection
 from zsched.runtime.recipes import Recipes
 from zsched.runtime.reload import Reload
 from zsched.runtime.sampler import Sampler
+from zsched.runtime.sealing import seals_of
 from zsched.runtime.secured import digest_of, require_own
 from zsched.runtime.sessions import SessionsRead
 from zsched.runtime.shell import Desk, Inbox, Shell
@@ -269,6 +271,9 @@ class Daemon:
             members=None if fleet.security is None else common_names_of(fleet, fleet.security),
             is_voter=self._spec.kind is NodeKind.ROBOT,
             hears_all_beats_at_once=any(task.exclusive for task in fleet.tasks),
+            seals=seals_of(fleet, incarnation),
+            limit=limit_for(fleet.timing, len(fleet.tasks)),
+            names=names_of(fleet),
         )
         access = StreamAccess(fleet, me, points.worker_connect[:1], self._texts[Side.VISIT])
         decisions = DecisionLog(

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zenoh
@@ -18,10 +19,14 @@ from support.authorities import install, make_authority
 from zsched.adapters.host.operator_socket import ask
 from zsched.config.load import load_fleet
 from zsched.core.values.certificates import Role
+from zsched.core.values.messages import Accept, Prepare, Promise
+from zsched.core.values.model import Ballot
 from zsched.pki.authority import opened
 from zsched.runtime.access_rules import Side
 from zsched.runtime.tls import session_text
-from zsched.sessions.config import client_config
+from zsched.sessions.config import client_config, control_config
+from zsched.wire import codec as wire
+from zsched.wire.keyspace import Keyspace
 from zsched_lab.fleet.testbed import TASK, Json, Testbed, echo_fleet
 
 
@@ -88,6 +93,65 @@ def test_an_operator_commands_from_elsewhere_and_a_guest_only_looks(bed: Testbed
     bed.wait(
         lambda: bed.task("robot2")["tuning"]["weights"]["memory"] == 0.75, 60, "the new weights at the other robot"
     )
+    bed.wait(
+        lambda: "SetWeights came, signed by ana.operator" in zsched(bed, "robot1", "events").stdout,
+        60,
+        "the command in the decision log, with the operator's name",
+    )
+
+
+def refusals(bed: Testbed, node: str) -> dict[str, int]:
+    """{counter: how many} of frames that were dropped for their seals."""
+    words = ("unsigned", "signature", "signer", "certificate", "replay", "stale")
+    found: dict[str, int] = bed.status(node)["counters"]
+    return {name: count for name, count in found.items() if name.startswith("dropped_") and name.endswith(words)}
+
+
+def test_who_has_a_member_s_link_and_not_its_key_says_nothing_where_it_counts(bed: Testbed) -> None:
+    """A router or a client in between: TLS lets it in as robot2, and it repeats and changes what robot2 has said."""
+    assert all(refusals(bed, node) == {} for node in ("robot1", "robot2", "edge1")), "members refuse each other"
+    ends = tuple(bed.fleet.node(name).listen_control for name in ("robot1", "robot2"))
+    assert bed.fleet.security is not None
+    security = replace(bed.fleet.security, folder=str(bed.folder / "pki" / "robot2"))
+    text = session_text(replace(bed.fleet, security=security), Side.CONTROL)
+    config = json.loads(control_config(listen=(), connect=ends, operator_json5=text))
+    del config["access_control"]
+    keys, before = Keyspace(bed.fleet.name), bed.task("robot1")
+    said: list[zenoh.Sample] = []
+    with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as session:
+        session.declare_subscriber(keys.allocation("robot2"), said.append)
+        session.declare_queryable(
+            keys.register("robot2", "*"),
+            lambda query: query.reply(str(query.key_expr).replace("*", "robot2"), promise_for(query)),
+        )
+
+        def repeats() -> bool:
+            for node, cpu in (("robot1", 0.5), ("robot2", 0.25)):  # each of them asks the electors, and tells
+                assert zsched(bed, node, "weights", TASK, f"cpu={cpu}", f"memory={1 - cpu}").returncode == 0
+            for sample in tuple(said):
+                frame, seal = sample.payload.to_bytes(), sample.attachment
+                assert seal is not None, "members sign what they have learnt"
+                session.put(keys.allocation("robot2"), frame, attachment=seal.to_bytes())
+                session.put(keys.allocation("robot2"), frame)
+                session.put(keys.proposal("robot2"), frame, attachment=seal.to_bytes())
+                asked, seal_bytes = wire.encode(PREPARE), seal.to_bytes()
+                session.get(keys.register("*", "robot2"), lambda _: None, payload=asked, attachment=seal_bytes)
+            wanted = {"allocation_replay", "allocation_unsigned", "proposal_signature", "register_signature"}
+            return {f"dropped_{word}" for word in (*wanted, "register_unsigned")} <= set(refusals(bed, "robot1"))
+
+        bed.wait(repeats, 60, f"every kind of refusal: {refusals(bed, 'robot1')}")
+    assert (bed.task("robot1")["owner"], bed.task("robot1")["epoch"]) == (before["owner"], before["epoch"])
+    assert bed.log("robot1").count("refused kind=") <= 2, "one line a minute"
+
+
+PREPARE = Prepare(task=TASK, ballot=Ballot(counter=10**6, node="robot2", incarnation=1), electorate="e")
+
+
+def promise_for(query: zenoh.Query) -> bytes:
+    assert query.payload is not None
+    asked: Any = wire.decode(query.payload.to_bytes(), Prepare, Accept)
+    ballot = asked.ballot if isinstance(asked, Prepare) else asked.acceptance.ballot
+    return wire.encode(Promise(elector="robot2", task=TASK, ballot=ballot))
 
 
 def test_streams_run_and_move_and_tools_find_their_certificates(bed: Testbed) -> None:

@@ -22,6 +22,7 @@ from zsched.exits import EXIT_FAILED, EXIT_TIMED_OUT, EXIT_UNREACHABLE, EXIT_USA
 
 if TYPE_CHECKING:
     from zsched.adapters.network.fleet_client import FleetClient  # imports zenoh
+    from zsched.adapters.network.seals import Seals
 
 CONTROL_PORT = 7457
 """Where a node's control session listens by the guides."""
@@ -211,7 +212,7 @@ def _client(endpoint: str) -> FleetClient:
 
     visit = _visit(endpoint)
     config = client_config(connect=(endpoint,), operator_json5=visit.text, patience_s=CONNECT_S)
-    client = FleetClient(endpoint, config, visit.asker, visit.fleet)
+    client = FleetClient(endpoint, config, visit.asker, visit.fleet, visit.seals)
     atexit.register(client.close)
     return client
 
@@ -223,6 +224,7 @@ class _Visit:
     text: str
     asker: str
     fleet: str
+    seals: Seals | None = None
 
 
 def _visit(endpoint: str) -> _Visit:
@@ -237,11 +239,14 @@ def _visit(endpoint: str) -> _Visit:
         return _Visit(text="", asker=asker, fleet="*")
     from zsched.config.load import load_fleet  # noqa: PLC0415 - ruamel.yaml is slow to import
     from zsched.runtime.access_rules import Side  # noqa: PLC0415 - as above
+    from zsched.runtime.sealing import seals_of  # noqa: PLC0415 - as above
     from zsched.runtime.tls import asker_in, session_text  # noqa: PLC0415 - as above
 
     fleet = load_fleet(places.config_path(None, os.environ))
     text = session_text(fleet, Side.VISIT)
-    return _Visit(text=text, asker=asker_in(fleet, asker), fleet=fleet.name if fleet.security is not None else "*")
+    if fleet.security is None:
+        return _Visit(text=text, asker=asker_in(fleet, asker), fleet="*")
+    return _Visit(text=text, asker=asker_in(fleet, asker), fleet=fleet.name, seals=seals_of(fleet))
 
 
 def _unanswered(door: Door, error: AdapterError) -> CliError:

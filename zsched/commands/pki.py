@@ -205,9 +205,7 @@ def _need_cryptography() -> None:
     try:
         import zsched.pki.certificates  # noqa: F401, PLC0415 - the package is an extra
     except ModuleNotFoundError as error:
-        raise CliError(
-            EXIT_FAILED, f"the package {error.name} is missing: pip install 'zsched[pki]' (no node needs it, only you)"
-        ) from error
+        raise CliError(EXIT_FAILED, f"the package {error.name} is missing: pip install 'zsched[pki]'") from error
 
 
 def _office(where: Where) -> _Office:

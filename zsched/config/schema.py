@@ -44,6 +44,7 @@ from zsched.core.values.fleet import (
     LinkSpec,
     LocalSide,
     PairReading,
+    Signatures,
     TaskSpec,
     Timing,
     WorkerSpec,
@@ -365,6 +366,12 @@ SECURITY: Final = Record(
         "revoked": Field(
             ListOf(Here(_LABEL_OF_KEY), least=1),
             "Keys that are not let in, as `zsched pki revoke` names them.",
+        ),
+        "signatures": Field(
+            Choice.of(Signatures),
+            "Signatures on votes, learnt values and commands: a frame without one is dropped (`required`), or taken "
+            "while nodes of an older version are in the fleet (`offered`); `off`: nobody signs.",
+            default="`required`",
         ),
     },
 )

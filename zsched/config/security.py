@@ -12,7 +12,7 @@ from zsched.config.nodes import Cast
 from zsched.config.reader import Collector
 from zsched.config.schema import PKI_FOLDER
 from zsched.core.values.certificates import MAX_COMMON_NAME, Holder, Role, parse_label
-from zsched.core.values.fleet import Security
+from zsched.core.values.fleet import Security, Signatures
 
 ENCRYPTED = ("tls/", "quic/")
 
@@ -45,6 +45,7 @@ def read_security(section: Section, cast: Cast, folder: Path, out: Collector) ->
         operators=operators,
         guests=guests,
         revoked=_revoked(given, {(one.name, one.role) for one in holders}, out),
+        signatures=given.get("signatures", Signatures.REQUIRED),
     )
 
 

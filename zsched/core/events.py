@@ -470,10 +470,23 @@ class FleetReadAsked:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameDropped:
-    """A frame came that is invalid or not for us: only a counter rises."""
+    """Frames came that are invalid or not for us: only a counter rises."""
 
     kind: str
     reason: str
+    count: int = 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Commanded:
+    """A command that changes something came, and its seal is right: it is told with the name of whoever gave it."""
+
+    by: str
+    """Label of the certificate, such as ``ana.operator``."""
+    what: str
+    """The command's class."""
+    task: TaskId
+    """Empty: the fleet."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -557,6 +570,7 @@ Event = (
     | FleetCommanded
     | FleetReadAsked
     | FrameDropped
+    | Commanded
     | AddressesTried
     | ProblemReported
     | RecipeCompared

@@ -20,6 +20,7 @@ from zsched.core.values.fleet import Security
 from zsched.doctor.model import Result, Scene, failed, joined, passed, skipped, warned
 from zsched.errors import ConfigError
 from zsched.files import read_regular
+from zsched.runtime.sealing import seals_of
 from zsched.runtime.secured import files_of, require_own
 from zsched.runtime.tls import ENCRYPTED, PLAIN, operator_json5, plain_text_problem, protocol_of
 from zsched.sessions.certificate import validities
@@ -87,6 +88,10 @@ def _own(scene: Scene, security: Security) -> list[Result]:
         require_own(scene.fleet, security, scene.node)
     except ConfigError as error:
         return [failed(str(error), fix=f"zsched pki issue {scene.node}")]
+    try:
+        seals_of(scene.fleet)
+    except ConfigError as error:
+        return [failed(str(error), fix="mend what it names; `signatures: off` needs neither")]
     return []
 
 

@@ -6,7 +6,7 @@ Knows: the folder's files. Does not know: sessions, who is let in (`zsched.runti
 the certificates that nodes trust (two between `rotate` and `finish`), and every key that was certified, with its newest
 certificate, so that a renewal needs no file of the node. Every change is one new record. ``ca.pem`` is a copy.
 
-The daemon never imports this package: ``cryptography`` takes 16 MiB of memory.
+No daemon loads this module: to make certificates ``cryptography`` takes 16 MiB of memory.
 """
 
 from __future__ import annotations

@@ -81,6 +81,13 @@ def common_names_of(fleet: Fleet, security: Security) -> frozenset[str]:
     return frozenset(name for _, names, _ in holders for name in names)
 
 
+def names_of(fleet: Fleet) -> tuple[str, ...]:
+    """Everybody who may say or ask something on the control network: nodes, operators, guests."""
+    security = fleet.security
+    people = () if security is None else (*security.operators, *security.guests)
+    return (*(node.name for node in fleet.nodes), *people)
+
+
 Rule = tuple[str, tuple[str, ...], list[str]]
 """(flow, messages, keys)."""
 

@@ -19,6 +19,7 @@ from zsched.core.route.route import watch_for
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId, TaskId
 from zsched.runtime.access import StreamAccess
+from zsched.runtime.access_rules import names_of
 from zsched.runtime.crew import Crew
 from zsched.runtime.endpoints import Endpoints, endpoints_for
 from zsched.runtime.recipes import Recipes
@@ -73,6 +74,7 @@ class Adoption:
         self.supervisor.adopt(self.recipes.specs)
         self.access.adopt(fleet)
         self.sampler.adopt(fleet.node(self.me), fleet.timing.sample_s)
+        self.bus.know(names_of(fleet))
         if any(task.exclusive for task in fleet.tasks):
             self.bus.hear_all_at_once()
         self._tell_watches(fleet)

@@ -74,7 +74,7 @@ def secured_text(fleet: Fleet, security: Security, side: Side, operator_json5: s
         raise ConfigError(f"{fleet.zenoh_config}: {error}") from error
     files = files_of(security)
     for path in (files.certificate, files.key, files.trusted):
-        _read(path)
+        bytes_of(path)
     rules = access_control(fleet, security, side)
     return zenoh_config.secured(
         certificate=str(files.certificate),
@@ -92,7 +92,7 @@ def identity_of(fleet: Fleet, security: Security) -> Identity:
         ConfigError: it cannot be read, or is no certificate of this fleet.
     """
     path = files_of(security).certificate
-    pem = _read(path)
+    pem = bytes_of(path)
     try:
         (name, *_), ((begins, ends), *_) = common_names(pem), validities(pem)
     except ValueError as error:
@@ -128,11 +128,16 @@ def digest_of(security: Security) -> str:
     files = files_of(security)
     state = hashlib.blake2s(digest_size=8)
     for path in (files.certificate, files.trusted):
-        state.update(_read(path))
+        state.update(bytes_of(path))
     return state.hexdigest()
 
 
-def _read(path: Path) -> bytes:
+def bytes_of(path: Path) -> bytes:
+    """The content of one of the three files.
+
+    Raises:
+        ConfigError: it cannot be read.
+    """
     try:
         return read_regular(path, MAX_BYTES)
     except PermissionError as error:

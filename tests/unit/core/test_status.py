@@ -17,6 +17,7 @@ from support.states import state_of
 from zsched.commands.report import degradations, render_status
 from zsched.core import events as ev
 from zsched.core import instructions as do
+from zsched.core.instructions import RecordStory
 from zsched.core.node import Node
 from zsched.core.report import snapshot_json
 from zsched.core.scheduler.patience import FIRST_PATIENCE
@@ -682,6 +683,16 @@ def test_counters_of_all_parts_stand_in_one_sorted_list() -> None:
     node.handle(ev.FrameDropped(kind="beat", reason="size"), 100.0)
     node.handle(ev.LearntReceived(learnt=Learnt(node="ghost", values=()), is_answer=True), 100.0)
     assert build_snapshot(node, 100.0).counters == (("dropped_beat_size", 1), ("learnt_foreign", 1))
+    node.handle(ev.FrameDropped(kind="beat", reason="rate", count=70), 100.0)
+    assert dict(build_snapshot(node, 100.0).counters)["dropped_beat_rate"] == 70
+
+
+def test_a_command_is_told_with_the_name_of_its_certificate() -> None:
+    node = make()
+    for task in ("merge", ""):
+        batch = node.handle(ev.Commanded(by="ana.operator", what="SetWeights", task=task), 100.0)
+        stories = [one for one in batch if isinstance(one, RecordStory)]
+        assert [(one.text, one.task) for one in stories] == [("SetWeights came, signed by ana.operator", task)]
 
 
 # --- the JSON --------------------------------------------------------------------------------------------------------

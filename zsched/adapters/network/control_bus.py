@@ -3,22 +3,30 @@
 Knows: zenoh, the control keys, the codec. Does not know: what any of it leads to.
 
 zenoh's callbacks only decode and enqueue (work in them would stall the process), every question is answered later, from
-the loop, by its number. A frame that is malformed, or whose key names another node than its content, becomes a
-`FrameDropped` event and nothing else. One subscriber and one queryable serve all kinds: three threads in all.
+the loop, by its number. A frame that is malformed, whose key names another node than its content, or whose seal is not
+right (`zsched.adapters.network.seals`), becomes a `FrameDropped` event and nothing else. What comes too fast is counted
+before anybody looks at it, and wakes nobody up (`zsched.adapters.network.limits`). One subscriber and one queryable
+serve all kinds: three threads in all.
 """
 
 from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import zenoh
 
+from zsched.adapters.network import seals as sealing
+from zsched.adapters.network.limits import Buckets, Drops, Limit
 from zsched.adapters.network.open_questions import Questions
+from zsched.adapters.network.seals import Seals
+from zsched.clock import monotonic_s
 from zsched.core import events as ev
 from zsched.core.events import commanded
+from zsched.core.values.certificates import Holder, Role
 from zsched.core.values.decision import Explanation
 from zsched.core.values.messages import (
     COMMANDS,
@@ -26,17 +34,21 @@ from zsched.core.values.messages import (
     Accepted,
     AskDocument,
     Command,
+    CommandOutcome,
     CommandResult,
     ExplainTask,
     FleetAnswer,
     FleetQuestion,
     FleetTold,
+    HoldTask,
     Learnt,
+    MoveTask,
     Prepare,
     Promise,
     ReadFleet,
     ReadLines,
     Refused,
+    TuneTask,
     Utilities,
     WorkerLines,
 )
@@ -47,12 +59,16 @@ from zsched.guard import guarded, tolerant
 from zsched.sessions.problems import why_not_open
 from zsched.sessions.relink import Introducer
 from zsched.wire import codec as wire
-from zsched.wire.keyspace import Keyspace, counter, parse
+from zsched.wire.keyspace import Keyspace, ParsedKey, counter, parse
+from zsched.wire.seal import Act
 
 OPERATOR_TIMEOUT_S = 3.0
 CLOSE_S = 0.5
 RING = 1024
 """Periodic frames that wait for the loop; if it does not come, the oldest go, and zenoh need not wait."""
+
+MAX_LIVES = 1024
+"""So many nodes' incarnations are remembered: commands to them are sealed for these."""
 
 Answer = Snapshot | CommandResult | Explanation | WorkerLines | FleetTold
 Post = Callable[[ev.Event], None]
@@ -64,6 +80,8 @@ _PUTS: dict[str, type[Beat | Profile | Proposal | Learnt]] = {
     "proposal": Proposal,
     "allocation": Learnt,
 }
+_LIMITED = ("put", "question", "answer", "token")
+"""A peer has a bucket for each of these."""
 _QUESTIONS = frozenset({"utility", "register", "allocation", "document", "status", "command"})
 
 
@@ -87,6 +105,22 @@ def answer_classes(command: Command | None) -> tuple[type[Answer], ...]:
     return (WorkerLines,) if isinstance(command, ReadLines) else (CommandResult, Explanation)
 
 
+def signed_by(holder: Holder, command: Command) -> Command:
+    """A command that tells who has ordered it, with the name of the certificate instead of what the tool says."""
+    if holder.role is Role.NODE or not isinstance(command, MoveTask | HoldTask | TuneTask):
+        return command
+    return replace(command, asked=replace(command.asked, by=holder.label))
+
+
+def task_of(command: Command) -> str:
+    """The task that a command is about; empty: the fleet."""
+    return str(getattr(command, "task", ""))
+
+
+def _attachment(message: zenoh.Sample | zenoh.Query) -> bytes:
+    return b"" if message.attachment is None else message.attachment.to_bytes()
+
+
 class ControlBus:
     """One node's control session. ``post`` must only enqueue; all other methods are called from the loop."""
 
@@ -101,12 +135,20 @@ class ControlBus:
         members: frozenset[str] | None = None,
         is_voter: bool = True,
         hears_all_beats_at_once: bool = True,
+        seals: Seals | None = None,
+        limit: Limit | None = None,
+        names: Iterable[str] = (),
     ) -> None:
         """``members``: the names of certificates that belong to the fleet, ``None`` where none are asked for.
 
         A link of another name says nothing that zenoh would let in; it is counted and logged. ``is_voter``: peers
-        gather utilities here. Periodic frames are posted at once, or wait for `waiting`.
+        gather utilities here. Periodic frames are posted at once, or wait for `waiting`. ``seals``: ``None`` where
+        nothing is sealed. ``limit``: what each of ``names`` may send, and all others together; ``None``: no limit.
         """
+        self._seals, self._drops = seals, Drops()
+        self._buckets = None if limit is None else {what: Buckets(limit, names) for what in _LIMITED}
+        self._lives: dict[NodeId, int] = {}
+        """{node: its newest incarnation}, by the tokens."""
         self._is_voter, self._hears_all_at_once = is_voter, hears_all_beats_at_once
         self._ring: zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]] | None = None
         self._keys, self._members = Keyspace(fleet), members
@@ -114,7 +156,7 @@ class ControlBus:
         self._config = zenoh_config
         self._introducer = Introducer(zenoh_config)
         self._post = post
-        self._questions = Questions()
+        self._questions = Questions(self._sealed_answer)
         self._session: zenoh.Session | None = None
         self._kept: list[Any] = []
         self._publishers: dict[str, zenoh.Publisher] = {}
@@ -191,10 +233,13 @@ class ControlBus:
         return [key(node, "*") for key in asked]
 
     def waiting(self) -> Iterator[ev.Event]:
-        """The periodic beats and profiles that have come since the last call (the loop)."""
+        """The periodic beats and profiles that have come since the last call, and what was dropped (the loop)."""
         ring = self._ring
         while ring is not None and (sample := ring.handler.try_recv()) is not None:
-            yield self._event(sample)
+            if (event := self._event(sample)) is not None:
+                yield event
+        for kind, reason, count in self._drops.take():
+            yield ev.FrameDropped(kind=kind, reason=reason, count=count)
 
     def _publisher(
         self, session: zenoh.Session, key: str, priority: zenoh.Priority, *, is_express: bool = True
@@ -239,21 +284,40 @@ class ControlBus:
         """Let everybody hear of everybody's address again; returns at once (nothing where addresses are configured)."""
         self._introducer.introduce()
 
+    def know(self, names: Iterable[str]) -> None:
+        """Give new names of the fleet a bucket of their own."""
+        for buckets in (self._buckets or {}).values():
+            buckets.know(names)
+
     def peers(self) -> int:
         """How many zenoh peers the session has a link to."""
         return 0 if self._session is None else len(self._session.info.peers_zid())
 
     # --- what comes in (zenoh's threads) -----------------------------------------------------------------------------
 
-    def _on_sample(self, sample: zenoh.Sample) -> None:
-        self._post(self._event(sample))
+    def _is_let_in(self, what: str, kind: str, name: str) -> bool:
+        """Whether a frame of that name is looked at; if not, it is counted."""
+        if self._buckets is None or self._buckets[what].take(name, monotonic_s()):
+            return True
+        self._drops.add(kind, "rate")
+        return False
 
-    def _event(self, sample: zenoh.Sample) -> ev.Event:
+    def _on_sample(self, sample: zenoh.Sample) -> None:
+        if (event := self._event(sample)) is not None:
+            self._post(event)
+
+    def _event(self, sample: zenoh.Sample) -> ev.Event | None:
         key = parse(str(sample.key_expr))
+        is_known = key is not None and key.kind in _PUTS
+        if not self._is_let_in("put", key.kind if key and is_known else "key", key.owner if key else ""):
+            return None
         if key is None or key.kind not in _PUTS:
             return ev.FrameDropped(kind="key", reason="unknown")
         try:
-            value = wire.decode(sample.payload.to_bytes(), _PUTS[key.kind])
+            frame = sample.payload.to_bytes()
+            if self._seals is not None and key.kind in sealing.PUTS:
+                self._seals.put(key.kind, str(sample.key_expr), frame, _attachment(sample), key.owner)
+            value = wire.decode(frame, _PUTS[key.kind])
         except WireError as error:
             return ev.FrameDropped(kind=key.kind, reason=error.reason)
         owner, event = _event_of(value)
@@ -270,9 +334,13 @@ class ControlBus:
     def _on_token(self, sample: zenoh.Sample) -> None:
         key = parse(str(sample.key_expr))
         incarnation = counter(key.rest[0]) if key is not None and len(key.rest) == 1 else None
+        if not self._is_let_in("token", "alive", key.owner if key is not None else ""):
+            return
         if key is None or key.kind != "alive" or incarnation is None:
             self._post(ev.FrameDropped(kind="alive", reason="key"))
             return
+        if key.owner in self._lives or len(self._lives) < MAX_LIVES:
+            self._lives[key.owner] = max(self._lives.get(key.owner, 0), incarnation)
         if sample.kind == zenoh.SampleKind.PUT:
             self._post(ev.TokenSeen(node=key.owner, incarnation=incarnation))
         else:
@@ -281,18 +349,33 @@ class ControlBus:
     def _on_query(self, query: zenoh.Query) -> None:
         chunks = str(query.key_expr).split("/")
         kind, asker = chunks[2] if len(chunks) > 2 else "", chunks[-1]
+        told = kind if kind in _QUESTIONS else "key"
+        if not self._is_let_in("question", told, asker):
+            query.drop()
+            return
         try:
             event = self._question(kind, asker, query)
         except WireError as error:
-            event = ev.FrameDropped(kind=kind if kind in _QUESTIONS else "key", reason=error.reason)
+            event = ev.FrameDropped(kind=told, reason=error.reason)
+            self._say_why_not(kind, asker, query, error)
             query.drop()
         self._post(event)
+
+    def _say_why_not(self, kind: str, asker: str, query: zenoh.Query, error: WireError) -> None:
+        """An operator that waits for a command's answer hears that its seal was refused."""
+        if kind != "command" or error.reason not in tuple(sealing.SealFault):
+            return
+        result = CommandResult(outcome=CommandOutcome.INVALID, detail=f"{self._node} refused it: {error.reason}")
+        query.reply(self._keys.command(self._node, asker), wire.encode(result))
 
     def _question(self, kind: str, asker: str, query: zenoh.Query) -> ev.Event:
         """The event of one query; whoever answers it does so by number."""
         if not NAME.fullmatch(asker):
             raise WireError("key", "no asker")
         payload = b"" if query.payload is None else query.payload.to_bytes()
+        holder = None
+        if self._seals is not None and kind in sealing.QUESTIONS:
+            holder = self._seals.question(kind, str(query.key_expr), payload, _attachment(query), asker)
         keys, node = self._keys, self._node
         if kind == "utility":
             number = self._questions.keep(query, keys.utility(node, asker))
@@ -316,6 +399,9 @@ class ControlBus:
             command: Any = wire.decode(payload, *COMMANDS)
             if not isinstance(command, ExplainTask | ReadLines | ReadFleet):
                 log.info("command=%s from=%s", type(command).__name__, asker)
+                if holder is not None:
+                    command = signed_by(holder, command)
+                    self._post(ev.Commanded(by=holder.label, what=type(command).__name__, task=task_of(command)))
             return commanded(self._questions.keep(query, keys.command(node, asker)), command)
         raise WireError("key", "unknown kind")
 
@@ -331,7 +417,11 @@ class ControlBus:
         if publisher is None:
             return
         try:
-            publisher.put(wire.encode(value))
+            frame = wire.encode(value)
+            if self._seals is None or kind not in sealing.PUTS:
+                publisher.put(frame)
+            else:
+                publisher.put(frame, attachment=self._seals.seal(Act.PUT, str(publisher.key_expr), frame))
         except (zenoh.ZError, WireError) as error:
             raise AdapterError(f"cannot publish {kind}: {error}") from error
 
@@ -410,12 +500,17 @@ class ControlBus:
         *,
         is_remote: bool = False,
     ) -> None:
+        question = self._attachment_of(selector, payload)
+
         def on_reply(reply: zenoh.Reply) -> None:
             sample = reply.ok
             if sample is None:
                 return  # the deadline passed for somebody: the core counts answers, not silences
             key = parse(str(sample.key_expr))
+            if not self._is_let_in("answer", "key" if key is None else key.kind, "" if key is None else key.owner):
+                return
             try:
+                self._judge_answer(key, sample, question)
                 value = wire.decode(sample.payload.to_bytes(), *classes)
             except WireError as error:
                 self._post(ev.FrameDropped(kind=key.kind if key is not None else "key", reason=error.reason))
@@ -431,6 +526,7 @@ class ControlBus:
                 selector,
                 tolerant(on_reply, "answer"),
                 payload=payload,
+                attachment=question or None,
                 target=zenoh.QueryTarget.ALL,
                 consolidation=zenoh.ConsolidationMode.NONE,  # the default withholds all answers for a frozen peer
                 timeout=deadline_s,
@@ -440,6 +536,27 @@ class ControlBus:
             )
         except zenoh.ZError as error:
             raise AdapterError(f"cannot ask {selector}: {error}") from error
+
+    def _attachment_of(self, selector: str, payload: bytes | None) -> bytes:
+        """A question's seal, or a number of its own, with which its answers are signed; empty: neither."""
+        kind = selector.split("/")[2]
+        if self._seals is None or kind not in sealing.ANSWERS:
+            return b""
+        if kind not in sealing.QUESTIONS:
+            return sealing.nonce()
+        return self._seals.seal(Act.QUESTION, selector, payload or b"", life=0)
+
+    def _judge_answer(self, key: ParsedKey | None, sample: zenoh.Sample, question: bytes) -> None:
+        if self._seals is None or key is None or key.kind not in sealing.ANSWERS:
+            return
+        frame, attachment = sample.payload.to_bytes(), _attachment(sample)
+        self._seals.answer(key.kind, str(sample.key_expr), frame, attachment, key.owner, question)
+
+    def _sealed_answer(self, key: str, frame: bytes, question: bytes) -> bytes | None:
+        """The seal of an answer under ``key``; ``None``: this kind has none."""
+        if self._seals is None or key.split("/")[2] not in sealing.ANSWERS:
+            return None
+        return self._seals.seal(Act.ANSWER, key, frame, question=question)
 
     # --- for the library (a thread of its own) -----------------------------------------------------------------------
 
@@ -478,9 +595,13 @@ class ControlBus:
         else:
             selector, payload = self._keys.command(node, self._node), wire.encode(command)
         kinds = answer_classes(command)
+        attachment = None
+        if self._seals is not None and payload is not None:
+            attachment = self._seals.seal(Act.QUESTION, selector, payload, life=self._lives.get(node, 0))
         for reply in self._session.get(
             selector,
             payload=payload,
+            attachment=attachment,
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=OPERATOR_TIMEOUT_S,
         ):

@@ -14,6 +14,7 @@ import time
 import zenoh
 
 from zsched.adapters.network.control_bus import Answer, answer_classes
+from zsched.adapters.network.seals import Seals
 from zsched.clock import monotonic_s
 from zsched.core.values.messages import ChangeFleet, Command
 from zsched.core.values.model import NodeId
@@ -22,6 +23,7 @@ from zsched.errors import AdapterError, WireError
 from zsched.sessions.problems import why_not_open
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import Keyspace
+from zsched.wire.seal import Act
 
 ANSWER_S = 3.0
 """So long a question is asked again, as a daemon waits for another node."""
@@ -35,14 +37,18 @@ ANY_FLEET = "*"
 class FleetClient:
     """One open session; safe to close twice."""
 
-    def __init__(self, endpoint: str, zenoh_config: str, asker: NodeId, fleet: str = ANY_FLEET) -> None:
+    def __init__(
+        self, endpoint: str, zenoh_config: str, asker: NodeId, fleet: str = ANY_FLEET, seals: Seals | None = None
+    ) -> None:
         """Open the session. A secured fleet takes questions only by its name, and in that of the certificate.
+
+        ``seals`` signs commands; ``None``: nothing is signed.
 
         Raises:
             AdapterError: nobody takes the connection.
         """
         zenoh.init_log_from_env_or("off")
-        self._endpoint, self._asker, self._keys = endpoint, asker, Keyspace(fleet)
+        self._endpoint, self._asker, self._keys, self._seals = endpoint, asker, Keyspace(fleet), seals
         try:
             self._session = zenoh.open(zenoh.Config.from_json5(zenoh_config))
         except zenoh.ZError as error:
@@ -60,24 +66,30 @@ class FleetClient:
         Raises:
             AdapterError: it did not answer in time, or something that this version does not read.
         """
-        if node is None and command is not None:
-            status = self.ask(None, None)
+        life = 0
+        if command is not None and (node is None or self._seals is not None):
+            status = self.ask(node, None)  # a command is signed for one life of the node that takes it
             assert isinstance(status, Snapshot)
-            node = status.node
+            node, life = status.node, status.incarnation
         end = monotonic_s() + ANSWER_S
         while monotonic_s() < end:
-            answer = self._ask_once(node, command)
+            answer = self._ask_once(node, command, life)
             if answer is not None:
                 return answer
             time.sleep(PAUSE_S)
         who = node or f"the node at {self._endpoint}"
         raise AdapterError(f"{who} did not answer within {ANSWER_S:g} s; is that a node's control endpoint?")
 
-    def _ask_once(self, node: NodeId | None, command: Command | None) -> Answer | None:
+    def _ask_once(self, node: NodeId | None, command: Command | None, life: int) -> Answer | None:
         keys, whom = self._keys, node or "*"
+        key = keys.status(whom, self._asker) if command is None else keys.command(whom, self._asker)
+        payload, attachment = None if command is None else wire.encode(command), None
+        if payload is not None and self._seals is not None:
+            attachment = self._seals.seal(Act.QUESTION, key, payload, life=life)
         replies = self._session.get(
-            keys.status(whom, self._asker) if command is None else keys.command(whom, self._asker),
-            payload=None if command is None else wire.encode(command),
+            key,
+            payload=payload,
+            attachment=attachment,
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=ANSWER_S if isinstance(command, ChangeFleet) else ROUND_S,

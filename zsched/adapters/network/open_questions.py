@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 import threading
+from collections.abc import Callable
 
 import zenoh
 
@@ -15,12 +16,19 @@ from zsched.wire import codec as wire
 
 QUESTION_TTL_S = 5.0
 MAX_QUESTIONS = 1024
+Seal = Callable[[str, bytes, bytes], bytes | None]
+"""(key, frame, the question's attachment) -> the answer's attachment."""
+
+
+def _no_seal(_key: str, _frame: bytes, _question: bytes) -> None:
+    return None
 
 
 class Questions:
     """Open zenoh queries by number, until they are answered or too old."""
 
-    def __init__(self) -> None:
+    def __init__(self, seal: Seal = _no_seal) -> None:
+        self._seal = seal
         self._numbers = itertools.count(1)
         self._open: dict[int, tuple[zenoh.Query, str, float]] = {}
         self._lock = threading.Lock()
@@ -46,7 +54,9 @@ class Questions:
             return
         query, reply_key, _ = entry
         try:
-            query.reply(reply_key, wire.encode(value))
+            frame = wire.encode(value)
+            question = b"" if query.attachment is None else query.attachment.to_bytes()
+            query.reply(reply_key, frame, attachment=self._seal(reply_key, frame, question))
         finally:
             query.drop()
 

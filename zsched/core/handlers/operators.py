@@ -94,8 +94,16 @@ def _on_lines(_node: Stages, event: ev.LinesAsked, todo: ToDo, _now: float) -> N
 
 
 def _on_dropped(node: Stages, event: ev.FrameDropped, _todo: ToDo, now: float) -> None:
-    node.counters[f"dropped_{event.kind}_{event.reason}"] += 1
+    node.counters[f"dropped_{event.kind}_{event.reason}"] += event.count
     node.frames_dropped_at = now
+
+
+def _on_commanded(node: Stages, event: ev.Commanded, todo: ToDo, _now: float) -> None:
+    """Tell who has given a command, whatever becomes of it."""
+    executor = node.executors.get(event.task)
+    epoch = 0 if executor is None else executor.epoch
+    text = f"{event.what} came, signed by {event.by}"
+    todo.add(do.RecordStory(stage="vote", text=text, task=event.task, epoch=epoch))
 
 
 def _on_problem(node: Stages, event: ev.ProblemReported, _todo: ToDo, _now: float) -> None:
@@ -116,6 +124,7 @@ HANDLERS: Final[Mapping[type[Any], Handler]] = {
     ev.RestartCommanded: _on_restart,
     ev.LinesAsked: _on_lines,
     ev.FrameDropped: _on_dropped,
+    ev.Commanded: _on_commanded,
     ev.ProblemReported: _on_problem,
     ev.StopRequested: _on_stop,
 }

@@ -280,6 +280,14 @@ class SharedMemory(StrEnum):
     AUTO = "auto"
 
 
+class Signatures(StrEnum):
+    """What a secured fleet does with signatures on votes, learnt values and commands."""
+
+    REQUIRED = "required"  # a frame without a right one is dropped
+    OFFERED = "offered"  # one that is there must be right; while nodes of an older version are in the fleet
+    OFF = "off"  # nobody signs, and nobody looks
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Security:
     """A fleet with certificates of its own authority: who is let in, besides its nodes.
@@ -295,6 +303,7 @@ class Security:
     """Sorted; they read status and streams."""
     revoked: tuple[str, ...] = ()
     """Sorted labels of keys that are not let in (`zsched.core.values.certificates`)."""
+    signatures: Signatures = Signatures.REQUIRED
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -18,9 +18,10 @@ from support.profiles import profile_of
 from support.proposals import proposal_of
 from support.waiting import free_endpoint, until
 from zsched.adapters.network import control_bus, open_questions
-from zsched.adapters.network.control_bus import RING, ControlBus
+from zsched.adapters.network.control_bus import RING, ControlBus, signed_by
 from zsched.adapters.network.open_questions import Questions
 from zsched.core import events as ev
+from zsched.core.values.certificates import Holder, Role
 from zsched.core.values.fleet import Timing
 from zsched.core.values.messages import (
     Accept,
@@ -28,6 +29,7 @@ from zsched.core.values.messages import (
     CommandOutcome,
     CommandResult,
     Learnt,
+    MoveTask,
     Prepare,
     Promise,
     Refusal,
@@ -35,7 +37,7 @@ from zsched.core.values.messages import (
     SetWeights,
     Utilities,
 )
-from zsched.core.values.model import Acceptance
+from zsched.core.values.model import Acceptance, Asked
 from zsched.core.values.snapshot import QuorumStatus, Snapshot
 from zsched.errors import AdapterError
 from zsched.sessions.config import control_config
@@ -127,6 +129,16 @@ def stranger(trio: tuple[Peer, Peer, Peer]) -> Iterator[zenoh.Session]:
         yield session
     finally:
         session.close()
+
+
+def test_an_operator_s_order_has_the_name_of_its_certificate_whatever_the_tool_says() -> None:
+    move = MoveTask(task="merge", node="edge1", asked=Asked(by="root@robot1", reason="why"))
+    ana, robot = Holder(name="ana", role=Role.OPERATOR), Holder(name="robot1")
+    signed = signed_by(ana, move)
+    assert isinstance(signed, MoveTask)
+    assert signed.asked == Asked(by="ana.operator", reason="why")
+    assert signed_by(robot, move) == move, "the user of a node's machine, as that node tells it"
+    assert signed_by(ana, COMMAND) == COMMAND
 
 
 # --- puts ------------------------------------------------------------------------------------------------------------

@@ -78,6 +78,25 @@ def test_accept_of_the_promised_ballot_is_persisted_first() -> None:
     assert answer == Accepted(elector="r1", task="merge", ballot=ballot(3))
 
 
+def test_a_prepare_or_accept_that_is_said_again_changes_nothing() -> None:
+    register = make()
+    old = prepare(2), accept(2, allocation(1))
+    promised(register, old[0])
+    accepted(register, old[1], 0.0)
+    before = register.state
+    _, answer = promised(register, old[0])
+    assert isinstance(answer, Refused)
+    _, again = accepted(register, old[1], 9.0)
+    assert again == Accepted(elector="r1", task="merge", ballot=ballot(2))
+    assert register.state == before
+    promised(register, prepare(3))
+    accepted(register, accept(3, allocation(2)), 9.0)
+    newer = register.state
+    assert isinstance(promised(register, old[0])[1], Refused)
+    assert isinstance(accepted(register, old[1], 9.0)[1], Refused)
+    assert register.state == newer
+
+
 def test_accept_under_a_higher_ballot_than_promised_raises_the_promise() -> None:
     register = make()
     accepted(register, accept(4, allocation(1)), 0.0)

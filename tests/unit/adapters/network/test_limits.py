@@ -1,0 +1,75 @@
+"""Who sends too much is held back alone, and what was dropped is counted to the last frame."""
+
+from __future__ import annotations
+
+import threading
+
+from zsched.adapters.network.limits import BURST_S, Buckets, Drops, Limit, limit_for
+from zsched.config.timing import PROFILES
+from zsched.core.values.fleet import Timing
+
+LIMIT = Limit(hz=10, burst=20)
+
+
+def test_a_flood_gets_its_burst_and_then_its_rate() -> None:
+    buckets = Buckets(LIMIT, ["robot1"])
+    assert sum(buckets.take("robot1", 0.0) for _ in range(1000)) == 20
+    assert sum(buckets.take("robot1", 1.0) for _ in range(1000)) == 10
+    assert sum(buckets.take("robot1", 100.0) for _ in range(1000)) == 20
+
+
+def test_one_peer_s_flood_takes_nothing_from_another() -> None:
+    buckets = Buckets(LIMIT, ["robot1", "robot2"])
+    for _ in range(1000):
+        buckets.take("robot1", 0.0)
+    assert buckets.take("robot2", 0.0)
+
+
+def test_invented_names_share_one_bucket_and_take_no_memory() -> None:
+    buckets = Buckets(LIMIT, ["robot1"])
+    assert sum(buckets.take(f"x{number}", 0.0) for number in range(1000)) == 20
+    assert len(buckets._left) == 2
+    assert buckets.take("robot1", 0.0)
+
+
+def test_a_name_that_is_new_in_the_file_gets_a_bucket_and_old_ones_keep_theirs() -> None:
+    buckets = Buckets(LIMIT, ["robot1"])
+    for name in ("robot1", "robot2"):
+        for _ in range(20):
+            buckets.take(name, 0.0)
+    buckets.know(["robot1", "robot2"])
+    assert buckets.take("robot2", 0.0)
+    assert not buckets.take("robot1", 0.0)
+
+
+def test_a_clock_that_stands_still_or_is_behind_gives_nothing() -> None:
+    buckets = Buckets(LIMIT, ["robot1"])
+    for _ in range(20):
+        buckets.take("robot1", 5.0)
+    assert not buckets.take("robot1", 4.0)
+
+
+def test_every_profile_leaves_room_for_a_vote_about_every_task_at_once() -> None:
+    for timing in (Timing(), *PROFILES.values()):
+        for tasks in (1, 10, 100):
+            limit = limit_for(timing, tasks)
+            assert limit.hz >= 10 * (1 / timing.beat_s + 1 / timing.publish_s)
+            assert limit.burst >= 2 * BURST_S * tasks, "a prepare and an accept, each asked twice"
+
+
+def test_drops_of_several_threads_are_all_counted() -> None:
+    drops = Drops()
+
+    def drop() -> None:
+        for _ in range(1000):
+            drops.add("beat", "rate")
+
+    threads = [threading.Thread(target=drop) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    taken = list(drops.take())
+    for thread in threads:
+        thread.join()
+    taken += drops.take()
+    assert sum(count for _, _, count in taken) == 4000
+    assert drops.take() == ()

@@ -1,0 +1,63 @@
+"""Makes the seals of a session from this machine's certificate, where the fleet file asks for signatures.
+
+Knows: the three files, who is let in. Does not know: what is sealed (`zsched.adapters.network.seals`).
+
+This is the one place by which a daemon, or a tool, loads the package ``cryptography``: where nothing is signed it is
+not needed.
+"""
+
+from __future__ import annotations
+
+from zsched.adapters.network.seals import Keys, Seals
+from zsched.core.values.certificates import Holder, Role, accepted
+from zsched.core.values.fleet import Fleet, Security, Signatures
+from zsched.errors import ConfigError
+from zsched.runtime.secured import bytes_of, files_of
+
+
+def seals_of(fleet: Fleet, life: int = 0) -> Seals | None:
+    """The seals of a session of this machine; ``None``: nothing is signed.
+
+    Args:
+        fleet: the fleet file.
+        life: this node's incarnation; 0: it is no node.
+
+    Raises:
+        ConfigError: a file cannot be used, or the package ``cryptography`` is missing.
+    """
+    security = fleet.security
+    if security is None or security.signatures is Signatures.OFF:
+        return None
+    return Seals(
+        fleet=fleet.name,
+        keys=_keys(security),
+        holders=holders_of(fleet, security),
+        life=life,
+        takes_unsigned=security.signatures is Signatures.OFFERED,
+    )
+
+
+def holders_of(fleet: Fleet, security: Security) -> frozenset[Holder]:
+    """The keys whose signatures count: those of the nodes and operators that are not revoked."""
+    names = [(node.name, Role.NODE) for node in fleet.nodes] + [(name, Role.OPERATOR) for name in security.operators]
+    return frozenset(one for name, role in names for one in accepted(name, role, security.revoked))
+
+
+def _keys(security: Security) -> Keys:
+    try:
+        from zsched.pki import signatures  # noqa: PLC0415 - the package is an extra
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"the package {error.name} is missing, and the fleet file asks for signatures: pip install 'zsched[pki]' "
+            "on every node, or write `signatures: off` below `security:`"
+        ) from error
+    files = files_of(security)
+    try:
+        return Keys(
+            sign=signatures.signing_with(bytes_of(files.key)),
+            certificate=signatures.own_certificate(bytes_of(files.certificate)),
+            certified=signatures.Trust(bytes_of(files.trusted)).certified,
+            checking_by=signatures.checking_by,
+        )
+    except ValueError as error:
+        raise ConfigError(f"{files.certificate.parent}: {error}; `zsched pki issue` makes one") from error
