@@ -31,7 +31,7 @@ from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.adapters.host.state_file import StateFile
 from zsched.adapters.host.systemd import Notifier, watchdog_interval_s
 from zsched.adapters.network.control_bus import ControlBus
-from zsched.adapters.network.limits import limit_for
+from zsched.adapters.network.limits import in_turn_hz, limit_for
 from zsched.adapters.relay.streams import SILENCE_S, Bequest, RelayHandle
 from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
 from zsched.clock import monotonic_s, wall_tenths
@@ -256,6 +256,7 @@ class Daemon:
         """Open the adapters; each is closed by ``stack`` in the reverse order."""
         zenoh_log.capture(os.environ)
         fleet, me = self._fleet, self._spec.name
+        is_exclusive = any(task.exclusive for task in fleet.tasks)
         bus = ControlBus(
             fleet=fleet.name,
             node=me,
@@ -266,11 +267,12 @@ class Daemon:
                 timing=fleet.timing,
                 operator_json5=self._texts[Side.CONTROL],
                 dials_by_gossip=points.control_by_gossip,
+                at_most_hz=None if is_exclusive else in_turn_hz(fleet),  # without a ring, none is pushed out
             ),
             post=self._inbox.post,
             members=None if fleet.security is None else common_names_of(fleet, fleet.security),
             is_voter=self._spec.kind is NodeKind.ROBOT,
-            hears_all_beats_at_once=any(task.exclusive for task in fleet.tasks),
+            hears_all_beats_at_once=is_exclusive,
             seals=seals_of(fleet, incarnation),
             limit=limit_for(fleet.timing, len(fleet.tasks)),
             names=names_of(fleet),

@@ -13,6 +13,7 @@ random zids (a fixed one keeps a restarted node out until its old link's lease e
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final
 
 from zsched.core.values.fleet import LocalMode, LocalSide, Timing, WorkerLink
@@ -60,8 +61,11 @@ def control_config(
     timing: Timing = DEFAULT_TIMING,
     operator_json5: str = "",
     dials_by_gossip: bool = True,
+    at_most_hz: Mapping[str, float] | None = None,
 ) -> str:
     """The daemon's control session: beats, ballots, status. Shared memory off, messages bounded, nothing shared.
+
+    ``at_most_hz``: puts under these keys that come faster by one link are dropped by zenoh, before anybody looks.
 
     Without ``dials_by_gossip`` only ``connect`` is dialled: when that covers every pair from one side, two sessions
     never redial each other at once after a cut, which can leave a link that is kept alive and delivers nothing.
@@ -75,7 +79,18 @@ def control_config(
     settings["transport/shared_memory/enabled"] = False
     settings["transport/link/rx/max_message_size"] = CONTROL_MAX_MESSAGE
     _set_gossip(settings, dials=dials_by_gossip)
+    if at_most_hz:
+        rules = [{"key_expr": key, "freq": hz} for key, hz in at_most_hz.items()]
+        own = {"id": "zsched", "messages": ["put"], "flows": ["ingress"], "rules": rules}
+        settings["downsampling"] = [own, *_downsampling_of(operator_json5)]
     return _render(settings, operator_json5)
+
+
+def _downsampling_of(operator_json5: str) -> list[Settings]:
+    if not operator_json5.strip():
+        return []
+    found: list[Settings] = json.loads(_parsed(operator_json5).get_json("downsampling"))
+    return found
 
 
 def data_config(

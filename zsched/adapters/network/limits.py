@@ -14,7 +14,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
-from zsched.core.values.fleet import Timing
+from zsched.core.values.fleet import Fleet, Timing
+from zsched.wire.keyspace import Keyspace
 
 ROOM: Final = 20.0
 """A peer may send so many times what the timing profile lets it send at rest."""
@@ -33,6 +34,16 @@ class Limit:
 
     hz: float
     burst: float
+
+
+def in_turn_hz(fleet: Fleet) -> dict[str, float]:
+    """{key: how often} of each node's periodic frames, which wait in one ring: a flood would push out those of others.
+
+    zenoh drops what comes sooner after the one before. It does so for each link and key.
+    """
+    keys, timing = Keyspace(fleet.name), fleet.timing
+    beats = {keys.beat_in_turn(node.name): ROOM / timing.beat_s for node in fleet.nodes}
+    return {**beats, **{keys.profile_in_turn(node.name): ROOM / timing.publish_s for node in fleet.nodes}}
 
 
 def limit_for(timing: Timing, tasks: int) -> Limit:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import threading
 
-from zsched.adapters.network.limits import BURST_S, Buckets, Drops, Limit, limit_for
+import zenoh
+
+from zsched.adapters.network.limits import BURST_S, Buckets, Drops, Limit, in_turn_hz, limit_for
 from zsched.config.timing import PROFILES
-from zsched.core.values.fleet import Timing
+from zsched.core.values.fleet import Fleet, NodeSpec, Timing
+from zsched.core.values.model import NodeKind
+from zsched.sessions.config import control_config
 
 LIMIT = Limit(hz=10, burst=20)
 
@@ -55,6 +60,22 @@ def test_every_profile_leaves_room_for_a_vote_about_every_task_at_once() -> None
             limit = limit_for(timing, tasks)
             assert limit.hz >= 10 * (1 / timing.beat_s + 1 / timing.publish_s)
             assert limit.burst >= 2 * BURST_S * tasks, "a prepare and an accept, each asked twice"
+
+
+def test_each_node_s_periodic_frames_are_thinned_far_above_their_rate() -> None:
+    nodes = tuple(NodeSpec(name=name, kind=NodeKind.ROBOT) for name in ("robot1", "robot2"))
+    fleet = Fleet(name="yard", timing=Timing(), nodes=nodes, tasks=(), electors=("robot1",))
+    rates = in_turn_hz(fleet)
+    assert set(rates) == {
+        f"@zsched/yard/{kind}/{name}/in/turn" for kind in ("beat", "profile") for name in ("robot1", "robot2")
+    }
+    assert rates["@zsched/yard/beat/robot1/in/turn"] * fleet.timing.beat_s >= 10
+    theirs = '{downsampling: [{messages: ["put"], flows: ["egress"], rules: [{key_expr: "a", freq: 2}]}]}'
+    for operator, count in (("", 1), (theirs, 2)):
+        text = control_config(listen=(), connect=(), at_most_hz=rates, operator_json5=operator)
+        found = json.loads(zenoh.Config.from_json5(text).get_json("downsampling"))
+        assert len(found) == count, "the operator's own stay"
+        assert {rule["key_expr"] for rule in found[0]["rules"]} == set(rates)
 
 
 def test_drops_of_several_threads_are_all_counted() -> None:

@@ -1,0 +1,179 @@
+"""What floods do to a secured fleet: state changed, false deaths, memory, CPU.
+
+``python -m benchmarks.floods [--count 100000] [--tokens 20000] [--connections 3000]``. Two robots and an edge on one
+machine. Who floods has the certificate of a third robot, which is in the fleet file and does not run, or a certificate
+for nobody in the file; its own session goes by no rules. Each flood goes to all three daemons. Memory is what a daemon
+has more of 2 s after the flood, in proportional shares (PSS). CPU is a daemon's, of one core, while the flood lasts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import psutil
+
+from benchmarks.common import machine
+from zsched.core.values.certificates import Role
+from zsched.core.values.messages import Prepare
+from zsched.core.values.model import Ballot, Beat, Proposal
+from zsched.pki.authority import create
+from zsched.pki.files import PRIVATE, PUBLIC, make_folder, write_whole
+from zsched.runtime.access_rules import Side
+from zsched.runtime.secured import CERTIFICATE, KEY, TRUSTED
+from zsched.runtime.tls import session_text
+from zsched.sessions.config import control_config
+from zsched.wire import codec as wire
+from zsched.wire.keyspace import Keyspace
+from zsched_lab.fleet.floods import connections
+from zsched_lab.fleet.testbed import TASK, Json, Testbed, echo_fleet
+
+IDLE, STRANGER = "robot3", "mallory"
+KEYS = Keyspace("testbed")
+
+
+def secured(folder: Path, signatures: str = "required", **options: int) -> Json:
+    """The echo fleet with certificates for every node."""
+    tree = echo_fleet(**options)  # type: ignore[arg-type]
+    for node in tree["nodes"].values():
+        node["listen"] = {kind: end.replace("tcp/", "tls/") for kind, end in node["listen"].items()}
+    tree["security"] = {"signatures": signatures}
+    authority = create(folder / "authority", tree["fleet"], b"", datetime.now(UTC))
+    for name in (*tree["nodes"], STRANGER):
+        issued = authority.issue(name, Role.NODE, [], b"", b"", datetime.now(UTC))
+        make_folder(folder / "pki" / name)
+        for file, content, mode in (
+            (CERTIFICATE, issued.certificate, PUBLIC),
+            (KEY, issued.key, PRIVATE),
+            (TRUSTED, issued.trusted, PUBLIC),
+        ):
+            write_whole(folder / "pki" / name / file, content, mode)
+    return tree
+
+
+def attacker_config(bed: Testbed, name: str) -> str:
+    """The control session of a member that goes by no rules."""
+    assert bed.fleet.security is not None
+    security = replace(bed.fleet.security, folder=str(bed.folder / "pki" / name))
+    text = session_text(replace(bed.fleet, security=security), Side.CONTROL)
+    ends = tuple(bed.fleet.node(node).listen_control for node in bed.running())
+    config = json.loads(control_config(listen=(), connect=ends, operator_json5=text))
+    config.pop("access_control")
+    config.pop("downsampling", None)
+    return json.dumps(config)
+
+
+@contextmanager
+def flood(bed: Testbed, kind: str, key: str, payload: bytes, count: int, holder: str = IDLE) -> Iterator[str]:
+    """One attacker's process; what it says when it has sent everything."""
+    command = [sys.executable, "-m", "zsched_lab.fleet.floods", kind, "--config", attacker_config(bed, holder)]
+    command += ["--key", key, "--payload", payload.hex(), "--count", str(count)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        yield process.stdout.readline().strip()
+        process.communicate("")
+
+
+def memory_mb(bed: Testbed) -> dict[str, float]:
+    """{node: its daemon's proportional share}."""
+    return {node: float(psutil.Process(bed.pid(node)).memory_full_info().pss) / 2**20 for node in bed.running()}
+
+
+def cpu_s(bed: Testbed) -> float:
+    """Seconds of a core that the daemons have used."""
+    times = [psutil.Process(bed.pid(node)).cpu_times() for node in bed.running()]
+    return float(sum(one.user + one.system for one in times))
+
+
+def deaths(bed: Testbed) -> int:
+    """How often a daemon that runs was taken for suspect or gone."""
+    words = [f"{node} alive -> suspect" for node in bed.running()]
+    return sum(bed.log(node).count(word) for node in bed.running() for word in words)
+
+
+def attack(bed: Testbed, name: str, run: Callable[[], str]) -> None:
+    """One line about one flood."""
+    task = bed.task("robot1")
+    before, used, died, start = memory_mb(bed), cpu_s(bed), deaths(bed), time.monotonic()
+    told = run()
+    lasted = time.monotonic() - start
+    used = cpu_s(bed) - used
+    time.sleep(2.0)
+    after = memory_mb(bed)
+    more = max(after[node] - before[node] for node in after)
+    now = bed.task("robot1")
+    changed = sum(now[key] != task[key] for key in ("owner", "epoch", "revision"))
+    drops = {name: count for name, count in bed.status("robot1")["counters"].items() if name.startswith("dropped_")}
+    print(
+        f"{name:<22} {told:<24} state changed {changed}, false deaths {deaths(bed) - died}, memory at most {more:+.1f} "
+        f"MiB a daemon, CPU {100 * used / lasted / len(after):.0f} % of a core a daemon for {lasted:.1f} s; {drops}",
+        flush=True,
+    )
+
+
+def rest() -> str:
+    """No flood."""
+    time.sleep(3.0)
+    return ""
+
+
+def main() -> None:
+    """Print one line for each flood."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--count", type=int, default=100_000)
+    parser.add_argument("--tokens", type=int, default=20_000)
+    parser.add_argument("--connections", type=int, default=3000)
+    given = parser.parse_args()
+    print(machine())
+    beat = wire.encode(Beat(node=IDLE, incarnation=1, sequence=1, loop_lag_s=0.0))
+    proposal = wire.encode(Proposal(voter=IDLE, task=TASK, base_revision=1, candidate="edge1", aggregate=0.5))
+    prepare = Prepare(task=TASK, ballot=Ballot(counter=1, node=IDLE, incarnation=1), electorate="e")
+    floods = {
+        "periodic beats": ("frames", KEYS.beat_in_turn(IDLE), beat, given.count),
+        "urgent beats": ("frames", KEYS.beat(IDLE), beat, given.count),
+        "proposals": ("frames", KEYS.proposal(IDLE), proposal, given.count),
+        "garbage": ("frames", KEYS.profile(IDLE), b"\xc1" * 64, given.count),
+        "prepares": ("questions", KEYS.register("*", IDLE), wire.encode(prepare), given.count // 10),
+    }
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        with Testbed(folder, secured(folder, robots=3, edges=1)) as bed:
+            bed.init()
+            bed.start("robot1", "robot2", "edge1")
+            bed.wait_settled()
+            attack(bed, "nothing", rest)
+            for what, (kind, key, payload, count) in floods.items():
+
+                def run(kind: str = kind, key: str = key, payload: bytes = payload, count: int = count) -> str:
+                    with flood(bed, kind, key, payload, count) as told:
+                        return told
+
+                attack(bed, what, run)
+            for holder, count in ((STRANGER, given.tokens), (IDLE, given.tokens // 10)):
+
+                def show(holder: str = holder, count: int = count) -> str:
+                    with flood(bed, "tokens", f"@zsched/testbed/alive/{IDLE}", b"", count, holder) as told:
+                        return told
+
+                attack(bed, f"tokens of {holder}", show)
+            ends = bed.fleet.node("robot1").listen_control
+
+            def connect() -> str:
+                with connections(ends, given.connections) as made:
+                    time.sleep(1.0)
+                    return f"made={made}"
+
+            attack(bed, "connections", connect)
+
+
+if __name__ == "__main__":
+    main()
