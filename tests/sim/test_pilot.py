@@ -178,11 +178,14 @@ def test_two_electors_wait_for_each_other() -> None:
     assert changes(world) == ""
 
 
-def test_one_elector_stays_alone_for_a_second_has_no_room() -> None:
-    world = fleet("r1", "r2", "e1", electors=1)
+def test_one_elector_stays_alone_with_one_spare_and_becomes_three_with_two() -> None:
+    world = fleet("r1", "r2", electors=1)
     world.pass_time(CALM_S)
     assert changes(world) == ""
-    assert world.lives[id(world.machine("r1"))].pilot.advice.reason.startswith("no room for")
+    world = fleet("r1", "r2", "e1", electors=1)
+    world.pass_time(CALM_S)
+    assert changes(world) in ("+e1 +r2", "+r1 +r2"), "the first elector is the one whose name comes first"
+    assert moves(world, "e1", "r2")
 
 
 def test_a_spare_that_dies_while_it_is_added_stops_nothing() -> None:

@@ -214,7 +214,8 @@ class Schedule:
         fit = [name for name in fit if value.electorate.seat(name) is None]
         dead = [name for name in value.electorate.names if name not in able]
         most = min(TARGET, len(able) + len(fit) - 1 + (len(able) + len(fit)) % 2)
-        if len(value.electors) > 1 and len(able) >= majority(len(value.electors) + 1) and len(able) < most:
+        has_room = len(able) >= majority(len(value.electors) + 1) or (len(value.electors) == 1 and len(fit) > 1)
+        if has_room and able and len(able) < most:
             raise ChosenError(f"electors {value.electorate.names}, alive {able}, and {fit} are to spare")
         if dead and len(value.electors) > 3:
             raise ChosenError(f"{dead} are dead and still electors of {value.electorate.names}")

@@ -8,7 +8,8 @@ Knows: what this node has heard in beats, what other electors think, the fleet v
 * An elector is removed when a majority of the electors takes it for gone: one deaf link, or a node that has slept,
   throws nobody out. A node that has itself paused begins to listen anew.
 * Remove first, then add. A node is added only with room: the electors that are alive now are a majority of the
-  enlarged electorate even if the new one never answers.
+  enlarged electorate even if the new one never answers. From one to two there is never such room. A single elector
+  takes a second one all the same when a third one is fit, too: the aim is odd, so the third follows at once.
 * A candidate has been heard without a break for `STEADY` times T, and shows the present number. It is added with the
   disk of its newest beat.
 * Two electors are no better than three of which one is gone: so the third goes only when a spare is there. Two never
@@ -280,7 +281,7 @@ class Pilot:
         aim = min(TARGET, _odd(len(alive) + len(fit)))
         if count >= aim or not fit:
             return _none(f"{count} electors, {len(alive)} alive, {len(fit)} to spare")
-        if len(alive) < majority(count + 1):
+        if count > 1 and len(alive) < majority(count + 1):
             return _none(f"no room for {fit[0]}: {len(alive)} of then {count + 1} electors are sure to answer")
         name = fit[0]
         reason = f"{name} becomes an elector: heard without a break for {now - self._peers[name].since:.0f} s"

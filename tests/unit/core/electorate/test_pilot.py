@@ -276,8 +276,24 @@ def test_add_only_with_room_for_one_that_never_answers() -> None:
 
 def test_one_elector_has_no_room_for_a_second() -> None:
     ear = Ear(value("a"))
+    ear.hear("x", STEADY * T + 1.0)
+    assert ear.wish == "1 electors, 1 alive, 1 to spare", "two are no better than one"
+
+
+def test_one_elector_becomes_three_over_two_when_two_nodes_are_fit() -> None:
+    ear = Ear(value("a"))
+    ear.hear("b", 10.0)
     ear.hear("bx", STEADY * T + 1.0)
-    assert ear.wish == "no room for x: 1 of then 2 electors are sure to answer"
+    assert ear.wish == f"+x/{disk_of('x')}", "the other kind first"
+    ear.value = value("ax")
+    ear.hear("bx", 1.0)
+    assert ear.wish == f"+b/{disk_of('b')}", "the third follows at once"
+
+
+def test_an_elector_whose_second_came_without_a_third_waits_for_one() -> None:
+    ear = Ear(value("ax"))
+    ear.hear("x", STEADY * T + 1.0)
+    assert ear.wish == "2 electors, 2 alive, 0 to spare"
 
 
 @pytest.mark.parametrize(
