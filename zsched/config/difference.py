@@ -202,7 +202,12 @@ def _verdicts(old: Fleet, new: Fleet, owners: Mapping[TaskId, NodeId | None]) ->
     yield from _tasks(old, new, owners)
     yield from _sessions(old, new)
     if old.seeds != new.seeds:
-        yield _restart("every daemon dials them from its next start on", "seeds", old.seeds, new.seeds)
+        text = "every daemon dials them from its next start on"
+        come = [node.name for node in new.nodes if all(node.name != other.name for other in old.nodes)]
+        if _dialled(new)[-len(come) :] == come and _dialled(new)[: -len(come)] == _dialled(old):
+            yield _set(replace(AT_ONCE, text=f"{', '.join(come)} dials the others"), "seeds", old.seeds, new.seeds)
+        else:
+            yield _restart(text, "seeds", old.seeds, new.seeds)
     yield from _access(old, new)
     before, after = (fleet.zenoh_config.rpartition("/")[2] for fleet in (old, new))
     if before != after:
@@ -218,6 +223,12 @@ def _verdicts(old: Fleet, new: Fleet, owners: Mapping[TaskId, NodeId | None]) ->
         yield _set(replace(AT_ONCE, text=text), "electorate", *words)
     if old.shared_memory is not new.shared_memory:
         yield _restart(EVERY_DAEMON, "shared_memory", old.shared_memory, new.shared_memory)
+
+
+def _dialled(fleet: Fleet) -> list[NodeId]:
+    """The nodes with an address, each behind those that it dials."""
+    others = (node.name for node in fleet.nodes if node.listen_control and node.name not in fleet.seeds)
+    return [*fleet.seeds, *others]
 
 
 def _timing(old: Fleet, new: Fleet) -> Iterator[_Verdict]:

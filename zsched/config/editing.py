@@ -112,6 +112,40 @@ def remove_node(text: str, name: str) -> str:
     return text
 
 
+def is_list(text: str, path: tuple[str, ...]) -> bool:
+    """Whether a list stands at ``path`` in a fleet file's text."""
+    return isinstance(_at(_tree(text), path), Listing)
+
+
+def add_names(text: str, path: tuple[str, ...], names: Sequence[str]) -> str:
+    """The fleet file ``text`` with ``names`` at the end of the list at ``path``.
+
+    A list at the top of the file, such as ``("seeds",)``, is begun where there is none.
+
+    Raises:
+        ConfigError: there is something else than a list, or the text cannot be spliced.
+    """
+    root = _tree(text)
+    what = f"{', '.join(names)} cannot be added to {'.'.join(path)}"
+    held = _at(root, path)
+    if held is None and len(path) == 1:
+        return _checked(f"{_ended(text)}{path[0]}: [{', '.join(names)}]\n", _listing(root, path, names), what)
+    if not isinstance(held, Listing):
+        raise ConfigError(f"{what}: it is no list of names; {_ADVICE}")
+    found = _find(text, path)
+    assert found is not None
+    if found.is_flow and found.entries:
+        at = found.entries[-1].end
+        spliced = f"{text[:at]}, {', '.join(names)}{text[at:]}"
+    elif found.is_flow:
+        spliced = f"{text[: found.start]}[{', '.join(names)}]{text[found.end :]}"
+    else:
+        last = found.entries[-1]
+        dash, at = text[_line_start(text, last.start) : last.start], _last_line_end(text, last)
+        spliced = _ended(text[:at]) + "".join(f"{dash}{name}\n" for name in names) + text[at:]
+    return _checked(spliced, _listing(root, path, names), what)
+
+
 # --- trees -----------------------------------------------------------------------------------------------------------
 
 
@@ -140,6 +174,29 @@ def _with(root: Node, section: str, added: Node) -> str:
     if not is_there:
         pairs.append((Scalar(text=section, is_plain=True, place=root.place), added))
     return flow(replace(root, pairs=tuple(pairs)))
+
+
+def _at(node: Node | None, path: Sequence[str]) -> Node | None:
+    for word in path:
+        node = dict(_pairs(node)).get(word)
+    return node
+
+
+def _listing(root: Node, path: Sequence[str], names: Sequence[str]) -> str:
+    """What the tree says once the names are at the end of the list at ``path``."""
+
+    def more(node: Node | None, left: Sequence[str]) -> Node:
+        if not left:
+            items = node.items if isinstance(node, Listing) else ()
+            added = tuple(Scalar(text=name, is_plain=True, place=root.place) for name in names)
+            return Listing(items=(*items, *added), place=root.place)
+        assert isinstance(node, Mapping)
+        pairs = [(key, more(held, left[1:]) if key.text == left[0] else held) for key, held in node.pairs]
+        if all(key.text != left[0] for key, _ in node.pairs):
+            pairs.append((Scalar(text=left[0], is_plain=True, place=root.place), more(None, left[1:])))
+        return replace(node, pairs=tuple(pairs))
+
+    return flow(more(root, path))
 
 
 def _pruned(node: Node, path: Sequence[str]) -> Node:

@@ -216,11 +216,13 @@ def _can_be_dialled(node: NodeSpec) -> bool:
 def _electors(section: Section, cast: Cast, out: Collector) -> tuple[NodeId, ...]:
     robots = cast.of_kind(NodeKind.ROBOT)
     given = section.get("electorate")
-    electors = select(given, cast, out) if given else robots
+    electors = select(given, cast, out) if given else robots or tuple(sorted(cast.names))
     place = section.where("electorate") if given is not None else cast.place
     if not robots and cast.is_whole:
-        out.error(cast.place, "the fleet has no robot: nobody would vote", "give at least one node `kind: robot`")
-    elif not electors and cast.is_whole:
+        out.warn(
+            cast.place, "the fleet has no robot: nobody votes, and no task gets an owner", "a robot may join later"
+        )
+    if not electors and cast.is_whole:
         out.error(place, "no node is an elector")
     elif electors and cast.is_whole:
         _advise_electors(electors, cast, place, out)

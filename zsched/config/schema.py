@@ -388,8 +388,8 @@ FLEET: Final = Record(
         "tasks": Field(MapOf(NAME_BLOCK, TASK), "What must run somewhere, and its streams."),
         "electorate": Field(
             Forms(word=Choice({"auto": ()}), listing=_NAMES, mapping=SELECTOR),
-            "Who stores the allocations and agrees on them; `auto`: the robots at first, and who follows an elector "
-            "that is gone is agreed.",
+            "Who stores the allocations and agrees on them; `auto`: the robots at first (where there is none, all "
+            "nodes), and who follows an elector that is gone is agreed.",
             default="`auto`",
         ),
         "zenoh": Field(

@@ -253,3 +253,23 @@ def test_what_a_secured_fleet_lets_in_follows_from_its_daemons_next_start() -> N
     assert not any("access rules" in one[3] for one in told(without, plain))
     task = secured.replace("tasks:\n", f"tasks:\n{EXCLUSIVE}", 1)
     assert any("access rules" in one[3] for one in told(task, secured) if one[0] == "tasks.pick")
+
+
+# --- who dials whom --------------------------------------------------------------------------------------------------
+
+
+def test_a_node_that_comes_at_the_end_of_the_seeds_dials_and_nobody_else_does_anew() -> None:
+    node = "{{kind: robot, host: 192.0.2.{0}, listen: {{control: tcp/0.0.0.0:7457, data: tcp/0.0.0.0:7458}}}}"
+    nodes = "".join(f"  r{n}: {node.format(n)}\n" for n in (1, 2, 4))
+    old = f"fleet: f\nnodes:\n{nodes}tasks: {{}}\n"
+
+    def told(seeds: str) -> str:
+        text = old.replace("tasks:", f"  r3: {node.format(3)}\ntasks:") + f"seeds: [{seeds}]\n"
+        before, after = (check_bytes(one.encode()).fleet for one in (old, text))
+        assert before is not None
+        assert after is not None
+        return next(one.consequence for one in difference(before, after, (old, text)) if one.path == "seeds")
+
+    assert told("r1, r2, r4, r3") == "r3 dials the others"
+    for seeds in ("r1, r2, r3, r4", "r3, r1, r2, r4", "r2, r1, r4, r3"):
+        assert told(seeds) == "every daemon dials them from its next start on"

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zsched.config.editing import add_entries, remove_node, remove_task
+from zsched.config.editing import add_entries, add_names, is_list, remove_node, remove_task
 from zsched.config.load import check_bytes
 from zsched.core.values.fleet import Fleet
 from zsched.errors import ConfigError
@@ -175,3 +175,34 @@ def test_every_entry_can_be_removed_and_the_others_keep_their_bytes(held: list[s
     kept = [part.rstrip("\n") for number, part in enumerate(parts) if number != gone]
     assert all(part.strip() in text for part in kept)
     assert f"t{gone}:" not in text
+
+
+# --- lists of names --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        ("seeds: [a]  # who\nfleet: f\n", "seeds: [a, x, y]  # who\nfleet: f\n"),
+        (
+            "seeds:   # who\n  - a   # first\n\nfleet: f\n",
+            "seeds:   # who\n  - a   # first\n  - x\n  - y\n\nfleet: f\n",
+        ),
+        ("seeds: []\nfleet: f\n", "seeds: [x, y]\nfleet: f\n"),
+        ("fleet: f", "fleet: f\nseeds: [x, y]\n"),
+    ],
+)
+def test_names_are_added_to_the_end_of_a_list(text: str, wanted: str) -> None:
+    assert add_names(text, ("seeds",), ["x", "y"]) == wanted
+    assert is_list(wanted, ("seeds",))
+
+
+def test_names_are_added_to_the_candidates_of_a_task_only_where_they_are_a_list() -> None:
+    text = "tasks:\n  merge: {candidates: [a], weights: {cpu: 1}}\n  count:\n    candidates: {kind: edge}\n"
+    path = ("tasks", "merge", "candidates")
+    assert add_names(text, path, ["x"]) == text.replace("[a]", "[a, x]")
+    assert not is_list(text, ("tasks", "count", "candidates"))
+    with pytest.raises(ConfigError, match=r"x cannot be added to tasks\.count\.candidates: it is no list of names"):
+        add_names(text, ("tasks", "count", "candidates"), ["x"])
+    with pytest.raises(ConfigError, match="cannot be added"):
+        add_names("{fleet: f}", ("seeds",), ["x"])

@@ -739,9 +739,12 @@ def test_a_worker_that_acknowledges_nothing_cannot_be_reliable() -> None:
     assert ["left undone" in fault.message for fault in faults] == [True]
 
 
-def test_fleet_without_robots_is_refused() -> None:
+def test_a_fleet_without_robots_waits_for_one_and_all_its_nodes_are_electors() -> None:
     text = GOOD.replace("kind: robot", "kind: edge")
-    assert "nobody would vote" in check(text).report()
+    result = check(text)
+    assert "nobody votes, and no task gets an owner" in result.report()
+    assert result.fleet is not None
+    assert result.fleet.electors == tuple(node.name for node in result.fleet.nodes)
 
 
 def test_nodes_that_nobody_can_dial_are_refused() -> None:
