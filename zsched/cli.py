@@ -33,6 +33,7 @@ from zsched.commands.fleet_verbs import (
     node_app,
     task_app,
 )
+from zsched.commands.member_verbs import add_member_verbs
 from zsched.commands.order_verbs import add_order_verbs
 from zsched.commands.pki_verbs import pki_app
 from zsched.commands.program import Program
@@ -539,6 +540,7 @@ def weights(
 
 add_order_verbs(app)
 add_flag_verbs(app)
+add_member_verbs(app)
 
 
 @app.command(cls=Verb)

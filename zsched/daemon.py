@@ -58,6 +58,7 @@ from zsched.runtime.descriptors import take_descriptors
 from zsched.runtime.endpoints import DATA_PORT, Endpoints, claim_port, endpoints_for, free_port, is_here
 from zsched.runtime.leaving import Leaving
 from zsched.runtime.library import Library
+from zsched.runtime.membership import copied_file
 from zsched.runtime.memory import shared_memory_objection
 from zsched.runtime.recipes import Recipes
 from zsched.runtime.reload import Reload
@@ -159,6 +160,7 @@ class Daemon:
             node.has_foreign_state = self._has_foreign_state
             node.fleet_path = str(self._options.config.absolute())
             node.by_file = self._in_file
+            node.copied_file = copied_file(self._options.state_dir)
             node.lacks_state_file = self._lacks_state_file
             if self._memory_objection:
                 log.warning("shared_memory off why=%s", self._memory_objection)

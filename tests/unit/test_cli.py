@@ -208,6 +208,7 @@ def test_every_verb_that_asks_a_daemon_takes_the_node_that_several_daemons_make_
     asking = [words for words, options in verbs(main) if "--runtime-dir" in options]
     arguments = {"write": [str(folder / "x.prom")], "wait": ["--for", "quorum", "--timeout", "0"]}
     arguments |= {
+        "invite": ["edge9", "--plan"],
         "logs": ["echo"],
         "restart": ["echo", "--yes"],
         "explain": ["echo"],

@@ -14,6 +14,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TextIO
 
 from zsched.commands.ask import Door
 from zsched.commands.common import CliError, Json, nearest, print_json
@@ -59,6 +60,13 @@ class ApplyView:
     revision: int | None = None
     """The only revision that may be changed; ``None``: whichever is in force."""
     reason: str = ""
+    is_data: bool = False
+    """Stdout is for something else: what is told goes to stderr."""
+
+    @property
+    def out(self) -> TextIO:
+        """Where what is told goes."""
+        return sys.stderr if self.is_data else sys.stdout
 
     def again(self, *more: str) -> str:
         """The command, with more words."""
@@ -127,7 +135,7 @@ def apply(door: Door, view: ApplyView, make: Callable[[InForce], str], file: str
     if plan.is_nothing:
         return _tell(view, plan, "unchanged", held.revision, EXIT_OK)
     if not view.is_json:
-        sys.stdout.write(harmless(table(plan)) + "\n")
+        view.out.write(harmless(table(plan)) + "\n")
     if view.is_plan:
         return _tell(view, plan, "planned", held.revision, EXIT_WOULD_CHANGE)
     missing = [(name, means) for name, means in plan.dangers if name not in view.accepted]
@@ -257,9 +265,9 @@ def _tell(view: ApplyView, plan: Plan, outcome: str, revision: int, code: int) -
     if view.is_json:
         print_json(_body(plan, outcome, revision))
     elif outcome == "unchanged":
-        sys.stdout.write(f"{plan.held.fleet}, revision {revision}: nothing would change\n")
+        view.out.write(f"{plan.held.fleet}, revision {revision}: nothing would change\n")
     elif outcome == "ok":
-        sys.stdout.write(f"{plan.held.fleet}: revision {revision} is agreed\n")
+        view.out.write(f"{plan.held.fleet}: revision {revision} is agreed\n")
     return code
 
 

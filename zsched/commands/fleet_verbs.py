@@ -57,6 +57,7 @@ def view_of(
     accept: list[str] | None,
     reason: str,
     is_json: bool,
+    is_data: bool = False,
 ) -> ApplyView:
     """The options of every verb that changes the document."""
     from zsched.commands.apply import ApplyView  # noqa: PLC0415 - each verb imports what it needs
@@ -69,6 +70,7 @@ def view_of(
         accepted=tuple(accept or ()),
         revision=revision,
         reason=reason,
+        is_data=is_data,
     )
 
 

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from zsched.pki.authority import Authority, Entry, Issued  # imports cryptography
 
 SCHEMA: Final = "zsched.pki.show/1"
+RECORD: Final = "authority.json"
+"""What is in every authority's folder."""
 PASSPHRASE: Final = "ZSCHED_AUTHORITY_PASSPHRASE"
 MAX_BYTES: Final = 1 << 20
 DUE, REVOKED, ENDED, VALID = "due", "revoked", "ended", "valid"
@@ -96,6 +98,24 @@ def issue(where: Where, name: str, role: Role, request: Path | None, out: Path |
     _say(f"{folder}: {files} of {issued.entry.label}, until {_day(issued.entry)}")
     _say(_how_to_install(folder, role, has_key=bool(issued.key)), _lacking(office.fleet, name, role))
     return EXIT_OK
+
+
+def issue_for(fleet: Fleet, node: str, given: Path | None) -> Issued | None:
+    """The first certificate of a node, with a new key; ``None``: this machine holds no authority of the fleet.
+
+    Raises:
+        CliError: the package cryptography is missing.
+        AdapterError: the node has a certificate already, or the authority cannot be used.
+    """
+    folder = places.authority_folder(given, os.environ, fleet.name)
+    if not (folder / RECORD).exists():
+        return None
+    _need_cryptography()
+    from zsched.pki.authority import opened  # noqa: PLC0415 - imports cryptography
+
+    hosts = _check_name(fleet, node, Role.NODE)
+    with opened(folder, fleet.name) as authority:
+        return authority.issue(node, Role.NODE, hosts, b"", _passphrase(authority), _now())
 
 
 def renew(where: Where, label: str | None, request: Path | None, out: Path | None) -> int:

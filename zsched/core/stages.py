@@ -116,6 +116,8 @@ class Stages:
         """Where that file lies, for the status."""
         self.by_file = self.fleet_file
         """Hash of what that file says; once a document is agreed, the node does not go by the file."""
+        self.copied_file = ""
+        """Hash of the file that was written here as a copy of an earlier document; empty: it is the operator's own."""
         self.joins_at: tuple[str, ...] = ()
         """Where applications on this machine join its streams, for the status."""
         self.security = ""

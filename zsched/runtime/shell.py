@@ -359,6 +359,7 @@ def _fleet_json(told: FleetTold) -> dict[str, Any]:
         "document": value.document,
         "text": "" if content is None else content.text,
         "flags": flags,
+        "value": wire.as_plain(value),
     }
 
 

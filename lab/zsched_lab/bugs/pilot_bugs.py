@@ -49,7 +49,11 @@ PILOT_BUGS: tuple[Bug, ...] = (
     ),
     _bug("an opinion of long ago counts", ("now - peer.at < course.silence_s and _answers", "_answers")),
     _bug("an opinion under another number counts", ("if peer.word.is_current else []", "")),
-    _bug("an elector is added without room", ("if len(alive) < majority(count + 1):", "if not alive:")),
+    _bug("an elector is added without room", ("if count > 1 and len(alive) < majority(count + 1):", "if not alive:")),
+    _bug(
+        "a single elector stays alone",
+        ("if count > 1 and len(alive) < majority(count + 1):", "if len(alive) < majority(count + 1):"),
+    ),
     _bug(
         "electors are added before the dead are removed",
         (

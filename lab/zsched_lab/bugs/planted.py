@@ -32,10 +32,19 @@ from zsched_lab.bugs.adoption_bugs import ADOPTION_BUGS
 from zsched_lab.bugs.core_bugs import CORE_BUGS, Bug
 from zsched_lab.bugs.elector_bugs import ELECTOR_BUGS
 from zsched_lab.bugs.flag_bugs import FLAG_BUGS
+from zsched_lab.bugs.member_bugs import MEMBER_BUGS
 from zsched_lab.bugs.pilot_bugs import PILOT_BUGS
 from zsched_lab.bugs.stream_bugs import STREAM_BUGS
 
-BUGS: tuple[Bug, ...] = (*CORE_BUGS, *ELECTOR_BUGS, *PILOT_BUGS, *STREAM_BUGS, *ADOPTION_BUGS, *FLAG_BUGS)
+BUGS: tuple[Bug, ...] = (
+    *CORE_BUGS,
+    *ELECTOR_BUGS,
+    *PILOT_BUGS,
+    *MEMBER_BUGS,
+    *STREAM_BUGS,
+    *ADOPTION_BUGS,
+    *FLAG_BUGS,
+)
 
 BUDGET_S = 30.0
 """What the schedules may take for one bug; the directed tests come on top."""

@@ -10,7 +10,7 @@ import contextlib
 from collections.abc import Collection
 from pathlib import Path
 
-from zsched.adapters.host.state_file import replace_synced
+from zsched.adapters.host.state_file import hand_over_folder, replace_synced
 from zsched.core.values.document import Document
 from zsched.core.values.electorate import check_id
 from zsched.errors import AdapterError, WireError
@@ -40,6 +40,7 @@ class DocumentStore:
             return name
         try:
             self.folder.mkdir(mode=0o700, exist_ok=True)
+            hand_over_folder(self.folder)
             replace_synced(self.folder / name, self.folder / NEW_NAME, encode(content))
         except OSError as error:
             raise AdapterError(

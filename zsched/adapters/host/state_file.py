@@ -257,6 +257,14 @@ def _hand_over(fd: int, folder: Path) -> None:
             os.fchown(fd, owner.st_uid, owner.st_gid)
 
 
+def hand_over_folder(path: Path) -> None:
+    """Give a folder that root has made to the owner of the folder above: the service must be able to use it."""
+    if os.geteuid() == 0:
+        with contextlib.suppress(OSError):  # a file system without owners
+            owner = path.parent.stat()
+            os.chown(path, owner.st_uid, owner.st_gid)
+
+
 def _sync_folder(folder: Path) -> None:
     fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:

@@ -1,4 +1,4 @@
-"""The fleet value with which a generation begins: of a fleet file, or recovered on one survivor.
+"""The fleet value with which a generation begins: of a fleet file, created on a first machine, or recovered.
 
 Knows: what a first value says. Does not know: random ids (they are passed in), disks, how an operator asks for it.
 """
@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 from zsched.core.values.electorate import Creation, Elector, FleetValue
+from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NO_BALLOT, Acceptance, Allocation, Ballot, NodeId, RegisterState, TaskId
 
 
@@ -30,6 +31,35 @@ def founded(fleet: str, generation: int, electors: Iterable[NodeId]) -> FleetVal
         lease_s=0.0,
         guard_lease_s=0.0,
         creations=generation,
+    )
+
+
+def created(fleet: Fleet, me: NodeId, *, disk: str, generation_id: str, document: str) -> FleetValue:
+    """What the first machine of a new fleet begins with: a document is agreed, and this machine is the only elector.
+
+    Args:
+        fleet: what the document says.
+        me: the first machine.
+        disk: its disk's id.
+        generation_id: random: two fleets of one name never mix.
+        document: the document's hash.
+    """
+    tasks = tuple(
+        Creation(task=task.name, number=index, exclusive=task.exclusive)
+        for index, task in enumerate(fleet.tasks, start=1)
+    )
+    return FleetValue(
+        fleet=fleet.name,
+        generation_id=generation_id,
+        revision=1,
+        number=1,
+        electors=(Elector(name=me, disk=disk, joining=1),),
+        settled=True,
+        lease_s=fleet.timing.lease_s,
+        guard_lease_s=fleet.timing.lease_s,
+        creations=len(tasks),
+        tasks=tasks,
+        document=document,
     )
 
 

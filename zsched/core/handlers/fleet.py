@@ -130,10 +130,13 @@ def _adopt_work(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
 
 
 def compare_file(node: Stages) -> None:
-    """Show whether this machine's fleet file says something else than the agreed document."""
+    """Show whether this machine's fleet file says something else than the agreed document.
+
+    A file that was written as a copy of an earlier document, and that nobody has changed, says nothing of its own.
+    """
     agreed = node.agreement.document
     complaint = None
-    if agreed is not None and fleet_hash(agreed) != node.by_file:
+    if agreed is not None and node.by_file not in (fleet_hash(agreed), node.copied_file):
         complaint = (
             f"the fleet file here differs from the agreed document, by which this node goes; what it would change: "
             f"`zsched apply {node.fleet_path} --plan`; to take the document: `zsched fleet export -o {node.fleet_path}`"

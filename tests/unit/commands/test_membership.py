@@ -1,0 +1,361 @@
+"""`zsched fleet create`, `invite`, `join`, against a node whose answers are written down here, and real files."""
+
+from __future__ import annotations
+
+import json
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from support.schemas import faults
+from zsched.adapters.host.operator_socket import OperatorSocket
+from zsched.adapters.host.state_file import StateFile
+from zsched.cli import app
+from zsched.commands import membership
+from zsched.commands.common import CliError
+from zsched.commands.membership import Address, address_of, dial_order, own_address
+from zsched.config.load import check_bytes, load_fleet
+from zsched.core.values.document import Document, Text
+from zsched.core.values.electorate import Elector, FleetValue
+from zsched.wire.codec import as_plain, document_hash
+from zsched.wire.invitation import decode_invitation
+
+Json = dict[str, Any]
+TEXT = """\
+fleet: hall   # the large one
+nodes:
+  robot1: {kind: robot, host: 127.0.0.1, listen: {control: tcp/127.0.0.1:7457, data: tcp/127.0.0.1:7458}}
+  edge1: {kind: edge, host: 127.0.0.1, listen: {control: tcp/127.0.0.1:7461, data: tcp/127.0.0.1:7462}}
+  robot3: {kind: robot}
+tasks:
+  merge: {candidates: [robot1, robot3], weights: {cpu: 0.5, memory: 0.5}}
+  count: {candidates: {kind: edge}, weights: {cpu: 1}}
+"""
+
+
+class Node:
+    """A node that agrees on every change of its document."""
+
+    def __init__(self, text: str = TEXT) -> None:
+        self.text, self.revision, self.flags = text, 7, [{"kind": "drain", "subject": "edge1"}]
+        self.states = {"robot1": "alive", "edge1": "alive", "robot3": "gone"}
+        self.changes: list[Json] = []
+        self.is_old = False
+
+    def answer(self, request: Json) -> Json:
+        if request["verb"] == "status":
+            nodes = [{"name": name, "state": state} for name, state in self.states.items()]
+            tasks = [{"name": "merge", "owner": "robot1"}]
+            return {"fleet": "hall", "nodes": nodes, "tasks": tasks, "fleet_file": "", "schema": "zsched.status/1"}
+        if request["verb"] == "change":
+            self.changes.append(request)
+            self.revision += 1
+            self.text = request["text"]
+            return {"outcome": "ok", "detail": "agreed", "revision": self.revision}
+        content = Document(text=Text(self.text))
+        value = FleetValue(
+            fleet="hall",
+            generation_id="ab" * 16,
+            revision=self.revision,
+            number=2,
+            electors=(Elector(name="robot1", disk="01", joining=1),),
+            settled=True,
+            lease_s=1.0,
+            guard_lease_s=1.0,
+            document=document_hash(content),
+        )
+        body = {
+            "node": "robot1",
+            "fleet": "hall",
+            "revision": self.revision,
+            "number": 2,
+            "settled": True,
+            "disk": "01",
+        }
+        told = {"electors": [{"name": "robot1", "disk": "01"}], "document": value.document, "text": self.text}
+        return {**body, **told, "flags": [], **({} if self.is_old else {"value": as_plain(value)})}
+
+
+@pytest.fixture
+def node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Node]:
+    monkeypatch.setenv("ZSCHED_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("ZSCHED_NODE", "robot1")
+    monkeypatch.setenv("ZSCHED_AUTHORITY", str(tmp_path / "authority"))
+    one = Node()
+    door = OperatorSocket(tmp_path / "robot1.sock", one.answer)
+    door.open()
+    yield one
+    door.close()
+
+
+def run(*words: object, stdin: str = "") -> Result:
+    return CliRunner().invoke(app, [str(word) for word in words], input=stdin)
+
+
+def here(folder: Path) -> tuple[object, ...]:
+    return ("--config", folder / "fleet.yaml", "--state-dir", folder / "state")
+
+
+# --- addresses -------------------------------------------------------------------------------------------------------
+
+
+def test_addresses_as_people_write_them() -> None:
+    assert address_of("robot4.local") == Address(host="robot4.local", port=7457)
+    assert address_of("2001:db8::1").entry("tls") == (
+        'host: "2001:db8::1", listen: {control: "tls/[::]:7457", data: "tls/[::]:7458"}'
+    )
+    assert address_of("[::1]:7500").entry("tcp") == (
+        'host: "::1", listen: {control: "tcp/[::1]:7500", data: "tcp/[::1]:7501"}'
+    )
+    for text in ("", "a b", "tcp/robot4:7457", "robot4:x", "robot4:0", "robot4:65535", 'a"b', "{a}"):
+        with pytest.raises(CliError, match="is no address"):
+            address_of(text)
+
+
+def test_who_dials_whom_is_kept_when_it_is_written_down() -> None:
+    fleet = check_bytes(TEXT.encode()).fleet
+    assert fleet is not None
+    assert dial_order(fleet) == ("robot1", "edge1"), "in the file's order; robot3 cannot be dialled"
+
+
+# --- create ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_fleet_of_one_is_created_with_this_machines_address(tmp_path: Path) -> None:
+    result = run("fleet", "create", "hall", "--node", "robot1", *here(tmp_path))
+    if not own_address():
+        assert result.exit_code == 1
+        assert "give one with --address" in result.stderr
+        return
+    assert result.exit_code == 0, result.stderr
+    fleet = load_fleet(tmp_path / "fleet.yaml")
+    assert (fleet.name, [node.name for node in fleet.nodes], fleet.tasks, fleet.seeds) == (
+        "hall",
+        ["robot1"],
+        (),
+        ("robot1",),
+    )
+    assert fleet.node("robot1").host == own_address()
+    assert "next: zsched up --config" in result.stdout
+
+
+def test_create_says_what_it_would_write_and_what_it_wrote(tmp_path: Path) -> None:
+    given = ("fleet", "create", "hall", "--node", "edge1", "--kind", "edge", "--address", "127.0.0.1:7500")
+    words = (*given, "--timing", "wired", *map(str, here(tmp_path)))
+    planned = run(*words, "--plan", "--json")
+    assert planned.exit_code == 10
+    assert not (tmp_path / "fleet.yaml").exists()
+    done = run(*words, "--json")
+    assert done.exit_code == 0
+    bodies = [json.loads(one.stdout) for one in (planned, done)]
+    assert [faults(body) for body in bodies] == [[], []]
+    assert [body["outcome"] for body in bodies] == ["planned", "created"]
+    assert bodies[0]["files"] == bodies[1]["files"]
+    assert load_fleet(tmp_path / "fleet.yaml").electors == ("edge1",), "without a robot all nodes are electors"
+    again = run(*words)
+    assert again.exit_code == 1
+    assert "exists already" in again.stderr
+
+
+def test_create_refuses_what_is_no_name(tmp_path: Path) -> None:
+    for words in (("Hall", "--node", "robot1"), ("hall", "--node", "Robot 1")):
+        result = run("fleet", "create", *words, "--address", "127.0.0.1", *here(tmp_path))
+        assert result.exit_code in (2, 78)
+        assert not list(tmp_path.iterdir())
+
+
+# --- invite ----------------------------------------------------------------------------------------------------------
+
+
+def test_an_invited_node_is_agreed_last_in_who_dials_whom_and_its_file_says_all(node: Node) -> None:
+    result = run("invite", "robot2", "--address", "192.0.2.12", "--candidate-for", "merge", "--yes", "-m", "more hands")
+    assert result.exit_code == 0, result.stderr
+    invitation = decode_invitation(result.stdout.encode())
+    assert (invitation.node, invitation.value.revision, invitation.papers) == ("robot2", 8, None)
+    assert invitation.addresses == ("tcp/127.0.0.1:7461", "tcp/127.0.0.1:7457")
+    fleet = check_bytes(node.text.encode()).fleet
+    assert fleet is not None
+    assert fleet.seeds == ("robot1", "edge1", "robot2")
+    assert fleet.task("merge").candidates == ("robot1", "robot2", "robot3")
+    assert fleet.node("robot2").listen_data == "tcp/0.0.0.0:7458"
+    assert node.text.startswith(TEXT.partition("tasks:")[0]), "every other character stays"
+    assert "more hands, by " in node.changes[0]["reason"]
+    assert "nodes.robot2" in result.stderr
+    assert "next, on that machine: sudo zsched join robot2.invite" in result.stderr
+    more = run("invite", "robot4", "--address", "192.0.2.14", "--kind", "edge", "--candidate-for", "count", "--yes")
+    assert more.exit_code == 0, more.stderr
+    fleet = check_bytes(node.text.encode()).fleet
+    assert fleet is not None
+    assert fleet.seeds == ("robot1", "edge1", "robot2", "robot4")
+    assert fleet.task("count").candidates == ("edge1", "robot4")
+
+
+def test_a_node_without_an_address_dials_the_others(node: Node) -> None:
+    result = run("invite", "robot2", "--yes", "--plan")
+    assert (result.exit_code, result.stdout, node.changes) == (10, "", [])
+    assert run("invite", "robot2", "--yes").exit_code == 0
+    assert "seeds" not in node.text
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "why"),
+    [
+        (("Robot2",), 2, "is not a name"),
+        (("robot1",), 1, "is a node of the fleet, and alive"),
+        (("robot3", "--address", "192.0.2.3"), 1, "is in the document already"),
+        (("robot2", "--candidate-for", "marge"), 2, "has no task 'marge'; did you mean merge?"),
+        (("robot2", "--candidate-for", "count"), 1, "are a selection that robot2 is not in"),
+        (("robot2", "--address", "a b"), 2, "is no address"),
+        (("robot2", "--address", "127.0.0.1:7460"), 78, "is already"),
+        (("robot2", "--revision", "3"), 1, "is overtaken"),
+    ],
+)
+def test_what_cannot_be_invited_changes_nothing(node: Node, words: tuple[str, ...], code: int, why: str) -> None:
+    result = run("invite", *words, "--yes")
+    assert result.exit_code == code, result.stderr
+    assert why in result.stderr
+    assert (result.stdout, node.changes) == ("", [])
+
+
+def test_off_a_terminal_an_invitation_takes_a_yes(node: Node) -> None:
+    result = run("invite", "robot2", "--address", "192.0.2.12")
+    assert result.exit_code == 2
+    assert "zsched invite robot2 --address 192.0.2.12 --yes" in result.stderr
+    assert node.changes == []
+
+
+def test_a_node_that_was_never_there_gets_its_file_once_more(node: Node, tmp_path: Path) -> None:
+    file = tmp_path / "robot3.invite"
+    result = run("invite", "robot3", "-o", file)
+    assert (result.exit_code, result.stdout, node.changes) == (0, "", [])
+    assert decode_invitation(file.read_bytes()).node == "robot3"
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    failed = run("invite", "robot3", "-o", tmp_path / "none" / "file")
+    assert failed.exit_code == 1
+    assert "write its invitation elsewhere" in failed.stderr
+
+
+def test_a_node_of_an_older_version_is_named(node: Node) -> None:
+    node.is_old = True
+    result = run("invite", "robot3")
+    assert result.exit_code == 1
+    assert "update zsched there" in result.stderr
+
+
+# --- join ------------------------------------------------------------------------------------------------------------
+
+
+def test_the_machine_of_an_invitation_has_all_files_and_a_second_time_nothing_to_do(node: Node, tmp_path: Path) -> None:
+    file, folder = tmp_path / "robot2.invite", tmp_path / "robot2"
+    file.write_text(run("invite", "robot2", "--address", "192.0.2.12", "--yes").stdout)
+    planned = run("join", file, "--dry-run", "--json", *here(folder))
+    assert planned.exit_code == 10
+    assert not folder.exists()
+    done = run("join", file, "--json", *here(folder))
+    assert done.exit_code == 0, done.stderr
+    bodies = [json.loads(one.stdout) for one in (planned, done)]
+    assert [faults(body) for body in bodies] == [[], []]
+    assert bodies[0]["files"] == bodies[1]["files"]
+    assert (folder / "fleet.yaml").read_text() == node.text
+    state = StateFile(folder / "state", fleet="hall", node="robot2").load().state
+    assert state is not None
+    again = run("join", file, *here(folder))
+    assert again.exit_code == 0
+    assert "already: nothing to do" in again.stdout
+    after = StateFile(folder / "state", fleet="hall", node="robot2").load().state
+    assert after == state
+    assert run("join", "-", *here(tmp_path / "other"), stdin=file.read_text()).exit_code == 0
+
+
+def test_what_is_no_invitation_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "text").write_text("hello")
+    for file, why in (
+        (tmp_path / "text", "no whole JSON"),
+        (tmp_path / "none", "No such file"),
+        (tmp_path, "a folder"),
+    ):
+        result = run("join", file, *here(tmp_path / "x"))
+        assert result.exit_code == 1
+        assert why in result.stderr
+    assert not (tmp_path / "x").exists()
+
+
+# --- certificates ----------------------------------------------------------------------------------------------------
+
+
+def secured(tmp_path: Path, node: Node) -> Path:
+    """The fleet's text with TLS, and an authority on this machine."""
+    pytest.importorskip("cryptography")
+    node.text = TEXT.replace("tcp/", "tls/") + "security: {}\n"
+    file = tmp_path / "secured.yaml"
+    file.write_text(node.text)
+    authority = tmp_path / "authority"
+    assert run("pki", "init", "--config", file, "--authority", authority).exit_code == 0
+    return authority
+
+
+def test_in_a_secured_fleet_the_certificate_and_its_key_come_along(node: Node, tmp_path: Path) -> None:
+    secured(tmp_path, node)
+    file, folder = tmp_path / "robot2.invite", tmp_path / "robot2"
+    result = run("invite", "robot2", "--address", "192.0.2.12", "--yes", "-o", file)
+    assert result.exit_code == 0, result.stderr
+    assert "holds its private key: only you may read it" in result.stderr
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    done = run("join", file, *here(folder))
+    assert done.exit_code == 0, done.stderr
+    assert "delete the invitation" in done.stdout
+    modes = {one.name: stat.S_IMODE(one.stat().st_mode) for one in (folder / "pki").iterdir()}
+    assert modes == {"certificate.pem": 0o644, "ca.pem": 0o644, "key.pem": 0o600}
+    from zsched.runtime.secured import require_own
+
+    fleet = load_fleet(folder / "fleet.yaml")
+    assert fleet.security is not None
+    require_own(fleet, fleet.security, "robot2")
+    again = run("invite", "robot2")
+    assert again.exit_code == 1
+    assert "is a node of the fleet" in again.stderr or "has a certificate until" in again.stderr
+
+
+def test_another_machines_certificate_is_left_as_it_is(node: Node, tmp_path: Path) -> None:
+    secured(tmp_path, node)
+    node.states["robot2"] = node.states["robot4"] = "gone"
+    for name in ("robot2", "robot4"):
+        assert run("invite", name, "--address", f"192.0.2.1{name[-1]}", "--yes", "-o", tmp_path / name).exit_code == 0
+    folder = tmp_path / "machine"
+    assert run("join", tmp_path / "robot2", *here(folder)).exit_code == 0
+    before = (folder / "pki" / "key.pem").read_bytes()
+    other = run("join", tmp_path / "robot4", "--config", folder / "fleet.yaml", "--state-dir", folder / "state2")
+    assert other.exit_code == 1
+    assert "is the certificate of 'robot2.hall.zsched.internal'" in other.stderr
+    assert (folder / "pki" / "key.pem").read_bytes() == before
+
+
+def test_without_the_authority_the_invitation_says_what_is_missing(node: Node, tmp_path: Path) -> None:
+    node.text = TEXT.replace("tcp/", "tls/") + "security: {}\n"
+    result = run("invite", "robot2", "--yes")
+    assert result.exit_code == 0, result.stderr
+    assert "the invitation has no certificate" in result.stderr
+    assert decode_invitation(result.stdout.encode()).papers is None
+    file = tmp_path / "robot2.invite"
+    file.write_text(result.stdout)
+    assert "zsched pki issue robot2" in run("join", file, *here(tmp_path / "robot2")).stdout
+
+
+def test_a_file_on_stdout_with_a_key_is_for_its_owner_only(
+    node: Node, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    secured(tmp_path, node)
+    file = tmp_path / "robot2.invite"
+    guest = membership.Guest(name="robot3")
+    with file.open("w") as out:
+        file.chmod(0o644)
+        monkeypatch.setattr("sys.stdout", out)
+        from zsched.commands.ask import find_door
+
+        membership._write(membership._invitation(find_door(None, None), guest), guest, None)
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    assert decode_invitation(file.read_bytes()).papers is not None

@@ -1,0 +1,199 @@
+"""What a machine keeps when it founds a fleet or joins one, and what is never mixed."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from zsched.adapters.host.document_store import DocumentStore
+from zsched.adapters.host.state_file import StateFile
+from zsched.config.load import load_fleet
+from zsched.core.values.document import Document
+from zsched.core.values.electorate import FleetValue
+from zsched.core.values.fleet import fleet_hash
+from zsched.errors import AdapterError, ConfigError
+from zsched.runtime.init import init_state
+from zsched.runtime.membership import BEFORE, Places, copied_file, found, is_joined, join
+from zsched.wire.codec import document_hash
+from zsched.wire.invitation import Invitation, Papers
+
+TEXT = """\
+fleet: hall
+seeds: [robot1]
+nodes:
+  robot1: {kind: robot, host: 127.0.0.1, listen: {control: tcp/127.0.0.1:7457, data: tcp/127.0.0.1:7458}}
+  robot2: {kind: robot}
+tasks:
+  merge: {candidates: {kind: robot}, weights: {cpu: 1}}
+  guard: {candidates: {kind: robot}, weights: {cpu: 1}}
+"""
+
+
+@pytest.fixture
+def first(tmp_path: Path) -> Places:
+    return Places(config=tmp_path / "one" / "etc" / "fleet.yaml", state=tmp_path / "one" / "state")
+
+
+@pytest.fixture
+def second(tmp_path: Path) -> Places:
+    return Places(config=tmp_path / "two" / "etc" / "fleet.yaml", state=tmp_path / "two" / "state")
+
+
+def value_at(places: Places, node: str) -> tuple[FleetValue, Document]:
+    state = StateFile(places.state, fleet="hall", node=node).load().state
+    assert state is not None
+    assert state.fleet_register is not None
+    value = state.fleet_register.learnt
+    assert value is not None
+    content = DocumentStore(places.state).load(value.document)
+    assert content is not None
+    return value, content
+
+
+@pytest.fixture
+def invitation(first: Places) -> Invitation:
+    found(TEXT, "robot1", first, is_plan=False)
+    value, content = value_at(first, "robot1")
+    return Invitation(node="robot2", value=value, document=content)
+
+
+def test_the_first_machine_is_the_only_elector_and_each_task_has_a_creation(first: Places) -> None:
+    fleet, files = found(TEXT, "robot1", first, is_plan=False)
+    value, content = value_at(first, "robot1")
+    assert (content.text, first.config.read_text()) == (TEXT, TEXT)
+    assert [one.name for one in value.electors] == ["robot1"]
+    assert (value.revision, value.number, value.settled, value.is_founding) == (1, 1, True, False)
+    assert [(one.task, one.number) for one in value.tasks] == [("guard", 1), ("merge", 2)]
+    assert len(value.generation_id) == 32
+    assert copied_file(first.state) == fleet_hash(fleet)
+    assert [one.path for one in files] == [first.config, first.state / "documents", first.state / "state"]
+    assert all(one.path.exists() for one in files)
+
+
+def test_two_fleets_of_one_name_have_different_generations(first: Places, second: Places) -> None:
+    for places in (first, second):
+        found(TEXT, "robot1", places, is_plan=False)
+    assert value_at(first, "robot1")[0].generation_id != value_at(second, "robot1")[0].generation_id
+
+
+def test_a_plan_writes_nothing(first: Places, second: Places, invitation: Invitation) -> None:
+    _, planned = join(invitation, second, is_plan=True)
+    assert not second.state.parent.exists()
+    _, written = join(invitation, second, is_plan=False)
+    assert planned == written
+    shutil.rmtree(first.config.parents[1])
+    found(TEXT, "robot1", first, is_plan=True)
+    assert not first.config.parents[1].exists()
+
+
+def test_no_fleet_is_founded_where_one_is(first: Places, second: Places) -> None:
+    found(TEXT, "robot1", first, is_plan=False)
+    with pytest.raises(AdapterError, match="exists already, and is left as it is"):
+        found(TEXT, "robot1", first, is_plan=False)
+    with pytest.raises(AdapterError, match="this machine belongs to a fleet"):
+        found(TEXT, "robot1", replace(first, config=second.config), is_plan=False)
+    assert not second.config.exists()
+
+
+def test_a_machine_that_joins_knows_the_value_the_document_and_has_a_disk_of_its_own(
+    first: Places, second: Places, invitation: Invitation
+) -> None:
+    assert not is_joined(invitation, second)
+    join(invitation, second, is_plan=False)
+    assert is_joined(invitation, second)
+    assert value_at(second, "robot2") == value_at(first, "robot1")
+    assert load_fleet(second.config).name == "hall"
+    states = [
+        StateFile(one.state, fleet="hall", node=name).load().state
+        for one, name in ((first, "robot1"), (second, "robot2"))
+    ]
+    assert len({state.disk for state in states if state is not None}) == 2
+
+
+def test_another_fleets_file_is_left_as_it_is(second: Places, invitation: Invitation) -> None:
+    second.config.parent.mkdir(parents=True)
+    for text, why in ((TEXT.replace("hall", "yard"), "the file of fleet yard"), ("fleet: [", "no usable fleet file")):
+        second.config.write_text(text)
+        with pytest.raises(AdapterError, match=why):
+            join(invitation, second, is_plan=False)
+        assert second.config.read_text() == text
+        assert not second.state.exists()
+
+
+def test_another_text_of_the_same_fleet_is_kept_beside(second: Places, invitation: Invitation) -> None:
+    second.config.parent.mkdir(parents=True)
+    old = TEXT.replace("robot2", "robot3")
+    second.config.write_text(old)
+    join(invitation, second, is_plan=False)
+    assert second.config.read_text() == TEXT
+    assert second.config.with_name(f"fleet.yaml{BEFORE}").read_text() == old
+
+
+def test_a_state_of_another_node_fleet_or_generation_is_left_as_it_is(
+    first: Places, second: Places, invitation: Invitation
+) -> None:
+    with pytest.raises(AdapterError, match="belongs to the node 'robot1'"):
+        is_joined(invitation, first)
+    other = replace(invitation, value=replace(invitation.value, generation_id="cd" * 16))
+    join(other, second, is_plan=False)
+    with pytest.raises(AdapterError, match="of another generation"):
+        is_joined(invitation, second)
+    with pytest.raises(AdapterError, match="belongs to the fleet"):
+        is_joined(replace(invitation, value=replace(invitation.value, fleet="yard")), second)
+
+
+def test_a_state_of_before_the_document_is_no_membership(first: Places, second: Places, invitation: Invitation) -> None:
+    init_state(load_fleet(first.config), "robot2", second.state, 0)
+    with pytest.raises(AdapterError, match="before its document was agreed"):
+        is_joined(invitation, second)
+
+
+def test_a_damaged_state_is_said_so(second: Places, invitation: Invitation) -> None:
+    join(invitation, second, is_plan=False)
+    (second.state / "state").write_bytes(b"torn")
+    with pytest.raises(AdapterError, match="is damaged"):
+        is_joined(invitation, second)
+
+
+def test_what_was_written_in_part_is_written_again(second: Places, invitation: Invitation) -> None:
+    join(invitation, second, is_plan=False)
+    (second.state / "state").unlink()
+    assert not is_joined(invitation, second)
+    join(invitation, second, is_plan=False)
+    assert is_joined(invitation, second)
+
+
+def test_a_state_folder_in_use_is_refused_before_anything_is_written(second: Places, invitation: Invitation) -> None:
+    with StateFile(second.state, fleet="hall", node="robot2"), pytest.raises(AdapterError, match="is in use by"):
+        join(invitation, second, is_plan=False)
+    assert not second.config.exists()
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path, invitation: Invitation) -> None:
+    (tmp_path / "file").write_text("")
+    places = Places(config=tmp_path / "file" / "fleet.yaml", state=tmp_path / "state")
+    with pytest.raises(AdapterError, match="Not a directory"):
+        join(invitation, places, is_plan=False)
+
+
+def test_a_document_that_cannot_be_used_here_is_refused(second: Places, invitation: Invitation) -> None:
+    for text, why in (("fleet: hall\nnodes: {}\n", "no nodes"), (TEXT.replace("robot2", "robot3"), "no node 'robot2'")):
+        content = replace(invitation.document, text=text)  # type: ignore[arg-type]
+        value = replace(invitation.value, document=document_hash(content))
+        with pytest.raises(ConfigError, match=why):
+            join(replace(invitation, document=content, value=value), second, is_plan=False)
+    papers = Papers(certificate="c", key="k", trusted="t")
+    with pytest.raises(ConfigError, match="has a certificate"):
+        join(replace(invitation, papers=papers), second, is_plan=False)
+
+
+def test_a_certificate_of_somebody_else_is_refused(second: Places, invitation: Invitation) -> None:
+    text = TEXT.replace("tcp/", "tls/") + "security: {}\n"
+    content = replace(invitation.document, text=text)  # type: ignore[arg-type]
+    value = replace(invitation.value, document=document_hash(content))
+    papers = Papers(certificate="c", key="k", trusted="t")
+    with pytest.raises(ConfigError, match="certificate names None, and its node is robot2"):
+        join(replace(invitation, document=content, value=value, papers=papers), second, is_plan=False)

@@ -1,0 +1,180 @@
+"""The verbs by which machines come and go: `fleet create`, `invite`, `join`, `leave`.
+
+Knows: options. Does not know: how anything is done (`zsched.commands.membership`, `zsched.commands.leave`, imported by
+the verb that runs).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from zsched.commands.common import Verb
+from zsched.commands.fleet_verbs import (
+    AcceptOption,
+    AskedOption,
+    ConnectOption,
+    JsonOption,
+    PlanOption,
+    ReasonOption,
+    RevisionOption,
+    RuntimeOption,
+    YesOption,
+    fleet_app,
+    view_of,
+)
+
+if TYPE_CHECKING:
+    from zsched.runtime.membership import Places
+
+
+class Kind(StrEnum):
+    """What a machine is."""
+
+    ROBOT = "robot"
+    EDGE = "edge"
+
+
+class Profile(StrEnum):
+    """The clocks of the protocol."""
+
+    WIRED = "wired"
+    WIFI = "wifi"
+    WAN = "wan"
+
+
+ConfigOption = Annotated[
+    Path | None,
+    typer.Option("--config", "-c", metavar="FILE", help="Fleet file. [ZSCHED_CONFIG, else /etc/zsched/fleet.yaml]"),
+]
+StateOption = Annotated[
+    Path | None,
+    typer.Option("--state-dir", metavar="DIR", help="Durable state. [ZSCHED_STATE_DIR, else /var/lib/zsched]"),
+]
+AddressHelp = "HOST or HOST:PORT of its control session; its data session has the next port."
+OnlyPlanOption = Annotated[
+    bool, typer.Option("--plan", "--dry-run", help="Only show what would be written; exits with 10.")
+]
+
+
+def add_member_verbs(app: typer.Typer) -> None:
+    """Add the verbs to the program."""
+    verbs: tuple[Callable[..., None], ...] = (invite, join)
+    for verb in verbs:
+        app.command(cls=Verb)(verb)
+
+
+def _places(config: Path | None, state_dir: Path | None) -> Places:
+    from zsched import paths  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.runtime.membership import Places  # noqa: PLC0415 - as above
+
+    return Places(config=paths.config_path(config, os.environ), state=paths.state_folder(state_dir, os.environ))
+
+
+@fleet_app.command("create", cls=Verb)
+def fleet_create(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="The new fleet's name.")],
+    node: Annotated[
+        str | None,
+        typer.Option("--node", "-n", metavar="NAME", help="This machine's name. [ZSCHED_NODE, else the host name]"),
+    ] = None,
+    kind: Annotated[
+        Kind, typer.Option("--kind", "--role", help="A robot votes and has streams; an edge only works.")
+    ] = Kind.ROBOT,
+    address: Annotated[str | None, typer.Option("--address", metavar="ADDRESS", help=f"{AddressHelp} [found]")] = None,
+    timing: Annotated[Profile, typer.Option("--timing", help="The clocks of the protocol.")] = Profile.WIFI,
+    plan: OnlyPlanOption = False,
+    json_: JsonOption = False,
+    config: ConfigOption = None,
+    state_dir: StateOption = None,
+) -> None:
+    """Make this machine the first one of a new fleet: writes its fleet file and its state.
+
+    Refused where a fleet file or a state is. A fleet of one works; `zsched invite` brings the next machine.
+    """
+    from zsched import paths  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.membership import CreateView, create  # noqa: PLC0415 - as above
+    from zsched.core.values.model import NodeKind  # noqa: PLC0415 - as above
+
+    view = CreateView(
+        fleet=name,
+        node=paths.node_name(node, os.environ),
+        kind=NodeKind(kind.value),
+        timing=timing.value,
+        address=address,
+        places=_places(config, state_dir),
+        is_plan=plan,
+        is_json=json_,
+    )
+    raise typer.Exit(create(view))
+
+
+def invite(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="The new machine's name in the fleet.")],
+    kind: Annotated[
+        Kind, typer.Option("--kind", "--role", help="A robot votes and has streams; an edge only works.")
+    ] = Kind.ROBOT,
+    address: Annotated[
+        str | None, typer.Option("--address", metavar="ADDRESS", help=f"{AddressHelp} [nobody dials it]")
+    ] = None,
+    candidate_for: Annotated[
+        list[str] | None,
+        typer.Option("--candidate-for", metavar="TASK", help="It may own this task; give it once for each."),
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FILE", help="Where to; else stdout.")
+    ] = None,
+    authority: Annotated[
+        Path | None,
+        typer.Option("--authority", metavar="DIR", help="In a secured fleet: who signs. [as of zsched pki]"),
+    ] = None,
+    plan: PlanOption = False,
+    yes: YesOption = False,
+    revision: RevisionOption = None,
+    accept: AcceptOption = None,
+    reason: ReasonOption = "",
+    node: AskedOption = None,
+    runtime_dir: RuntimeOption = None,
+    connect: ConnectOption = None,
+) -> None:
+    """Add a machine to the fleet, and write the file with which it joins (`zsched join`).
+
+    In a secured fleet the file holds the machine's certificate and key, where this machine has the authority.
+    For a node that was never there it is written once more.
+    """
+    from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.membership import Guest  # noqa: PLC0415 - as above
+    from zsched.commands.membership import invite as bring  # noqa: PLC0415 - as above
+    from zsched.core.values.model import NodeKind  # noqa: PLC0415 - as above
+
+    tasks = tuple(candidate_for or ())
+    words = ["invite", name, *(["--kind", "edge"] if kind is Kind.EDGE else [])]
+    words += ["--address", address] if address is not None else []
+    words += [word for task in tasks for word in ("--candidate-for", task)]
+    words += ["--output", str(output)] if output is not None else []
+    view = view_of(
+        tuple(words), plan=plan, yes=yes, revision=revision, accept=accept, reason=reason, is_json=False, is_data=True
+    )
+    guest = Guest(name=name, kind=NodeKind(kind.value), address=address, tasks=tasks, authority=authority)
+    raise typer.Exit(bring(find_door(runtime_dir, node, connect=connect), view, guest, output))
+
+
+def join(
+    file: Annotated[str, typer.Argument(metavar="FILE", help="What `zsched invite` wrote; -: stdin.")],
+    plan: OnlyPlanOption = False,
+    json_: JsonOption = False,
+    config: ConfigOption = None,
+    state_dir: StateOption = None,
+) -> None:
+    """Make this machine the node that an invitation names: writes its fleet file, state and certificate.
+
+    Nothing of another fleet is touched: it is refused. Start the daemon then; it votes as soon as it hears the others.
+    """
+    from zsched.commands.membership import join as come  # noqa: PLC0415 - each verb imports what it needs
+
+    raise typer.Exit(come(file, _places(config, state_dir), is_plan=plan, is_json=json_))

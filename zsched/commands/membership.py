@@ -1,0 +1,419 @@
+"""`zsched fleet create`, `zsched invite` and `zsched join`: how a fleet begins, and how a machine comes into it.
+
+Knows: what is asked of an operator, what is said in the end. Does not know: which files a machine keeps
+(`zsched.runtime.membership`), how a change is agreed (`zsched.commands.apply`).
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+import shlex
+import socket
+import stat
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from zsched import paths as places
+from zsched.commands.apply import ApplyView, apply
+from zsched.commands.ask import CONTROL_PORT, Door, ask_door
+from zsched.commands.common import CliError, Json, nearest, print_json
+from zsched.commands.document import InForce, document_text, in_force, status_of
+from zsched.commands.entries import DOCUMENT, HERE
+from zsched.commands.page import harmless
+from zsched.config.editing import add_entries, add_names, is_list
+from zsched.config.load import check_bytes
+from zsched.core.values.document import Document
+from zsched.core.values.electorate import FleetValue
+from zsched.core.values.fleet import Fleet, NodeSpec, dial_endpoint
+from zsched.core.values.model import NAME, NodeId, NodeKind
+from zsched.errors import WireError
+from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
+from zsched.files import read_regular
+from zsched.runtime.membership import Places, Written, found, is_joined
+from zsched.runtime.membership import join as join_here
+from zsched.wire.codec import from_plain
+from zsched.wire.invitation import MAX_BYTES, Invitation, Papers, decode_invitation, encode_invitation
+
+SCHEMA: Final = "zsched.member/1"
+PRIVATE: Final = 0o600
+MAX_PORT: Final = 65_535
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Told:
+    """What a verb of these has done to this machine, or would do."""
+
+    fleet: str
+    node: NodeId
+    outcome: str
+    """created, joined, left, planned, or unchanged."""
+    said: str
+    """One line for people."""
+    files: tuple[Written, ...] = ()
+    next: tuple[str, ...] = ()
+
+    def tell(self, *, is_json: bool) -> None:
+        """Print it."""
+        if is_json:
+            files = [{"path": str(one.path), "what": one.what} for one in self.files]
+            body: Json = {"schema": SCHEMA, "fleet": self.fleet, "node": self.node, "outcome": self.outcome}
+            print_json({**body, "files": files, "next": list(self.next)})
+            return
+        lines = [self.said, *(f"  {one.path}: {one.what}" for one in self.files)]
+        lines += [f"next: {one}" for one in self.next]
+        sys.stdout.write(harmless("\n".join(lines)) + "\n")
+
+
+# --- addresses -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Address:
+    """Where a node is dialled: its control session at ``port``, its data session at the next one."""
+
+    host: str
+    port: int = CONTROL_PORT
+
+    def entry(self, protocol: str) -> str:
+        """The part of a node's entry in the fleet file that says so."""
+        where = self.host if _is_loopback(self.host) else "::" if ":" in self.host else "0.0.0.0"  # noqa: S104 - a robot's
+        where = f"[{where}]" if ":" in where else where
+        listen = ", ".join(
+            f'{kind}: "{protocol}/{where}:{port}"' for kind, port in (("control", self.port), ("data", self.port + 1))
+        )
+        return f'host: "{self.host}", listen: {{{listen}}}'
+
+
+def address_of(text: str) -> Address:
+    """An address out of what people write: ``HOST``, ``HOST:PORT``, ``[IPV6]:PORT``.
+
+    >>> address_of("192.0.2.11"), address_of("[2001:db8::1]:7500").port
+    (Address(host='192.0.2.11', port=7457), 7500)
+
+    Raises:
+        CliError: it is none.
+    """
+    host, port = text, ""
+    if text.startswith("["):
+        host, _, port = text[1:].partition("]")
+        port = port.removeprefix(":")
+    elif text.count(":") == 1:
+        host, _, port = text.partition(":")
+    is_good = bool(host) and not set(host) & set(' "/{}\\') and (not port or port.isdigit())
+    if not is_good or not 0 < int(port or CONTROL_PORT) < MAX_PORT:
+        advice = f"write HOST or HOST:PORT, as 192.0.2.11 or robot4.local:{CONTROL_PORT}"
+        raise CliError(EXIT_USAGE, f"--address: {text!r} is no address; {advice}")
+    return Address(host=host, port=int(port or CONTROL_PORT))
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def own_address() -> str:
+    """The address of this machine from which packets for other networks would leave; empty: it has none."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # of documentation, and nothing is sent: the kernel only looks for the way
+        except OSError:
+            return ""
+        return str(probe.getsockname()[0])
+
+
+def _entry_of(name: str, kind: NodeKind, address: Address | None, protocol: str) -> str:
+    more = "" if address is None else f", {address.entry(protocol)}"
+    return f"  {name}: {{kind: {kind.value}{more}}}\n"
+
+
+# --- create ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CreateView:
+    """The first machine of a new fleet."""
+
+    fleet: str
+    node: str
+    kind: NodeKind
+    timing: str
+    address: str | None
+    places: Places
+    is_plan: bool = False
+    is_json: bool = False
+
+
+def create(view: CreateView) -> int:
+    """Write the fleet file, document and state of a fleet of this one machine; the exit code.
+
+    Raises:
+        CliError: no address is found, or a name is none (2).
+        AdapterError: the machine belongs to a fleet already, or a file cannot be written.
+        ConfigError: what comes of the options is no good fleet file.
+    """
+    if NAME.fullmatch(view.fleet) is None:
+        raise CliError(EXIT_USAGE, f"{view.fleet!r} is not a name ([a-z0-9][a-z0-9_-]{{0,62}})")
+    host = own_address() if view.address is None else ""
+    if view.address is None and not host:
+        raise CliError(EXIT_FAILED, "this machine has no address in a network: connect it, or give one with --address")
+    address = Address(host=host) if view.address is None else address_of(view.address)
+    fleet, files = found(_first_text(view, address), view.node, view.places, is_plan=view.is_plan)
+    where = f"{address.host}, ports {address.port} and {address.port + 1}"
+    said = f"{fleet.name}: a fleet of one node, {view.node} at {where}"
+    outcome = "planned" if view.is_plan else "created"
+    more = "`zsched task add FILE` gives it work, `zsched invite NAME > NAME.invite` brings the next machine"
+    told = Told(
+        fleet=fleet.name,
+        node=view.node,
+        outcome=outcome,
+        said=f"would be written; {said}" if view.is_plan else said,
+        files=files,
+        next=() if view.is_plan else (*_start(view.node, view.places), more),
+    )
+    told.tell(is_json=view.is_json)
+    return EXIT_WOULD_CHANGE if view.is_plan else EXIT_OK
+
+
+def _first_text(view: CreateView, address: Address) -> str:
+    return (
+        f"fleet: {view.fleet}\n"
+        f"timing: {view.timing}\n"
+        "# Each node dials those before it in this list; `zsched invite` adds to its end.\n"
+        f"seeds: [{view.node}]\n"
+        "nodes:\n"
+        f"{_entry_of(view.node, view.kind, address, 'tcp')}"
+        "tasks: {}\n"
+    )
+
+
+def _start(node: NodeId, where: Places) -> tuple[str, ...]:
+    """How its daemon is started."""
+    by_default = places.SYSTEM_CONFIG, Path("/var/lib/zsched")
+    is_named = node == places.node_name(None, {})
+    if (where.config, where.state) == by_default:
+        lines = () if is_named else (f"write `[Service] Environment=ZSCHED_NODE={node}`: `sudo systemctl edit zsched`",)
+        return (*lines, "sudo systemctl enable --now zsched (or in the foreground: sudo zsched up)")
+    words = ["zsched", "up", "--config", str(where.config), "--node", node, "--state-dir", str(where.state)]
+    return (shlex.join(words),)
+
+
+# --- invite ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Guest:
+    """The machine that is to come."""
+
+    name: str
+    kind: NodeKind = NodeKind.ROBOT
+    address: str | None = None
+    """``None``: it dials the others, and nobody dials it."""
+    tasks: tuple[str, ...] = ()
+    """Of which it becomes a candidate."""
+    authority: Path | None = None
+
+
+def invite(door: Door, view: ApplyView, guest: Guest, file: Path | None) -> int:
+    """Have a machine added to the document, and write the file with which it joins; the exit code.
+
+    Raises:
+        CliError, ConfigError: as of `zsched.commands.apply.apply`; or the name is taken, or a task is not there.
+        AdapterError: its certificate cannot be made.
+    """
+    if NAME.fullmatch(guest.name) is None:
+        raise CliError(EXIT_USAGE, f"{guest.name!r} is not a name ([a-z0-9][a-z0-9_-]{{0,62}})")
+    if file is None and sys.stdout.isatty() and not view.is_plan:
+        raise CliError(EXIT_USAGE, f"the invitation is a file: zsched invite {guest.name} > {guest.name}.invite")
+    held = in_force(door)
+    fleet = _fleet_of(document_text(held))
+    if any(node.name == guest.name for node in fleet.nodes):
+        _check_invited_again(door, guest)
+    else:
+        address = None if guest.address is None else address_of(guest.address)
+        code = apply(door, view, lambda held: _with_guest(held, guest, address), DOCUMENT)
+        if code != EXIT_OK:
+            return code
+    if not view.is_plan:
+        _write(_invitation(door, guest), guest, file)
+    return EXIT_OK
+
+
+def _check_invited_again(door: Door, guest: Guest) -> None:
+    """A node of the document that was never there may get its file once more."""
+    state = next((str(one["state"]) for one in status_of(door)["nodes"] if one["name"] == guest.name), "")
+    if state in HERE:
+        raise CliError(EXIT_FAILED, f"{guest.name} is a node of the fleet, and {state}: give the machine another name")
+    if guest.address is not None or guest.tasks:
+        advice = "without options it gets its invitation once more; `zsched edit` changes what it is"
+        raise CliError(EXIT_FAILED, f"{guest.name} is in the document already; {advice}")
+
+
+def _fleet_of(text: str) -> Fleet:
+    fleet = check_bytes(text.encode(), DOCUMENT).fleet
+    if fleet is None:
+        advice = "update zsched here; `zsched fleet export` shows the document"
+        raise CliError(EXIT_FAILED, f"the document in force has faults for this version of zsched; {advice}")
+    return fleet
+
+
+def _with_guest(held: InForce, guest: Guest, address: Address | None) -> str:
+    """The document with the node, at the end of who dials whom, and among the candidates."""
+    text = document_text(held)
+    fleet = _fleet_of(text)
+    entry = _entry_of(guest.name, guest.kind, address, _protocol(fleet))
+    text = add_entries(text, "nodes", f"nodes:\n{entry}", f"the name {guest.name}")
+    if address is not None:
+        known = fleet.seeds if is_list(text, ("seeds",)) else ()
+        text = add_names(text, ("seeds",), [*(name for name in dial_order(fleet) if name not in known), guest.name])
+    for task in dict.fromkeys(guest.tasks):
+        text = _with_candidate(text, fleet, task, guest)
+    return text
+
+
+def dial_order(fleet: Fleet) -> tuple[NodeId, ...]:
+    """The nodes that can be dialled, each after those that it dials."""
+    others = [node.name for node in fleet.nodes if node.name not in fleet.seeds and _can_be_dialled(node)]
+    return (*fleet.seeds, *others)
+
+
+def _can_be_dialled(node: NodeSpec) -> bool:
+    ends = (node.listen_control, node.listen_data)
+    return all(endpoint and dial_endpoint(endpoint, node.host) for endpoint in ends)
+
+
+def _protocol(fleet: Fleet) -> str:
+    """With which the others listen."""
+    if fleet.security is not None:
+        return "tls"
+    said = [node.listen_control.partition("/")[0] for node in fleet.nodes if node.listen_control]
+    return said[0] if said else "tcp"
+
+
+def _with_candidate(text: str, fleet: Fleet, task: str, guest: Guest) -> str:
+    names = [one.name for one in fleet.tasks]
+    if task not in names:
+        raise CliError(EXIT_USAGE, f"--candidate-for: fleet {fleet.name} has no task {task!r}{nearest(task, names)}")
+    if is_list(text, ("tasks", task, "candidates")):
+        return add_names(text, ("tasks", task, "candidates"), [guest.name])
+    if guest.name not in _fleet_of(text).task(task).candidates:
+        advice = "invite it without that, and change them with `zsched edit`"
+        raise CliError(EXIT_FAILED, f"the candidates of {task} are a selection that {guest.name} is not in; {advice}")
+    return text
+
+
+def _invitation(door: Door, guest: Guest) -> Invitation:
+    """What the node at the door goes by now, with a certificate for the new one."""
+    told = ask_door(door, {"verb": "fleet"})
+    try:
+        value = from_plain(told["value"], FleetValue)
+        document = from_plain({"text": told["text"], "flags": told["flags"]}, Document)
+    except (KeyError, WireError) as error:
+        raise CliError(EXIT_FAILED, f"{told['node']} does not tell its fleet value: update zsched there") from error
+    fleet = _fleet_of(document.text)
+    addresses = [dial_endpoint(node.listen_control, node.host) for node in fleet.nodes if node.name != guest.name]
+    papers = _papers(fleet, guest)
+    return Invitation(
+        node=guest.name, value=value, document=document, addresses=tuple(filter(None, addresses)), papers=papers
+    )
+
+
+def _papers(fleet: Fleet, guest: Guest) -> Papers | None:
+    if fleet.security is None:
+        return None
+    from zsched.commands.pki import issue_for  # noqa: PLC0415 - only a secured fleet needs it
+
+    issued = issue_for(fleet, guest.name, guest.authority)
+    if issued is None:
+        advice = f"where it is: zsched pki issue {guest.name}; bring its files to the machine before it starts"
+        sys.stderr.write(f"the invitation has no certificate: the fleet's authority is not on this machine; {advice}\n")
+        return None
+    pems = (issued.certificate, issued.key, issued.trusted)
+    certificate, key, trusted = (pem.decode("ascii") for pem in pems)
+    return Papers(certificate=certificate, key=key, trusted=trusted)
+
+
+def _write(invitation: Invitation, guest: Guest, file: Path | None) -> None:
+    """To a file that only its owner may read if there is a key in it, or to stdout."""
+    text, has_key = encode_invitation(invitation), invitation.papers is not None
+    if file is None:
+        sys.stdout.flush()
+        number = sys.stdout.fileno() if hasattr(sys.stdout, "fileno") and has_key else None
+        if number is not None and stat.S_ISREG(os.fstat(number).st_mode):
+            os.fchmod(number, PRIVATE)
+        sys.stdout.write(text)
+    else:
+        _write_private(file, text)
+    where = "this file" if file is None else str(file)
+    secret = f"; {where} holds its private key: only you may read it, bring it there by a way that nobody else reads"
+    name = f"{guest.name}.invite" if file is None else file.name
+    sys.stderr.write(
+        f"{invitation.fleet}: {guest.name} may join{secret if has_key else ''}\n"
+        f"next, on that machine: sudo zsched join {shlex.quote(name)}\n"
+    )
+
+
+def _write_private(file: Path, text: str) -> None:
+    try:
+        number = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC, PRIVATE)
+        with os.fdopen(number, "w", encoding="utf-8") as out:
+            os.fchmod(number, PRIVATE)
+            out.write(text)
+    except OSError as error:
+        advice = "the node is in the document; write its invitation elsewhere: zsched invite NAME -o FILE"
+        raise CliError(EXIT_FAILED, f"{file}: {error.strerror}; {advice}") from error
+
+
+# --- join ------------------------------------------------------------------------------------------------------------
+
+
+def join(file: str, where: Places, *, is_plan: bool, is_json: bool) -> int:
+    """Make this machine the node that an invitation names; the exit code.
+
+    Raises:
+        CliError: the file is no invitation.
+        AdapterError: the machine has files of another fleet or node, or a file cannot be written.
+        ConfigError: the document cannot be used here.
+    """
+    invitation = _read(file)
+    fleet, node = invitation.fleet, invitation.node
+    if is_joined(invitation, where):
+        said = f"{where.state}: this machine is {node} of fleet {fleet} already: nothing to do"
+        Told(fleet=fleet, node=node, outcome="unchanged", said=said).tell(is_json=is_json)
+        return EXIT_OK
+    read, files = join_here(invitation, where, is_plan=is_plan)
+    would = "would become" if is_plan else "is"
+    said = f"{fleet}: this machine {would} {node} (generation {invitation.value.generation_id[:8]})"
+    follow = () if is_plan else (*_lacking(read, invitation), *_start(node, where), *_look(invitation))
+    outcome = "planned" if is_plan else "joined"
+    Told(fleet=fleet, node=node, outcome=outcome, said=said, files=files, next=follow).tell(is_json=is_json)
+    return EXIT_WOULD_CHANGE if is_plan else EXIT_OK
+
+
+def _read(file: str) -> Invitation:
+    try:
+        data = sys.stdin.buffer.read(MAX_BYTES + 1) if file == "-" else read_regular(Path(file), MAX_BYTES)
+    except OSError as error:
+        raise CliError(EXIT_FAILED, f"{file}: cannot be read: {error.strerror}; give the invitation's path") from error
+    try:
+        return decode_invitation(data)
+    except WireError as error:
+        advice = "write it anew on a node of the fleet: zsched invite NAME > NAME.invite"
+        raise CliError(EXIT_FAILED, f"{file}: {error}; {advice}") from error
+
+
+def _lacking(fleet: Fleet, invitation: Invitation) -> Sequence[str]:
+    if fleet.security is None:
+        return ()
+    if invitation.papers is None:
+        return (f"bring this node's certificate into {fleet.security.folder} (zsched pki issue {invitation.node})",)
+    return (f"delete the invitation: it holds the private key, which is now in {fleet.security.folder}",)
+
+
+def _look(invitation: Invitation) -> Sequence[str]:
+    return (f"`zsched status` then shows the fleet; it dials {', '.join(invitation.addresses)}",)

@@ -1,0 +1,268 @@
+"""What a machine keeps when it founds a fleet, joins one or leaves one: fleet file, state, document, certificate.
+
+Knows: which files these are, what may not be mixed, in which order they are written. Does not know: how an operator
+asks for it, how a daemon uses them.
+
+The state is written last: a machine on which only a part was written has no state, and the command can be given again.
+"""
+
+from __future__ import annotations
+
+import secrets
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+from zsched.adapters.host.document_store import FOLDER_NAME, DocumentStore
+from zsched.adapters.host.state_file import STATE_NAME, StateFile, hardware_id, replace_synced
+from zsched.clock import wall_tenths
+from zsched.config.load import check_bytes
+from zsched.config.reader import MAX_FILE_BYTES, render_all
+from zsched.core.electorate.founding import created
+from zsched.core.values.certificates import Role, parse_common_name
+from zsched.core.values.document import Document, Text
+from zsched.core.values.electorate import FleetValue
+from zsched.core.values.fleet import Fleet, fleet_hash
+from zsched.core.values.model import NodeId, RegisterState
+from zsched.core.vote.generations import blank_state
+from zsched.errors import AdapterError, ConfigError
+from zsched.files import read_regular
+from zsched.runtime.secured import CERTIFICATE, KEY, TRUSTED
+from zsched.sessions.certificate import common_names
+from zsched.wire.codec import document_hash
+from zsched.wire.invitation import Invitation, Papers
+
+BEFORE: Final = ".before-join"
+"""Behind the name of a fleet file that another text of the same fleet has replaced."""
+COPY_NAME: Final = "copied"
+"""In the state folder: the hash of the fleet file that was written as a copy of the document."""
+PUBLIC_MODE, PRIVATE_MODE = 0o644, 0o600
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Places:
+    """Where a machine keeps what belongs to its node."""
+
+    config: Path
+    state: Path
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Written:
+    """One file of a machine that was written, or that would be."""
+
+    path: Path
+    what: str
+
+
+# --- to found --------------------------------------------------------------------------------------------------------
+
+
+def found(text: str, me: NodeId, places: Places, *, is_plan: bool) -> tuple[Fleet, tuple[Written, ...]]:
+    """Make this machine the first one of a new fleet; ``is_plan``: only say what would be written.
+
+    Raises:
+        AdapterError: the machine belongs to a fleet already, or a file cannot be written.
+        ConfigError: the text has faults.
+    """
+    fleet = _read(text, places.config)
+    if places.config.exists():
+        advice = "use it (`zsched init`), or give another file with --config"
+        raise AdapterError(f"{places.config} exists already, and is left as it is; {advice}")
+    _check_no_state(fleet.name, me, places.state)
+    content = Document(text=Text(text))
+    disk = secrets.token_hex(8)
+    value = created(fleet, me, disk=disk, generation_id=secrets.token_hex(16), document=document_hash(content))
+    return fleet, _write(fleet, me, value, content, places, disk, papers=None, is_plan=is_plan)
+
+
+# --- to join ---------------------------------------------------------------------------------------------------------
+
+
+def is_joined(invitation: Invitation, places: Places) -> bool:
+    """Whether this machine is that node of that fleet already.
+
+    Raises:
+        AdapterError: it has a state of another node, fleet or generation.
+    """
+    file = StateFile(places.state, fleet=invitation.fleet, node=invitation.node)
+    file.check_owner()
+    loaded = file.load()
+    if loaded.is_missing:
+        return False
+    state = loaded.state
+    register = None if state is None else state.fleet_register
+    value = None if register is None else register.learnt
+    if value is not None and value.generation_id == invitation.value.generation_id:
+        return True
+    if state is None:
+        raise AdapterError(f"{loaded.problem}; move the folder {places.state} away, then join again")
+    what = "another generation of it" if value is not None else "a time before its document was agreed"
+    advice = f"if that state is not needed any more, move the folder {places.state} away, then join again"
+    raise AdapterError(f"{file.path} is {invitation.node}'s in fleet {invitation.fleet}, of {what}; {advice}")
+
+
+def join(invitation: Invitation, places: Places, *, is_plan: bool) -> tuple[Fleet, tuple[Written, ...]]:
+    """Make this machine the node that an invitation names; ``is_plan``: only say what would be written.
+
+    Raises:
+        AdapterError: the machine has files of another fleet, or a file cannot be written.
+        ConfigError: the document cannot be used here.
+    """
+    fleet = _read(invitation.document.text, places.config)
+    if fleet.name != invitation.fleet or all(node.name != invitation.node for node in fleet.nodes):
+        raise ConfigError(f"the invitation's document has no node {invitation.node!r} in fleet {invitation.fleet!r}")
+    _check_file(places.config, fleet.name)
+    if invitation.papers is not None and fleet.security is None:
+        raise ConfigError("the invitation has a certificate, and its document has no `security:` section")
+    _check_papers(fleet, invitation)
+    disk = secrets.token_hex(8)
+    return fleet, _write(
+        fleet,
+        invitation.node,
+        invitation.value,
+        invitation.document,
+        places,
+        disk,
+        papers=invitation.papers,
+        is_plan=is_plan,
+    )
+
+
+def _check_file(path: Path, fleet: str) -> None:
+    """Refuse to take the place of another fleet's file."""
+    try:
+        data = read_regular(path, MAX_FILE_BYTES)
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise AdapterError(f"{path}: cannot be read: {error.strerror}; move it away, or give --config") from error
+    found_ = check_bytes(data, str(path)).fleet
+    if found_ is None:
+        raise AdapterError(f"{path} is no usable fleet file, and is left as it is; move it away, or give --config")
+    if found_.name != fleet:
+        advice = "leave that fleet first (`zsched leave`), or move the file away"
+        raise AdapterError(f"{path} is the file of fleet {found_.name}, and the invitation of fleet {fleet}; {advice}")
+
+
+def _check_papers(fleet: Fleet, invitation: Invitation) -> None:
+    """Refuse certificates that are not this node's, and to take the place of somebody else's."""
+    if invitation.papers is None or fleet.security is None:
+        return
+    mine = _named(invitation.papers.certificate.encode())
+    holder = None if mine is None else parse_common_name(mine, fleet.name)
+    if holder is None or (holder.name, holder.role) != (invitation.node, Role.NODE):
+        raise ConfigError(f"the invitation's certificate names {mine!r}, and its node is {invitation.node}")
+    path = Path(fleet.security.folder) / CERTIFICATE
+    try:
+        theirs = _named(read_regular(path, MAX_FILE_BYTES))
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise AdapterError(f"{path}: cannot be read: {error.strerror}; move the folder away") from error
+    if theirs != mine:
+        raise AdapterError(f"{path} is the certificate of {theirs!r}, and is left as it is; move the folder away")
+
+
+def _named(pem: bytes) -> str | None:
+    try:
+        return next(iter(common_names(pem)), None)
+    except ValueError:
+        return None
+
+
+# --- files -----------------------------------------------------------------------------------------------------------
+
+
+def _read(text: str, config: Path) -> Fleet:
+    result = check_bytes(text.encode(), str(config))
+    if result.fleet is None:
+        raise ConfigError(render_all(str(config), result.faults))
+    return result.fleet
+
+
+def _check_no_state(fleet: str, node: NodeId, folder: Path) -> None:
+    file = StateFile(folder, fleet=fleet, node=node)
+    file.check_owner()
+    if not file.load().is_missing:
+        advice = "leave that fleet first (`zsched leave --purge`), or give a folder with --state-dir"
+        raise AdapterError(f"{file.path} exists already: this machine belongs to a fleet; {advice}")
+
+
+def _write(
+    fleet: Fleet,
+    me: NodeId,
+    value: FleetValue,
+    content: Document,
+    places: Places,
+    disk: str,
+    *,
+    papers: Papers | None,
+    is_plan: bool,
+) -> tuple[Written, ...]:
+    """Write all of it, the state last."""
+    text = content.text.encode()
+    plain = blank_state(fleet, me, 0, None, incarnation=wall_tenths(), hardware=hardware_id(), disk=disk)
+    state = replace(plain, fleet_register=RegisterState(task=fleet.name, learnt=value))
+    written = [Written(path=places.config, what="the fleet file, as a copy of the agreed document")]
+    old = _other_text(places.config, text)
+    if old is not None:
+        kept = places.config.with_name(f"{places.config.name}{BEFORE}")
+        written.append(Written(path=kept, what="the fleet file that was there"))
+    folder = None if papers is None or fleet.security is None else Path(fleet.security.folder)
+    if folder is not None:
+        written += [
+            Written(path=folder / CERTIFICATE, what="the certificate"),
+            Written(path=folder / TRUSTED, what="whom it trusts"),
+            Written(path=folder / KEY, what="the private key, for its owner only"),
+        ]
+    written.append(Written(path=places.state / FOLDER_NAME, what="the agreed document"))
+    written.append(Written(path=places.state / STATE_NAME, what=f"the state of {me}: it has never voted"))
+    if is_plan:
+        return tuple(written)
+    with StateFile(places.state, fleet=fleet.name, node=me) as file:
+        try:
+            if old is not None:
+                _put(places.config.with_name(f"{places.config.name}{BEFORE}"), old, PUBLIC_MODE)
+            _put(places.config, text, PUBLIC_MODE)
+            if papers is not None and folder is not None:
+                _put_papers(folder, papers)
+        except OSError as error:
+            advice = "run this as root, or give places of your own with --config and --state-dir"
+            raise AdapterError(f"{error.filename or places.config}: {error.strerror}; {advice}") from error
+        DocumentStore(places.state).save(content)
+        _put(places.state / COPY_NAME, f"{fleet_hash(fleet)}\n".encode(), PRIVATE_MODE)
+        file.create(state)
+    return tuple(written)
+
+
+def copied_file(state: Path) -> str:
+    """The hash of the fleet file that was written here as a copy of the document; empty: none was.
+
+    Such a file says nothing of its own, so it is not compared with later documents until somebody changes it.
+    """
+    try:
+        return read_regular(state / COPY_NAME, 64).decode("ascii", "replace").strip()
+    except OSError:
+        return ""
+
+
+def _other_text(path: Path, text: bytes) -> bytes | None:
+    """What a fleet file holds that is about to be replaced; ``None``: there is none, or it says the same."""
+    try:
+        old = read_regular(path, MAX_FILE_BYTES)
+    except OSError:
+        return None
+    return None if old == text else old
+
+
+def _put(path: Path, content: bytes, mode: int) -> None:
+    path.parent.mkdir(mode=0o755, parents=True, exist_ok=True)
+    replace_synced(path, path.with_name(f"{path.name}.new"), content)
+    path.chmod(mode)
+
+
+def _put_papers(folder: Path, papers: Papers) -> None:
+    _put(folder / KEY, papers.key.encode(), PRIVATE_MODE)  # first: a certificate without its key would look complete
+    _put(folder / TRUSTED, papers.trusted.encode(), PUBLIC_MODE)
+    _put(folder / CERTIFICATE, papers.certificate.encode(), PUBLIC_MODE)

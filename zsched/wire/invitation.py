@@ -1,0 +1,117 @@
+"""The file that brings a machine into a fleet: all that its node must know before it has heard anybody.
+
+Knows: the fields of an invitation, that it is whole, that its parts fit each other. Does not know: who writes one
+(`zsched.commands.invite`), what becomes of it on the new machine (`zsched.runtime.membership`).
+
+It is JSON, so that an operator can read it. A node that is new must be told the generation that it joins: of two fleets
+of one name it could not know which is meant.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from typing import Any, Final
+
+from zsched.core.values.document import Document
+from zsched.core.values.electorate import FleetValue
+from zsched.core.values.model import NAME, NodeId
+from zsched.errors import WireError
+from zsched.wire.codec import as_plain, document_hash, from_plain
+
+SCHEMA: Final = "zsched.invite/1"
+MAX_BYTES: Final = 1 << 20
+MAX_PEM: Final = 64 * 1024
+PEMS: Final = ("certificate", "key", "trusted")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Papers:
+    """What a node of a secured fleet shows to the others, as PEM."""
+
+    certificate: str
+    key: str
+    trusted: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Invitation:
+    """One machine may join one fleet."""
+
+    node: NodeId
+    """The name that the machine has in the document."""
+    value: FleetValue
+    """What the fleet register held when the invitation was written; the node learns newer ones from its peers."""
+    document: Document
+    """The document of that value."""
+    addresses: tuple[str, ...] = ()
+    """Where nodes of the fleet can be dialled."""
+    papers: Papers | None = None
+    """``None``: the fleet is not secured, or its certificate comes by another way."""
+
+    @property
+    def fleet(self) -> str:
+        """The fleet's name."""
+        return self.value.fleet
+
+
+def encode_invitation(invitation: Invitation) -> str:
+    """The file's text."""
+    body: dict[str, Any] = {
+        "schema": SCHEMA,
+        "fleet": invitation.fleet,
+        "node": invitation.node,
+        "generation_id": invitation.value.generation_id,
+        "addresses": list(invitation.addresses),
+        "value": as_plain(invitation.value),
+        "document": as_plain(invitation.document),
+    }
+    if invitation.papers is not None:
+        body |= {name: getattr(invitation.papers, name) for name in PEMS}
+    return json.dumps({**body, "digest": _digest(body)}, ensure_ascii=False, indent=2) + "\n"
+
+
+def decode_invitation(data: bytes) -> Invitation:
+    """The invitation in a file.
+
+    Raises:
+        WireError: it is none, it was changed or cut off, or its parts do not fit each other.
+    """
+    if len(data) > MAX_BYTES:
+        raise WireError("size", f"{len(data)} bytes, at most {MAX_BYTES}")
+    try:
+        body = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise WireError("garbage", "it is no whole JSON object") from error
+    if not isinstance(body, dict) or "schema" not in body:
+        raise WireError("garbage", "it is no invitation")
+    if body["schema"] != SCHEMA:
+        raise WireError("version", f"it is {str(body['schema'])[:40]!r}, this version of zsched reads {SCHEMA}")
+    if body.pop("digest", None) != _digest(body):
+        raise WireError("checksum", "it was changed or cut off on its way")
+    value = from_plain(body.get("value"), FleetValue)
+    document = from_plain(body.get("document"), Document)
+    if document_hash(document) != value.document:
+        raise WireError("checksum", "its document is not the one of its fleet value")
+    node, addresses = body.get("node"), body.get("addresses")
+    if not isinstance(node, str) or NAME.fullmatch(node) is None:
+        raise WireError("type", "it names no node")
+    if not isinstance(addresses, list) or not all(isinstance(one, str) for one in addresses):
+        raise WireError("type", "its addresses are no list")
+    return Invitation(node=node, value=value, document=document, addresses=tuple(addresses), papers=_papers(body))
+
+
+def _papers(body: dict[str, Any]) -> Papers | None:
+    given = {name: body[name] for name in PEMS if name in body}
+    if not given:
+        return None
+    if len(given) < len(PEMS) or not all(isinstance(one, str) and len(one) <= MAX_PEM for one in given.values()):
+        raise WireError("type", f"it lacks one of {', '.join(PEMS)}")
+    return Papers(**given)
+
+
+def _digest(body: dict[str, Any]) -> str:
+    """Of all that stands beside it: a file that was edited or cut off is told from a whole one."""
+    plain = json.dumps(body, ensure_ascii=True, sort_keys=True, separators=(",", ":"))
+    return hashlib.blake2s(plain.encode(), digest_size=16, person=b"zsched1", salt=b"invite").hexdigest()
