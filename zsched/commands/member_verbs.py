@@ -1,6 +1,6 @@
-"""The verbs by which machines come and go: `fleet create`, `invite`, `join`, `leave`.
+"""The verbs by which machines come and go: `fleet create`, `invite`, `join`.
 
-Knows: options. Does not know: how anything is done (`zsched.commands.membership`, `zsched.commands.leave`, imported by
+Knows: options. Does not know: how anything is done (`zsched.commands.membership`, imported by
 the verb that runs).
 """
 
