@@ -246,7 +246,7 @@ def test_a_node_without_a_data_endpoint_takes_the_default_port_and_the_next_one_
 
 def test_samplers_problem_is_told_once_and_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A driver that fails for a while: one problem, one end, and samples again."""
-    inbox, shell = Inbox(), SimpleNamespace(crew=SimpleNamespace(supervisor=None))
+    inbox, shell = Inbox(), SimpleNamespace(crew=SimpleNamespace(supervisor=None, sessions={}))
     sampler = Sampler(spec("a"), 0.001, tmp_path, shell, inbox)  # type: ignore[arg-type]
     sample, failures = sampler._device.sample, iter([True] * 3)
 
@@ -274,7 +274,7 @@ def test_samplers_problem_is_told_once_and_ends(tmp_path: Path, monkeypatch: pyt
 
 def test_the_sampler_tells_the_node_of_a_slew_and_a_jump(tmp_path: Path) -> None:
     """What is wrong wakes the loop, what is well does not; the readings are ours, the watch and its judgement real."""
-    inbox, shell = Inbox(), SimpleNamespace(crew=SimpleNamespace(supervisor=None))
+    inbox, shell = Inbox(), SimpleNamespace(crew=SimpleNamespace(supervisor=None, sessions={}))
     sampler = Sampler(spec("a"), 0.001, tmp_path, shell, inbox)  # type: ignore[arg-type]
     rest = [(10.0 + 0.2 * n, 5.0) for n in range(4)]
     slew = [(10.8 + 0.2 * n, 5.0 + 0.083 * 0.2 * (n + 1)) for n in range(3)]

@@ -213,6 +213,7 @@ def test_every_verb_that_asks_a_daemon_takes_the_node_that_several_daemons_make_
         "restart": ["echo", "--yes"],
         "explain": ["echo"],
         "move": ["echo", "edge1", "--plan"],
+        "undrain": ["edge1", "--plan"],
         "unpin": ["echo", "--plan"],
         "resume": ["--all", "--plan"],
         "weights": ["echo"],

@@ -15,7 +15,6 @@ import queue
 import signal
 import subprocess
 import sys
-import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
@@ -23,6 +22,7 @@ from typing import Final, Protocol
 from zsched.adapters.workers.process import LAUNCHER
 from zsched.drivers.place import Place
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_OK
+from zsched.guard import guarded
 
 COMMAND_S: Final = 10.0
 """An engine that does not answer a command within this time has failed."""
@@ -155,7 +155,7 @@ class _Drive:
         if not command:
             return
         self._child = _tied(command, is_child=self._engine.is_child)
-        threading.Thread(target=self._await_child, args=(self._child,), daemon=True).start()
+        guarded(self._await_child, self._child, name="zsched driver", is_lasting=False).start()
 
     def _await_child(self, child: subprocess.Popen[bytes]) -> None:
         child.wait()

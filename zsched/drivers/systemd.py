@@ -12,10 +12,10 @@ import argparse
 import os
 import shlex
 import sys
-import time
 from collections.abc import Callable, Sequence
 from typing import Final
 
+from zsched.clock import wall_s
 from zsched.drivers.engine import Ended, Look, ask, drive, said
 from zsched.drivers.place import Place
 from zsched.errors import ConfigError
@@ -93,7 +93,7 @@ class SystemdUnit:
 
     def log(self) -> Sequence[str]:
         """What the unit's processes print from now on; the follower itself may take a second to start."""
-        since = f"--since=@{time.time():.6f}"
+        since = f"--since=@{wall_s():.6f}"
         match = f"_SYSTEMD_UNIT={self.unit}"
         return ("journalctl", "--quiet", "--no-pager", "-o", "cat", "-f", "-n", "all", since, match)
 
