@@ -8,6 +8,7 @@ import pytest
 
 from support.plays import FLEET, ROBOTS, TASK, Play
 from zsched.core.electorate.documents import Documents
+from zsched.core.values.electorate import CREATION_STEP
 from zsched.core.values.messages import ChangeFleet, CommandOutcome
 from zsched_lab.sim import fleets
 
@@ -57,6 +58,29 @@ def test_who_was_away_during_changes_starts_by_the_old_value_and_learns() -> Non
     play.settle(20)
     assert play.electors("robot3") == ("edge1", "robot1", "robot2")
     assert not play.sim.node("robot3").agreement.is_elector
+
+
+@pytest.mark.parametrize("orphan_s", [FLEET.relay_orphan_s, 5.0])
+def test_a_task_that_is_added_again_is_another_one_for_who_was_away(orphan_s: float) -> None:
+    """Its streams do not go on to the owner of the task before, also when the document is the same one again."""
+    play = Play()
+    play.adopt()
+    both = replace(FLEET, tasks=(*FLEET.tasks, replace(FLEET.tasks[0], name="other", exclusive=False)))
+    assert play.told("robot1", ChangeFleet(document=play.document(both))).outcome is CommandOutcome.OK
+    play.settle(20)
+    assert play.sim.run_until(lambda: play.sim.agreed("other") is not None, 20)
+    play.sim.crash("robot3")
+    for said in (FLEET, replace(both, relay_orphan_s=orphan_s)):
+        assert play.told("robot1", ChangeFleet(document=play.document(said))).outcome is CommandOutcome.OK
+        assert play.sim.run_until(lambda said=said: play.sim.node("robot2").fleet.tasks == said.tasks, 20)
+    play.sim.start("robot3")
+    back = play.sim.node("robot3")
+    epoch, newest = back.executors["other"].epoch, play.sim.node("robot1").agreement.fleet_revision
+    assert epoch // CREATION_STEP == 1
+    assert play.sim.run_until(lambda: play.sim.node("robot3").agreement.fleet_revision == newest, 5)
+    assert play.sim.node("robot3").executors["other"].epoch // CREATION_STEP in (0, 2)
+    play.settle(20)
+    assert play.sim.run_until(lambda: play.sim.agreed("other") is not None, 20)
 
 
 def test_a_node_starts_by_its_document_and_shows_that_its_file_differs() -> None:

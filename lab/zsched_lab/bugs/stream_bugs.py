@@ -357,7 +357,7 @@ STREAM_BUGS = (
     _bug(
         "a cold standby without a command is let through",
         "zsched.config.tasks",
-        'is Standby.COLD and not section.get("command"):',
+        'is Standby.COLD and not (command or section.get("command")):',
         'is Standby.COLD and section.get("command") == ():',
         ("tests/unit/config/test_load.py::test_one_fault_is_reported_once_at_its_place",),
     ),

@@ -21,8 +21,9 @@ from zsched.core.handlers.work import carry_out
 from zsched.core.stages import HISTORY, Handler, Stages
 from zsched.core.todo import ToDo
 from zsched.core.values.adoption import in_force, obstacle
+from zsched.core.values.electorate import CREATION_STEP
 from zsched.core.values.fleet import Fleet, fleet_hash
-from zsched.core.values.model import NodeKind
+from zsched.core.values.model import Allocation, NodeKind
 from zsched.core.values.plan import WorkerRole
 
 SOURCE: Final = "fleet"
@@ -40,8 +41,9 @@ def adopt(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
         todo: what there is to do.
         now: monotonic seconds.
     """
-    before = node.fleet
-    if _is_refused(node, fleet) or fleet == before:
+    before, values = node.fleet, node.values()
+    is_new = any(_is_of_before(executor, values[name]) for name, executor in node.executors.items() if name in values)
+    if _is_refused(node, fleet) or (fleet == before and not is_new):
         return
     node.fleet, node.fleet_file = fleet, fleet_hash(fleet)
     _adopt_nodes(node, fleet)
@@ -101,11 +103,12 @@ def _adopt_work(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
     node.executors.clear()  # tenure and sealing go by the same table
     values, come = node.values(), []
     for spec in fleet.tasks:
-        executor = kept.pop(spec.name, None)
-        if executor is None:
+        executor = kept.get(spec.name)
+        if executor is None or _is_of_before(executor, values[spec.name]):
             executor = Executor(spec=spec, me=node.me, has_streams=node.kind is NodeKind.ROBOT)
             come.append(executor)
         else:
+            del kept[spec.name]
             executor.adopt(spec, todo, is_agreed_leased=values[spec.name].leased)
         node.executors[spec.name] = executor
     for executor in kept.values():
@@ -127,6 +130,11 @@ def _adopt_work(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
         value = values[executor.spec.name]
         if value.revision > 0:
             carry_out(node, value, "known from before the task left the fleet file", todo, now)
+
+
+def _is_of_before(executor: Executor, value: Allocation) -> bool:
+    """Whether the task was removed and added again unheard here: it is another task (decision 0043)."""
+    return 0 < executor.epoch < value.epoch // CREATION_STEP * CREATION_STEP
 
 
 def compare_file(node: Stages) -> None:

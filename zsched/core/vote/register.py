@@ -304,11 +304,13 @@ class Register(ABC, Generic[V]):
     # --- learner -----------------------------------------------------------------------------------------------
 
     def learn(self, value: V, todo: ToDo, now: float) -> None:
-        """A committed value is known; older ones change nothing."""
+        """A committed value is known; older ones change nothing, nor do those of an earlier creation."""
         if self._highest(value) > MAX_REVISION:
             self.problem = f"revision {value.revision} cannot be"
             return
         current = self.state.learnt
+        if value.revision < self._initial.revision:
+            return
         if current is not None and value.revision <= current.revision:
             if value.revision == current.revision and value != current:
                 both = f"{self._named(current)} and {self._named(value)}"

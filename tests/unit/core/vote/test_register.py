@@ -263,6 +263,15 @@ def test_a_value_that_nothing_could_follow_is_not_learnt() -> None:
     assert register.value == last_one
 
 
+def test_a_value_of_the_task_before_is_not_learnt() -> None:
+    """A task that was removed and added again begins with a later revision; peers that were away tell the old ones."""
+    register = make("r1")
+    register.adopt(allocation(4), ballot_s=BALLOT_S, stagger_s=STAGGER_S)
+    assert not did(register.learn, allocation(3), 0.0).is_dirty
+    assert register.state.learnt is None
+    assert did(register.learn, allocation(4), 0.0).is_dirty
+
+
 def test_an_acceptance_is_asked_about_only_once_its_proposer_has_had_its_time() -> None:
     for _ in range(5):
         register = make("r1")
