@@ -72,7 +72,8 @@ def test_a_task_that_is_added_again_is_another_one_for_who_was_away(orphan_s: fl
     play.sim.crash("robot3")
     for said in (FLEET, replace(both, relay_orphan_s=orphan_s)):
         assert play.told("robot1", ChangeFleet(document=play.document(said))).outcome is CommandOutcome.OK
-        assert play.sim.run_until(lambda said=said: play.sim.node("robot2").fleet.tasks == said.tasks, 20)
+        tasks = said.tasks
+        assert play.sim.run_until(lambda: play.sim.node("robot2").fleet.tasks == tasks, 20)  # noqa: B023 - at once
     play.sim.start("robot3")
     back = play.sim.node("robot3")
     epoch, newest = back.executors["other"].epoch, play.sim.node("robot1").agreement.fleet_revision
