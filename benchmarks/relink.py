@@ -67,7 +67,7 @@ class Peers:
             command,
             stdout=subprocess.PIPE,
             text=True,
-            env={**os.environ, "ZENOH_RUNTIME": zenoh_config.runtime_pools(len(self.names))},
+            env={**os.environ, "ZENOH_RUNTIME": zenoh_config.daemon_pools(len(self.names))},
         )
         threading.Thread(target=self._listen, args=(name, process), daemon=True).start()
         return process

@@ -153,7 +153,7 @@ class Loop:
 def child(config: Path, folder: Path, names: list[NodeId]) -> None:
     """Run some of the nodes; commands on standard input, one JSON object a line; stories on standard output."""
     fleet = load_fleet(config)
-    os.environ.setdefault("ZENOH_RUNTIME", zenoh_config.runtime_pools(len(fleet.nodes)))
+    os.environ.setdefault("ZENOH_RUNTIME", zenoh_config.daemon_pools(len(fleet.nodes)))
     lines: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
     threading.Thread(target=_write, args=(lines,), daemon=True).start()
     loops = {name: Loop(fleet, name, folder, lines) for name in names}

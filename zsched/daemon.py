@@ -122,6 +122,8 @@ class Daemon:
         self._flags: dict[str, tuple[Flag, ...]] = {}
         """{hash: its flags} of the same documents."""
         self._in_file = fleet_hash(self._fleet)
+        self._pools: str | None = None
+        """An operator's own ``ZENOH_RUNTIME``."""
         self._read_settings()
 
     def run(self) -> int:
@@ -130,10 +132,9 @@ class Daemon:
         with state_file, contextlib.ExitStack() as stack:
             durable, problem = self._restore(state_file)
             self._take_document(durable)
-            # Read once, when zenoh's runtime starts; the workers inherit it. An operator's own setting wins.
-            os.environ.setdefault(
-                "ZENOH_RUNTIME", zenoh_config.runtime_pools(len(self._fleet.nodes), len(self._fleet.tasks))
-            )
+            # Read once, when zenoh's runtime starts. An operator's own setting wins, and workers inherit it.
+            self._pools = os.environ.get("ZENOH_RUNTIME")
+            os.environ.setdefault("ZENOH_RUNTIME", zenoh_config.daemon_pools(len(self._fleet.nodes)))
             incarnation = durable.incarnation if durable is not None else wall_tenths()
             points = endpoints_for(
                 self._fleet, self._spec, functools.partial(self._data_port, stack), is_here, self._protocol
@@ -367,6 +368,7 @@ class Daemon:
                 WorkerLink.PEER: self._texts[Side.DATA],
                 WorkerLink.CLIENT: self._texts[Side.VISIT],
             },
+            pools=self._pools,
         )
         stack.callback(recipes.close)
         recipes.adopt(fleet, points.worker_connect, dials_by_gossip=points.worker_by_gossip)

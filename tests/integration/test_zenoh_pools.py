@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from zsched.sessions.config import TX_THREADS, pool_threads, runtime_pools
+from zsched.sessions.config import TX_THREADS, daemon_pools, pool_threads, worker_pools
 from zsched_lab.fleet.netbed import descendants_running
 from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
@@ -46,13 +46,13 @@ def test_a_daemon_gives_itself_its_relay_and_its_workers_a_thread_for_every_link
     """Of the daemon and the relay the threads themselves are counted: what they set is in no environment of theirs."""
     count = pool_threads(NODES, TASKS)
     assert count >= TX_THREADS + 2, "or a relay that sets nothing could not be told from one that does"
-    assert has_threads(bed.pid("edge1"), rx=count, tx=TX_THREADS, net=count, acc=count)
+    assert has_threads(bed.pid("edge1"), rx=pool_threads(NODES) + TX_THREADS, tx=0, net=0, acc=0)
     relay = bed.relay_pid("edge1")
     assert relay is not None
-    assert environment(relay)["ZENOH_RUNTIME"] == runtime_pools(NODES, TASKS), "its daemon's, until it sets its own:"
+    assert environment(relay)["ZENOH_RUNTIME"] == daemon_pools(NODES), "its daemon's, until it sets its own:"
     assert has_threads(relay, rx=count, tx=count, net=count, acc=1)
     workers = descendants_running(bed.pid("edge1"), "zsched.tasks.echo")
     assert workers
     for worker in workers:
-        assert environment(worker)["ZENOH_RUNTIME"] == runtime_pools(NODES, TASKS)
+        assert environment(worker)["ZENOH_RUNTIME"] == worker_pools(NODES, TASKS)
         assert has_threads(worker, rx=count, net=count)  # nobody dials it: no `acc`

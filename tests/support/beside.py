@@ -19,7 +19,7 @@ from itertools import pairwise
 
 import zenoh
 
-from zsched.sessions.config import runtime_pools, worker_config
+from zsched.sessions.config import worker_config, worker_pools
 
 PERIOD_S = 0.005
 COUPLED = "coupled"
@@ -35,7 +35,7 @@ class Beside:
         self._on_coupled: Callable[[], None] = lambda: None
         self._process = subprocess.Popen(
             [sys.executable, __file__, near, far, from_expr, to_expr],
-            env=os.environ | {"ZENOH_RUNTIME": runtime_pools(3, 2)},
+            env=os.environ | {"ZENOH_RUNTIME": worker_pools(3, 2)},
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,

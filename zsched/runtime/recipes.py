@@ -44,13 +44,15 @@ class Recipes:
         *,
         shared_memory: bool,
         operator_json5: Mapping[WorkerLink, str],
+        pools: str | None,
     ) -> None:
         """``folder``: where the session files go; ``read``: of workers that somebody else starts.
 
-        ``operator_json5``: {how a worker joins: the settings of zenoh that every such session has}.
+        ``operator_json5``: {how a worker joins: the settings of zenoh that every such session has}; ``pools``: zenoh's
+        pools of threads as an operator has set them for this node's processes.
         """
         self._me, self._folder, self.read = me, folder, read
-        self._shared_memory, self._operator_json5 = shared_memory, operator_json5
+        self._shared_memory, self._operator_json5, self._pools = shared_memory, operator_json5, pools
         self._made = _Made(specs={}, sessions={}, environments={})
 
     @property
@@ -106,10 +108,11 @@ class Recipes:
                 self.read.begin(task.name, sessions[task.name])
         if any(not task.worker.command for task in mine):
             self.read.save()
+        pools = self._pools or zenoh_config.worker_pools(len(fleet.nodes), len(fleet.tasks))
         self._made = _Made(
             specs={task.name: task.worker for task in mine},
             sessions=sessions,
-            environments={task.name: self._environment(task) for task in mine},
+            environments={task.name: self._environment(task, pools) for task in mine},
         )
 
     def close(self) -> None:
@@ -132,10 +135,11 @@ class Recipes:
         except OSError as error:
             raise AdapterError(f"cannot write {path}: {error.strerror}; check --runtime-dir") from error
 
-    def _environment(self, task: TaskSpec) -> dict[str, str]:
+    def _environment(self, task: TaskSpec, pools: str) -> dict[str, str]:
         path = str(self._path(task.name))
         made = {
             "PYTHONFAULTHANDLER": "1",
+            "ZENOH_RUNTIME": pools,
             "ZSCHED_ZENOH_CONFIG": path,
             "ZENOH_SESSION_CONFIG_URI": path,  # a ROS node (rmw_zenoh) joins the data network by this
         }

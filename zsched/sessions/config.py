@@ -39,6 +39,7 @@ ACCEPT_TIMEOUT_S: Final = 1.0
 RELAY_START_S: Final = 10.0
 """A worker that is started together with its relay, on a busy machine, waits so long for it."""
 TX_THREADS: Final = 4
+"""Threads that transmit, beyond those for every link."""
 DEFAULT_TIMING: Final = Timing()
 
 Settings = dict[str, Any]
@@ -292,8 +293,20 @@ def pool_threads(nodes: int, tasks: int = 0) -> int:
     return min(max(nodes * (1 + tasks) + 2, 4), 64)
 
 
-def runtime_pools(nodes: int, tasks: int = 0) -> str:
-    """The value of ``ZENOH_RUNTIME`` for a process with links to so many nodes (zenoh reads it once).
+def daemon_pools(nodes: int) -> str:
+    """The value of ``ZENOH_RUNTIME`` for a daemon with links to so many nodes (zenoh reads it once).
+
+    What receives, transmits, closes links and shakes hands shares one pool: with a pool each, every packet wakes twice
+    as many threads (decision 0060). Closing a link that is dead one way holds a thread for zenoh's SO_LINGER, 10 s, and
+    a stalled peer holds one that transmits: so there is one for every link, and `TX_THREADS`. A daemon's frames are
+    small; large values starve behind one pool, so relays and workers have their own.
+    """
+    shared = ", ".join(f"{pool}: (handover: rx)" for pool in ("tx", "net", "acc"))
+    return f"(rx: (worker_threads: {pool_threads(nodes) + TX_THREADS}), {shared})"
+
+
+def worker_pools(nodes: int, tasks: int) -> str:
+    """The value of ``ZENOH_RUNTIME`` for a worker in a fleet of so many nodes and tasks.
 
     ``net`` closes links and dials, ``acc`` shakes hands with who dials us; both have one thread by default. Closing a
     link that is dead one way holds a thread for zenoh's SO_LINGER, 10 s, in which no other link came or went.

@@ -313,10 +313,17 @@ STREAM_BUGS = (
         ("tests/unit/sessions/test_config.py", "tests/integration/test_zenoh_pools.py"),
     ),
     _bug(
-        "a node's processes have as many threads as zenoh likes",
+        "a daemon has as many threads as zenoh likes",
         "zsched.daemon",
-        'os.environ.setdefault(\n                "ZENOH_RUNTIME",',
-        'os.environ.setdefault(\n                "ZENOH_RUNTIME_UNREAD",',
+        'os.environ.setdefault("ZENOH_RUNTIME",',
+        'os.environ.setdefault("ZENOH_RUNTIME_UNREAD",',
+        ("tests/integration/test_zenoh_pools.py",),
+    ),
+    _bug(
+        "a worker has the threads that its daemon has",
+        "zsched.runtime.recipes",
+        '            "ZENOH_RUNTIME": pools,\n',
+        "",
         ("tests/integration/test_zenoh_pools.py",),
     ),
     _bug(
