@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from enum import StrEnum
 from typing import Final
 
-from zsched.config.blocks import Choice, Field, Here, Located, Section, Text
+from zsched.config.blocks import Choice, Field, Here, ListOf, Located, Section, Text
 from zsched.config.reader import Collector
 
 
@@ -19,12 +19,21 @@ class Driver(StrEnum):
 
     PROCESS = "process"
     SYSTEMD = "systemd"
+    CONTAINER = "container"
+
+
+class ContainerEngine(StrEnum):
+    """What runs containers (`zsched.drivers.container`)."""
+
+    PODMAN = "podman"
+    DOCKER = "docker"
 
 
 _UNIT: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9:_.\\-]{0,200}(@[A-Za-z0-9:_.\\-]*)?\.service")
 _OWN: Final[Mapping[Driver, tuple[str, ...]]] = {
     Driver.PROCESS: ("command",),
     Driver.SYSTEMD: ("unit",),
+    Driver.CONTAINER: ("image", "args", "mounts", "options", "engine"),
 }
 """The keys of each driver, the first one needed (but that of a process: somebody else may start it)."""
 
@@ -35,15 +44,55 @@ def _unit_fault(text: str) -> str | None:
     return "NAME.service, or NAME@.service of a template"
 
 
+_IMAGE: Final = re.compile(r"[a-z0-9][A-Za-z0-9._/:@-]{0,254}")
+_MOUNT: Final = re.compile(r"/[^:,]*:/[^:,]*(:(ro|rw))?")
+_OPTION: Final = re.compile(r"--?[a-z][A-Za-z0-9-]*(=.*)?", re.DOTALL)
+
+
+def _image_fault(text: str) -> str | None:
+    return None if _IMAGE.fullmatch(text) is not None else "NAME:TAG or NAME@DIGEST, with its registry where it has one"
+
+
+def _mount_fault(text: str) -> str | None:
+    return None if _MOUNT.fullmatch(text) is not None else "/ON/THE/HOST:/INSIDE, and `:ro` where it is only read"
+
+
+def _option_fault(text: str) -> str | None:
+    return None if _OPTION.fullmatch(text) is not None else "one word, its value after '='"
+
+
+def _word_fault(text: str) -> str | None:
+    return "it has a NUL" if "\0" in text else None
+
+
 DRIVER_KEYS: Final = {
     "driver": Field(
         Choice.of(Driver),
-        "What keeps the worker: `process`: its `command`; `systemd`: a `unit` of each machine.",
+        "What keeps the worker: `process`: its `command`; `systemd`: a `unit` of the machine; `container`: an `image`.",
         default=f"`{Driver.PROCESS}`",
     ),
     "unit": Field(
         Here(Text("a systemd service", _unit_fault)),
         "Driver `systemd`: the unit. Of a template, `NAME@.service`, the instance is NODE-TASK.",
+    ),
+    "image": Field(
+        Text("an image", _image_fault),
+        "Driver `container`: the image. It must be on the machine: nothing is pulled.",
+    ),
+    "args": Field(
+        ListOf(Text("a word", _word_fault)), "Driver `container`: what runs inside, instead of the image's command."
+    ),
+    "mounts": Field(
+        ListOf(Text("a mount", _mount_fault)),
+        "Driver `container`: folders and files of the host, `/HOST:/INSIDE` or `/HOST:/INSIDE:ro`.",
+    ),
+    "options": Field(
+        ListOf(Text("an option", _option_fault)),
+        "Driver `container`: more options of `run`, one word each, as `--gpus=all`; the last of two counts.",
+    ),
+    "engine": Field(
+        Choice.of(ContainerEngine),
+        "Driver `container`: what runs it; otherwise podman, and docker where there is no podman.",
     ),
 }
 
@@ -74,4 +123,18 @@ def _systemd_words(section: Section) -> tuple[str, ...]:
     return ("--unit", unit.value)
 
 
-_WORDS: Final[Mapping[Driver, Callable[[Section], tuple[str, ...]]]] = {Driver.SYSTEMD: _systemd_words}
+def _container_words(section: Section) -> tuple[str, ...]:
+    engine: ContainerEngine | None = section.get("engine")
+    return (
+        f"--image={section.get('image')}",
+        *((f"--engine={engine}",) if engine is not None else ()),
+        *(f"--mount={mount}" for mount in section.get("mounts", ())),
+        *(f"--option={option}" for option in section.get("options", ())),
+        *(f"--arg={word}" for word in section.get("args", ())),
+    )
+
+
+_WORDS: Final[Mapping[Driver, Callable[[Section], tuple[str, ...]]]] = {
+    Driver.SYSTEMD: _systemd_words,
+    Driver.CONTAINER: _container_words,
+}

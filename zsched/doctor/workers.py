@@ -16,13 +16,16 @@ from typing import Final
 
 from zsched.core.values.fleet import TaskSpec, runs_worker
 from zsched.doctor.model import Result, Scene, failed, joined, passed, skipped, warned
-from zsched.drivers import systemd
+from zsched.drivers import container, systemd
 from zsched.drivers.engine import Look
 
 IMPORT_S: Final = 60.0
 """numpy and OpenCV from an SD card take ten seconds and more."""
 PYTHON: Final = ("python", "python3")
-LOOKS: Final[Mapping[str, Callable[[Sequence[str], str, str], Look]]] = {"zsched.drivers.systemd": systemd.look}
+LOOKS: Final[Mapping[str, Callable[[Sequence[str], str, str], Look]]] = {
+    "zsched.drivers.systemd": systemd.look,
+    "zsched.drivers.container": container.look,
+}
 FINDER: Final = Path(__file__).with_name("imports.py")
 
 

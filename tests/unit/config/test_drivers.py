@@ -38,6 +38,26 @@ def test_a_unit_is_a_command_of_the_drivers_program() -> None:
     assert worker.env == (("A", "d"), ("B", "c"))
 
 
+def test_an_image_with_its_words_is_a_command_of_the_drivers_program() -> None:
+    mounts, options = "['/data:/data:ro', /m:/n]", "[--gpus=all, --device=/dev/video0]"
+    worker = worker_of(
+        f"{{driver: container, image: 'acme/merge:2', args: [a, -b], mounts: {mounts}, options: {options}}}"
+    )
+    assert worker.command == (
+        *(
+            "python",
+            "-m",
+            "zsched.drivers.container",
+            "--image=acme/merge:2",
+            "--mount=/data:/data:ro",
+            "--mount=/m:/n",
+        ),
+        *("--option=--gpus=all", "--option=--device=/dev/video0", "--arg=a", "--arg=-b"),
+    )
+    named = worker_of("{driver: container, image: a, engine: docker, env: {A: b}}").command
+    assert named[3:] == ("--image=a", "--engine=docker", "--env", "A")
+
+
 def test_without_a_driver_the_command_is_the_operators() -> None:
     assert worker_of("{command: [a, b]}") == worker_of("{driver: process, command: [a, b]}")
     assert worker_of("{ready: matching}").command == ()
@@ -53,6 +73,13 @@ def test_without_a_driver_the_command_is_the_operators() -> None:
         ("{driver: systemd, unit: '../a.service'}", "is not a systemd service", 37),
         ("{driver: systemd, unit: '@.service'}", "is not a systemd service", 37),
         ("{driver: systemd, unit: '-f.service'}", "is not a systemd service", 37),
+        ("{driver: container}", "driver container needs the key 'image'", 22),
+        ("{driver: container, image: a, unit: a.service}", "driver container has no 'unit'", 49),
+        ("{command: [a], mounts: [/a:/b]}", "driver process has no 'mounts'", 36),
+        ("{driver: container, image: -a}", "'-a' is not an image", 40),
+        ("{driver: container, image: a, mounts: [a:/b]}", "'a:/b' is not a mount", 52),
+        ("{driver: container, image: a, options: [-v /a]}", "'-v /a' is not an option: one word", 53),
+        ("{driver: container, image: a, engine: lxc}", "`podman` or `docker`", 51),
         ("{driver: sysd, unit: a.service}", "did you mean 'systemd'?", 22),
     ],
 )
