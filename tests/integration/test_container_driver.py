@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 
+from support.waiting import until
 from zsched_lab.fleet.containers import Host, NoEngineError, container_host
 from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 
@@ -48,7 +49,7 @@ def bed(tmp_path: Path, host: Host) -> Iterator[Testbed]:
         made.init()
         made.start()
         yield made
-    assert host.containers(FLEET) == [], "every container has gone with its daemon"
+    until(lambda: not host.containers(FLEET), "every container has gone with its daemon")
 
 
 def load(bed: Testbed, node: str) -> dict[str, Any]:
@@ -68,26 +69,27 @@ def command(bed: Testbed, *words: str) -> str:
     return done.stdout + done.stderr
 
 
-def name_of(node: str) -> str:
-    return f"zsched-{FLEET}-{node}-{TASK}"
+def name_of(host: Host, node: str) -> str:
+    (name,) = (name for name in host.containers(FLEET) if name.startswith(f"zsched-{FLEET}-{node}-{TASK}-"))
+    return name
 
 
 def test_a_task_moves_between_containers_and_outlives_each_kind_of_end(bed: Testbed, host: Host) -> None:
     first = bed.wait_whole()
     other = "edge2" if first == "edge1" else "edge1"
     bed.wait(lambda: all(load(bed, edge)["state"] == "ready" for edge in (first, other)), 60, "both are ready")
-    assert host.containers(FLEET) == [name_of("edge1"), name_of("edge2")]
-    assert "GREETING=a" in host.ask("inspect", "--format", "{{.Config.Env}}", name_of(first))
+    assert len(host.containers(FLEET)) == 2
+    assert "GREETING=a" in host.ask("inspect", "--format", "{{.Config.Env}}", name_of(host, first))
 
     seen = bed.wait(lambda: load(bed, first) if load(bed, first).get("cpu_cores") is not None else None, 30, "its load")
     assert seen is not None
     noted = int((bed.folder / f"{first}-{TASK}.pid").read_text().split()[0])
-    assert str(noted) == host.ask("inspect", "--format", "{{.State.Pid}}", name_of(first))
+    assert str(noted) == host.ask("inspect", "--format", "{{.State.Pid}}", name_of(host, first))
 
     said = command(bed, "move", TASK, other, "--yes")
     bed.wait(lambda: bed.owner() == other, 30, f"the move, of which was said: {said}")
 
-    host.ask("kill", "--signal=KILL", name_of(other))
+    host.ask("kill", "--signal=KILL", name_of(host, other))
     bed.wait(lambda: "killed by signal 9" in load(bed, other).get("reason", ""), 30, "the reason in status")
     bed.wait(lambda: load(bed, other)["state"] == "ready", 60, "a container anew")
 
@@ -96,7 +98,7 @@ def test_a_task_moves_between_containers_and_outlives_each_kind_of_end(bed: Test
     os.kill(bed.pid(owner), signal.SIGKILL)
     bed.kill(owner)
     bed.wait(lambda: bed.owner() == heir, 60, "the other takes over")
-    bed.wait(lambda: host.containers(FLEET) == [name_of(heir)], 30, "a killed daemon leaves no container")
+    bed.wait(lambda: host.containers(FLEET) == [name_of(host, heir)], 30, "a killed daemon leaves no container")
 
 
 def test_an_image_that_is_not_there_is_refused_with_the_command(tmp_path: Path, host: Host) -> None:

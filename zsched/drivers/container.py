@@ -37,11 +37,17 @@ NOT_EXECUTABLE: Final = 126
 NOT_FOUND: Final = 127
 SIGNALLED: Final = 128
 MOST_LINE: Final = 160
+CLEARED_WITHIN: Final = 3
+"""So often a container of the last life is removed before the worker counts as failed."""
 
 
-def container_name(place: Place) -> str:
-    """What the container is called: at most one of a task runs on a node."""
-    return f"zsched-{place.fleet}-{place.node}-{place.task}"
+def container_name(place: Place, driver: int) -> str:
+    """What the container is called.
+
+    Each life has a name of its own, by the driver's process: a container of the last life may still be being removed,
+    by its name.
+    """
+    return f"zsched-{place.fleet}-{place.node}-{place.task}-{driver}"
 
 
 def files_named(session: str) -> list[str]:
@@ -81,11 +87,12 @@ class Container:
     """One container (`zsched.drivers.engine.Engine`)."""
 
     is_child = False
+    leaves_nothing = False
 
     def __init__(self, given: argparse.Namespace, place: Place) -> None:
         self._given, self._place = given, place
         self._engine = engine_of(given.engine)
-        self._name = container_name(place)
+        self._name = container_name(place, os.getpid())
         self._pid: int | None = None
 
     def begin(self, tell_end: Callable[[Ended], None]) -> Ended | None:
@@ -132,37 +139,33 @@ class Container:
         ask(self._engine, "kill", f"--signal={signal}", self._name)
 
     def why(self, status: int) -> Ended:
-        """By the status, and by what the engine knows of the container; it is removed then."""
+        """By the status, and by what the engine knows of the container."""
         is_oom = self._inspect("{{.State.OOMKilled}}") == "true"
         logs = ask(self._engine, "logs", "--tail", "1", self._name)
         lines = (logs.stdout + logs.stderr).strip().splitlines() if logs.returncode == 0 else []
-        end = why_it_ended(self._given.image, status, is_oom=is_oom, last_line=lines[-1] if lines else "")
-        self.close()
-        return end
+        return why_it_ended(self._given.image, status, is_oom=is_oom, last_line=lines[-1] if lines else "")
 
     def last_resort(self) -> str:
         """Remove the container, whatever has become of this driver."""
         name = shlex.quote(self._name)
         return f"{self._engine} kill --signal=KILL {name}; {self._engine} rm --force {name}"
 
-    def close(self) -> None:
-        """Remove the container that has ended."""
-        ask(self._engine, "rm", "--force", self._name)
-
     @property
     def _label(self) -> str:
         return f"{self._place.fleet}/{self._place.node}/{self._place.task}"
 
     def _clear(self) -> Ended | None:
-        found = ask(self._engine, "ps", "--all", "--quiet", "--filter", f"label={LABEL}={self._label}")
-        if found.returncode != 0:
-            return Ended(reason=f"{self._engine} does not list its containers: {said(found)}")
-        left = found.stdout.split()
-        if left:
-            done = ask(self._engine, "rm", "--force", *left)
-            if done.returncode != 0:
-                return Ended(reason=f"{self._engine} does not remove a container of the last run: {said(done)}")
-        return None
+        why = ""
+        for _ in range(CLEARED_WITHIN):
+            found = ask(self._engine, "ps", "--all", "--quiet", "--filter", f"label={LABEL}={self._label}")
+            if found.returncode != 0:
+                return Ended(reason=f"{self._engine} does not list its containers: {said(found)}")
+            left = found.stdout.split()
+            if not left:
+                return None
+            ask(self._engine, "kill", "--signal=KILL", *left)
+            why = said(ask(self._engine, "rm", "--force", *left))  # or the last life's keeper was quicker
+        return Ended(reason=f"{self._engine} does not remove a container of the last run: {why}")
 
     def _files(self) -> list[str]:
         try:
@@ -221,11 +224,7 @@ def main(arguments: list[str] | None = None) -> int:
     except ConfigError as error:
         print(error, file=sys.stderr)
         return EXIT_CONFIG
-    container = Container(given, place)
-    try:
-        return drive(container, place)
-    finally:
-        container.close()
+    return drive(Container(given, place), place)
 
 
 if __name__ == "__main__":

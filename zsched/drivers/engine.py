@@ -63,6 +63,9 @@ class Engine(Protocol):
     is_child: bool
     """`run` is the worker itself, not a command that follows it: it gets the daemon's signals as this process does."""
 
+    leaves_nothing: bool
+    """After the worker's end there is nothing to clear away; otherwise `last_resort` is run in any case."""
+
     def begin(self, tell_end: Callable[[Ended], None]) -> Ended | None:
         """Look whether it can be started, and clear away what a dead driver has left; ``None``: go on.
 
@@ -137,7 +140,7 @@ class _Drive:
         refused = self._engine.begin(self._news.put)
         if refused is not None:
             return self._ends(refused)
-        with _Keeper(self._engine.last_resort()):
+        with _Keeper(self._engine.last_resort(), is_always=not self._engine.leaves_nothing):
             log = self._engine.log()
             follower = _tied(log, is_child=False) if log else None
             self._start()
@@ -189,10 +192,15 @@ class _Drive:
 
 
 class _Keeper:
-    """A shell of a session of its own, which ends the worker when this process is killed."""
+    """A shell of a session of its own, which ends the worker when this process is killed.
 
-    def __init__(self, stop: str) -> None:
+    ``is_always``: it also runs ``stop`` when this process ends by itself. The daemon kills a driver that takes long to
+    end, with all of its group: what a clear-up must finish is done here.
+    """
+
+    def __init__(self, stop: str, *, is_always: bool) -> None:
         self._shell: subprocess.Popen[bytes] | None = None
+        self._last_word = b"" if is_always else b"done\n"
         if stop:
             script = KEEPER.format(stop=stop)
             self._shell = subprocess.Popen(
@@ -208,10 +216,15 @@ class _Keeper:
         """Nothing to do."""
 
     def __exit__(self, *_: object) -> None:
-        """The worker has ended: there is nothing to end any more."""
-        if self._shell is not None:
-            with contextlib.suppress(OSError):
-                self._shell.communicate(b"done\n", timeout=1.0)
+        """The worker has ended."""
+        if self._shell is None or self._shell.stdin is None:
+            return
+        with contextlib.suppress(OSError):
+            self._shell.stdin.write(self._last_word)
+            self._shell.stdin.close()
+        if self._last_word:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._shell.wait(1.0)
 
 
 def _tied(command: Sequence[str], *, is_child: bool) -> subprocess.Popen[bytes]:

@@ -65,6 +65,7 @@ class SystemdUnit:
     """One unit (`zsched.drivers.engine.Engine`)."""
 
     is_child = False
+    leaves_nothing = True
 
     def __init__(self, unit: str, place: Place) -> None:
         self.unit = unit_name(unit, place.node, place.task)

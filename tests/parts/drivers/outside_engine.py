@@ -7,18 +7,20 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from zsched.drivers.engine import Ended, drive
 from zsched.drivers.place import Place
 
 
 class Outside:
-    """``mode``: refuse, deaf (hears SIGKILL only), or anything else."""
+    """``mode``: refuse, deaf (hears SIGKILL only), messy (leaves something to be cleared away), or anything else."""
 
     is_child = False
 
     def __init__(self, mode: str) -> None:
         self._mode, self._pid = mode, 0
+        self.leaves_nothing = mode != "messy"
 
     def begin(self, tell_end: Callable[[Ended], None]) -> Ended | None:
         del tell_end
@@ -46,7 +48,8 @@ class Outside:
         return Ended(reason=f"it has ended, status {status}")
 
     def last_resort(self) -> str:
-        return f"kill -KILL {self._pid}"
+        cleared = Path(os.environ["ZSCHED_ZENOH_CONFIG"]).with_name("cleared")
+        return f"kill -KILL {self._pid}; : > {cleared}"
 
 
 if __name__ == "__main__":

@@ -61,6 +61,14 @@ def test_the_end_of_the_worker_is_the_drivers_with_its_reason(tmp_path: Path) ->
     assert list(tmp_path.iterdir()) == []
 
 
+def test_what_is_left_after_an_end_is_cleared_away(tmp_path: Path) -> None:
+    with driver(tmp_path, "messy") as process:
+        noted(tmp_path)
+        os.killpg(process.pid, signal.SIGINT)
+        assert output(process).splitlines() == ["it runs"]
+    until((tmp_path / "cleared").exists, "the keeper has cleared away, after the driver's end")
+
+
 def test_what_cannot_run_here_says_so_by_its_status(tmp_path: Path) -> None:
     with driver(tmp_path, "refuse") as process:
         assert output(process) == "there is no such thing here\n"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import doctest
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -77,17 +78,20 @@ def test_no_value_of_a_variable_is_in_the_command_line(tmp_path: Path, monkeypat
     session = tmp_path / "edge1-merge.zenoh.json5"
     mounts = f"--volume {session}:{session}:ro --volume /s/a.key:/s/a.key:ro --volume /s/a.pem:/s/a.pem:ro"
     assert f"{mounts} --volume /data:/d:ro --gpus=all {IMAGE} a -b" in text
-    assert "--name zsched-f-edge1-merge --label zsched.worker=f/edge1/merge --pull=never" in text
+    assert f"--name zsched-f-edge1-merge-{os.getpid()} --label zsched.worker=f/edge1/merge --pull=never" in text
 
 
 def test_a_dead_drivers_container_is_removed_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     said = tmp_path / "said"
-    engine(tmp_path, monkeypatch, f'echo "$@" >> {said}; [ "$1" = ps ] && echo 12ab; exit 0')
+    gone = f"[ $1 = rm ] && : > {said}.rm; [ $1 = ps ] && [ ! -e {said}.rm ] && echo 12ab"
+    engine(tmp_path, monkeypatch, f'echo "$@" >> {said}; {gone}; exit 0')
     assert made(tmp_path).begin(lambda _: None) is None
     assert said.read_text().splitlines() == [
         f"image inspect --format {{{{.Id}}}} {IMAGE}",
         "ps --all --quiet --filter label=zsched.worker=f/edge1/merge",
+        "kill --signal=KILL 12ab",
         "rm --force 12ab",
+        "ps --all --quiet --filter label=zsched.worker=f/edge1/merge",
     ]
 
 
