@@ -61,7 +61,7 @@ def step(
     others = {name: profile for name, profile in sorted(profiles.items()) if name in spec.candidates and name != me}
     others = {name: profile for name, profile in others.items() if _takes_part(spec, profile)}
     behind = [name for name, profile in others.items() if _renewal(spec, profile) is not Renewal.NONE]
-    starting = [name for name, profile in others.items() if _state(spec, profile) is WorkerState.STARTING]
+    starting = [name for name, profile in others.items() if _is_starting(spec, profile)]
     if allocation.owner != me:
         is_my_turn = not [name for name in behind if name < me and name != allocation.owner]
         is_quiet = not [name for name in starting if name != allocation.owner]
@@ -76,8 +76,18 @@ def step(
 def _takes_part(spec: TaskSpec, profile: Profile) -> bool:
     """Whether a candidate could have the task, now or when its worker is ready."""
     state = _state(spec, profile)
-    is_idle = state is WorkerState.STOPPED and not (spec.worker.standby is Standby.COLD and spec.worker.command)
-    return not profile.draining and state is not WorkerState.FAILED and state is not None and not is_idle
+    is_absent = state is WorkerState.STOPPED and not spec.worker.command
+    return not profile.draining and state is not WorkerState.FAILED and state is not None and not is_absent
+
+
+def _is_starting(spec: TaskSpec, profile: Profile) -> bool:
+    """Whether a candidate's worker will be ready, or will have failed, without anybody asking it to start.
+
+    A warm worker that its daemon starts is stopped for the moment between two of its processes only.
+    """
+    is_warm = bool(spec.worker.command) and spec.worker.standby is Standby.WARM
+    state = _state(spec, profile)
+    return state is WorkerState.STARTING or (is_warm and state is WorkerState.STOPPED)
 
 
 def _state(spec: TaskSpec, profile: Profile) -> WorkerState | None:

@@ -13,9 +13,10 @@ from support.profiles import load_of, profile_of
 from zsched.core.executor.renewing import GIVE_AWAY_S, OTHER_FILE_S, SAME_FILE_S, Renewing, Step, step
 from zsched.core.instructions import RecordStory, RenewWorker
 from zsched.core.todo import ToDo
+from zsched.core.values.fleet import Standby, WorkerSpec
 from zsched.core.values.model import Allocation, NodeId, Profile, Renewal, WorkerState
 
-SPEC = task_of("merge", ("edge1", "edge2", "edge3"))
+SPEC = task_of("merge", ("edge1", "edge2", "edge3"), worker=WorkerSpec(command=("work",)))
 OWNED = allocation_of(3, "edge2", task="merge")
 FILE = "new"
 
@@ -44,6 +45,8 @@ DUE = Renewal.DUE
         ("edge3", (seen("edge1"), seen("edge2", DUE)), Step.RENEW),
         ("edge2", (seen("edge1"), seen("edge3", DUE)), Step.WAIT),
         ("edge2", (seen("edge1", state=WorkerState.STARTING), seen("edge3")), Step.WAIT),
+        ("edge2", (seen("edge1", state=WorkerState.STOPPED),), Step.WAIT),
+        ("edge3", (seen("edge1", state=WorkerState.STOPPED), seen("edge2", DUE)), Step.WAIT),
         ("edge2", (seen("edge1"), seen("edge3")), Step.GIVE_AWAY),
         ("edge2", (seen("edge1", DUE, draining=True), seen("edge3")), Step.GIVE_AWAY),
         ("edge2", (seen("edge1", DUE, WorkerState.FAILED),), Step.RENEW_IN_PLACE),
@@ -52,6 +55,20 @@ DUE = Renewal.DUE
 )
 def test_the_turn_goes_by_name_and_the_owner_is_the_last(me: NodeId, others: tuple[Profile, ...], wanted: Step) -> None:
     assert chosen(me, *others) is wanted
+
+
+@pytest.mark.parametrize(
+    ("command", "standby", "wanted"),
+    [
+        (("work",), Standby.WARM, Step.WAIT),
+        (("work",), Standby.COLD, Step.GIVE_AWAY),
+        ((), Standby.WARM, Step.RENEW_IN_PLACE),
+    ],
+)
+def test_a_stopped_worker_of_another_candidate(command: tuple[str, ...], standby: Standby, wanted: Step) -> None:
+    spec = replace(SPEC, worker=replace(SPEC.worker, command=command, standby=standby))
+    known = {"edge1": seen("edge1", state=WorkerState.STOPPED)}
+    assert step(spec, "edge2", OWNED, known, is_at_work=True) is wanted
 
 
 def test_who_still_drains_waits_and_a_task_that_may_not_move_stays() -> None:
