@@ -7,6 +7,7 @@ Knows: files, how one is written so that it survives a power cut. Does not know:
 from __future__ import annotations
 
 import contextlib
+import errno
 from collections.abc import Collection
 from pathlib import Path
 
@@ -40,13 +41,21 @@ class DocumentStore:
             return name
         try:
             self.folder.mkdir(mode=0o700, exist_ok=True)
+            self._check_own()
             hand_over_folder(self.folder)
             replace_synced(self.folder / name, self.folder / NEW_NAME, encode(content))
         except OSError as error:
+            is_misplaced = error.errno in (errno.ELOOP, errno.EEXIST, errno.ENOTDIR)
+            advice = "move it away" if is_misplaced else "free or remount the disk"
             raise AdapterError(
-                f"cannot write the fleet's document into {self.folder}: {error.strerror}; free or remount the disk"
+                f"cannot write the fleet's document into {self.folder}: {error.strerror}; {advice}"
             ) from error
         return name
+
+    def _check_own(self) -> None:
+        """Refuse a folder behind a link: root writes here too, and the folder above is the service's."""
+        if self.folder.is_symlink():
+            raise OSError(errno.ELOOP, "it is a link, not a folder", str(self.folder))
 
     def load(self, name: str) -> Document | None:
         """The document with this hash; ``None``: it is not stored, or its file is damaged."""
@@ -59,7 +68,12 @@ class DocumentStore:
             return None
 
     def delete_others(self, keep: Collection[str]) -> None:
-        """Delete every document whose hash is not in ``keep``; a file that cannot be deleted stays."""
+        """Delete every document whose hash is not in ``keep``; a file that cannot be deleted stays.
+
+        Nothing is deleted behind a link.
+        """
+        if self.folder.is_symlink():
+            return
         with contextlib.suppress(OSError):
             for file in sorted(self.folder.iterdir()):
                 if file.name not in keep:

@@ -69,10 +69,12 @@ class StateFile:
             return
         try:
             self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            fd = os.open(self.folder / LOCK_NAME, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            fd = _open_own(self.folder / LOCK_NAME)
         except OSError as error:
             is_file = error.errno in (errno.EEXIST, errno.ENOTDIR)
             advice = "a file is where a folder should be: see --state-dir" if is_file else "check its owner"
+            if error.errno in (errno.ELOOP, errno.EMLINK):
+                advice = f"delete {self.folder / LOCK_NAME}: it leads to another file, and zsched makes none such"
             raise AdapterError(f"cannot use the state folder {self.folder}: {error.strerror}; {advice}") from error
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -237,8 +239,24 @@ def replace_synced(path: Path, new: Path, content: bytes) -> None:
         raise
 
 
+def _open_own(path: Path) -> int:
+    """Open a file of the state folder for writing, and make it if need be; never one that a link leads to.
+
+    The folder is the service's and root writes there too (`zsched init`): a link in it would choose what root writes.
+
+    Raises:
+        OSError: it cannot be opened, or it is a link.
+    """
+    fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o600)
+    if os.fstat(fd).st_nlink > 1:
+        os.close(fd)
+        raise OSError(errno.EMLINK, os.strerror(errno.EMLINK), str(path))
+    return fd
+
+
 def _write_synced(path: Path, content: bytes) -> None:
-    fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NONBLOCK | os.O_CLOEXEC, 0o600)  # waits for no pipe
+    path.unlink(missing_ok=True)  # of a save that was cut off, or what leads elsewhere: the file is always a new one
+    fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
     try:
         written = 0
         while written < len(content):
@@ -262,7 +280,7 @@ def hand_over_folder(path: Path) -> None:
     if os.geteuid() == 0:
         with contextlib.suppress(OSError):  # a file system without owners
             owner = path.parent.stat()
-            os.chown(path, owner.st_uid, owner.st_gid)
+            os.chown(path, owner.st_uid, owner.st_gid, follow_symlinks=False)
 
 
 def _sync_folder(folder: Path) -> None:

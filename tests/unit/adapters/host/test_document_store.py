@@ -53,6 +53,24 @@ def test_a_folder_that_cannot_be_written_is_an_error_that_names_it(tmp_path: Pat
         DocumentStore(tmp_path).save(ONE)
 
 
+def test_nothing_is_written_or_deleted_behind_a_link(tmp_path: Path) -> None:
+    elsewhere, store = tmp_path / "elsewhere", DocumentStore(tmp_path / "own")
+    elsewhere.mkdir()
+    (elsewhere / "theirs").write_text("")
+    store.folder.parent.mkdir()
+    store.folder.symlink_to(elsewhere)
+    with pytest.raises(AdapterError, match="it is a link, not a folder; move it away"):
+        store.save(ONE)
+    store.delete_others(())
+    assert [file.name for file in elsewhere.iterdir()] == ["theirs"]
+    store.folder.unlink()
+    name = store.save(ONE)
+    (store.folder / "new").symlink_to(elsewhere / "theirs")
+    store.save(OTHER)
+    assert (elsewhere / "theirs").read_text() == ""
+    assert store.load(name) == ONE
+
+
 def test_a_hash_that_is_none_names_no_file(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="is not an id"):
         DocumentStore(tmp_path).load("../state")
