@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -101,6 +102,9 @@ def test_ping_and_bugreport_of_a_real_fleet(bed: Testbed) -> None:
     bed.wait(lambda: heard(bed, "robot1", "edge1") == "alive", WAIT_S, "robot1 hears edge1")
     bed.wait(lambda: heard(bed, "edge1", "robot1") == "alive", WAIT_S, "edge1 hears robot1")
 
+    # daemons hear each other by their control sessions; the relay, which has the data session, may still be starting
+    bed.wait(lambda: listens(bed.fleet.node("edge1").listen_data), WAIT_S, "edge1's relay listens")
+
     def ping(node: str) -> tuple[int, dict[str, Any]]:
         done = zsched(bed, "robot1", "ping", node, "--json", "--count", "2", "--timeout", "5")
         return done.returncode, json.loads(done.stdout)
@@ -113,6 +117,15 @@ def test_ping_and_bugreport_of_a_real_fleet(bed: Testbed) -> None:
     body = json.loads(zsched(bed, "robot1", "bugreport", str(bed.folder / "report.tar.gz"), "--json").stdout)
     assert {"status/robot1.json", "status/edge1.json", "doctor.txt", "fleet.yaml"} <= set(body["members"])
     assert body["missing"]["status/edge2.json"] == "edge2 does not answer"
+
+
+def listens(endpoint: str) -> bool:
+    host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
+    try:
+        socket.create_connection((host, int(port)), timeout=1.0).close()
+    except OSError:
+        return False
+    return True
 
 
 def heard(bed: Testbed, listener: str, speaker: str) -> str:
