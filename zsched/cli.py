@@ -41,7 +41,8 @@ from zsched.commands.stream_verbs import stream_app
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE
 
 if TYPE_CHECKING:
-    from zsched.runtime.init import Heard  # imports zenoh
+    from zsched.commands.recover import Place  # imports zenoh
+    from zsched.runtime.init import Heard  # likewise
 
 EPILOG = (
     "Exit codes: 0 fine, 1 failed, 2 usage, 3 daemon not reachable, 4 reachable but degraded, 5 timed out, "
@@ -223,6 +224,74 @@ def init(
     _say(_heard(heard, name, generation, is_elector=name in fleet.electors))
     typer.echo(f"a core of this machine has speed {core_speed.kept_or_new(state):.2f}")
     typer.echo(f"{path}: blank state of {name} in fleet {fleet.name}, generation {generation}")
+
+
+@app.command(cls=Verb)
+def recover(
+    config: ConfigOption = None,
+    node: NameOption = None,
+    state_dir: StateOption = None,
+    brought: Annotated[
+        list[Path] | None,
+        typer.Option("--from", metavar="STATE_FILE", help="State of a dead machine's disk; give it once for each."),
+    ] = None,
+    plan: PlanOption = False,
+    yes: YesOption = False,
+    accept: AcceptOption = None,
+) -> None:
+    """Begin anew on one survivor when a majority of the electors is lost for good: it becomes the only elector.
+
+    Tasks keep their newest values of all states that are given, under higher epochs. Its daemon must be stopped. It is
+    refused while a majority of the electors can agree. Every other node changes sides by `zsched rejoin` there.
+    """
+    from zsched.commands.recover import Manner  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.recover import recover as run  # noqa: PLC0415 - as above
+
+    words = ["recover", *_place_words(config, node, state_dir)]
+    words += [part for path in brought or () for part in ("--from", str(path))]
+    manner = Manner(words=tuple(words), is_plan=plan, is_sure=yes, accepted=tuple(accept or ()))
+    raise typer.Exit(run(_place(config, node, state_dir), manner, tuple(brought or ())))
+
+
+@app.command(cls=Verb)
+def rejoin(
+    generation: Annotated[
+        str, typer.Argument(metavar="GENERATION", help="The beginning of its id; needed where there are several.")
+    ] = "",
+    config: ConfigOption = None,
+    node: NameOption = None,
+    state_dir: StateOption = None,
+    plan: PlanOption = False,
+    yes: YesOption = False,
+) -> None:
+    """Let this node change sides to another generation of its fleet, as after `zsched recover` elsewhere.
+
+    It starts blank there: what it has promised and learnt in its own generation is dropped. Its daemon must be stopped.
+    """
+    from zsched.commands.recover import Manner  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.recover import rejoin as run  # noqa: PLC0415 - as above
+
+    words = ("rejoin", *([generation] if generation else []), *_place_words(config, node, state_dir))
+    manner = Manner(words=words, is_plan=plan, is_sure=yes)
+    raise typer.Exit(run(_place(config, node, state_dir), manner, generation))
+
+
+def _place_words(config: Path | None, node: str | None, state_dir: Path | None) -> list[str]:
+    """The options that name a node and its files, as they were given."""
+    given = (("--config", config), ("--node", node), ("--state-dir", state_dir))
+    return [part for name, value in given if value is not None for part in (name, str(value))]
+
+
+def _place(config: Path | None, node: str | None, state_dir: Path | None) -> Place:
+    from zsched import paths as places  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.recover import Place  # noqa: PLC0415 - likewise
+    from zsched.config.load import load_fleet, require_node  # noqa: PLC0415 - ruamel.yaml is slow to import
+
+    file = places.config_path(config, os.environ)
+    fleet = load_fleet(file)
+    name = _node_name(node)
+    require_node(fleet, name, file)
+    return Place(fleet=fleet, node=name, config=file, folder=places.state_folder(state_dir, os.environ))
 
 
 def _write_example(example: Example, folder: Path) -> None:

@@ -245,6 +245,8 @@ def _quorum(node: Stages) -> QuorumStatus:
         generation=node.agreement.generation or 0,
         pilot=node.agreement.helm.reason,
         away=() if value is None else value.away,
+        generation_id="" if value is None else value.generation_id,
+        recovered_by="" if value is None else value.recovered_by,
     )
 
 

@@ -93,7 +93,7 @@ def check_blank(
     if _is_there(folder):
         with StateFile(folder, fleet=fleet.name, node=node):
             pass  # in use, or not to be written: said before anybody is asked
-    heard = _ask(fleet, node)
+    heard = ask_others(fleet, node)
     is_elector = node in fleet.electors
     good = standing if standing is not None and not standing.lost else None
     why = objection(node, generation, good, heard.answers, is_elector=is_elector, is_forced=is_forced)
@@ -109,7 +109,8 @@ def _is_there(folder: Path) -> bool:
         return True
 
 
-def _ask(fleet: Fleet, node: NodeId) -> Heard:
+def ask_others(fleet: Fleet, node: NodeId) -> Heard:
+    """Ask every other node that has an address for its status."""
     others = [spec for spec in fleet.nodes if spec.name != node and spec.listen_control]
     endpoints = tuple(filter(None, (dial_endpoint(spec.listen_control, spec.host) for spec in others)))
     text = session_text(fleet, Side.VISIT)

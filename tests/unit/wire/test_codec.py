@@ -81,7 +81,7 @@ ONE_OF = {
     messages.FleetAnswer: ("promise", "accepted", "refused"),
     messages.ChangeFleet: ("document", "add_elector", "remove_elector"),
 }
-IDS = {"disk", "document"}
+IDS = {"disk", "document", "joins"}
 FREE_TEXT = {"reason", "detail", "electorate", "hardware", "problem", "source", "zid", "incarnation", "from_expr"}
 RANGES: dict[str, tuple[float, float]] = {
     "rssi_dbm": (-120.0, 0.0),

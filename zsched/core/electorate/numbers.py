@@ -60,6 +60,7 @@ class Numbers:
         self._registers, self._rng = registers, rng
         self.disk = "" if durable is None else durable.disk
         self._stored = None if durable is None else durable.fleet_register
+        self._joins = "" if durable is None else durable.joins
         self.documents = Documents(me, stored, flags)
         self.roll: Roll | None = None
         self._before = ""
@@ -74,6 +75,8 @@ class Numbers:
     def begin(self, generation: int, electorate: str, todo: ToDo, now: float, *, may_elect: bool) -> None:
         """The generation is known: count by what the state holds, or by what every node makes of its file."""
         first = founded(self._fleet.name, generation, self._fleet.electors)
+        if self._joins:  # who knows nothing of that generation but its id waits for the first word of it
+            first = replace(first, generation_id=self._joins)
         self.roll = Roll(
             me=self._me,
             disk=self.disk,
@@ -126,6 +129,16 @@ class Numbers:
     def value(self) -> FleetValue | None:
         """The learnt fleet value; ``None`` while the generation is not known."""
         return None if self.roll is None else self.roll.value
+
+    @property
+    def is_named(self) -> bool:
+        """Whether this node's generation has an id that its fleet file does not tell."""
+        return bool(self._joins) or self.changed is not None
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether this node is to join a generation of which it has learnt nothing yet."""
+        return bool(self._joins) and self.changed is None and self._stored is None
 
     @property
     def changed(self) -> FleetValue | None:
@@ -187,6 +200,16 @@ class Numbers:
         return min(due, self.documents.next_deadline())
 
     # --- elector -----------------------------------------------------------------------------------------------------
+
+    def is_foreign(self, question: Prepare | Accept) -> bool:
+        """Whether a question is of another generation: it gets no answer.
+
+        Nodes that all go by their files refuse each other instead, by the generation that operators count.
+        """
+        ours = self.value
+        if ours is None or not question.generation_id or question.generation_id == ours.generation_id:
+            return False
+        return self.is_named or question.number > 1
 
     def turned_away(self, question: Prepare | Accept, asker: NodeId, todo: ToDo) -> Refused | None:
         """The no to a question that names another number or creation; ``None``: its register answers."""

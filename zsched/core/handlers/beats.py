@@ -99,6 +99,9 @@ def _on_beat(node: Stages, event: ev.BeatReceived, todo: ToDo, now: float) -> No
         node.counters["beat_foreign"] += 1
         node.knocking.on_beat(beat, now)
         return
+    if node.agreement.is_stranger(beat, todo, now):
+        node.counters["beat_stranger"] += 1
+        return
     if node.namesakes.on_beat(beat, now):
         todo.must_beat = True  # the two of them may not hear each other
         text = f"two daemons call themselves {beat.node}"

@@ -54,6 +54,9 @@ def _on_profile(node: Stages, event: ev.ProfileReceived, todo: ToDo, now: float)
     profile = event.profile
     if profile.node == node.me:
         return
+    if node.agreement.strangers.is_one(profile.node, now):
+        node.counters["profile_stranger"] += 1
+        return
     reason = node.gateway.absorb(profile, now, node.membership.incarnation(profile.node))
     if reason is not None:
         node.counters[f"profile_{reason}"] += 1
@@ -78,10 +81,13 @@ def _on_utility_asked(node: Stages, event: ev.UtilityAsked, todo: ToDo, now: flo
     todo.add(do.AnswerUtilities(request=event.request, utilities=utilities))
 
 
-def _on_utility(node: Stages, event: ev.UtilityReceived, _todo: ToDo, _now: float) -> None:
+def _on_utility(node: Stages, event: ev.UtilityReceived, _todo: ToDo, now: float) -> None:
     voter = event.utilities.voter
     if not node.membership.is_known(voter):
         node.counters["utility_foreign"] += 1
+        return
+    if node.agreement.strangers.is_one(voter, now):
+        node.counters["utility_stranger"] += 1
         return
     if voter not in node.fleet.voters:
         return  # edges hear the question too and have nothing to say
@@ -93,6 +99,9 @@ def _on_proposal(node: Stages, event: ev.ProposalReceived, todo: ToDo, now: floa
     proposal = event.proposal
     if proposal.voter == node.me or not _is_ours(node, proposal):
         node.counters["proposal_foreign"] += 1
+        return
+    if node.agreement.strangers.is_one(proposal.voter, now):
+        node.counters["proposal_stranger"] += 1
         return
     value = node.registers[proposal.task].value
     if proposal.base_revision != value.revision:
@@ -124,6 +133,8 @@ def _on_answer(node: Stages, event: ev.ElectorAnswered, todo: ToDo, now: float) 
 
 def _on_learnt(node: Stages, event: ev.LearntReceived, todo: ToDo, now: float) -> None:
     node.agreement.on_learnt(event, todo, now)
+    if node.agreement.strangers.is_one(event.learnt.node, now):
+        return
     if event.is_answer and node.membership.is_known(event.learnt.node):
         node.sealing.on_answer(event.learnt)
         on_twins(node, event, todo, now)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from zsched.core.values.electorate import FleetValue
+from zsched.core.values.electorate import FleetValue, check_id
 from zsched.core.values.model import NodeId, RegisterState
 
 
@@ -37,5 +37,10 @@ class DurableState:
     """Id of the disk, drawn with this state; empty: the state is older than such ids."""
     fleet_register: RegisterState[FleetValue] | None = None
     """``None``: the fleet value is still the one that every node makes of its file (`founded`)."""
+    joins: str = ""
+    """Generation id that this node is to follow, by its operator's word; empty: that of its fleet file."""
     lost: str = ""
     """Why peers have seen a newer state of this node than this one; empty: they have not."""
+
+    def __post_init__(self) -> None:
+        check_id("state.joins", self.joins)

@@ -16,6 +16,10 @@ from zsched.core.values.model import NodeId, TaskId, check_counter, check_name, 
 CREATION_STEP = 2**32
 """Revision and epoch of a task that was created as number C start at C times this."""
 MAX_LEASE_S = 3600.0
+TOLD_DIGITS = 16
+"""So many digits of a generation id are told in beats, and are enough to name one."""
+SAID_DIGITS = 8
+"""So many digits of a generation id stand in a sentence."""
 _ID = re.compile(r"[0-9a-f]{0,32}")
 
 
@@ -90,6 +94,25 @@ class Electorate:
         return tuple(one.name for one in self.electors)
 
 
+def terms_of(generation_id: str, number: int) -> str:
+    """How beats tell a generation and a number.
+
+    >>> terms_of("8d3f0a1152b64c70aa", 3)
+    '8d3f0a1152b64c70/3'
+    """
+    return f"{generation_id[:TOLD_DIGITS]}/{number}"
+
+
+def generation_in(terms: str) -> str:
+    """The generation that a beat's terms name; empty: they are of a fleet file, which names none.
+
+    >>> generation_in("8d3f0a1152b64c70/3, clock in doubt"), generation_in("0123456789abcdef")
+    ('8d3f0a1152b64c70', '')
+    """
+    named, is_named, _ = terms.partition("/")
+    return named if is_named else ""
+
+
 def _is_founding(number: int, electors: tuple[Elector, ...]) -> bool:
     return number <= 1 and all(one.joining == 0 for one in electors)
 
@@ -128,6 +151,8 @@ class FleetValue:
     """Generation from which this one was recovered; empty: from none."""
     away: tuple[NodeId, ...] = ()
     """Sorted: robots that do not count in votes, because the electors have not heard them for long."""
+    recovered_by: NodeId = ""
+    """The node on which an operator has recovered this generation; empty: it was founded."""
 
     def __post_init__(self) -> None:
         check_name("fleet.fleet", self.fleet)
@@ -140,6 +165,8 @@ class FleetValue:
         _check_sorted("fleet.electors", [one.name for one in self.electors])
         _check_sorted("fleet.tasks", [one.task for one in self.tasks])
         _check_sorted("fleet.away", list(self.away))
+        if self.recovered_by:
+            check_name("fleet.recovered_by", self.recovered_by)
         if not self.electors:
             raise ValueError("fleet.electors: a fleet has at least one elector")
         if any(one.joining > self.number for one in self.electors):
@@ -156,6 +183,11 @@ class FleetValue:
     def electorate(self) -> Electorate:
         """With whom rounds under this value count."""
         return Electorate(generation_id=self.generation_id, number=self.number, electors=self.electors)
+
+    @property
+    def terms(self) -> str:
+        """What leases hang on, as beats tell it: the generation, and the number in it."""
+        return terms_of(self.generation_id, self.number)
 
     @property
     def is_founding(self) -> bool:

@@ -198,6 +198,10 @@ class QuorumStatus:
     """What this elector does about electors and robots that are not heard, or why it does nothing; empty: it rests."""
     away: tuple[NodeId, ...] = ()
     """Robots that do not count in votes, because the electors have not heard them for long."""
+    generation_id: str = ""
+    """Of the generation by which the answering node counts; empty: it knows none yet, or is an older version."""
+    recovered_by: NodeId = ""
+    """The node on which that generation was recovered; empty: it was founded."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

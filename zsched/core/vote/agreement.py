@@ -19,11 +19,12 @@ from zsched.core.electorate.changes import FleetChange
 from zsched.core.electorate.helm import Helm, voters
 from zsched.core.electorate.numbers import Numbers
 from zsched.core.electorate.orders import Orders
+from zsched.core.electorate.strangers import Strangers
 from zsched.core.todo import ToDo
 from zsched.core.values.change import Change, Ended, MoveOwner, Retune, RoundOutcome, SetLeased
 from zsched.core.values.document import Flag
 from zsched.core.values.durable import DurableState
-from zsched.core.values.electorate import CREATION_STEP, Elector, FleetValue
+from zsched.core.values.electorate import CREATION_STEP, SAID_DIGITS, Elector, FleetValue, terms_of
 from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.messages import (
     Accepted,
@@ -129,8 +130,9 @@ class Agreement:
         self.voted = set() if durable is None else set(durable.voted)
         self.is_elector = durable is not None and me in fleet.electors and not self._disputed and not self._lost
         self._problems: dict[str, str] = {}
-        if self._lost:
-            self._problems["state"] = _lost_text(self._lost, self.newest_generation)
+        if durable is not None and self._lost:
+            text = _moved_text(durable) if durable.joins else _lost_text(self._lost, self.newest_generation)
+            self._problems["state"] = text
         if self._disputed:
             self._problems["state"] = f"{self._disputed}; no elector until `zsched init --settle`"
         self.counters: Counter[str] = Counter()
@@ -156,6 +158,7 @@ class Agreement:
             flags=flags,
         )
         self.orders = Orders(self._numbers)
+        self.strangers = Strangers(fleet=fleet.name, silence_s=fleet.timing.suspect_s)
         self.helm = Helm(self._numbers, me, stagger_s=2 * fleet.timing.ballot_s, now=now)
         self.at_start = ToDo()
         """What the first batch must do: fetch a document that is missing."""
@@ -176,6 +179,8 @@ class Agreement:
             now=now,
             granted_s=0.0 if durable is None else durable.lease_s,
         )
+        if durable is not None and self._numbers.is_waiting:
+            self.leases.terms = terms_of(durable.joins, 0)  # beats tell what this node is to join
         self._parked: dict[tuple[TaskId, NodeId], tuple[ev.AcceptAsked, float]] = {}
         first = self._numbers.value
         self._seats = {} if first is None else {seat.name: seat for seat in first.electors}
@@ -255,7 +260,8 @@ class Agreement:
     def problems(self) -> dict[str, str]:
         """{subject: why agreement does not work here as it should}."""
         stuck = {f"register/{name}": register.problem for name, register in self.registers.items() if register.problem}
-        return {**self._problems, **self._numbers.problems, **stuck}
+        strangers = self.strangers.problems(self._numbers.value)
+        return {**self._problems, **self._numbers.problems, **strangers, **stuck}
 
     def values(self) -> Mapping[TaskId, Allocation]:
         """{task: the newest learnt value}; a new mapping whenever one changes."""
@@ -360,6 +366,9 @@ class Agreement:
         if register is None or not self._is_its_own(event.prepare.ballot, event.asker):
             self.counters["prepare_foreign"] += 1
             return
+        if self._numbers.is_foreign(event.prepare):
+            self.counters["prepare_stranger"] += 1
+            return
         ballot = event.prepare.ballot
         answer: Promise | Refused
         turned_away = self._numbers.turned_away(event.prepare, event.asker, todo)
@@ -434,6 +443,9 @@ class Agreement:
         register = self.registers.get(event.accept.task)
         if register is None or not self._is_its_own(acceptance.ballot, event.asker):
             self.counters["accept_foreign"] += 1
+            return
+        if self._numbers.is_foreign(event.accept):
+            self.counters["accept_stranger"] += 1
             return
         if not is_fit(self._fleet, acceptance.value, register):
             self.counters["accept_unfit"] += 1
@@ -566,7 +578,7 @@ class Agreement:
         self.is_elector = roll.is_elector
         self.leases.count_with(
             self.electors,
-            terms=f"{value.generation_id[:16]}/{value.number}",
+            terms=value.terms,
             number=value.number,
             lease_s=value.lease_s,
             standing=self.standing() if self.is_elector else {},
@@ -616,6 +628,9 @@ class Agreement:
             return
         if event.is_answer:
             self._follow(learnt, todo, now)
+        if self.strangers.on_learnt(learnt, self._numbers.value, is_named=self._numbers.is_named):
+            self.counters["learnt_stranger"] += 1
+            return
         if not self._is_our_generation(learnt.node, learnt.generation):
             return
         if not event.is_answer:
@@ -652,6 +667,17 @@ class Agreement:
         if now - self._read_at.get(task, -math.inf) >= READ_EVERY_S:
             self._read_at[task] = now
             register.settle(todo, now)
+
+    def is_stranger(self, beat: Beat, todo: ToDo, now: float) -> bool:
+        """Whether a beat is of another generation: nothing of it counts here, and it is shown."""
+        ours = self._numbers.value
+        named = "" if ours is None else ours.generation_id
+        if not self.strangers.hear(beat, named, is_named=self._numbers.is_named, now=now):
+            return False
+        self.apart.discard(beat.node)
+        if self.strangers.must_ask(beat.node, now):
+            todo.add(do.AskLearnt(peer=beat.node, deadline_s=self._fleet.timing.ballot_s))
+        return True
 
     def _hear_electorate(self, beat: Beat) -> None:
         """Note whether an elector and this node refuse each other's ballots (other electors, or another generation)."""
@@ -793,6 +819,7 @@ class Agreement:
 
     def tick(self, todo: ToDo, now: float) -> None:
         """Time has passed."""
+        self.strangers.forget(now)
         if now >= self._settle_at:
             self._numbers.settle(todo, now)
         if now >= self._numbers.next_deadline():
@@ -850,6 +877,14 @@ def _newest(register: TaskRegister) -> Allocation | None:
     if accepted is None:
         return learnt
     return accepted.value if learnt is None or accepted.value.revision > learnt.revision else learnt
+
+
+def _moved_text(durable: DurableState) -> str:
+    """Why a node that was told to join another generation is no elector."""
+    return (
+        f"{durable.lost} yet (generation {durable.joins[:SAID_DIGITS]}): no elector until it is added as one, which "
+        "`electorate: auto` does by itself"
+    )
 
 
 def _lost_text(why: str, newest_generation: int) -> str:

@@ -332,6 +332,12 @@ class Leases:
     def _watch(self, task: TaskId, standing: NodeId | None, until: float) -> None:
         self._granters[task] = Granter(task=task, lease_s=self.lease_s, until=until, standing=standing)
 
+    def _counts_like_us(self, beat: Beat) -> bool:
+        """Whether a beat's sender counts by our number of our generation; by a fleet file there is neither."""
+        if beat.number != self.number:
+            return False
+        return not self.number or beat.lease_terms.partition(",")[0] == self.terms  # behind it a clock is in doubt
+
     @property
     def over_at(self) -> float:
         """When every grant to, or by, an earlier life of this node is over."""
@@ -377,7 +383,7 @@ class Leases:
             lease_s: of that value.
             standing: {task: its newest value here}; empty when this node is no elector.
         """
-        if number == self.number:
+        if (terms, number) == (self.terms, self.number):
             return
         self.terms, self.number, self.electors, self.lease_s = terms, number, electors, lease_s
         self._others.clear()
@@ -549,13 +555,13 @@ class Leases:
         """A beat came, or our own left: grant, count echoes, note who must leave. Whether to beat at once."""
         is_new = False
         for task, granter in self._granters.items():
-            owned = accepted.get(task) if beat.number == self.number else None
+            owned = accepted.get(task) if self._counts_like_us(beat) else None
             is_new |= granter.on_beat(beat, owned, now, is_newest=is_newest)
         if beat.lease_terms == self.terms:
             self._others.pop(beat.node, None)
         else:
             self._others[beat.node] = beat.lease_terms
-        is_counted = beat.lease_terms == self.terms and beat.number == self.number
+        is_counted = beat.lease_terms == self.terms and self._counts_like_us(beat)
         for grant in beat.echoes if is_counted else ():
             if grant.task in self._holders:
                 self._holders[grant.task].on_echo(beat.node, grant)

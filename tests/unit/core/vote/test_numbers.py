@@ -306,6 +306,23 @@ def test_owner_that_never_learns_the_new_number_is_granted_nothing(*, number: in
     assert bool(elector.on_sent(1, 10.0).echoes) is grants
 
 
+@pytest.mark.parametrize(
+    ("terms", "grants"), [("t/2", True), ("t/2, clock in doubt", True), ("u/2", False), ("", False)]
+)
+def test_an_owner_of_another_generation_is_granted_nothing_though_number_and_epoch_are_the_same(
+    *, terms: str, grants: bool
+) -> None:
+    elector = renumbered(leases())
+    assert elector.on_beat(replace(beat(2), lease_terms=terms), OWNERS, 10.0) is grants
+    assert bool(elector.on_sent(1, 10.0).echoes) is grants
+
+
+def test_another_generation_with_the_same_number_is_counted_anew() -> None:
+    one = renumbered(leases())
+    one.count_with(("robot1",), terms="u/2", number=2, lease_s=L, standing={"merge": HELD})
+    assert (one.terms, one.electors) == ("u/2", ("robot1",))
+
+
 def test_a_release_counts_whatever_number_its_sender_counts_by() -> None:
     elector = leases()
     assert elector.on_beat(beat(0), OWNERS, 10.0)

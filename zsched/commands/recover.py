@@ -1,0 +1,182 @@
+"""`zsched recover` and `zsched rejoin`: show what would become of the fleet, ask, and do it.
+
+Knows: tables, dangers that are accepted by name, what comes next. Does not know: what speaks against it
+(`zsched.core.electorate.recovery`), files and sessions (`zsched.runtime.recovery`).
+"""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from zsched.commands.common import CliError, nearest
+from zsched.commands.page import harmless
+from zsched.core.electorate.recovery import Danger, Recovery, consider
+from zsched.core.values.durable import DurableState
+from zsched.core.values.electorate import SAID_DIGITS, FleetValue
+from zsched.core.values.fleet import Fleet
+from zsched.core.values.model import NodeId, RegisterState
+from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
+from zsched.runtime import recovery as runtime
+
+DANGERS = tuple(danger.value for danger in Danger)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Place:
+    """Which node it is, and where its files are."""
+
+    fleet: Fleet
+    node: NodeId
+    config: Path
+    folder: Path
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Manner:
+    """How it is shown and confirmed."""
+
+    words: tuple[str, ...]
+    """The command as it was given, without what follows here."""
+    is_plan: bool = False
+    is_sure: bool = False
+    accepted: tuple[str, ...] = ()
+
+    def again(self, *more: str) -> str:
+        """The command, with more words."""
+        kept = [part for name in self.accepted for part in ("--accept", name)]
+        return shlex.join(("zsched", *self.words, *kept, *more))
+
+
+def recover(place: Place, manner: Manner, brought: Sequence[Path]) -> int:
+    """Make this node the only elector of a new generation; the exit code.
+
+    Raises:
+        CliError: something speaks against it, a danger is not accepted, or the operator says no.
+        AdapterError: a daemon runs here, or a state cannot be read or written.
+    """
+    for name in manner.accepted:
+        if name not in DANGERS:
+            raise CliError(EXIT_USAGE, f"--accept: there is no danger {name!r}{nearest(name, DANGERS)}")
+    plan = consider(runtime.look(place.fleet, place.node, place.config, place.folder, brought))
+    if isinstance(plan, str):
+        raise CliError(EXIT_FAILED, f"nothing was changed: {plan}")
+    draft = plan.carry_out(generation_id="0", disk="", incarnation=0, hardware="")
+    _say(_table(plan, draft))
+    if manner.is_plan:
+        return EXIT_WOULD_CHANGE
+    missing = [(danger, means) for danger, means in plan.dangers if danger.value not in manner.accepted]
+    if missing:
+        names = [part for danger, _ in missing for part in ("--accept", danger.value)]
+        lines = "\n".join(f"  {danger.value}: {means}" for danger, means in missing)
+        raise CliError(EXIT_FAILED, f"nothing was changed; if this may be:\n{lines}\n{manner.again(*names)}")
+    _confirm(manner, f"Make {place.node} the only elector of a new generation of {place.fleet.name}?")
+    state = runtime.recover(plan, place.config, place.folder, brought)
+    _say(_next(plan, _value_of(state)))
+    return EXIT_OK
+
+
+def rejoin(place: Place, manner: Manner, wanted: str) -> int:
+    """Let this node change sides to another generation; the exit code.
+
+    Raises:
+        CliError: there is no such generation, or the operator says no.
+        AdapterError: a daemon runs here, or its state cannot be written.
+    """
+    own, side = runtime.find_side(place.fleet, place.node, place.folder, wanted)
+    if isinstance(side, str):
+        raise CliError(EXIT_FAILED, f"nothing was changed: {side}")
+    by = f", recovered by {side.recovered_by}" if side.recovered_by else ""
+    told = f"generation {side.generation_id[:SAID_DIGITS]}{by} ({', '.join(side.nodes)} count by it)"
+    _say(f"{place.node}: follows {told}, and starts blank there; what it knew of its own generation is dropped")
+    if manner.is_plan:
+        return EXIT_WOULD_CHANGE
+    _confirm(manner, f"Let {place.node} change sides?")
+    path = runtime.rejoin(place.fleet, place.node, place.folder, own, side)
+    _say(f"{path}: blank state of {place.node}, which is to follow {side.generation_id[:SAID_DIGITS]}")
+    _say("next: start this daemon; it fetches the rest, and is no elector until it is added as one")
+    return EXIT_OK
+
+
+def _say(text: str) -> None:
+    sys.stdout.write(f"{harmless(text)}\n")
+
+
+def _confirm(manner: Manner, question: str) -> None:
+    """Let the operator decide; off a terminal it takes --yes."""
+    if manner.is_sure:
+        return
+    if not sys.stdin.isatty():
+        raise CliError(EXIT_USAGE, f"nothing was changed; to change it without being asked: {manner.again('--yes')}")
+    sys.stdout.flush()
+    sys.stderr.write(f"{question} [y/N] ")
+    sys.stderr.flush()
+    if sys.stdin.readline().strip().lower() not in ("y", "yes"):
+        raise CliError(EXIT_FAILED, "nothing was changed")
+
+
+def _value_of(state: DurableState) -> FleetValue:
+    assert state.fleet_register is not None
+    assert state.fleet_register.learnt is not None
+    return state.fleet_register.learnt
+
+
+def _table(plan: Recovery, draft: DurableState) -> str:
+    """What changes: before -> after."""
+    before, after = plan.before, _value_of(draft)
+    by = f" (recovered by {before.recovered_by})" if before.recovered_by else ""
+    rows = [
+        ("generation", f"{before.generation_id[:SAID_DIGITS]}{by}", f"a new one, recovered by {after.recovered_by}"),
+        ("number", str(before.number), str(after.number)),
+        ("electors", ", ".join(before.electorate.names), ", ".join(after.electorate.names)),
+    ]
+    if before.document != after.document:
+        old = before.document[:SAID_DIGITS] or "each node by its own file"
+        rows.append(("document", old, f"this machine's file, {after.document[:SAID_DIGITS]}"))
+    held = {state.task: state for state in draft.registers}
+    olds = _epochs(plan)
+    rows += [
+        (f"task {one.task}", olds.get(one.task, "no value"), _begins(held.get(one.task), one.start))
+        for one in after.tasks
+    ]
+    wide = max(len(what) for what, _, _ in rows)
+    return "\n".join([f"{after.fleet}:", *(f"  {what:{wide}}  {old} -> {new}" for what, old, new in rows)])
+
+
+def _epochs(plan: Recovery) -> dict[str, str]:
+    """{task: its newest value among the states that were given}; whose it is tells what may be lost."""
+    found: dict[str, tuple[int, str]] = {}
+    for state in plan.found.states:
+        for register in state.registers:
+            held = None if register.accepted is None else register.accepted.value
+            for value in (held, register.learnt):
+                if value is not None and value.revision >= found.get(register.task, (0, ""))[0]:
+                    told = f"{value.owner or 'nobody'}, epoch {value.epoch} (state of {state.node})"
+                    found[register.task] = value.revision, told
+    return {task: told for task, (_, told) in found.items()}
+
+
+def _begins(state: RegisterState | None, start: int) -> str:
+    if state is None or state.learnt is None:
+        return f"nobody, epoch {start}"
+    return f"{state.learnt.owner or 'nobody'}, epoch {state.learnt.epoch}"
+
+
+def _next(plan: Recovery, value: FleetValue) -> str:
+    """What the operator does now."""
+    named = value.generation_id[:SAID_DIGITS]
+    others = [node.name for node in plan.document.nodes if node.name != value.recovered_by]
+    lines = [f"{value.recovered_by} is the only elector of generation {named}", "next: start this daemon"]
+    if others:
+        lines.append(f"then on each of {', '.join(others)}: stop zsched, `zsched rejoin {named}`, start it")
+    if plan.document.is_auto:
+        lines.append("electors are added by themselves once those nodes are back (`zsched fleet show`)")
+    elif others:
+        lines.append(
+            "its document names the electors: when they are back, `zsched apply` the fleet file adds them, "
+            "`electorate: auto` in it lets them be added by themselves"
+        )
+    return "\n".join(lines)

@@ -1,0 +1,169 @@
+"""`zsched recover` and `zsched rejoin`: read the states that are there, ask the others, write the new state.
+
+Knows: state files and documents on disk, whom to ask. Does not know: what speaks against it
+(`zsched.core.electorate.recovery`), how it is shown and confirmed.
+
+Both work on a node whose daemon is stopped. The daemon that starts by the new state is one that has just started:
+what a start does for ballots, leases and workers is thereby done.
+"""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Sequence
+from pathlib import Path
+
+from zsched.adapters.host.document_store import DocumentStore
+from zsched.adapters.host.state_file import MAX_STATE_BYTES, StateFile, hardware_id
+from zsched.clock import wall_tenths
+from zsched.core.electorate.founding import newest_fleet
+from zsched.core.electorate.recovery import Found, Recovery, Sides, choose_side, rejoined, sides_of
+from zsched.core.values.document import Document, Text
+from zsched.core.values.durable import DurableState
+from zsched.core.values.fleet import Fleet
+from zsched.core.values.model import NodeId
+from zsched.errors import AdapterError, ConfigError, WireError
+from zsched.files import read_regular
+from zsched.runtime.init import ask_others
+from zsched.runtime.library import read_document
+from zsched.wire.codec import decode_state, document_hash
+
+
+def look(fleet: Fleet, node: NodeId, config: Path, folder: Path, brought: Sequence[Path]) -> Found:
+    """Read this node's state and those that were brought, with the documents beside them, and ask the other nodes.
+
+    Args:
+        fleet: the fleet file.
+        node: this node.
+        config: the fleet file's path.
+        folder: this node's state folder.
+        brought: state files of other machines' disks.
+
+    Raises:
+        AdapterError: a daemon runs in that folder, it is another node's, or a state that was brought cannot be read.
+        ConfigError: the operator's zenoh file is not usable.
+    """
+    file = StateFile(folder, fleet=fleet.name, node=node)
+    with file:  # a running daemon holds it: said before anybody is asked
+        file.check_owner()
+        own = file.load().state
+    others = tuple(map(read_state, brought))
+    states = (() if own is None else (own,)) + others
+    stores = [DocumentStore(folder), *(DocumentStore(path.parent) for path in brought)]
+    documents = {}
+    for name in sorted({name for state in states for name in _named(state)}):
+        content = next((found for store in stores if (found := store.load(name)) is not None), None)
+        read = None if content is None else _read(content, fleet.name, node, config)
+        if read is not None:
+            documents[name] = read
+    newest = newest_fleet([one.fleet_register for one in states if one.fleet_register is not None])
+    known = fleet if newest is None else documents.get(newest.document, fleet)
+    return Found(
+        fleet=fleet,
+        me=node,
+        own=own,
+        others=others,
+        answers=ask_others(known, node).answers,
+        documents=documents,
+        file_hash=document_hash(_document_of(config)),
+    )
+
+
+def _named(state: DurableState) -> tuple[str, ...]:
+    """The documents that a state names."""
+    register = state.fleet_register
+    held = () if register is None else (register.learnt, None if register.accepted is None else register.accepted.value)
+    return tuple(value.document for value in held if value is not None and value.document)
+
+
+def _read(content: Document, fleet: str, node: NodeId, config: Path) -> Fleet | None:
+    try:
+        return read_document(content, fleet, node, config)
+    except ConfigError:
+        return None  # as if it were not there: the operator is told so
+
+
+def _document_of(config: Path) -> Document:
+    try:
+        return Document(text=Text(config.read_text("utf-8")))
+    except (OSError, ValueError) as error:
+        raise AdapterError(f"{config} cannot be a document: {error}") from error
+
+
+def read_state(path: Path) -> DurableState:
+    """A state file from another machine's disk.
+
+    Raises:
+        AdapterError: it cannot be read, or is damaged.
+    """
+    try:
+        return decode_state(read_regular(path, MAX_STATE_BYTES))
+    except OSError as error:
+        raise AdapterError(
+            f"{path} cannot be read: {error.strerror}; give the file `state` of a state folder"
+        ) from error
+    except WireError as error:
+        raise AdapterError(f"{path} is damaged, or no state file: {error}; leave it out") from error
+
+
+def recover(recovery: Recovery, config: Path, folder: Path, brought: Sequence[Path]) -> DurableState:
+    """Write the document, then the state of the new generation; the state.
+
+    Raises:
+        AdapterError: the disk is full or read-only, or a daemon was started meanwhile; the old state is whole.
+    """
+    found = recovery.found
+    state = recovery.carry_out(
+        generation_id=secrets.token_hex(16),
+        disk=secrets.token_hex(8),
+        incarnation=wall_tenths(),
+        hardware=hardware_id(),
+    )
+    with StateFile(folder, fleet=found.fleet.name, node=found.me) as file:
+        store = DocumentStore(folder)
+        if recovery.agreed is not None:
+            store.save(_document_of(config))
+        elif store.load(recovery.before.document) is None:
+            store.save(_brought(recovery.before.document, brought))
+        file.save(state)
+    return state
+
+
+def _brought(document: str, brought: Sequence[Path]) -> Document:
+    """A document that lies beside a state that was brought."""
+    stores = (DocumentStore(path.parent) for path in brought)
+    return next(content for store in stores if (content := store.load(document)) is not None)
+
+
+def find_side(fleet: Fleet, node: NodeId, folder: Path, wanted: str) -> tuple[DurableState | None, Sides | str]:
+    """(this node's state, the generation that it changes to or why there is none).
+
+    Raises:
+        AdapterError: a daemon runs in that folder, or it is another node's.
+        ConfigError: the operator's zenoh file is not usable.
+    """
+    file = StateFile(folder, fleet=fleet.name, node=node)
+    with file:
+        file.check_owner()
+        own = file.load().state
+    return own, choose_side(own, sides_of(ask_others(fleet, node).answers), wanted)
+
+
+def rejoin(fleet: Fleet, node: NodeId, folder: Path, own: DurableState | None, side: Sides) -> Path:
+    """Write the blank state of a node that changes sides; the file's path.
+
+    Raises:
+        AdapterError: the disk is full or read-only, or a daemon was started meanwhile; the old state is whole.
+    """
+    state = rejoined(
+        fleet,
+        node,
+        own,
+        side,
+        disk=secrets.token_hex(8),
+        incarnation=wall_tenths(),
+        hardware=hardware_id(),
+    )
+    with StateFile(folder, fleet=fleet.name, node=node) as file:
+        file.save(state)
+        return file.path
