@@ -205,17 +205,17 @@ ELECTOR_BUGS: tuple[Bug, ...] = (
     _bug(
         "recovered tasks keep their registers",
         FOUNDING,
-        ("number=before.creations + index", "number=one.number + 0 * index"),
+        ("number=before.creations + index", "number=_creation_of(before, task) or index"),
     ),
     _numbers_bug(
         "an elector grants to a beat of another number",
         LEASE,
-        ("accepted.get(task) if beat.number == self.number else None", "accepted.get(task)"),
+        ("accepted.get(task) if self._counts_like_us(beat) else None", "accepted.get(task)"),
     ),
     _numbers_bug(
         "an echo of another number counts",
         LEASE,
-        ("beat.lease_terms == self.terms and beat.number == self.number", "beat.lease_terms == self.terms"),
+        ("beat.lease_terms == self.terms and self._counts_like_us(beat)", "beat.lease_terms == self.terms"),
     ),
     _numbers_bug(
         "a longer lease counts from a beat of the number before",
