@@ -365,8 +365,8 @@ LEASE_BUGS = (
     _bug(
         "echo of another electorate counts",
         LEASE,
-        "is_counted = beat.lease_terms == self.terms and beat",
-        "is_counted = beat",
+        "is_counted = beat.lease_terms == self.terms and self._counts_like_us(beat)",
+        "is_counted = self._counts_like_us(beat)",
         _LEASE,
     ),
     _bug("lease of a minority", LEASE, "number = numbers[needed - 1]", "number = numbers[0]", _LEASE, 26),
