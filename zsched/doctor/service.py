@@ -115,9 +115,11 @@ def _key(scene: Scene, settings: Settings, *, is_nameless: bool) -> Iterator[Res
     """Of a secured fleet: the key, which a user without a name gets from systemd."""
     security = scene.fleet.security
     handed = [value for name, value in settings if name == "LoadCredential"]
-    if security is None or not is_nameless or any(one.startswith(f"{KEY}:") for one in handed):
+    if security is None or not is_nameless:
         return
     path = Path(security.folder, KEY)
+    if f"{KEY}:{path}" in handed:
+        return
     fix = f"systemctl edit zsched: [Service] LoadCredential={KEY}:{path} (docs/guide/secure.md)"
     yield failed(f"{path} is not handed over to the service's user, which has no name", fix=fix)
 

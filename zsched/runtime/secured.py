@@ -24,6 +24,8 @@ from zsched.sessions.certificate import common_names, validities
 
 CERTIFICATE, KEY, TRUSTED = "certificate.pem", "key.pem", "ca.pem"
 MAX_BYTES: Final = 1 << 20
+BEGIN: Final = b"-----BEGIN "
+"""Of all PEM."""
 CREDENTIALS: Final = "CREDENTIALS_DIRECTORY"
 """Where systemd puts what `LoadCredential=` names: the key, which nobody but root reads where it lies."""
 
@@ -51,11 +53,21 @@ def files_of(security: Security, env: Mapping[str, str] = os.environ) -> Files:
     handed = Path(env[CREDENTIALS]) if env.get(CREDENTIALS) else None
 
     def place(name: str) -> Path:
-        if handed is not None and (handed / name).exists():
+        if handed is not None and _is_handed(handed / name):
             return handed / name
         return Path(security.folder) / name
 
     return Files(certificate=place(CERTIFICATE), key=place(KEY), trusted=place(TRUSTED))
+
+
+def _is_handed(path: Path) -> bool:
+    """Whether there is what it should be: the unit hands over one word where this machine has no key."""
+    try:
+        return BEGIN in read_regular(path, MAX_BYTES)
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return True  # who reads it says what is wrong with it
 
 
 def secured_text(fleet: Fleet, security: Security, side: Side, operator_json5: str) -> str:

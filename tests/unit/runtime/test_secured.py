@@ -65,7 +65,10 @@ def test_what_systemd_hands_over_counts_first(pki: Path, tmp_path: Path) -> None
     _, security = fleet(pki)
     handed = tmp_path / "credentials"
     handed.mkdir()
-    (handed / "key.pem").touch()
+    (handed / "key.pem").write_text("none")
+    found = files_of(security, {"CREDENTIALS_DIRECTORY": str(handed)})
+    assert found.key == pki / "key.pem", "the unit says so where it found no key"
+    (handed / "key.pem").write_bytes((pki / "key.pem").read_bytes())
     found = files_of(security, {"CREDENTIALS_DIRECTORY": str(handed)})
     assert (found.key, found.certificate) == (handed / "key.pem", pki / "certificate.pem")
 
