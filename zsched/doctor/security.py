@@ -6,9 +6,7 @@ what other machines have.
 
 from __future__ import annotations
 
-import ipaddress
 import os
-import re
 import stat
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
@@ -20,6 +18,7 @@ from zsched.core.values.fleet import Security
 from zsched.doctor.model import Result, Scene, failed, joined, passed, skipped, warned
 from zsched.errors import ConfigError
 from zsched.files import read_regular
+from zsched.runtime.own_addresses import Address, addresses_at
 from zsched.runtime.sealing import seals_of
 from zsched.runtime.secured import files_of, require_own
 from zsched.runtime.tls import ENCRYPTED, PLAIN, operator_json5, plain_text_problem, protocol_of
@@ -32,11 +31,6 @@ OWN_SOON: Final = timedelta(days=7)
 """Of the fleet's own, which live for 30 days and are due after 20."""
 MAX_BYTES: Final = 1 << 20
 MEND: Final = "mend the file that the fleet file names under `zenoh: {config: ...}`"
-FIB: Final = "/proc/net/fib_trie"
-"""The kernel's routes: after a line with an address one that calls it ``host LOCAL`` if it is this machine's."""
-IF_INET6: Final = "/proc/net/if_inet6"
-
-Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 
 def nothing_in_plain_text(scene: Scene) -> Result:
@@ -157,49 +151,16 @@ def is_not_open_to_everybody(scene: Scene) -> Result:
         return passed("whoever connects needs a certificate")
     found = [(end, address) for end in plain for address in _addresses(scene, end)]
     public = [f"{end} at {address}" for end, address in found if address.is_global]
-    fix = "secure the fleet (docs/guide/secure.md), or let it listen at a private address only"
+    fix = "secure the fleet (docs/guide/secure.md)"
     if public:
-        return failed(f"anybody in the internet may read and change everything: {', '.join(public)}", fix=fix)
+        told = f"anybody in the internet may read and change everything: {', '.join(public)}"
+        return failed(told, fix=f"{fix}, or let it listen at a private address only")
     if all(address.is_loopback for _, address in found):
         return passed("without certificates, and only for this machine")
-    return passed("without certificates: whoever is in its private network may read and change everything")
+    return warned("without certificates: whoever is in its private network may read and change everything", fix=fix)
 
 
 def _addresses(scene: Scene, endpoint: str) -> Iterator[Address]:
     """The addresses of this machine at which an endpoint takes connections; none of a host name."""
     host = endpoint.partition("/")[2].partition("?")[0].partition("#")[0].rpartition(":")[0].strip("[]")
-    try:
-        address = ipaddress.ip_address(host)
-    except ValueError:
-        return
-    if not address.is_unspecified:
-        yield address
-        return
-    yield from _ipv4(scene)
-    if address.version == 6:
-        yield from _ipv6(scene)
-
-
-def _ipv4(scene: Scene) -> Iterator[Address]:
-    seen: set[Address] = set()
-    last = ""
-    for line in _lines(scene, FIB):
-        if match := re.search(r"\|-- (\S+)", line):
-            last = match[1]
-        elif "host LOCAL" in line and last:
-            address = ipaddress.ip_address(last)
-            if address not in seen:
-                seen.add(address)
-                yield address
-
-
-def _ipv6(scene: Scene) -> Iterator[Address]:
-    for line in _lines(scene, IF_INET6):
-        yield ipaddress.IPv6Address(int(line.split()[0], 16))
-
-
-def _lines(scene: Scene, path: str) -> list[str]:
-    try:
-        return scene.at(path).read_text(encoding="ascii", errors="replace").splitlines()
-    except OSError:
-        return []
+    yield from addresses_at(scene.root, host)

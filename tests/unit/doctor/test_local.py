@@ -25,7 +25,16 @@ ROBOTS_OWN = FLEET.replace("  robot1: {kind: robot}", "  robot1: {kind: robot, w
 
 def test_a_machine_in_order_has_no_fault(tmp_path: Path) -> None:
     """What these checks say of the machine itself (its unit, its memory) is another matter."""
-    elsewhere = ("unit.", "machine.", "net.own_addresses", "net.ports", "clock.", "state.fsync", "state.space")
+    elsewhere = (
+        "unit.",
+        "machine.",
+        "tls.open",
+        "net.own_addresses",
+        "net.ports",
+        "clock.",
+        "state.fsync",
+        "state.space",
+    )
     scene = scene_of(tmp_path, node="robot1")
     bad = [(check.name, result) for check, result in run_all(scene) if result.fix]
     assert [one for one in bad if not one[0].startswith(elsewhere)] == []
