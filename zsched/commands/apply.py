@@ -41,7 +41,9 @@ from zsched.runtime.restarts import restarts
 SCHEMA = "zsched.apply/1"
 OTHER_FILES = "other-files"
 """The danger of a first document: nodes that go by another file now."""
-DANGERS = (*(danger.value for danger in Danger), OTHER_FILES)
+OPEN_NETWORK = "open-network"
+"""The danger of a node that strangers may reach, in a fleet without certificates."""
+DANGERS = (*(danger.value for danger in Danger), OTHER_FILES, OPEN_NETWORK)
 PATH_ROOM, VALUE_ROOM = 44, 28
 STDIN = "-"
 

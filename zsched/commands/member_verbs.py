@@ -88,12 +88,23 @@ def fleet_create(
     ] = Kind.ROBOT,
     address: Annotated[str | None, typer.Option("--address", metavar="ADDRESS", help=f"{AddressHelp} [found]")] = None,
     timing: Annotated[Profile, typer.Option("--timing", help="The clocks of the protocol.")] = Profile.WIFI,
+    insecure: Annotated[
+        bool, typer.Option("--insecure", help="Without certificates: whoever reaches the network changes everything.")
+    ] = False,
+    authority: Annotated[
+        Path | None,
+        typer.Option("--authority", metavar="DIR", help="Where the fleet's authority goes. [as of zsched pki]"),
+    ] = None,
+    passphrase: Annotated[
+        bool, typer.Option("--passphrase", help="Lock its key. [ZSCHED_AUTHORITY_PASSPHRASE, else it asks]")
+    ] = False,
+    accept: AcceptOption = None,
     plan: OnlyPlanOption = False,
     json_: JsonOption = False,
     config: ConfigOption = None,
     state_dir: StateOption = None,
 ) -> None:
-    """Make this machine the first one of a new fleet: writes its fleet file and its state.
+    """Make this machine the first one of a new fleet: writes its fleet file, state, authority and certificate.
 
     Refused where a fleet file or a state is. A fleet of one works; `zsched invite` brings the next machine.
     """
@@ -108,6 +119,10 @@ def fleet_create(
         timing=timing.value,
         address=address,
         places=_places(config, state_dir),
+        is_secured=not insecure,
+        authority=authority,
+        asks_passphrase=passphrase,
+        accepted=tuple(accept or ()),
         is_plan=plan,
         is_json=json_,
     )
@@ -133,6 +148,10 @@ def invite(
         Path | None,
         typer.Option("--authority", metavar="DIR", help="In a secured fleet: who signs. [as of zsched pki]"),
     ] = None,
+    csr: Annotated[
+        Path | None,
+        typer.Option("--csr", metavar="FILE", help="In a secured fleet: its request; its key stays where it was made."),
+    ] = None,
     plan: PlanOption = False,
     yes: YesOption = False,
     revision: RevisionOption = None,
@@ -144,7 +163,8 @@ def invite(
 ) -> None:
     """Add a machine to the fleet, and write the file with which it joins (`zsched join`).
 
-    In a secured fleet the file holds the machine's certificate and key, where this machine has the authority.
+    In a secured fleet the file holds the machine's certificate, and its key unless --csr is given, where this machine
+    has the authority.
     For a node that was never there it is written once more.
     """
     from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
@@ -157,15 +177,23 @@ def invite(
     words += ["--address", address] if address is not None else []
     words += [word for task in tasks for word in ("--candidate-for", task)]
     words += ["--output", str(output)] if output is not None else []
+    words += ["--csr", str(csr)] if csr is not None else []
     view = view_of(
         tuple(words), plan=plan, yes=yes, revision=revision, accept=accept, reason=reason, is_json=False, is_data=True
     )
-    guest = Guest(name=name, kind=NodeKind(kind.value), address=address, tasks=tasks, authority=authority)
+    guest = Guest(name=name, kind=NodeKind(kind.value), address=address, tasks=tasks, authority=authority, request=csr)
     raise typer.Exit(bring(find_door(runtime_dir, node, connect=connect), view, guest, output))
 
 
 def join(
-    file: Annotated[str, typer.Argument(metavar="FILE", help="What `zsched invite` wrote; -: stdin.")],
+    file: Annotated[str | None, typer.Argument(metavar="[FILE]", help="What `zsched invite` wrote; -: stdin.")] = None,
+    request: Annotated[
+        str | None,
+        typer.Option("--request", metavar="NAME", help="Before: make a key here, and NAME.csr for `zsched invite`."),
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FILE", help="With --request: where it goes. [./NAME.csr]")
+    ] = None,
     plan: OnlyPlanOption = False,
     json_: JsonOption = False,
     config: ConfigOption = None,
@@ -173,8 +201,20 @@ def join(
 ) -> None:
     """Make this machine the node that an invitation names: writes its fleet file, state and certificate.
 
+    With --request the machine makes its key by itself, and no key travels.
     Nothing of another fleet is touched: it is refused. Start the daemon then; it votes as soon as it hears the others.
     """
-    from zsched.commands.membership import join as come  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands import membership  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.common import CliError  # noqa: PLC0415 - as above
+    from zsched.exits import EXIT_USAGE  # noqa: PLC0415 - as above
 
-    raise typer.Exit(come(file, _places(config, state_dir), is_plan=plan, is_json=json_))
+    if (file is None) == (request is None):
+        raise CliError(EXIT_USAGE, "give the invitation's file, or --request NAME before you have one")
+    if request is not None:
+        if plan:
+            raise CliError(EXIT_USAGE, "--plan goes with an invitation: --request writes a key and a request only")
+        raise typer.Exit(membership.request(request, _places(config, state_dir), output, is_json=json_))
+    assert file is not None
+    if output is not None:
+        raise CliError(EXIT_USAGE, "--output goes with --request")
+    raise typer.Exit(membership.join(file, _places(config, state_dir), is_plan=plan, is_json=json_))

@@ -24,22 +24,26 @@ from zsched.commands.common import CliError, Json, nearest, print_json
 from zsched.commands.document import InForce, document_text, in_force, status_of
 from zsched.commands.entries import DOCUMENT, HERE
 from zsched.commands.page import harmless
+from zsched.commands.papers import FirstPapers, ask_for_certificate, check_request, papers_for, refuse_open_network
 from zsched.config.editing import add_entries, add_names, is_list
 from zsched.config.load import check_bytes
 from zsched.core.values.document import Document
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet, NodeSpec, dial_endpoint
 from zsched.core.values.model import NAME, NodeId, NodeKind
-from zsched.errors import WireError
+from zsched.errors import WireError, ZschedError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
 from zsched.files import read_regular
 from zsched.runtime.membership import Places, Written, found, is_joined
 from zsched.runtime.membership import join as join_here
 from zsched.wire.codec import from_plain
-from zsched.wire.invitation import MAX_BYTES, Invitation, Papers, decode_invitation, encode_invitation
+from zsched.wire.invitation import MAX_BYTES, Invitation, decode_invitation, encode_invitation
 
 SCHEMA: Final = "zsched.member/1"
 PRIVATE: Final = 0o600
+SECURED: Final = "tls"
+LOCAL_PORT_AFTER: Final = 3
+"""The port of a host's applications comes after those of its two sessions and of `zsched web`."""
 MAX_PORT: Final = 65_535
 
 
@@ -50,7 +54,7 @@ class Told:
     fleet: str
     node: NodeId
     outcome: str
-    """created, joined, left, planned, or unchanged."""
+    """created, joined, left, planned, requested, or unchanged."""
     said: str
     """One line for people."""
     files: tuple[Written, ...] = ()
@@ -78,10 +82,14 @@ class Address:
     host: str
     port: int = CONTROL_PORT
 
+    @property
+    def listened_host(self) -> str:
+        """At which of the machine's addresses its sessions listen: at all of them, but for a loopback address."""
+        return self.host if _is_loopback(self.host) else "::" if ":" in self.host else "0.0.0.0"  # noqa: S104 - a robot's
+
     def entry(self, protocol: str) -> str:
         """The part of a node's entry in the fleet file that says so."""
-        where = self.host if _is_loopback(self.host) else "::" if ":" in self.host else "0.0.0.0"  # noqa: S104 - a robot's
-        where = f"[{where}]" if ":" in where else where
+        where = f"[{self.listened_host}]" if ":" in self.listened_host else self.listened_host
         listen = ", ".join(
             f'{kind}: "{protocol}/{where}:{port}"' for kind, port in (("control", self.port), ("data", self.port + 1))
         )
@@ -129,10 +137,19 @@ def own_address() -> str:
 
 def _entry_of(name: str, kind: NodeKind, address: Address | None, protocol: str) -> str:
     more = "" if address is None else f", {address.entry(protocol)}"
+    if protocol == SECURED and kind is NodeKind.ROBOT:  # its applications have no certificate
+        port = (CONTROL_PORT if address is None else address.port) + LOCAL_PORT_AFTER
+        more += f', local: {{mode: peer, listen: ["tcp/127.0.0.1:{port}"]}}'
     return f"  {name}: {{kind: {kind.value}{more}}}\n"
 
 
 # --- create ----------------------------------------------------------------------------------------------------------
+
+
+SECURITY_TEXT: Final = """\
+# Who has no certificate of this fleet is not let in. `operators: [NAME]` are people who command from elsewhere.
+security: {}
+"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -145,15 +162,20 @@ class CreateView:
     timing: str
     address: str | None
     places: Places
+    is_secured: bool = True
+    authority: Path | None = None
+    asks_passphrase: bool = False
+    accepted: tuple[str, ...] = ()
+    """Names of dangers."""
     is_plan: bool = False
     is_json: bool = False
 
 
 def create(view: CreateView) -> int:
-    """Write the fleet file, document and state of a fleet of this one machine; the exit code.
+    """Write the fleet file, document, state and certificate of a fleet of this one machine; the exit code.
 
     Raises:
-        CliError: no address is found, or a name is none (2).
+        CliError: no address is found; a name is none (2); without certificates: strangers could reach it.
         AdapterError: the machine belongs to a fleet already, or a file cannot be written.
         ConfigError: what comes of the options is no good fleet file.
     """
@@ -163,9 +185,22 @@ def create(view: CreateView) -> int:
     if view.address is None and not host:
         raise CliError(EXIT_FAILED, "this machine has no address in a network: connect it, or give one with --address")
     address = Address(host=host) if view.address is None else address_of(view.address)
-    fleet, files = found(_first_text(view, address), view.node, view.places, is_plan=view.is_plan)
+    if not view.is_secured:
+        refuse_open_network((address.host, address.listened_host), view.accepted)
+    papers = _first_papers(view) if view.is_secured else None
+    certify = None if papers is None else papers.certify
+    text = _first_text(view, address)
+    try:
+        fleet, files = found(text, view.node, view.places, is_plan=view.is_plan, certify=certify)
+        if papers is not None and view.is_plan:
+            papers.check()
+    except ZschedError:
+        if papers is not None:
+            papers.destroy()
+        raise
     where = f"{address.host}, ports {address.port} and {address.port + 1}"
-    said = f"{fleet.name}: a fleet of one node, {view.node} at {where}"
+    trust = "secured" if view.is_secured else "NOT SECURED: whoever reaches this network reads and changes everything"
+    said = f"{fleet.name}: a fleet of one node, {view.node} at {where}, {trust}"
     outcome = "planned" if view.is_plan else "created"
     more = "`zsched task add FILE` gives it work, `zsched invite NAME > NAME.invite` brings the next machine"
     told = Told(
@@ -173,11 +208,15 @@ def create(view: CreateView) -> int:
         node=view.node,
         outcome=outcome,
         said=f"would be written; {said}" if view.is_plan else said,
-        files=files,
-        next=() if view.is_plan else (*_start(view.node, view.places), more),
+        files=files if papers is None else (*files, *papers.files),
+        next=() if view.is_plan else (*_start(view.node, view.places), more, *([papers.advice] if papers else [])),
     )
     told.tell(is_json=view.is_json)
     return EXIT_WOULD_CHANGE if view.is_plan else EXIT_OK
+
+
+def _first_papers(view: CreateView) -> FirstPapers:
+    return FirstPapers(view.fleet, view.node, view.authority, asks_passphrase=view.asks_passphrase)
 
 
 def _first_text(view: CreateView, address: Address) -> str:
@@ -187,8 +226,9 @@ def _first_text(view: CreateView, address: Address) -> str:
         "# Each node dials those before it in this list; `zsched invite` adds to its end.\n"
         f"seeds: [{view.node}]\n"
         "nodes:\n"
-        f"{_entry_of(view.node, view.kind, address, 'tcp')}"
+        f"{_entry_of(view.node, view.kind, address, SECURED if view.is_secured else 'tcp')}"
         "tasks: {}\n"
+        f"{SECURITY_TEXT if view.is_secured else ''}"
     )
 
 
@@ -217,6 +257,8 @@ class Guest:
     tasks: tuple[str, ...] = ()
     """Of which it becomes a candidate."""
     authority: Path | None = None
+    request: Path | None = None
+    """For a key that was made on the machine itself."""
 
 
 def invite(door: Door, view: ApplyView, guest: Guest, file: Path | None) -> int:
@@ -232,6 +274,9 @@ def invite(door: Door, view: ApplyView, guest: Guest, file: Path | None) -> int:
         raise CliError(EXIT_USAGE, f"the invitation is a file: zsched invite {guest.name} > {guest.name}.invite")
     held = in_force(door)
     fleet = _fleet_of(document_text(held))
+    check_request(fleet, guest.request, guest.authority)
+    if fleet.security is None and guest.address is not None:
+        refuse_open_network((address_of(guest.address).host,), view.accepted)
     if any(node.name == guest.name for node in fleet.nodes):
         _check_invited_again(door, guest)
     else:
@@ -290,7 +335,7 @@ def _can_be_dialled(node: NodeSpec) -> bool:
 def _protocol(fleet: Fleet) -> str:
     """With which the others listen."""
     if fleet.security is not None:
-        return "tls"
+        return SECURED
     said = [node.listen_control.partition("/")[0] for node in fleet.nodes if node.listen_control]
     return said[0] if said else "tcp"
 
@@ -317,30 +362,16 @@ def _invitation(door: Door, guest: Guest) -> Invitation:
         raise CliError(EXIT_FAILED, f"{told['node']} does not tell its fleet value: update zsched there") from error
     fleet = _fleet_of(document.text)
     addresses = [dial_endpoint(node.listen_control, node.host) for node in fleet.nodes if node.name != guest.name]
-    papers = _papers(fleet, guest)
+    papers = papers_for(fleet, guest.name, guest.authority, guest.request)
     return Invitation(
         node=guest.name, value=value, document=document, addresses=tuple(filter(None, addresses)), papers=papers
     )
 
 
-def _papers(fleet: Fleet, guest: Guest) -> Papers | None:
-    if fleet.security is None:
-        return None
-    from zsched.commands.pki import issue_for  # noqa: PLC0415 - only a secured fleet needs it
-
-    issued = issue_for(fleet, guest.name, guest.authority)
-    if issued is None:
-        advice = f"where it is: zsched pki issue {guest.name}; bring its files to the machine before it starts"
-        sys.stderr.write(f"the invitation has no certificate: the fleet's authority is not on this machine; {advice}\n")
-        return None
-    pems = (issued.certificate, issued.key, issued.trusted)
-    certificate, key, trusted = (pem.decode("ascii") for pem in pems)
-    return Papers(certificate=certificate, key=key, trusted=trusted)
-
-
 def _write(invitation: Invitation, guest: Guest, file: Path | None) -> None:
     """To a file that only its owner may read if there is a key in it, or to stdout."""
-    text, has_key = encode_invitation(invitation), invitation.papers is not None
+    papers = invitation.papers
+    text, has_key = encode_invitation(invitation), papers is not None and bool(papers.key)
     if file is None:
         sys.stdout.flush()
         number = sys.stdout.fileno() if hasattr(sys.stdout, "fileno") and has_key else None
@@ -395,6 +426,23 @@ def join(file: str, where: Places, *, is_plan: bool, is_json: bool) -> int:
     return EXIT_WOULD_CHANGE if is_plan else EXIT_OK
 
 
+def request(name: str, where: Places, out: Path | None, *, is_json: bool) -> int:
+    """Make this machine's key and the request with which it is invited; the exit code.
+
+    Raises:
+        CliError: it is no name.
+        AdapterError: this machine has a certificate already, or a file cannot be written.
+    """
+    files = ask_for_certificate(name, where, out)
+    file = files[-1].path.name
+    follow = f"bring {file} to the fleet's authority, and there: zsched invite {name} --csr {file} > {name}.invite"
+    told = Told(
+        fleet="", node=name, outcome="requested", said=f"{name}: a key, and a request", files=files, next=(follow,)
+    )
+    told.tell(is_json=is_json)
+    return EXIT_OK
+
+
 def _read(file: str) -> Invitation:
     try:
         data = sys.stdin.buffer.read(MAX_BYTES + 1) if file == "-" else read_regular(Path(file), MAX_BYTES)
@@ -412,6 +460,8 @@ def _lacking(fleet: Fleet, invitation: Invitation) -> Sequence[str]:
         return ()
     if invitation.papers is None:
         return (f"bring this node's certificate into {fleet.security.folder} (zsched pki issue {invitation.node})",)
+    if not invitation.papers.key:
+        return ()
     return (f"delete the invitation: it holds the private key, which is now in {fleet.security.folder}",)
 
 

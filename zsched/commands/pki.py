@@ -59,10 +59,8 @@ def init(where: Where, *, asks_passphrase: bool) -> int:
     """Make the authority of the fleet in the fleet file.
 
     Raises:
-        CliError: the package cryptography is missing.
         AdapterError: there is an authority already, or the folder cannot be written.
     """
-    _need_cryptography()
     from zsched.pki.authority import create  # noqa: PLC0415 - imports cryptography
 
     office = _office(where)
@@ -100,22 +98,53 @@ def issue(where: Where, name: str, role: Role, request: Path | None, out: Path |
     return EXIT_OK
 
 
-def issue_for(fleet: Fleet, node: str, given: Path | None) -> Issued | None:
-    """The first certificate of a node, with a new key; ``None``: this machine holds no authority of the fleet.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Begun:
+    """A new authority, and the certificate of its first node."""
+
+    authority: Authority
+    issued: Issued
+    is_locked: bool
+    """Whether its key needs a passphrase."""
+
+
+def begin_for(fleet: Fleet, node: str, given: Path | None, *, asks_passphrase: bool) -> Begun:
+    """A new authority for a new fleet, and the first node's certificate with a new key.
 
     Raises:
-        CliError: the package cryptography is missing.
+        AdapterError: there is an authority already, or the folder cannot be written.
+    """
+    from zsched.pki.authority import create  # noqa: PLC0415 - imports cryptography
+
+    folder = places.authority_folder(given, os.environ, fleet.name)
+    secret = _new_passphrase() if asks_passphrase else os.environ.get(PASSPHRASE, "").encode()
+    authority = create(folder, fleet.name, secret, _now())
+    issued = authority.issue(node, Role.NODE, _check_name(fleet, node, Role.NODE), b"", secret, _now())
+    return Begun(authority=authority, issued=issued, is_locked=bool(secret))
+
+
+def holds_authority(fleet: str, given: Path | None) -> Path | None:
+    """The folder of a fleet's authority on this machine; ``None``: there is none."""
+    folder = places.authority_folder(given, os.environ, fleet)
+    return folder if (folder / RECORD).exists() else None
+
+
+def issue_for(fleet: Fleet, node: str, given: Path | None, request: bytes = b"") -> Issued | None:
+    """The first certificate of a node; ``None``: this machine holds no authority of the fleet.
+
+    ``request``: a certificate request (PEM) for a key that was made elsewhere; without it there is a new key.
+
+    Raises:
         AdapterError: the node has a certificate already, or the authority cannot be used.
     """
-    folder = places.authority_folder(given, os.environ, fleet.name)
-    if not (folder / RECORD).exists():
+    folder = holds_authority(fleet.name, given)
+    if folder is None:
         return None
-    _need_cryptography()
     from zsched.pki.authority import opened  # noqa: PLC0415 - imports cryptography
 
     hosts = _check_name(fleet, node, Role.NODE)
     with opened(folder, fleet.name) as authority:
-        return authority.issue(node, Role.NODE, hosts, b"", _passphrase(authority), _now())
+        return authority.issue(node, Role.NODE, hosts, request, _passphrase(authority), _now())
 
 
 def renew(where: Where, label: str | None, request: Path | None, out: Path | None) -> int:
@@ -221,13 +250,6 @@ def rotate(where: Where, *, is_end: bool) -> int:
 # --- parts -----------------------------------------------------------------------------------------------------------
 
 
-def _need_cryptography() -> None:
-    try:
-        import zsched.pki.certificates  # noqa: F401, PLC0415 - the package is an extra
-    except ModuleNotFoundError as error:
-        raise CliError(EXIT_FAILED, f"the package {error.name} is missing: pip install 'zsched[pki]'") from error
-
-
 def _office(where: Where) -> _Office:
     fleet = load_fleet(places.config_path(where.config, os.environ))
     return _Office(fleet=fleet, folder=places.authority_folder(where.authority, os.environ, fleet.name))
@@ -235,7 +257,6 @@ def _office(where: Where) -> _Office:
 
 @contextmanager
 def _opened(where: Where) -> Iterator[tuple[_Office, Authority]]:
-    _need_cryptography()
     from zsched.pki.authority import opened  # noqa: PLC0415 - imports cryptography
 
     office = _office(where)

@@ -214,6 +214,17 @@ class Authority:
                 former.unlink(missing_ok=True)
         return left
 
+    def destroy(self) -> None:
+        """Delete all of it: of an authority whose certificates nobody has got.
+
+        Raises:
+            OSError: a file cannot be deleted.
+        """
+        for name in (key_name(self.record.number), RECORD, TRUSTED, LOCK):
+            (self._folder / name).unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # somebody's own file is in it
+            self._folder.rmdir()
+
     # --- parts -------------------------------------------------------------------------------------------------------
 
     def _requested(self, request: bytes) -> x509.PublicKey:

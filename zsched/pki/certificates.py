@@ -165,6 +165,25 @@ def is_locked(pem: bytes) -> bool:
     return b"ENCRYPTED PRIVATE KEY" in pem
 
 
+def is_key_of(pem: bytes, certificate: bytes) -> bool:
+    """Whether a private key (PEM, not locked) is the one that a certificate (PEM) is for.
+
+    Raises:
+        ValueError: one of the two cannot be read.
+    """
+    try:
+        key = serialization.load_pem_private_key(pem, None)
+    except TypeError as error:  # it is locked
+        raise ValueError(str(error)) from error
+    return fingerprint(_fit(key.public_key())) == fingerprint(certified_key(read_certificate(certificate)))
+
+
+def request_pem(key: PrivateKey, name: str) -> bytes:
+    """A certificate request for a key; ``name`` is for people, only the key counts."""
+    asked = x509.CertificateSigningRequestBuilder().subject_name(_named(name)).sign(key, None)
+    return asked.public_bytes(serialization.Encoding.PEM)
+
+
 def certificate_pem(certificate: x509.Certificate) -> bytes:
     """A certificate as PEM."""
     return certificate.public_bytes(serialization.Encoding.PEM)

@@ -9,6 +9,7 @@ The state is written last: a machine on which only a part was written has no sta
 from __future__ import annotations
 
 import secrets
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -18,6 +19,7 @@ from zsched.adapters.host.state_file import STATE_NAME, StateFile, hardware_id, 
 from zsched.clock import wall_tenths
 from zsched.config.load import check_bytes
 from zsched.config.reader import MAX_FILE_BYTES, render_all
+from zsched.config.schema import PKI_FOLDER
 from zsched.core.electorate.founding import created
 from zsched.core.values.certificates import Role, parse_common_name
 from zsched.core.values.document import Document, Text
@@ -27,6 +29,7 @@ from zsched.core.values.model import NodeId, RegisterState
 from zsched.core.vote.generations import blank_state
 from zsched.errors import AdapterError, ConfigError
 from zsched.files import read_regular
+from zsched.pki.files import PRIVATE, PUBLIC, write_whole
 from zsched.runtime.secured import CERTIFICATE, KEY, TRUSTED
 from zsched.sessions.certificate import common_names
 from zsched.wire.codec import document_hash
@@ -36,7 +39,12 @@ BEFORE: Final = ".before-join"
 """Behind the name of a fleet file that another text of the same fleet has replaced."""
 COPY_NAME: Final = "copied"
 """In the state folder: the hash of the fleet file that was written as a copy of the document."""
-PUBLIC_MODE, PRIVATE_MODE = 0o644, 0o600
+PUBLIC_MODE, PRIVATE_MODE, FOLDER_MODE = 0o644, 0o600, 0o755
+_WHAT: Final = {
+    CERTIFICATE: "the certificate",
+    TRUSTED: "whom it trusts",
+    KEY: "the private key, for its owner only",
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,8 +66,17 @@ class Written:
 # --- to found --------------------------------------------------------------------------------------------------------
 
 
-def found(text: str, me: NodeId, places: Places, *, is_plan: bool) -> tuple[Fleet, tuple[Written, ...]]:
+def found(
+    text: str,
+    me: NodeId,
+    places: Places,
+    *,
+    is_plan: bool,
+    certify: Callable[[Fleet], Papers] | None = None,
+) -> tuple[Fleet, tuple[Written, ...]]:
     """Make this machine the first one of a new fleet; ``is_plan``: only say what would be written.
+
+    ``certify`` makes the certificate of a secured fleet; it is called when nothing else is in the way.
 
     Raises:
         AdapterError: the machine belongs to a fleet already, or a file cannot be written.
@@ -73,7 +90,45 @@ def found(text: str, me: NodeId, places: Places, *, is_plan: bool) -> tuple[Flee
     content = Document(text=Text(text))
     disk = secrets.token_hex(8)
     value = created(fleet, me, disk=disk, generation_id=secrets.token_hex(16), document=document_hash(content))
-    return fleet, _write(fleet, me, value, content, places, disk, papers=None, is_plan=is_plan)
+    if certify is not None and fleet.security is not None:
+        _check_no_papers(Path(fleet.security.folder))
+    papers = None if certify is None or is_plan else certify(fleet)
+    listed = (CERTIFICATE, TRUSTED, KEY) if certify is not None else ()
+    return fleet, _write(fleet, me, value, content, places, disk, papers=papers, listed=listed, is_plan=is_plan)
+
+
+# --- to ask for a certificate ----------------------------------------------------------------------------------------
+
+
+def request_here(name: NodeId, places: Places, out: Path) -> tuple[Written, ...]:
+    """Make a key for this machine, or take the one of an earlier request, and write a request for its certificate.
+
+    Raises:
+        AdapterError: this machine has a certificate already, or a file cannot be read or written.
+    """
+    from zsched.pki import certificates  # noqa: PLC0415 - imports cryptography
+
+    folder = places.config.parent / PKI_FOLDER
+    if (folder / CERTIFICATE).exists():
+        advice = "its fleet has let it in; for another fleet move the folder away"
+        raise AdapterError(f"{folder / CERTIFICATE} is there already; {advice}")
+    try:
+        _make_folder(folder)
+        if (folder / KEY).exists():
+            key = certificates.read_key(read_regular(folder / KEY, MAX_FILE_BYTES), b"")
+        else:
+            key = certificates.new_key()
+            write_whole(folder / KEY, certificates.key_pem(key), PRIVATE)
+        write_whole(out, certificates.request_pem(key, name), PUBLIC)
+    except ValueError as error:
+        raise AdapterError(f"{folder / KEY}: {error}; move it away, then ask again") from error
+    except OSError as error:
+        advice = "run this as root, or give places of your own with --config"
+        raise AdapterError(f"{error.filename or out}: {error.strerror}; {advice}") from error
+    return (
+        Written(path=folder / KEY, what=f"{_WHAT[KEY]}; it stays here"),
+        Written(path=out, what="the request, which is no secret"),
+    )
 
 
 # --- to join ---------------------------------------------------------------------------------------------------------
@@ -116,7 +171,7 @@ def join(invitation: Invitation, places: Places, *, is_plan: bool) -> tuple[Flee
     if invitation.papers is not None and fleet.security is None:
         raise ConfigError("the invitation has a certificate, and its document has no `security:` section")
     _check_papers(fleet, invitation)
-    disk = secrets.token_hex(8)
+    disk, papers = secrets.token_hex(8), invitation.papers
     return fleet, _write(
         fleet,
         invitation.node,
@@ -124,7 +179,8 @@ def join(invitation: Invitation, places: Places, *, is_plan: bool) -> tuple[Flee
         invitation.document,
         places,
         disk,
-        papers=invitation.papers,
+        papers=papers,
+        listed=() if papers is None else (CERTIFICATE, TRUSTED, *((KEY,) if papers.key else ())),
         is_plan=is_plan,
     )
 
@@ -153,6 +209,8 @@ def _check_papers(fleet: Fleet, invitation: Invitation) -> None:
     holder = None if mine is None else parse_common_name(mine, fleet.name)
     if holder is None or (holder.name, holder.role) != (invitation.node, Role.NODE):
         raise ConfigError(f"the invitation's certificate names {mine!r}, and its node is {invitation.node}")
+    if not invitation.papers.key:
+        _check_own_key(Path(fleet.security.folder) / KEY, invitation)
     path = Path(fleet.security.folder) / CERTIFICATE
     try:
         theirs = _named(read_regular(path, MAX_FILE_BYTES))
@@ -162,6 +220,32 @@ def _check_papers(fleet: Fleet, invitation: Invitation) -> None:
         raise AdapterError(f"{path}: cannot be read: {error.strerror}; move the folder away") from error
     if theirs != mine:
         raise AdapterError(f"{path} is the certificate of {theirs!r}, and is left as it is; move the folder away")
+
+
+def _check_own_key(path: Path, invitation: Invitation) -> None:
+    """Refuse an invitation without a key where the key that was asked for is not."""
+    from zsched.pki.certificates import is_key_of  # noqa: PLC0415 - imports cryptography
+
+    advice = f"join on the machine that made the request, or make another one: zsched join --request {invitation.node}"
+    papers = invitation.papers
+    assert papers is not None
+    try:
+        is_ours = is_key_of(read_regular(path, MAX_FILE_BYTES), papers.certificate.encode())
+    except FileNotFoundError:
+        raise AdapterError(f"{path} is not there, and the invitation brings no key; {advice}") from None
+    except OSError as error:
+        raise AdapterError(f"{path}: cannot be read: {error.strerror}; run this as root") from error
+    except ValueError as error:
+        raise AdapterError(f"{path}: {error}; {advice}") from error
+    if not is_ours:
+        raise AdapterError(f"{path} is another key than the one that the certificate is for; {advice}")
+
+
+def _check_no_papers(folder: Path) -> None:
+    """Refuse to found a secured fleet over somebody's certificate or key."""
+    for path in (folder / CERTIFICATE, folder / KEY):
+        if path.exists():
+            raise AdapterError(f"{path} exists already, and is left as it is; move the folder {folder} away")
 
 
 def _named(pem: bytes) -> str | None:
@@ -198,6 +282,7 @@ def _write(
     disk: str,
     *,
     papers: Papers | None,
+    listed: tuple[str, ...],
     is_plan: bool,
 ) -> tuple[Written, ...]:
     """Write all of it, the state last."""
@@ -209,13 +294,9 @@ def _write(
     if old is not None:
         kept = places.config.with_name(f"{places.config.name}{BEFORE}")
         written.append(Written(path=kept, what="the fleet file that was there"))
-    folder = None if papers is None or fleet.security is None else Path(fleet.security.folder)
+    folder = None if fleet.security is None else Path(fleet.security.folder)
     if folder is not None:
-        written += [
-            Written(path=folder / CERTIFICATE, what="the certificate"),
-            Written(path=folder / TRUSTED, what="whom it trusts"),
-            Written(path=folder / KEY, what="the private key, for its owner only"),
-        ]
+        written += [Written(path=folder / name, what=_WHAT[name]) for name in listed]
     written.append(Written(path=places.state / FOLDER_NAME, what="the agreed document"))
     written.append(Written(path=places.state / STATE_NAME, what=f"the state of {me}: it has never voted"))
     if is_plan:
@@ -257,12 +338,23 @@ def _other_text(path: Path, text: bytes) -> bytes | None:
 
 
 def _put(path: Path, content: bytes, mode: int) -> None:
-    path.parent.mkdir(mode=0o755, parents=True, exist_ok=True)
+    _make_folder(path.parent)
     replace_synced(path, path.with_name(f"{path.name}.new"), content)
     path.chmod(mode)
 
 
+def _make_folder(path: Path) -> None:
+    """A folder that the service's user may look into, whatever the umask of who calls."""
+    missing = [one for one in (path, *path.parents) if not one.exists()]
+    path.mkdir(parents=True, exist_ok=True)
+    for one in missing:
+        one.chmod(FOLDER_MODE)
+
+
 def _put_papers(folder: Path, papers: Papers) -> None:
-    _put(folder / KEY, papers.key.encode(), PRIVATE_MODE)  # first: a certificate without its key would look complete
-    _put(folder / TRUSTED, papers.trusted.encode(), PUBLIC_MODE)
-    _put(folder / CERTIFICATE, papers.certificate.encode(), PUBLIC_MODE)
+    """Whole, never readable by others in between, and each the property of the folder's owner."""
+    _make_folder(folder)
+    if papers.key:  # first: a certificate without its key would look complete
+        write_whole(folder / KEY, papers.key.encode(), PRIVATE)
+    write_whole(folder / TRUSTED, papers.trusted.encode(), PUBLIC)
+    write_whole(folder / CERTIFICATE, papers.certificate.encode(), PUBLIC)

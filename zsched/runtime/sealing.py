@@ -23,7 +23,7 @@ def seals_of(fleet: Fleet, life: int = 0) -> Seals | None:
         life: this node's incarnation; 0: it is no node.
 
     Raises:
-        ConfigError: a file cannot be used, or the package ``cryptography`` is missing.
+        ConfigError: a file cannot be used.
     """
     security = fleet.security
     if security is None or security.signatures is Signatures.OFF:
@@ -44,13 +44,8 @@ def holders_of(fleet: Fleet, security: Security) -> frozenset[Holder]:
 
 
 def _keys(security: Security) -> Keys:
-    try:
-        from zsched.pki import signatures  # noqa: PLC0415 - the package is an extra
-    except ModuleNotFoundError as error:
-        raise ConfigError(
-            f"the package {error.name} is missing, and the fleet file asks for signatures: pip install 'zsched[pki]' "
-            "on every node, or write `signatures: off` below `security:`"
-        ) from error
+    from zsched.pki import signatures  # noqa: PLC0415 - it takes 8 MiB: only where something is signed
+
     files = files_of(security)
     try:
         return Keys(

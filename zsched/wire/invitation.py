@@ -24,6 +24,7 @@ SCHEMA: Final = "zsched.invite/1"
 MAX_BYTES: Final = 1 << 20
 MAX_PEM: Final = 64 * 1024
 PEMS: Final = ("certificate", "key", "trusted")
+"""The key is missing where it was made on the machine that joins."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,8 +32,9 @@ class Papers:
     """What a node of a secured fleet shows to the others, as PEM."""
 
     certificate: str
-    key: str
     trusted: str
+    key: str = ""
+    """Empty: the machine that joins has made it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,7 +70,7 @@ def encode_invitation(invitation: Invitation) -> str:
         "document": as_plain(invitation.document),
     }
     if invitation.papers is not None:
-        body |= {name: getattr(invitation.papers, name) for name in PEMS}
+        body |= {name: pem for name in PEMS if (pem := getattr(invitation.papers, name))}
     return json.dumps({**body, "digest": _digest(body)}, ensure_ascii=False, indent=2) + "\n"
 
 
@@ -106,8 +108,10 @@ def _papers(body: dict[str, Any]) -> Papers | None:
     given = {name: body[name] for name in PEMS if name in body}
     if not given:
         return None
-    if len(given) < len(PEMS) or not all(isinstance(one, str) and len(one) <= MAX_PEM for one in given.values()):
-        raise WireError("type", f"it lacks one of {', '.join(PEMS)}")
+    if not {"certificate", "trusted"} <= given.keys():
+        raise WireError("type", "it lacks one of certificate, trusted")
+    if not all(isinstance(one, str) and len(one) <= MAX_PEM for one in given.values()):
+        raise WireError("type", f"one of {', '.join(PEMS)} is no certificate or key")
     return Papers(**given)
 
 

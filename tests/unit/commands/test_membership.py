@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import stat
 from collections.abc import Iterator
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,13 @@ from support.schemas import faults
 from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.adapters.host.state_file import StateFile
 from zsched.cli import app
-from zsched.commands import membership
+from zsched.commands import membership, papers
 from zsched.commands.common import CliError
 from zsched.commands.membership import Address, address_of, dial_order, own_address
 from zsched.config.load import check_bytes, load_fleet
 from zsched.core.values.document import Document, Text
 from zsched.core.values.electorate import Elector, FleetValue
+from zsched.runtime.secured import require_own
 from zsched.wire.codec import as_plain, document_hash
 from zsched.wire.invitation import decode_invitation
 
@@ -84,12 +86,19 @@ class Node:
 def node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Node]:
     monkeypatch.setenv("ZSCHED_RUNTIME_DIR", str(tmp_path))
     monkeypatch.setenv("ZSCHED_NODE", "robot1")
-    monkeypatch.setenv("ZSCHED_AUTHORITY", str(tmp_path / "authority"))
     one = Node()
     door = OperatorSocket(tmp_path / "robot1.sock", one.answer)
     door.open()
     yield one
     door.close()
+
+
+@pytest.fixture(autouse=True)
+def authority(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where the authority lies, instead of the user's own folder."""
+    folder = tmp_path / "authority"
+    monkeypatch.setenv("ZSCHED_AUTHORITY", str(folder))
+    return folder
 
 
 def run(*words: object, stdin: str = "") -> Result:
@@ -140,6 +149,7 @@ def test_a_fleet_of_one_is_created_with_this_machines_address(tmp_path: Path) ->
         ("robot1",),
     )
     assert fleet.node("robot1").host == own_address()
+    assert fleet.security is not None, "secured, unless somebody says otherwise"
     assert "next: zsched up --config" in result.stdout
 
 
@@ -159,6 +169,80 @@ def test_create_says_what_it_would_write_and_what_it_wrote(tmp_path: Path) -> No
     again = run(*words)
     assert again.exit_code == 1
     assert "exists already" in again.stderr
+
+
+def test_a_created_fleet_has_an_authority_and_its_first_node_a_certificate(tmp_path: Path, authority: Path) -> None:
+    result = run("fleet", "create", "hall", "--node", "robot1", "--address", "127.0.0.1", *here(tmp_path / "one"))
+    assert result.exit_code == 0, result.stderr
+    assert f"{authority}/ca-1.key: the key of the fleet's authority" in result.stdout
+    assert f"move the folder {authority} to a stick" in result.stdout
+    assert "not locked" in result.stdout
+    fleet = load_fleet(tmp_path / "one" / "fleet.yaml")
+    assert fleet.security is not None
+    require_own(fleet, fleet.security, "robot1")
+    assert fleet.node("robot1").listen_control == "tls/127.0.0.1:7457"
+    local = fleet.node("robot1").local
+    assert local is not None
+    assert local.listen == ("tcp/127.0.0.1:7460",), "applications of its host have no certificate"
+    modes = {one.name: stat.S_IMODE(one.stat().st_mode) for one in (tmp_path / "one" / "pki").iterdir()}
+    assert modes == {"certificate.pem": 0o644, "ca.pem": 0o644, "key.pem": 0o600}
+    again = run("fleet", "create", "hall", "--node", "robot1", "--address", "127.0.0.1", *here(tmp_path / "two"))
+    assert again.exit_code == 1
+    assert "holds an authority, and is left as it is" in again.stderr
+    assert not (tmp_path / "two").exists()
+
+
+def test_a_locked_authority_takes_its_passphrase(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    words = ("fleet", "create", "hall", "--node", "edge1", "--kind", "edge", "--address", "127.0.0.1", *here(tmp_path))
+    result = run(*words, "--passphrase", stdin="secret\nsecret\n")
+    assert result.exit_code == 0, result.stderr
+    assert "not locked" not in result.stdout
+    assert load_fleet(tmp_path / "fleet.yaml").node("edge1").local is None, "an edge has no applications"
+    monkeypatch.setenv("ZSCHED_AUTHORITY_PASSPHRASE", "another")
+    issued = run("pki", "renew", "edge1", "--config", tmp_path / "fleet.yaml")
+    assert "the passphrase is wrong" in issued.stderr
+
+
+def test_a_fleet_that_cannot_be_written_leaves_no_authority(tmp_path: Path, authority: Path) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    words = ("fleet", "create", "hall", "--node", "robot1", "--address", "127.0.0.1")
+    result = run(*words, "--config", blocked / "fleet.yaml", "--state-dir", tmp_path / "state")
+    assert result.exit_code == 1
+    assert not authority.exists()
+    (tmp_path / "pki").mkdir()
+    (tmp_path / "pki" / "key.pem").write_text("somebody's")
+    result = run(*words, *here(tmp_path))
+    assert "key.pem exists already, and is left as it is" in result.stderr
+    assert (tmp_path / "pki" / "key.pem").read_text() == "somebody's"
+    assert not authority.exists()
+
+
+def test_without_certificates_a_fleet_says_so_and_stays_where_strangers_are_not(
+    tmp_path: Path, authority: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("fleet", "create", "hall", "--node", "robot1", "--insecure", *here(tmp_path))
+    for host, said in (
+        ("93.184.216.34", "anybody who reaches 93.184.216.34 reads and changes everything"),
+        ("[2001:4860::1]:7457", "anybody who reaches 2001:4860::1"),
+        ("no.such.name.invalid", "nobody knows whether no.such.name.invalid is a private address"),
+    ):
+        refused = run(*words, "--address", host)
+        assert refused.exit_code == 1
+        assert said in refused.stderr
+        assert "--accept open-network" in refused.stderr
+    monkeypatch.setattr(papers, "addresses_at", lambda _root, _host: iter([ip_address("93.184.216.34")]))
+    elsewhere = run(*words, "--address", "10.0.0.7")
+    assert "anybody who reaches 93.184.216.34 (this machine)" in elsewhere.stderr, "it listens there, too"
+    assert run(*words, "--address", "10.0.0.7", "--accept", "open-net").exit_code == 2
+    assert not (tmp_path / "fleet.yaml").exists()
+    done = run(*words, "--address", "10.0.0.7", "--accept", "open-network")
+    assert done.exit_code == 0, done.stderr
+    assert "NOT SECURED" in done.stdout
+    fleet = load_fleet(tmp_path / "fleet.yaml")
+    assert fleet.security is None
+    assert fleet.node("robot1").listen_data == "tcp/0.0.0.0:7458"
+    assert not authority.exists()
 
 
 def test_create_refuses_what_is_no_name(tmp_path: Path) -> None:
@@ -210,6 +294,8 @@ def test_a_node_without_an_address_dials_the_others(node: Node) -> None:
         (("robot2", "--candidate-for", "marge"), 2, "has no task 'marge'; did you mean merge?"),
         (("robot2", "--candidate-for", "count"), 1, "are a selection that robot2 is not in"),
         (("robot2", "--address", "a b"), 2, "is no address"),
+        (("robot2", "--address", "93.184.216.34"), 1, "--accept open-network"),
+        (("robot2", "--csr", "/none"), 2, "has no certificates"),
         (("robot2", "--address", "127.0.0.1:7460"), 78, "is already"),
         (("robot2", "--revision", "3"), 1, "is overtaken"),
     ],
@@ -289,7 +375,6 @@ def test_what_is_no_invitation_is_refused(tmp_path: Path) -> None:
 
 def secured(tmp_path: Path, node: Node) -> Path:
     """The fleet's text with TLS, and an authority on this machine."""
-    pytest.importorskip("cryptography")
     node.text = TEXT.replace("tcp/", "tls/") + "security: {}\n"
     file = tmp_path / "secured.yaml"
     file.write_text(node.text)
@@ -310,14 +395,64 @@ def test_in_a_secured_fleet_the_certificate_and_its_key_come_along(node: Node, t
     assert "delete the invitation" in done.stdout
     modes = {one.name: stat.S_IMODE(one.stat().st_mode) for one in (folder / "pki").iterdir()}
     assert modes == {"certificate.pem": 0o644, "ca.pem": 0o644, "key.pem": 0o600}
-    from zsched.runtime.secured import require_own
-
     fleet = load_fleet(folder / "fleet.yaml")
     assert fleet.security is not None
     require_own(fleet, fleet.security, "robot2")
     again = run("invite", "robot2")
     assert again.exit_code == 1
     assert "is a node of the fleet" in again.stderr or "has a certificate until" in again.stderr
+
+
+def test_a_key_that_the_machine_made_stays_there(node: Node, tmp_path: Path) -> None:
+    secured(tmp_path, node)
+    folder, csr, file = tmp_path / "robot2", tmp_path / "robot2.csr", tmp_path / "robot2.invite"
+    asked = run("join", "--request", "robot2", "-o", csr, "--json", *here(folder))
+    assert asked.exit_code == 0, asked.stderr
+    assert faults(json.loads(asked.stdout)) == []
+    assert "zsched invite robot2 --csr robot2.csr" in json.loads(asked.stdout)["next"][0]
+    key = (folder / "pki" / "key.pem").read_bytes()
+    assert stat.S_IMODE((folder / "pki" / "key.pem").stat().st_mode) == 0o600
+    assert stat.S_IMODE((folder / "pki").stat().st_mode) == 0o755
+    assert run("join", "--request", "robot2", "-o", csr, *here(folder)).exit_code == 0
+    assert (folder / "pki" / "key.pem").read_bytes() == key, "a second request is for the same key"
+
+    result = run("invite", "robot2", "--address", "192.0.2.12", "--csr", csr, "--yes", "-o", file)
+    assert result.exit_code == 0, result.stderr
+    assert "private key" not in result.stderr
+    given = decode_invitation(file.read_bytes()).papers
+    assert given is not None
+    assert given.key == ""
+    assert "PRIVATE" not in file.read_text()
+
+    elsewhere = run("join", file, *here(tmp_path / "other"))
+    assert elsewhere.exit_code == 1
+    assert "key.pem is not there, and the invitation brings no key" in elsewhere.stderr
+    run("join", "--request", "robot2", "-o", tmp_path / "other.csr", *here(tmp_path / "third"))
+    another = run("join", file, *here(tmp_path / "third"))
+    assert "is another key than the one that the certificate is for" in another.stderr
+    done = run("join", file, *here(folder))
+    assert done.exit_code == 0, done.stderr
+    assert "delete the invitation" not in done.stdout
+    assert (folder / "pki" / "key.pem").read_bytes() == key
+    fleet = load_fleet(folder / "fleet.yaml")
+    assert fleet.security is not None
+    require_own(fleet, fleet.security, "robot2")
+    assert "certificate.pem is there already" in run("join", "--request", "robot2", *here(folder)).stderr
+
+
+def test_a_request_that_cannot_be_answered_changes_nothing(node: Node, tmp_path: Path) -> None:
+    node.text = TEXT.replace("tcp/", "tls/") + "security: {}\n"
+    (tmp_path / "some.csr").write_text("hello")
+    words = ("invite", "robot2", "--yes", "--csr", tmp_path / "some.csr")
+    assert "the authority of fleet hall is not on this machine" in run(*words).stderr
+    secured(tmp_path, node)
+    assert "it is no certificate request in PEM" in run(*words).stderr
+    assert "cannot be read" in run("invite", "robot2", "--yes", "--csr", tmp_path / "none").stderr
+    assert node.changes == []
+    for more in ((), ("file", "--request", "robot2"), ("--request", "robot2", "--plan"), ("file", "-o", "x")):
+        assert run("join", *more, *here(tmp_path / "x")).exit_code == 2
+    assert run("join", "--request", "Robot 2", *here(tmp_path / "x")).exit_code == 2
+    assert not (tmp_path / "x").exists()
 
 
 def test_another_machines_certificate_is_left_as_it_is(node: Node, tmp_path: Path) -> None:
