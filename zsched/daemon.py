@@ -62,6 +62,7 @@ from zsched.runtime.membership import copied_file
 from zsched.runtime.memory import shared_memory_objection
 from zsched.runtime.recipes import Recipes
 from zsched.runtime.reload import Reload
+from zsched.runtime.reopening import Reopening, turns
 from zsched.runtime.sampler import Sampler
 from zsched.runtime.sealing import seals_of
 from zsched.runtime.secured import digest_of, require_own
@@ -72,6 +73,10 @@ from zsched.sessions import config as zenoh_config
 NAME_TAKEN_WAIT_S = 5.0
 CLOSE_WORKERS_S = 0.7
 LOOP_MAX_WAIT_S = 1.0
+LOOK_S = 30.0
+"""How often the certificate's files are looked at."""
+SESSIONS = "sessions"
+"""Of the problem that sessions cannot be opened anew."""
 STDERR = 2
 RESTART_SIGNAL = signal.SIGUSR2
 """As SIGTERM, but the relay stays and carries the streams on for the daemon that follows (`systemctl restart`)."""
@@ -106,6 +111,14 @@ class Daemon:
         self._notify = Notifier()
         self._next_status = 0.0
         self._is_restart = False
+        self._reopening = Reopening(options.node)
+        self._lets_in_others = False
+        """Open sessions go by other access rules than the fleet in force."""
+        self._certificate = ""
+        """Digest of the certificate that open sessions listen with."""
+        self._next_look = 0.0
+        self.begins_anew = False
+        """The process is to become another daemon, in place, once this one has ended."""
         self._has_foreign_state = False
         self._lacks_state_file = False
         self._door = Door(options.runtime_dir, options.node)
@@ -241,6 +254,7 @@ class Daemon:
         self._texts = {side: daemon_tls.session_text(self._fleet, side) for side in Side}
         if self._fleet.security is not None:
             require_own(self._fleet, self._fleet.security, self._spec.name)
+            self._certificate = digest_of(self._fleet.security)
         self._memory_objection = shared_memory_objection(self._fleet, self._spec)
 
     def _data_port(self, stack: contextlib.ExitStack) -> int:
@@ -316,6 +330,7 @@ class Daemon:
             bus=bus,
             access=access,
             sampler=sampler,
+            lets_in_others=self._note_rules,
             post=self._inbox.post,
         )
         adoption.begin()
@@ -387,7 +402,7 @@ class Daemon:
 
     def _handle_signals(self, stack: contextlib.ExitStack) -> None:
         def stop(number: int, _frame: object) -> None:
-            self._is_restart = number == RESTART_SIGNAL
+            self._is_restart, self.begins_anew = number == RESTART_SIGNAL, False
             self._inbox.post(ev.StopRequested())
 
         for number in (signal.SIGTERM, signal.SIGINT, RESTART_SIGNAL):
@@ -419,8 +434,10 @@ class Daemon:
                 raise NameTakenError(f"{node.me}: {shell.stand_down}")
             if isinstance(event, ev.TokenLost):
                 alert_until = now + ALERT_S
-            if isinstance(event, ev.StopRequested) and leaving.ask(node.owned(), now):
+            if isinstance(event, ev.StopRequested) and leaving.ask(node.owned(), now) and not self.begins_anew:
                 self._notify.stopping()
+            if self._fleet.security is not None and leaving.asked_at is None:
+                self._tend_sessions(node, now)
             if leaving.asked_at is not None and leaving.is_over(node.owned(), node.movable(now), now):
                 self._say_goodbye(node, leaving.last_words(node.owned(), now))
                 return
@@ -430,6 +447,51 @@ class Daemon:
             if now >= self._next_status:
                 self._next_status = now + 1.0
                 self._notify.status(status_line(node))
+
+    # --- sessions that are opened anew -------------------------------------------------------------------------------
+
+    def _note_rules(self, lets_in_others: bool) -> None:
+        self._lets_in_others, self._next_look = lets_in_others, 0.0
+
+    def _tend_sessions(self, node: Node, now: float) -> None:
+        """Begin anew when it is this node's turn and what its sessions were opened with holds no more."""
+        electors, alive = node.fleet.electors, node.membership.alive()
+        if now >= self._next_look:
+            self._next_look = now + LOOK_S
+            if self._lets_in_others or self._has_another_certificate(node):
+                self._reopening.want(turns((*alive, node.me), electors), now)
+            else:
+                self._reopening.forget()
+        if not self._reopening.is_due(electors, alive, now):
+            return
+        why_not = self._why_not_anew(node)
+        self._inbox.post(ev.ProblemReported(source=SESSIONS, problem=why_not))
+        if why_not is not None:
+            self._reopening.put_off(now)
+            return
+        log.info("sessions node=%s are opened anew: others are let in, or its certificate is another", node.me)
+        self._is_restart = self.begins_anew = True
+        self._inbox.post(ev.StopRequested())
+
+    def _has_another_certificate(self, node: Node) -> bool:
+        try:
+            return node.fleet.security is not None and digest_of(node.fleet.security) != self._certificate
+        except ConfigError:
+            return False  # it is being replaced, or cannot be used: the one that is used goes on
+
+    def _why_not_anew(self, node: Node) -> str | None:
+        """What would keep a daemon from starting by the fleet in force; ``None``: nothing."""
+        security = node.fleet.security
+        try:
+            require_node(load_fleet(self._options.config), node.me, self._options.config)
+            if security is not None:
+                require_own(node.fleet, security, node.me)
+                seals_of(node.fleet)
+            for side in Side:
+                daemon_tls.session_text(node.fleet, side)
+        except ConfigError as error:
+            return f"its sessions let in others than the fleet says, and cannot be opened anew: {error}"
+        return None
 
     def _say_goodbye(self, node: Node, last_words: str) -> None:
         if last_words:
@@ -489,7 +551,8 @@ def main(arguments: list[str] | None = None) -> int:
         runtime_dir=places.runtime_folder(given.runtime_dir, os.environ),
     )
     try:
-        return Daemon(options).run()
+        daemon = Daemon(options)
+        code = daemon.run()
     except ConfigError as error:
         print(error, file=sys.stderr)
         return EXIT_CONFIG
@@ -501,6 +564,17 @@ def main(arguments: list[str] | None = None) -> int:
     except AdapterError as error:
         print(f"zsched up: {error}", file=sys.stderr)
         return EXIT_FAILED
+    if daemon.begins_anew:
+        _begin_anew()
+    return code
+
+
+def _begin_anew() -> None:
+    """Become the next daemon: the same process, so that nobody who watches it starts a second one."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGTERM, signal.SIGINT))  # it takes what comes while it loads
+    os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])  # noqa: S606 - no shell is wanted
 
 
 def _set_up_logging(level: str) -> None:

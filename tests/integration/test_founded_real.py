@@ -79,12 +79,20 @@ class Hall:
                 process.kill()
                 process.wait()
 
+    def pid(self, node: str) -> int:
+        process = self._daemons[node]
+        assert process.poll() is None
+        return process.pid
+
     def status(self, node: str) -> dict[str, Any]:
         """A daemon's status; empty: it does not answer yet."""
         try:
             return ask(self.folder / node / "run" / f"{node}.sock", {"verb": "status"}, 3.0)
         except AdapterError:
             return {}
+
+    def problems(self, node: str) -> list[str]:
+        return [str(one) for one in self.status(node).get("problems", ())]
 
     def alive(self, node: str) -> set[str]:
         return {str(one["name"]) for one in self.status(node).get("nodes", ()) if one["state"] == "alive"}
@@ -97,7 +105,7 @@ def hall(tmp_path: Path) -> Iterator[Hall]:
     one.stop()
 
 
-def test_two_machines_are_a_secured_fleet_by_four_commands_and_no_key_travels(hall: Hall) -> None:
+def test_two_machines_are_a_secured_fleet_by_four_commands_and_nobody_restarts_a_daemon(hall: Hall) -> None:
     port = block_of_ports(20)
     hall.zsched("robot1", "fleet", "create", "hall", "--address", f"127.0.0.1:{port}")
     hall.start("robot1")
@@ -106,13 +114,14 @@ def test_two_machines_are_a_secured_fleet_by_four_commands_and_no_key_travels(ha
     request = hall.folder / "robot2" / "robot2.csr"
     words = ("--address", f"127.0.0.1:{port + 10}", "--csr", str(request), "--yes")
     (hall.folder / "robot2.invite").write_text(hall.zsched("robot1", "invite", "robot2", *words))
-    hall.stop("robot1")
-    hall.start("robot1")  # its open sessions would let nobody in that is new
+    daemon = hall.pid("robot1")
     hall.zsched("robot2", "join", str(hall.folder / "robot2.invite"))
     hall.start("robot2")
     for node in ("robot1", "robot2"):
         until(lambda node=node: hall.alive(node) == {"robot1", "robot2"}, f"both at {node}")  # type: ignore[misc]
         assert hall.status(node)["security"] == "secured"
+    assert hall.pid("robot1") == daemon, "the same process has begun anew, to let the new node in"
+    assert "sessions node=robot1 are opened anew" in (hall.folder / "robot1" / "log").read_text()
 
     with pytest.raises(zenoh.ZError):
         zenoh.open(zenoh.Config.from_json5(client_config(connect=(f"tcp/127.0.0.1:{port}",), patience_s=0.4)))
@@ -120,5 +129,12 @@ def test_two_machines_are_a_secured_fleet_by_four_commands_and_no_key_travels(ha
     assert local == [f"tcp/127.0.0.1:{port + LOCAL_AFTER}"]
     with zenoh.open(zenoh.Config.from_json5(client_config(connect=tuple(local), patience_s=20.0))) as session:
         until(session.info.links, "an application at the local side")
+    text = hall.zsched("robot1", "fleet", "export")
+    (hall.folder / "revoked.yaml").write_text(text.replace("security: {}", "security: {revoked: [robot2]}"))
+    hall.zsched("robot1", "apply", str(hall.folder / "revoked.yaml"), "--yes")
+    until(lambda: hall.alive("robot1") == {"robot1"}, "the open session of a revoked key to end")
+    until(lambda: any("`security: revoked`" in one for one in hall.problems("robot2")), "robot2 to say why it stays")
+    assert hall.pid("robot1") == daemon
+
     checks = json.loads(hall.zsched("robot1", "pki", "show", "--json"))["certificates"]
     assert [(one["name"], one["state"]) for one in checks] == [("robot1", "valid"), ("robot2", "valid")]

@@ -170,7 +170,7 @@ def renew(where: Where, label: str | None, request: Path | None, out: Path | Non
             _write(folder, issued)
             _say(f"{folder}: {CERTIFICATE}, {TRUSTED} of {one}, until {_day(issued.entry)}")
     if labels:
-        _say("next: put both files beside its key, then restart its daemon: its streams stop for that moment")
+        _say("next: put both files beside its key; within a minute its daemon begins anew with them, in its turn")
     else:
         _say("no certificate is due")
     return EXIT_OK
@@ -211,7 +211,7 @@ def revoke(where: Where, label: str) -> int:
     _say(
         f"{label} is revoked: its key is never certified again",
         f"it is let in until every node goes by a fleet file with `security: {{revoked: [{', '.join(revoked)}]}}`, "
-        "or without the name: change the file everywhere, then restart one daemon after another, electors last",
+        "or without the name: zsched edit (or the file everywhere, and systemctl reload); daemons begin anew in turn",
         f"`zsched pki issue {name}{'' if role is Role.NODE else f' --role {role}'}` makes a new key for the name",
     )
     return EXIT_OK
@@ -229,9 +229,9 @@ def rotate(where: Where, *, is_end: bool) -> int:
             authority.rotate(_passphrase(authority), _now())
             _say(
                 f"authority {authority.record.number} signs from now on; the former one is trusted until the end",
-                f"1. put {authority.folder / TRUSTED} on every machine as {TRUSTED}, restart one daemon after another",
-                "2. `zsched pki renew`: put every new certificate in its place, restart again",
-                f"3. `zsched pki rotate --finish`; put {TRUSTED} on every machine once more, and restart",
+                f"1. put {authority.folder / TRUSTED} on every machine as {TRUSTED}: daemons begin anew in turn",
+                "2. `zsched pki renew`: put every new certificate in its place, and wait likewise",
+                f"3. `zsched pki rotate --finish`; put {TRUSTED} on every machine once more",
             )
             return EXIT_OK
         left = authority.finish()
@@ -242,7 +242,7 @@ def rotate(where: Where, *, is_end: bool) -> int:
             )
         _say(
             "the former authority is not trusted any more, and its key is deleted",
-            f"next: put {authority.folder / TRUSTED} on every machine as {TRUSTED}, restart one daemon after another",
+            f"next: put {authority.folder / TRUSTED} on every machine as {TRUSTED}: daemons begin anew in turn",
         )
     return EXIT_OK
 

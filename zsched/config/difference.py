@@ -21,10 +21,20 @@ from zsched.config.reader import Scalar, read_yaml
 from zsched.config.rows import rows
 from zsched.core.route.route import outputs_of
 from zsched.core.route.templates import named_rules
-from zsched.core.values.fleet import Fleet, NodeSpec, StreamRule, TaskSpec, WorkerSpec, dial_endpoint, runs_worker
+from zsched.core.values.fleet import (
+    Fleet,
+    NodeSpec,
+    Security,
+    StreamRule,
+    TaskSpec,
+    WorkerSpec,
+    dial_endpoint,
+    runs_worker,
+)
 from zsched.core.values.model import NodeId, NodeKind, TaskId, Weights
 
 EVERY_DAEMON: Final = "every daemon must be restarted"
+OPENED_ANEW: Final = "daemons begin anew, one after another: a robot's streams stop for that moment"
 
 
 class Effect(StrEnum):
@@ -271,18 +281,27 @@ def _access(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
         None if one is None else replace(one, folder=one.folder.rpartition("/")[2])
         for one in (old.security, new.security)
     )
-    if before != after:
-        yield _restart(EVERY_DAEMON, "security", _plain(before), _plain(after))
+    anew = _Verdict(effect=Effect.STREAMS, text=OPENED_ANEW)
     if before is None or after is None:
+        if before is not after:
+            yield _restart(EVERY_DAEMON, "security", _plain(before), _plain(after))
         return
+    if _nameless(before) != _nameless(after):
+        yield _restart(EVERY_DAEMON, "security", _plain(before), _plain(after))
+    elif before != after:
+        yield _set(anew, "security", _plain(before), _plain(after))
     names, tasks = ({node.name for node in old.nodes}, {task.name: (task.rules, task.candidates) for task in old.tasks})
-    rested = _Verdict(effect=Effect.RESTART, text=f"{EVERY_DAEMON}, for the access rules")
     for node in new.nodes:
         if node.name not in names:
-            yield replace(rested, paths=(f"nodes.{node.name}",))
+            yield replace(anew, paths=(f"nodes.{node.name}",))
     for task in new.tasks:
         if tasks.get(task.name) != (task.rules, task.candidates):
-            yield replace(rested, paths=(f"tasks.{task.name}",))
+            yield replace(anew, paths=(f"tasks.{task.name}",))
+
+
+def _nameless(security: Security) -> Security:
+    """The section without whom it lets in."""
+    return replace(security, operators=(), guests=(), revoked=())
 
 
 def _addresses(fleet: Fleet) -> dict[NodeId, str]:

@@ -8,8 +8,9 @@ session dials, where it listens, its lease. Does not know: what the daemon does 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
-from zsched.core.values.fleet import Fleet, NodeSpec
+from zsched.core.values.fleet import Fleet, NodeSpec, Security
 from zsched.core.values.model import NodeId
 from zsched.runtime.access_rules import Side, access_control
 from zsched.runtime.endpoints import Endpoints, endpoints_for
@@ -17,7 +18,6 @@ from zsched.sessions.config import pool_threads
 
 _FIELDS = (
     ("zenoh_config", "`zenoh: {config}`"),
-    ("security", "`security`"),
     ("shared_memory", "`shared_memory`"),
     ("relay_orphan_s", "`relay_orphan_s`"),
 )
@@ -33,7 +33,23 @@ def restarts(old: Fleet, new: Fleet, me: NodeId, *, is_agreed: bool = False) -> 
         me: the node.
         is_agreed: electors and leases of ``new`` are those in force.
     """
-    return (*(() if is_agreed else _agreed(old, new)), *_made(old, new, me), *_rules(old, new), *_links(old, new, me))
+    return (*(() if is_agreed else _agreed(old, new)), *_made(old, new, me), *_links(old, new, me))
+
+
+def opens_anew(old: Fleet, new: Fleet) -> bool:
+    """Whether sessions that are open by ``old`` let in others, or elsewhere, than ``new`` says; both are secured.
+
+    Such a daemon begins anew by itself (`zsched.runtime.reopening`).
+    """
+    before, after = old.security, new.security
+    if before is None or after is None or _nameless(before) != _nameless(after):
+        return False
+    return any(access_control(old, before, side) != access_control(new, after, side) for side in Side)
+
+
+def _nameless(security: Security | None) -> Security | None:
+    """The section without whom it lets in."""
+    return None if security is None else replace(security, operators=(), guests=(), revoked=())
 
 
 def _agreed(old: Fleet, new: Fleet) -> Iterator[str]:
@@ -51,6 +67,8 @@ def _agreed(old: Fleet, new: Fleet) -> Iterator[str]:
 
 def _made(old: Fleet, new: Fleet, me: NodeId) -> Iterator[str]:
     changed = [text for name, text in _FIELDS if getattr(new, name) != getattr(old, name)]
+    if _nameless(new.security) != _nameless(old.security):
+        changed.append("`security`")
     before, after = old.node(me), new.node(me)
     changed += [f"{me}: {text}" for name, text in _OWN if getattr(after, name) != getattr(before, name)]
     if new.timing.zenoh_lease_s != old.timing.zenoh_lease_s:
@@ -60,15 +78,6 @@ def _made(old: Fleet, new: Fleet, me: NodeId) -> Iterator[str]:
     threads = pool_threads(len(new.nodes), len(new.tasks))
     if threads > pool_threads(len(old.nodes), len(old.tasks)):
         yield f"so many links need {threads} threads in zenoh's pools, which are made at the start"
-
-
-def _rules(old: Fleet, new: Fleet) -> Iterator[str]:
-    """Whom the open sessions of a secured fleet would have to let in, and do not."""
-    security = new.security
-    if security is None or security != old.security:
-        return
-    if any(access_control(old, security, side) != access_control(new, security, side) for side in Side):
-        yield "the access rules are for other nodes or streams: open sessions keep those that they were opened with"
 
 
 def _links(old: Fleet, new: Fleet, me: NodeId) -> Iterator[str]:

@@ -237,22 +237,24 @@ def test_no_field_of_a_fleet_changes_unnoticed() -> None:
         assert is_told or not waits, "what a daemon cannot take over while it runs is told as that"
 
 
-def test_what_a_secured_fleet_lets_in_follows_from_its_daemons_next_start() -> None:
+def test_what_a_secured_fleet_lets_in_follows_when_its_daemons_begin_anew() -> None:
     plain = TEXT.replace("tcp/", "tls/")
     secured = f"{plain}\nsecurity: {{}}\n"
-    anew = "every daemon must be restarted"
-    assert told(secured, plain)[0][3] == anew
+    anew = "daemons begin anew, one after another: a robot's streams stop for that moment"
+    assert told(secured, plain)[0][3] == "every daemon must be restarted"
+    folder = secured.replace("{}", "{folder: /etc/other}")
+    assert told(folder, secured)[0][3] == "every daemon must be restarted"
     assert told(f"{plain}\nsecurity: {{revoked: [robot1]}}\n", secured) == [
         ("security.revoked", None, "[robot1]", anew)
     ]
     node = with_(
         "  robot1: {kind: robot, wifi: wlan0}", "  robot1: {kind: robot, wifi: wlan0}\n  robot9: {kind: robot}", secured
     )
-    assert any(f"{anew}, for the access rules" in one[3] for one in told(node, secured) if one[0] == "nodes.robot9")
+    assert any(anew in one[3] for one in told(node, secured) if one[0] == "nodes.robot9")
     without = node.replace("\nsecurity: {}\n", "\n")
-    assert not any("access rules" in one[3] for one in told(without, plain))
+    assert not any("begin anew" in one[3] for one in told(without, plain))
     task = secured.replace("tasks:\n", f"tasks:\n{EXCLUSIVE}", 1)
-    assert any("access rules" in one[3] for one in told(task, secured) if one[0] == "tasks.pick")
+    assert any("begin anew" in one[3] for one in told(task, secured) if one[0] == "tasks.pick")
 
 
 # --- who dials whom --------------------------------------------------------------------------------------------------

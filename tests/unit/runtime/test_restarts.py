@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 
 from support.fleets import fleet_of, task_of
-from zsched.core.values.fleet import Fleet, NodeSpec, SharedMemory
+from zsched.core.values.fleet import Fleet, NodeSpec, Security, SharedMemory
 from zsched.core.values.model import NodeKind
-from zsched.runtime.restarts import restarts
+from zsched.runtime.restarts import opens_anew, restarts
 
 
 def addressed(name: str, kind: NodeKind = NodeKind.EDGE, host: str = "") -> NodeSpec:
@@ -70,6 +70,23 @@ def test_a_node_that_comes_dials_those_that_are_named_as_seeds() -> None:
     come = with_node(addressed("edge0"), seeds=("edge1", "edge2", "robot1", "robot2"))
     assert [one for one in restarts(OLD, come, "robot1") if "dialled" in one] == []
     assert [one for one in restarts(OLD, come, "edge1") if "dialled" in one] == []
+
+
+def test_who_is_let_in_by_other_names_begins_anew_by_itself() -> None:
+    secured = replace(OLD, security=Security(folder="pki"))
+    assert not opens_anew(secured, secured)
+    come = replace(with_node(addressed("robot9", NodeKind.ROBOT)), security=secured.security)
+    for new in (
+        come,
+        replace(secured, security=Security(folder="pki", revoked=("robot2",))),
+        replace(secured, security=Security(folder="pki", operators=("ana",))),
+    ):
+        assert opens_anew(secured, new)
+        assert [one for one in restarts(secured, new, "robot1") if "security" in one] == []
+    for other in (OLD, replace(OLD, security=Security(folder="other"))):
+        assert not opens_anew(secured, other), "who is secured otherwise does not meet the others"
+        assert any("`security`" in one for one in restarts(secured, other, "robot1"))
+    assert not opens_anew(OLD, with_node(addressed("robot9", NodeKind.ROBOT))), "nobody is kept out"
 
 
 def test_agreed_electors_need_no_generation() -> None:
