@@ -12,8 +12,8 @@ from support.fleets import tuning_of
 from support.proposals import vector_of
 from zsched.core.scheduler.scoring import Standing, compare, pick
 from zsched.core.scheduler.utility import cpu_utility, memory_utility, network_utility, predicted_use, total_utility
-from zsched.core.values.fleet import LinkLimits, Reach, TaskSpec
-from zsched.core.values.model import Aggregate, Tuning, Weights
+from zsched.core.values.fleet import LinkLimits, TaskSpec
+from zsched.core.values.model import Aggregate, Reach, Tuning, Weights
 
 ALL = frozenset({"cpu", "memory", "network"})
 LIMITS = LinkLimits()

@@ -10,8 +10,8 @@ from support.proposals import proposal_of
 from support.robots import Decider
 from zsched.core import events as ev
 from zsched.core.gateway.gateway import Gateway
-from zsched.core.values.fleet import Reach, TaskSpec, WorkerSpec
-from zsched.core.values.model import PeerState, Proposal
+from zsched.core.values.fleet import TaskSpec, WorkerSpec
+from zsched.core.values.model import PeerState, Proposal, Reach
 from zsched.core.vote.tally import VoteOutcome, tally
 from zsched_lab.sim.simulator import Simulator
 from zsched_lab.sim.swarm import plan

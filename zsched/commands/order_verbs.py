@@ -152,7 +152,7 @@ def tune(
         list[str] | None,
         typer.Argument(
             metavar="[KEY=VALUE]...",
-            help="cpu, memory, network (weights), bonus, cool_down_s, deadline_ms, aggregate, score; null: the file's.",
+            help="Weights (cpu, memory, network) and all of scheduling and link, as bonus=0.2; null: the file's.",
         ),
     ] = None,
     reason: ReasonOption = "",

@@ -13,7 +13,8 @@ import socket
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from enum import StrEnum
 from typing import Any, Final
 
 from zsched.clock import monotonic_s
@@ -23,7 +24,18 @@ from zsched.commands.page import harmless, span
 from zsched.commands.report import FLAGS, millis, told_flag, told_hold
 from zsched.commands.wait import Condition, missing
 from zsched.commands.weights import NAMES, shares
-from zsched.core.values.model import MAX_ASKED, MAX_ASKER, MAX_FOR_S, Aggregate, ScoreForm, Tuning, Weights
+from zsched.core.values.fleet import TUNED_LINKS, TUNED_RULES
+from zsched.core.values.model import (
+    MAX_ASKED,
+    MAX_ASKER,
+    MAX_FOR_S,
+    Aggregate,
+    PairReading,
+    Reach,
+    ScoreForm,
+    Tuning,
+    Weights,
+)
 from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE, EXIT_WOULD_CHANGE
 
 MOVE_SCHEMA: Final = "zsched.move/1"
@@ -351,9 +363,17 @@ def _tell_move(
 # --- tune ------------------------------------------------------------------------------------------------------------
 
 _NUMBERS: Final = ("bonus", "cool_down_s", "deadline_ms")
-_WORDS: Final[Mapping[str, type[Aggregate | ScoreForm]]] = {"aggregate": Aggregate, "score": ScoreForm}
+_WORDS: Final[Mapping[str, type[StrEnum]]] = {
+    "aggregate": Aggregate,
+    "score": ScoreForm,
+    "reach": Reach,
+    "pair": PairReading,
+}
+_WHOLE: Final = ("max_moves_per_minute",)
 WEIGHTS: Final = NAMES
-KEYS: Final = (*WEIGHTS, *_NUMBERS, *_WORDS)
+OF_THE_FILE: Final = (*TUNED_RULES, *TUNED_LINKS)
+"""Settings that follow the fleet file, unless an operator has set another value."""
+KEYS: Final = (*WEIGHTS, *_NUMBERS, "aggregate", "score", *OF_THE_FILE)
 
 
 def tuned(before: Json, file: Json, pairs: Sequence[str]) -> dict[str, Any]:
@@ -380,7 +400,7 @@ def tuned(before: Json, file: Json, pairs: Sequence[str]) -> dict[str, Any]:
             raise CliError(EXIT_USAGE, f"{pair!r}: {key} is given twice; give it once")
         seen.add(key)
         place, source = (after["weights"], by_file) if key in WEIGHTS else (after, file)
-        default = source.get(key, 0.0) if key in WEIGHTS else source[key]
+        default = source.get(key, 0.0) if key in WEIGHTS else source.get(key)
         place[key] = default if text == "null" else _setting(pair, key, text)
     after["weights"] = shares(after["weights"])
     return after
@@ -388,9 +408,10 @@ def tuned(before: Json, file: Json, pairs: Sequence[str]) -> dict[str, Any]:
 
 def _setting(pair: str, key: str, text: str) -> Any:
     try:
-        return str(_WORDS[key](text)) if key in _WORDS else float(text)
+        return str(_WORDS[key](text)) if key in _WORDS else int(text) if key in _WHOLE else float(text)
     except ValueError:
-        kind = f"one of {', '.join(list(_WORDS[key]))}" if key in _WORDS else "a number"
+        number = "a whole number" if key in _WHOLE else "a number"
+        kind = f"one of {', '.join(list(_WORDS[key]))}" if key in _WORDS else number
         raise CliError(EXIT_USAGE, f"{pair!r}: {text!r} is not {kind}") from None
 
 
@@ -409,10 +430,10 @@ def tune(view: OrderView, name: str | None, pairs: Sequence[str]) -> int:
         return _list_tunings(view, [known[name]] if name is not None else list(known.values()))
     task = known[name]
     after = tuned(task["tuning"], _file_tuning(task), pairs)
-    tuning = _checked(after)
+    tuning = _checked(after, _file_tuning(task))
     flat_before, flat_after = _flat(task["tuning"]), _flat(after)
     rows = [
-        (name, key, _figure(flat_before.get(key, 0.0)), _figure(flat_after.get(key, 0.0)))
+        (name, key, _figure(key, flat_before.get(key, 0.0)), _figure(key, flat_after.get(key, 0.0)))
         for key in KEYS
         if flat_before.get(key, 0.0) != flat_after.get(key, 0.0)
     ]
@@ -430,8 +451,8 @@ def tune(view: OrderView, name: str | None, pairs: Sequence[str]) -> int:
     return _tell_results({name: result})
 
 
-def _checked(after: Json) -> Json:
-    """The tuning as a request carries it.
+def _checked(after: Json, file: Json) -> Json:
+    """The tuning as a request carries it: a setting that is the file's is left to the file.
 
     Raises:
         CliError: a figure is out of range, or the weights' sum is not 1.
@@ -447,13 +468,21 @@ def _checked(after: Json) -> Json:
             aggregate=Aggregate(after["aggregate"]),
             score=ScoreForm(after["score"]),
             deadline_ms=deadline_ms,
+            **_own(after),
         )
     except ValueError as error:
         raise CliError(EXIT_USAGE, f"{error}; nothing was changed") from None
     if tuning.deadline_ms is not None and tuning.score is ScoreForm.PAPER:
         raise CliError(EXIT_USAGE, "the paper's score knows no deadlines: score=service, or deadline_ms=null")
-    body: Json = as_plain(tuning)
+    kept: dict[str, Any] = {key: None for key in OF_THE_FILE if after.get(key) == file.get(key)}
+    body: Json = as_plain(replace(tuning, **kept))
     return body
+
+
+def _own(after: Json) -> Json:
+    """The settings of the file that this tuning has; those in words as their enumerations."""
+    given = {key: after.get(key) for key in OF_THE_FILE}
+    return {key: _WORDS[key](value) if key in _WORDS and value is not None else value for key, value in given.items()}
 
 
 def _file_tuning(task: Json) -> Json:
@@ -467,8 +496,10 @@ def _flat(tuning: Json) -> Json:
     return {**shares(tuning["weights"]), **{key: tuning.get(key) for key in KEYS if key not in WEIGHTS}}
 
 
-def _figure(value: Any) -> str:
-    return "none" if value is None else f"{value:g}" if isinstance(value, float | int) else str(value)
+def _figure(key: str, value: Any) -> str:
+    if value is None:
+        return {"patience": "learnt"}.get(key, "none")
+    return f"{value:g}" if isinstance(value, float | int) else str(value)
 
 
 def _list_tunings(view: OrderView, tasks: Sequence[Json]) -> int:
@@ -487,7 +518,7 @@ def _list_tunings(view: OrderView, tasks: Sequence[Json]) -> int:
     for task in tasks:
         now, file = _flat(task["tuning"]), _flat(_file_tuning(task))
         words = [
-            f"{key}={_figure(now.get(key, 0.0))}{_differs(now.get(key, 0.0), file.get(key, 0.0))}"
+            f"{key}={_figure(key, now.get(key, 0.0))}{_differs(key, now.get(key, 0.0), file.get(key, 0.0))}"
             for key in KEYS
             if key in now or key in file
         ]
@@ -495,8 +526,8 @@ def _list_tunings(view: OrderView, tasks: Sequence[Json]) -> int:
     return EXIT_OK
 
 
-def _differs(now: Any, file: Any) -> str:
-    return "" if now == file else f" (file: {_figure(file)})"
+def _differs(key: str, now: Any, file: Any) -> str:
+    return "" if now == file else f" (file: {_figure(key, file)})"
 
 
 # --- maint -----------------------------------------------------------------------------------------------------------

@@ -12,9 +12,9 @@ from zsched.core.scheduler.damping import ESCAPES_PER_MINUTE
 from zsched.core.scheduler.links import FORESEE_MOST_DB
 from zsched.core.scheduler.patience import CHOICES, FIRST_PATIENCE, spend
 from zsched.core.scheduler.utility import NEARLY_FULL
-from zsched.core.values.fleet import PairReading, TaskSpec, Timing
+from zsched.core.values.fleet import TaskSpec, Timing
 from zsched.core.values.gauges import BY_NAME
-from zsched.core.values.model import ScoreForm
+from zsched.core.values.model import PairReading, ScoreForm
 
 LEADS = (0.5, 0.1)
 """The leads of which it is told how soon they are followed: a machine that is worth half, and a slight one."""

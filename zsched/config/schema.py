@@ -43,7 +43,6 @@ from zsched.core.values.fleet import (
     LinkLimits,
     LinkSpec,
     LocalSide,
-    PairReading,
     Signatures,
     TaskSpec,
     Timing,
@@ -52,12 +51,14 @@ from zsched.core.values.fleet import (
 from zsched.core.values.gauges import GAUGES, Gauge
 from zsched.core.values.model import (
     MAX_DEADLINE_MS,
+    MAX_PATIENCE,
     MIN_DEADLINE_MS,
     RSSI_MAX_DBM,
     RSSI_MIN_DBM,
     Aggregate,
     NodeKind,
     Objective,
+    PairReading,
     ScoreForm,
 )
 from zsched.core.values.plan import ServiceSettings, StreamSettings
@@ -254,7 +255,7 @@ SCHEDULING: Final = Record(
         ),
         **keys(TaskSpec, "reach", "memory_floor_ratio", "max_moves_per_minute"),
         "patience": Field(
-            Number(0, 1000),
+            Number(0, MAX_PATIENCE),
             "What staying may cost before the task moves. Staying costs the best candidate's lead in utility, times "
             "the seconds that it lasts: 0.3 is a lead of 0.1 for 3 s. `0`: the first lead that is seen is followed.",
             default=f"learnt, {CHOICES[0]:g} to {CHOICES[-1]:g}; `{RADIO_PATIENCE:g}` with a weight for the network; "

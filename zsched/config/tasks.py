@@ -32,6 +32,7 @@ from zsched.core.values.fleet import (
     DEFAULT_SCORE,
     PAPER_PATIENCE,
     RADIO_PATIENCE,
+    TUNED_RULES,
     Demand,
     LinkLimits,
     OnIsolation,
@@ -154,7 +155,7 @@ def _tuning(given: Section, out: Collector) -> Tuning | None:
     if scheduling is None:
         return Tuning(weights=weights, score=score, **default)
     more = {"score": score, **default, **_of(scheduling, *default), **deadline}
-    return scheduling.build(Tuning, out, weights=weights, **more)
+    return scheduling.build(Tuning, out, weights=weights, **more, **dict.fromkeys(TUNED_RULES))
 
 
 def _deadline(scheduling: Section, score: ScoreForm, weights: Weights, out: Collector) -> dict[str, float | None]:

@@ -308,7 +308,7 @@ def _task_status(node: Stages, spec: TaskSpec, now: float) -> TaskStatus:
         since_s=None if value.owner is None else now - standing.settled_at,
         owner_state=owner_state,
         phase=executor.phase.value,
-        tuning=value.tuning,
+        tuning=spec.in_force(value.tuning),
         candidates=spec.candidates,
         patience=standing.judge.patience,
         round_trips=_round_trips(node, spec) if value.tuning.deadline_ms is not None else (),
@@ -317,7 +317,7 @@ def _task_status(node: Stages, spec: TaskSpec, now: float) -> TaskStatus:
         problems=tuple(_task_problems(node, spec, value, now)),
         pause=_hold(node, value, "pause", now),
         pin=_hold(node, value, "pin", now),
-        file_tuning=spec.tuning,
+        file_tuning=spec.in_force(spec.tuning),
         switched_s=executor.switched_s,
         gap_s=_move_gap(node, executor),
         streams=tuple(

@@ -14,7 +14,8 @@ from typing import Final
 
 import numpy as np
 
-from zsched.core.values.fleet import RADIO_PATIENCE, LinkLimits, PairReading
+from zsched.core.values.fleet import RADIO_PATIENCE, LinkLimits
+from zsched.core.values.model import PairReading
 from zsched_lab.decisions import entries
 from zsched_lab.decisions.radio import Drive, read_drive
 from zsched_lab.decisions.replay import Entry, replay

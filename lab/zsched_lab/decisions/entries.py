@@ -14,15 +14,8 @@ from dataclasses import replace
 from random import Random
 from typing import Any, Final
 
-from zsched.core.values.fleet import (
-    DEFAULT_BONUS,
-    DEFAULT_COOL_DOWN_S,
-    DEFAULT_FORESEE_S,
-    PAPER_PATIENCE,
-    LinkLimits,
-    PairReading,
-)
-from zsched.core.values.model import Tuning, Weights
+from zsched.core.values.fleet import DEFAULT_BONUS, DEFAULT_COOL_DOWN_S, DEFAULT_FORESEE_S, PAPER_PATIENCE, LinkLimits
+from zsched.core.values.model import PairReading, Tuning, Weights
 from zsched_lab.decisions.replay import Entry
 from zsched_lab.decisions.rules import (
     BlindRule,

@@ -19,8 +19,7 @@ from zsched.commands.explain import SCHEMA, ExplainView, explain
 from zsched.core.instructions import RecordStory
 from zsched.core.scheduler.decision import decide_again, verdict_of
 from zsched.core.values.decision import Decision, Explanation, Figures, Move, Need, Rules
-from zsched.core.values.fleet import Reach
-from zsched.core.values.model import Allocation, PeerState, Tuning, Utility, UtilityVector, Weights
+from zsched.core.values.model import Allocation, PeerState, Reach, Tuning, Utility, UtilityVector, Weights
 from zsched.core.values.snapshot import VoteStatus
 from zsched.exits import EXIT_FAILED, EXIT_UNREACHABLE, EXIT_USAGE, EXIT_WOULD_CHANGE
 from zsched.wire.codec import as_plain

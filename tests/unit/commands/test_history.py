@@ -20,8 +20,7 @@ from zsched.commands.history import EventsView, duration_s, events, history, sub
 from zsched.core.instructions import RecordStory
 from zsched.core.scheduler.decision import decide_again, verdict_of
 from zsched.core.values.decision import Decision, Figures, Move, Rules
-from zsched.core.values.fleet import Reach
-from zsched.core.values.model import Allocation, PeerState, Tuning, Utility, UtilityVector, Weights
+from zsched.core.values.model import Allocation, PeerState, Reach, Tuning, Utility, UtilityVector, Weights
 from zsched.exits import EXIT_UNREACHABLE, EXIT_USAGE
 
 NOW = 1_790_000_000.0

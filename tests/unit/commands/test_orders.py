@@ -197,6 +197,41 @@ def test_a_tuning_is_shown_changed_and_set_back_to_the_file(daemon: Daemon) -> N
     assert (faults(body), body["tasks"][0]["tuning"]["bonus"]) == ([], 0.1)
 
 
+OWN: Json = {
+    **TUNING,
+    "patience": None,
+    "max_moves_per_minute": 6,
+    "memory_floor_ratio": 0.05,
+    "reach": "majority",
+    "nu_dbm": -80.0,
+    "rho_dbm": -40.0,
+    "pair": "candidate",
+    "foresee_s": 3.0,
+}
+
+
+def test_settings_of_the_file_are_tuned_and_left_to_the_file_again(daemon: Daemon) -> None:
+    daemon.status["tasks"][0] |= {"tuning": OWN, "file_tuning": OWN}
+    result = run("tune", "echo", "patience=0.5", "max_moves_per_minute=2", "reach=all", "nu_dbm=-70", "--yes")
+    assert result.exit_code == 0, result.stderr
+    assert ["echo", "patience", "learnt", "0.5"] in [line.split() for line in result.stdout.splitlines()]
+    told = daemon.orders[0]["tuning"]
+    assert {key: told[key] for key in ("patience", "max_moves_per_minute", "reach", "nu_dbm")} == {
+        "patience": 0.5,
+        "max_moves_per_minute": 2,
+        "reach": "all",
+        "nu_dbm": -70.0,
+    }
+    assert not {"rho_dbm", "pair", "foresee_s", "memory_floor_ratio"} & set(told), "they follow the file"
+    daemon.status["tasks"][0]["tuning"] = {**OWN, "patience": 0.5, "reach": "all"}
+    assert "patience=0.5 (file: learnt)" in run("tune", "echo").stdout
+    assert "reach=all (file: majority)" in run("tune", "echo").stdout
+    plan = json.loads(run("tune", "echo", "patience=null", "reach=majority", "--plan", "--json").stdout)
+    assert (faults(plan), plan["tasks"][0]["tuning"]["patience"]) == ([], None)
+    assert run("tune", "echo", "patience=null", "reach=majority", "--yes", "--revision", "7").exit_code == 0
+    assert not {"patience", "reach"} & set(daemon.orders[-1]["tuning"])
+
+
 @pytest.mark.parametrize(
     ("pair", "says"),
     [
@@ -207,6 +242,10 @@ def test_a_tuning_is_shown_changed_and_set_back_to_the_file(daemon: Daemon) -> N
         ("score=best", "one of paper, service"),
         ("cpu=0.9", "the sum is 1.4, not 1"),
         ("deadline_ms=0", "deadline_ms: 0.0"),
+        ("patience=-1", "patience: -1.0 is not in [0, 1000]"),
+        ("max_moves_per_minute=1.5", "not a whole number"),
+        ("reach=some", "one of majority, all"),
+        ("paitence=1", "did you mean patience?"),
     ],
 )
 def test_a_setting_that_cannot_be_is_refused_before_anybody_is_asked(daemon: Daemon, pair: str, says: str) -> None:
@@ -217,7 +256,7 @@ def test_a_setting_that_cannot_be_is_refused_before_anybody_is_asked(daemon: Dae
 
 def test_every_setting_can_be_set_back() -> None:
     other = {**TUNING, "weights": {"cpu": 1.0, "memory": 0.0, "network": 0.0}, "bonus": 0.9, "score": "paper"}
-    assert tuned(other, TUNING, [f"{key}=null" for key in KEYS]) == TUNING
+    assert tuned(other, OWN, [f"{key}=null" for key in KEYS]) == OWN
     with pytest.raises(CliError, match="given twice"):
         tuned(other, TUNING, ["bonus=1", "bonus=0"])
 

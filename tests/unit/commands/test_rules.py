@@ -9,8 +9,8 @@ import pytest
 from support.fleets import task_of, tuning_of
 from zsched.commands.rules import LONGEST_S, left_after_s, told
 from zsched.config.schema import LINK_LIMITS, SCHEDULING
-from zsched.core.values.fleet import LinkLimits, PairReading, TaskSpec, Timing
-from zsched.core.values.model import ScoreForm
+from zsched.core.values.fleet import LinkLimits, TaskSpec, Timing
+from zsched.core.values.model import PairReading, ScoreForm
 
 TIMING = Timing()
 RADIO = tuning_of(cpu=0.5, memory=0.2, network=0.3, score=ScoreForm.SERVICE, bonus=0.05)

@@ -19,8 +19,6 @@ from zsched.core.values.fleet import (
     Fleet,
     LinkSpec,
     OnIsolation,
-    PairReading,
-    Reach,
     Standby,
     Timing,
     WorkerLink,
@@ -28,7 +26,7 @@ from zsched.core.values.fleet import (
     electorate_hash,
     fleet_hash,
 )
-from zsched.core.values.model import Aggregate, LinkSource, NodeKind, Objective, ScoreForm
+from zsched.core.values.model import Aggregate, LinkSource, NodeKind, Objective, PairReading, Reach, ScoreForm
 from zsched.core.values.plan import Direction, HandoverRule, ReadyWhen, StreamClass
 from zsched.errors import ConfigError
 

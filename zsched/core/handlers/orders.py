@@ -18,7 +18,7 @@ from zsched.core.scheduler.scoring import score
 from zsched.core.stages import Handler, Stages
 from zsched.core.todo import ToDo
 from zsched.core.values.change import Change, MoveOwner, Retune, SetHold
-from zsched.core.values.messages import CommandOutcome, CommandResult, Hold, HoldTask, MoveTask
+from zsched.core.values.messages import CommandOutcome, CommandResult, Hold, HoldTask, MoveTask, TuneTask
 from zsched.core.values.model import Allocation, NodeId, Pause, PeerState, Pin, TaskId, told_by
 
 Refusal = tuple[CommandOutcome, str]
@@ -76,7 +76,7 @@ def _unfit(node: Stages, value: Allocation, target: NodeId, now: float) -> str:
     state = node.membership.state(target)
     if target != node.me and state is not PeerState.ALIVE:
         return f"it is {state}" if state is not PeerState.UNKNOWN else "it was never heard"
-    spec = node.fleet.task(value.task)
+    spec = node.fleet.task(value.task).under(value.tuning)
     vector = score(spec, value, node.me, node.gateway, node.membership.states(), now)
     refused = dict(vector.refused)
     if target in refused:
@@ -131,8 +131,8 @@ def _on_tune(node: Stages, event: ev.TuneCommanded, todo: ToDo, now: float) -> N
     """Change a task's tuning."""
     command = event.command
     refusal = _refused(node, command.task, command.base_revision)
-    if refusal is None and command.tuning == node.registers[command.task].value.tuning:
-        refusal = CommandOutcome.UNCHANGED, _SO_ALREADY
+    if refusal is None:
+        refusal = _tuning_refused(node, command)
     if refusal is not None:
         _answer(node, event.request, command.task, *refusal, todo)
         return
@@ -140,6 +140,18 @@ def _on_tune(node: Stages, event: ev.TuneCommanded, todo: ToDo, now: float) -> N
         base_revision=command.base_revision, tuning=command.tuning, asked=command.asked, request=event.request
     )
     node.agreement.propose(command.task, change, todo, now)
+
+
+def _tuning_refused(node: Stages, command: TuneTask) -> Refusal | None:
+    """Why a tuning is not taken: it is in force, or its signals do not fit the file's."""
+    if command.tuning == node.registers[command.task].value.tuning:
+        return CommandOutcome.UNCHANGED, _SO_ALREADY
+    spec = node.fleet.task(command.task)
+    nu, rho = command.tuning.nu_dbm, command.tuning.rho_dbm
+    low, high = spec.limits.nu_dbm if nu is None else nu, spec.limits.rho_dbm if rho is None else rho
+    if low >= high:
+        return CommandOutcome.INVALID, f"nu_dbm ({low:g}) must be below rho_dbm ({high:g})"
+    return None
 
 
 def _refused(node: Stages, task: TaskId, base_revision: int | None) -> Refusal | None:

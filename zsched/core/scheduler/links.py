@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.utility import network_utility
-from zsched.core.values.fleet import LinkLimits, PairReading
-from zsched.core.values.model import Link, LinkSource, NodeId, Profile
+from zsched.core.values.fleet import LinkLimits
+from zsched.core.values.model import Link, LinkSource, NodeId, PairReading, Profile
 
 WIRED_DBM = 0.0
 """Stands for a cable in comparisons of signals: better than any radio."""

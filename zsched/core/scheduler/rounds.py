@@ -31,7 +31,7 @@ from zsched.core.todo import ToDo
 from zsched.core.values.decision import Decision, Figures, Need, Rules
 from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.messages import Utilities
-from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, TaskId, UtilityVector
+from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, TaskId, Tuning, UtilityVector
 
 FRESH_MARGIN_S = 0.001
 """Sums of floats: a profile is certainly fresh until so long before its end."""
@@ -57,6 +57,10 @@ class TaskRound:
     """When this node learnt the current epoch."""
     is_called: bool = False
     is_called_escape: bool = False
+    file: TaskSpec = field(init=False)
+    """What the fleet file says; ``spec`` is that as operators have tuned it."""
+    tuning: Tuning | None = None
+    """By which ``spec`` was made; ``None``: by none."""
     rules: Rules = field(init=False)
     figures: Figures | None = None
     """What the last judgement went by."""
@@ -70,13 +74,25 @@ class TaskRound:
     """The last decision written to the journal; the same one again is not."""
 
     def __post_init__(self) -> None:
+        self.file = self.spec
         self.rules = rules_of(self.spec)
 
-    def by(self, spec: TaskSpec) -> TaskRound:
-        """The same standing by another version of the task's file; the last judgement was by the one before."""
+    def under(self, tuning: Tuning) -> None:
+        """Judge from now on by the file's settings and this tuning."""
+        if tuning is not self.tuning:
+            self.tuning = tuning
+            self._judge_by(self.file.under(tuning))
+
+    def _judge_by(self, spec: TaskSpec) -> None:
         if spec != self.spec:
             self.spec = self.judge.spec = spec
             self.rules = rules_of(spec)
+
+    def by(self, spec: TaskSpec) -> TaskRound:
+        """The same standing by another version of the task's file; the last judgement was by the one before."""
+        if spec != self.file:
+            self.file, self.tuning = spec, None
+            self._judge_by(spec)
             self.figures = self.standing = self.judgement = None
             self.told = ""
         return self
@@ -164,6 +180,8 @@ class Rounds:
         if not self.is_voter:
             return Utilities(voter=self._me, vectors=())
         version, until, seen, answer = self._answer
+        for name, task in self.tasks.items():
+            task.under(values[name].tuning)
         doubts = {name: self._doubts(task.spec, now) for name, task in self.tasks.items()}
         if version == self._gateway.version and now <= until and seen == (states, values, doubts):
             return answer  # several robots ask within a round, and nothing has changed since
@@ -287,6 +305,7 @@ class Rounds:
         todo: ToDo,
         now: float,
     ) -> Proposal | None:
+        task.under(allocation.tuning)
         figures = self._figures(task, vectors, allocation, states, now)
         is_called, task.is_called, task.is_called_escape = task.is_called, False, False
         decided = decide(task.judge, task.damping, figures)

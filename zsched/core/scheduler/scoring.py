@@ -25,7 +25,7 @@ from zsched.core.scheduler.utility import (
     service_utility,
     total_utility,
 )
-from zsched.core.values.fleet import Demand, Reach, Standby, TaskSpec
+from zsched.core.values.fleet import Demand, Standby, TaskSpec
 from zsched.core.values.gauges import BY_NAME, possible
 from zsched.core.values.model import (
     Aggregate,
@@ -33,6 +33,7 @@ from zsched.core.values.model import (
     NodeId,
     PeerState,
     Profile,
+    Reach,
     ScoreForm,
     TaskId,
     Tuning,

@@ -10,8 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from zsched.core.values.fleet import Reach
-from zsched.core.values.model import Allocation, NodeId, PeerState, Profile, TaskId, UtilityVector
+from zsched.core.values.model import Allocation, NodeId, PeerState, Profile, Reach, TaskId, UtilityVector
 from zsched.core.values.snapshot import VoteStatus
 
 

@@ -10,21 +10,27 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from enum import StrEnum
 from functools import lru_cache
+from typing import Any
 
 from zsched.core.values.gauges import check_limits
 from zsched.core.values.limits import Range, check_ranges, key
 from zsched.core.values.model import (
     MAX_CPU_CORES,
+    MAX_FORESEE_S,
+    MAX_MEMORY_FLOOR,
     MAX_MEMORY_MB,
+    MAX_MOVES_PER_MINUTE,
     RSSI_MAX_DBM,
     RSSI_MIN_DBM,
     Allocation,
     LinkSource,
     NodeId,
     NodeKind,
+    PairReading,
+    Reach,
     Readings,
     ScoreForm,
     TaskId,
@@ -60,13 +66,6 @@ class OnIsolation(StrEnum):
 
     HOLD = "hold"
     LOCAL = "local"
-
-
-class Reach(StrEnum):
-    """How many robots must reach a candidate: a majority of the fresh voters, or all of them."""
-
-    MAJORITY = "majority"
-    ALL = "all"
 
 
 class WorkerLink(StrEnum):
@@ -180,15 +179,6 @@ class StreamRule:
     """Services only."""
 
 
-class PairReading(StrEnum):
-    """How to value a link whose two ends reach each other through one access point (docs/decisions/0018)."""
-
-    CANDIDATE = "candidate"
-    """The candidate's own way, as the paper prints Eq. 3: the robot's is part of every path, and decides nothing."""
-    WEAKER = "weaker"
-    """The weaker of the two ways: the bottleneck."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkLimits:
     """Eq. 3: nu (least usable) and rho (best achievable) in dBm, and how links are read."""
@@ -202,9 +192,14 @@ class LinkLimits:
     foresee_s: float = key(
         0.0,
         "Signals count as they will be so far ahead along their trend (at most 6 dB); `0`: as they are.",
-        Range(0, 30, "s"),
+        Range(0, MAX_FORESEE_S, "s"),
         shown=f"`{DEFAULT_FORESEE_S:g}`",
     )
+
+
+TUNED_RULES = ("patience", "max_moves_per_minute", "memory_floor_ratio", "reach")
+TUNED_LINKS = ("nu_dbm", "rho_dbm", "pair", "foresee_s")
+"""Settings of a task's file that a `Tuning` may set anew: fields of `TaskSpec` and of `LinkLimits`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -224,9 +219,11 @@ class TaskSpec:
         0.05,
         "Where a task leaves less memory free than this share, its memory counts up to 15 % less "
         "(`score: paper`: an owner that has less is left).",
-        Range(0, 0.9),
+        Range(0, MAX_MEMORY_FLOOR),
     )
-    max_moves_per_minute: int = key(6, "Hard cap of planned moves; escapes are bounded too, at 60.", Range(1, 100_000))
+    max_moves_per_minute: int = key(
+        6, "Hard cap of planned moves; escapes are bounded too, at 60.", Range(1, MAX_MOVES_PER_MINUTE)
+    )
     """Escapes: `zsched.core.scheduler.damping`."""
     patience: float = PAPER_PATIENCE
     """Utility seconds that staying may cost before the task moves; 0: none, the first judgement of a lead moves it."""
@@ -244,6 +241,29 @@ class TaskSpec:
 
     def __post_init__(self) -> None:
         check_limits(self.gauge_limits)
+
+    def under(self, tuning: Tuning) -> TaskSpec:
+        """This task as operators have tuned it: what they have not set is the file's.
+
+        A pair of signals that no link could lie between is left out: another node's file may be the one it fits.
+        """
+        own: dict[str, Any] = {name: getattr(tuning, name) for name in TUNED_RULES}
+        links: dict[str, Any] = {name: getattr(tuning, name) for name in TUNED_LINKS}
+        if tuning.patience is not None:
+            own["learns_patience"] = False
+        limits = replace(self.limits, **{name: value for name, value in links.items() if value is not None})
+        if limits.nu_dbm >= limits.rho_dbm:
+            limits = replace(limits, nu_dbm=self.limits.nu_dbm, rho_dbm=self.limits.rho_dbm)
+        return replace(self, limits=limits, **{name: value for name, value in own.items() if value is not None})
+
+    def in_force(self, tuning: Tuning) -> Tuning:
+        """The tuning with every setting that it leaves to the file; a patience of ``None`` is learnt."""
+        spec = self.under(tuning)
+        rules = {name: getattr(spec, name) for name in TUNED_RULES}
+        links = {name: getattr(spec.limits, name) for name in TUNED_LINKS}
+        if spec.learns_patience:
+            rules["patience"] = None
+        return replace(tuning, **rules, **links)
 
     def first_value(self, start: int, *, is_new: bool = True) -> Allocation:
         """The first value of a generation, by this file; ``is_new``: no worker may still run by an earlier one."""

@@ -32,6 +32,7 @@ MAX_COUNTER = 2**53
 MAX_CPU_CORES, MAX_MEMORY_MB, MAX_BITRATE_MBPS = 4096.0, 1e8, 1e6
 MIN_SPEED, MAX_SPEED = 0.001, 1000.0
 MAX_RUNNABLE = 1e6
+RSSI_MIN_DBM, RSSI_MAX_DBM = -120.0, 0.0
 MAX_TREND_DB_S = 100.0
 MAX_JOBS_HZ, MAX_JOB_S = 1e6, 1e6
 MAX_GAUGES, MAX_READING = 16, 1e9
@@ -111,6 +112,22 @@ PAPER_METRICS = ("cpu", "memory", "network")
 """The metrics of Eq. 1 to 3; the others are gauges."""
 
 
+class Reach(StrEnum):
+    """How many robots must reach a candidate: a majority of the fresh voters, or all of them."""
+
+    MAJORITY = "majority"
+    ALL = "all"
+
+
+class PairReading(StrEnum):
+    """How to value a link whose two ends reach each other through one access point (docs/decisions/0018)."""
+
+    CANDIDATE = "candidate"
+    """The candidate's own way, as the paper prints Eq. 3: the robot's is part of every path, and decides nothing."""
+    WEAKER = "weaker"
+    """The weaker of the two ways: the bottleneck."""
+
+
 # --- what an operator sets -------------------------------------------------------------------------------------------
 
 
@@ -153,6 +170,7 @@ class Weights:
 
 
 MIN_DEADLINE_MS, MAX_DEADLINE_MS = 1.0, 3.6e6
+MAX_PATIENCE, MAX_MOVES_PER_MINUTE, MAX_MEMORY_FLOOR, MAX_FORESEE_S = 1000.0, 100_000, 0.9, 30.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -171,6 +189,15 @@ class Tuning:
     deadline_ms: float | None = None
     """`Objective.LATENCY`: a job that takes longer from input to output, network included, comes too late. ``None``:
     `Objective.SERVICE`. `ScoreForm.PAPER` knows no deadlines."""
+    patience: float | None = None
+    """From here on ``None``: as the fleet file says, also when the file changes."""
+    max_moves_per_minute: int | None = None
+    memory_floor_ratio: float | None = None
+    reach: Reach | None = None
+    nu_dbm: float | None = None
+    rho_dbm: float | None = None
+    pair: PairReading | None = None
+    foresee_s: float | None = None
 
     @property
     def objective(self) -> Objective:
@@ -181,6 +208,14 @@ class Tuning:
         check_range("deadline_ms", self.deadline_ms, MIN_DEADLINE_MS, MAX_DEADLINE_MS)
         check_range("bonus", self.bonus, 0.0, 1.0)
         check_range("cool_down_s", self.cool_down_s, 0.0, 86400.0)
+        check_range("patience", self.patience, 0.0, MAX_PATIENCE)
+        check_range("max_moves_per_minute", self.max_moves_per_minute, 1, MAX_MOVES_PER_MINUTE)
+        check_range("memory_floor_ratio", self.memory_floor_ratio, 0.0, MAX_MEMORY_FLOOR)
+        check_range("nu_dbm", self.nu_dbm, RSSI_MIN_DBM, RSSI_MAX_DBM)
+        check_range("rho_dbm", self.rho_dbm, RSSI_MIN_DBM, RSSI_MAX_DBM)
+        check_range("foresee_s", self.foresee_s, 0.0, MAX_FORESEE_S)
+        if self.nu_dbm is not None and self.rho_dbm is not None and self.nu_dbm >= self.rho_dbm:
+            raise ValueError(f"nu_dbm ({self.nu_dbm:g}) must be below rho_dbm ({self.rho_dbm:g})")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -252,9 +287,6 @@ class LinkSource(StrEnum):
     WIRED = "wired"
     FIXED = "fixed"
     TRACE = "trace"
-
-
-RSSI_MIN_DBM, RSSI_MAX_DBM = -120.0, 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -3,7 +3,8 @@
 A task's tuning is agreed: the file's counts for its first value only. When a node takes over a file with another
 tuning, it wants these fields changed in the agreed one. All nodes that take the file over want the same. So they try
 one after another, by rank, and the first success ends it for all. A tuning that somebody else has changed meanwhile is
-left as it is: the newer word counts.
+left as it is: the newer word counts. Some settings are the file's unless an operator has set them; a file that changes
+such a setting ends what the operator has set.
 
 Knows: which fields differ, whose turn it is. Does not know: how a value is agreed.
 """
@@ -15,7 +16,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 from zsched.core.values.change import Retune
-from zsched.core.values.fleet import Fleet
+from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.model import Allocation, NodeId, TaskId, Tuning
 
 RANK_S = 0.5
@@ -41,12 +42,12 @@ class Retuning:
 
     def adopt(self, old: Fleet, new: Fleet, values: Mapping[TaskId, Allocation], now: float) -> None:
         """Want what differs between two files; a task that was never agreed begins with the new file's tuning."""
-        before = {task.name: task.tuning for task in old.tasks}
+        before = {task.name: task for task in old.tasks}
         rank = [node.name for node in new.nodes].index(self.me)
         self._wishes = {task: wish for task, wish in self._wishes.items() if any(one.name == task for one in new.tasks)}
         for task in new.tasks:
             value = values[task.name]
-            changed = _changed(before.get(task.name, task.tuning), task.tuning)
+            changed = _changed(before.get(task.name, task), task)
             if changed and value.revision > 0:
                 wanted = replace(value.tuning, **changed)
                 self._wishes[task.name] = _Wish(seen=value.tuning, wanted=wanted, at=now + rank * RANK_S)
@@ -67,6 +68,8 @@ class Retuning:
         return not self._wishes
 
 
-def _changed(before: Tuning, after: Tuning) -> dict[str, Any]:
-    pairs = ((one.name, getattr(before, one.name), getattr(after, one.name)) for one in fields(Tuning))
-    return {name: new for name, old, new in pairs if new != old}
+def _changed(before: TaskSpec, after: TaskSpec) -> dict[str, Any]:
+    """What a changed file wants of the agreed tuning; a setting that the file keeps for itself is left to it again."""
+    old, new = before.in_force(before.tuning), after.in_force(after.tuning)
+    differing = {one.name for one in fields(Tuning) if getattr(old, one.name) != getattr(new, one.name)}
+    return {one.name: getattr(after.tuning, one.name) for one in fields(Tuning) if one.name in differing}

@@ -13,8 +13,7 @@ import pytest
 from zsched.adapters.host.decision_log import NAME, OLD_NAME, QUEUE_LIMIT, SCHEMA, DecisionLog, read_page
 from zsched.core.instructions import RecordStory
 from zsched.core.values.decision import Decision, Figures, Move, Rules, Verdict
-from zsched.core.values.fleet import Reach
-from zsched.core.values.model import Allocation, Tuning, Weights
+from zsched.core.values.model import Allocation, Reach, Tuning, Weights
 
 MOVE = Move(epoch=2, revision=2, left="edge1", owner="edge2", reason="edge1 is gone", votes=(("robot1", "edge2"),))
 VALUE = Allocation(

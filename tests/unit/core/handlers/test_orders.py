@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 from random import Random
 
 import pytest
@@ -234,6 +235,9 @@ def test_a_tuning_is_agreed_for_the_revision_that_it_was_made_of() -> None:
     assert lone.ask(ev.TuneCommanded(request=42, command=command)).outcome is CommandOutcome.CONFLICT
     again = TuneTask(task="merge", tuning=wanted, base_revision=6, asked=ADA)
     assert lone.ask(ev.TuneCommanded(request=42, command=again)).outcome is CommandOutcome.UNCHANGED
+    crossed = TuneTask(task="merge", tuning=replace(wanted, nu_dbm=-30.0), base_revision=6, asked=ADA)
+    refused = lone.ask(ev.TuneCommanded(request=42, command=crossed))
+    assert (refused.outcome, refused.detail) == (CommandOutcome.INVALID, "nu_dbm (-30) must be below rho_dbm (-40)")
     unknown = TuneTask(task="mergee", tuning=wanted, base_revision=6, asked=ADA)
     assert lone.ask(ev.TuneCommanded(request=42, command=unknown)).outcome is CommandOutcome.INVALID
 

@@ -9,8 +9,8 @@ from support.allocations import allocation_of
 from support.fleets import tuning_of
 from support.proposals import vector_of
 from zsched.core.scheduler.scoring import Standing, compare, pick, rounded
-from zsched.core.values.fleet import Reach, TaskSpec
-from zsched.core.values.model import Aggregate, Utility, UtilityVector
+from zsched.core.values.fleet import TaskSpec
+from zsched.core.values.model import Aggregate, Reach, Utility, UtilityVector
 from zsched.core.values.quorum import majority
 
 SPEC = TaskSpec(

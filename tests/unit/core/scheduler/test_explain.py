@@ -13,11 +13,11 @@ from zsched.core.scheduler.decision import decide_again, verdict_of
 from zsched.core.scheduler.explain import Explained, explained, judged_again, owner_cpu_below, utility_of, without
 from zsched.core.scheduler.scoring import pick
 from zsched.core.values.decision import DampingMemory, Decision, Figures, Need, Rules
-from zsched.core.values.fleet import Reach
 from zsched.core.values.model import (
     Aggregate,
     Allocation,
     PeerState,
+    Reach,
     ScoreForm,
     Tuning,
     Utility,

@@ -283,6 +283,20 @@ def test_a_lead_is_followed_in_the_round_by_which_staying_has_cost_the_patience(
     assert proposed(out) == ["edge2"]
 
 
+def test_an_operator_s_patience_and_cap_count_from_the_next_round_and_the_file_s_when_they_end() -> None:
+    robot = Robot(owner_cpu=3.9)
+    robot.round(edge1=0.02)
+    assert robot.outcome() is Outcome.WAIT
+    robot.value = replace(robot.value, revision=6, tuning=replace(TUNING, patience=0.0, max_moves_per_minute=1))
+    robot.profiles({"edge1": 3.9})
+    assert proposed(robot.round(edge1=0.02)) == ["edge2"]
+    figures = robot.task.figures
+    assert figures is not None
+    assert (figures.rules.patience, figures.rules.max_moves_per_minute) == (0.0, 1)
+    robot.task.under(TUNING)
+    assert (robot.task.spec, robot.task.judge.patience) == (FLEET.tasks[0], PATIENCE)
+
+
 @pytest.mark.parametrize(("paused", "pinned"), [(True, False), (False, True)])
 def test_what_staying_costs_while_an_operator_holds_a_task_moves_nothing_afterwards(
     *, paused: bool, pinned: bool

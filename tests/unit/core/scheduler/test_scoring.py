@@ -11,20 +11,12 @@ from support.profiles import load_of, profile_of
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts, compare, score
 from zsched.core.scheduler.utility import NEARLY_FULL, service_utility
-from zsched.core.values.fleet import (
-    DEFAULT_BONUS,
-    Demand,
-    LinkLimits,
-    PairReading,
-    Standby,
-    TaskSpec,
-    Timing,
-    WorkerSpec,
-)
+from zsched.core.values.fleet import DEFAULT_BONUS, Demand, LinkLimits, Standby, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.model import (
     Allocation,
     Link,
     LinkSource,
+    PairReading,
     PeerState,
     Profile,
     ScoreForm,

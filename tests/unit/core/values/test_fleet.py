@@ -1,11 +1,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
 from support.fleets import tuning_of
 from zsched.core.values.fleet import (
+    TUNED_LINKS,
+    TUNED_RULES,
     Demand,
     Fleet,
     LinkLimits,
@@ -19,7 +22,7 @@ from zsched.core.values.fleet import (
     electorate_hash,
     fleet_hash,
 )
-from zsched.core.values.model import Aggregate, LinkSource, NodeKind, Weights
+from zsched.core.values.model import Aggregate, LinkSource, NodeKind, PairReading, Reach, Weights
 from zsched.core.values.plan import Direction
 
 TUNING = tuning_of()
@@ -135,3 +138,47 @@ def test_electorate_hash_depends_on_fleet_and_electors_only() -> None:
     assert electorate_hash(replace(FLEET, name="lab2")) != base
     assert electorate_hash(replace(FLEET, electors=("robot1",))) != base
     assert electorate_hash(replace(FLEET, electors=("robot1robot2",))) != base
+
+
+# --- tuned by operators ----------------------------------------------------------------------------------------------
+
+OWN: dict[str, Any] = {
+    "patience": 0.7,
+    "max_moves_per_minute": 2,
+    "memory_floor_ratio": 0.3,
+    "reach": Reach.ALL,
+    "nu_dbm": -70.0,
+    "rho_dbm": -30.0,
+    "pair": PairReading.WEAKER,
+    "foresee_s": 9.0,
+}
+
+
+def test_a_tuning_sets_what_it_names_and_leaves_the_rest_to_the_file() -> None:
+    assert set(OWN) == {*TUNED_RULES, *TUNED_LINKS}
+    assert TASK.under(TUNING) == TASK
+    for key, value in OWN.items():
+        tuned = replace(TUNING, **{key: value})
+        nothing: dict[str, Any] = {key: None}
+        told, file = TASK.in_force(tuned), TASK.in_force(TUNING)
+        assert getattr(told, key) == value != getattr(file, key)
+        assert replace(told, **nothing) == replace(file, **nothing)
+        spec = TASK.under(tuned)
+        assert getattr(spec if key in TUNED_RULES else spec.limits, key) == value
+
+
+def test_a_tuned_patience_is_not_learnt_and_a_learnt_one_is_told_as_none() -> None:
+    learning = replace(TASK, learns_patience=True)
+    assert learning.in_force(TUNING).patience is None
+    assert not learning.under(replace(TUNING, patience=0.7)).learns_patience
+
+
+def test_ranges_are_those_of_the_file_and_a_signal_that_does_not_fit_the_file_is_left_out() -> None:
+    wrong: dict[str, Any] = {"max_moves_per_minute": 0, "memory_floor_ratio": 0.95, "foresee_s": 31.0, "nu_dbm": 1.0}
+    for key, value in wrong.items():
+        with pytest.raises(ValueError, match=key):
+            replace(TUNING, **{key: value})
+    with pytest.raises(ValueError, match="must be below"):
+        replace(TUNING, nu_dbm=-40.0, rho_dbm=-40.0)
+    spec = TASK.under(replace(TUNING, nu_dbm=-30.0, foresee_s=9.0))
+    assert (spec.limits.nu_dbm, spec.limits.rho_dbm, spec.limits.foresee_s) == (-80.0, -40.0, 9.0)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from zsched.core import events, relay_protocol
-from zsched.core.values import decision, document, durable, electorate, fleet, messages, model, plan, snapshot
+from zsched.core.values import decision, document, durable, electorate, messages, model, plan, snapshot
 from zsched.ipc import pipe as relay_pipe
 from zsched.ipc import protocol
 from zsched.wire import codec as wire
@@ -58,7 +58,7 @@ _DECISION = decision.Decision(
         now=1234.5,
         rules=decision.Rules(
             candidates=("edge1", "edge2"),
-            reach=fleet.Reach.MAJORITY,
+            reach=model.Reach.MAJORITY,
             memory_floor_ratio=0.05,
             max_moves_per_minute=6,
             patience=0.15,

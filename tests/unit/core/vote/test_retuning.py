@@ -1,0 +1,90 @@
+"""A changed fleet file and an operator's tuning of the same settings: which one counts, and who proposes it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from support.allocations import allocation_of
+from support.fleets import fleet_of, task_of, tuning_of
+from zsched.core.values.change import Retune
+from zsched.core.values.fleet import LinkLimits
+from zsched.core.values.model import Allocation, Reach, Tuning
+from zsched.core.vote.retuning import AGAIN_S, RANK_S, Retuning
+
+FILE = tuning_of(bonus=0.05)
+
+
+def wished(agreed: Tuning, before: dict[str, Any], after: dict[str, Any], *, me: str = "edge1") -> Tuning | None:
+    """What a node wants agreed that takes over a file with another task; ``None``: nothing."""
+    old, new = (fleet_of(task_of(**{"tuning": FILE, **options})) for options in (before, after))
+    value = replace(allocation_of(5, "edge1"), tuning=agreed)
+    retuning = Retuning(me)
+    retuning.adopt(old, new, {"merge": value}, 0.0)
+    due = list(retuning.due({"merge": value}, 100.0))
+    assert all(retune.base_revision == 5 for _, retune in due)
+    return due[0][1].tuning if due else None
+
+
+def test_a_changed_setting_is_wanted_and_the_others_stay_as_they_were_tuned() -> None:
+    agreed = replace(FILE, cool_down_s=30.0, patience=0.7)
+    assert wished(agreed, {}, {"tuning": replace(FILE, bonus=0.2)}) == replace(agreed, bonus=0.2)
+    assert wished(agreed, {}, {"tuning": FILE}) is None
+
+
+@pytest.mark.parametrize(
+    ("tuned", "before", "after"),
+    [
+        ({"patience": 0.7}, {"patience": 0.3}, {"patience": 0.4}),
+        ({"patience": 0.7}, {"patience": 0.3}, {"learns_patience": True}),
+        ({"max_moves_per_minute": 2}, {}, {"max_moves_per_minute": 9}),
+        ({"memory_floor_ratio": 0.3}, {}, {"memory_floor_ratio": 0.2}),
+        ({"reach": Reach.MAJORITY}, {}, {"reach": Reach.ALL}),
+        ({"nu_dbm": -70.0}, {}, {"limits": LinkLimits(nu_dbm=-75.0)}),
+        ({"foresee_s": 9.0}, {}, {"limits": LinkLimits(foresee_s=1.0)}),
+    ],
+)
+def test_a_file_that_changes_a_tuned_setting_of_its_own_ends_the_tuning_of_it_alone(
+    tuned: dict[str, Any], before: dict[str, Any], after: dict[str, Any]
+) -> None:
+    agreed = replace(FILE, bonus=0.3, **tuned)
+    wanted = wished(agreed, before, after)
+    ended: dict[str, Any] = dict.fromkeys(tuned)
+    assert wanted == replace(agreed, **ended)
+    task = task_of(**{"tuning": FILE, **after})
+    now = task.in_force(wanted)
+    assert {key: getattr(now, key) for key in tuned} == {key: getattr(task.in_force(FILE), key) for key in tuned}
+
+
+def test_a_file_that_changes_another_setting_leaves_the_tuned_one() -> None:
+    agreed = replace(FILE, patience=0.7)
+    assert wished(agreed, {"patience": 0.3}, {"patience": 0.3, "max_moves_per_minute": 2}) is None
+    spec = task_of(tuning=FILE, patience=0.3, max_moves_per_minute=2).under(agreed)
+    assert (spec.patience, spec.max_moves_per_minute) == (0.7, 2)
+
+
+def test_a_tuning_that_comes_between_is_the_newer_word() -> None:
+    old, new = fleet_of(task_of(tuning=FILE, patience=0.3)), fleet_of(task_of(tuning=FILE, patience=0.4))
+    value = replace(allocation_of(5, "edge1"), tuning=replace(FILE, patience=0.7))
+    newer: Allocation = replace(value, revision=6, tuning=replace(FILE, patience=0.9))
+    retuning = Retuning("edge2")
+    retuning.adopt(old, new, {"merge": value}, 0.0)
+    assert list(retuning.due({"merge": value}, 0.0)) == [], "the first in rank tries before this node"
+    assert list(retuning.due({"merge": newer}, RANK_S)) == []
+    assert retuning.is_idle
+
+
+def test_who_found_no_quorum_tries_again_and_ends_once_somebody_had_success() -> None:
+    old, new = fleet_of(task_of(tuning=FILE, patience=0.3)), fleet_of(task_of(tuning=FILE, patience=0.4))
+    value = replace(allocation_of(5, "edge1"), tuning=replace(FILE, patience=0.7))
+    retuning = Retuning("edge1")
+    retuning.adopt(old, new, {"merge": value}, 0.0)
+    wanted = [("merge", Retune(base_revision=5, tuning=FILE))]
+    assert list(retuning.due({"merge": value}, 0.0)) == wanted
+    assert list(retuning.due({"merge": value}, AGAIN_S - 0.1)) == []
+    assert list(retuning.due({"merge": value}, AGAIN_S)) == wanted
+    done = replace(value, revision=6, tuning=FILE)
+    assert list(retuning.due({"merge": done}, 2 * AGAIN_S)) == []
+    assert retuning.is_idle
