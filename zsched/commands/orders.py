@@ -472,6 +472,9 @@ def _checked(after: Json, file: Json) -> Json:
         )
     except ValueError as error:
         raise CliError(EXIT_USAGE, f"{error}; nothing was changed") from None
+    nu, rho = tuning.nu_dbm, tuning.rho_dbm
+    if nu is not None and rho is not None and nu >= rho:
+        raise CliError(EXIT_USAGE, f"nu_dbm ({nu:g}) must be below rho_dbm ({rho:g}); nothing was changed")
     if tuning.deadline_ms is not None and tuning.score is ScoreForm.PAPER:
         raise CliError(EXIT_USAGE, "the paper's score knows no deadlines: score=service, or deadline_ms=null")
     kept: dict[str, Any] = {key: None for key in OF_THE_FILE if after.get(key) == file.get(key)}

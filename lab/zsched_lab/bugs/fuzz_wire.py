@@ -147,11 +147,11 @@ def _dataclass(cls: Any, rng: Random) -> Any:
 
 
 def _in_range(name: str, hint: Any, rng: Random) -> Any:
-    if hint is int:
+    if hint is int or int in get_args(hint):
         return 1
     if hint is str:
         return rng.choice(("0d", "0e"))
-    return -50.0 if "dbm" in name else 1.0
+    return -50.0 if "dbm" in name else 0.5 if "floor" in name else 1.0
 
 
 # --- damaged frames --------------------------------------------------------------------------------------------------

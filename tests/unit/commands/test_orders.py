@@ -232,6 +232,13 @@ def test_settings_of_the_file_are_tuned_and_left_to_the_file_again(daemon: Daemo
     assert not {"patience", "reach"} & set(daemon.orders[-1]["tuning"])
 
 
+def test_signals_that_no_link_could_lie_between_are_refused(daemon: Daemon) -> None:
+    daemon.status["tasks"][0] |= {"tuning": OWN, "file_tuning": OWN}
+    result = run("tune", "echo", "nu_dbm=-40", "--yes")
+    assert (result.exit_code, daemon.orders) == (2, [])
+    assert "nu_dbm (-40) must be below rho_dbm (-40)" in result.stderr
+
+
 @pytest.mark.parametrize(
     ("pair", "says"),
     [

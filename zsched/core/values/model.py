@@ -214,8 +214,6 @@ class Tuning:
         check_range("nu_dbm", self.nu_dbm, RSSI_MIN_DBM, RSSI_MAX_DBM)
         check_range("rho_dbm", self.rho_dbm, RSSI_MIN_DBM, RSSI_MAX_DBM)
         check_range("foresee_s", self.foresee_s, 0.0, MAX_FORESEE_S)
-        if self.nu_dbm is not None and self.rho_dbm is not None and self.nu_dbm >= self.rho_dbm:
-            raise ValueError(f"nu_dbm ({self.nu_dbm:g}) must be below rho_dbm ({self.rho_dbm:g})")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
