@@ -439,7 +439,10 @@ _PATHS = frozenset({("Fleet", "zenoh_config"), ("LinkSpec", "value"), ("Security
 """Fields that may hold a path: relative to the fleet file, hence another one on every machine."""
 
 
-_LATER = frozenset({("Weights", "gauges"), ("Demand", "gpu"), ("TaskSpec", "gauge_limits")})
+_LATER = frozenset(
+    {("Weights", "gauges"), ("Demand", "gpu"), ("TaskSpec", "gauge_limits")}
+    | {("Tuning", name) for name in (*TUNED_RULES, *TUNED_LINKS)}
+)
 """Fields that came later: left out where they say nothing, so that nodes of two versions see the same file."""
 
 
