@@ -43,6 +43,7 @@ from zsched.core.status import status_line
 from zsched.core.values.document import Flag
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet, WorkerLink, dial_endpoint, electorate_hash, fleet_hash
+from zsched.core.values.messages import CommandResult
 from zsched.core.values.model import NodeId, NodeKind
 from zsched.core.values.snapshot import Exposure
 from zsched.errors import AdapterError, ConfigError, NameTakenError
@@ -50,6 +51,7 @@ from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_NAME_TAKEN, EXIT_OK
 from zsched.guard import on_failure
 from zsched.ipc.takeover import Door
 from zsched.log_limit import limit_handlers
+from zsched.runtime import renewal
 from zsched.runtime import tls as daemon_tls
 from zsched.runtime.access import StreamAccess, joins_at
 from zsched.runtime.access_rules import Side, common_names_of, names_of
@@ -75,6 +77,8 @@ CLOSE_WORKERS_S = 0.7
 LOOP_MAX_WAIT_S = 1.0
 LOOK_S = 30.0
 """How often the certificate's files are looked at."""
+CERTIFICATE = "certificate"
+"""Of the problem that this node's certificate ends soon."""
 SESSIONS = "sessions"
 """Of the problem that sessions cannot be opened anew."""
 STDERR = 2
@@ -309,6 +313,7 @@ class Daemon:
         stack.callback(bus.close)
         shell = Shell(node=me, inbox=self._inbox, bus=bus, state_file=state_file, desk=desk, fleet=fleet)
         shell.log, shell.library = decisions, self._library
+        shell.take_certificate = self._take_certificate
         self._library.fetch = bus.fetch_document
         self._library.start()
         stack.callback(self._library.close)
@@ -453,11 +458,18 @@ class Daemon:
     def _note_rules(self, lets_in_others: bool) -> None:
         self._lets_in_others, self._next_look = lets_in_others, 0.0
 
+    def _take_certificate(self, pem: str) -> CommandResult:
+        result = renewal.take(self._fleet, self._options.state_dir, pem)
+        self._next_look = 0.0
+        return result
+
     def _tend_sessions(self, node: Node, now: float) -> None:
         """Begin anew when it is this node's turn and what its sessions were opened with holds no more."""
         electors, alive = node.fleet.electors, node.membership.alive()
         if now >= self._next_look:
             self._next_look = now + LOOK_S
+            with contextlib.suppress(ConfigError):  # it is being replaced
+                node.set_problem(CERTIFICATE, renewal.ends_soon(self._fleet, renewal.now_utc()))
             if self._lets_in_others or self._has_another_certificate(node):
                 self._reopening.want(turns((*alive, node.me), electors), now)
             else:
@@ -550,6 +562,8 @@ def main(arguments: list[str] | None = None) -> int:
         state_dir=places.state_folder(given.state_dir, os.environ),
         runtime_dir=places.runtime_folder(given.runtime_dir, os.environ),
     )
+    # Where a renewed certificate is looked for (`zsched.runtime.secured`), whatever the state folder was named by.
+    os.environ["ZSCHED_STATE_DIR"] = str(options.state_dir)
     try:
         daemon = Daemon(options)
         code = daemon.run()

@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import socket
+import ssl
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -94,6 +95,20 @@ class Hall:
     def problems(self, node: str) -> list[str]:
         return [str(one) for one in self.status(node).get("problems", ())]
 
+    def certificate(self, node: str) -> str:
+        """The one that was sent to a node, DER as text of bytes."""
+        return ssl.PEM_cert_to_DER_cert((self.folder / node / "state" / "pki" / "certificate.pem").read_text()).hex()
+
+    def presented(self, port: int) -> str:
+        """With which certificate a session listens; empty: with none."""
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+        try:
+            with socket.create_connection(("127.0.0.1", port), 2.0) as plain, context.wrap_socket(plain) as link:
+                return (link.getpeercert(binary_form=True) or b"").hex()
+        except OSError:
+            return ""
+
     def alive(self, node: str) -> set[str]:
         return {str(one["name"]) for one in self.status(node).get("nodes", ()) if one["state"] == "alive"}
 
@@ -129,12 +144,17 @@ def test_two_machines_are_a_secured_fleet_by_four_commands_and_nobody_restarts_a
     assert local == [f"tcp/127.0.0.1:{port + LOCAL_AFTER}"]
     with zenoh.open(zenoh.Config.from_json5(client_config(connect=tuple(local), patience_s=20.0))) as session:
         until(session.info.links, "an application at the local side")
+    hall.zsched("robot1", "pki", "renew", "robot2", "--deliver")
+    hall.zsched("robot1", "pki", "renew", "robot1", "--deliver")
+    assert hall.certificate("robot1") not in hall.presented(port), "its open session listens with the first one"
     text = hall.zsched("robot1", "fleet", "export")
     (hall.folder / "revoked.yaml").write_text(text.replace("security: {}", "security: {revoked: [robot2]}"))
     hall.zsched("robot1", "apply", str(hall.folder / "revoked.yaml"), "--yes")
     until(lambda: hall.alive("robot1") == {"robot1"}, "the open session of a revoked key to end")
     until(lambda: any("`security: revoked`" in one for one in hall.problems("robot2")), "robot2 to say why it stays")
     assert hall.pid("robot1") == daemon
+    until(lambda: hall.certificate("robot1") in hall.presented(port), "the renewed certificate to be listened with")
+    assert hall.certificate("robot2"), "it is sent to who has no authority, too"
 
     checks = json.loads(hall.zsched("robot1", "pki", "show", "--json"))["certificates"]
     assert [(one["name"], one["state"]) for one in checks] == [("robot1", "valid"), ("robot2", "valid")]

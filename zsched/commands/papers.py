@@ -89,7 +89,10 @@ class FirstPapers:
         how = (
             f"move the folder {self._folder} to a stick, and name it to `zsched invite` and `zsched pki` by --authority"
         )
-        return f"{said}. To take it offline, {how}"
+        last = (
+            "certificates last 30 days: where the key is, `zsched pki renew --deliver` renews them (zsched-renew.timer)"
+        )
+        return f"{said}. To take it offline, {how}; {last}"
 
 
 def papers_for(fleet: Fleet, node: NodeId, authority: Path | None, request: Path | None) -> Papers | None:

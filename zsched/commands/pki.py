@@ -18,7 +18,9 @@ import typer
 
 from zsched import paths as places
 from zsched.clock import wall_ns
+from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, nearest, print_json
+from zsched.commands.page import harmless
 from zsched.config.load import load_fleet
 from zsched.core.values.certificates import Role, parse_label
 from zsched.core.values.fleet import Fleet
@@ -174,6 +176,45 @@ def renew(where: Where, label: str | None, request: Path | None, out: Path | Non
     else:
         _say("no certificate is due")
     return EXIT_OK
+
+
+def deliver(where: Where, door: Door, label: str | None) -> int:
+    """Renew what is due, or one label, and send every node its newest certificate; the exit code.
+
+    A node that was away gets it the next time.
+
+    Raises:
+        CliError: there is no such node's key, or nobody answers here.
+        AdapterError: a file is not usable.
+    """
+    members = {str(one["name"]) for one in ask_door(door, {"verb": "status"})["nodes"]}
+    with _opened(where) as (_, authority):
+        now, number = int(_now().timestamp()), authority.record.number
+        live = [one for one in authority.record.entries if one.revoked is None and one.holder.role is Role.NODE]
+        named = [one for one in live if label in (None, one.label)]
+        if not named and label is not None:
+            hint = nearest(label, [one.label for one in live])
+            raise CliError(EXIT_USAGE, f"no node's key {label!r} that is not revoked{hint}")
+        due = [one.label for one in named if one.label == label or one.is_due(now, number)]
+        secret = _passphrase(authority) if due else b""
+        for one in due:
+            authority.renew(one, None, b"", secret, _now())
+        newest = [entry for one in named if (entry := authority.record.entry(one.label)) is not None]
+    results = [_send(door, entry) for entry in newest if entry.holder.name in members]
+    return EXIT_OK if all(results) else EXIT_FAILED
+
+
+def _send(door: Door, entry: Entry) -> bool:
+    """Send a node its certificate; whether it has it now."""
+    there = Door(socket=door.socket, node=entry.holder.name)
+    try:
+        answer = ask_door(there, {"verb": "certificate", "certificate": entry.certificate})
+    except CliError as error:
+        sys.stderr.write(f"{entry.label}: {error}\n")
+        return False
+    outcome = str(answer["outcome"])
+    _say(f"{entry.label}: {harmless(str(answer['detail']))}")
+    return outcome in ("ok", "unchanged")
 
 
 def show(where: Where, *, is_json: bool) -> int:

@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from zsched.commands.common import Verb, Verbs
+from zsched.commands.fleet_verbs import AskedOption, RuntimeOption
 from zsched.core.values.certificates import Role
 
 pki_app = typer.Typer(
@@ -87,12 +88,28 @@ def renew(
     name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Only this one. [all that are due]")] = None,
     csr: RequestOption = None,
     out: OutOption = None,
+    deliver: Annotated[
+        bool, typer.Option("--deliver", help="Send each node its newest one, through the daemon here; no files.")
+    ] = False,
+    node: AskedOption = None,
+    runtime_dir: RuntimeOption = None,
     config: ConfigOption = None,
     authority: AuthorityOption = None,
 ) -> None:
-    """Make new certificates for keys that have one. A certificate is due after two thirds of its life."""
+    """Make new certificates for keys that have one. A certificate is due after two thirds of its life.
+
+    With --deliver the nodes take them by themselves; the timer zsched-renew does that every day.
+    """
     from zsched.commands import pki  # noqa: PLC0415 - each verb imports what it needs
 
+    if deliver:
+        from zsched.commands.ask import find_door  # noqa: PLC0415 - as above
+        from zsched.commands.common import CliError  # noqa: PLC0415 - as above
+        from zsched.exits import EXIT_USAGE  # noqa: PLC0415 - as above
+
+        if csr is not None or out is not None:
+            raise CliError(EXIT_USAGE, "--csr and --out go without --deliver")
+        raise typer.Exit(pki.deliver(pki.Where(config=config, authority=authority), find_door(runtime_dir, node), name))
     raise typer.Exit(pki.renew(pki.Where(config=config, authority=authority), name, csr, out))
 
 

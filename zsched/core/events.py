@@ -30,6 +30,7 @@ from zsched.core.values.messages import (
     RestartTask,
     RetryTask,
     SetWeights,
+    TakeCertificate,
     TuneTask,
     Utilities,
 )
@@ -445,6 +446,14 @@ class RestartCommanded:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class CertificateSent:
+    """Somebody has sent a newer certificate for this node's key."""
+
+    request: int
+    command: TakeCertificate
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LinesAsked:
     """An operator asks what this node's worker has printed."""
 
@@ -566,6 +575,7 @@ Event = (
     | RetryCommanded
     | ExplanationAsked
     | RestartCommanded
+    | CertificateSent
     | LinesAsked
     | FleetCommanded
     | FleetReadAsked
@@ -587,6 +597,8 @@ def commanded(request: int, command: Command) -> Event:
         return RetryCommanded(request=request, command=command)
     if isinstance(command, RestartTask):
         return RestartCommanded(request=request, command=command)
+    if isinstance(command, TakeCertificate):
+        return CertificateSent(request=request, command=command)
     if isinstance(command, MoveTask):
         return MoveCommanded(request=request, command=command)
     if isinstance(command, HoldTask):

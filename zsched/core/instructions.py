@@ -245,6 +245,14 @@ class AnswerLines:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class TakeCertificate:
+    """Keep a newer certificate for this node's key (PEM) if it is one, and answer who has sent it."""
+
+    request: int
+    certificate: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class StandDown:
     """End this daemon with the exit code of a wrong configuration: its name is alive elsewhere."""
 
@@ -400,6 +408,7 @@ Instruction = (
     | AnswerCommand
     | AnswerExplanation
     | AnswerLines
+    | TakeCertificate
     | StandDown
     | RecordStory
 )

@@ -14,13 +14,14 @@ from datetime import datetime
 from pathlib import Path
 from typing import Final
 
+from zsched import paths as places
 from zsched.core.values.certificates import Holder, Role, accepted, parse_common_name
 from zsched.core.values.fleet import Fleet, Security
 from zsched.errors import ConfigError
 from zsched.files import owner_of, read_regular
 from zsched.runtime.access_rules import Side, access_control
 from zsched.sessions import config as zenoh_config
-from zsched.sessions.certificate import common_names, validities
+from zsched.sessions.certificate import common_names, ders_of, parts_of, validities
 
 CERTIFICATE, KEY, TRUSTED = "certificate.pem", "key.pem", "ca.pem"
 MAX_BYTES: Final = 1 << 20
@@ -49,7 +50,10 @@ class Files:
 
 
 def files_of(security: Security, env: Mapping[str, str] = os.environ) -> Files:
-    """The files of a `security:` section; of each the one that systemd handed over, where there is one."""
+    """The files of a `security:` section; of each the one that systemd handed over, where there is one.
+
+    A certificate for the same key that was renewed since, and lies in the state folder, takes the place of the first.
+    """
     handed = Path(env[CREDENTIALS]) if env.get(CREDENTIALS) else None
 
     def place(name: str) -> Path:
@@ -57,7 +61,24 @@ def files_of(security: Security, env: Mapping[str, str] = os.environ) -> Files:
             return handed / name
         return Path(security.folder) / name
 
-    return Files(certificate=place(CERTIFICATE), key=place(KEY), trusted=place(TRUSTED))
+    first = place(CERTIFICATE)
+    renewed = renewed_in(places.state_folder(None, env))
+    certificate = renewed if _is_newer(renewed, first) else first
+    return Files(certificate=certificate, key=place(KEY), trusted=place(TRUSTED))
+
+
+def renewed_in(state: Path) -> Path:
+    """Where a daemon keeps the certificate that was sent to it: what `zsched join` has written is not its to change."""
+    return state / "pki" / CERTIFICATE
+
+
+def _is_newer(renewed: Path, first: Path) -> bool:
+    """Whether a certificate is for the same name and key as another one, and ends later."""
+    try:
+        after, before = (parts_of(ders_of(read_regular(path, MAX_BYTES))[0]) for path in (renewed, first))
+    except (OSError, ValueError):
+        return False
+    return (after.common_name, after.key) == (before.common_name, before.key) and after.ends > before.ends
 
 
 def _is_handed(path: Path) -> bool:

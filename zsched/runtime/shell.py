@@ -43,6 +43,7 @@ from zsched.core.values.gauges import GAUGES
 from zsched.core.values.messages import (
     ChangeFleet,
     Command,
+    CommandOutcome,
     CommandResult,
     ExplainTask,
     FleetTold,
@@ -54,6 +55,7 @@ from zsched.core.values.messages import (
     RestartTask,
     RetryTask,
     SetWeights,
+    TakeCertificate,
     TuneTask,
     WorkerLines,
     fleet_question,
@@ -269,6 +271,10 @@ def _restart_of(request: dict[str, Any]) -> RestartTask:
     return RestartTask(task=str(request["task"]))
 
 
+def _certificate_of(request: dict[str, Any]) -> TakeCertificate:
+    return TakeCertificate(certificate=Text(str(request["certificate"])))
+
+
 def _lines_of(request: dict[str, Any]) -> ReadLines:
     after = request.get("after", 0)
     if type(after) is not int:
@@ -310,6 +316,7 @@ _COMMANDS: dict[str, Callable[[dict[str, Any]], Command]] = {
     "explain": _explain_of,
     "restart": _restart_of,
     "lines": _lines_of,
+    "certificate": _certificate_of,
     "change": _change_of,
     "fleet": _fleet_of,
 }
@@ -363,6 +370,10 @@ def _fleet_json(told: FleetTold) -> dict[str, Any]:
     }
 
 
+def _no_certificate(_pem: str) -> CommandResult:
+    return CommandResult(outcome=CommandOutcome.INVALID, detail="this node's fleet has no certificates")
+
+
 class Shell:
     """The adapters of one daemon, and what each instruction means for them."""
 
@@ -388,6 +399,8 @@ class Shell:
         self.log: DecisionLog | None = None
         self.follow: Callable[[Fleet, bool], None] = lambda _fleet, _is_agreed: None
         """Lets the adapters follow another fleet (`zsched.runtime.adoption`), once they are all made."""
+        self.take_certificate: Callable[[str], CommandResult] = _no_certificate
+        """Keeps a newer certificate (`zsched.runtime.renewal`)."""
         self.stand_down = ""
         """Why this daemon must end, for its name is taken; empty: it need not."""
         self._failed_at: dict[str, float] = {}
@@ -472,6 +485,8 @@ class Shell:
                 self._answer_operator(request, explanation)
             case do.AnswerLines(request=request, task=task, after=after):
                 self._answer_operator(request, self._lines(task, after))
+            case do.TakeCertificate(request=request, certificate=certificate):
+                self._answer_operator(request, self.take_certificate(certificate))
             case do.ApplyRoutes(plan=plan):
                 self._streams().apply(plan)
             case do.AdoptFleet(fleet=fleet, is_agreed=is_agreed):

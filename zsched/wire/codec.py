@@ -57,6 +57,7 @@ KINDS: dict[str, tuple[type, int]] = {
     "explain_task": (messages.ExplainTask, SMALL),
     "explanation": (decision.Explanation, LARGE),
     "restart_task": (messages.RestartTask, SMALL),
+    "take_certificate": (messages.TakeCertificate, SMALL),
     "read_lines": (messages.ReadLines, SMALL),
     "change_fleet": (messages.ChangeFleet, LARGE),
     "read_fleet": (messages.ReadFleet, SMALL),

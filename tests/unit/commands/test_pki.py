@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import json
 import stat
+from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner, Result
 
 from support.schemas import faults
+from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.cli import app
 from zsched.sessions.certificate import common_names
 
+Json = dict[str, Any]
 FLEET = """\
 fleet: yard
 nodes:
@@ -106,6 +110,42 @@ def test_renew_takes_what_is_due_or_one_by_name_and_makes_no_key(here: Path) -> 
     assert "--csr and --out go with a NAME" in pki("renew", "--out", "x", code=2).stderr
     pki("renew", "robot1")
     assert sorted(path.name for path in (here / "robot1").iterdir()) == ["ca.pem", "certificate.pem"]
+
+
+def test_what_is_due_is_sent_to_the_nodes_and_so_is_what_a_node_has_missed(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[Json] = []
+    outcomes = {"robot1": "ok", "robot2": "invalid"}
+
+    def answer(request: Json) -> Json:
+        if request["verb"] == "status":
+            return {"fleet": "yard", "nodes": [{"name": "robot1"}, {"name": "robot2"}]}
+        asked.append(request)
+        return {"outcome": outcomes[request["node"]], "detail": "as it is", "revision": None}
+
+    pki("init")
+    for name in ("robot1", "robot2"):
+        pki("issue", name)
+    pki("issue", "ana", "--role", "operator")
+    with closing(OperatorSocket(here / "robot1.sock", answer)) as door:
+        door.open()
+        monkeypatch.setenv("ZSCHED_NODE", "robot1")
+        words = ("renew", "--deliver", "--runtime-dir", str(here))
+        said = pki(*words, code=1)
+        assert said.stdout == "robot1: as it is\nrobot2: as it is\n"
+        first = (here / "robot1" / "certificate.pem").read_text()
+        assert [(one["node"], one["certificate"] == first) for one in asked] == [("robot1", True), ("robot2", False)]
+        outcomes["robot2"] = "unchanged"
+        asked.clear()
+        pki(*words, "robot1")
+        assert [(one["node"], one["certificate"] == first) for one in asked] == [("robot1", False)], "a newer one"
+        pki("revoke", "robot1")
+        asked.clear()
+        pki(*words)
+        assert [one["node"] for one in asked] == ["robot2"], "nobody renews a revoked key"
+        assert "no node's key 'ana.operator'" in pki(*words, "ana.operator", code=2).stderr
+        assert "go without --deliver" in pki(*words, "robot2", "--out", "x", code=2).stderr
 
 
 def test_a_rotation_ends_once_everything_is_renewed(here: Path) -> None:

@@ -22,6 +22,7 @@ from zsched.core.membership.identity import QUIET_S
 from zsched.core.membership.knocking import KNOCKERS_KEPT
 from zsched.core.node import Node
 from zsched.core.status import build_snapshot
+from zsched.core.values.document import Text
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import StreamRule, TaskSpec, WorkerSpec, electorate_hash
 from zsched.core.values.messages import (
@@ -36,6 +37,7 @@ from zsched.core.values.messages import (
     Refused,
     RestartTask,
     RetryTask,
+    TakeCertificate,
     Utilities,
 )
 from zsched.core.values.model import (
@@ -731,6 +733,15 @@ def test_a_restart_of_what_does_not_run_is_refused(name: str, task: str, state: 
     assert of(batch, do.RenewWorker) == []
     result = of(batch, do.AnswerCommand)[0].result
     assert (result.outcome, result.detail) == (CommandOutcome.INVALID, said)
+
+
+def test_a_certificate_is_handed_on_whoever_has_sent_it() -> None:
+    event = ev.CertificateSent(request=7, command=TakeCertificate(certificate=Text("pem")))
+    assert of(make("edge1").handle(event, 100.0), do.TakeCertificate) == [
+        do.TakeCertificate(request=7, certificate="pem")
+    ]
+    with pytest.raises(ValueError, match="at most 4096"):
+        TakeCertificate(certificate=Text("x" * 4097))
 
 
 def test_a_question_for_lines_is_handed_on() -> None:

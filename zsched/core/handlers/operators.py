@@ -93,6 +93,10 @@ def _on_lines(_node: Stages, event: ev.LinesAsked, todo: ToDo, _now: float) -> N
     todo.add(do.AnswerLines(request=event.request, task=event.command.task, after=event.command.after))
 
 
+def _on_certificate(_node: Stages, event: ev.CertificateSent, todo: ToDo, _now: float) -> None:
+    todo.add(do.TakeCertificate(request=event.request, certificate=event.command.certificate))
+
+
 def _on_dropped(node: Stages, event: ev.FrameDropped, _todo: ToDo, now: float) -> None:
     node.counters[f"dropped_{event.kind}_{event.reason}"] += event.count
     node.frames_dropped_at = now
@@ -123,6 +127,7 @@ HANDLERS: Final[Mapping[type[Any], Handler]] = {
     ev.ExplanationAsked: _on_explanation,
     ev.RestartCommanded: _on_restart,
     ev.LinesAsked: _on_lines,
+    ev.CertificateSent: _on_certificate,
     ev.FrameDropped: _on_dropped,
     ev.Commanded: _on_commanded,
     ev.ProblemReported: _on_problem,

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Generic, get_args
+from typing import Final, Generic, get_args
 
-from zsched.core.values.document import Document
+from zsched.core.values.document import Document, Text
 from zsched.core.values.electorate import FleetValue, check_id
 from zsched.core.values.model import (
     MAX_FOR_S,
@@ -28,6 +28,9 @@ from zsched.core.values.model import (
     check_range,
     check_readings,
 )
+
+MAX_CERTIFICATE: Final = 4096
+"""Characters of a certificate that is sent to a node; those of `zsched pki` have 900."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -296,6 +299,21 @@ class RestartTask:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class TakeCertificate:
+    """Operator command to one node: go by a newer certificate for the key that it has.
+
+    Nobody needs to be trusted for it: the node looks at the authority's signature.
+    """
+
+    certificate: Text
+    """PEM."""
+
+    def __post_init__(self) -> None:
+        if len(self.certificate) > MAX_CERTIFICATE:
+            raise ValueError(f"certificate: {len(self.certificate)} characters, at most {MAX_CERTIFICATE}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ReadLines:
     """Operator's question to one node: what its worker for the task has printed behind line ``after``."""
 
@@ -410,6 +428,7 @@ Command = (
     | RetryTask
     | ExplainTask
     | RestartTask
+    | TakeCertificate
     | ReadLines
     | MoveTask
     | HoldTask

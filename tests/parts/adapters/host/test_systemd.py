@@ -125,6 +125,17 @@ def test_unit_is_accepted_by_systemd(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
+def test_the_units_that_renew_are_accepted_by_systemd(tmp_path: Path) -> None:
+    program = tmp_path / "zsched"
+    program.write_text("#!/bin/sh\n")
+    program.chmod(0o755)
+    for name in ("zsched-renew.service", "zsched-renew.timer"):
+        text = (UNIT.parent / name).read_text()
+        (tmp_path / name).write_text(text.replace("/opt/zsched/bin/zsched", str(program)))
+    done = analyze("verify", "--man=no", *(str(tmp_path / f"zsched-renew.{kind}") for kind in ("service", "timer")))
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_unit_exposes_little() -> None:
     done = analyze("security", "--offline=true", "--no-pager", str(UNIT))
     if "--offline" in done.stderr:

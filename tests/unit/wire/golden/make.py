@@ -243,6 +243,7 @@ SAMPLES: dict[str, object] = {
     ),
     "change_fleet": messages.ChangeFleet(document=_DOCUMENT, base_revision=3, reason="a third robot"),
     "restart_task": messages.RestartTask(task="map_merge"),
+    "take_certificate": messages.TakeCertificate(certificate=document.Text("-----BEGIN CERTIFICATE-----")),
     "read_lines": messages.ReadLines(task="map_merge", after=12),
     "worker_lines": messages.WorkerLines(
         node="edge1",

@@ -1,0 +1,116 @@
+"""A certificate that was sent to a node: which one it takes, and which files its sessions go by from then on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from support.authorities import install, make_authority
+from zsched.config.load import check_bytes
+from zsched.core.values.fleet import Fleet
+from zsched.core.values.messages import CommandOutcome
+from zsched.pki.authority import Authority
+from zsched.runtime.renewal import ends_soon, take
+from zsched.runtime.secured import digest_of, files_of, renewed_in, require_own
+
+OK, UNCHANGED, INVALID = CommandOutcome.OK, CommandOutcome.UNCHANGED, CommandOutcome.INVALID
+NOW = datetime.now(UTC)
+
+
+@pytest.fixture
+def authority(tmp_path: Path) -> Authority:
+    return make_authority(tmp_path / "authority", "yard")
+
+
+@pytest.fixture
+def fleet(tmp_path: Path, authority: Authority, monkeypatch: pytest.MonkeyPatch) -> Fleet:
+    """Of which this machine is robot1; its certificate was made ten days ago."""
+    install(authority, tmp_path / "pki", "robot1", ago=timedelta(days=10))
+    monkeypatch.setenv("ZSCHED_STATE_DIR", str(tmp_path / "state"))
+    text = f"fleet: yard\nsecurity: {{folder: {tmp_path / 'pki'}}}\nnodes:\n  robot1: {{kind: robot}}\ntasks: {{}}\n"
+    found = check_bytes(text.encode()).fleet
+    assert found is not None
+    return found
+
+
+def renewed(authority: Authority, ago: timedelta = timedelta()) -> str:
+    return authority.renew("robot1", None, b"", b"", NOW - ago).certificate.decode()
+
+
+def test_a_newer_certificate_for_the_same_key_is_gone_by(fleet: Fleet, authority: Authority, tmp_path: Path) -> None:
+    assert fleet.security is not None
+    before, pem = digest_of(fleet.security), renewed(authority)
+    result = take(fleet, tmp_path / "state", pem)
+    assert result.outcome is OK, result
+    files = files_of(fleet.security)
+    assert files.certificate == renewed_in(tmp_path / "state")
+    assert files.certificate.read_text() == pem
+    assert files.key == tmp_path / "pki" / "key.pem"
+    require_own(fleet, fleet.security, "robot1")
+    assert digest_of(fleet.security) != before, "open sessions have another one"
+    assert take(fleet, tmp_path / "state", pem).outcome is UNCHANGED
+    older = renewed(authority, timedelta(days=5))
+    assert take(fleet, tmp_path / "state", older).outcome is UNCHANGED
+    assert files.certificate.read_text() == pem
+
+
+def test_what_systemd_hands_over_is_renewed_too(
+    fleet: Fleet, authority: Authority, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert fleet.security is not None
+    (tmp_path / "pki").rename(tmp_path / "handed")
+    monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(tmp_path / "handed"))
+    assert take(fleet, tmp_path / "state", renewed(authority)).outcome is OK
+    assert files_of(fleet.security).certificate == renewed_in(tmp_path / "state")
+
+
+def test_nothing_else_is_taken(fleet: Fleet, authority: Authority, tmp_path: Path) -> None:
+    assert fleet.security is not None
+    state, other = tmp_path / "state", make_authority(tmp_path / "other", "yard")
+    install(other, tmp_path / "mallory", "robot1")
+    install(authority, tmp_path / "robot2", "robot2")
+    forged = (tmp_path / "mallory" / "certificate.pem").read_text()
+    theirs = (tmp_path / "robot2" / "certificate.pem").read_text()
+    ended = authority.renew("robot1", None, b"", b"", NOW - timedelta(days=31)).certificate.decode()
+    to_come = authority.renew("robot1", None, b"", b"", NOW + timedelta(days=2)).certificate.decode()
+    authority.revoke("robot1", NOW)
+    next_key = authority.issue("robot1", authority.record.entries[0].holder.role, [], b"", b"", NOW)
+    for pem, why in (
+        (forged, "of no authority that this node trusts"),
+        (theirs, "is robot2.yard.zsched.internal's"),
+        (ended, "not valid by its clock"),
+        (to_come, "not valid by its clock"),
+        (next_key.certificate.decode(), "robot1.k2.yard"),
+        ("", "no certificate in it"),
+        ("-----BEGIN CERTIFICATE-----\nMAoG\n-----END CERTIFICATE-----", ""),
+    ):
+        result = take(fleet, state, pem)
+        assert result.outcome is INVALID
+        assert why in result.detail
+    assert not renewed_in(state).exists()
+    assert files_of(fleet.security).certificate == tmp_path / "pki" / "certificate.pem"
+    assert take(replace(fleet, security=None), state, forged).outcome is INVALID
+
+
+def test_a_file_of_another_key_in_the_state_folder_counts_for_nothing(fleet: Fleet, tmp_path: Path) -> None:
+    assert fleet.security is not None
+    install(make_authority(tmp_path / "again", "yard"), renewed_in(tmp_path / "state").parent, "robot1")
+    assert files_of(fleet.security).certificate == tmp_path / "pki" / "certificate.pem"
+
+
+def test_a_state_folder_that_cannot_be_written_is_told(fleet: Fleet, authority: Authority, tmp_path: Path) -> None:
+    (tmp_path / "state").write_text("")
+    result = take(fleet, tmp_path / "state", renewed(authority))
+    assert result.outcome is INVALID
+    assert "cannot be written" in result.detail
+
+
+def test_a_certificate_that_nobody_renews_is_told_of_a_week_before_its_end(fleet: Fleet) -> None:
+    assert ends_soon(fleet, NOW) is None
+    assert ends_soon(fleet, NOW + timedelta(days=12)) is None
+    assert "certificate ends on" in (ends_soon(fleet, NOW + timedelta(days=14)) or "")
+    assert "has ended on" in (ends_soon(fleet, NOW + timedelta(days=21)) or "")
+    assert ends_soon(replace(fleet, security=None), NOW + timedelta(days=99)) is None

@@ -1,0 +1,88 @@
+"""Takes a newer certificate for this node's key, which the holder of the fleet's authority has sent.
+
+Knows: what must stand in it, where it is kept. Does not know: who has sent it: the authority's signature counts, and
+nothing else; how it comes (`zsched.adapters.network.control_bus`), when sessions go by it (`zsched.daemon`).
+"""
+
+from __future__ import annotations
+
+import logging
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Final
+
+from zsched.clock import wall_ns
+from zsched.core.values.fleet import Fleet
+from zsched.core.values.messages import CommandOutcome, CommandResult
+from zsched.errors import ConfigError
+from zsched.pki.files import PUBLIC, make_folder, write_whole
+from zsched.runtime.secured import bytes_of, files_of, identity_of, renewed_in
+from zsched.sessions.certificate import ders_of, parts_of
+
+SOON: Final = timedelta(days=7)
+"""So long before its certificate ends a node says so: it is due since 3 days then, and nobody has renewed it."""
+
+_log = logging.getLogger("zsched.daemon")
+
+
+def now_utc() -> datetime:
+    """The time on this machine's clock."""
+    return datetime.fromtimestamp(wall_ns() / 1e9, UTC)
+
+
+def take(fleet: Fleet, state: Path, pem: str) -> CommandResult:
+    """Keep a newer certificate of this node; the answer to who has sent it.
+
+    Args:
+        fleet: by which the node goes.
+        state: its state folder.
+        pem: the certificate.
+    """
+    if fleet.security is None:
+        return _refused("this node's fleet has no certificates")
+    from zsched.pki.signatures import Trust  # noqa: PLC0415 - it takes 8 MiB: only where there are certificates
+
+    files = files_of(fleet.security)
+    try:
+        der = ders_of(pem.encode())[0]
+        offered = Trust(bytes_of(files.trusted)).certified(der, now_utc())
+        own = parts_of(ders_of(bytes_of(files.certificate))[0])
+    except (ValueError, ConfigError) as error:
+        return _refused(str(error))
+    if offered is None:
+        return _refused("it is of no authority that this node trusts, or not valid by its clock")
+    if (offered.key, offered.common_name) != (own.key, own.common_name):
+        return _refused(f"it is {offered.common_name}'s, or for another key; this node is {own.common_name}")
+    until = f"until {offered.ends:%Y-%m-%d}"
+    if offered.ends <= own.ends:
+        return CommandResult(outcome=CommandOutcome.UNCHANGED, detail=f"its certificate lasts {own.ends:%Y-%m-%d}")
+    path = renewed_in(state)
+    try:
+        make_folder(path.parent)
+        write_whole(path, pem.encode(), PUBLIC)
+    except OSError as error:
+        return _refused(f"{path}: cannot be written: {error.strerror}")
+    _log.info("certificate renewed until=%s", f"{offered.ends:%Y-%m-%d}")
+    return CommandResult(outcome=CommandOutcome.OK, detail=f"its certificate is renewed {until}")
+
+
+def ends_soon(fleet: Fleet, now: datetime) -> str | None:
+    """What is to be done about a certificate that ends soon; ``None``: nothing.
+
+    Raises:
+        ConfigError: it cannot be read.
+    """
+    if fleet.security is None:
+        return None
+    ends = identity_of(fleet, fleet.security).ends
+    if now < ends - SOON:
+        return None
+    has = "has ended" if now > ends else "ends"
+    return (
+        f"this node's certificate {has} on {ends:%Y-%m-%d %H:%M} UTC, and its links with it: "
+        "`zsched pki renew --deliver` where the fleet's authority is, or is this machine's clock wrong?"
+    )
+
+
+def _refused(why: str) -> CommandResult:
+    return CommandResult(outcome=CommandOutcome.INVALID, detail=why)
