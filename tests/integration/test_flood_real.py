@@ -1,0 +1,73 @@
+"""A member of a secured fleet floods its daemons: nothing changes, nobody is taken for dead, and it is counted."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+from support.authorities import install, make_authority
+from zsched.core.values.messages import Prepare
+from zsched.core.values.model import Ballot, Beat, Proposal
+from zsched.runtime.access_rules import Side
+from zsched.runtime.tls import session_text
+from zsched.sessions.config import control_config
+from zsched.wire import codec as wire
+from zsched.wire.keyspace import Keyspace
+from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
+
+IDLE = "robot3"
+"""In the file, and not started: who floods has its certificate."""
+COUNT = 10_000
+KEYS = Keyspace("testbed")
+
+
+def attacker(bed: Testbed) -> str:
+    """The control session of a member that goes by no rules of its own."""
+    assert bed.fleet.security is not None
+    security = replace(bed.fleet.security, folder=str(bed.folder / "pki" / IDLE))
+    text = session_text(replace(bed.fleet, security=security), Side.CONTROL)
+    ends = tuple(bed.fleet.node(node).listen_control for node in bed.running())
+    config = json.loads(control_config(listen=(), connect=ends, operator_json5=text))
+    for rules in ("access_control", "downsampling"):
+        config.pop(rules, None)
+    return json.dumps(config)
+
+
+def test_ten_thousand_frames_of_each_kind_change_nothing(tmp_path: Path) -> None:
+    tree = echo_fleet(robots=3, edges=1)
+    for node in tree["nodes"].values():
+        node["listen"] = {kind: end.replace("tcp/", "tls/") for kind, end in node["listen"].items()}
+    tree["security"] = {}
+    authority = make_authority(tmp_path / "authority", tree["fleet"])
+    for name in tree["nodes"]:
+        install(authority, tmp_path / "pki" / name, name)
+    beat = wire.encode(Beat(node=IDLE, incarnation=1, sequence=1, loop_lag_s=0.0))
+    proposal = wire.encode(Proposal(voter=IDLE, task=TASK, base_revision=1, candidate="edge1", aggregate=0.5))
+    prepare = Prepare(task=TASK, ballot=Ballot(counter=10**6, node=IDLE, incarnation=1), electorate="e")
+    floods = (
+        ("frames", KEYS.beat(IDLE), beat, COUNT),
+        ("frames", KEYS.proposal(IDLE), proposal, COUNT),
+        ("frames", KEYS.profile(IDLE), b"\xc1" * 64, COUNT),
+        ("questions", KEYS.register("*", IDLE), wire.encode(prepare), COUNT // 10),
+    )
+    with Testbed(tmp_path, tree) as bed:
+        bed.init()
+        bed.start("robot1", "robot2", "edge1")
+        bed.wait_settled()
+        before = {key: bed.task("robot1")[key] for key in ("owner", "epoch", "revision")}
+        config = attacker(bed)
+        for kind, key, payload, count in floods:
+            command = [sys.executable, "-m", "zsched_lab.fleet.floods", kind, "--config", config, "--key", key]
+            command += ["--payload", payload.hex(), "--count", str(count)]
+            done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False, input="")
+            assert done.stdout.startswith(f"sent={count} "), done.stderr
+
+        wanted = {"dropped_beat_rate", "dropped_proposal_rate", "dropped_profile_garbage", "dropped_register_rate"}
+        bed.wait(lambda: wanted <= set(bed.status("robot1")["counters"]), 60, "every flood in the counters")
+        assert {key: bed.task("robot1")[key] for key in before} == before
+        mine = (f"{node} alive ->" for node in bed.running())
+        told = [one for one in mine for node in bed.running() if one in bed.log(node)]
+        assert told == [], "nobody who lives is taken for suspect or gone"
