@@ -367,7 +367,7 @@ def test_desk_refuses_what_is_no_request(house: House) -> None:
     for request, says in (
         (
             {"verb": "fly"},
-            "unknown verb 'fly'; known: access, change, explain, fleet, hold, lines, log, move, restart, ",
+            "unknown verb 'fly'; known: access, certificate, change, explain, fleet, hold, lines, log, move, restart, ",
         ),
         ({"verb": "move", "task": "merge", "target": "edge1"}, "move: 'by' is missing"),
         ({**order, "verb": "move"}, "move: 'target' is missing"),
