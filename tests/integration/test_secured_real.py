@@ -119,7 +119,8 @@ def test_who_has_a_member_s_link_and_not_its_key_says_nothing_where_it_counts(be
     keys, before = Keyspace(bed.fleet.name), bed.task("robot1")
     said: list[zenoh.Sample] = []
     with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as session:
-        session.declare_subscriber(keys.allocation("robot2"), said.append)
+        # what it repeats itself has no seal, and is not to be repeated
+        session.declare_subscriber(keys.allocation("robot2"), said.append, allowed_origin=zenoh.Locality.REMOTE)
         session.declare_queryable(
             keys.register("robot2", "*"),
             lambda query: query.reply(str(query.key_expr).replace("*", "robot2"), promise_for(query)),
