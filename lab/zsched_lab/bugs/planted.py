@@ -34,6 +34,7 @@ from zsched_lab.bugs.elector_bugs import ELECTOR_BUGS
 from zsched_lab.bugs.flag_bugs import FLAG_BUGS
 from zsched_lab.bugs.member_bugs import MEMBER_BUGS
 from zsched_lab.bugs.pilot_bugs import PILOT_BUGS
+from zsched_lab.bugs.recovery_bugs import RECOVERY_BUGS
 from zsched_lab.bugs.stream_bugs import STREAM_BUGS
 
 BUGS: tuple[Bug, ...] = (
@@ -41,6 +42,7 @@ BUGS: tuple[Bug, ...] = (
     *ELECTOR_BUGS,
     *PILOT_BUGS,
     *MEMBER_BUGS,
+    *RECOVERY_BUGS,
     *STREAM_BUGS,
     *ADOPTION_BUGS,
     *FLAG_BUGS,

@@ -13,7 +13,7 @@ from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.electorate.changes import AdoptDocument
 from zsched.core.electorate.founding import founded, recovered
-from zsched.core.electorate.recovery import MOVED, rejoined, sides_of
+from zsched.core.electorate.recovery import MOVED, Found, Recovery, consider, rejoined, sides_of
 from zsched.core.electorate.strangers import SHOWN_S, Strangers
 from zsched.core.node import Node
 from zsched.core.status import build_snapshot
@@ -22,7 +22,7 @@ from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.messages import Learnt, Prepare
-from zsched.core.values.model import Allocation, Ballot, Beat, PeerState, Proposal, RegisterState
+from zsched.core.values.model import Allocation, Ballot, Beat, Grant, PeerState, Proposal, RegisterState
 from zsched.core.vote.agreement import Agreement
 
 NAMES = ("edge1", "robot1", "robot2", "robot3")
@@ -201,6 +201,33 @@ def test_one_forged_beat_makes_no_stranger_of_a_peer() -> None:
     assert one.hear(beat(RIGHT), LEFT.generation_id, is_named=True, now=100.1)
     assert not one.is_one("robot3", 100.2)
     assert one.is_one("robot3", 101.3)
+
+
+def granted(one: Agreement, value: FleetValue, now: float) -> tuple[Grant, ...]:
+    """What an elector echoes after a beat of the task's owner that counts by a fleet value."""
+    owner, epoch = "robot3", ALLOCATION.epoch
+    sent = replace(beat(value), learnt=(("merge", ALLOCATION.revision, epoch),))
+    one.leases.on_beat(sent, {"merge": (owner, epoch)}, now)
+    return one.leases.on_sent(1, now).echoes
+
+
+def test_a_grant_needs_the_same_generation_as_well_as_the_same_number() -> None:
+    assert LEFT.number == RIGHT.number
+    one, later = agreement(), 200.0  # what was granted before its start is over
+    assert granted(one, RIGHT, later) == ()
+    assert [grant.owner for grant in granted(one, LEFT, later)] == ["robot3"]
+
+
+def test_recover_at_once_grants_nothing_while_a_lease_of_before_may_last() -> None:
+    """The leases of the generation before were longer than those of this one."""
+    own = replace(state_of("robot1", AGREED), lease_s=7.0)
+    it = Found(fleet=FLEET, me="robot1", own=own, others=(), answers=(), documents={"0d": FLEET}, file_hash="0f")
+    plan = consider(it)
+    assert isinstance(plan, Recovery)
+    state = plan.carry_out(generation_id="aa" * 16, disk="d1", incarnation=8, hardware="h")
+    one = agreement(state=state)
+    assert granted(one, LEFT, 100.0 + 6.9) == ()
+    assert [grant.owner for grant in granted(one, LEFT, 100.0 + 7.1)] == ["robot3"]
 
 
 # --- changing sides --------------------------------------------------------------------------------------------------
