@@ -27,6 +27,7 @@ from zsched.core.values.model import PAPER_METRICS
 from zsched.errors import WireError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
 from zsched.wire.codec import from_plain
+from zsched.wire.keyspace import MAX_DIGITS
 
 SCHEMA = "zsched.explain/1"
 MIN_WIDTH, MAX_WIDTH = 60, 160
@@ -128,7 +129,7 @@ def _point_of(word: str) -> Point:
     Raises:
         CliError: it is none of them.
     """
-    if word.isascii() and word.isdigit():
+    if word.isascii() and word.isdigit() and len(word) <= MAX_DIGITS:
         return Point(word=word, epoch=int(word))
     age_s = age_s_of(word)
     if age_s is not None:

@@ -22,7 +22,7 @@ from zsched.exits import EXIT_OK, EXIT_UNREACHABLE, EXIT_USAGE
 
 SCHEMA = "zsched.history/1"
 FOLLOW_S = 0.5
-_DURATION = re.compile(r"(\d+(?:\.\d+)?)(s|m|h|d)")
+_DURATION = re.compile(r"([0-9]{1,12}(?:\.[0-9]{1,9})?)(s|m|h|d)")
 _UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 
 

@@ -105,16 +105,20 @@ def address_of(text: str) -> Address:
     Raises:
         CliError: it is none.
     """
-    host, port = text, ""
+    host, port, is_closed = text, "", True
     if text.startswith("["):
-        host, _, port = text[1:].partition("]")
+        host, bracket, port = text[1:].partition("]")
+        is_closed = bool(bracket) and (not port or port.startswith(":"))
         port = port.removeprefix(":")
     elif text.count(":") == 1:
         host, _, port = text.partition(":")
-    is_good = bool(host) and not set(host) & set(' "/{}\\') and (not port or port.isdigit())
+    is_port = not port or (port.isascii() and port.isdigit() and len(port) <= len(str(MAX_PORT)))
+    is_good = bool(host) and is_closed and is_port and not set(host) & set(' "/{}\\')
+    advice = f"write HOST or HOST:PORT, as 192.0.2.11 or robot4.local:{CONTROL_PORT}"
     if not is_good or not 0 < int(port or CONTROL_PORT) < MAX_PORT:
-        advice = f"write HOST or HOST:PORT, as 192.0.2.11 or robot4.local:{CONTROL_PORT}"
         raise CliError(EXIT_USAGE, f"--address: {text!r} is no address; {advice}")
+    if _is_of_nobody(host):
+        raise CliError(EXIT_USAGE, f"--address: {host} is no address of one machine; {advice}")
     return Address(host=host, port=int(port or CONTROL_PORT))
 
 
@@ -123,6 +127,15 @@ def _is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
+
+
+def _is_of_nobody(host: str) -> bool:
+    """Whether a host is an address that no node can dial: of all interfaces, of a group, or of everybody."""
+    try:
+        address = ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return address.is_unspecified or address.is_multicast or host == "255.255.255.255"
 
 
 def own_address() -> str:

@@ -337,6 +337,7 @@ def test_a_past_that_is_not_there_is_said_with_what_there_is(past: Fleet, tmp_pa
         "3": (EXIT_FAILED, "no move of merge to epoch 3"),
         "1970-01-01T00:00:00Z": (EXIT_FAILED, "no judgement of merge until"),
         "yesterday": (EXIT_USAGE, "an epoch .12., an age"),
+        "9" * 5000: (EXIT_USAGE, "an epoch .12., an age"),
     }
     for word, (code, text) in refusals.items():
         with pytest.raises(CliError, match=text) as refused:

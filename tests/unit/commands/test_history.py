@@ -176,7 +176,7 @@ def test_another_machine_s_log_is_refused(pages: Pages) -> None:
     assert pages.asked == []
 
 
-@pytest.mark.parametrize("word", ["10", "m", "-5m", "1w", "1.5.2h", ""])
+@pytest.mark.parametrize("word", ["10", "m", "-5m", "1w", "1.5.2h", "", "\u0663m", f"{'9' * 400}d"])
 def test_what_is_no_duration_is_refused(word: str) -> None:
     with pytest.raises(CliError, match="no duration"):
         duration_s(word)

@@ -120,9 +120,16 @@ def test_addresses_as_people_write_them() -> None:
     assert address_of("[::1]:7500").entry("tcp") == (
         'host: "::1", listen: {control: "tcp/[::1]:7500", data: "tcp/[::1]:7501"}'
     )
-    for text in ("", "a b", "tcp/robot4:7457", "robot4:x", "robot4:0", "robot4:65535", 'a"b', "{a}"):
+    wrong = ("", "a b", "tcp/robot4:7457", "robot4:x", "robot4:0", "robot4:65535", 'a"b', "{a}")
+    for text in (*wrong, "robot4:\u00b2", "robot4:\u0663", f"robot4:{'1' * 5000}", "[::1", "[::1]7500"):
         with pytest.raises(CliError, match="is no address"):
             address_of(text)
+
+
+@pytest.mark.parametrize("text", ["0.0.0.0:7457", "[::]:7500", "224.0.0.1", "ff02::1", "255.255.255.255"])
+def test_an_address_that_nobody_can_dial_is_refused(text: str) -> None:
+    with pytest.raises(CliError, match="is no address of one machine"):
+        address_of(text)
 
 
 def test_who_dials_whom_is_kept_when_it_is_written_down() -> None:
