@@ -8,6 +8,8 @@ The state is written last: a machine on which only a part was written has no sta
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import secrets
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -94,7 +96,12 @@ def found(
         _check_no_papers(Path(fleet.security.folder))
     papers = None if certify is None or is_plan else certify(fleet)
     listed = (CERTIFICATE, TRUSTED, KEY) if certify is not None else ()
-    return fleet, _write(fleet, me, value, content, places, disk, papers=papers, listed=listed, is_plan=is_plan)
+    try:
+        return fleet, _write(fleet, me, value, content, places, disk, papers=papers, listed=listed, is_plan=is_plan)
+    except AdapterError:
+        with contextlib.suppress(OSError):  # else the next try would take it for the file of a fleet that is there
+            places.config.unlink(missing_ok=True)
+        raise
 
 
 # --- to ask for a certificate ----------------------------------------------------------------------------------------
@@ -302,15 +309,11 @@ def _write(
     if is_plan:
         return tuple(written)
     with StateFile(places.state, fleet=fleet.name, node=me) as file:
-        try:
-            if old is not None:
-                _put(places.config.with_name(f"{places.config.name}{BEFORE}"), old, PUBLIC_MODE)
-            _put(places.config, text, PUBLIC_MODE)
-            if papers is not None and folder is not None:
-                _put_papers(folder, papers)
-        except OSError as error:
-            advice = "run this as root, or give places of your own with --config and --state-dir"
-            raise AdapterError(f"{error.filename or places.config}: {error.strerror}; {advice}") from error
+        if old is not None:
+            _put(places.config.with_name(f"{places.config.name}{BEFORE}"), old, PUBLIC_MODE)
+        _put(places.config, text, PUBLIC_MODE)
+        if papers is not None and folder is not None:
+            _put_papers(folder, papers)
         DocumentStore(places.state).save(content)
         _put(places.state / COPY_NAME, f"{fleet_hash(fleet)}\n".encode(), PRIVATE_MODE)
         file.create(state)
@@ -338,9 +341,25 @@ def _other_text(path: Path, text: bytes) -> bytes | None:
 
 
 def _put(path: Path, content: bytes, mode: int) -> None:
-    _make_folder(path.parent)
-    replace_synced(path, path.with_name(f"{path.name}.new"), content)
-    path.chmod(mode)
+    """Let a file hold that.
+
+    Raises:
+        AdapterError: it cannot be written.
+    """
+    try:
+        _make_folder(path.parent)
+        replace_synced(path, path.with_name(f"{path.name}.new"), content)
+        path.chmod(mode)
+    except OSError as error:
+        raise AdapterError(f"cannot write {path}: {error.strerror}; {_advice(error, path)}") from error
+
+
+def _advice(error: OSError, path: Path) -> str:
+    if error.errno in (errno.EACCES, errno.EPERM):
+        return "run this as root, or give places of your own with --config and --state-dir"
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO):
+        return "free or remount the disk, then give the command again"
+    return f"look what is at {error.filename or path}, move it away, then give the command again"
 
 
 def _make_folder(path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 
@@ -177,6 +178,56 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path, invitation: In
     places = Places(config=tmp_path / "file" / "fleet.yaml", state=tmp_path / "state")
     with pytest.raises(AdapterError, match="Not a directory"):
         join(invitation, places, is_plan=False)
+
+
+def test_a_fleet_that_was_founded_in_part_is_founded_again(first: Places) -> None:
+    first.state.mkdir(parents=True)
+    (first.state / "documents").write_text("in the way")
+    with pytest.raises(AdapterError, match="cannot write the fleet's document"):
+        found(TEXT, "robot1", first, is_plan=False)
+    assert not first.config.exists()
+    (first.state / "documents").unlink()
+    found(TEXT, "robot1", first, is_plan=False)
+    assert value_at(first, "robot1")[1].text == TEXT
+
+
+@pytest.mark.parametrize("place", ["config", "copy"])
+def test_what_is_in_the_way_of_a_file_is_named(second: Places, invitation: Invitation, place: str) -> None:
+    file = second.config if place == "config" else second.state / "copied"
+    (file.parent / f"{file.name}.new").mkdir(parents=True)
+    with pytest.raises(AdapterError, match=rf"cannot write .*/{file.name}: Is a directory; look what is at"):
+        join(invitation, second, is_plan=False)
+
+
+@pytest.mark.root
+def test_a_full_disk_is_told_as_that_and_the_command_can_be_given_again(
+    tmp_path: Path, second: Places, invitation: Invitation
+) -> None:
+    disk = tmp_path / "small"
+    disk.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=28k", "tmpfs", str(disk)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    if mounted.returncode != 0:
+        pytest.skip(f"cannot mount a small disk: {mounted.stderr.strip()}")
+    try:
+        where = Places(config=second.config, state=disk / "state")
+        told = set()
+        for pages in (7, 6, 5, 4):  # what is left is enough for one file more each time
+            (disk / "filler").write_bytes(b"x" * 4096 * pages)
+            with pytest.raises(AdapterError, match=r"No space left on device; free or remount the disk") as caught:
+                join(invitation, where, is_plan=False)
+            told.add(str(caught.value).partition(":")[0].rpartition("/")[2])
+        assert {"documents", "copied", "state"} <= told
+        (disk / "filler").unlink()
+        join(invitation, where, is_plan=False)
+        assert is_joined(invitation, where)
+    finally:
+        subprocess.run(["umount", str(disk)], check=True, timeout=60)
 
 
 def test_a_document_that_cannot_be_used_here_is_refused(second: Places, invitation: Invitation) -> None:
