@@ -50,7 +50,7 @@ from zsched.errors import AdapterError, ConfigError, NameTakenError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_NAME_TAKEN, EXIT_OK
 from zsched.guard import on_failure
 from zsched.ipc.takeover import Door
-from zsched.log_limit import limit_handlers
+from zsched.log_limit import log_to_stderr
 from zsched.runtime import renewal
 from zsched.runtime import tls as daemon_tls
 from zsched.runtime.access import StreamAccess, joins_at
@@ -594,8 +594,7 @@ def _begin_anew() -> None:
 def _set_up_logging(level: str) -> None:
     # journald stamps its own times; elsewhere a person wants them.
     stamp = "" if "JOURNAL_STREAM" in os.environ else "%(asctime)s "
-    logging.basicConfig(stream=sys.stderr, level=level, format=f"{stamp}%(levelname)s %(name)s %(message)s")
-    limit_handlers()
+    log_to_stderr(level, f"{stamp}%(levelname)s %(name)s %(message)s")
 
 
 if __name__ == "__main__":

@@ -1,5 +1,8 @@
 """No log line repeats without limit: a burst passes, then a few a second, with a count of what was left out.
 
+And no text in a line can look like a line of its own, nor tell a terminal what to do: an operator's reason, a worker's
+output and a peer's words are logged on every node.
+
 Knows: where in the source a line comes from. Does not know: what it says.
 """
 
@@ -53,10 +56,24 @@ LIBRARY: Final = ("zsched.guard", "zsched.introduction", "zsched.streams", "zsch
 """The loggers of the worker library, whose handlers are the program's own."""
 
 
-def limit_handlers() -> None:
-    """Limit whatever this process logs (a daemon, a relay): once its handlers are there."""
-    for handler in logging.getLogger().handlers:
-        handler.addFilter(LIMIT)
+class PlainLines(logging.Formatter):
+    """A formatter whose records begin in the first column, and only they."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The record; what follows a line end is indented, and control characters are replaced by ``?``."""
+        text = super().format(record)
+        if text.isprintable():
+            return text
+        plain = "".join(char if char.isprintable() or char in "\n\t" else "?" for char in text)
+        return plain.replace("\n", "\n  ")
+
+
+def log_to_stderr(level: str, form: str) -> None:
+    """Let this process (a daemon, a relay) log to stderr by ``form``, in plain lines and with the limit."""
+    handler = logging.StreamHandler()
+    handler.setFormatter(PlainLines(form))
+    handler.addFilter(LIMIT)
+    logging.basicConfig(level=level, handlers=[handler])
 
 
 def limit_library() -> None:

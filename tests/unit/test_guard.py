@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import logging
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -14,7 +15,7 @@ import pytest
 import zsched
 from zsched import guard
 from zsched.guard import guarded
-from zsched.log_limit import LIBRARY, MAX_PLACES, LogLimit, limit_library
+from zsched.log_limit import LIBRARY, MAX_PLACES, LogLimit, PlainLines, limit_library
 from zsched.log_limit import LIMIT as SHARED
 
 PACKAGE = Path(zsched.__file__).parent
@@ -224,6 +225,25 @@ def test_a_line_that_repeats_is_cut_and_the_rest_is_counted(monkeypatch: pytest.
     now[0] += 1.0
     storm(10)
     assert lines.lines[3:] == ["another place is not held up", "sample 0 [997 more from here were left out]"]
+
+
+def test_no_text_of_a_line_begins_another_line_or_commands_a_terminal() -> None:
+    reason = "new fan\n2026-11-24 INFO zsched.vote forged\r\x1b[2J\u2028\x85"
+    record = logging.LogRecord("zsched.vote", logging.INFO, "file", 1, "drained: %s", (reason,), None)
+    first, second = PlainLines("%(levelname)s %(name)s %(message)s").format(record).split("\n")
+    assert first == "INFO zsched.vote drained: new fan"
+    assert second == "  2026-11-24 INFO zsched.vote forged??[2J??"
+
+
+def test_a_traceback_stays_readable() -> None:
+    try:
+        int("one\ntwo")
+    except ValueError:
+        record = logging.LogRecord("x", logging.ERROR, "file", 1, "failed", None, sys.exc_info())
+    lines = PlainLines("%(message)s").format(record).splitlines()
+    assert lines[:2] == ["failed", "  Traceback (most recent call last):"]
+    assert lines[-1].startswith("  ValueError: ")
+    assert all(line.startswith("  ") for line in lines[1:])
 
 
 def test_what_is_remembered_of_places_is_bounded() -> None:

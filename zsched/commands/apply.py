@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TextIO
 
 from zsched.commands.ask import Door
-from zsched.commands.common import CliError, Json, nearest, print_json
+from zsched.commands.common import CliError, Json, check_reason, nearest, print_json
 from zsched.commands.document import (
     QUESTION,
     InForce,
@@ -128,6 +128,7 @@ def apply(door: Door, view: ApplyView, make: Callable[[InForce], str], file: str
         ConfigError: the new file has faults.
     """
     _check_accepted(view)
+    check_reason(view.reason)
     held = in_force(door)
     if view.revision is not None and view.revision != held.revision:
         raise CliError(EXIT_FAILED, f"revision {view.revision} is overtaken: {held.fleet} has revision {held.revision}")

@@ -16,6 +16,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from zsched.commands.page import harmless
+from zsched.core.values.model import MAX_ASKED
 from zsched.errors import AdapterError, ConfigError, ZschedError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE
 
@@ -152,6 +153,18 @@ def print_json(body: Mapping[str, Any], *, is_line: bool = False) -> None:
     text = json.dumps(body, ensure_ascii=False, indent=None if is_line else 2)
     sys.stdout.write(f"{text}\n")
     sys.stdout.flush()
+
+
+def check_reason(reason: str) -> None:
+    """Refuse a reason that no node would take, or that would not be one line of its journal.
+
+    Raises:
+        CliError: it is too long, or has a line end or a control character.
+    """
+    if len(reason) > MAX_ASKED:
+        raise CliError(EXIT_USAGE, f"--reason: {len(reason)} characters, at most {MAX_ASKED}")
+    if not reason.isprintable():
+        raise CliError(EXIT_USAGE, "--reason: it has a line end or a control character; write one line of plain text")
 
 
 def nearest(name: str, known: Sequence[str]) -> str:

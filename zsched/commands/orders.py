@@ -19,14 +19,13 @@ from typing import Any, Final
 
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door
-from zsched.commands.common import CliError, Json, nearest, print_json
+from zsched.commands.common import CliError, Json, check_reason, nearest, print_json
 from zsched.commands.page import harmless, span
 from zsched.commands.report import FLAGS, millis, told_flag, told_hold
 from zsched.commands.wait import Condition, missing
 from zsched.commands.weights import NAMES, shares
 from zsched.core.values.fleet import TUNED_LINKS, TUNED_RULES
 from zsched.core.values.model import (
-    MAX_ASKED,
     MAX_ASKER,
     MAX_FOR_S,
     Aggregate,
@@ -102,10 +101,9 @@ def check_said(view: OrderView) -> None:
     """Refuse a reason or a duration that no order can carry.
 
     Raises:
-        CliError: one is too long.
+        CliError: one is too long, or the reason is not one line.
     """
-    if len(view.reason) > MAX_ASKED:
-        raise CliError(EXIT_USAGE, f"--reason: {len(view.reason)} characters, at most {MAX_ASKED}")
+    check_reason(view.reason)
     if view.for_s is not None and not 1.0 <= view.for_s <= MAX_FOR_S:
         raise CliError(EXIT_USAGE, f"--for: {span(view.for_s)} is not from 1s to 366d")
 

@@ -19,7 +19,7 @@ import signal
 import sys
 
 from zsched.ipc.protocol import RelayHello
-from zsched.log_limit import limit_handlers
+from zsched.log_limit import log_to_stderr
 from zsched.sessions.config import relay_pools
 
 PR_SET_PDEATHSIG = 1
@@ -32,8 +32,7 @@ STOP_S = 2.0
 def main() -> None:
     """Run the relay; never returns (threads of zenoh must not be waited for at exit)."""
     arguments = _arguments()
-    logging.basicConfig(stream=sys.stderr, level=arguments.log_level, format="%(name)s %(levelname)s %(message)s")
-    limit_handlers()
+    log_to_stderr(arguments.log_level, "%(name)s %(levelname)s %(message)s")
     _few_arenas()
     if arguments.door is None:
         _die_with(arguments.parent)

@@ -401,3 +401,13 @@ def test_show_names_the_electors_and_who_goes_by_something_else(node: Node) -> N
         "  edge1   no answer",
     ]
     assert faults(json.loads(run("fleet", "show", "--json").stdout)) == []
+
+
+@pytest.mark.parametrize("reason", ["by night\n2026-11-24 INFO forged", "x" * 201])
+def test_a_reason_that_is_not_one_short_line_is_refused(node: Node, tmp_path: Path, reason: str) -> None:
+    file = tmp_path / "new.yaml"
+    file.write_text(node.text.replace("timing: wifi", "timing: wired"))
+    done = run("apply", file, "--yes", "-m", reason)
+    assert done.exit_code == 2
+    assert "--reason: " in done.stderr
+    assert node.changes == []

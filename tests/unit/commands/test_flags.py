@@ -256,3 +256,11 @@ def test_a_word_that_is_neither_on_nor_off_and_a_self_elsewhere_are_refused(daem
     assert run("drain", "--self", "--node", "robot1").exit_code == 2
     assert run("drain", "--self", "--plan").stdout.splitlines()[1].split()[:2] == ["robot1", "drain"]
     assert daemon.changes == []
+
+
+@pytest.mark.parametrize("reason", ["new fan\n2026-11-24 INFO forged", "\x1b[2J", "\udcff", "x" * 201])
+def test_a_reason_that_is_not_one_short_line_is_refused(daemon: Daemon, reason: str) -> None:
+    done = run("drain", "edge1", "--yes", "--detach", "-m", reason)
+    assert done.exit_code == 2
+    assert "--reason: " in done.stderr
+    assert daemon.changes == []
