@@ -34,6 +34,7 @@ from zsched.core.values.messages import (
     RestartTask,
     RetryTask,
     SetWeights,
+    TakeCertificate,
     Utilities,
     fleet_answer,
     fleet_question,
@@ -410,6 +411,8 @@ class Storm:
             return ev.LinesAsked(request=self.number(), command=ReadLines(task=self.task()))
         if self.rng.random() < 0.1:
             return ev.FleetReadAsked(request=self.number(), command=ReadFleet())
+        if self.rng.random() < 0.1:
+            return ev.CertificateSent(request=self.number(), command=TakeCertificate(certificate=Text("pem")))
         base = self.rng.choice((None, self.number()))
         cpu = self.rng.choice((0.25, 0.75, 2.0))
         command = SetWeights(task=self.task(), cpu=cpu, memory=1.0 - cpu, network=0.0, base_revision=base)
