@@ -463,6 +463,8 @@ def test_options_are_found_in_arguments_and_environment(
     seen: list[daemon.Options] = []
 
     class Recorder:
+        begins_anew = False
+
         def __init__(self, options: daemon.Options) -> None:
             seen.append(options)
 
