@@ -42,7 +42,10 @@ def names_this_machine(scene: Scene) -> Result:
 
 
 def in_force(scene: Scene) -> Result:
-    """Whether the daemon goes by the fleet file as it is now."""
+    """Whether the daemon goes by the fleet file as it is now, where no document is agreed."""
+    if scene.status.get("document"):
+        told = f"the daemon goes by the agreed document, hash {scene.status['fleet_file']}, and not by {scene.file}"
+        return passed(f"{told}; `zsched apply FILE` changes the document")
     mine, running = fleet_hash(scene.fleet), str(scene.status["fleet_file"])
     if mine == running:
         return passed(f"the daemon goes by this file, hash {mine}")

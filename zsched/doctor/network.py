@@ -10,6 +10,7 @@ import contextlib
 import ipaddress
 import os
 import socket
+import sys
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures import TimeoutError as LateError
@@ -25,6 +26,7 @@ RESOLVE_S: Final = 5.0
 CONNECT_S: Final = 2.0
 LISTENS: Final = "0A"
 """The state of a listening socket in /proc/net/tcp."""
+WILDCARDS: Final = frozenset({"0.0.0.0", "::"})  # noqa: S104 - what others listen at
 OURS: Final = ("zsched.daemon", "zsched.relay")
 
 
@@ -115,18 +117,39 @@ def _is_loopback(host: str) -> bool:
 
 def ports_are_ours(scene: Scene) -> Result:
     """Whether nobody but this node's daemon and relay listens on its ports."""
-    ports: dict[int, str] = {}
+    ports: list[tuple[str, int, str]] = []
     for session, listen in (("control", scene.me.listen_control), ("data", scene.me.listen_data)):
-        port = listen.partition("?")[0].partition("#")[0].rpartition(":")[2]
+        host, _, port = listen.partition("/")[2].partition("?")[0].partition("#")[0].rpartition(":")
         if port.isdecimal() and int(port) and listen.startswith(("tcp/", "tls/")):
-            ports[int(port)] = session
+            ports.append((host.strip("[]"), int(port), session))
     if not ports:
         return skipped(f"{scene.node} has no fixed port")
     listening = _listeners()
-    return joined((_port(scene, port, session, listening.get(port)) for port, session in ports.items()), passed())
+    found = ((port, session, _at(host, listening.get(port, []))) for host, port, session in ports)
+    return joined((_port(scene, port, session, inodes) for port, session, inodes in found), passed())
 
 
-def _port(scene: Scene, port: int, session: str, inodes: set[str] | None) -> Result:
+def _at(host: str, listeners: list[tuple[str, str]]) -> set[str]:
+    """The sockets among these that listen at ``host``; a wildcard address meets every other one.
+
+    Two daemons may have one port at different addresses of a machine.
+    """
+    wanted: set[str] = set()
+    with contextlib.suppress(OSError, UnicodeError):
+        wanted = {_plain(str(one[4][0])) for one in socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)}
+    if not wanted or wanted & WILDCARDS:
+        return {inode for _, inode in listeners}
+    return {inode for address, inode in listeners if address in wanted or address in WILDCARDS}
+
+
+def _plain(address: str) -> str:
+    """An address without its zone; one of IPv4 that is written in IPv6 as itself."""
+    found = ipaddress.ip_address(address.partition("%")[0])
+    mapped = found.ipv4_mapped if isinstance(found, ipaddress.IPv6Address) else None
+    return str(mapped or found)
+
+
+def _port(scene: Scene, port: int, session: str, inodes: set[str]) -> Result:
     is_up = scene.own is not None
     if not inodes:
         if not is_up:
@@ -149,16 +172,24 @@ def _is_ours(words: list[str], node: str) -> bool:
     return any(module in words for module in OURS) and node in words
 
 
-def _listeners() -> dict[int, set[str]]:
-    """{TCP port: inodes of the sockets that listen on it} of this network namespace."""
-    found: dict[int, set[str]] = {}
+def _listeners() -> dict[int, list[tuple[str, str]]]:
+    """{TCP port: (address, inode) of every socket that listens on it} of this network namespace."""
+    found: dict[int, list[tuple[str, str]]] = {}
     for table in ("/proc/net/tcp", "/proc/net/tcp6"):
         with contextlib.suppress(OSError):
             for line in Path(table).read_text(encoding="ascii").splitlines()[1:]:
                 fields = line.split()
                 if fields[3] == LISTENS:
-                    found.setdefault(int(fields[1].rpartition(":")[2], 16), set()).add(fields[9])
+                    address, _, port = fields[1].partition(":")
+                    found.setdefault(int(port, 16), []).append((_address(address), fields[9]))
     return found
+
+
+def _address(digits: str) -> str:
+    """An address as /proc/net writes it, 32 bits at a time in the machine's own order."""
+    words = (int(digits[at : at + 8], 16) for at in range(0, len(digits), 8))
+    packed = b"".join(word.to_bytes(4, sys.byteorder) for word in words)
+    return _plain(str(ipaddress.ip_address(packed)))
 
 
 def _holders(inodes: set[str]) -> list[tuple[int, list[str]]]:

@@ -67,6 +67,15 @@ def test_a_daemon_with_yesterday_s_file_is_found(tmp_path: Path) -> None:
     assert_finds(run("file.in_force", newer), WARN, "goes by a file of hash")
 
 
+def test_a_file_that_is_not_the_agreed_document_is_no_fault(tmp_path: Path) -> None:
+    scene = scene_of(tmp_path)
+    scene.file.write_text(FLEET.replace("cpu: 0.5, memory: 0.5", "cpu: 0.6, memory: 0.4"))
+    agreed = scene_of(tmp_path, scene.file.read_text(), own={**(scene.own or {}), "document": "0d" * 8})
+    result = run("file.in_force", agreed)
+    assert result.verdict is PASS
+    assert "goes by the agreed document" in "\n".join(result.evidence)
+
+
 # --- the state -------------------------------------------------------------------------------------------------------
 
 
@@ -314,6 +323,26 @@ def test_another_program_on_our_port_is_found(tmp_path: Path, listener: tuple[so
     assert_finds(run("net.ports", scene), FAIL, f"port {listener[1]} (control) is held by process")
     listener[0].close()
     assert run("net.ports", scene).verdict is PASS
+
+
+def test_another_program_on_our_port_at_another_address_of_the_machine_is_no_fault(
+    tmp_path: Path, listener: tuple[socket.socket, int]
+) -> None:
+    text = FLEET.replace("0.0.0.0:21257", f"127.0.0.2:{listener[1]}")
+    scene = replace(scene_of(tmp_path, text), own=None)
+    assert run("net.ports", scene).verdict is PASS
+    with socket.create_server(("::1", 0), family=socket.AF_INET6) as other:
+        port = other.getsockname()[1]
+        text = FLEET.replace("0.0.0.0:21257", f"'[::1]:{port}'").replace("tcp/'[::1]", "'tcp/[::1]")
+        scene = replace(scene_of(tmp_path, text), own=None)
+        assert_finds(run("net.ports", scene), FAIL, f"port {port} (control) is held by process")
+
+
+def test_another_program_at_every_address_is_found_at_ours(tmp_path: Path) -> None:
+    with socket.create_server(("0.0.0.0", 0)) as other:  # noqa: S104 - that is what is tested
+        port = other.getsockname()[1]
+        scene = replace(scene_of(tmp_path, FLEET.replace("0.0.0.0:21257", f"127.0.0.2:{port}")), own=None)
+        assert_finds(run("net.ports", scene), FAIL, f"port {port} (control) is held by process")
 
 
 def test_a_daemon_that_does_not_listen_where_it_should_is_found(
