@@ -22,7 +22,7 @@ from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import ChangeFleet, CommandOutcome, CommandResult
 
 MAX_OPEN = 16
-"""So many commands may wait for their documents; of more the oldest end without an answer."""
+"""So many commands may wait for their documents; of more the oldest ends, and its operator hears so."""
 
 _ENDED = {
     RoundOutcome.CONFLICT: (CommandOutcome.CONFLICT, "another change came first; look and try again"),
@@ -57,6 +57,8 @@ class Orders:
             self._storing[request] = replace(command, base_revision=value.revision)
             for old in tuple(self._storing)[:-MAX_OPEN]:
                 del self._storing[old]
+                detail = f"{MAX_OPEN} newer changes wait here for their documents; nothing is changed, try again"
+                self._answer(old, CommandOutcome.CONFLICT, detail, todo)
             todo.add(do.StoreDocument(request=request, content=command.document))
         elif command.add_elector:
             change = AddElector(base_revision=value.revision, name=command.add_elector, disk=command.disk)

@@ -15,6 +15,7 @@ from zsched.core import instructions as do
 from zsched.core.electorate.changes import AdoptDocument
 from zsched.core.electorate.founding import founded
 from zsched.core.electorate.numbers import in_force
+from zsched.core.electorate.orders import MAX_OPEN
 from zsched.core.todo import ToDo
 from zsched.core.values.change import RoundOutcome
 from zsched.core.values.document import Document, Flag, FlagKind, Text
@@ -118,6 +119,21 @@ def commanded(agreement: Agreement, command: ChangeFleet, request: int = 3) -> T
 def told(todo: ToDo) -> tuple[CommandOutcome, str]:
     (answer,) = of(todo, do.AnswerCommand)
     return answer.result.outcome, answer.result.detail
+
+
+def test_of_more_commands_than_can_wait_the_oldest_ends_with_an_answer_and_changes_nothing() -> None:
+    agreement = make(FIRST)
+    for request in range(MAX_OPEN):
+        content = Document(text=Text(f"fleet: {request}"))
+        assert of(commanded(agreement, ChangeFleet(document=content), request), do.AnswerCommand) == []
+    todo = commanded(agreement, ChangeFleet(document=Document(text=Text("fleet: new"))), MAX_OPEN)
+    (answer,) = of(todo, do.AnswerCommand)
+    assert (answer.request, answer.result.outcome) == (0, CommandOutcome.CONFLICT)
+    assert "try again" in answer.result.detail
+    late = ToDo()
+    stored = ev.DocumentStored(document="0d", fleet=SAID, request=0)
+    agreement.orders.on_stored(stored, late, 100.2)
+    assert of(late, do.AnswerCommand) == []
 
 
 # --- electors --------------------------------------------------------------------------------------------------------
