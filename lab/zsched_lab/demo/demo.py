@@ -5,6 +5,7 @@ Knows: options, exit codes, and how a run ends at any moment. Does not know: wha
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from dataclasses import dataclass
@@ -96,9 +97,21 @@ def usage_fault(options: DemoOptions) -> str | None:
         return f"--mode {options.mode}: choose one of {', '.join(MODES)}"
     if not MIN_DURATION_S <= options.duration_s <= MAX_DURATION_S:
         return f"--duration {options.duration_s:g}: give {MIN_DURATION_S:g} to {MAX_DURATION_S:g} seconds"
-    if options.out is not None and options.out.exists() and any(options.out.iterdir()):
-        return f"--out {options.out}: the folder is not empty; name a new one, nothing is overwritten"
-    return None
+    return None if options.out is None else _folder_fault(options.out)
+
+
+def _folder_fault(out: Path) -> str | None:
+    """Why the run's files cannot be written there, if so; touches nothing."""
+    try:
+        if out.exists() and any(out.iterdir()):
+            return f"--out {out}: the folder is not empty; name a new one, nothing is overwritten"
+        there = next(path for path in (out.absolute(), *out.absolute().parents) if path.exists())
+    except OSError as error:
+        return f"--out {out}: {error.strerror}; name a folder that you may write into"
+    if there.is_dir() and os.access(there, os.W_OK | os.X_OK):
+        return None
+    why = "you may not write there" if there.is_dir() else "it is no folder"
+    return f"--out {out}: {there}: {why}; name another folder"
 
 
 def complain(text: str) -> None:

@@ -38,6 +38,16 @@ def test_a_folder_with_something_in_it_is_not_overwritten(tmp_path: Path, capsys
     assert "not empty" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("inner", ["", "below"])
+def test_a_folder_that_is_a_file_is_told_before_anything_starts(
+    inner: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine").write_text("x")
+
+    assert run_demo(DemoOptions(out=tmp_path / "mine" / inner)) == 2
+    assert "--out" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_the_first_signal_interrupts_and_later_ones_cannot_cut_the_clean_up(number: signal.Signals) -> None:
     cleaned = []
