@@ -18,3 +18,7 @@ def main() -> None:
         from zsched.exits import EXIT_INTERRUPTED  # noqa: PLC0415 - nothing is imported outside of the `try`
 
         sys.exit(EXIT_INTERRUPTED)
+
+
+if __name__ == "__main__":
+    main()

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from zsched.commands.common import CliError, Json, Verb, Verbs, print_json
+from zsched.commands.common import CliError, Json, Verb, Verbs, nearest, print_json
 from zsched.commands.example import Example, write_example
 from zsched.commands.flag_verbs import add_flag_verbs
 from zsched.commands.fleet_verbs import (
@@ -201,11 +201,17 @@ def init(
     from zsched import paths as places  # noqa: PLC0415 - each verb imports what it needs
     from zsched.adapters.machine import core_speed  # noqa: PLC0415 - likewise
     from zsched.config.load import load_fleet, require_node  # noqa: PLC0415 - ruamel.yaml is slow to import
+    from zsched.core.vote.belief import MAX_GENERATION  # noqa: PLC0415 - likewise
     from zsched.runtime.init import check_blank, init_state, settle_dispute, standing_state  # noqa: PLC0415 - imports zenoh
 
+    if generation > MAX_GENERATION:
+        raise CliError(EXIT_USAGE, f"--generation {generation}: at most {MAX_GENERATION}")
     file = places.config_path(config, os.environ)
     fleet = load_fleet(file)
-    name = _node_name(node)
+    name, names = _node_name(node), [spec.name for spec in fleet.nodes]
+    if node is not None and name not in names:  # a wrong word, and no wrong file
+        told = f"--node: {file} has no node {name!r}{nearest(name, names)}; there are {', '.join(names)}"
+        raise CliError(EXIT_USAGE, told)
     require_node(fleet, name, file)
     state = places.state_folder(state_dir, os.environ)
     if settle:

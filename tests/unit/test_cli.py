@@ -22,6 +22,7 @@ import pytest
 import typer
 from typer.testing import CliRunner, Result
 
+from support.clinic import FLEET
 from support.schemas import faults
 from support.waiting import within
 from zsched.adapters.host.operator_socket import OperatorSocket
@@ -620,6 +621,37 @@ def test_connect_only_asks(daemon: Daemon) -> None:
     assert (result.exit_code, daemon.asked) == (2, [])
     assert "--connect only asks" in result.stderr
     assert run("status", "--connect", "robot1", "--node", "*").exit_code == 2
+
+
+# --- words that are wrong --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("--generation", "99999999999", "--node", "edge1"), "--generation 99999999999: at most 1048575"),
+        (("--node", "edg1"), "has no node 'edg1'; did you mean edge1?"),
+    ],
+)
+def test_init_with_a_wrong_word_ends_as_usage_and_writes_nothing(
+    words: tuple[str, ...], says: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "fleet.yaml"
+    file.write_text(FLEET)
+    state = tmp_path / "state"
+    result = CliRunner().invoke(app, ["init", "--config", str(file), "--state-dir", str(state), *words])
+    assert result.exit_code == 2, result.stderr
+    assert says in result.stderr
+    assert not state.exists()
+
+
+def test_the_module_runs_the_verb_as_the_program_does(tmp_path: Path) -> None:
+    file = tmp_path / "fleet.yaml"
+    file.write_text(FLEET.replace("kind: edge", "kind: ege"))
+    done = subprocess.run(
+        [sys.executable, "-m", "zsched", "check", str(file)], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, "ege" in done.stderr + done.stdout) == (78, True)
 
 
 # --- what is imported ------------------------------------------------------------------------------------------------
