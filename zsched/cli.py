@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from zsched.commands.common import CliError, Json, Verb, Verbs, nearest, print_json
+from zsched.commands.common import CliError, Json, Verb, Verbs, print_json
 from zsched.commands.example import Example, write_example
 from zsched.commands.flag_verbs import add_flag_verbs
 from zsched.commands.fleet_verbs import (
@@ -38,6 +38,7 @@ from zsched.commands.order_verbs import add_order_verbs
 from zsched.commands.pki_verbs import pki_app
 from zsched.commands.program import Program
 from zsched.commands.stream_verbs import stream_app
+from zsched.errors import ConfigError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE
 
 if TYPE_CHECKING:
@@ -208,11 +209,13 @@ def init(
         raise CliError(EXIT_USAGE, f"--generation {generation}: at most {MAX_GENERATION}")
     file = places.config_path(config, os.environ)
     fleet = load_fleet(file)
-    name, names = _node_name(node), [spec.name for spec in fleet.nodes]
-    if node is not None and name not in names:  # a wrong word, and no wrong file
-        told = f"--node: {file} has no node {name!r}{nearest(name, names)}; there are {', '.join(names)}"
-        raise CliError(EXIT_USAGE, told)
-    require_node(fleet, name, file)
+    name = _node_name(node)
+    try:
+        require_node(fleet, name, file)
+    except ConfigError as error:
+        if node is None:
+            raise
+        raise CliError(EXIT_USAGE, str(error)) from error  # a wrong word, and no wrong file
     state = places.state_folder(state_dir, os.environ)
     if settle:
         done = settle_dispute(fleet, name, state)

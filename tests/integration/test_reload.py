@@ -14,6 +14,7 @@ from typing import Any, Self
 import zenoh
 
 from support.sessions import matches
+from zsched.core.executor.renewing import SAME_FILE_S
 from zsched.core.hop.books import unaccounted
 from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 
@@ -104,6 +105,8 @@ def test_tasks_weights_and_commands_change_while_a_reliable_stream_runs(tmp_path
             reload(bed, tree)
             bed.wait(lambda: has_another_task(bed), 60, "the task that came has an owner")
             bed.wait(lambda: bed.task("robot1")["tuning"]["weights"]["cpu"] == 0.25, 60, "the weights are agreed anew")
+            agreed = time.monotonic()
+            bed.wait(lambda: time.monotonic() > agreed + 2.0 * SAME_FILE_S, 60, "the time after which old workers end")
             assert [len(lives) for lives in worker_lives(bed).values()] == [1, 1, 0], "no worker was started again"
 
             # another command: standby first, then a move, then the owner of before

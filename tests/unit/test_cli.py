@@ -630,7 +630,7 @@ def test_connect_only_asks(daemon: Daemon) -> None:
     ("words", "says"),
     [
         (("--generation", "99999999999", "--node", "edge1"), "--generation 99999999999: at most 1048575"),
-        (("--node", "edg1"), "has no node 'edg1'; did you mean edge1?"),
+        (("--node", "edg1"), "no node 'edg1' under 'nodes' (there are"),
     ],
 )
 def test_init_with_a_wrong_word_ends_as_usage_and_writes_nothing(

@@ -277,11 +277,11 @@ def test_init_in_another_nodes_folder_says_whose_it_is_and_leaves_it(tmp_path: P
     assert (state / "state").read_bytes() == before
 
 
-def test_init_of_a_name_that_is_not_in_the_file_exits_with_78(tmp_path: Path) -> None:
+def test_init_of_a_name_that_is_not_in_the_file_exits_with_2(tmp_path: Path) -> None:
     file = tmp_path / "fleet.yaml"
     file.write_text(FLEET)
     result = run("init", "--config", file, "--node", "robot9", "--state-dir", tmp_path / "state")
-    assert result.exit_code == 78
+    assert result.exit_code == 2
     assert "there are robot1, robot2, robot3" in result.stderr
     assert not (tmp_path / "state").exists()
 
@@ -291,7 +291,7 @@ def test_init_of_a_name_that_is_not_in_the_file_suggests_the_nearest(tmp_path: P
     file = tmp_path / "fleet.yaml"
     file.write_text(FLEET)
     result = run("init", "--config", file, "--node", name, "--state-dir", tmp_path / "state")
-    assert result.exit_code == 78
+    assert result.exit_code == 2
     assert f"no node {name!r} under 'nodes' (there are robot1, robot2, robot3); " in result.stderr
     assert said in result.stderr
 

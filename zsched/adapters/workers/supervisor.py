@@ -105,10 +105,16 @@ class _Phase(StrEnum):
 
 _SHOWN = {_Phase.STARTING: WorkerState.STARTING, _Phase.READY: WorkerState.READY, _Phase.FAILED: WorkerState.FAILED}
 
+_OF_ITS_START = frozenset({"ZENOH_RUNTIME"})
+"""Variables that a process keeps from its start: zenoh's threads follow the number of nodes and tasks.
+
+A node or a task that comes is no reason to start every worker of the fleet again.
+"""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recipe:
-    """All that a worker's process is made with and keeps until it ends."""
+    """What a worker's process is made with, and must be started again for when it changes."""
 
     command: tuple[str, ...] = ()
     environment: tuple[tuple[str, str], ...] = ()
@@ -338,7 +344,8 @@ class WorkerSupervisor:
     def _recipe_of(self, worker: _Worker) -> Recipe:
         if not worker.is_kept:
             return worker.made_by
-        environment = {**self._environment(worker.task), **dict(worker.spec.env)}
+        made = {name: value for name, value in self._environment(worker.task).items() if name not in _OF_ITS_START}
+        environment = {**made, **dict(worker.spec.env)}
         return Recipe(
             command=worker.spec.command,
             environment=tuple(sorted(environment.items())),

@@ -484,6 +484,37 @@ def test_a_changed_command_waits_for_the_order_and_then_runs() -> None:
         assert recorder.wait("compared", 3) == ("compared", "merge", True), "a deadline alone makes nothing old"
 
 
+def test_a_fleet_that_grows_makes_no_worker_old() -> None:
+    """zenoh's threads follow the number of nodes and tasks: who runs keeps those of the start."""
+    made = {"ZENOH_RUNTIME": "few", "ZSCHED_OUTPUT_KEYS": "{}"}
+    recorder = Recorder()
+    supervisor = WorkerSupervisor(
+        specs={"merge": python(SLEEP)},
+        context=WorkerContext(fleet="hall", node="edge1", incarnation=7),
+        events=recorder,
+        environment=lambda _task: dict(made),
+        policy=QUICK,
+    )
+    try:
+        supervisor.start("merge")
+        recorder.wait("started")
+        made["ZENOH_RUNTIME"] = "many"
+        supervisor.adopt({"merge": python(SLEEP)})
+        supervisor.adopt({"merge": python(SLEEP), "other": python(SLEEP)})
+        supervisor.start("other")
+        recorder.wait("started", 2)
+        assert [call for call in recorder.calls if call[0] == "compared"] == []
+        supervisor.adopt({"merge": python(SLEEP, env=(("ZENOH_RUNTIME", "an operator's own"),))})
+        assert recorder.wait("compared") == ("compared", "merge", True), "what the file names is a change"
+        supervisor.adopt({"merge": python(SLEEP)})
+        assert recorder.wait("compared", 2) == ("compared", "merge", False)
+        made["ZSCHED_OUTPUT_KEYS"] = "{1}"
+        supervisor.adopt({"merge": python(SLEEP)})
+        assert recorder.wait("compared", 3) == ("compared", "merge", True)
+    finally:
+        supervisor.close(within_s=10.0)
+
+
 def test_workers_come_and_go_with_the_file() -> None:
     with supervised(python(SLEEP)) as (supervisor, recorder):
         supervisor.start("merge")

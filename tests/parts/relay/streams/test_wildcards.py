@@ -97,6 +97,9 @@ def test_the_last_value_of_every_key_warms_a_new_owner_up(bench: Bench) -> None:
     for name in "abc":
         bench.put(f"robot1/s/{name}/scan", f"new {name}")
     bench.put("robot1/s/a/b/scan", "two chunks are not one")
+    seen: list[zenoh.Sample] = []
+    bench.relay.declare_subscriber("robot1/s/end", seen.append)
+    until(lambda: bench.put("robot1/s/end", "") or seen, "what was put before: a link keeps its order")
     bench.listen("edge1/t/**")
     stream.open(1, route)
     until(lambda: stream.is_matching(1), "the worker's subscription")
