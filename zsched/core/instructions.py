@@ -127,6 +127,13 @@ class IntroducePeers:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class EndLinks:
+    """These nodes are gone: end the control session's links to them that are still up. zenoh makes new ones."""
+
+    nodes: tuple[NodeId, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TryAddresses:
     """Nobody was ever heard: find out what becomes of an attempt at each address (`AddressesTried`)."""
 
@@ -394,6 +401,7 @@ Instruction = (
     | AskLearnt
     | AnswerLearnt
     | IntroducePeers
+    | EndLinks
     | TryAddresses
     | StartWorker
     | StopWorker

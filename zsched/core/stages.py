@@ -28,7 +28,7 @@ from zsched.core.membership.identity import Identity
 from zsched.core.membership.knocking import Knocking
 from zsched.core.membership.namesakes import Namesakes
 from zsched.core.membership.peers import Membership
-from zsched.core.membership.relink import Introductions
+from zsched.core.membership.relink import Introductions, MuteLinks
 from zsched.core.membership.solitude import Solitude
 from zsched.core.profile.profile import Profiler
 from zsched.core.profile.relay_ends import RelayEnds
@@ -180,7 +180,7 @@ class Stages:
         self.identity = Identity(me, incarnation, self.fleet_file, now, fleet.timing.beat_s)
         self.namesakes = Namesakes(fleet.timing.beat_s)
         self.knocking = Knocking(self.fleet_file)
-        self.introductions = Introductions()
+        self.introductions, self.mute_links = Introductions(), MuteLinks()
         self.solitude = Solitude(timing=fleet.timing, started_at=now)
         self.stateless: set[NodeId] = set()
         """Electors whose newest beat says that they answer no proposer."""

@@ -469,6 +469,8 @@ class Shell:
                 bus.ask_learnt(peer, deadline_s)
             case do.IntroducePeers():
                 bus.introduce_peers()
+            case do.EndLinks(nodes=nodes):
+                bus.end_links(nodes)
             case do.TryAddresses(addresses=addresses):
                 self._trial.begin(addresses)
             case do.AnswerUtilities(request=request, utilities=value):

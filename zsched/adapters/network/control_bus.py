@@ -56,6 +56,7 @@ from zsched.core.values.model import NAME, Beat, NodeId, Profile, Proposal
 from zsched.core.values.snapshot import Snapshot
 from zsched.errors import AdapterError, WireError
 from zsched.guard import guarded, tolerant
+from zsched.sessions.link_sockets import LinkSockets
 from zsched.sessions.problems import why_not_open
 from zsched.sessions.relink import Introducer
 from zsched.wire import codec as wire
@@ -68,7 +69,7 @@ RING = 1024
 """Periodic frames that wait for the loop; if it does not come, the oldest go, and zenoh need not wait."""
 
 MAX_LIVES = 1024
-"""So many nodes' incarnations are remembered: commands to them are sealed for these."""
+"""So many nodes' incarnations and sessions are remembered: commands to them are sealed for the former."""
 
 Answer = Snapshot | CommandResult | Explanation | WorkerLines | FleetTold
 Post = Callable[[ev.Event], None]
@@ -155,6 +156,9 @@ class ControlBus:
         self._node, self._incarnation = node, incarnation
         self._config = zenoh_config
         self._introducer = Introducer(zenoh_config)
+        self._zids: dict[NodeId, str] = {}
+        """{node: the session that answered in its name last}."""
+        self._sockets: LinkSockets | None = None
         self._post = post
         self._questions = Questions(self._sealed_answer)
         self._session: zenoh.Session | None = None
@@ -174,7 +178,7 @@ class ControlBus:
             session = zenoh.open(zenoh.Config.from_json5(self._config))
         except zenoh.ZError as error:
             raise AdapterError(f"the control session {why_not_open(self._config, error)}") from error
-        self._session = session
+        self._session, self._sockets = session, LinkSockets(session)
         keys, node = self._keys, self._node
         self._publishers = {
             "beat": self._publisher(session, keys.beat(node), zenoh.Priority.REAL_TIME),
@@ -283,6 +287,16 @@ class ControlBus:
     def introduce_peers(self) -> None:
         """Let everybody hear of everybody's address again; returns at once (nothing where addresses are configured)."""
         self._introducer.introduce()
+
+    def end_links(self, nodes: Iterable[NodeId]) -> None:
+        """End the links to these nodes, as far as there are any over TCP; zenoh makes new ones."""
+        if self._sockets is None or self._session is None:
+            return
+        names = {self._zids[node]: node for node in nodes if node in self._zids}
+        with contextlib.suppress(zenoh.ZError):  # it is being closed
+            for link in self._sockets.links() if names else ():
+                if link.zid in names and link.cut():
+                    log.warning("%s is gone and its link is up: the link to %s is ended", names[link.zid], link.name)
 
     def know(self, names: Iterable[str]) -> None:
         """Give new names of the fleet a bucket of their own."""
@@ -517,7 +531,10 @@ class ControlBus:
                 return
             if key is not None:
                 replier = reply.replier_id
-                on_answer(key.owner, value, "" if replier is None else str(replier.zid))
+                zid = "" if replier is None else str(replier.zid)
+                if zid and (key.owner in self._zids or len(self._zids) < MAX_LIVES):
+                    self._zids[key.owner] = zid
+                on_answer(key.owner, value, zid)
 
         if self._session is None:
             return

@@ -62,6 +62,8 @@ def send_beat(node: Stages, todo: ToDo, now: float) -> None:
     _hear_leases(node, beat, todo, now, is_newest=True)
     if node.introductions.is_due(now, is_missing=node.membership.misses_anybody):
         todo.add(do.IntroducePeers())
+    if mute := node.mute_links.due(now, node.membership.gone if node.membership.misses_anybody else ()):
+        todo.add(do.EndLinks(nodes=mute))
     if node.solitude.must_try(now, has_heard=node.membership.has_heard):
         todo.add(do.TryAddresses(addresses=node.solitude.dialled))
 

@@ -144,6 +144,11 @@ class Membership:
         return self._misses_anybody
 
     @property
+    def gone(self) -> tuple[NodeId, ...]:
+        """Who is gone, in the order of the fleet file."""
+        return tuple(name for name, state in self._states.items() if state is PeerState.GONE)
+
+    @property
     def has_heard(self) -> bool:
         """Whether any peer was ever heard; also true of a node without peers."""
         return self._has_heard

@@ -330,6 +330,20 @@ def test_one_peer_is_asked_for_what_it_has_learnt(mesh: tuple[Peer, Peer, Peer])
     assert c.events == []
 
 
+def test_a_gone_nodes_link_is_ended_and_made_anew(mesh: tuple[Peer, Peer, Peer]) -> None:
+    a, b, c = mesh
+    b.bus.ask_learnt("a", 2.0)
+    a.bus.answer(a.next(ev.LearntAsked).request, LEARNT)
+    b.next(ev.LearntReceived)
+    b.bus.end_links(("nobody", "a"))
+    until(lambda: b.of(ev.TokenLost), "the end of the link")
+    until(lambda: b.sees("a"), "a's token by a new link")
+    a.bus.publish("beat", BEAT)
+    until(lambda: b.of(ev.BeatReceived), "a beat by the new link")
+    assert {event.node for event in b.of(ev.TokenLost)} == {"a"}
+    assert c.of(ev.TokenLost) == []
+
+
 def test_operator_asks_and_commands_another_node(mesh: tuple[Peer, Peer, Peer]) -> None:
     a, b, _ = mesh
     answers: list[object] = []
