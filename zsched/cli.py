@@ -9,6 +9,8 @@ live owner), 5 timed out, 10 by a plan something would change, 75 the name is an
 
 from __future__ import annotations
 
+import atexit
+import contextlib
 import errno
 import io
 import os
@@ -16,7 +18,7 @@ import signal
 import sys
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
@@ -1029,6 +1031,17 @@ def main() -> None:
             raise
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the interpreter will try once more
         _say(f"zsched: the answer cannot be written: {error.strerror}; see where stdout goes")
+    _end(code)
+
+
+def _end(code: str | int | None) -> NoReturn:
+    """End the process: at once where zenoh's threads run, for the interpreter's end may abort one that waits there."""
+    if "zenoh" in sys.modules and not isinstance(code, str):
+        atexit._run_exitfuncs()  # noqa: SLF001 - what closes sessions
+        with contextlib.suppress(OSError):
+            sys.stdout.flush()
+            sys.stderr.flush()
+        os._exit(code or 0)
     sys.exit(code)
 
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from support.verbs import move
 from support.waiting import until
 from zsched_lab.fleet.containers import Host, NoEngineError, container_host
 from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
@@ -58,17 +58,6 @@ def load(bed: Testbed, node: str) -> dict[str, Any]:
     return worker
 
 
-def command(bed: Testbed, *words: str) -> str:
-    done = subprocess.run(
-        [sys.executable, "-m", "zsched.cli", *words, "--node", "robot1", "--runtime-dir", str(bed.folder)],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    return done.stdout + done.stderr
-
-
 def name_of(host: Host, node: str) -> str:
     (name,) = (name for name in host.containers(FLEET) if name.startswith(f"zsched-{FLEET}-{node}-{TASK}-"))
     return name
@@ -86,8 +75,7 @@ def test_a_task_moves_between_containers_and_outlives_each_kind_of_end(bed: Test
     noted = int((bed.folder / f"{first}-{TASK}.pid").read_text().split()[0])
     assert str(noted) == host.ask("inspect", "--format", "{{.State.Pid}}", name_of(host, first))
 
-    said = command(bed, "move", TASK, other, "--yes")
-    bed.wait(lambda: bed.owner() == other, 30, f"the move, of which was said: {said}")
+    move(bed, other)
 
     host.ask("kill", "--signal=KILL", name_of(host, other))
     bed.wait(lambda: "killed by signal 9" in load(bed, other).get("reason", ""), 30, "the reason in status")

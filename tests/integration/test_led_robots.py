@@ -18,6 +18,7 @@ import pytest
 import zenoh
 
 from support.programs import running
+from support.verbs import move
 from zsched.tasks.map_merge.cdr import decode_grid
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched_lab.explore.laser import Laser
@@ -134,13 +135,14 @@ def test_a_slam_that_moves_takes_its_map_along(tmp_path: Path) -> None:
         until(lambda: robot.slipped_m > 0.6 and bool(maps) and len(poses) > 10, "no poses or no map")
         stopped_ns = time.time_ns()
 
-        bed.stop(owner)
+        other = next(name for name in ("edge1", "edge2") if name != owner)
+        move(bed, other)
         until(lambda: bool(poses) and poses[-1][0] > stopped_ns + 2_000_000_000, "no poses from the next owner")
         robot.is_over.set()
         robot.join()
         seen = len(maps)
 
-        assert bed.wait_settled() != owner
+        assert bed.wait_settled() == other
         assert all(math.hypot(pose.x, pose.y) < 0.15 for _, pose in poses)
         assert decode_grid(maps[-1]).known_area_m2 >= 0.95 * decode_grid(maps[0]).known_area_m2
         assert seen > 1

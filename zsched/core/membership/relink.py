@@ -14,7 +14,7 @@ from zsched.core.values.model import NodeId
 LINK_WAIT_S = 1.0
 """A link has this long to come back by itself: zenoh redials known addresses within a second."""
 FIRST_PAUSE_S, MAX_PAUSE_S = 2.0, 60.0
-MUTE_S = 3.0
+MUTE_S = 5.0
 """A link to a node that has been gone for so long, and that is still up, is mute."""
 MUTE_PAUSE_S = 15.0
 """Longest pause between two ends of the links to one node: so long it may stay deaf once it is well again."""
