@@ -39,6 +39,7 @@ from zsched.commands.member_verbs import add_member_verbs
 from zsched.commands.order_verbs import add_order_verbs
 from zsched.commands.pki_verbs import pki_app
 from zsched.commands.program import Program
+from zsched.commands.rehearse_verb import add_rehearse_verb
 from zsched.commands.stream_verbs import stream_app
 from zsched.errors import ConfigError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE
@@ -621,6 +622,7 @@ def weights(
 add_order_verbs(app)
 add_flag_verbs(app)
 add_member_verbs(app)
+add_rehearse_verb(app)
 
 
 @app.command(cls=Verb)

@@ -28,6 +28,7 @@ from zsched import paths as places
 from zsched.adapters.host import zenoh_log
 from zsched.adapters.host.decision_log import DecisionLog
 from zsched.adapters.host.operator_socket import OperatorSocket
+from zsched.adapters.host.rehearsals import RehearsalStore
 from zsched.adapters.host.state_file import StateFile
 from zsched.adapters.host.systemd import Notifier, watchdog_interval_s
 from zsched.adapters.network.control_bus import ControlBus
@@ -70,6 +71,7 @@ from zsched.runtime.sealing import seals_of
 from zsched.runtime.secured import digest_of, require_own
 from zsched.runtime.sessions import SessionsRead
 from zsched.runtime.shell import Desk, Inbox, Shell
+from zsched.runtime.strikes import Strikes
 from zsched.sessions import config as zenoh_config
 
 NAME_TAKEN_WAIT_S = 5.0
@@ -314,6 +316,8 @@ class Daemon:
         shell = Shell(node=me, inbox=self._inbox, bus=bus, state_file=state_file, desk=desk, fleet=fleet)
         shell.log, shell.library = decisions, self._library
         shell.take_certificate = self._take_certificate
+        shell.rehearsals = RehearsalStore(self._options.state_dir)
+        shell.strikes = Strikes(me, shell.answer_operator)
         self._library.fetch = bus.fetch_document
         self._library.start()
         stack.callback(self._library.close)

@@ -42,6 +42,7 @@ from zsched.core.values.messages import (
 from zsched.core.values.model import (
     Acceptance,
     Allocation,
+    Asked,
     Ballot,
     DeviceSample,
     Grant,
@@ -53,6 +54,7 @@ from zsched.core.values.model import (
     WorkerState,
 )
 from zsched.core.values.plan import Direction, ReadyWhen, StreamCount
+from zsched.core.values.rehearsal import FAULTS, KeepRehearsal, ReadRehearsals, Strike
 from zsched.wire import codec as wire
 
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
@@ -399,6 +401,18 @@ class Storm:
     def status(self) -> ev.Event:
         return ev.StatusAsked(request=self.number())
 
+    def rehearsal(self) -> ev.Event:
+        asked = Asked(by="root@robot1", reason="a test")
+        kind = self.rng.randrange(4)
+        if kind == 0:
+            kept = KeepRehearsal(task=self.task(), name="one", body=Text("{}"), told="kept", asked=asked)
+            return ev.RehearsalKept(request=self.number(), command=kept)
+        if kind == 1:
+            asks = ReadRehearsals(task=self.rng.choice(("", self.task())), name=self.rng.choice(("", "one")))
+            return ev.RehearsalsAsked(request=self.number(), command=asks)
+        strike = Strike(task=self.task(), step=self.rng.choice(FAULTS), asked=asked, is_plan=self.rng.random() < 0.5)
+        return ev.StrikeCommanded(request=self.number(), command=strike, is_near=self.rng.random() < 0.8)
+
     def command(self) -> ev.Event:
         if self.rng.random() < 0.2:
             return ev.ExplanationAsked(request=self.number(), command=ExplainTask(task=self.task()))
@@ -413,6 +427,8 @@ class Storm:
             return ev.FleetReadAsked(request=self.number(), command=ReadFleet())
         if self.rng.random() < 0.1:
             return ev.CertificateSent(request=self.number(), command=TakeCertificate(certificate=Text("pem")))
+        if self.rng.random() < 0.1:
+            return self.rehearsal()
         base = self.rng.choice((None, self.number()))
         cpu = self.rng.choice((0.25, 0.75, 2.0))
         command = SetWeights(task=self.task(), cpu=cpu, memory=1.0 - cpu, network=0.0, base_revision=base)

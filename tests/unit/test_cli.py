@@ -222,6 +222,7 @@ def test_every_verb_that_asks_a_daemon_takes_the_node_that_several_daemons_make_
         "bw": ["in/0"],
         "hz": ["in/0"],
         "tail": ["in/0"],
+        "rehearse": ["echo", "--plan"],
         "renew": ["--deliver"],
     }
     file = str(Path(__file__).parents[2] / "configs" / "fleet.yaml")

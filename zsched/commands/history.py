@@ -78,14 +78,16 @@ def history(door: Door, task: str | None, *, is_json: bool, about: str | None = 
     """
     node, now, entries, _ = read_log(door, is_moves=True)
     moves = [move for move in moves_of(entries, now, task) if about in (None, move["from"], move["to"])]
+    rehearsals = list(rehearsals_of(entries, now, task)) if about is None else []
     if is_json:
-        print_json({"schema": SCHEMA, "node": node, "moves": moves})
+        print_json({"schema": SCHEMA, "node": node, "moves": moves, "rehearsals": rehearsals})
         return EXIT_OK
-    if not moves:
+    if not moves and not rehearsals:
         whose = (f" of {task}" if task else "") + (f" to {about} or away from it" if about else "")
         sys.stdout.write(f"no move{whose} in the log of {node}\n")
-    for move in moves:
-        sys.stdout.write(_move_line(printable(move)))
+    lines = [(move["age_s"], _move_line(printable(move))) for move in moves]
+    lines += [(one["age_s"], _rehearsal_line(printable(one))) for one in rehearsals]
+    sys.stdout.writelines(line for _, line in sorted(lines, key=lambda line: -line[0]))
     return EXIT_OK
 
 
@@ -161,6 +163,19 @@ def moves_of(entries: Iterable[Json], now: float, task: str | None) -> Iterator[
             "switched_s": took.get((entry["task"], move["epoch"], entry["life"])),
             "gap_s": gaps.get((entry["task"], move["epoch"])),
         }
+
+
+def rehearsals_of(entries: Iterable[Json], now: float, task: str | None) -> Iterator[Json]:
+    """The rehearsals among a log's entries."""
+    for entry in entries:
+        if entry.get("rehearsal") and task in (None, entry["task"]):
+            age_s = max(now - entry["at"], 0.0)
+            told = {"task": entry["task"], "rehearsal": entry["rehearsal"], "text": entry["text"]}
+            yield {"at": wall_text(entry["at"]), "age_s": age_s, **told}
+
+
+def _rehearsal_line(one: Json) -> str:
+    return f"{span(one['age_s']):>6} ago  {one['at']}  {one['task']} {one['text']}\n"
 
 
 def _move_line(move: Json) -> str:

@@ -49,6 +49,7 @@ from zsched.core.values.model import (
     check_range,
 )
 from zsched.core.values.plan import StreamCount
+from zsched.core.values.rehearsal import KeepRehearsal, ReadRehearsals, Strike
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -454,6 +455,32 @@ class CertificateSent:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class StrikeCommanded:
+    """An operator rehearses: this node is to do something to itself."""
+
+    request: int
+    command: Strike
+    is_near: bool = False
+    """It came over this daemon's own operator socket."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RehearsalKept:
+    """An operator has rehearsed, and this node is to keep what was found."""
+
+    request: int
+    command: KeepRehearsal
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RehearsalsAsked:
+    """An operator asks for promises, or for rehearsals that were kept."""
+
+    request: int
+    command: ReadRehearsals
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LinesAsked:
     """An operator asks what this node's worker has printed."""
 
@@ -576,6 +603,9 @@ Event = (
     | ExplanationAsked
     | RestartCommanded
     | CertificateSent
+    | StrikeCommanded
+    | RehearsalKept
+    | RehearsalsAsked
     | LinesAsked
     | FleetCommanded
     | FleetReadAsked
@@ -589,8 +619,14 @@ Event = (
 )
 
 
-def commanded(request: int, command: Command) -> Event:
-    """The event of an operator's command."""
+def commanded(request: int, command: Command, *, is_near: bool = False) -> Event:
+    """The event of an operator's command; ``is_near``: it came over this daemon's own operator socket."""
+    if isinstance(command, Strike):
+        return StrikeCommanded(request=request, command=command, is_near=is_near)
+    if isinstance(command, KeepRehearsal):
+        return RehearsalKept(request=request, command=command)
+    if isinstance(command, ReadRehearsals):
+        return RehearsalsAsked(request=request, command=command)
     if isinstance(command, ExplainTask):
         return ExplanationAsked(request=request, command=command)
     if isinstance(command, RetryTask):

@@ -30,6 +30,7 @@ from zsched.core.values.messages import (
 )
 from zsched.core.values.model import Beat, NodeId, Profile, Proposal, TaskId
 from zsched.core.values.plan import Role, RoutePlan
+from zsched.core.values.rehearsal import KeepRehearsal, RehearsalsTold, Strike
 from zsched.core.values.snapshot import Snapshot
 
 
@@ -178,6 +179,34 @@ class RestartWorker:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class StrikeDaemon:
+    """An operator rehearses: answer whether this machine can do it to this daemon, and do it."""
+
+    request: int
+    strike: Strike
+    fleet: Fleet
+    """Whose links they are."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StoreRehearsal:
+    """Keep what a rehearsal has found on this machine, and answer."""
+
+    request: int
+    rehearsal: KeepRehearsal
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AnswerRehearsals:
+    """Answer an operator's question for promises and kept rehearsals; what is kept is filled in from the disk."""
+
+    request: int
+    told: RehearsalsTold
+    name: str
+    """The rehearsal that is wanted whole."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RenewWorker:
     """An operator wants this node's worker for the task stopped and started again; that is no failure."""
 
@@ -284,6 +313,8 @@ class RecordStory:
     gap_s: float | None = None
     """With it, one of this node's output streams was without an answer for so long, until the owner of ``epoch``
     answered."""
+    rehearsal: str = ""
+    """With it, an operator has rehearsed; this is the rehearsal's name."""
 
 
 # --- of the fleet register -------------------------------------------------------------------------------------------
@@ -408,6 +439,9 @@ Instruction = (
     | ResetWorker
     | RestartWorker
     | RenewWorker
+    | StrikeDaemon
+    | StoreRehearsal
+    | AnswerRehearsals
     | AdoptFleet
     | EndTask
     | SetRole

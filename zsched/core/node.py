@@ -16,7 +16,7 @@ from typing import Any, Final
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.handlers import beats, choice, documents, fleet, operators, orders, work
+from zsched.core.handlers import beats, choice, documents, fleet, operators, orders, rehearsal, work
 from zsched.core.stages import Handler, Stages
 from zsched.core.todo import ToDo
 from zsched.core.values.change import MoveOwner
@@ -31,6 +31,7 @@ _HANDLERS: Final[Mapping[type[Any], Handler]] = {
     **documents.HANDLERS,
     **fleet.HANDLERS,
     **orders.HANDLERS,
+    **rehearsal.HANDLERS,
 }
 _OFTEN_QUIET: Final = frozenset(
     {

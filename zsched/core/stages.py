@@ -171,6 +171,8 @@ class Stages:
         """{stream: (how many samples it has dropped, when that last rose)}."""
         self.rates = StreamRates()
         self.gaps = StreamGaps()
+        self.killed_at: dict[TaskId, float] = {}
+        """{task: when our worker was last killed for a rehearsal}."""
         self.frames_dropped_at: float | None = None
         """When the newest invalid frame came."""
         self.unready: dict[TaskId, Unready] = {}

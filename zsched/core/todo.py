@@ -29,6 +29,8 @@ _LOCAL = frozenset(
         do.ResetWorker,
         do.RenewWorker,
         do.RestartWorker,
+        do.StrikeDaemon,
+        do.StoreRehearsal,
         do.RecordStory,
         do.StandDown,
     }

@@ -19,6 +19,7 @@ from dataclasses import replace
 from typing import Any, assert_never
 
 from zsched.adapters.host.decision_log import DecisionLog
+from zsched.adapters.host.rehearsals import RehearsalStore
 from zsched.adapters.host.state_file import StateFile
 from zsched.adapters.network.address_trial import AddressTrial
 from zsched.adapters.network.control_bus import ControlBus
@@ -61,10 +62,12 @@ from zsched.core.values.messages import (
     fleet_question,
 )
 from zsched.core.values.model import MAX_ASKER, MAX_REASON, NAME, Asked, NodeId, TaskId, Tuning
+from zsched.core.values.rehearsal import KeepRehearsal, ReadRehearsals, RehearsalsTold, Step, Strike
 from zsched.core.values.snapshot import Snapshot
 from zsched.errors import AdapterError, WireError
 from zsched.runtime.crew import Crew
 from zsched.runtime.library import Library
+from zsched.runtime.strikes import Strikes
 from zsched.wire import codec as wire
 
 INBOX_LIMIT = 20_000
@@ -179,7 +182,9 @@ class Desk:
         slot: queue.SimpleQueue[object] = queue.SimpleQueue()
         with self._lock:
             self._waiting[number] = slot
-        self._inbox.post(ev.StatusAsked(request=number) if command is None else ev.commanded(number, command))
+        self._inbox.post(
+            ev.StatusAsked(request=number) if command is None else ev.commanded(number, command, is_near=True)
+        )
         try:
             return answer_json(slot.get(timeout=ANSWER_TIMEOUT_S))
         except queue.Empty:
@@ -307,6 +312,30 @@ def _fleet_of(request: dict[str, Any]) -> ReadFleet:
     return ReadFleet(with_document=request.get("with_document") is not False)
 
 
+def _strike_of(request: dict[str, Any]) -> Strike:
+    return Strike(
+        task=str(request["task"]),
+        step=Step(str(request["step"])),
+        asked=_asked_of(request),
+        cut_s=float(request.get("cut_s") or 0.0),
+        is_plan=bool(request.get("plan")),
+    )
+
+
+def _keep_of(request: dict[str, Any]) -> KeepRehearsal:
+    return KeepRehearsal(
+        task=str(request["task"]),
+        name=str(request["name"]),
+        body=Text(str(request["body"])),
+        told=str(request["told"])[:MAX_REASON],
+        asked=_asked_of(request),
+    )
+
+
+def _rehearsals_of(request: dict[str, Any]) -> ReadRehearsals:
+    return ReadRehearsals(task=str(request.get("task") or ""), name=str(request.get("name") or ""))
+
+
 _COMMANDS: dict[str, Callable[[dict[str, Any]], Command]] = {
     "weights": _weights_of,
     "move": _move_of,
@@ -319,6 +348,9 @@ _COMMANDS: dict[str, Callable[[dict[str, Any]], Command]] = {
     "certificate": _certificate_of,
     "change": _change_of,
     "fleet": _fleet_of,
+    "strike": _strike_of,
+    "keep": _keep_of,
+    "rehearsals": _rehearsals_of,
 }
 
 
@@ -343,6 +375,10 @@ def answer_json(value: object) -> dict[str, Any]:
         return {**body, "newest": value.newest, "is_here": value.is_here}
     if isinstance(value, FleetTold):
         return _fleet_json(value)
+    if isinstance(value, RehearsalsTold):
+        promised = {one.step.value: wire.as_plain(one) for one in value.promised}
+        kept = {"names": list(value.names), "body": value.body}
+        return {"node": value.node, "timing": value.timing, "promised": promised, **kept}
     assert isinstance(value, CommandResult)
     return {"outcome": value.outcome.value, "detail": value.detail, "revision": value.revision}
 
@@ -396,6 +432,8 @@ class Shell:
         """It reports to this shell, so it is made after it."""
         self.library: Library | None = None
         """The fleet's documents."""
+        self.strikes: Strikes | None = None
+        self.rehearsals: RehearsalStore | None = None
         self.log: DecisionLog | None = None
         self.follow: Callable[[Fleet, bool], None] = lambda _fleet, _is_agreed: None
         """Lets the adapters follow another fleet (`zsched.runtime.adoption`), once they are all made."""
@@ -507,6 +545,13 @@ class Shell:
                 self._workers().renew(task)
             case do.RestartWorker(task=task, reason=reason):
                 self._workers().report_hung(task, self.crew.life_of(task), reason)
+            case do.StrikeDaemon(request=request, strike=strike, fleet=fleet):
+                assert self.strikes is not None
+                self.strikes.order(request, strike, fleet)
+            case do.StoreRehearsal(request=request, rehearsal=rehearsal):
+                self._keep(request, rehearsal)
+            case do.AnswerRehearsals(request=request, told=told, name=name):
+                self._answer_operator(request, self._with_kept(told, name))
             case do.StandDown(reason=reason):
                 self.stand_down = reason
             case do.RecordStory():
@@ -524,6 +569,24 @@ class Shell:
             return WorkerLines(node=self._node, task=task, is_here=False)
         lines, newest = kept.behind(after)
         return WorkerLines(node=self._node, task=task, lines=lines, newest=newest)
+
+    def _keep(self, request: int, rehearsal: KeepRehearsal) -> None:
+        assert self.rehearsals is not None
+        outcome, detail = CommandOutcome.OK, "kept"
+        try:
+            self.rehearsals.save(rehearsal.name, rehearsal.body)
+        except AdapterError as error:
+            outcome, detail = CommandOutcome.INVALID, str(error)
+        self._answer_operator(request, CommandResult(outcome=outcome, detail=detail))
+
+    def _with_kept(self, told: RehearsalsTold, name: str) -> RehearsalsTold:
+        assert self.rehearsals is not None
+        body = self.rehearsals.load(name) if name else ""
+        return replace(told, names=self.rehearsals.names(), body=Text(body))
+
+    def answer_operator(self, request: int, result: CommandResult) -> None:
+        """Answer an operator's command; from any thread."""
+        self._answer_operator(request, result)
 
     def _documents(self) -> Library:
         assert self.library is not None

@@ -22,7 +22,7 @@ from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 import msgpack
 
 from zsched.core.membership.beat_room import MAX_BEAT_BYTES
-from zsched.core.values import decision, document, durable, messages, model, plan, snapshot
+from zsched.core.values import decision, document, durable, messages, model, plan, rehearsal, snapshot
 from zsched.errors import WireError
 
 VERSION = 1
@@ -63,6 +63,10 @@ KINDS: dict[str, tuple[type, int]] = {
     "read_fleet": (messages.ReadFleet, SMALL),
     "fleet_told": (messages.FleetTold, LARGE),
     "worker_lines": (messages.WorkerLines, LARGE),
+    "strike": (rehearsal.Strike, SMALL),
+    "keep_rehearsal": (rehearsal.KeepRehearsal, LARGE),
+    "read_rehearsals": (rehearsal.ReadRehearsals, SMALL),
+    "rehearsals_told": (rehearsal.RehearsalsTold, LARGE),
     "command_result": (messages.CommandResult, SMALL),
     "status": (snapshot.Snapshot, LARGE),
     "state": (durable.DurableState, LARGE),

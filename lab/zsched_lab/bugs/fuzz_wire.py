@@ -60,6 +60,7 @@ from zsched.core.values.model import (
     WorkerLoad,
     WorkerState,
 )
+from zsched.core.values.rehearsal import FAULTS, Strike
 from zsched.errors import WireError
 from zsched.ipc import pipe as relay_pipe
 from zsched.wire import codec as wire
@@ -131,6 +132,8 @@ def _dataclass(cls: Any, rng: Random) -> Any:
     values = {one.name: sample(hints[one.name], rng, one.name) for one in fields(made)}
     if made is Accept:
         values["task"] = values["acceptance"].value.task
+    if made is Strike:
+        values["step"] = rng.choice(FAULTS)
     chosen = rng.choice(ONE_OF.get(made, ("",)))
     for other in ONE_OF.get(made, ()):
         if other != chosen:

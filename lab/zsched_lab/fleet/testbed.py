@@ -164,6 +164,10 @@ class Testbed:
         if relay is not None:
             self._end_relay(node, relay)
 
+    def let_end(self, *nodes: NodeId) -> None:
+        """These daemons may end although nobody here tells them to, until they are started again."""
+        self._may_end.update(nodes)
+
     def has_ended(self, node: NodeId) -> bool:
         """Whether a daemon that was told to stop has ended; it is forgotten then."""
         if self._processes[node].poll() is None:

@@ -125,6 +125,7 @@ def test_moves_of_one_task_as_json(capsys: pytest.CaptureFixture[str]) -> None:
                 "gap_s": 0.3,
             }
         ],
+        "rehearsals": [],
     }
     assert history(HERE, "nothing", is_json=False) == 0
     assert capsys.readouterr().out == "no move of nothing in the log of robot1\n"

@@ -20,6 +20,7 @@ from zsched.core.electorate.founding import founded
 from zsched.core.membership.beat_room import MAX_BEAT_BYTES
 from zsched.core.values import document, messages, model
 from zsched.core.values.electorate import FleetValue
+from zsched.core.values.rehearsal import FAULTS, Strike
 from zsched.errors import WireError
 from zsched.ipc import pipe as relay_pipe
 from zsched.wire import codec as wire
@@ -152,6 +153,8 @@ def dataclass_strategy(cls: type[Any]) -> st.SearchStrategy[Any]:
     hints = wire.hints_of(cls)
     made = get_origin(cls) or cls
     parts = {field.name: strategy(hints[field.name], field.name) for field in fields(made)}
+    if made is Strike:
+        parts["step"] = st.sampled_from(FAULTS)
     if made not in ONE_OF:
         return st.builds(made, **parts)
     whole = [

@@ -57,6 +57,7 @@ class Entry:
     move: Move | None = None
     took_s: float | None = None
     gap_s: float | None = None
+    rehearsal: str = ""
     decision: Decision | None = None
     """Last, for readers that do without it."""
 
@@ -137,6 +138,7 @@ class DecisionLog:
             move=story.move,
             took_s=story.took_s,
             gap_s=story.gap_s,
+            rehearsal=story.rehearsal,
             decision=story.decision,
         )
         return json.dumps(as_plain(entry), separators=(",", ":")).encode() + b"\n"
@@ -185,7 +187,7 @@ def _parsed(line: bytes) -> Json | None:
 
 
 def _is_of_move(line: bytes) -> bool:
-    return any(mark in line for mark in (b',"move":', b',"took_s":', b',"gap_s":'))
+    return any(mark in line for mark in (b',"move":', b',"took_s":', b',"gap_s":', b',"rehearsal":'))
 
 
 def judged_before(lines: list[bytes], wish: Json) -> Json:

@@ -53,6 +53,7 @@ from zsched.core.values.messages import (
     WorkerLines,
 )
 from zsched.core.values.model import NAME, Beat, NodeId, Profile, Proposal
+from zsched.core.values.rehearsal import ReadRehearsals, RehearsalsTold
 from zsched.core.values.snapshot import Snapshot
 from zsched.errors import AdapterError, WireError
 from zsched.guard import guarded, tolerant
@@ -71,7 +72,7 @@ RING = 1024
 MAX_LIVES = 1024
 """So many nodes' incarnations and sessions are remembered: commands to them are sealed for the former."""
 
-Answer = Snapshot | CommandResult | Explanation | WorkerLines | FleetTold
+Answer = Snapshot | CommandResult | Explanation | WorkerLines | FleetTold | RehearsalsTold
 Post = Callable[[ev.Event], None]
 log = logging.getLogger("zsched.bus")
 
@@ -103,6 +104,8 @@ def answer_classes(command: Command | None) -> tuple[type[Answer], ...]:
         return (Snapshot,)
     if isinstance(command, ReadFleet):
         return (FleetTold,)
+    if isinstance(command, ReadRehearsals):
+        return (RehearsalsTold, CommandResult)
     return (WorkerLines,) if isinstance(command, ReadLines) else (CommandResult, Explanation)
 
 
@@ -411,7 +414,7 @@ class ControlBus:
             return ev.StatusAsked(request=self._questions.keep(query, keys.status(node, asker)))
         if kind == "command":
             command: Any = wire.decode(payload, *COMMANDS)
-            if not isinstance(command, ExplainTask | ReadLines | ReadFleet):
+            if not isinstance(command, ExplainTask | ReadLines | ReadFleet | ReadRehearsals):
                 log.info("command=%s from=%s", type(command).__name__, asker)
                 if holder is not None:
                     command = signed_by(holder, command)

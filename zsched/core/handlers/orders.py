@@ -57,7 +57,7 @@ def _no_move(node: Stages, command: MoveTask, now: float) -> Refusal | None:
     if value.home is not None and target != value.home:
         detail = f"it is pinned to {value.home}: pin it to {target}, or `zsched unpin {command.task}` first"
         return CommandOutcome.INVALID, detail
-    why = _unfit(node, value, target, now)
+    why = unfit(node, value, target, now)
     return (CommandOutcome.INVALID, f"{target} cannot have it: {why}") if why else None
 
 
@@ -68,7 +68,7 @@ def _no_place(node: Stages, task: TaskId, target: NodeId) -> Refusal | None:
     return CommandOutcome.INVALID, f"{target!r} is no candidate; there are {', '.join(candidates)}"
 
 
-def _unfit(node: Stages, value: Allocation, target: NodeId, now: float) -> str:
+def unfit(node: Stages, value: Allocation, target: NodeId, now: float) -> str:
     """Why a candidate cannot have the task by what this node knows of it; empty: it can."""
     if target in node.flags.closed:
         closed = node.flags.closed[target]

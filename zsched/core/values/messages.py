@@ -28,6 +28,7 @@ from zsched.core.values.model import (
     check_range,
     check_readings,
 )
+from zsched.core.values.rehearsal import KeepRehearsal, ReadRehearsals, Strike
 
 MAX_CERTIFICATE: Final = 4096
 """Characters of a certificate that is sent to a node; those of `zsched pki` have 900."""
@@ -425,6 +426,9 @@ class TuneTask:
 
 Command = (
     SetWeights
+    | Strike
+    | KeepRehearsal
+    | ReadRehearsals
     | RetryTask
     | ExplainTask
     | RestartTask

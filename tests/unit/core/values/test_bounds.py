@@ -16,14 +16,18 @@ from support.proposals import proposal_of
 from zsched.core.events import (
     FleetReadAsked,
     LinesAsked,
+    RehearsalKept,
+    RehearsalsAsked,
     RestartCommanded,
     RetryCommanded,
+    StrikeCommanded,
     WeightsCommanded,
     WorkerJobs,
     commanded,
 )
 from zsched.core.relay_protocol import EndMarker, SnapshotChunk, StreamAck, WorkerTrouble
 from zsched.core.values import model
+from zsched.core.values.document import Text
 from zsched.core.values.fleet import Demand
 from zsched.core.values.messages import (
     Accepted,
@@ -42,6 +46,7 @@ from zsched.core.values.messages import (
 )
 from zsched.core.values.model import (
     MAX_COUNTER,
+    Asked,
     Echo,
     Grant,
     Jobs,
@@ -53,6 +58,15 @@ from zsched.core.values.model import (
     UtilityVector,
 )
 from zsched.core.values.plan import ServiceSettings, StreamSettings
+from zsched.core.values.rehearsal import (
+    MAX_CUT_S,
+    MAX_KEPT_BYTES,
+    KeepRehearsal,
+    ReadRehearsals,
+    RehearsalsTold,
+    Step,
+    Strike,
+)
 
 TUNING = tuning_of(score=ScoreForm.SERVICE)
 BALLOT = ballot_of(node="r1")
@@ -141,6 +155,10 @@ NAMES = [
     (RetryTask(task="merge"), "node", "retry"),
     (RestartTask(task="merge"), "task", "restart"),
     (ReadLines(task="merge"), "task", "lines"),
+    (Strike(task="merge", step=Step.DAEMON, asked=Asked(by="ada@robot1")), "task", "strike"),
+    (ReadRehearsals(task="merge"), "task", "rehearsals"),
+    (ReadRehearsals(name="1"), "name", "rehearsals"),
+    (RehearsalsTold(node="edge1"), "node", "rehearsals_told"),
     (WorkerLines(node="edge1", task="merge"), "node", "worker_lines"),
     (WorkerLines(node="edge1", task="merge"), "task", "worker_lines"),
     (FleetTold(node="edge1", value=None, fleet_file=""), "node", "fleet_told"),
@@ -232,4 +250,24 @@ def test_each_command_is_its_own_event() -> None:
     assert commanded(8, RetryTask(task="merge")) == RetryCommanded(request=8, command=RetryTask(task="merge"))
     assert commanded(9, RestartTask(task="merge")) == RestartCommanded(request=9, command=RestartTask(task="merge"))
     assert commanded(9, ReadLines(task="merge")) == LinesAsked(request=9, command=ReadLines(task="merge"))
+    strike = Strike(task="merge", step=Step.DAEMON, asked=Asked(by="ada@robot1"))
+    assert commanded(9, strike) == StrikeCommanded(request=9, command=strike)
+    assert commanded(9, strike, is_near=True) == StrikeCommanded(request=9, command=strike, is_near=True)
+    keep = KeepRehearsal(task="merge", name="1", body=Text("{}"), told="", asked=Asked(by="ada@robot1"))
+    assert commanded(9, keep) == RehearsalKept(request=9, command=keep)
+    assert commanded(9, ReadRehearsals()) == RehearsalsAsked(request=9, command=ReadRehearsals())
     assert commanded(9, ReadFleet()) == FleetReadAsked(request=9, command=ReadFleet())
+
+
+def test_a_rehearsal_keeps_within_its_bounds() -> None:
+    asked = Asked(by="ada@robot1")
+    assert Strike(task="merge", step=Step.LINK, asked=asked, cut_s=MAX_CUT_S).cut_s == MAX_CUT_S
+    with pytest.raises(ValueError, match=r"strike\.cut_s"):
+        Strike(task="merge", step=Step.LINK, asked=asked, cut_s=MAX_CUT_S + 1)
+    with pytest.raises(ValueError, match=r"strike\.step: move is not done by a node to itself"):
+        Strike(task="merge", step=Step.MOVE, asked=asked)
+    keep = KeepRehearsal(task="merge", name="1", body=Text("x" * MAX_KEPT_BYTES), told="x" * 400, asked=asked)
+    with pytest.raises(ValueError, match=r"rehearsal\.body: larger than"):
+        replace(keep, body=Text("x" * (MAX_KEPT_BYTES + 1)))
+    with pytest.raises(ValueError, match=r"rehearsal\.told: 401 characters"):
+        replace(keep, told="x" * 401)

@@ -11,7 +11,17 @@ from __future__ import annotations
 from pathlib import Path
 
 from zsched.core import events, relay_protocol
-from zsched.core.values import decision, document, durable, electorate, messages, model, plan, snapshot
+from zsched.core.values import (
+    decision,
+    document,
+    durable,
+    electorate,
+    messages,
+    model,
+    plan,
+    rehearsal,
+    snapshot,
+)
 from zsched.ipc import pipe as relay_pipe
 from zsched.ipc import protocol
 from zsched.wire import codec as wire
@@ -250,6 +260,18 @@ SAMPLES: dict[str, object] = {
         task="map_merge",
         lines=(messages.WorkerLine(number=13, age_s=1.5, text="merged 3 maps"),),
         newest=14,
+    ),
+    "strike": rehearsal.Strike(task="map_merge", step=rehearsal.Step.LINK, asked=_ASKED, cut_s=5.0, is_plan=True),
+    "keep_rehearsal": rehearsal.KeepRehearsal(
+        task="map_merge", name="20261124-002423", body=document.Text("{}"), told="2 steps", asked=_ASKED
+    ),
+    "read_rehearsals": rehearsal.ReadRehearsals(task="map_merge", name="20261124-002423"),
+    "rehearsals_told": rehearsal.RehearsalsTold(
+        node="robot1",
+        timing="wifi",
+        promised=(rehearsal.Promised(step=rehearsal.Step.DAEMON, gap_s=1.75, decide_s=1.5, whole=("map_merge/in/0",)),),
+        names=("20261124-002423",),
+        body=document.Text("{}"),
     ),
     "command_result": messages.CommandResult(
         outcome=messages.CommandOutcome.CONFLICT, detail="the value had changed", revision=8

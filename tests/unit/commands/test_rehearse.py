@@ -1,0 +1,158 @@
+"""`zsched rehearse` before it acts: what is refused and why, what is planned, what is kept."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from support.schemas import faults
+from zsched.adapters.host.operator_socket import Json, OperatorSocket
+from zsched.cli import app
+from zsched.commands.common import CliError
+from zsched.commands.rehearse import parse_steps
+from zsched.core.values.rehearsal import Step
+
+STATUS = json.loads((Path(__file__).parent / "recorded_status" / "healthy.json").read_text())
+PROMISED = {
+    "move": {"step": "move", "gap_s": 0.3, "decide_s": 1.0, "whole": ["echo/in/0"]},
+    "worker": {"step": "worker", "gap_s": 3.0, "decide_s": None, "whole": []},
+    "daemon": {"step": "daemon", "gap_s": 3.0, "decide_s": 2.0, "whole": []},
+    "link": {"step": "link", "gap_s": 4.0, "decide_s": 3.0, "whole": []},
+}
+
+
+def node(name: str, kind: str) -> Json:
+    recorded = STATUS["nodes"][0]
+    worker = {**recorded["workers"][0], "task": "echo", "state": "ready"}
+    return {**recorded, "name": name, "kind": kind, "state": "alive", "draining": False, "workers": [worker]}
+
+
+class Daemon:
+    """Answers as a robot's daemon in a fleet of two edges; notes what it is told to do."""
+
+    def __init__(self, folder: Path) -> None:
+        nodes = [node("edge1", "edge"), node("edge2", "edge"), node("robot1", "robot")]
+        task = copy.deepcopy(STATUS["tasks"][0])
+        more = {"name": "echo", "owner": "edge1", "owner_state": "alive", "revision": 7, "phase": "settled"}
+        task |= {**more, "streams": [], "candidates": ["edge1", "edge2"], "pause": None, "pin": None, "switched_s": 0.1}
+        self.task: Json = task
+        self.status: Json = {**STATUS, "fleet": "lab", "node": "robot1", "nodes": nodes, "tasks": [task]}
+        self.done: list[Json] = []
+        self.refusal = ""
+        self.kept: dict[str, str] = {}
+        self.socket = OperatorSocket(folder / "robot1.sock", self.answer)
+
+    def answer(self, request: Json) -> Json:
+        if request["verb"] == "status":
+            return copy.deepcopy(self.status)
+        if request["verb"] == "rehearsals":
+            body = self.kept.get(request.get("name", ""), "")
+            return {"node": "robot1", "timing": "wifi", "promised": PROMISED, "names": list(self.kept), "body": body}
+        if not request.get("plan"):
+            self.done.append(request)
+        if request["verb"] == "move" and self.refusal:
+            return {"outcome": "invalid", "detail": self.refusal, "revision": 7}
+        return {"outcome": "ok", "detail": "it can be done", "revision": 7}
+
+
+@pytest.fixture
+def daemon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Daemon]:
+    monkeypatch.setenv("ZSCHED_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.delenv("ZSCHED_NODE", raising=False)
+    running = Daemon(tmp_path)
+    running.socket.open()
+    yield running
+    running.socket.close()
+
+
+def run(*words: str) -> Result:
+    return CliRunner().invoke(app, ["rehearse", *words])
+
+
+# --- words -----------------------------------------------------------------------------------------------------------
+
+
+def test_steps_keep_their_order() -> None:
+    assert parse_steps("worker, move") == (Step.WORKER, Step.MOVE)
+
+
+@pytest.mark.parametrize(("text", "says"), [("mvoe", "no step 'mvoe'; did you mean move?"), (" ,", "at least")])
+def test_a_word_that_is_no_step_is_refused(text: str, says: str) -> None:
+    with pytest.raises(CliError, match="--steps") as refused:
+        parse_steps(text)
+    assert says in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ((), "name a task, or --list"),
+        (("echo", "--list"), "--list and --show go without a task"),
+        (("ecko",), "has no task 'ecko'; did you mean echo?"),
+        (("echo", "--pause", "1"), "--pause: at least 3 s"),
+        (("echo", "--cut", "2"), "--cut: more than 3.0 s"),
+        (("echo", "--cut", "61"), "at most 60 s"),
+        (("echo", "-m", "x" * 400), "--reason: 400 characters are too many"),
+        (("--show", "none"), "robot1 has kept no rehearsal 'none'"),
+    ],
+)
+def test_wrong_words_end_as_usage_and_nothing_is_done(daemon: Daemon, words: tuple[str, ...], says: str) -> None:
+    result = run(*words)
+    assert result.exit_code == 2, result.output
+    assert says in result.stderr
+    assert daemon.done == []
+
+
+# --- guard rails -----------------------------------------------------------------------------------------------------
+
+
+def test_a_task_that_nobody_else_could_have_is_not_touched(daemon: Daemon) -> None:
+    daemon.refusal = "edge2 has no room"
+    result = run("echo", "--yes")
+    assert result.exit_code == 1
+    assert "echo: no candidate but edge1 is fit" in result.stderr
+    assert daemon.done == []
+
+
+@pytest.mark.parametrize(("key", "says"), [("pause", "zsched resume echo"), ("pin", "zsched unpin echo")])
+def test_a_task_that_is_held_is_not_touched(daemon: Daemon, key: str, says: str) -> None:
+    daemon.task[key] = {"by": "ann", "reason": "", "known_s": 1.0, "for_s": None, "node": "edge1", "is_hard": False}
+    result = run("echo", "--yes")
+    assert result.exit_code == 1
+    assert says in result.stderr
+    assert daemon.done == []
+
+
+def test_off_a_terminal_nothing_is_done_without_consent(daemon: Daemon) -> None:
+    result = run("echo", "--steps", "move,worker")
+    assert result.exit_code == 2
+    assert "nothing was done, for nobody can be asked here" in result.stderr
+    assert daemon.done == []
+
+
+def test_a_plan_says_what_is_left_out_and_does_nothing(daemon: Daemon) -> None:
+    """The one daemon that this rehearsal could look through is its owner's: it must not be ended."""
+    daemon.task["owner"], daemon.task["candidates"] = "robot1", ["robot1", "edge1"]
+    result = run("echo", "--plan", "--json", "--steps", "move,daemon")
+    assert result.exit_code == 10, result.output
+    body = json.loads(result.stdout)
+    assert faults(body) == []
+    move, killed = body["plan"]
+    assert (move["step"], move["left_out"]) == ("move", None)
+    assert "give it another node by --connect" in killed["left_out"]
+    assert daemon.done == []
+
+
+# --- kept ones -------------------------------------------------------------------------------------------------------
+
+
+def test_kept_rehearsals_are_listed(daemon: Daemon) -> None:
+    assert run("--list").stdout == "robot1 has kept no rehearsal\n"
+    daemon.kept = {"20260101-000000-001": "{}", "20260102-000000-001": "{}"}
+    assert run("--list").stdout.split() == list(daemon.kept)
+    assert json.loads(run("--list", "--json").stdout)["names"] == list(daemon.kept)

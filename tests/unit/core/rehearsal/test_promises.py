@@ -1,0 +1,70 @@
+"""What is promised of each step, by the timing profile and the task's settings."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from support.fleets import fleet_of, tuning_of
+from zsched.config.timing import PROFILES
+from zsched.core.rehearsal.promises import promises
+from zsched.core.values.fleet import Fleet, Standby, StreamRule, TaskSpec, WorkerSpec
+from zsched.core.values.plan import Direction, HandoverRule, OnCrash, ReadyWhen, StreamClass, StreamSettings
+from zsched.core.values.rehearsal import Promised, Step
+
+
+def rule(direction: Direction, stream_class: StreamClass, **settings: object) -> StreamRule:
+    made = StreamSettings(stream_class=stream_class, **settings)  # type: ignore[arg-type]
+    return StreamRule(direction=direction, from_template="{robot}/a", to_template="{target}/b", settings=made)
+
+
+RULES = (
+    rule(Direction.INPUT, StreamClass.RELIABLE),
+    rule(Direction.INPUT, StreamClass.RELIABLE, on_crash=OnCrash.REPLAY),
+    rule(Direction.INPUT, StreamClass.LATEST),
+    rule(Direction.OUTPUT, StreamClass.RELIABLE, handover=HandoverRule.ALL),
+    rule(Direction.OUTPUT, StreamClass.RELIABLE),
+)
+TASK = TaskSpec(
+    name="merge",
+    candidates=("edge1", "edge2"),
+    tuning=tuning_of(),
+    worker=WorkerSpec(command=("merge",), start_deadline_s=20.0),
+    rules=RULES,
+)
+FLEET = fleet_of(TASK, of=("edge1", "edge2", "robot1", "robot2", "robot3"), electors=("robot1",))
+
+
+def of(fleet: Fleet = FLEET, task: TaskSpec = TASK) -> dict[Step, Promised]:
+    return {one.step: one for one in promises(fleet, task)}
+
+
+def test_the_limits_are_those_of_the_timing_page() -> None:
+    found = of(replace(FLEET, timing=PROFILES["wifi"]))
+    assert list(found) == list(Step)
+    # "from suspect on add up to about 1.8 s": confirm 0.3, gather 0.15, vote 0.4, commit 0.6, ranks 0.09, flip 0.3
+    assert found[Step.DAEMON].gap_s == pytest.approx(1.84)
+    assert found[Step.DAEMON].decide_s == pytest.approx(1.54)
+    assert found[Step.LINK].gap_s == pytest.approx(1.84 + 1.4), "silence first, noticed up to a beat late"
+    assert found[Step.MOVE].gap_s == 0.3
+    assert found[Step.MOVE].decide_s == pytest.approx(0.69)
+    assert found[Step.WORKER].gap_s > 20.0, "it starts in place"
+    assert found[Step.WORKER].decide_s is None
+    wired = of(replace(FLEET, timing=PROFILES["wired"]))
+    assert wired[Step.LINK].gap_s < found[Step.LINK].gap_s
+
+
+def test_an_exclusive_task_waits_for_its_lease_and_a_cold_one_for_its_worker() -> None:
+    plain, leased = of()[Step.DAEMON], of(task=replace(TASK, exclusive=True))[Step.DAEMON]
+    assert leased.gap_s == pytest.approx(plain.gap_s + FLEET.timing.lease_s)
+    cold = of(task=replace(TASK, worker=replace(TASK.worker, standby=Standby.COLD)))
+    assert cold[Step.MOVE].gap_s == pytest.approx(20.3)
+
+
+def test_what_loses_nothing_is_named_by_its_stream() -> None:
+    found = of()
+    assert found[Step.MOVE].whole == ("merge/in/0", "merge/in/1", "merge/out/0")
+    assert found[Step.DAEMON].whole == ("merge/in/1",), "what was not acknowledged is replayed"
+    foreign = of(task=replace(TASK, worker=replace(TASK.worker, ready_when=ReadyWhen.MATCHING)))
+    assert all(one.whole == () for one in foreign.values()), "nobody numbers what a foreign worker takes"

@@ -1,0 +1,485 @@
+"""`zsched rehearse`: plays faults on a live fleet, by consent, and tells what the fleet makes of them.
+
+Knows: how the fleet is looked at and how each step is done; that the task goes back where it was. Does not know: which
+step comes when and when to stop (`zsched.core.rehearsal.programme`), how the outcome is shown
+(`zsched.commands.rehearse_report`).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from zsched import paths as places
+from zsched.clock import monotonic_s, wall_s
+from zsched.commands.ask import Door, ask_door
+from zsched.commands.common import CliError, Json, nearest, print_json
+from zsched.commands.orders import OrderView, Row, begin, user_name
+from zsched.commands.page import harmless
+from zsched.commands.rehearse_report import SCHEMA, as_json, table
+from zsched.commands.wait import Condition, missing
+from zsched.core.rehearsal.programme import MIN_CALM_S, Do, Look, Over, Programme, Result, Sight
+from zsched.core.values.model import MAX_ASKED
+from zsched.core.values.rehearsal import FAULTS, MAX_CUT_S, Promised, Step
+from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE
+
+LOOK_S: Final = 0.2
+"""Between two looks at the fleet."""
+ANSWER_S: Final = 0.3
+"""A daemon begins so long after it has answered (`zsched.runtime.strikes`)."""
+CUT_MORE_S: Final = 2.0
+"""A cut lasts so much longer than deciding may take, so that the task moves within it."""
+BACK_S: Final = 30.0
+"""How long the way back may take."""
+DEFAULT_PAUSE_S: Final = 5.0
+DEFAULT_LIMIT_S: Final = 60.0
+DOES: Final = {
+    Step.MOVE: "is moved to another candidate",
+    Step.WORKER: "its owner's worker is killed",
+    Step.DAEMON: "its owner's daemon is killed",
+    Step.LINK: "its owner's links are cut",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RehearseOrder:
+    """What is rehearsed."""
+
+    task: str
+    steps: tuple[Step, ...]
+    rounds: int = 1
+    pause_s: float = DEFAULT_PAUSE_S
+    limit_s: float = DEFAULT_LIMIT_S
+    cut_s: float | None = None
+    """``None``: as long as it takes until the task has moved."""
+
+
+def parse_steps(text: str) -> tuple[Step, ...]:
+    """The steps that a list of words names, in their order.
+
+    >>> parse_steps("move,worker")
+    (<Step.MOVE: 'move'>, <Step.WORKER: 'worker'>)
+
+    Raises:
+        CliError: a word is no step.
+    """
+    known = [step.value for step in Step]
+    words = [word.strip() for word in text.split(",") if word.strip()]
+    for word in words:
+        if word not in known:
+            raise CliError(EXIT_USAGE, f"--steps: there is no step {word!r}{nearest(word, known)}")
+    if not words:
+        raise CliError(EXIT_USAGE, f"--steps: name at least one of {', '.join(known)}")
+    return tuple(Step(word) for word in words)
+
+
+# --- kept ones -------------------------------------------------------------------------------------------------------
+
+
+def show_kept(door: Door, name: str | None, *, is_json: bool) -> int:
+    """List the rehearsals that a node has kept, or show one; returns the exit code.
+
+    Raises:
+        CliError: nobody answers, or there is no such rehearsal.
+    """
+    told = ask_door(door, {"verb": "rehearsals", "name": name or ""})
+    if "outcome" in told:
+        raise CliError(EXIT_FAILED, str(told["detail"]))
+    names = [str(one) for one in told["names"]]
+    if name is not None and not told["body"]:
+        raise CliError(EXIT_USAGE, f"{told['node']} has kept no rehearsal {name!r}{nearest(name, names)}")
+    kept = json.loads(told["body"]) if name is not None else None
+    if is_json:
+        print_json({"schema": SCHEMA, "node": told["node"], "names": names, "rehearsal": kept})
+    elif kept is not None:
+        sys.stdout.write(table(kept))
+    elif not names:
+        sys.stdout.write(f"{told['node']} has kept no rehearsal\n")
+    else:
+        sys.stdout.writelines(f"{harmless(one)}\n" for one in names)
+    return EXIT_OK
+
+
+# --- one rehearsal ---------------------------------------------------------------------------------------------------
+
+
+def rehearse(view: OrderView, order: RehearseOrder, runtime: Path) -> int:
+    """Show the programme, ask, play it, tell what came, and bring the task back; returns the exit code.
+
+    Raises:
+        CliError: nobody answers, there is no such task, it may not be touched, or it was not agreed to.
+    """
+    if len(view.reason) > MAX_ASKED - len("rehearsal 20260101-000000: "):
+        raise CliError(EXIT_USAGE, f"--reason: {len(view.reason)} characters are too many")
+    if order.pause_s < MIN_CALM_S:
+        raise CliError(EXIT_USAGE, f"--pause: at least {MIN_CALM_S:g} s, or one step's gap is taken for the usual one")
+    stage = Stage(view, order, runtime)
+    look = stage.look()
+    if look.hold:
+        raise CliError(EXIT_FAILED, look.hold)
+    planned = {step: stage.why_not(step, look.owner or "") for step in dict.fromkeys(order.steps)}
+    rows: list[Row] = [
+        (order.task, step.value, DOES[step], f"left out: {planned[step]}" if planned[step] else "it recovers")
+        for step in planned
+    ]
+    doable = [step for step in planned if not planned[step]]
+    if not look.fit:
+        raise CliError(EXIT_FAILED, f"{order.task}: no candidate but {look.owner} is fit; {_why_unfit(look)}")
+    warning = f"This disturbs the running fleet {order.rounds} x {len(doable)} times; it stops at the first surprise."
+    plan = {"schema": SCHEMA, "node": stage.first["node"], "names": [], "rehearsal": None}
+    plan["plan"] = [{"step": step.value, "left_out": why or None} for step, why in planned.items()]
+    code = begin(view, rows, plan, is_change=bool(doable), warning=warning)
+    if code is not None:
+        return code
+    return _play(view, order, stage)
+
+
+def _why_unfit(look: Look) -> str:
+    return "; ".join(look.lacks) or "`zsched explain` says why"
+
+
+def _play(view: OrderView, order: RehearseOrder, stage: Stage) -> int:
+    programme = Programme(order.steps, stage.promised, rounds=order.rounds, calm_s=order.pause_s, limit_s=order.limit_s)
+    interrupted = ""
+    over = Over(is_kept=False, why="interrupted")
+    try:
+        over = _run(programme, stage)
+    except KeyboardInterrupt:
+        interrupted = "interrupted"
+        sys.stderr.write("\ninterrupted: nothing more is done\n")
+    except CliError as error:
+        over = Over(is_kept=False, why=str(error))
+    way_back = stage.go_back()
+    body = as_json(
+        name=stage.name,
+        at=stage.at,
+        asked=stage.asked,
+        order={
+            "task": order.task,
+            "steps": [step.value for step in order.steps],
+            "rounds": order.rounds,
+            "pause_s": order.pause_s,
+            "limit_s": order.limit_s,
+            "cut_s": stage.cut_s,
+        },
+        timing=stage.timing,
+        promised=stage.promised,
+        results=programme.results,
+        over=over,
+        way_back=way_back,
+    )
+    kept_by = stage.keep(body)
+    if view.is_json:
+        print_json({"schema": SCHEMA, "node": kept_by, "names": [stage.name], "rehearsal": body})
+    else:
+        sys.stdout.write(table(body))
+    if over.is_kept:
+        return EXIT_OK
+    return EXIT_FAILED if any(result.broken for result in programme.results) and not interrupted else EXIT_TIMED_OUT
+
+
+def _run(programme: Programme, stage: Stage) -> Over:
+    """Look and act until the programme is over."""
+    told, known = "", 0
+    while True:
+        began = monotonic_s()
+        action = programme.advance(stage.look())
+        for result in programme.results[known:]:
+            _say(_line(result))
+        known = len(programme.results)
+        if isinstance(action, Over):
+            return action
+        if isinstance(action, Do):
+            _say(f"round {action.round}: {action.step} of {action.node}")
+            at, why = stage.act(action)
+            if why:
+                programme.leave_out(why)
+            else:
+                programme.struck(at)
+            continue
+        if action.why != told and not action.why.startswith("calm"):
+            told = action.why
+            _say(f"  {told}")
+        time.sleep(max(0.0, LOOK_S - (monotonic_s() - began)))
+
+
+def _say(text: str) -> None:
+    sys.stderr.write(f"{harmless(text)}\n")
+    sys.stderr.flush()
+
+
+def _line(result: Result) -> str:
+    if result.left_out:
+        return f"  left out: {result.left_out}"
+    gaps = [gap.more_s for gap in result.gaps if gap.more_s is not None]
+    gap = f"at most {max(gaps) * 1000:.0f} ms without an answer more than usual" if gaps else "no gap measured"
+    word = f"BROKEN: {result.broken[0]}" if result.broken else "as promised"
+    whole = "" if result.whole_s is None else f", whole after {result.whole_s:.1f} s"
+    return f"  {gap}{whole}, lost {result.lost}: {word}"
+
+
+@dataclass(slots=True)
+class _Base:
+    """What was there when the rehearsal began."""
+
+    alive: frozenset[str]
+    ready: frozenset[str]
+    """Nodes whose worker of the task was ready."""
+    owner: str
+    moved: bool = field(default=False)
+
+
+class Stage:
+    """The fleet as the rehearsal sees and touches it."""
+
+    def __init__(self, view: OrderView, order: RehearseOrder, runtime: Path) -> None:
+        """Look for the first time.
+
+        Raises:
+            CliError: nobody answers, or there is no such task.
+        """
+        self._view, self._order = view, order
+        self._sockets = {path.stem: path for path in places.local_sockets(runtime)} if runtime.is_dir() else {}
+        self.first = self._status(view.door)
+        names = [str(task["name"]) for task in self.first["tasks"]]
+        if order.task not in names:
+            text = f"fleet {self.first['fleet']} has no task {order.task!r}{nearest(order.task, names)}"
+            raise CliError(EXIT_USAGE, text)
+        self.at = wall_s()
+        self.name = time.strftime("%Y%m%d-%H%M%S", time.gmtime(self.at)) + f"-{os.getpid() % 1000:03d}"
+        who = view.door.socket.stem or os.uname().nodename
+        reason = f"rehearsal {self.name}" + (f": {view.reason}" if view.reason else "")
+        self.asked: Json = {"by": f"{user_name()}@{who}", "reason": reason}
+        told = ask_door(view.door, {"verb": "rehearsals", "task": order.task})
+        if "outcome" in told:
+            raise CliError(EXIT_FAILED, str(told["detail"]))
+        self.timing = str(told["timing"])
+        self.promised = {Step(step): _promised(one) for step, one in told["promised"].items()}
+        silent_s = self.promised[Step.LINK].decide_s or 0.0
+        self.cut_s = order.cut_s if order.cut_s is not None else min(silent_s + CUT_MORE_S, MAX_CUT_S)
+        if Step.LINK in order.steps and not silent_s < self.cut_s <= MAX_CUT_S:
+            text = f"--cut: more than {silent_s:.1f} s (before that nobody misses the owner), at most {MAX_CUT_S:g} s"
+            raise CliError(EXIT_USAGE, text)
+        task = self._task(self.first)
+        self._base = _Base(
+            alive=frozenset(str(node["name"]) for node in self.first["nodes"] if node["state"] == "alive"),
+            ready=frozenset(_ready(self.first, order.task)),
+            owner=str(task["owner"] or ""),
+        )
+
+    # --- looking -----------------------------------------------------------------------------------------------------
+
+    def _way(self, node: str) -> Door:
+        """The shortest way to a node: its own socket here, else by the door."""
+        own = self._sockets.get(node)
+        return self._view.door.to(node) if own is None else Door(socket=own)
+
+    def _status(self, door: Door) -> Json:
+        return ask_door(door, {"verb": "status"})
+
+    def _task(self, status: Json) -> Json:
+        task: Json = next(one for one in status["tasks"] if one["name"] == self._order.task)
+        return task
+
+    def look(self) -> Look:
+        """What the robots tell now; what cannot be asked is something that the task lacks."""
+        now = monotonic_s()
+        statuses: dict[str, Json] = {}
+        silent = []
+        robots = [node["name"] for node in self.first["nodes"] if node["kind"] == "robot"]
+        for robot in [str(name) for name in robots if name in self._base.alive]:
+            try:
+                statuses[robot] = self._status(self._way(robot))
+            except CliError as error:
+                silent.append(f"{robot} does not answer: {error}")
+        if not statuses:
+            return Look(now=now, owner=None, epoch=-1, lacks=tuple(silent))
+        tasks = {robot: self._task(status) for robot, status in statuses.items()}
+        first = next(iter(statuses.values()))
+        task = max(tasks.values(), key=lambda one: int(one["epoch"]))
+        lacks = [*silent, *self._lacks(statuses, first)]
+        switched = [one["switched_s"] for one in tasks.values() if one["epoch"] == task["epoch"]]
+        return Look(
+            now=now,
+            owner=task["owner"],
+            epoch=int(task["epoch"]),
+            since_s=float("inf") if task["since_s"] is None else float(task["since_s"]),
+            switched_s=None if None in switched else max(switched, default=None),
+            hold=_hold(task),
+            lacks=tuple(lacks),
+            fit=() if lacks else self._fit(task),
+            sights=tuple(_sights(tasks)),
+        )
+
+    def _lacks(self, statuses: Mapping[str, Json], first: Json) -> list[str]:
+        """What is missing at full strength, by what was there at the beginning."""
+        lacks = missing(Condition(kind="settled", task=self._order.task), statuses)
+        for observer, status in statuses.items():
+            states = {str(node["name"]): str(node["state"]) for node in status["nodes"]}
+            lacks += [
+                f"{name} is {states[name]} to {observer}"
+                for name in sorted(self._base.alive)
+                if states[name] != "alive"
+            ]
+        ready = _ready(first, self._order.task)
+        lacks += [f"the worker on {name} is not ready" for name in sorted(self._base.ready - ready)]
+        if not first["quorum"]["ok"]:
+            lacks.append("no quorum")
+        return lacks
+
+    def _fit(self, task: Json) -> tuple[str, ...]:
+        """The other candidates that could have the task at once, by the answering node's own check of a move."""
+        others = [str(name) for name in task["candidates"] if name != task["owner"]]
+        return tuple(name for name in others if not self._why_no_move(name))
+
+    def _why_no_move(self, target: str) -> str:
+        result = self._move(target, is_plan=True)
+        return "" if result["outcome"] == "ok" else str(result["detail"])
+
+    def _move(self, target: str, *, is_plan: bool = False) -> Json:
+        return self._ask({"verb": "move", "task": self._order.task, "target": target, "plan": is_plan, **self.asked})
+
+    def _ask(self, request: Json) -> Json:
+        """The answer of the first node that gives one: the door's own daemon may be down."""
+        doors = [self._view.door, *(Door(socket=path) for path in self._sockets.values())]
+        failure: CliError | None = None
+        for door in doors:
+            try:
+                return ask_door(door, request)
+            except CliError as error:
+                failure = failure or error
+        assert failure is not None
+        raise failure
+
+    # --- doing -------------------------------------------------------------------------------------------------------
+
+    def why_not(self, step: Step, owner: str) -> str:
+        """Why a step cannot be done to this owner now; empty: it can."""
+        if step not in FAULTS:
+            return ""
+        if step is not Step.WORKER and not self._has_other_eye(owner):
+            return f"this rehearsal looks at the fleet through {owner}: give it another node by --connect"
+        return self._strike(step, owner, is_plan=True)
+
+    def _has_other_eye(self, owner: str) -> bool:
+        """Whether the fleet can still be seen without this node."""
+        door = self._view.door
+        if door.endpoint:
+            return door.node != owner
+        return any(name != owner for name in self._sockets)
+
+    def _strike(self, step: Step, owner: str, *, is_plan: bool) -> str:
+        request = {"verb": "strike", "task": self._order.task, "step": step.value, "plan": is_plan, **self.asked}
+        if step is Step.LINK:
+            request["cut_s"] = self.cut_s
+        result = ask_door(self._way(owner), request)
+        return "" if result["outcome"] == "ok" else str(result["detail"])
+
+    def act(self, do: Do) -> tuple[float, str]:
+        """Do a step: (when it began, why it was not done)."""
+        at = monotonic_s()
+        if do.step is Step.MOVE:
+            result = self._move(do.target)
+            if result["outcome"] == "ok":
+                self._base.moved = True
+                return at, ""
+            return at, str(result["detail"])
+        try:
+            why = self.why_not(do.step, do.node) or self._strike(do.step, do.node, is_plan=False)
+        except CliError as error:
+            why = str(error)
+        if why:
+            return at, why
+        self._base.moved = True
+        return (at if do.step is Step.WORKER else monotonic_s() + ANSWER_S), ""
+
+    def go_back(self) -> str:
+        """Bring the task back to the node that had it, if it is elsewhere; what became of that."""
+        owner = self._base.owner
+        if not self._base.moved or not owner:
+            return "nothing has changed"
+        began = monotonic_s()
+        why = ""
+        while monotonic_s() - began < BACK_S:
+            try:
+                look = self.look()
+                if look.owner == owner:
+                    return f"{self._order.task} is on {owner} again, where it was"
+                why = "; ".join(look.lacks)
+                if not look.lacks:
+                    result = self._move(owner)
+                    why = "" if result["outcome"] in ("ok", "unchanged") else str(result["detail"])
+            except CliError as error:
+                why = str(error)
+            except KeyboardInterrupt:
+                why = "interrupted"
+                break
+            time.sleep(LOOK_S)
+        return f"{self._order.task} is not back on {owner}: {why or 'it takes too long'}; `zsched move` brings it there"
+
+    def keep(self, body: Json) -> str:
+        """Have the outcome kept; the node that keeps it, or empty."""
+        text = json.dumps(body, ensure_ascii=False, separators=(",", ":"))
+        request = {"verb": "keep", "task": self._order.task, "name": self.name, "body": text, **self.asked}
+        try:
+            result = self._ask({**request, "told": _told(body)})
+        except CliError as error:
+            _say(f"the outcome is not kept: {error}")
+            return ""
+        if result["outcome"] != "ok":
+            _say(f"the outcome is not kept: {result['detail']}")
+            return ""
+        return str(self.first["node"])
+
+
+def _told(body: Json) -> str:
+    done = sum(1 for one in body["steps_done"] if not one["left_out"])
+    word = "every promise was kept" if body["is_kept"] else str(body["why"])
+    return f"{done} steps, {word}; `zsched rehearse --show {body['id']}`"
+
+
+def _promised(one: Json) -> Promised:
+    fields: dict[str, Any] = {**one, "step": Step(one["step"]), "whole": tuple(one.get("whole", ()))}
+    return Promised(**fields)
+
+
+def _ready(status: Json, task: str) -> set[str]:
+    found = set()
+    for node in status["nodes"]:
+        if any(worker["task"] == task and worker["state"] == "ready" for worker in node["workers"]):
+            found.add(str(node["name"]))
+    return found
+
+
+def _hold(task: Json) -> str:
+    """Why nobody may touch the task."""
+    name = task["name"]
+    if task["pause"] is not None:
+        return f"{name} is paused: a dead owner is not replaced; `zsched resume {name}` first"
+    if task["pin"] is not None:
+        return f"{name} is pinned: it may not move; `zsched unpin {name}` first"
+    return ""
+
+
+def _sights(tasks: Mapping[str, Json]) -> list[Sight]:
+    return [
+        Sight(
+            robot=robot,
+            stream=str(stream["stream"]),
+            messages=int(stream["messages"]),
+            lost=int(stream["lost"]),
+            at_most_lost=int(stream["at_most_lost"]),
+            doubled=int(stream["doubled"]),
+            gap_s=stream.get("gap_s"),
+            move_gap_s=stream.get("move_gap_s"),
+            move_epoch=int(stream.get("move_epoch") or 0),
+        )
+        for robot, task in tasks.items()
+        for stream in task["streams"]
+    ]

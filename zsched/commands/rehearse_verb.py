@@ -1,0 +1,69 @@
+"""`zsched rehearse` on the command line: arguments in, exit code out.
+
+Knows: options. Does not know: how anything is done (`zsched.commands.rehearse`, imported when the verb runs).
+"""
+
+from __future__ import annotations
+
+import os
+from typing import Annotated
+
+import typer
+
+from zsched.commands.common import CliError, Verb
+from zsched.commands.order_verbs import AskedOption, JsonOption, PlanOption, ReasonOption, RuntimeOption, YesOption
+from zsched.exits import EXIT_USAGE
+
+
+def add_rehearse_verb(app: typer.Typer) -> None:
+    """Add the verb to the program."""
+    app.command(cls=Verb)(rehearse)
+
+
+def rehearse(
+    task: Annotated[str | None, typer.Argument(metavar="[TASK]", help="A task of the fleet file.")] = None,
+    steps: Annotated[
+        str, typer.Option(metavar="STEPS", help="What is done, in this order: move, worker, daemon, link.")
+    ] = "move,worker,daemon,link",
+    rounds: Annotated[int, typer.Option(min=1, max=100, metavar="N", help="How often all of it.")] = 1,
+    pause: Annotated[float, typer.Option(metavar="S", help="Seconds of calm before each step; at least 3.")] = 5.0,
+    limit: Annotated[
+        float, typer.Option(min=5.0, max=3600.0, metavar="S", help="Seconds that recovering may take.")
+    ] = 60.0,
+    cut: Annotated[
+        float | None, typer.Option(metavar="S", help="Seconds of a cut. [until the task has moved, and 2 more]")
+    ] = None,
+    kept: Annotated[bool, typer.Option("--list", help="List the rehearsals that the node has kept.")] = False,
+    show: Annotated[str | None, typer.Option(metavar="ID", help="Show one of them.")] = None,
+    reason: ReasonOption = "",
+    plan: PlanOption = False,
+    yes: YesOption = False,
+    json_: JsonOption = False,
+    node: AskedOption = None,
+    connect: Annotated[
+        str | None, typer.Option("--connect", metavar="ENDPOINT", help="Look through this node's control endpoint.")
+    ] = None,
+    runtime_dir: RuntimeOption = None,
+) -> None:
+    """Play faults on the running fleet, one at a time, and tell what it makes of them beside what is promised.
+
+    It asks first, needs a second fit candidate, waits for calm before each step, and stops at the first broken promise.
+    Exits with 1 when one was broken, with 5 when it could not go on.
+    """
+    from zsched import paths as places  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands import rehearse as verb  # noqa: PLC0415 - as above
+    from zsched.commands.ask import find_door  # noqa: PLC0415 - as above
+    from zsched.commands.orders import OrderView  # noqa: PLC0415 - as above
+
+    door = find_door(runtime_dir, node, connect=connect)
+    if kept or show is not None:
+        if task is not None:
+            raise CliError(EXIT_USAGE, "--list and --show go without a task")
+        raise typer.Exit(verb.show_kept(door, show, is_json=json_))
+    if task is None:
+        raise CliError(EXIT_USAGE, "name a task, or --list: `zsched rehearse TASK`")
+    view = OrderView(door=door, is_json=json_, is_yes=yes, is_plan=plan, reason=reason)
+    order = verb.RehearseOrder(
+        task=task, steps=verb.parse_steps(steps), rounds=rounds, pause_s=pause, limit_s=limit, cut_s=cut
+    )
+    raise typer.Exit(verb.rehearse(view, order, places.runtime_folder(runtime_dir, os.environ)))
