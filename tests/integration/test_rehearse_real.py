@@ -50,7 +50,7 @@ def test_a_fleet_is_moved_hurt_and_killed_and_the_page_tells_what_it_did(
 
         pids = {node: bed.pid(node) for node in bed.names}
         bed.let_end("edge1", "edge2")
-        played = rehearse(bed, "--steps", "move,worker,daemon", "--pause", "3", "--yes", "--json", "-m", "new radio")
+        played = rehearse(bed, "--steps", "move,worker,daemon", "--pause", "11", "--yes", "--json", "-m", "new radio")
         again: list[str] = []
 
         def is_over() -> bool:

@@ -37,7 +37,7 @@ CUT_MORE_S: Final = 2.0
 """A cut lasts so much longer than deciding may take, so that the task moves within it."""
 BACK_S: Final = 30.0
 """How long the way back may take."""
-DEFAULT_PAUSE_S: Final = 5.0
+DEFAULT_PAUSE_S: Final = 12.0
 DEFAULT_LIMIT_S: Final = 60.0
 DOES: Final = {
     Step.MOVE: "is moved to another candidate",

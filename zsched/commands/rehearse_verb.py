@@ -26,7 +26,7 @@ def rehearse(
         str, typer.Option(metavar="STEPS", help="What is done, in this order: move, worker, daemon, link.")
     ] = "move,worker,daemon,link",
     rounds: Annotated[int, typer.Option(min=1, max=100, metavar="N", help="How often all of it.")] = 1,
-    pause: Annotated[float, typer.Option(metavar="S", help="Seconds of calm before each step; at least 3.")] = 5.0,
+    pause: Annotated[float, typer.Option(metavar="S", help="Seconds of calm before each step; at least 11.")] = 12.0,
     limit: Annotated[
         float, typer.Option(min=5.0, max=3600.0, metavar="S", help="Seconds that recovering may take.")
     ] = 60.0,

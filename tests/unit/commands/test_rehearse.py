@@ -94,7 +94,7 @@ def test_a_word_that_is_no_step_is_refused(text: str, says: str) -> None:
         ((), "name a task, or --list"),
         (("echo", "--list"), "--list and --show go without a task"),
         (("ecko",), "has no task 'ecko'; did you mean echo?"),
-        (("echo", "--pause", "1"), "--pause: at least 3 s"),
+        (("echo", "--pause", "5"), "--pause: at least 11 s"),
         (("echo", "--cut", "2"), "--cut: more than 3.0 s"),
         (("echo", "--cut", "61"), "at most 60 s"),
         (("echo", "-m", "x" * 400), "--reason: 400 characters are too many"),

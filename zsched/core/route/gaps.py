@@ -11,8 +11,8 @@ from typing import Final
 
 from zsched.core.values.plan import StreamCount
 
-GAP_WINDOW_S: Final = 2.0
-"""The status tells the longest gap of this many seconds, so that a reader who looks every second misses none."""
+GAP_WINDOW_S: Final = 10.0
+"""The status tells the longest gap of this many seconds, so that a reader who looks every few seconds misses none."""
 
 
 class StreamGaps:
