@@ -71,7 +71,7 @@ HEAVY: Final = frozenset(
 )
 OUTSIDE: Final[dict[str, str]] = {
     # library: who alone may import it, besides lab and tasks
-    "zenoh": r"(adapters\.network|relay|worker|sessions)(\..+)?",
+    "zenoh": r"(adapters\.network|relay|worker|sessions)(\..+)?|drivers\.ros2_lifecycle",
     "msgpack": r"wire\.codec",
     "ruamel": r"config\.(reader|editing)",
     "typer": r"cli|commands\..+",

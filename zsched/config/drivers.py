@@ -12,6 +12,8 @@ from typing import Final
 
 from zsched.config.blocks import Choice, Field, Here, ListOf, Located, Section, Text
 from zsched.config.reader import Collector
+from zsched.core.route.ros2 import name_fault
+from zsched.core.values.plan import ReadyWhen
 
 
 class Driver(StrEnum):
@@ -20,6 +22,7 @@ class Driver(StrEnum):
     PROCESS = "process"
     SYSTEMD = "systemd"
     CONTAINER = "container"
+    ROS2_LIFECYCLE = "ros2_lifecycle"
 
 
 class ContainerEngine(StrEnum):
@@ -34,8 +37,11 @@ _OWN: Final[Mapping[Driver, tuple[str, ...]]] = {
     Driver.PROCESS: ("command",),
     Driver.SYSTEMD: ("unit",),
     Driver.CONTAINER: ("image", "args", "mounts", "options", "engine"),
+    Driver.ROS2_LIFECYCLE: ("node", "command"),
 }
-"""The keys of each driver, the first one needed (but that of a process: somebody else may start it)."""
+"""The keys of each driver, the first one needed (but that of a process: somebody else may start it), of a node both."""
+
+TARGET: Final = "{target}"
 
 
 def _unit_fault(text: str) -> str | None:
@@ -65,10 +71,17 @@ def _word_fault(text: str) -> str | None:
     return "it has a NUL" if "\0" in text else None
 
 
+def _node_fault(text: str) -> str | None:
+    if text.count(TARGET) != 1 or "*" in text or set(text.replace(TARGET, "")) & set("{}"):
+        return f"/{TARGET}/NAME: each machine has a node of its own, and all see each other's services"
+    return name_fault(text)
+
+
 DRIVER_KEYS: Final = {
     "driver": Field(
         Choice.of(Driver),
-        "What keeps the worker: `process`: its `command`; `systemd`: a `unit` of the machine; `container`: an `image`.",
+        "What keeps the worker: `process`: its `command`; `systemd`: a `unit` of the machine; `container`: an `image`; "
+        "`ros2_lifecycle`: a managed `node`, which its `command` starts.",
         default=f"`{Driver.PROCESS}`",
     ),
     "unit": Field(
@@ -94,6 +107,10 @@ DRIVER_KEYS: Final = {
         Choice.of(ContainerEngine),
         "Driver `container`: what runs it; otherwise podman, and docker where there is no podman.",
     ),
+    "node": Field(
+        Text("a managed node", _node_fault),
+        "Driver `ros2_lifecycle`: the node's full name, with `{target}` for the machine: `/{target}/slam`.",
+    ),
 }
 
 
@@ -108,11 +125,15 @@ def command_of(section: Section, out: Collector) -> tuple[str, ...] | None:
                 return None
     if driver is Driver.PROCESS:
         return None
-    needed = _OWN[driver][0]
-    if needed not in section.places:
-        out.error(section.where("driver"), f"driver {driver} needs the key {needed!r}", f"{needed}: ...")
-        return None
+    for needed in _OWN[driver] if driver is Driver.ROS2_LIFECYCLE else _OWN[driver][:1]:
+        if needed not in section.places:
+            out.error(section.where("driver"), f"driver {driver} needs the key {needed!r}", f"{needed}: ...")
+            return None
     if not section.is_whole:
+        return None
+    if driver is Driver.ROS2_LIFECYCLE and section.get("ready") is not ReadyWhen.MATCHING:
+        message = "a ROS 2 node shows no token of zsched.worker: it is ready when it subscribes"
+        out.error(section.where("driver"), message, "ready: matching")
         return None
     program = ("python", "-m", f"zsched.drivers.{driver}")
     return (*program, *_WORDS[driver](section), *(word for name in section.get("env", {}) for word in ("--env", name)))
@@ -134,7 +155,12 @@ def _container_words(section: Section) -> tuple[str, ...]:
     )
 
 
+def _lifecycle_words(section: Section) -> tuple[str, ...]:
+    return (f"--node={section.get('node')}", *(f"--arg={word}" for word in section.get("command")))
+
+
 _WORDS: Final[Mapping[Driver, Callable[[Section], tuple[str, ...]]]] = {
     Driver.SYSTEMD: _systemd_words,
     Driver.CONTAINER: _container_words,
+    Driver.ROS2_LIFECYCLE: _lifecycle_words,
 }

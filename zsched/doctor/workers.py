@@ -16,7 +16,7 @@ from typing import Final
 
 from zsched.core.values.fleet import TaskSpec, runs_worker
 from zsched.doctor.model import Result, Scene, failed, joined, passed, skipped, warned
-from zsched.drivers import container, systemd
+from zsched.drivers import container, ros2_lifecycle, systemd
 from zsched.drivers.engine import Look
 
 IMPORT_S: Final = 60.0
@@ -25,6 +25,7 @@ PYTHON: Final = ("python", "python3")
 LOOKS: Final[Mapping[str, Callable[[Sequence[str], str, str], Look]]] = {
     "zsched.drivers.systemd": systemd.look,
     "zsched.drivers.container": container.look,
+    "zsched.drivers.ros2_lifecycle": ros2_lifecycle.look,
 }
 FINDER: Final = Path(__file__).with_name("imports.py")
 

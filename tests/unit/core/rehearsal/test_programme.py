@@ -213,7 +213,7 @@ def test_the_gap_of_a_move_counts_though_the_status_was_away_when_it_ended() -> 
 
 @pytest.mark.parametrize(("rounds", "calm_s", "steps"), [(0, 12.0, 1), (1, 1.0, 1), (1, 12.0, 0)])
 def test_a_programme_out_of_range_is_refused(rounds: int, calm_s: float, steps: int) -> None:
-    with pytest.raises(ValueError, match="expected steps, rounds from 1, a calm of 3 s or more"):
+    with pytest.raises(ValueError, match="expected steps, rounds from 1, a calm of 11 s or more"):
         Programme([Step.MOVE][:steps], PROMISED, rounds=rounds, calm_s=calm_s, limit_s=30.0)
 
 

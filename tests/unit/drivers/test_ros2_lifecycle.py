@@ -1,0 +1,66 @@
+"""What the driver of managed nodes refuses before it starts one, and how it says why one has ended."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from zsched.drivers.place import Place
+from zsched.drivers.ros2_lifecycle import LifecycleNode, as_client, fault_of, look
+from zsched.errors import ConfigError
+from zsched.sessions.config import worker_config
+
+
+def node(tmp_path: Path, domain: str = "0") -> LifecycleNode:
+    place = Place(fleet="f", node="edge1", task="t", session=tmp_path / "none", variables=())
+    return LifecycleNode(argparse.Namespace(node="/{target}/slam", arg=["sh"]), place, domain)
+
+
+@pytest.mark.parametrize(
+    ("name", "machine", "domain", "said"),
+    [
+        ("/edge-1/slam", "edge-1", "0", "'edge-1' cannot stand in the ROS name /edge-1/slam"),
+        ("/edge1/7", "edge1", "0", "/edge1/7 is no ROS name"),
+        ("/edge1/slam", "edge1", "233", "ROS_DOMAIN_ID is '233', not a number up to 232"),
+        ("/edge1/slam", "edge1", "x", "ROS_DOMAIN_ID is 'x'"),
+    ],
+)
+def test_a_name_or_domain_that_ros_has_not_is_refused(name: str, machine: str, domain: str, said: str) -> None:
+    assert said in (fault_of(name, machine, domain) or "")
+
+
+def test_a_wrong_domain_is_final_and_a_missing_session_file_is_not(tmp_path: Path) -> None:
+    wrong = node(tmp_path, "x").begin(lambda _: None)
+    assert wrong is not None
+    assert wrong.is_final
+    missing = node(tmp_path).begin(lambda _: None)
+    assert missing is not None
+    assert "the services of /edge1/slam cannot be asked" in missing.reason
+    assert not missing.is_final
+
+
+def test_the_end_of_the_process_is_told_by_status_or_signal(tmp_path: Path) -> None:
+    engine = node(tmp_path)
+    assert engine.why(-9).reason == "/edge1/slam was killed by signal 9"
+    assert engine.why(0).reason == "/edge1/slam has ended by itself"
+    assert engine.why(78).is_final
+    assert not engine.why(1).is_final
+
+
+def test_the_driver_is_a_client_of_the_nodes_relay_only() -> None:
+    config = zenoh.Config.from_json5(as_client(worker_config(connect=("tcp/127.0.0.1:1", "tcp/127.0.0.1:2"))))
+    assert config.get_json("mode") == '"client"'
+    assert "127.0.0.1:1" in config.get_json("connect/endpoints")
+    assert "127.0.0.1:2" not in config.get_json("connect/endpoints")
+    for text in ("{}", "{no"):
+        with pytest.raises(ConfigError):
+            as_client(text)
+
+
+def test_the_doctor_looks_for_the_program_and_the_name() -> None:
+    assert look(["--node=/{target}/slam", "--arg=sh"], "edge1", "t").fix == ""
+    assert "no program nobody-has-this" in look(["--node=/{target}/slam", "--arg=nobody-has-this"], "edge1", "t").told
+    assert "cannot stand" in look(["--node=/{target}/slam", "--arg=sh"], "edge-1", "t").told
