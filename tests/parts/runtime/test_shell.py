@@ -367,7 +367,7 @@ def test_desk_refuses_what_is_no_request(house: House) -> None:
     for request, says in (
         (
             {"verb": "fly"},
-            "unknown verb 'fly'; known: access, certificate, change, explain, fleet, hold, lines, log, move, restart, ",
+            "unknown verb 'fly'; known: access, certificate, change, explain, fleet, hold, keep, lines, log, move, ",
         ),
         ({"verb": "move", "task": "merge", "target": "edge1"}, "move: 'by' is missing"),
         ({**order, "verb": "move"}, "move: 'target' is missing"),
@@ -376,6 +376,11 @@ def test_desk_refuses_what_is_no_request(house: House) -> None:
         ({**order, "verb": "hold", "hold": "pause", "reason": "x" * 201}, "hold: asked.reason: 201 characters"),
         ({**order, "verb": "tune", "tuning": {"weights": 1}, "base_revision": 3}, "tune: tuning: "),
         ({**order, "verb": "tune", "tuning": TUNING}, "tune: 'base_revision' is missing"),
+        ({**order, "verb": "strike", "step": "move"}, "strike: strike.step: move is not done by a node to itself"),
+        ({**order, "verb": "strike", "step": "nap"}, "strike: 'nap' is not a valid Step"),
+        ({**order, "verb": "strike", "step": "link", "cut_s": 61}, "strike: strike.cut_s: "),
+        ({**order, "verb": "keep", "name": "one", "told": ""}, "keep: 'body' is missing"),
+        ({"verb": "rehearsals", "name": "../x"}, "rehearsals: rehearsals.name: '../x' is not a name"),
         ({"verb": "retry"}, "retry: 'task' is missing"),
         ({"verb": "restart"}, "restart: 'task' is missing"),
         ({"verb": "lines", "task": "merge", "after": "1"}, "lines: after: expected a whole number, not '1'"),
