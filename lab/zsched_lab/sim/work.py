@@ -205,15 +205,19 @@ class Work:
         """The worker follows its role; an exclusive one works only under its lease, and says when it has stopped."""
         before = machine.roles.get(role.task)
         machine.roles[role.task] = role
-        self._note_unleased(machine, before, role)
-        self._note_leased(machine, role)
         was_active = before is not None and before.role is WorkerRole.ACTIVE
+        ends = was_active and role.role is not WorkerRole.ACTIVE
+        is_freed = before is not None and _is_free(before) and not _is_free(role)
+        # one time for both: it says that it has stopped when it has
+        stop_s = self._sim.rng.choice(self.stop_s) if ends or is_freed else 0.0
+        self._note_unleased(machine, before, role, stop_s)
+        self._note_leased(machine, role)
         if role.role is WorkerRole.ACTIVE and not was_active:
             self._begun[machine.key, role.task] += 1
-        if before is None or not was_active or role.role is WorkerRole.ACTIVE:
+        if before is None or not ends:
             return
         begun = self._begun[machine.key, role.task]
-        self._sim.later(self._sim.rng.choice(self.stop_s), self._stopped, machine, machine.life, before, begun)
+        self._sim.later(stop_s, self._stopped, machine, machine.life, before, begun)
 
     def _note_leased(self, machine: Machine, role: Role) -> None:
         """A worker works until its lease ends, by its machine's clock."""
@@ -222,7 +226,7 @@ class Work:
             self._sim.invariants.on_worked(machine, role, self._sim.now, until)
             self.working[role.task] = (machine.key, until)
 
-    def _note_unleased(self, machine: Machine, before: Role | None, role: Role) -> None:
+    def _note_unleased(self, machine: Machine, before: Role | None, role: Role, stop_s: float = 0.0) -> None:
         """A worker that needs no lease works until it has heard that it is idle, or needs one."""
         sim = self._sim
         if _is_free(role):
@@ -230,7 +234,7 @@ class Work:
                 sim.invariants.on_worked(machine, role, sim.now, math.inf)
                 self._free.add((machine.key, role.task))
         elif before is not None and _is_free(before):
-            sim.later(sim.rng.choice(self.stop_s), self._stopped_free, machine, machine.life, role.task)
+            sim.later(stop_s, self._stopped_free, machine, machine.life, role.task)
 
     def _stopped_free(self, machine: Machine, life: int, task: TaskId) -> None:
         if machine.life == life and not _is_free(machine.roles[task]):
