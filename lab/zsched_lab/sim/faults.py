@@ -179,6 +179,7 @@ class Stage:
             machine.event_s, machine.disk_s = 0.0, (0.0, 0.0)
             sim.unpause(machine, machine.life)
             is_wrong = machine.fleet != scene.fleet or machine.key in sim.broken_disks or self._is_stopping(machine)
+            is_wrong |= self._needs_restart(machine)
             machine.fleet = scene.fleet
             sim.broken_disks.discard(machine.key)
             if is_wrong or machine.key == missing:
@@ -205,6 +206,11 @@ class Stage:
         is_waited_for = self.scene.done["rollout of exclusive"] > 0
         is_missed |= any(set(task.candidates) <= {name} or is_waited_for for task in fleet.tasks)
         return None if is_missed or self._rng.random() < 0.5 else name
+
+    @staticmethod
+    def _needs_restart(machine: Machine) -> bool:
+        """Whether it runs with other electors than its file names: a reload does not change them, and it says so."""
+        return machine.node is not None and machine.node.fleet.electors != machine.fleet.electors
 
     @staticmethod
     def _is_stopping(machine: Machine) -> bool:
