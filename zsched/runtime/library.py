@@ -134,6 +134,8 @@ class Library:
             log.warning("document refused document=%s why=%s", name, reason)
             self._post(ev.DocumentRefused(document=name, reason=reason[:MAX_FAULT], request=request))
             return
+        if name in self._recent:  # one that comes again takes no other's place
+            self._recent.remove(name)
         self._recent.append(name)
         self._tidy()
         self._post(ev.DocumentStored(document=name, fleet=fleet, flags=content.flags, request=request))
@@ -157,5 +159,6 @@ def read_document(content: Document, fleet: str, node: NodeId, config: Path) -> 
     if result.fleet.name != fleet:
         raise ConfigError(f"the document is of the fleet {result.fleet.name!r}, this node of {fleet!r}")
     if all(one.name != node for one in result.fleet.nodes):
-        raise ConfigError(f"the document names no node {node!r}: this machine goes on by its last one")
+        advice = "this machine was taken out, and goes on by its last one until `zsched leave`"
+        raise ConfigError(f"the document names no node {node!r}: {advice}")
     return result.fleet

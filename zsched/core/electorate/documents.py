@@ -48,6 +48,8 @@ class Documents:
         """{hash: who said that it has it, the last first}."""
         self._ask_at: dict[str, float] = {}
         self._kept: tuple[str, ...] = tuple(stored)
+        self._told: tuple[str, ...] = tuple(sorted(stored))
+        """What the disk was told to keep: every document that is known here, or one that comes back is not on it."""
         self.refused: dict[str, str] = {}
         """{hash: why it is not valid here}."""
 
@@ -94,13 +96,13 @@ class Documents:
         self._wanted.pop(document, None)
         self._ask_at.pop(document, None)
 
-    def on_stored(self, document: str, fleet: Fleet, flags: tuple[Flag, ...] = ()) -> None:
+    def on_stored(self, document: str, fleet: Fleet, todo: ToDo, flags: tuple[Flag, ...] = ()) -> None:
         """A document is on disk, and valid."""
         self._forget(document)
         self.refused.pop(document, None)
         self._fleets.pop(document, None)
         self._fleets[document], self._flags[document] = fleet, flags
-        self._drop_old()
+        self._drop_old(todo)
 
     def on_refused(self, document: str, reason: str) -> None:
         """A document that a peer sent is not valid here: it is not asked for again."""
@@ -111,11 +113,14 @@ class Documents:
         """The node's state names these from now on; of the others those that were stored last stay."""
         if documents != self._kept:
             self._kept = documents
-            self._drop_old()
-            todo.add(do.KeepDocuments(documents=documents))
+            self._drop_old(todo)
 
-    def _drop_old(self) -> None:
+    def _drop_old(self, todo: ToDo) -> None:
         others = [document for document in self._fleets if document not in self._kept]
         for document in others[:-RECENT]:
             del self._fleets[document]
             self._flags.pop(document, None)
+        known = tuple(sorted({*self._fleets, *self._kept}))
+        if known != self._told:
+            self._told = known
+            todo.add(do.KeepDocuments(documents=known))

@@ -304,7 +304,7 @@ class Numbers:
     def on_stored(self, document: str, fleet: Fleet, todo: ToDo, now: float, *, flags: tuple[Flag, ...] = ()) -> bool:
         """A document is on disk, and valid; whether this node goes by another fleet from now on."""
         was_missing = self.roll is not None and not self.documents.holds(self.roll.value)
-        self.documents.on_stored(document, fleet, flags)
+        self.documents.on_stored(document, fleet, todo, flags)
         if self.roll is None:
             return False
         before = self.value

@@ -13,6 +13,7 @@ from support.todos import agreed
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.electorate.changes import AdoptDocument
+from zsched.core.electorate.documents import RECENT
 from zsched.core.electorate.founding import founded
 from zsched.core.electorate.numbers import in_force
 from zsched.core.electorate.orders import MAX_OPEN
@@ -183,12 +184,13 @@ def test_a_value_is_accepted_once_its_document_is_stored() -> None:
     (fetch,) = of(todo, do.FetchDocument)
     assert (fetch.document, fetch.peers[0]) == ("0d", "robot2")
     assert "robot1" not in fetch.peers
-    agreed(agreement.on_stored, ev.DocumentStored(document="0d", fleet=SAID), 100.2)
+    todo = agreed(agreement.on_stored, ev.DocumentStored(document="0d", fleet=SAID), 100.2)
+    assert of(todo, do.KeepDocuments) == [do.KeepDocuments(documents=("0d",))]
     todo, answer = asked(agreement, accept)
     assert answer is not None
     assert answer.accepted is not None
     assert todo.must_persist
-    assert of(todo, do.KeepDocuments) == [do.KeepDocuments(documents=("0d",))]
+    assert of(todo, do.KeepDocuments) == [], "it is kept already"
     assert agreement.fleet_value == FIRST, "accepted is not learnt"
 
 
@@ -222,16 +224,26 @@ def test_a_learnt_value_is_followed_once_its_document_is_stored_and_asked_for_un
     assert (agreement.fleet_value, todo.must_persist, todo.in_force) == (value, True, in_force(SAID, value))
 
 
-def test_the_document_before_is_kept_and_older_ones_go() -> None:
+def test_what_is_known_here_is_kept_on_disk_and_older_ones_go() -> None:
+    """A document that comes back is known, so it is not fetched: then it must still be on the disk."""
     agreement = make(ADOPTED, {"0d": FLEET})
-    before = ADOPTED
-    for document in ("0e", "0f"):
+    before, seen = ADOPTED, list[str]()
+    kept: tuple[str, ...] = ("0d",)
+    for document in ("0e", "0f", "0d", "1a", "1b", "1c", "1d", "0d"):
         after = replace(before, document=document, revision=before.revision + 1)
-        agreed(agreement.on_stored, ev.DocumentStored(document=document, fleet=SAID), 100.0)
         answer = Learnt(node="robot3", values=(), fleet=after)
         todo = agreed(agreement.on_learnt, ev.LearntReceived(learnt=answer, is_answer=True), 100.1)
-        assert of(todo, do.KeepDocuments) == [do.KeepDocuments(documents=(document, before.document))]
+        kept = next((one.documents for one in of(todo, do.KeepDocuments)), kept)
+        if of(todo, do.FetchDocument):
+            seen.append(f"fetches {document}")
+            todo = agreed(agreement.on_stored, ev.DocumentStored(document=document, fleet=SAID), 100.2)
+            for one in of(todo, do.KeepDocuments):
+                kept = one.documents
+        assert agreement.fleet_value == after
+        assert {document, before.document} <= set(kept), "the newest and the one before"
+        assert len(kept) <= 2 + RECENT
         before = after
+    assert seen == [f"fetches {one}" for one in ("0e", "0f", "1a", "1b", "1c", "1d", "0d")], "0d is old in the end"
 
 
 def test_a_node_that_has_lost_its_document_goes_on_and_asks_for_it() -> None:
