@@ -38,6 +38,8 @@ ACCEPT_TIMEOUT_S: Final = 1.0
 """The other end, which begins with the connection, not with the SYN: between 0.6 s and 1.4 s."""
 RELAY_START_S: Final = 10.0
 """A worker that is started together with its relay, on a busy machine, waits so long for it."""
+FEWEST_THREADS: Final = 12
+"""Of a pool: a fleet of one machine grows to five with one task before a daemon must be started again."""
 TX_THREADS: Final = 4
 """Threads that transmit, beyond those for every link."""
 DEFAULT_TIMING: Final = Timing()
@@ -283,14 +285,14 @@ def tls_files(operator_json5: str) -> dict[str, str]:
 
 
 def pool_threads(nodes: int, tasks: int = 0) -> int:
-    """How many threads zenoh's pools of one process need in a fleet of so many nodes and tasks (4..64).
+    """How many threads zenoh's pools of one process need in a fleet of so many nodes and tasks (`FEWEST_THREADS`..64).
 
     A link that falls silent holds one of them when its lease ends: about a second, or 10 s (zenoh's SO_LINGER) where
     something was still to be sent. With fewer threads than links, a split that takes all of them also silences those
     that still work: beats stop, the living look dead, a robot that is cut off is not served by its own worker. On the
     data network every worker is a peer of its own: a node may have a relay and one worker per task.
     """
-    return min(max(nodes * (1 + tasks) + 2, 4), 64)
+    return min(max(nodes * (1 + tasks) + 2, FEWEST_THREADS), 64)
 
 
 def daemon_pools(nodes: int) -> str:

@@ -125,15 +125,15 @@ def test_an_operators_file_that_is_none_is_refused_in_words() -> None:
 
 
 def test_a_process_has_a_receive_thread_for_every_link_that_may_fall_silent_at_once() -> None:
-    assert [pool_threads(nodes) for nodes in (1, 6, 48, 1000)] == [4, 8, 50, 64]
-    assert [pool_threads(5, tasks) for tasks in (0, 1, 3)] == [7, 12, 22], "a relay, and a worker per task, on each"
-    pools = "(rx: (worker_threads: 8), tx: (worker_threads: 4), net: (worker_threads: 8), acc: (worker_threads: 8))"
-    assert worker_pools(3, 1) == pools
+    assert [pool_threads(nodes) for nodes in (1, 6, 11, 48, 1000)] == [12, 12, 13, 50, 64]
+    assert [pool_threads(5, tasks) for tasks in (0, 1, 3)] == [12, 12, 22], "a relay, and a worker per task, on each"
+    pools = "(rx: (worker_threads: 14), tx: (worker_threads: 4), net: (worker_threads: 14), acc: (worker_threads: 14))"
+    assert worker_pools(6, 1) == pools
 
 
 def test_a_daemon_has_one_pool_with_a_thread_for_every_link() -> None:
     """Or each packet wakes twice as many threads."""
-    assert daemon_pools(6) == "(rx: (worker_threads: 12), tx: (handover: rx), net: (handover: rx), acc: (handover: rx))"
+    assert daemon_pools(6) == "(rx: (worker_threads: 16), tx: (handover: rx), net: (handover: rx), acc: (handover: rx))"
 
 
 def test_a_relay_reads_the_links_that_it_has_dialled_with_as_many_threads_as_those_that_dial_it() -> None:
