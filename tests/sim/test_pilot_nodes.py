@@ -7,6 +7,7 @@ from dataclasses import replace
 from support.fleets import fleet_of, tuning_of
 from zsched.core import events as ev
 from zsched.core.status import build_snapshot
+from zsched.core.values.document import Flag, FlagKind
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec
 from zsched.core.values.messages import ChangeFleet
@@ -137,3 +138,22 @@ def test_a_robot_that_comes_back_into_its_document_counts_from_its_start() -> No
     play.sim.start("robot2")
     assert play.sim.run_until(lambda: "robot2" in play.sim.running(), 5)
     assert play.sim.node("robot2").rounds.voters == ("robot2", "robot3"), "its disk says who is away"
+
+
+def test_a_node_that_leaves_hands_over_gives_its_seat_up_and_gets_neither_back() -> None:
+    agreed = fleet(("edge1", "robot1", "robot2"))
+    play = Play(agreed)
+    play.reaches(5)
+    play.owner_is_alive()
+    owner = play.sim.agreed(TASK)
+    assert owner is not None
+    leavers = sorted({owner, play.electors()[0]})
+    flags = tuple(Flag(kind=FlagKind.LEAVE, subject=name) for name in leavers)
+    content = play.sim.documents.write(agreed, flags)
+    play.sim.deliver(play.sim.machines["robot3"], ev.FleetCommanded(request=2, command=ChangeFleet(document=content)))
+    stay = tuple(name for name in play.sim.running() if name not in leavers)
+    play.reaches(stay if len(stay) % 2 else len(stay) - 1)
+    assert not set(leavers) & set(play.electors())
+    assert play.sim.run_until(lambda: play.sim.agreed(TASK) in stay, 20)
+    play.sim.run_until(lambda: False, 20)
+    assert not set(leavers) & {*play.electors(), play.sim.agreed(TASK)}, "they get nothing back while they run"

@@ -84,6 +84,6 @@ def _check_may_go(held: InForce, status: Json, node: str, *, is_lost: bool) -> N
     if state in HERE and owned:
         flags = next(one.get("flags", ()) for one in status["nodes"] if one["name"] == node)
         advice = f"`zsched drain {node}` first: it hands them over, and gets nothing new"
-        if any(flag["kind"] == "drain" for flag in flags):
+        if any(flag["kind"] in ("drain", "leave") for flag in flags):
             advice = f"it is drained: `zsched drain {node}` says what it waits for"
         raise CliError(EXIT_FAILED, f"{node} is {state} and owns {', '.join(owned)}; {advice}")

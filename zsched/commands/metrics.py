@@ -74,7 +74,7 @@ def _of_nodes(nodes: list[Json]) -> Iterator[Family]:
     yield "zsched_node_state", "gauge", "1 for the state that the node is in.", states
     yield "zsched_node_draining", "gauge", "Whether it hands over what it owns.", _each(nodes, "draining")
     flags = [({"node": n["name"], "kind": f["kind"]}, 1.0) for n in nodes for f in n.get("flags", ())]
-    yield "zsched_node_flag", "gauge", "1 for what an operator has said of the node: drain, ineligible.", flags
+    yield "zsched_node_flag", "gauge", "1 for what an operator has said of the node: drain, ineligible, leave.", flags
     yield "zsched_node_profile_age_seconds", "gauge", "Age of its newest profile.", _each(nodes, "age_s")
     yield "zsched_node_cpu_cores", "gauge", "Cores.", _each(nodes, "cpu_cores")
     yield "zsched_node_cpu_used_cores", "gauge", "Cores in use.", _each(nodes, "cpu_used_cores")

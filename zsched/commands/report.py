@@ -177,7 +177,7 @@ def state_word(node: Json) -> str:
         return str(node["state"])
     if node["draining"]:
         return "draining"
-    return "drained" if "drain" in kinds else "no new" if kinds else "alive"
+    return "leaving" if "leave" in kinds else "drained" if "drain" in kinds else "no new" if kinds else "alive"
 
 
 def _gauges(page: Page, nodes: Sequence[Json]) -> None:
@@ -319,7 +319,7 @@ def told_hold(kind: str, order: Json) -> str:
     return ", ".join(words)
 
 
-FLAGS: Final = {"drain": "drained", "ineligible": "gets nothing new"}
+FLAGS: Final = {"drain": "drained", "ineligible": "gets nothing new", "leave": "leaving the fleet"}
 """{kind of a flag: the same in words}."""
 
 

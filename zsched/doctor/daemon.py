@@ -6,7 +6,7 @@ Knows: the status of one node. Does not know: what other nodes say.
 from __future__ import annotations
 
 from zsched import __version__
-from zsched.core.scheduler.flags import told_flag
+from zsched.core.scheduler.flags import HANDS_OVER, told_flag
 from zsched.core.values.document import Flag, FlagKind
 from zsched.doctor.model import Json, Result, Scene, failed, joined, passed, skipped, warned
 
@@ -77,7 +77,7 @@ def nodes_get_tasks(scene: Scene) -> Result:
 def _told(name: str, flag: Json) -> str:
     kind = FlagKind(flag["kind"])
     told = told_flag(Flag(kind=kind, subject=name, by=flag["by"], reason=flag["reason"]))
-    return f"is {told}" if kind is FlagKind.DRAIN else told
+    return f"is {told}" if kind in HANDS_OVER else told
 
 
 def tasks_have_owners(scene: Scene) -> Result:

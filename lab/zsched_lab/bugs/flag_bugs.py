@@ -42,10 +42,17 @@ FLAG_BUGS: tuple[Bug, ...] = (
     _bug(
         "an ineligible owner hands over",
         FLAGS,
-        "drained = {flag.subject: told_flag(flag) for flag in flags if flag.kind is FlagKind.DRAIN}",
+        "drained = {flag.subject: told_flag(flag) for flag in flags if flag.kind in HANDS_OVER}",
         "drained = {flag.subject: told_flag(flag) for flag in flags}",
         _FLAGS,
         has_schedules=True,
+    ),
+    _bug(
+        "a document that is still known here leaves the disk",
+        "zsched.core.electorate.documents",
+        "        known = tuple(sorted({*self._fleets, *self._kept}))\n",
+        "        known = tuple(sorted(self._kept))\n",
+        _ORDERS,
     ),
     _bug(
         "a flag counts anew with every document",

@@ -78,6 +78,26 @@ PILOT_BUGS: tuple[Bug, ...] = (
         "a leaver goes before the others are settled",
         ("return value.settled and value.electorate", "return value.electorate"),
     ),
+    _bug(
+        "a leaver goes though too few of the electors that stay are alive",
+        ("            if len(staying) >= majority(count - 1):\n", "            if staying:\n"),
+    ),
+    _bug(
+        "a single elector that leaves finds nobody to follow it",
+        ("if not fit or (count >= aim and not is_handed_on):", "if not fit or count >= aim:"),
+    ),
+    _bug(
+        "who leaves becomes an elector",
+        ("name in kept or name in course.leaving or not peer.word.disk", "name in kept or not peer.word.disk"),
+    ),
+    _node_bug(
+        "the pilot is not told who leaves",
+        HELM,
+        (
+            "        leaving=tuple(flag.subject for flag in flags if flag.kind is FlagKind.LEAVE),\n",
+            "        leaving=(),\n",
+        ),
+    ),
     _bug("electors that the operator has named are replaced", ("if not course.is_auto:", "if not course.members:")),
     _bug("the electors become an even number", ("return count - 1 + count % 2", "return count")),
     _bug("one elector's view sends a robot away", ("if count >= needed or (name", "if count or (name")),

@@ -15,8 +15,8 @@ from zsched.core import instructions as do
 from zsched.core.executor.handover import Phase
 from zsched.core.scheduler.damping import ESCAPES_PER_MINUTE, WINDOW_S
 from zsched.core.scheduler.decision import decide_again, verdict_of
+from zsched.core.scheduler.flags import HANDS_OVER
 from zsched.core.values.decision import Decision
-from zsched.core.values.document import FlagKind
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import Accepted, Promise
@@ -42,8 +42,8 @@ FORGED = -1
 """The number of a question that a stranger asks, or in another one's name: a yes to it is a violation."""
 _SAYS_NOTHING = frozenset({do.AskUtilities, do.AnswerUtilities, do.PublishProfile, do.AskLearnt, do.RecordStory})
 """Half of what leaves: it claims nothing that must be on a disk."""
-DRAINED = " is drained by "
-"""In the reason of a move that an operator's drain has caused: no cap counts it."""
+DRAINED = (" is drained by ", " is leaving the fleet, by ")
+"""In the reason of a move that an operator's flag has caused: no cap counts it."""
 MAX_WAKES = 50
 """So often in a row a node may want to be woken without time passing."""
 
@@ -237,7 +237,7 @@ class Invariants:
         assert node is not None
         task = node.rounds.tasks[proposal.task]
         owner = node.registers[proposal.task].value.owner
-        drained = {flag.subject for flag in node.agreement.flags if flag.kind is FlagKind.DRAIN}
+        drained = {flag.subject for flag in node.agreement.flags if flag.kind in HANDS_OVER}
         if owner in (None, proposal.candidate, *drained):
             return
         moves = sum(
@@ -246,7 +246,7 @@ class Invariants:
             and new.value.asked is None
             and task.judged_at - new.at <= WINDOW_S
             for old, new in pairwise(node.history[proposal.task])
-            if DRAINED not in new.reason
+            if not any(told in new.reason for told in DRAINED)
         )
         planned = moves - task.damping.moves_within(WINDOW_S, task.judged_at, escapes=True)
         if planned >= task.spec.max_moves_per_minute:

@@ -19,6 +19,7 @@ from dataclasses import dataclass, field, replace
 from random import Random
 
 from zsched.core import events as ev
+from zsched.core.scheduler.flags import HANDS_OVER
 from zsched.core.values.document import Flag, FlagKind
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
@@ -264,7 +265,7 @@ class Schedule:
     def _ill_flagged(self, said: Fleet) -> str:
         """A node that goes by other flags than the document's, or a drained one that has not handed over."""
         flags = self._flags()
-        drained = {flag.subject for flag in flags if flag.kind is FlagKind.DRAIN}
+        drained = {flag.subject for flag in flags if flag.kind in HANDS_OVER}
         for name in self.sim.running():
             node = self.sim.node(name)
             if set(node.flags.drained) != drained or set(node.flags.closed) != {flag.subject for flag in flags}:

@@ -10,6 +10,7 @@ from zsched.core import instructions as do
 from zsched.core.electorate.numbers import Numbers
 from zsched.core.electorate.pilot import Course, Pilot, Word
 from zsched.core.todo import ToDo
+from zsched.core.values.document import Flag, FlagKind
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import Beat, NodeId
@@ -79,7 +80,8 @@ class Helm:
         document, course = self._read
         if document != value.document or course is None:
             fleet = self._numbers.documents.fleet(value.document)
-            course = None if fleet is None else course_of(fleet)
+            flags = self._numbers.documents.flags(value.document)
+            course = None if fleet is None else course_of(fleet, flags)
             self._read = value.document, course
         return course
 
@@ -98,13 +100,14 @@ class Helm:
             todo.add(do.RecordStory(stage="vote", text=text))
 
 
-def course_of(fleet: Fleet) -> Course:
+def course_of(fleet: Fleet, flags: tuple[Flag, ...] = ()) -> Course:
     """What a document says about electors and robots."""
     return Course(
         members=tuple((node.name, node.kind) for node in fleet.nodes),
         is_auto=fleet.is_auto,
         silence_s=fleet.replace_s,
         away_s=fleet.away_s,
+        leaving=tuple(flag.subject for flag in flags if flag.kind is FlagKind.LEAVE),
     )
 
 

@@ -14,6 +14,8 @@ Knows: what this node has heard in beats, what other electors think, the fleet v
   disk of its newest beat.
 * Two electors are no better than three of which one is gone: so the third goes only when a spare is there. Two never
   become one but by a leave, for a majority of two is both. The last one stays.
+* A leaver is removed once those that are alive without it are a majority of the electors that stay: else whoever is
+  gone is replaced first. A single elector that leaves takes a second one, if one is fit, and goes then.
 * A leaver stays until it has learnt a settled value without it (`may_go`).
 * The aim is an odd number, at most `TARGET`, of robots and edges alike, of those the steadiest.
 * Robots that a majority of the electors has not heard for long are *away*; they are back when it hears them.
@@ -220,16 +222,21 @@ class Pilot:
         names, count = value.electorate.names, len(value.electors)
         members = {name for name, _ in course.members}
         leaver = next((name for name in names if name in course.leaving or name not in members), None)
+        told = []
         if leaver is not None:
             if count == 1:
                 return _none(f"{leaver} is the last elector, and stays")
-            return _remove(value, leaver, "it leaves")
+            staying = [name for name in self._alive(value, course, now) if name != leaver]
+            if len(staying) >= majority(count - 1):
+                return _remove(value, leaver, "it leaves")
+            told.append(f"{leaver} leaves when {majority(count - 1)} of the other electors are alive")
         opinions = {name: self._who_miss(name, value, course, now) for name in names}
         needed = majority(count)
         lost = next((name for name in names if len(opinions[name]) >= needed), None)
         if lost is None:
             doubted = [f"{name} is gone for {', '.join(who)}" for name, who in opinions.items() if who]
-            return _none(f"{'; '.join(doubted)}: {needed} electors must say so") if doubted else None
+            told += [f"{'; '.join(doubted)}: {needed} electors must say so"] if doubted else []
+            return _none("; ".join(told)) if told else None
         if count == 3 and not self._fit(value, course, now, instead=lost):
             return _none(f"{lost} is gone, and no node is fit to follow it: two electors are no better than three")
         return _remove(value, lost, f"gone for {', '.join(opinions[lost])}")
@@ -279,7 +286,8 @@ class Pilot:
         count = len(value.electors)
         alive, fit = self._alive(value, course, now), self._fit(value, course, now)
         aim = min(TARGET, _odd(len(alive) + len(fit)))
-        if count >= aim or not fit:
+        is_handed_on = count == 1 and value.electorate.names[0] in course.leaving
+        if not fit or (count >= aim and not is_handed_on):
             return _none(f"{count} electors, {len(alive)} alive, {len(fit)} to spare")
         if count > 1 and len(alive) < majority(count + 1):
             return _none(f"no room for {fit[0]}: {len(alive)} of then {count + 1} electors are sure to answer")

@@ -22,6 +22,9 @@ SPREAD_S = 0.5
 AGAIN_S = 5.0
 """An end that was not agreed is proposed again after so long."""
 
+HANDS_OVER = (FlagKind.DRAIN, FlagKind.LEAVE)
+"""A node with one of these hands over what it owns."""
+
 Known = tuple[FlagKind, NodeId, int]
 """(kind, node, revision): one order of one operator."""
 
@@ -55,7 +58,7 @@ class NodeFlags:
             for flag in flags
             if flag.for_s is not None
         }
-        drained = {flag.subject: told_flag(flag) for flag in flags if flag.kind is FlagKind.DRAIN}
+        drained = {flag.subject: told_flag(flag) for flag in flags if flag.kind in HANDS_OVER}
         closed = {flag.subject: told_flag(flag) for flag in flags if flag.kind is FlagKind.INELIGIBLE}
         self.drained, self.closed = drained, {**closed, **drained}
         return tuple(_changes(before, flags))
@@ -89,7 +92,19 @@ def told_flag(flag: Flag) -> str:
     """
     who = flag.by or "an operator"
     who = f"{who} ({flag.reason})" if flag.reason else who
-    return f"drained by {who}" if flag.kind is FlagKind.DRAIN else f"takes nothing new, by {who}"
+    return f"{_SAID[flag.kind]} {who}"
+
+
+_SAID = {
+    FlagKind.DRAIN: "drained by",
+    FlagKind.INELIGIBLE: "takes nothing new, by",
+    FlagKind.LEAVE: "leaving the fleet, by",
+}
+_ENDED = {
+    FlagKind.DRAIN: "is not drained any more",
+    FlagKind.INELIGIBLE: "may get tasks again",
+    FlagKind.LEAVE: "does not leave the fleet any more",
+}
 
 
 def _key(flag: Flag) -> Known:
@@ -100,10 +115,8 @@ def _changes(before: tuple[Flag, ...], after: tuple[Flag, ...]) -> Iterator[str]
     was, now = ({(flag.subject, flag.kind): flag for flag in flags} for flags in (before, after))
     for place, flag in now.items():
         if was.get(place) != flag:
-            told = told_flag(flag)
-            yield f"{flag.subject} {'is ' if flag.kind is FlagKind.DRAIN else ''}{told}"
+            yield f"{flag.subject} {'is ' if flag.kind in HANDS_OVER else ''}{told_flag(flag)}"
     for place, flag in was.items():
         if place not in now:
-            ended = "is not drained any more" if flag.kind is FlagKind.DRAIN else "may get tasks again"
             other = flag.subject in {one.subject for one in after}
-            yield f"{flag.subject} {ended}{', and still takes nothing new' if other else ''}"
+            yield f"{flag.subject} {_ENDED[flag.kind]}{', and still takes nothing new' if other else ''}"

@@ -25,6 +25,7 @@ class FlagKind(StrEnum):
 
     DRAIN = "drain"  # its tasks move away, and none comes
     INELIGIBLE = "ineligible"  # no task comes; what it owns stays
+    LEAVE = "leave"  # as drained, and it gives its seat among the electors up
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -218,6 +218,29 @@ def test_a_leaver_is_removed_at_once_but_the_last_one_stays(names: str, wish: st
     assert ear.wish == wish
 
 
+def test_a_leaver_waits_where_too_few_would_be_left_and_who_is_gone_is_replaced_first() -> None:
+    ear = Ear(value("abc"), replace(COURSE, leaving=("b",)))
+    ear.hear("b", T + 1.0)
+    assert ear.wish == "b leaves when 2 of the other electors are alive; c is gone for a: 2 electors must say so"
+    ear.hear("bx", STEADY * T + 1.0, gone=("c",))
+    assert ear.wish == "-c"
+    ear.value = value("ab", number=4, revision=8)
+    assert ear.wish == "-b", "the one that stays is a majority of one"
+
+
+def test_a_single_elector_that_leaves_hands_its_seat_to_one_that_is_fit() -> None:
+    ear = Ear(value("a"))
+    ear.hear("x", STEADY * T + 1.0)
+    assert ear.wish == "1 electors, 1 alive, 1 to spare", "two are no better than one"
+    ear.course = replace(COURSE, leaving=("a",))
+    assert ear.wish == f"+x/{disk_of('x')}"
+    ear.value = value("ax", number=4, revision=8)
+    ear.hear("x", 1.0)
+    assert ear.wish == "-a"
+    ear.value, ear.course = value("a"), replace(COURSE, leaving=("a", "x"))
+    assert ear.wish == "a is the last elector, and stays", "who leaves too takes no seat"
+
+
 def test_whom_the_document_does_not_name_leaves() -> None:
     ear = Ear(value("abc"), replace(COURSE, members=tuple(one for one in COURSE.members if one[0] != "b")))
     ear.hear("bc", 2.0)

@@ -49,6 +49,14 @@ def test_a_drain_also_keeps_new_tasks_out_and_an_ineligible_node_hands_nothing_o
     assert flags.closed == {}
 
 
+def test_a_node_that_leaves_hands_over_what_it_owns_and_is_told_so() -> None:
+    flags = NodeFlags(rank=0)
+    leave = Flag(kind=FlagKind.LEAVE, subject="edge1", by="ada@edge1", revision=3)
+    assert flags.take((leave,), 100.0) == ("edge1 is leaving the fleet, by ada@edge1",)
+    assert flags.drained == flags.closed == {"edge1": "leaving the fleet, by ada@edge1"}
+    assert flags.take((), 101.0) == ("edge1 does not leave the fleet any more",)
+
+
 def test_the_end_of_a_flag_is_told_when_its_time_is_over_and_again_until_it_is_agreed() -> None:
     flags, stays = NodeFlags(rank=2), ineligible("edge2")
     flags.take((drain(for_s=60.0), stays), 100.0)

@@ -56,7 +56,7 @@ const roomOf = (id, least, most) => Math.min(Math.max(byId(id).clientWidth, leas
 const stateWord = (node) => {
   const kinds = (node.flags || []).map((flag) => flag.kind);
   if (node.state !== "alive" || node.draining) return node.state === "alive" ? "draining" : node.state;
-  return kinds.includes("drain") ? "drained" : kinds.length ? "no new" : "alive";
+  return kinds.includes("leave") ? "leaving" : kinds.includes("drain") ? "drained" : kinds.length ? "no new" : "alive";
 };
 const isAway = (node) => node.state === "gone" || node.state === "unknown";
 
