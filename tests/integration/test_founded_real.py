@@ -2,122 +2,24 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
-import socket
-import ssl
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 import zenoh
 
 from support.waiting import until
-from zsched.adapters.host.operator_socket import ask
-from zsched.errors import AdapterError
 from zsched.sessions.config import client_config
+from zsched_lab.fleet.hall import Hall, block_of_ports
 
 LOCAL_AFTER = 3
 
 
-def block_of_ports(count: int) -> int:
-    """The first of ``count`` ports in a row that nobody has now."""
-    for first in range(21_000, 32_000, count):
-        with contextlib.ExitStack() as stack:
-            try:
-                for port in range(first, first + count):
-                    one = stack.enter_context(socket.socket())
-                    one.bind(("127.0.0.1", port))
-            except OSError:
-                continue
-            return first
-    raise AssertionError("no free ports")
-
-
-class Hall:
-    """Two machines, each with folders of its own below one."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self._daemons: dict[str, subprocess.Popen[bytes]] = {}
-
-    def zsched(self, node: str, *words: str) -> str:
-        """A verb on a node's machine; what it printed.
-
-        Raises:
-            AssertionError: it failed.
-        """
-        home = self.folder / node
-        home.mkdir(exist_ok=True)
-        more = {"CONFIG": home / "etc" / "fleet.yaml", "STATE_DIR": home / "state", "RUNTIME_DIR": home / "run"}
-        env = {**os.environ, **{f"ZSCHED_{name}": str(path) for name, path in more.items()}, "ZSCHED_NODE": node}
-        env["ZSCHED_AUTHORITY"] = str(self.folder / "stick")
-        command = [sys.executable, "-m", "zsched.cli", *words]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, env=env, cwd=home)
-        assert done.returncode == 0, done.stdout + done.stderr
-        return done.stdout
-
-    def start(self, node: str) -> None:
-        home = self.folder / node
-        (home / "run").mkdir(exist_ok=True)
-        given = [f"--config={home / 'etc' / 'fleet.yaml'}", f"--node={node}"]
-        given += [f"--state-dir={home / 'state'}", f"--runtime-dir={home / 'run'}"]
-        with (home / "log").open("ab") as log:
-            command = [sys.executable, "-m", "zsched.daemon", *given]
-            self._daemons[node] = subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=log)
-
-    def stop(self, *nodes: str) -> None:
-        for node in nodes or tuple(self._daemons):
-            process = self._daemons.pop(node)
-            process.terminate()
-            try:
-                process.wait(20)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-
-    def pid(self, node: str) -> int:
-        process = self._daemons[node]
-        assert process.poll() is None
-        return process.pid
-
-    def status(self, node: str) -> dict[str, Any]:
-        """A daemon's status; empty: it does not answer yet."""
-        try:
-            return ask(self.folder / node / "run" / f"{node}.sock", {"verb": "status"}, 3.0)
-        except AdapterError:
-            return {}
-
-    def problems(self, node: str) -> list[str]:
-        return [str(one) for one in self.status(node).get("problems", ())]
-
-    def certificate(self, node: str) -> str:
-        """The one that was sent to a node, DER as text of bytes."""
-        return ssl.PEM_cert_to_DER_cert((self.folder / node / "state" / "pki" / "certificate.pem").read_text()).hex()
-
-    def presented(self, port: int) -> str:
-        """With which certificate a session listens; empty: with none."""
-        context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-        context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
-        try:
-            with socket.create_connection(("127.0.0.1", port), 2.0) as plain, context.wrap_socket(plain) as link:
-                return (link.getpeercert(binary_form=True) or b"").hex()
-        except OSError:
-            return ""
-
-    def alive(self, node: str) -> set[str]:
-        return {str(one["name"]) for one in self.status(node).get("nodes", ()) if one["state"] == "alive"}
-
-
 @pytest.fixture
 def hall(tmp_path: Path) -> Iterator[Hall]:
-    one = Hall(tmp_path)
-    yield one
-    one.stop()
+    with Hall(tmp_path) as one:
+        yield one
 
 
 def test_two_machines_are_a_secured_fleet_by_four_commands_and_nobody_restarts_a_daemon(hall: Hall) -> None:

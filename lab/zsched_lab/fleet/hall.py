@@ -1,0 +1,141 @@
+"""Machines of a fleet that is founded, joined and left by the verbs, as an operator gives them; each has its folders.
+
+Knows: the verbs' environment, daemons as processes, their statuses. Does not know: what a test or a benchmark expects.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import ssl
+import subprocess
+import sys
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from zsched.adapters.host.operator_socket import ask
+from zsched.errors import AdapterError
+
+
+def block_of_ports(count: int) -> int:
+    """The first of ``count`` ports in a row that nobody has now."""
+    for first in range(21_000, 32_000, count):
+        with contextlib.ExitStack() as stack:
+            try:
+                for port in range(first, first + count):
+                    one = stack.enter_context(socket.socket())
+                    one.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+            return first
+    raise AssertionError("no free ports")
+
+
+class Hall:
+    """Machines with folders of their own below one; use as a context manager."""
+
+    def __init__(self, folder: Path) -> None:
+        """Name the folder; nothing is started."""
+        self.folder = folder
+        self._daemons: dict[str, subprocess.Popen[bytes]] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def zsched(self, node: str, *words: str) -> str:
+        """A verb on a node's machine; what it printed.
+
+        Raises:
+            AssertionError: it failed.
+        """
+        done = self.run(node, *words)
+        if done.returncode != 0:
+            raise AssertionError(f"zsched {' '.join(words)} on {node}: {done.stdout}{done.stderr}")
+        return done.stdout
+
+    def run(self, node: str, *words: str) -> subprocess.CompletedProcess[str]:
+        """A verb on a node's machine, whatever comes of it."""
+        home = self.folder / node
+        home.mkdir(exist_ok=True)
+        more = {"CONFIG": home / "etc" / "fleet.yaml", "STATE_DIR": home / "state", "RUNTIME_DIR": home / "run"}
+        env = {**os.environ, **{f"ZSCHED_{name}": str(path) for name, path in more.items()}, "ZSCHED_NODE": node}
+        env["ZSCHED_AUTHORITY"] = str(self.folder / "stick")
+        command = [sys.executable, "-m", "zsched.cli", *words]
+        return subprocess.run(command, capture_output=True, text=True, timeout=90, check=False, env=env, cwd=home)
+
+    def start(self, node: str) -> None:
+        """Start a node's daemon."""
+        home = self.folder / node
+        (home / "run").mkdir(exist_ok=True)
+        given = [f"--config={home / 'etc' / 'fleet.yaml'}", f"--node={node}"]
+        given += [f"--state-dir={home / 'state'}", f"--runtime-dir={home / 'run'}"]
+        with (home / "log").open("ab") as log:
+            command = [sys.executable, "-m", "zsched.daemon", *given]
+            self._daemons[node] = subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=log)
+
+    def stop(self, *nodes: str) -> None:
+        """Stop daemons (default: all)."""
+        for node in nodes or tuple(self._daemons):
+            process = self._daemons.pop(node)
+            process.terminate()
+            try:
+                process.wait(20)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+    def pid(self, node: str) -> int:
+        """Of a daemon that runs.
+
+        Raises:
+            AssertionError: it has ended.
+        """
+        process = self._daemons[node]
+        if process.poll() is not None:
+            raise AssertionError(f"{node}: its daemon has ended with {process.returncode}: {self.log(node)}")
+        return process.pid
+
+    def ended(self, node: str, within_s: float) -> int:
+        """The exit code of a daemon that ends by itself."""
+        return self._daemons.pop(node).wait(within_s)
+
+    def log(self, node: str) -> str:
+        """What a node's daemons have written to stderr."""
+        return (self.folder / node / "log").read_text(errors="replace")
+
+    def status(self, node: str) -> dict[str, Any]:
+        """A daemon's status; empty: it does not answer yet."""
+        try:
+            found: dict[str, Any] = ask(self.folder / node / "run" / f"{node}.sock", {"verb": "status"}, 3.0)
+        except AdapterError:
+            return {}
+        return found
+
+    def problems(self, node: str) -> list[str]:
+        """The problems in a node's status."""
+        return [str(one) for one in self.status(node).get("problems", ())]
+
+    def certificate(self, node: str) -> str:
+        """The one that was sent to a node, DER as text of bytes."""
+        return ssl.PEM_cert_to_DER_cert((self.folder / node / "state" / "pki" / "certificate.pem").read_text()).hex()
+
+    def presented(self, port: int) -> str:
+        """With which certificate a session listens; empty: with none."""
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+        try:
+            with socket.create_connection(("127.0.0.1", port), 2.0) as plain, context.wrap_socket(plain) as link:
+                return (link.getpeercert(binary_form=True) or b"").hex()
+        except OSError:
+            return ""
+
+    def alive(self, node: str) -> set[str]:
+        """Whom a node takes for alive; empty: it does not answer yet."""
+        return {str(one["name"]) for one in self.status(node).get("nodes", ()) if one["state"] == "alive"}
