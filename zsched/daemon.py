@@ -48,7 +48,7 @@ from zsched.core.values.messages import CommandResult
 from zsched.core.values.model import NodeId, NodeKind
 from zsched.core.values.snapshot import Exposure
 from zsched.errors import AdapterError, ConfigError, NameTakenError
-from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_NAME_TAKEN, EXIT_OK
+from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_LEFT, EXIT_NAME_TAKEN, EXIT_OK
 from zsched.guard import on_failure
 from zsched.ipc.takeover import Door
 from zsched.log_limit import log_to_stderr
@@ -117,6 +117,8 @@ class Daemon:
         self._notify = Notifier()
         self._next_status = 0.0
         self._is_restart = False
+        self._has_left = False
+        """This machine is in no fleet any more, by `zsched leave`."""
         self._reopening = Reopening(options.node)
         self._lets_in_others = False
         """Open sessions go by other access rules than the fleet in force."""
@@ -190,7 +192,7 @@ class Daemon:
             node.security = self._exposure(points)
             gc.freeze()  # what lives until the end need not be looked at again
             self._loop(node, shell)
-        return EXIT_OK
+        return EXIT_LEFT if self._has_left else EXIT_OK
 
     # --- building ----------------------------------------------------------------------------------------------------
 
@@ -307,7 +309,7 @@ class Daemon:
             incarnation,
             lambda problem: self._inbox.post(ev.ProblemReported(source="log", problem=problem)),
         )
-        desk = Desk(me, self._inbox, bus, access.answer, decisions.answer)
+        desk = Desk(me, self._inbox, bus, access.answer, decisions.answer, self._leave)
         operators = OperatorSocket(places.socket_path(self._options.runtime_dir, me), desk.answer)
         operators.open()
         stack.callback(operators.close)
@@ -424,6 +426,12 @@ class Daemon:
         stack.callback(signal.signal, RELOAD_SIGNAL, previous)
         # `zsched up` has held them back since before we loaded: an early Ctrl-C is an orderly stop, and no traceback
         signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGTERM, signal.SIGINT))
+
+    def _leave(self) -> None:
+        """An operator has taken this machine out of its fleet; called by the operator socket's threads."""
+        self._has_left, self._is_restart, self.begins_anew = True, False, False
+        log.info("left node=%s: the service does not start it again", self._options.node)
+        self._inbox.post(ev.StopRequested())
 
     def _loop(self, node: Node, shell: Shell) -> None:
         """Take an event, handle it, carry the batch out; wake up in time for the node's next deadline."""

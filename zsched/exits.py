@@ -22,6 +22,8 @@ EXIT_NAME_TAKEN: Final = 75
 """EX_TEMPFAIL of sysexits.h: another machine has this name; trying again may help."""
 EXIT_CONFIG: Final = 78
 """EX_CONFIG: the fleet file or the environment is wrong; trying again does not help (systemd does not, either)."""
+EXIT_LEFT: Final = 79
+"""`zsched leave` has ended the daemon: this machine is in no fleet any more, and no service starts it again."""
 EXIT_SIGNAL: Final = 128
 """Plus the signal's number, as a shell counts."""
 EXIT_INTERRUPTED: Final = 130

@@ -141,6 +141,25 @@ def observe() -> dict[str, object]:
     return report
 
 
+def depart() -> dict[str, object]:
+    """The machine leaves its fleet: the daemon ends, and no restart follows."""
+    run("systemctl", "start", UNIT)
+    running = wait_for(lambda state: EXPECTED in state["StatusText"], 30.0)
+    user = os.stat(f"/proc/{running['MainPID']}").st_uid  # noqa: PTH116 - as above
+    done = subprocess.run(
+        ["/opt/zsched/bin/zsched", "leave", "--yes", "--accept", "last-node"],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    wait_for(lambda state: state["ActiveState"] == "inactive", 10.0)
+    time.sleep(2.5)
+    kept = [str(path) for folder in ("/etc/zsched", "/var/lib/zsched") for path in sorted(Path(folder).iterdir())]
+    said = done.stdout + done.stderr
+    return {"said": said, "code": done.returncode, "later": show(), "left": processes(user), "kept": kept}
+
+
 def misconfigure() -> dict[str, object]:
     """A wrong fleet file: exit 78 and no restart, however long we wait."""
     Path("/etc/zsched/fleet.yaml").write_text("fleet: [this is no fleet\n")
@@ -154,6 +173,8 @@ def main() -> int:
     report: dict[str, object] = {}
     try:
         report = observe()
+        if report.get("relay"):
+            report["departed"] = depart()
         report["misconfigured"] = misconfigure()
     except Exception as error:  # noqa: BLE001 - whatever happens, the report is written and the machine goes off
         report["error"] = repr(error)

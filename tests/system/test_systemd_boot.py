@@ -192,4 +192,12 @@ def test_daemon_lives_by_its_unit_and_remembers_the_allocation(reports: dict[str
         assert report[when]["relay"] == report["relay"] != [], report["journal"]
     assert report["crashed"]["escaped"] == [], report["journal"]  # a process of a session of its own
     assert any("zsched.relay" in line for line in report["survivors"])
+    departed = report["departed"]
+    assert departed["code"] == 0, departed
+    assert (departed["later"]["ActiveState"], departed["later"]["Result"]) == ("inactive", "success"), departed
+    assert "left node=edge1: the service does not start it again" in report["journal"]
+    assert departed["left"] == [], departed
+    kept = departed["kept"]
+    assert {"/etc/zsched/fleet.yaml.left", "/var/lib/zsched/state.left"} <= set(kept), departed
+    assert not {"/etc/zsched/fleet.yaml", "/var/lib/zsched/state"} & set(kept), departed
     assert any("zsched.tasks.echo" in line for line in report["processes"]), report["processes"]

@@ -24,7 +24,7 @@ Json = dict[str, Any]
 NAMED_OTHERWISE: Final = {
     "events": "event",
     **dict.fromkeys(("task.add", "task.remove", "node.add", "node.remove", "node.forget"), "apply"),
-    **dict.fromkeys(("fleet.create", "join"), "member"),
+    **dict.fromkeys(("fleet.create", "join", "leave"), "member"),
     "tune": "tuning",
     **dict.fromkeys(("pin", "unpin", "pause", "resume"), "task"),
     **dict.fromkeys(("undrain", "eligible"), "drain"),

@@ -17,14 +17,16 @@ from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, nearest, print_json
 from zsched.commands.document import InForce, change, document_text, in_force
-from zsched.commands.orders import OrderView, begin, check_said
+from zsched.commands.orders import OrderView, Row, begin, check_said
 from zsched.commands.page import harmless, span
 from zsched.commands.report import millis, told_flag
 from zsched.commands.wait import Condition, missing
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE
 
 SCHEMA: Final = "zsched.drain/1"
-DRAIN, INELIGIBLE = "drain", "ineligible"
+DRAIN, INELIGIBLE, LEAVE = "drain", "ineligible", "leave"
+ENDS: Final = {DRAIN: (DRAIN, LEAVE), INELIGIBLE: (INELIGIBLE,)}
+"""{flag: which ones go when it is taken back}: who is not drained any more does not leave, either."""
 PAUSE_S: Final = 0.2
 """Between two looks at a node that is drained."""
 STAYS_S: Final = 3.0
@@ -49,6 +51,10 @@ class DrainOrder:
     """``None``: wait until they are empty."""
     accepted: tuple[str, ...] = ()
     """Names of dangers."""
+    kind: str = DRAIN
+    """``LEAVE``: they give up their seats among the electors, too."""
+    more_rows: tuple[Row, ...] = ()
+    """What else follows, in the table of what changes."""
 
 
 @dataclass(slots=True)
@@ -63,6 +69,7 @@ class _Watch:
     stays: dict[str, str] = field(default_factory=dict)
     """{task: why it stays, as it was told last}."""
     empty: set[str] = field(default_factory=set)
+    kind: str = DRAIN
 
     def tell(self, event: str, text: str, **more: Any) -> None:
         tell(self.view, event, text, after_s=monotonic_s() - self.began, **more)
@@ -80,25 +87,25 @@ def drain(view: OrderView, order: DrainOrder) -> int:
     if not nodes:
         return _list(view, status, DRAIN)
     held = _held(view)
-    after = _with(view, held, DRAIN, nodes)
-    rows = [_row(status, name, DRAIN, after) for name in nodes] + list(_task_rows(status, nodes, after))
+    after = _with(view, held, order.kind, nodes)
+    rows = [*(_row(status, name, order.kind, after) for name in nodes), *_task_rows(status, nodes, after)]
     danger = _check_dangers(view, order.accepted, status, held.flags, after)
     owned = [row[0] for row in rows if row[1] == "owner"]
     plan = _body("planned", nodes=nodes, revision=held.revision, tasks=owned, reason=danger)
     is_change = after != held.flags
     if is_change or view.is_plan:
-        code = begin(view, rows, plan, is_change=is_change, titles=TITLES, is_line=True)
+        code = begin(view, [*rows, *order.more_rows], plan, is_change=is_change, titles=TITLES, is_line=True)
         if code is not None:
             return code
     found = {} if order.is_detached else _statuses(view.door, status, nodes)
     before = {name: _counts(found, name) for name in _owned(status, nodes)}
-    revision = _commit(view, held, after, f"drain {', '.join(nodes)}")
+    revision = _commit(view, held, after, f"{order.kind} {', '.join(nodes)}")
     what = "It is agreed" if is_change else "It is so already"
-    watch = "" if order.is_detached else ". Ctrl-C ends the watching, not the drain"
+    watch = "" if order.is_detached else f". Ctrl-C ends the watching, not the {order.kind}"
     tell(view, "agreed", f"{what}{watch}.", after_s=0.0, nodes=nodes, revision=revision)
     if order.is_detached:
         return EXIT_OK
-    watching = _Watch(view=view, began=monotonic_s(), owners=_owned(status, nodes), before=before)
+    watching = _Watch(view=view, began=monotonic_s(), owners=_owned(status, nodes), before=before, kind=order.kind)
     return _watch(watching, nodes, revision, order.deadline_s)
 
 
@@ -131,7 +138,7 @@ def _set(view: OrderView, kind: str, nodes: tuple[str, ...], *, is_on: bool, acc
     held = _held(view)
     after = _with(view, held, kind, nodes) if is_on else _without(held, kind, nodes)
     danger = _check_dangers(view, accepted, status, held.flags, after) if is_on else None
-    rows = [_row(status, name, kind, after) for name in nodes]
+    rows = [_row(status, name, one, after) for name in nodes for one in _shown(status, name, kind)]
     plan = _body("planned", nodes=nodes, revision=held.revision, reason=danger)
     code = begin(view, rows, plan, is_change=after != held.flags, titles=TITLES, is_line=True)
     if code is not None:
@@ -146,7 +153,7 @@ def _set(view: OrderView, kind: str, nodes: tuple[str, ...], *, is_on: bool, acc
 
 
 def _way_out(flags: Sequence[Json], name: str) -> str:
-    is_drained = any(flag["subject"] == name and flag["kind"] == DRAIN for flag in flags)
+    is_drained = any(flag["subject"] == name and flag["kind"] in ENDS[DRAIN] for flag in flags)
     return f"undrain {name}" if is_drained else f"eligible {name} on"
 
 
@@ -170,7 +177,10 @@ def _body(event: str, **more: Any) -> Json:
 
 def _list(view: OrderView, status: Json, kind: str) -> int:
     found = [
-        (str(node["name"]), flag) for node in status["nodes"] for flag in node.get("flags", ()) if flag["kind"] == kind
+        (str(node["name"]), flag)
+        for node in status["nodes"]
+        for flag in node.get("flags", ())
+        if flag["kind"] in ENDS[kind]
     ]
     if not found and not view.is_json:
         word = "drained" if kind == DRAIN else "kept from getting tasks"
@@ -180,6 +190,13 @@ def _list(view: OrderView, status: Json, kind: str) -> int:
         told = {key: flag[key] for key in ("by", "reason", "known_s", "for_s")}
         tell(view, "listed", text, node=name, nodes=[name], **told)
     return EXIT_OK
+
+
+def _shown(status: Json, name: str, kind: str) -> tuple[str, ...]:
+    """The kinds of flags of a node that a row is about: this one, and what goes with it if the node has it."""
+    node = next(node for node in status["nodes"] if node["name"] == name)
+    has = {flag["kind"] for flag in node.get("flags", ())}
+    return tuple(one for one in ENDS[kind] if one in has) or (kind,)
 
 
 def _row(status: Json, name: str, kind: str, after: Sequence[Json]) -> tuple[str, str, str, str]:
@@ -254,7 +271,7 @@ def _with(view: OrderView, held: InForce, kind: str, nodes: Sequence[str]) -> tu
 
 
 def _without(held: InForce, kind: str, nodes: Sequence[str]) -> tuple[Json, ...]:
-    return tuple(flag for flag in held.flags if flag["kind"] != kind or flag["subject"] not in nodes)
+    return tuple(flag for flag in held.flags if flag["kind"] not in ENDS[kind] or flag["subject"] not in nodes)
 
 
 def _check_dangers(
@@ -323,7 +340,7 @@ def _watch(watch: _Watch, nodes: Sequence[str], revision: int, deadline_s: float
         passed_s = monotonic_s() - watch.began
         if deadline_s is not None and passed_s >= deadline_s:
             left = [name for name in nodes if name not in watch.empty]
-            text = f"{', '.join(left)}: not empty after {span(passed_s)}; the drain stays in force"
+            text = f"{', '.join(left)}: not empty after {span(passed_s)}; the {watch.kind} stays in force"
             watch.tell("deadline", "\n".join((text, *(f"  {lack}" for lack in lacks))), nodes=left, missing=lacks)
             return EXIT_TIMED_OUT
         time.sleep(PAUSE_S)
@@ -345,7 +362,8 @@ def _look(watch: _Watch, nodes: Sequence[str], revision: int) -> list[str]:
         missed = missing(Condition(kind="empty", node=name), found)
         if not missed and name not in watch.empty:
             watch.empty.add(name)
-            watch.tell("empty", f"{name}: empty, and gets nothing new until `zsched undrain {name}`", node=name)
+            until = f" until `zsched undrain {name}`" if watch.kind == DRAIN else ""
+            watch.tell("empty", f"{name}: empty, and gets nothing new{until}", node=name)
         lacks += missed
     return lacks
 

@@ -1,4 +1,4 @@
-"""The verbs by which machines come and go: `fleet create`, `invite`, `join`.
+"""The verbs by which machines come and go: `fleet create`, `invite`, `join`, `leave`.
 
 Knows: options. Does not know: how anything is done (`zsched.commands.membership`, imported by
 the verb that runs).
@@ -64,7 +64,7 @@ OnlyPlanOption = Annotated[
 
 def add_member_verbs(app: typer.Typer) -> None:
     """Add the verbs to the program."""
-    verbs: tuple[Callable[..., None], ...] = (invite, join)
+    verbs: tuple[Callable[..., None], ...] = (invite, join, leave)
     for verb in verbs:
         app.command(cls=Verb)(verb)
 
@@ -218,3 +218,43 @@ def join(
     if output is not None:
         raise CliError(EXIT_USAGE, "--output goes with --request")
     raise typer.Exit(membership.join(file, _places(config, state_dir), is_plan=plan, is_json=json_))
+
+
+def leave(
+    purge: Annotated[
+        bool,
+        typer.Option("--purge", help="Delete this machine's files of the fleet, its key too; else they are renamed."),
+    ] = False,
+    deadline: Annotated[
+        str, typer.Option("--deadline", metavar="DURATION", help="So long it waits in all: 90s, 10m, 2h.")
+    ] = "10m",
+    accept: AcceptOption = None,
+    reason: ReasonOption = "",
+    plan: OnlyPlanOption = False,
+    yes: YesOption = False,
+    json_: JsonOption = False,
+    config: ConfigOption = None,
+    state_dir: StateOption = None,
+    runtime_dir: RuntimeOption = None,
+) -> None:
+    """Take this machine out of its fleet: its tasks move away, its seat among the electors too, and its daemon ends.
+
+    Nothing of the others' streams is interrupted. Exits with 5 at the deadline: the leave stays in force, and the same
+    command goes on with it; `zsched undrain` takes it back. Another machine is taken out by `zsched node forget`.
+    """
+    from zsched.commands.history import duration_s  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.leave import LeaveOrder  # noqa: PLC0415 - as above
+    from zsched.commands.leave import leave as go  # noqa: PLC0415 - as above
+
+    order = LeaveOrder(
+        places=_places(config, state_dir),
+        runtime_dir=runtime_dir,
+        is_purged=purge,
+        deadline_s=duration_s(deadline),
+        accepted=tuple(accept or ()),
+        reason=reason,
+        is_plan=plan,
+        is_yes=yes,
+        is_json=json_,
+    )
+    raise typer.Exit(go(order))

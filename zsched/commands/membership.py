@@ -60,12 +60,12 @@ class Told:
     files: tuple[Written, ...] = ()
     next: tuple[str, ...] = ()
 
-    def tell(self, *, is_json: bool) -> None:
-        """Print it."""
+    def tell(self, *, is_json: bool, is_line: bool = False) -> None:
+        """Print it; ``is_line``: its JSON on one line, behind others."""
         if is_json:
             files = [{"path": str(one.path), "what": one.what} for one in self.files]
             body: Json = {"schema": SCHEMA, "fleet": self.fleet, "node": self.node, "outcome": self.outcome}
-            print_json({**body, "files": files, "next": list(self.next)})
+            print_json({**body, "files": files, "next": list(self.next)}, is_line=is_line)
             return
         lines = [self.said, *(f"  {one.path}: {one.what}" for one in self.files)]
         lines += [f"next: {one}" for one in self.next]

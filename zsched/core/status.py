@@ -83,7 +83,7 @@ def build_snapshot(node: Stages, now: float) -> Snapshot:
             *node.namesakes.problems(now),
             *_problems(node, quorum, now),
             *_relay_problems(node, now),
-            *node.knocking.problems(now, node.fleet_path),
+            *node.knocking.problems(now, node.fleet_path, is_agreed=bool(node.agreement.document_hash)),
         ),
     )
 

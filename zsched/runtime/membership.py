@@ -10,14 +10,25 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import os
 import secrets
-from collections.abc import Callable
+import shutil
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
+from zsched.adapters.host import decision_log, rehearsals
 from zsched.adapters.host.document_store import FOLDER_NAME, DocumentStore
-from zsched.adapters.host.state_file import STATE_NAME, StateFile, hardware_id, replace_synced
+from zsched.adapters.host.state_file import (
+    MAX_STATE_BYTES,
+    STATE_NAME,
+    StateFile,
+    hardware_id,
+    replace_synced,
+    sync_folder,
+)
+from zsched.adapters.machine import core_speed
 from zsched.clock import wall_tenths
 from zsched.config.load import check_bytes
 from zsched.config.reader import MAX_FILE_BYTES, render_all
@@ -29,16 +40,18 @@ from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet, fleet_hash
 from zsched.core.values.model import NodeId, RegisterState
 from zsched.core.vote.generations import blank_state
-from zsched.errors import AdapterError, ConfigError
+from zsched.errors import AdapterError, ConfigError, WireError
 from zsched.files import read_regular
 from zsched.pki.files import PRIVATE, PUBLIC, write_whole
 from zsched.runtime.secured import CERTIFICATE, KEY, TRUSTED
 from zsched.sessions.certificate import common_names
-from zsched.wire.codec import document_hash
+from zsched.wire.codec import decode_state, document_hash
 from zsched.wire.invitation import Invitation, Papers
 
 BEFORE: Final = ".before-join"
 """Behind the name of a fleet file that another text of the same fleet has replaced."""
+LEFT: Final = ".left"
+"""Behind the names of files of a fleet that this machine has left."""
 COPY_NAME: Final = "copied"
 """In the state folder: the hash of the fleet file that was written as a copy of the document."""
 PUBLIC_MODE, PRIVATE_MODE, FOLDER_MODE = 0o644, 0o600, 0o755
@@ -260,6 +273,117 @@ def _named(pem: bytes) -> str | None:
         return next(iter(common_names(pem)), None)
     except ValueError:
         return None
+
+
+# --- to leave --------------------------------------------------------------------------------------------------------
+
+
+def whose(folder: Path) -> tuple[str, NodeId]:
+    """(fleet, node) of a state folder.
+
+    Raises:
+        AdapterError: it has no state, or none that can be read.
+    """
+    path = folder / STATE_NAME
+    try:
+        state = decode_state(read_regular(path, MAX_STATE_BYTES))
+    except FileNotFoundError:
+        raise AdapterError(f"{path} is not there: this machine is in no fleet, or give --state-dir") from None
+    except OSError as error:
+        raise AdapterError(f"{path}: cannot be read: {error.strerror}; run this as root") from error
+    except WireError as error:
+        raise AdapterError(f"{path} is damaged ({error}); move the folder {folder} away") from error
+    return state.fleet, state.node
+
+
+def belongings(places: Places, *, is_purged: bool) -> tuple[Written, ...]:
+    """What `leave` does with this machine's files of its fleet; nothing is touched.
+
+    Raises:
+        AdapterError: a folder cannot be written.
+    """
+    there = tuple(_belongings(places, is_purged=is_purged))
+    for folder in dict.fromkeys(one.path.parent for one in there):
+        if not os.access(folder, os.W_OK):
+            raise AdapterError(f"{folder} cannot be written; run this as root")
+    return tuple(Written(path=one.path, what=_fate(one, is_purged=is_purged)) for one in there)
+
+
+def check_ended(fleet: str, node: NodeId, places: Places) -> None:
+    """Whether no daemon runs by this machine's files any more.
+
+    Raises:
+        AdapterError: one does.
+    """
+    with StateFile(places.state, fleet=fleet, node=node):
+        pass
+
+
+def put_away(fleet: str, node: NodeId, places: Places, *, is_purged: bool) -> tuple[Written, ...]:
+    """Rename this machine's files of its fleet, or delete them; then it can found or join one. Its daemon has ended.
+
+    Raises:
+        AdapterError: a daemon runs by them, they are another node's, or one cannot be renamed or deleted.
+    """
+    with StateFile(places.state, fleet=fleet, node=node) as file:
+        file.check_owner()
+        there = tuple(_belongings(places, is_purged=is_purged))
+        for one in there:
+            _put_one_away(one.path, is_deleted=is_purged or one.path.name == COPY_NAME)
+    return tuple(Written(path=one.path, what=_fate(one, is_purged=is_purged)) for one in there)
+
+
+def _belongings(places: Places, *, is_purged: bool) -> Iterator[Written]:
+    """The files that make this machine a node, the state last: without it nothing is half a node."""
+    yield from _there(places.config, "the fleet file", is_purged=is_purged)
+    if is_purged:
+        yield from _there(places.config.with_name(f"{places.config.name}{BEFORE}"), "the fleet file of before")
+    for folder in (_pki_folder(places.config), places.state / PKI_FOLDER):
+        for name, what in _WHAT.items():
+            yield from _there(folder / name, what, is_purged=is_purged)
+    more = (decision_log.OLD_NAME, decision_log.NAME, rehearsals.FOLDER_NAME, core_speed.NAME) if is_purged else ()
+    for name in (*more, COPY_NAME, FOLDER_NAME, STATE_NAME):
+        yield from _there(places.state / name, _KEPT.get(name, "the node's records"), is_purged=is_purged)
+
+
+_KEPT: Final = {COPY_NAME: "which fleet file was a copy", FOLDER_NAME: "agreed documents", STATE_NAME: "the state"}
+
+
+def _pki_folder(config: Path) -> Path:
+    """Where the fleet file says that this node's certificate is."""
+    try:
+        fleet = check_bytes(read_regular(config, MAX_FILE_BYTES), str(config)).fleet
+    except OSError:
+        fleet = None
+    named = None if fleet is None or fleet.security is None else Path(fleet.security.folder)
+    return config.parent / PKI_FOLDER if named is None else named
+
+
+def _there(path: Path, what: str, *, is_purged: bool = True) -> Iterator[Written]:
+    """The file, if it is there; where all goes, also what an earlier `leave` has renamed."""
+    for one in (path, path.with_name(f"{path.name}{LEFT}")) if is_purged else (path,):
+        if os.path.lexists(one):
+            yield Written(path=one, what=what)
+
+
+def _fate(one: Written, *, is_purged: bool) -> str:
+    is_deleted = is_purged or one.path.name == COPY_NAME
+    return f"{one.what}, {'deleted' if is_deleted else f'now {one.path.name}{LEFT}'}"
+
+
+def _put_one_away(path: Path, *, is_deleted: bool) -> None:
+    old = path.with_name(f"{path.name}{LEFT}")
+    try:
+        for gone in (path,) if is_deleted else (old,):
+            if gone.is_dir() and not gone.is_symlink():
+                shutil.rmtree(gone)
+            else:
+                gone.unlink(missing_ok=True)
+        if not is_deleted:
+            path.rename(old)
+        sync_folder(path.parent)
+    except OSError as error:
+        raise AdapterError(f"cannot put {path} away: {error.strerror}; {_advice(error, path)}") from error
 
 
 # --- files -----------------------------------------------------------------------------------------------------------

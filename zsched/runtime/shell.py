@@ -139,10 +139,14 @@ class Desk:
         bus: ControlBus,
         access: Callable[[NodeId], dict[str, Any]] | None = None,
         log: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
+        leave: Callable[[], None] | None = None,
     ) -> None:
-        """``access`` says how a tool on this machine joins a node's data network, ``log`` tells of the decision log."""
+        """``access`` says how a tool on this machine joins a node's data network, ``log`` tells of the decision log.
+
+        ``leave`` ends this daemon for good.
+        """
         self._node, self._inbox, self._bus = node, inbox, bus
-        self._access, self._log = access, log
+        self._access, self._log, self._leave = access, log, leave
         self._numbers = itertools.count(LOCAL_REQUESTS_FROM)
         self._waiting: dict[int, queue.SimpleQueue[object]] = {}
         self._lock = threading.Lock()
@@ -169,7 +173,12 @@ class Desk:
             return self._access(node)
         if verb == "log" and self._log is not None:
             return self._log(request) if node == self._node else {"error": f"the log of {node} is told on {node} only"}
-        known = ", ".join(sorted(("access", "log", "status", *_COMMANDS)))
+        if verb == "leave" and self._leave is not None:
+            if node != self._node:
+                return {"error": f"{node} leaves by a command on its own machine: zsched leave"}
+            self._leave()
+            return {"outcome": "ok"}
+        known = ", ".join(sorted(("access", "leave", "log", "status", *_COMMANDS)))
         return {"error": f"unknown verb {verb!r:.80}; known: {known}"}
 
     def _ask(self, node: NodeId, command: Command | None) -> dict[str, Any]:

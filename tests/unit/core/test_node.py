@@ -582,6 +582,11 @@ def test_a_node_that_our_file_does_not_name_is_told_while_it_beats() -> None:
         "fleet/robot10: robot10 beats in this fleet, goes by another fleet file (0123456789abcdef, "
     )
     assert "and is in no line of this one: compare them (`zsched check` tells a file's hash)" in said[0]
+    agreed = node.knocking.problems(100.0, is_agreed=True)
+    assert agreed[0] == (
+        "fleet/robot10: robot10 beats in this fleet, and the agreed document does not name it: `zsched leave` on that "
+        "machine if it was taken out, `zsched invite robot10` here if it shall come"
+    )
     assert not any("robot1" in one for one in build_snapshot(node, 100.0 + QUIET_S).problems)
     node.handle(ev.BeatReceived(beat=beat("robot99")), 100.0 + QUIET_S)
     assert any("robot99" in one for one in build_snapshot(node, 100.0 + QUIET_S).problems), "the others made room"

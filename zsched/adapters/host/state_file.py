@@ -232,7 +232,7 @@ def replace_synced(path: Path, new: Path, content: bytes) -> None:
     try:
         _write_synced(new, content)
         new.replace(path)
-        _sync_folder(path.parent)
+        sync_folder(path.parent)
     except OSError:
         with contextlib.suppress(OSError):
             new.unlink()
@@ -283,7 +283,12 @@ def hand_over_folder(path: Path) -> None:
             os.chown(path, owner.st_uid, owner.st_gid, follow_symlinks=False)
 
 
-def _sync_folder(folder: Path) -> None:
+def sync_folder(folder: Path) -> None:
+    """Let renames and deletions in a folder survive a power cut.
+
+    Raises:
+        OSError: the disk refused.
+    """
     fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         os.fsync(fd)

@@ -36,12 +36,24 @@ class Knocking:
         if beat.node in self._heard or len(self._heard) < KNOCKERS_KEPT:
             self._heard[beat.node] = (beat, now)
 
-    def problems(self, now: float, path: str = "") -> tuple[str, ...]:
-        """The status lines about unknown nodes that were heard lately; our own fleet file is at ``path``."""
+    def problems(self, now: float, path: str = "", *, is_agreed: bool = False) -> tuple[str, ...]:
+        """The status lines about unknown nodes that were heard lately.
+
+        Args:
+            now: monotonic seconds.
+            path: where our own fleet file is.
+            is_agreed: the fleet goes by an agreed document, not by a file on each machine.
+        """
+        heard = [(name, beat) for name, (beat, at) in sorted(self._heard.items()) if now < at + QUIET_S]
+        if is_agreed:
+            return tuple(
+                f"fleet/{name}: {name} beats in this fleet, and the agreed document does not name it: `zsched leave` "
+                f"on that machine if it was taken out, `zsched invite {name}` here if it shall come"
+                for name, _ in heard
+            )
         ours = here(self.fleet_file, path)
         return tuple(
             f"fleet/{name}: {name} beats in this fleet, goes by another fleet file ({beat.fleet_file or 'not told'}, "
             f"{ours}), and is in no line of this one: {ONE_FILE}"
-            for name, (beat, at) in sorted(self._heard.items())
-            if now < at + QUIET_S
+            for name, beat in heard
         )

@@ -1,0 +1,318 @@
+"""`zsched leave`: in which order things are agreed, what is refused, and which files are left; nodes are stand-ins."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from support.schemas import faults
+from zsched.adapters.host.operator_socket import Json, OperatorSocket
+from zsched.adapters.host.state_file import StateFile
+from zsched.cli import app
+from zsched.commands import flags, leave
+from zsched.config.load import load_fleet
+from zsched.core.values.electorate import Elector, FleetValue
+from zsched.core.vote.generations import blank_state
+from zsched.wire.codec import as_plain
+
+STATUS = json.loads((Path(__file__).parent / "recorded_status" / "healthy.json").read_text())
+TEXT = """\
+fleet: hall
+nodes:
+  robot1: {kind: robot, host: 127.0.0.1, listen: {control: tcp/127.0.0.1:7457, data: tcp/127.0.0.1:7458}}
+  robot2: {kind: robot, host: 127.0.0.1, listen: {control: tcp/127.0.0.1:7461, data: tcp/127.0.0.1:7462}}
+  robot3: {kind: robot}
+tasks:
+  merge: {candidates: {kind: robot}, weights: {cpu: 0.5, memory: 0.5}}
+"""
+ALONE = "fleet: hall\nnodes:\n  robot3: {kind: robot}\ntasks: {}\n"
+
+
+class Hall:
+    """Three nodes behind the socket of robot3, which agree on everything; each look at robot3's value is a step."""
+
+    def __init__(self, folder: Path, text: str = TEXT) -> None:
+        self.folder, self.text = folder, text
+        self.revision, self.flags = 7, list[Json]()
+        self.electors = ["robot1", "robot2", "robot3"]
+        self.owner, self.quorum_ok, self.is_told_gone, self.has_document = "robot3", True, False, True
+        self.seat_goes_after: float = 2
+        self.looks_of_robot2, self.fetches_after = 0, 0
+        self.asked: list[str] = []
+        self.step: Callable[[], None] = lambda: None
+        self.door = OperatorSocket(folder / "run" / "robot3.sock", self.answer)
+
+    def answer(self, request: Json) -> Json:
+        who, verb = request.get("node", "robot3"), request["verb"]
+        if verb == "status":
+            return self._status(who)
+        if verb == "fleet":
+            return self._fleet(who)
+        if verb == "leave":
+            self.asked.append("leave")
+            return {"outcome": "ok"}
+        return self._change(who, request)
+
+    def _status(self, who: str) -> Json:
+        nodes = [
+            {
+                **STATUS["nodes"][0],
+                "name": name,
+                "kind": "robot",
+                "state": "alive",
+                "draining": False,
+                "flags": [{**flag, "known_s": 1.0} for flag in self.flags if flag["subject"] == name],
+                "workers": [{**STATUS["nodes"][0]["workers"][0], "task": "merge", "state": "ready"}],
+            }
+            for name in ("robot1", "robot2", "robot3")
+            if f"  {name}:" in TEXT
+        ]
+        names = [str(node["name"]) for node in nodes]
+        task = {**copy.deepcopy(STATUS["tasks"][0]), "name": "merge", "owner": self.owner, "candidates": names}
+        task |= {
+            "phase": "settled",
+            "streams": [],
+            "owner_state": "alive",
+            "pin": None,
+            "pause": None,
+            "switched_s": 0.03,
+        }
+        quorum = {**STATUS["quorum"], "ok": self.quorum_ok, "names": self.electors, "pilot": "it waits for a spare"}
+        body = {**STATUS, "fleet": "hall", "node": who, "nodes": nodes, "tasks": [task], "quorum": quorum}
+        return {**body, "fleet_revision": self.revision}
+
+    def _fleet(self, who: str) -> Json:
+        if who == "robot3" and any(flag["kind"] == "leave" for flag in self.flags):
+            self.seat_goes_after -= 1
+            if self.seat_goes_after <= 0 and "electorate:" not in self.text:
+                self._remove_elector()
+        names = [{"name": name, "disk": "01"} for name in self.electors]
+        value = FleetValue(
+            fleet="hall",
+            generation_id="ab" * 16,
+            revision=self.revision,
+            number=2,
+            electors=tuple(Elector(name=name, disk="01", joining=1) for name in self.electors),
+            settled=True,
+            lease_s=1.0,
+            guard_lease_s=1.0,
+            document="cd" * 16,
+        )
+        text = "" if (who == "robot3" and self.is_told_gone) or not self._knows(who) else self.text
+        body = {"node": who, "fleet": "hall", "revision": self.revision, "number": 2, "settled": True}
+        told = {"electors": names, "document": "cd" * 16, "text": text, "flags": self.flags, "value": as_plain(value)}
+        return {**body, **told, **({} if self.has_document else {"document": "", "text": ""})}
+
+    def _remove_elector(self) -> None:
+        self.electors = [name for name in self.electors if name != "robot3"]
+
+    def _knows(self, who: str) -> bool:
+        """Whether a node has the newest document; robot2 needs some looks to fetch it."""
+        self.looks_of_robot2 += who == "robot2" and "robot3" not in self.text
+        return who != "robot2" or "robot3" in self.text or self.looks_of_robot2 > self.fetches_after
+
+    def _change(self, who: str, request: Json) -> Json:
+        if request.get("remove_elector"):
+            self.asked.append(f"{who} removes {request['remove_elector']}")
+            self._remove_elector()
+        elif request["text"] == self.text:
+            self.flags = request["flags"]
+            self.asked.append(f"{who} flags {', '.join(str(flag['kind']) for flag in self.flags)}")
+            self.owner = "robot1"
+        else:
+            self.asked.append(f"{who} writes")
+            self.text, self.flags = request["text"], request["flags"]
+        self.revision += 1
+        return {"outcome": "ok", "detail": "as told", "revision": self.revision}
+
+
+@pytest.fixture
+def hall(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hall]:
+    for name, folder in (("CONFIG", "fleet.yaml"), ("STATE_DIR", "state"), ("RUNTIME_DIR", "run")):
+        monkeypatch.setenv(f"ZSCHED_{name}", str(tmp_path / folder))
+    monkeypatch.delenv("ZSCHED_NODE", raising=False)
+    for module in (flags, leave):
+        monkeypatch.setattr(module, "PAUSE_S", 0.001)
+    (tmp_path / "fleet.yaml").write_text(TEXT)
+    fleet = load_fleet(tmp_path / "fleet.yaml")
+    state = blank_state(fleet, "robot3", 0, None, incarnation=1, hardware="", disk="01")
+    with StateFile(tmp_path / "state", fleet="hall", node="robot3") as file:
+        file.create(state)
+    (tmp_path / "state" / "documents").mkdir()
+    (tmp_path / "state" / "documents" / "cd").write_text("x")
+    (tmp_path / "state" / "decisions.ndjson").write_text("{}\n")
+    (tmp_path / "run").mkdir()
+    one = Hall(tmp_path)
+    one.door.open()
+    yield one
+    one.door.close()
+
+
+def run(*words: str) -> Result:
+    result = CliRunner().invoke(app, ["leave", *words])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result
+
+
+def left(folder: Path) -> list[str]:
+    """The names of files that a machine keeps."""
+    kept = [path for part in (folder, folder / "state") for path in part.iterdir()]
+    return sorted(path.name for path in kept if path.name not in ("run", "state", "lock") or path.is_file())
+
+
+RENAMED = ["decisions.ndjson", "documents.left", "fleet.yaml.left", "lock", "state.left"]
+UNTOUCHED = ["decisions.ndjson", "documents", "fleet.yaml", "lock", "state"]
+
+
+def test_it_hands_over_gives_its_seat_up_goes_out_of_the_document_and_ends(hall: Hall) -> None:
+    plan = run("--plan")
+    assert (plan.exit_code, hall.asked, left(hall.folder)) == (10, [], UNTOUCHED)
+    rows = [line.split() for line in plan.stdout.splitlines()]
+    assert ["merge", "owner", "robot3", "one", "of", "robot1,", "robot2"] in rows
+    assert ["robot3", "member", "hall", "-"] in rows
+    assert ["robot3", "elector", "robot1,", "robot2,", "robot3", "robot1,", "robot2"] in rows
+    assert "robot3 would leave hall" in plan.stdout
+    assert "fleet.yaml: the fleet file, now fleet.yaml.left" in plan.stdout
+    assert run().exit_code == 2, "off a terminal it takes --yes"
+    assert (hall.asked, left(hall.folder)) == ([], UNTOUCHED)
+
+    done = run("--yes", "-m", "sold")
+    assert (done.exit_code, done.stderr) == (0, "")
+    assert hall.asked == ["robot3 flags leave", "robot1 writes", "leave"]
+    assert "robot3" not in hall.text
+    assert hall.flags == []
+    assert left(hall.folder) == RENAMED
+    said = done.stdout
+    order = ["merge: robot3 -> robot1", "robot3: empty, and gets nothing new\n", "still: it waits for a spare"]
+    order += ["electors: robot1, robot2", "revision 9 is agreed, and robot3 is no node of it", "the daemon has ended"]
+    places = [said.index(one) for one in (*order, "robot3 has left hall", "it comes back by `zsched invite robot3`")]
+    assert places == sorted(places)
+
+
+def test_it_stays_until_the_others_have_the_new_document(hall: Hall) -> None:
+    hall.fetches_after = 3
+    done = run("--yes")
+    assert (done.exit_code, done.stderr, hall.looks_of_robot2) == (0, "", 4)
+
+
+def test_one_that_does_not_fetch_it_in_time_is_told(hall: Hall, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(leave, "LEARN_S", 0.05)
+    hall.fetches_after = 10**9
+    done = run("--yes")
+    assert done.exit_code == 0
+    assert done.stderr == "robot2: not heard yet that robot3 has left; the others tell\n"
+
+
+@pytest.mark.usefixtures("hall")
+def test_programs_read_events_and_then_what_was_left() -> None:
+    for words in (("--plan", "--json"), ("--yes", "--json")):
+        found = [json.loads(line) for line in run(*words).stdout.splitlines()]
+        assert [fault for one in found for fault in faults(one)] == []
+        assert [one["schema"] for one in found] == ["zsched.drain/1"] * (len(found) - 1) + ["zsched.member/1"]
+        assert found[-1]["outcome"] == ("left" if "--yes" in words else "planned")
+    assert [one["event"] for one in found[:-1]] == ["agreed", "moved", "empty"]
+
+
+def test_an_elector_that_the_operator_has_named_is_removed_by_the_command(hall: Hall) -> None:
+    hall.text = f"{TEXT}electorate: [robot1, robot2, robot3]\n"
+    assert run("--yes").exit_code == 0
+    assert hall.asked == ["robot3 flags leave", "robot3 removes robot3", "robot1 writes", "leave"]
+    assert "electorate: [robot1, robot2]\n" in hall.text
+
+
+def test_at_the_deadline_the_leave_stays_in_force_and_says_what_it_waits_for(hall: Hall) -> None:
+    hall.seat_goes_after = 1e9
+    late = run("--yes", "--deadline", "1s")
+    assert (late.exit_code, hall.asked, left(hall.folder)) == (5, ["robot3 flags leave"], UNTOUCHED)
+    assert "it is an elector still: it waits for a spare; give `zsched leave` again" in late.stderr
+    assert "zsched undrain robot3" in late.stderr
+    hall.seat_goes_after = 0
+    assert run("--yes").exit_code == 0, "the same command goes on"
+    assert hall.asked == ["robot3 flags leave", "robot1 writes", "leave"]
+
+
+def test_a_machine_that_was_taken_out_only_stops(hall: Hall) -> None:
+    hall.is_told_gone, hall.text = True, TEXT.replace("  robot3: {kind: robot}\n", "")
+    done = run("--yes")
+    assert (done.exit_code, hall.asked, left(hall.folder)) == (0, ["leave"], RENAMED)
+    assert "robot3 is no node of hall since revision 7" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("danger", "means"),
+    [
+        ("last-node", "robot3 is the only node of hall, which ends with it"),
+        ("not-told", "electors can answer"),
+        ("not-told", "hall goes by the file on each machine: take robot3 out of it there, or agree a document first"),
+    ],
+)
+def test_what_cannot_be_agreed_takes_a_danger_by_name(hall: Hall, danger: str, means: str) -> None:
+    if danger == "last-node":
+        hall.text = ALONE
+    elif "file" in means:
+        hall.has_document = False
+    else:
+        hall.quorum_ok = False
+    refused = run("--yes")
+    assert (refused.exit_code, hall.asked, left(hall.folder)) == (1, [], UNTOUCHED)
+    assert f"if this may be, --accept {danger}: " in refused.stderr
+    assert means in refused.stderr
+    assert run("--plan").exit_code == 10
+    assert run("--yes", "--accept", danger).exit_code == 0
+    assert (hall.asked, left(hall.folder)) == (["leave"], RENAMED), "nobody was asked to agree"
+    assert "there is no danger 'last-nod'; did you mean last-node?" in run("--accept", "last-nod").stderr
+
+
+def test_where_no_daemon_runs_the_files_go_and_the_others_are_not_told(hall: Hall) -> None:
+    hall.door.close()
+    refused = run("--yes")
+    assert (refused.exit_code, left(hall.folder)) == (1, UNTOUCHED)
+    assert "`zsched node forget robot3` tells them" in refused.stderr
+    assert run("--yes", "--accept", "not-told").exit_code == 0
+    assert left(hall.folder) == RENAMED
+    gone = run("--yes", "--accept", "not-told")
+    assert gone.exit_code == 1
+    assert "is not there: this machine is in no fleet" in gone.stderr
+
+
+def test_a_document_that_needs_the_node_is_changed_first(hall: Hall) -> None:
+    hall.text = TEXT.replace("{kind: robot}, weights", "[robot3], weights")
+    refused = run("--yes")
+    assert (refused.exit_code, hall.asked) == (78, [])
+    assert "candidates" in refused.stderr
+    assert "change it first: zsched edit" in refused.stderr
+
+
+def test_purged_nothing_is_left(hall: Hall) -> None:
+    (hall.folder / "fleet.yaml.left").write_text("an older fleet\n")
+    (hall.folder / "pki").mkdir()
+    (hall.folder / "pki" / "key.pem").write_text("secret")
+    (hall.folder / "pki" / "operator.pem").write_text("ours")
+    plan = run("--purge", "--plan")
+    assert "key.pem: the private key, for its owner only, deleted" in plan.stdout
+    assert run("--purge", "--yes").exit_code == 0
+    assert left(hall.folder) == ["lock", "pki"]
+    assert [path.name for path in (hall.folder / "pki").iterdir()] == ["operator.pem"], "it is nobody's here to delete"
+
+
+def test_a_daemon_that_does_not_end_keeps_its_files(hall: Hall, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(leave, "STOP_S", 0.0)
+    with StateFile(hall.folder / "state", fleet="hall", node="robot3"):
+        late = run("--yes")
+    assert (late.exit_code, left(hall.folder)) == (5, UNTOUCHED)
+    assert "robot3 has left hall, and its daemon does not end" in late.stderr
+
+
+def test_another_machine_s_daemon_is_left_alone(hall: Hall) -> None:
+    with StateFile(hall.folder / "other", fleet="hall", node="robot1") as file:
+        fleet = load_fleet(hall.folder / "fleet.yaml")
+        file.create(blank_state(fleet, "robot1", 0, None, incarnation=1, hardware="", disk="02"))
+    wrong = run("--yes", "--state-dir", str(hall.folder / "other"))
+    assert (wrong.exit_code, hall.asked) == (1, [])
+    assert "no daemon of robot1 runs on this machine" in wrong.stderr

@@ -1,0 +1,382 @@
+"""`zsched leave`: this machine hands over what it does, gives its seat up, goes out of the document, and stops.
+
+Knows: the order of these steps, what must be true before the next one, what is said. Does not know: which elector goes
+when (`zsched.core.electorate.pilot`), how a node is emptied (`zsched.commands.flags`), which files a machine keeps
+(`zsched.runtime.membership`).
+
+Each step is agreed before the next one begins, so the command can be broken off and given again at any point.
+"""
+
+from __future__ import annotations
+
+import itertools
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from zsched import paths
+from zsched.clock import monotonic_s
+from zsched.commands.ask import Door, ask_door, find_door
+from zsched.commands.common import CliError, Json, check_reason, nearest
+from zsched.commands.document import QUESTION, InForce, ask_all, change, document_text, in_force
+from zsched.commands.entries import DOCUMENT, HERE
+from zsched.commands.flags import LEAVE, NO_OTHER, DrainOrder, drain
+from zsched.commands.membership import Told
+from zsched.commands.orders import OrderView, Row
+from zsched.commands.page import harmless, span
+from zsched.config.difference import names_electors
+from zsched.config.editing import remove_node
+from zsched.config.load import check_bytes
+from zsched.core.electorate.pilot import may_go
+from zsched.core.values.electorate import FleetValue
+from zsched.errors import AdapterError, ConfigError
+from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_UNREACHABLE, EXIT_USAGE, EXIT_WOULD_CHANGE
+from zsched.runtime.membership import Places, Written, belongings, check_ended, put_away, whose
+from zsched.wire.codec import from_plain
+
+LAST: Final = "last-node"
+"""The danger: the fleet has no other node, and ends."""
+NOT_TOLD: Final = "not-told"
+"""The danger: the others cannot be told, and count this node until somebody has them forget it."""
+DANGERS: Final = (NO_OTHER, LAST, NOT_TOLD)
+PAUSE_S: Final = 0.2
+STOP_S: Final = 20.0
+"""How long a daemon may take to end: it hands over, and stops its workers and its relay."""
+LEARN_S: Final = 10.0
+"""How long the other nodes may take to learn that this one is gone."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LeaveOrder:
+    """What the operator has said."""
+
+    places: Places
+    runtime_dir: Path | None = None
+    is_purged: bool = False
+    deadline_s: float = 600.0
+    accepted: tuple[str, ...] = ()
+    """Names of dangers."""
+    reason: str = ""
+    is_plan: bool = False
+    is_yes: bool = False
+    is_json: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Way:
+    """One node on its way out."""
+
+    order: LeaveOrder
+    view: OrderView
+    me: str
+    began: float
+    files: tuple[Written, ...]
+
+    @property
+    def door(self) -> Door:
+        return self.view.door
+
+    def tell(self, text: str) -> None:
+        """A step that is done, for people; programs read the events and the end."""
+        if not self.order.is_json:
+            sys.stdout.write(harmless(text) + "\n")
+            sys.stdout.flush()
+
+    def check_time(self, lacks: str) -> None:
+        """End at the deadline.
+
+        Raises:
+            CliError: it has come (5).
+        """
+        passed_s = monotonic_s() - self.began
+        if passed_s >= self.order.deadline_s:
+            again = f"give `zsched leave` again to go on, or take it back: zsched undrain {self.me}"
+            raise CliError(EXIT_TIMED_OUT, f"{self.me} has not left after {span(passed_s)}: {lacks}; {again}")
+
+
+def leave(order: LeaveOrder) -> int:
+    """Take this machine out of its fleet; the exit code.
+
+    Raises:
+        CliError: it was not agreed to, a step was not agreed, or the deadline has come (5).
+        ConfigError: without this node the document would have faults.
+        AdapterError: this machine is in no fleet, or its files cannot be put away.
+    """
+    for name in order.accepted:
+        if name not in DANGERS:
+            raise CliError(EXIT_USAGE, f"--accept: there is no danger {name!r}{nearest(name, DANGERS)}")
+    check_reason(order.reason)
+    fleet, me = whose(order.places.state)
+    files = belongings(order.places, is_purged=order.is_purged)
+    try:
+        door = _own_door(order, me)
+        status = ask_door(door, {"verb": "status"})
+    except CliError as error:
+        if error.code != EXIT_UNREACHABLE:
+            raise
+        _accept(order, NOT_TOLD, f"{error}. The others are not told: `zsched node forget {me}` tells them")
+        return _end(order, fleet, me, files)
+    if (status["fleet"], status["node"]) != (fleet, me):
+        other = f"{status['node']} of fleet {status['fleet']}"
+        raise CliError(EXIT_USAGE, f"the daemon here is {other}, and {order.places.state} is {me}'s; give --state-dir")
+    view = OrderView(door=door, is_json=order.is_json, is_yes=order.is_yes, is_plan=order.is_plan, reason=order.reason)
+    way = _Way(order=order, view=view, me=me, began=monotonic_s(), files=files)
+    code = _take_leave(way, status)
+    if code != EXIT_OK:
+        return code
+    _stop(way, fleet)
+    return _end(order, fleet, me, files)
+
+
+def _own_door(order: LeaveOrder, me: str) -> Door:
+    door = find_door(order.runtime_dir, me)
+    if door.node is not None:
+        raise CliError(EXIT_UNREACHABLE, f"no daemon of {me} runs on this machine")
+    return door
+
+
+def _accept(order: LeaveOrder, name: str, means: str) -> None:
+    """Go on only if a danger is accepted by its name.
+
+    Raises:
+        CliError: it is not.
+    """
+    if name not in order.accepted and not order.is_plan:
+        raise CliError(EXIT_FAILED, f"nothing was changed; if this may be, --accept {name}: {means}")
+    if not order.is_json:
+        sys.stderr.write(harmless(f"{name}: {means}") + "\n")
+
+
+# --- while the daemon runs -------------------------------------------------------------------------------------------
+
+
+def _take_leave(way: _Way, status: Json) -> int:
+    """Have the fleet agree, step by step; the exit code."""
+    order, me = way.order, way.me
+    held = _newest(way, status)
+    members = _members(held, status)
+    danger = _danger(way, status, held, members)
+    if danger is not None:
+        _accept(order, *danger)
+    if me not in members:
+        way.tell(f"{me} is no node of {held.fleet} since revision {held.revision}")
+    if danger is not None or me not in members:
+        return _planned(way, held.fleet) if order.is_plan else EXIT_OK
+    _without_me(document_text(held), me)  # its faults come before anything is done
+    rows: tuple[Row, ...] = ((me, "member", held.fleet, "-"),)
+    if any(name == me for name, _ in held.electors):
+        rows = (*rows, (me, "elector", ", ".join(name for name, _ in held.electors), _others(held, me)))
+    drained = DrainOrder(
+        nodes=(me,),
+        kind=LEAVE,
+        deadline_s=order.deadline_s,
+        accepted=tuple(name for name in order.accepted if name == NO_OTHER),
+        more_rows=rows,
+    )
+    code = drain(way.view, drained)
+    if order.is_plan and code == EXIT_WOULD_CHANGE:
+        return _planned(way, held.fleet)
+    if order.is_plan or code != EXIT_OK:
+        return EXIT_WOULD_CHANGE if order.is_plan and code == EXIT_OK else code
+    _give_up_the_seat(way)
+    _go_out(way)
+    return EXIT_OK
+
+
+def _planned(way: _Way, fleet: str) -> int:
+    _told(way.order, fleet, way.me, way.files, "planned", f"{way.me} would leave {fleet}")
+    return EXIT_WOULD_CHANGE
+
+
+def _others(held: InForce, me: str) -> str:
+    return ", ".join(name for name, _ in held.electors if name != me) or "another node"
+
+
+def _newest(way: _Way, status: Json) -> InForce:
+    """The newest document that some node of the fleet has: this one may have been taken out of it."""
+    held = in_force(way.door)
+    if held.text:
+        return held
+    names = [str(one["name"]) for one in status["nodes"] if one["name"] != way.me and one["state"] in HERE]
+    answers = ask_all(way.door, names, QUESTION).items()
+    for name, answer in answers:
+        if not isinstance(answer, CliError) and answer.get("revision") is not None:
+            there = in_force(way.door.to(name))
+            if there.revision >= held.revision and there.text:
+                return there
+    return held
+
+
+def _members(held: InForce, status: Json) -> tuple[str, ...]:
+    """The nodes of the document, or of the file by which each machine goes."""
+    if not held.document:
+        return tuple(str(node["name"]) for node in status["nodes"])
+    fleet = check_bytes(document_text(held).encode(), DOCUMENT).fleet
+    if fleet is None:
+        advice = "update zsched here; `zsched fleet export` shows the document"
+        raise CliError(EXIT_FAILED, f"the document in force has faults for this version of zsched; {advice}")
+    return tuple(node.name for node in fleet.nodes)
+
+
+def _danger(way: _Way, status: Json, held: InForce, members: tuple[str, ...]) -> tuple[str, str] | None:
+    """(name, what it means) of what keeps the fleet from agreeing; ``None``: it can."""
+    me, quorum = way.me, status["quorum"]
+    if members == (me,):
+        return LAST, f"{me} is the only node of {held.fleet}, which ends with it"
+    if me not in members:
+        return None
+    if not held.document:
+        told = f"{held.fleet} goes by the file on each machine: take {me} out of it there, or agree a document first"
+        return NOT_TOLD, f"{told} (zsched apply {paths.SYSTEM_CONFIG})"
+    if not quorum["ok"]:
+        told = f"{quorum['alive']} of {quorum['electors']} electors can answer, {quorum['needed']} needed"
+        return NOT_TOLD, f"{told}. The others are not told: `zsched node forget {me}` tells them"
+    return None
+
+
+def _without_me(text: str, me: str) -> str:
+    """The document without this node.
+
+    Raises:
+        ConfigError: it would have faults.
+    """
+    shorter = remove_node(text, me)
+    result = check_bytes(shorter.encode(), f"{DOCUMENT} without {me}")
+    if result.fleet is None:
+        raise ConfigError(f"nothing was changed: {result.report()}\nchange it first: zsched edit")
+    return shorter
+
+
+def _give_up_the_seat(way: _Way) -> None:
+    """Wait until this node knows that the electors have settled without it (rule of `may_go`).
+
+    By itself an elector that leaves is removed; one that the operator has named is removed by this command.
+    """
+    told = ""
+    while True:
+        told_now = ask_door(way.door, {"verb": "fleet"})
+        value = from_plain(told_now["value"], FleetValue)
+        if may_go(value, way.me):
+            if told:
+                way.tell(f"{way.me}: no elector any more; electors: {', '.join(value.electorate.names)}")
+            return
+        why = _ask_for_the_seat(way, in_force(way.door))
+        if why != told:
+            told = why
+            way.tell(f"{way.me} is an elector still: {why}")
+        way.check_time(f"it is an elector still: {why}")
+        time.sleep(PAUSE_S)
+
+
+def _ask_for_the_seat(way: _Way, held: InForce) -> str:
+    """Why the seat is not given up yet."""
+    if not held.is_settled:
+        return f"number {held.number} is being settled"
+    if not held.text or not names_electors(held.text):
+        return str(ask_door(way.door, {"verb": "status"})["quorum"].get("pilot") or "the electors are about to change")
+    try:
+        change(way.door, {"remove_elector": way.me, "base_revision": held.revision, "reason": _reason(way)})
+    except CliError as error:
+        return str(error)
+    return "it is removed"
+
+
+def _go_out(way: _Way) -> None:
+    """Have this node taken out of the document, and wait until the others know.
+
+    One of them proposes it: this node would not store a document that does not name it.
+    """
+    for count in itertools.count():
+        others = _alive(way)
+        try:
+            held = in_force(way.door.to(others[count % len(others)]) if others else way.door)
+            flags = [flag for flag in held.flags if flag["subject"] != way.me]
+            text = {"text": _without_me(document_text(held), way.me), "flags": flags, "reason": _reason(way)}
+            answer = change(way.door.to(held.node), {**text, "base_revision": held.revision})
+        except CliError as error:
+            way.check_time(str(error))
+            time.sleep(PAUSE_S)
+        else:
+            break
+    revision = int(answer["revision"])
+    way.tell(f"{held.fleet}: revision {revision} is agreed, and {way.me} is no node of it")
+    _wait_until_known(way, revision)
+
+
+def _alive(way: _Way) -> list[str]:
+    """The other nodes that are alive, electors first."""
+    status = ask_door(way.door, {"verb": "status"})
+    electors = status["quorum"]["names"]
+    names = [str(one["name"]) for one in status["nodes"] if one["name"] != way.me and one["state"] == "alive"]
+    return sorted(names, key=lambda name: name not in electors)
+
+
+def _wait_until_known(way: _Way, revision: int) -> None:
+    """Wait until the others have that document; whoever does not in time learns it from them."""
+    until = monotonic_s() + LEARN_S
+    waiting = _alive(way)
+    while waiting and monotonic_s() < until:
+        answers = ask_all(way.door, waiting, {"verb": "fleet"})
+        waiting = [name for name, answer in answers.items() if not _knows(answer, revision)]
+        if waiting:
+            time.sleep(PAUSE_S)
+    if waiting:
+        sys.stderr.write(
+            harmless(f"{', '.join(waiting)}: not heard yet that {way.me} has left; the others tell") + "\n"
+        )
+
+
+def _knows(answer: Json | CliError, revision: int) -> bool:
+    """Whether a node goes by a value of at least this revision, and has its document."""
+    if isinstance(answer, CliError) or answer.get("revision") is None:
+        return False
+    return int(answer["revision"]) >= revision and bool(answer["text"])
+
+
+def _reason(way: _Way) -> str:
+    asked = way.view.asked
+    return f"leave, by {asked['by']}" + (f": {way.order.reason}" if way.order.reason else "")
+
+
+# --- the end ---------------------------------------------------------------------------------------------------------
+
+
+def _stop(way: _Way, fleet: str) -> None:
+    """End the daemon, and wait until it has given its state folder back.
+
+    Raises:
+        CliError: it does not end.
+    """
+    ask_door(way.door, {"verb": "leave"})
+    until = monotonic_s() + STOP_S
+    while True:
+        try:
+            check_ended(fleet, way.me, way.order.places)
+        except AdapterError as error:
+            if monotonic_s() > until:
+                told = f"{way.me} has left {fleet}, and its daemon does not end: {error}"
+                raise CliError(EXIT_TIMED_OUT, f"{told}; stop it, then give `zsched leave` again") from error
+            time.sleep(PAUSE_S)
+        else:
+            way.tell(f"{way.me}: the daemon has ended")
+            return
+
+
+def _end(order: LeaveOrder, fleet: str, me: str, files: tuple[Written, ...]) -> int:
+    """Put the files away."""
+    if order.is_plan:
+        _told(order, fleet, me, files, "planned", f"{me} would leave {fleet}")
+        return EXIT_WOULD_CHANGE
+    done = put_away(fleet, me, order.places, is_purged=order.is_purged)
+    _told(order, fleet, me, done, "left", f"{me} has left {fleet}")
+    return EXIT_OK
+
+
+def _told(order: LeaveOrder, fleet: str, me: str, files: tuple[Written, ...], outcome: str, said: str) -> None:
+    is_service = order.places.config == paths.SYSTEM_CONFIG
+    service = ("sudo systemctl disable zsched: it would find no fleet at the next boot",) if is_service else ()
+    more = () if order.is_plan else (*service, f"it comes back by `zsched invite {me}` on another node")
+    told = Told(fleet=fleet, node=me, outcome=outcome, said=said, files=files, next=more)
+    told.tell(is_json=order.is_json, is_line=True)
