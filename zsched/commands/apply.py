@@ -29,7 +29,7 @@ from zsched.commands.document import (
     wait_until_settled,
 )
 from zsched.commands.page import cut, harmless
-from zsched.config.difference import Change, Danger, difference, names_electors, wanted_electors
+from zsched.config.difference import Change, Danger, difference, wanted_electors, warnings_in_force
 from zsched.config.load import check_bytes
 from zsched.config.reader import MAX_FILE_BYTES, render_all
 from zsched.core.values.fleet import Fleet, fleet_hash
@@ -169,8 +169,7 @@ def make_plan(door: Door, held: InForce, text: str, file: str) -> Plan:
     warnings = render_all(file, result.warnings, "warning")
     if not held.document:
         return _first(door, held, text, fleet, warnings)
-    if not names_electors(text):  # then those that are agreed stay, and what the file's default would be is moot
-        warnings = render_all(file, tuple(one for one in result.warnings if "elector" not in one.message), "warning")
+    warnings = render_all(file, warnings_in_force(text, result.warnings), "warning")
     old = check_bytes(document_text(held).encode(), file).fleet
     if old is None:
         advice = "update zsched here; `zsched fleet export` shows the document"

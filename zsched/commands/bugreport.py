@@ -70,7 +70,7 @@ def report(machine: Machine, file: Path | None, *, is_json: bool) -> int:
 
 def gathered(scene: Scene, journal: Journal | None = None) -> Iterator[Member]:
     """Every file of the report, secrets taken out."""
-    secrets = secrets_of(scene.reading.fleet)
+    secrets = (*secrets_of(scene.reading.fleet), *secrets_of(scene.known))
     machine = {"system": platform.platform(), "machine": platform.machine(), "node": scene.node}
     yield _json("versions.json", {**versions(), **machine})
     try:
@@ -78,11 +78,13 @@ def gathered(scene: Scene, journal: Journal | None = None) -> Iterator[Member]:
         yield Member(name="fleet.yaml", content=clean_yaml(text, secrets).encode())
     except OSError as error:
         yield Member(name="fleet.yaml", missing=f"{scene.file}: {error.strerror}")
+    if scene.text:
+        yield Member(name="document.yaml", content=clean_yaml(scene.text, secrets).encode())
     results = [(check, _cleaned(result, secrets)) for check, result in run_all(scene)]  # before lines are broken
     yield Member(name="doctor.txt", content=as_text(results, TEXT_WIDTH, is_colored=False).encode())
     yield _json("doctor.json", as_json(scene, results))
     statuses = dict(scene.statuses) or ({} if scene.own is None else {scene.node: scene.own})
-    nodes = () if scene.reading.fleet is None else scene.reading.fleet.nodes
+    nodes = () if scene.known is None else scene.known.nodes
     for name in sorted({*statuses, *(spec.name for spec in nodes)}):
         if name in statuses:
             yield _json(f"status/{name}.json", clean_json(statuses[name], secrets))

@@ -60,7 +60,7 @@ def diagnose(machine: Machine, *, is_fleet: bool, is_strict: bool, is_json: bool
 
 def as_json(scene: Scene, results: Results) -> Json:
     """The results with their schema's name."""
-    fleet = scene.reading.fleet
+    fleet = scene.known
     return {
         "schema": SCHEMA,
         "fleet": None if fleet is None else fleet.name,

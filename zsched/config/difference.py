@@ -16,8 +16,8 @@ from enum import StrEnum
 from typing import Any, Final
 
 from zsched.config.drivers import DRIVER_KEYS
+from zsched.config.reader import Fault, Scalar, read_yaml
 from zsched.config.reader import Mapping as Block
-from zsched.config.reader import Scalar, read_yaml
 from zsched.config.rows import rows
 from zsched.core.route.route import outputs_of
 from zsched.core.route.templates import named_rules
@@ -117,6 +117,14 @@ def names_electors(text: str) -> bool:
     root, _ = read_yaml(text.encode())
     named = [held for key, held in root.pairs if key.text == "electorate"] if isinstance(root, Block) else []
     return any(not isinstance(held, Scalar) for held in named)
+
+
+def warnings_in_force(text: str, warnings: tuple[Fault, ...]) -> tuple[Fault, ...]:
+    """Those of a document's warnings that count once electors are agreed.
+
+    Where it names no electors, those that are agreed stay, and what the file's default would be is moot.
+    """
+    return warnings if names_electors(text) else tuple(one for one in warnings if "elector" not in one.message)
 
 
 def wanted_electors(agreed: Sequence[NodeId], new: Fleet, text: str) -> tuple[NodeId, ...]:

@@ -53,7 +53,9 @@ def have_one_file(scene: Scene) -> Result:
     apart = {name: found for name, found in others.items() if found != mine}
     if not apart:
         return passed(f"{counted(len(others), 'nodes')} with hash {mine}")
-    told = [f"{name} goes by hash {found}, {scene.file} here has {mine}" for name, found in apart.items()]
+    told = [f"{name} goes by hash {found}, {scene.source} here has {mine}" for name, found in apart.items()]
+    if scene.document is not None:
+        return failed(*told, fix="zsched fleet show names the revision of each node, and why it does not follow")
     return failed(*told, fix="copy the one file to all machines, and restart their daemons one after the other")
 
 

@@ -15,21 +15,26 @@ def valid(scene: Scene) -> Result:
     fleet = scene.reading.fleet
     if fleet is None:
         return failed(*_lines(scene, scene.reading.faults), fix=f"zsched check {scene.file}")
+    if scene.document is not None:
+        return passed(f"{scene.file} has no fault; nothing goes by it, for a document is agreed (file.in_force)")
     counts = ((len(fleet.nodes), "nodes"), (len(fleet.tasks), "tasks"), (len(fleet.electors), "electors"))
     told = ", ".join(counted(number, noun) for number, noun in counts)
     return passed(f"{scene.file}: {told}, hash {fleet_hash(fleet)}")
 
 
 def without_warnings(scene: Scene) -> Result:
-    """Whether the fleet file has no warning."""
-    found = scene.reading.warnings
-    if not found:
+    """Whether what the fleet goes by, the agreed document or the file, has no warning."""
+    if scene.document is not None:
+        found = scene.document.warnings
+        told = [f"{scene.source}:{fault.line}:{fault.col}: {fault.message}" for fault in found]
+        return warned(*told, fix="zsched edit") if told else passed(f"{scene.source}: no warnings")
+    if not scene.reading.warnings:
         return passed(f"{scene.file}: no warnings")
-    return warned(*_lines(scene, found), fix=f"zsched check {scene.file}")
+    return warned(*_lines(scene, scene.reading.warnings), fix=f"zsched check {scene.file}")
 
 
 def names_this_machine(scene: Scene) -> Result:
-    """Whether this machine is a node of the fleet file."""
+    """Whether this machine is a node of the fleet."""
     names = ", ".join(node.name for node in scene.fleet.nodes)
     if scene.is_node:
         return passed(f"this machine is {scene.node}, {scene.me.kind}")
@@ -45,7 +50,10 @@ def in_force(scene: Scene) -> Result:
     """Whether the daemon goes by the fleet file as it is now, where no document is agreed."""
     if scene.status.get("document"):
         told = f"the daemon goes by the agreed document, hash {scene.status['fleet_file']}, and not by {scene.file}"
-        return passed(f"{told}; `zsched apply FILE` changes the document")
+        counts = ((len(scene.fleet.nodes), "nodes"), (len(scene.fleet.tasks), "tasks"))
+        held = ", ".join(counted(number, noun) for number, noun in counts)
+        more = () if scene.document is None else (f"revision {scene.revision}: {held}",)
+        return passed(f"{told}; `zsched apply FILE` changes the document", *more)
     mine, running = fleet_hash(scene.fleet), str(scene.status["fleet_file"])
     if mine == running:
         return passed(f"the daemon goes by this file, hash {mine}")

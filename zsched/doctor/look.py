@@ -8,24 +8,30 @@ from __future__ import annotations
 import threading
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
 from zsched import paths as places
+from zsched.adapters.host.document_store import DocumentStore
 from zsched.adapters.host.operator_socket import ask
+from zsched.adapters.host.state_file import StateFile
 from zsched.adapters.network.fleet_poll import ask_fleet
 from zsched.clock import monotonic_s
-from zsched.config.load import check_file
+from zsched.config.difference import warnings_in_force
+from zsched.config.load import CheckResult, check_bytes, check_file
+from zsched.core.electorate.numbers import in_force
 from zsched.core.report import snapshot_json
+from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet, dial_endpoint
 from zsched.core.values.model import NodeId
 from zsched.doctor.fleet import differs
 from zsched.doctor.model import Json, Scene
-from zsched.errors import AdapterError, ConfigError
+from zsched.errors import AdapterError, ConfigError, WireError
 from zsched.runtime.access_rules import Side
 from zsched.runtime.tls import asker_in, session_text
 from zsched.sessions import config as zenoh_config
+from zsched.wire.codec import from_plain
 
 ASK_S: Final = 5.0
 AT_ONCE: Final = 8
@@ -60,15 +66,20 @@ def look(machine: Machine, *, is_fleet: bool) -> Scene:
     socket, node = places.socket_path(machine.runtime_folder, machine.node), machine.node
     own, refusal = _own(socket)
     door = None if own is None else socket
+    document, text, revision = _agreed(machine, reading.fleet, door)
+    known = reading.fleet if document is None else document.fleet
     asked = _Asked(statuses={}, answered_s={})
     if is_fleet:
-        asked = _all(reading.fleet, node, door)
+        asked = _all(known, node, door)
         if differs(asked.statuses):
             threading.Event().wait(AGAIN_S)
-            asked = _all(reading.fleet, node, door)
+            asked = _all(known, node, door)
     return Scene(
         file=machine.file,
         reading=reading,
+        document=document,
+        text=text,
+        revision=revision,
         node=node,
         state_folder=machine.state_folder,
         own=own,
@@ -78,6 +89,42 @@ def look(machine: Machine, *, is_fleet: bool) -> Scene:
         answered_s=asked.answered_s,
         sides={} if door is None else _sides(door, node),
     )
+
+
+def _agreed(machine: Machine, by_file: Fleet | None, door: Path | None) -> tuple[CheckResult | None, str, int]:
+    """(what the agreed document says with the electors in force, its text, its revision), from daemon or disk.
+
+    Without the first: no document is agreed, or none that can be read here.
+    """
+    held = _by_disk(machine, by_file) if door is None else _by_daemon(door)
+    if held is None:
+        return None, "", 0
+    text, value = held
+    result = check_bytes(text.encode("utf-8", "replace"), str(machine.file.parent / "the fleet's document"))
+    if result.fleet is None:
+        return None, text, value.revision
+    warnings = warnings_in_force(text, result.warnings)
+    return replace(result, fleet=in_force(result.fleet, value), warnings=warnings), text, value.revision
+
+
+def _by_daemon(door: Path) -> tuple[str, FleetValue] | None:
+    try:
+        told = ask(door, {"verb": "fleet"}, ASK_S)
+        if not told.get("text") or not told.get("value"):
+            return None
+        return str(told["text"]), from_plain(told["value"], FleetValue)
+    except (AdapterError, WireError):
+        return None
+
+
+def _by_disk(machine: Machine, by_file: Fleet | None) -> tuple[str, FleetValue] | None:
+    if by_file is None:
+        return None
+    state = StateFile(machine.state_folder, fleet=by_file.name, node=machine.node).load().state
+    register = None if state is None else state.fleet_register
+    value = None if register is None else register.learnt
+    content = None if value is None else DocumentStore(machine.state_folder).load(value.document)
+    return None if value is None or content is None else (content.text, value)
 
 
 def _sides(door: Path, node: NodeId) -> Mapping[str, str]:

@@ -101,9 +101,16 @@ class Scene:
     file: Path
     """The fleet file."""
     reading: CheckResult
+    """What the file says."""
     node: NodeId
     """What this machine is called."""
     state_folder: Path
+    document: CheckResult | None = None
+    """What the agreed document says, with the electors that are agreed; ``None``: none is agreed, or it is not here."""
+    text: str = ""
+    """The document itself."""
+    revision: int = 0
+    """Of the fleet value that has this document."""
     own: Json | None = None
     """The status of the daemon on this machine; ``None`` when it does not answer."""
     refusal: str = ""
@@ -118,15 +125,26 @@ class Scene:
     root: Path = Path("/")
 
     @property
+    def known(self) -> Fleet | None:
+        """By what this machine goes: the agreed document, else the fleet file; ``None``: neither can be read."""
+        held = None if self.document is None else self.document.fleet
+        return self.reading.fleet if held is None else held
+
+    @property
     def fleet(self) -> Fleet:
-        """What the fleet file says; only for checks that need it."""
-        if self.reading.fleet is None:
+        """The same; only for checks that need it."""
+        if self.known is None:
             raise InvariantError("a check of the doctor needs a fleet file and does not say so")
-        return self.reading.fleet
+        return self.known
+
+    @property
+    def source(self) -> str:
+        """Where that stands."""
+        return str(self.file) if self.document is None else f"the agreed document (revision {self.revision})"
 
     @property
     def me(self) -> NodeSpec:
-        """This machine in the fleet file; only for checks that need it."""
+        """This machine in the fleet; only for checks that need it."""
         return self.fleet.node(self.node)
 
     @property
@@ -138,15 +156,15 @@ class Scene:
 
     @property
     def is_node(self) -> bool:
-        """Whether the fleet file names this machine."""
-        fleet = self.reading.fleet
+        """Whether the fleet names this machine."""
+        fleet = self.known
         return fleet is not None and any(spec.name == self.node for spec in fleet.nodes)
 
     @property
     def is_visit(self) -> bool:
         """Whether this is no node of the fleet, such as an operator's laptop: then only the fleet is looked at."""
         is_bare = self.own is None and not self.state_folder.exists()
-        return self.is_fleet and self.reading.fleet is not None and not self.is_node and is_bare
+        return self.is_fleet and self.known is not None and not self.is_node and is_bare
 
     def at(self, path: str | Path) -> Path:
         """Where an absolute path of the machine is."""

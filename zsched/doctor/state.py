@@ -38,19 +38,19 @@ def valid(scene: Scene) -> Result:
         fix = "zsched init --help says how a node becomes an elector again; do not copy a state from elsewhere"
     if scene.node not in scene.fleet.electors:
         return warned(told, f"{scene.node} is {role}: it works without", fix=fix)
-    return failed(told, f"{scene.node} is {role} of the fleet file and cannot vote", fix=fix)
+    return failed(told, f"{scene.node} is {role} and cannot vote", fix=fix)
 
 
 def makes_an_elector(scene: Scene) -> Result:
     """Whether the state is one of these electors, not lost and not disputed."""
     if scene.node not in scene.fleet.electors:
-        return skipped(f"{scene.node} is no elector of the fleet file")
+        return skipped(f"{scene.node} is no elector")
     if _is_hidden(scene.state_folder):
         return skipped(f"user {os.geteuid()} may not look into {scene.state_folder}: run the doctor as root")
     state = StateFile(scene.state_folder, fleet=scene.fleet.name, node=scene.node).load().state
     if state is None:
         return skipped("there is no valid state")
-    if state.electorate != electorate_hash(scene.fleet):
+    if scene.document is None and state.electorate != electorate_hash(scene.fleet):  # an agreed value names seats
         fix = "bring the fleet file of the others here, or see docs/guide/service.md, Add or remove a machine"
         return failed("the state is one of other electors than the fleet file names", fix=fix)
     if state.disputed:

@@ -166,7 +166,7 @@ def _missing(needs: Needs, scene: Scene) -> str:
     """What a check lacks; empty: nothing."""
     if needs is Needs.NOTHING:
         return ""
-    if scene.reading.fleet is None:
+    if scene.known is None:
         return "it needs a fleet file without faults"
     if needs in (Needs.NODE, Needs.STATUS) and not scene.is_node:
         return "it needs this machine's name in the fleet file"

@@ -13,11 +13,19 @@ from typing import Any
 import pytest
 
 from support.clinic import FLEET, assert_finds, make_state, run, scene_of
+from zsched.adapters.host.document_store import DocumentStore
+from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.adapters.radio.nl80211 import GenericNetlink, Interface
 from zsched.clock import ClockWatch, Drift
+from zsched.config.load import load_fleet
+from zsched.core.values.document import Document, Text
+from zsched.core.values.electorate import Elector, FleetValue
+from zsched.core.values.model import RegisterState
 from zsched.doctor import machine, state
+from zsched.doctor.look import Machine, look
 from zsched.doctor.model import Scene, Verdict
 from zsched.doctor.table import run_all
+from zsched.wire.codec import as_plain, document_hash
 
 FAIL, WARN, PASS, SKIP = Verdict.FAIL, Verdict.WARN, Verdict.PASS, Verdict.SKIP
 ROBOTS_OWN = FLEET.replace("  robot1: {kind: robot}", "  robot1: {kind: robot, wifi: wlan7}")
@@ -74,6 +82,74 @@ def test_a_file_that_is_not_the_agreed_document_is_no_fault(tmp_path: Path) -> N
     result = run("file.in_force", agreed)
     assert result.verdict is PASS
     assert "goes by the agreed document" in "\n".join(result.evidence)
+
+
+AGREED = FLEET.replace("  robot3: {kind: robot}\n", "  robot3: {kind: robot}\n  robot4: {kind: robot}\n")
+
+
+def agreed_on(folder: Path) -> FleetValue:
+    """The state and the document of edge1, as agreed: robot4 has come, and only edge1 elects."""
+    file = folder / "agreed.yaml"
+    file.write_text(AGREED)
+    content = Document(text=Text(AGREED))
+    DocumentStore(folder / "state").save(content)
+    value = FleetValue(
+        fleet="hall",
+        generation_id="ab" * 16,
+        revision=9,
+        number=1,
+        electors=(Elector(name="edge1", disk="01", joining=1),),
+        settled=True,
+        lease_s=1.0,
+        guard_lease_s=1.0,
+        document=document_hash(content),
+    )
+    make_state(load_fleet(file), "edge1", folder / "state", fleet_register=RegisterState(task="hall", learnt=value))
+    return value
+
+
+def machine_of(scene: Scene, folder: Path) -> Machine:
+    return Machine(file=scene.file, state_folder=folder / "state", runtime_folder=folder, node="edge1")
+
+
+def test_where_a_document_is_agreed_it_counts_and_not_the_file(tmp_path: Path) -> None:
+    by_file = scene_of(tmp_path)
+    value = agreed_on(tmp_path)
+    answer = {"text": AGREED, "value": as_plain(value), "document": value.document}
+    door = OperatorSocket(
+        tmp_path / "edge1.sock", lambda asked: answer if asked["verb"] == "fleet" else {"error": "not asked for"}
+    )
+    from_disk = look(machine_of(by_file, tmp_path), is_fleet=False)
+    door.open()
+    try:
+        from_daemon = _seen(look(machine_of(by_file, tmp_path), is_fleet=False), by_file)
+    finally:
+        door.close()
+    for scene in (_seen(from_disk, by_file), from_daemon):
+        assert (scene.text, scene.revision, scene.fleet.electors) == (AGREED, 9, ("edge1",))
+        assert [node.name for node in scene.fleet.nodes][-1] == "robot4"
+        assert "nothing goes by it, for a document is agreed" in run("file.valid", scene).evidence[0]
+        told = "the agreed document (revision 9): no warnings"
+        assert run("file.warnings", scene).evidence == (told,), "electors are agreed: the file's default is moot"
+        assert run("file.in_force", scene).evidence[1] == "revision 9: 5 nodes, 1 task"
+        assert run("state.elector", scene).evidence == ("edge1 is one of 1 electors, and its state is theirs",)
+    other = replace(from_daemon, is_fleet=True, statuses={"robot1": {"fleet_file": "00"}})
+    found = run("fleet.files", other)
+    assert_finds(found, FAIL, "the agreed document (revision 9) here has")
+    assert "zsched fleet show" in found.fix
+
+
+def _seen(scene: Scene, by_file: Scene) -> Scene:
+    """The same, with the answer of a daemon that goes by the document."""
+    return replace(scene, own={**(by_file.own or {}), "document": "0d" * 8})
+
+
+def test_a_document_that_cannot_be_read_here_leaves_the_file(tmp_path: Path) -> None:
+    scene = scene_of(tmp_path)
+    value = agreed_on(tmp_path)
+    (tmp_path / "state" / "documents" / value.document).write_text("broken")
+    seen = look(machine_of(scene, tmp_path), is_fleet=False)
+    assert (seen.document, seen.text, len(seen.fleet.nodes)) == (None, "", 4)
 
 
 # --- the state -------------------------------------------------------------------------------------------------------
