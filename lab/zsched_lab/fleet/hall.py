@@ -15,8 +15,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+import psutil
+
 from zsched.adapters.host.operator_socket import ask
 from zsched.errors import AdapterError
+from zsched_lab.fleet.netns import Network
 
 
 def block_of_ports(count: int) -> int:
@@ -34,11 +37,11 @@ def block_of_ports(count: int) -> int:
 
 
 class Hall:
-    """Machines with folders of their own below one; use as a context manager."""
+    """Machines with folders of their own below one, on loopback or in ``network``; use as a context manager."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, network: Network | None = None) -> None:
         """Name the folder; nothing is started."""
-        self.folder = folder
+        self.folder, self._network = folder, network
         self._daemons: dict[str, subprocess.Popen[bytes]] = {}
 
     def __enter__(self) -> Self:
@@ -67,7 +70,7 @@ class Hall:
         more = {"CONFIG": home / "etc" / "fleet.yaml", "STATE_DIR": home / "state", "RUNTIME_DIR": home / "run"}
         env = {**os.environ, **{f"ZSCHED_{name}": str(path) for name, path in more.items()}, "ZSCHED_NODE": node}
         env["ZSCHED_AUTHORITY"] = str(self.folder / "stick")
-        command = [sys.executable, "-m", "zsched.cli", *words]
+        command = self._on(node, [sys.executable, "-m", "zsched.cli", *words])
         return subprocess.run(command, capture_output=True, text=True, timeout=90, check=False, env=env, cwd=home)
 
     def start(self, node: str) -> None:
@@ -77,8 +80,21 @@ class Hall:
         given = [f"--config={home / 'etc' / 'fleet.yaml'}", f"--node={node}"]
         given += [f"--state-dir={home / 'state'}", f"--runtime-dir={home / 'run'}"]
         with (home / "log").open("ab") as log:
-            command = [sys.executable, "-m", "zsched.daemon", *given]
+            command = self._on(node, [sys.executable, "-m", "zsched.daemon", *given])
             self._daemons[node] = subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=log)
+
+    def _on(self, node: str, command: list[str | Path]) -> list[str | Path]:
+        return command if self._network is None else self._network.wrap(node, command)
+
+    def kill(self, node: str) -> None:
+        """End a node's daemon and its relay as a power cut does."""
+        process = self._daemons.pop(node)
+        relays = [child for child in psutil.Process(process.pid).children(recursive=True) if child.is_running()]
+        process.kill()
+        process.wait()
+        for child in relays:
+            with contextlib.suppress(psutil.NoSuchProcess):
+                child.kill()
 
     def stop(self, *nodes: str) -> None:
         """Stop daemons (default: all)."""
