@@ -188,7 +188,7 @@ def test_a_saved_worker_is_started_again_and_a_broken_one_leaves_the_owner_its_o
             application.wait_answer(r"\(from ")
             worker.write_text("raise SystemExit('this is broken')\n")
             run.wait(r"\| this is broken")
-            run.wait(r"the new worker is not ready on (\w+); (\w+) keeps the worker that it has")
+            run.wait(r"the new worker is not ready on (\w+) \(failed after \d+ s\); (\w+) keeps the worker that it has")
             application.wait_answer(r"\(from ")
             told = len(run.said)
             worker.write_text(good)

@@ -11,6 +11,8 @@ from typing import Any
 import pytest
 from ruamel.yaml import YAML
 
+from support.waiting import until
+from zsched_lab.fleet.hall import Hall, block_of_ports
 from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 
 ROOT = Path(__file__).parents[2]
@@ -46,14 +48,15 @@ def fleet_of(folder: Path, program: str, task: str) -> dict[str, Any]:
     return tree
 
 
-def run_application(
-    bed: Testbed, page: str = "docs/guide/streams.md", changes: dict[str, str] | None = None
-) -> list[str]:
-    """A page's application on robot1: what it prints; it must end by itself."""
-    text = examples(page, "python")[0]
-    for old, new in {"tcp/127.0.0.1:7458": bed.fleet.node("robot1").listen_data, **(changes or {})}.items():
-        assert old in text
-        text = text.replace(old, new)
+def run_application(bed: Testbed) -> list[str]:
+    """The application of docs/guide/streams.md on robot1: what it prints."""
+    text = examples("docs/guide/streams.md", "python")[0]
+    assert "tcp/127.0.0.1:7458" in text
+    return run_text(text.replace("tcp/127.0.0.1:7458", bed.fleet.node("robot1").listen_data))
+
+
+def run_text(text: str) -> list[str]:
+    """What a program prints; it must end by itself."""
     done = subprocess.run(
         [sys.executable, "-c", text], capture_output=True, text=True, timeout=30, check=False, stdin=subprocess.DEVNULL
     )
@@ -92,18 +95,32 @@ def test_a_program_without_the_library_is_told_to_say_ready_matching(tmp_path: P
         assert "@zsched/testbed/worker/edge1/shout/" in told[0]
 
 
-def test_the_first_fleet_answers_its_application(tmp_path: Path) -> None:
-    """The task and the application of docs/guide/first-fleet.md, on two robots and an edge that all may own it."""
-    page = YAML(typ="safe").load(examples("docs/guide/first-fleet.md", "yaml")[0])
-    tree = echo_fleet(robots=2, edges=1, timing=page["timing"])
-    tree["electorate"], tree["tasks"] = page["electorate"], page["tasks"]
-    assert sorted(tree["nodes"]) == sorted(page["nodes"])
-    with Testbed(tmp_path, tree) as bed:
-        bed.init()
-        bed.start()
-        owner = bed.wait_settled()
-        bed.wait(lambda: not bed.task("robot1")["problems"], 60, "the worker takes its inputs")
-        said = run_application(bed, "docs/guide/first-fleet.md", {"range(1000)": "range(20)"})
+def test_the_first_fleet_by_its_verbs_answers_its_application(tmp_path: Path) -> None:
+    """docs/guide/first-fleet.md, with its task and its application: a secured fleet of two robots and an edge."""
+    page, port = "docs/guide/first-fleet.md", block_of_ports(30)
+    (tmp_path / "echo.yaml").write_text(examples(page, "yaml")[0])
+    with Hall(tmp_path) as hall:
+        hall.zsched("robot1", "fleet", "create", "hall", "--address", f"127.0.0.1:{port}")
+        hall.start("robot1")
+        hall.zsched("robot1", "wait", "--for", "quorum", "--timeout", "30")
+        hall.zsched("robot1", "task", "add", str(tmp_path / "echo.yaml"), "--yes")
+        for count, (name, kind) in enumerate((("robot2", "robot"), ("edge1", "edge")), 1):
+            words = ("--kind", kind, "--address", f"127.0.0.1:{port + 10 * count}", "--candidate-for", "echo", "--yes")
+            (tmp_path / f"{name}.invite").write_text(hall.zsched("robot1", "invite", name, *words))
+            hall.zsched(name, "join", str(tmp_path / f"{name}.invite"))
+            hall.start(name)
+            until(lambda name=name: name in hall.alive("robot1"), f"{name} joins")  # type: ignore[misc]
+        everybody = {"robot1", "robot2", "edge1"}
+        until(lambda: all(hall.alive(name) == everybody for name in everybody), "all hear each other")
+        hall.zsched("robot1", "wait", "--for", "healthy", "--timeout", "60")
+        joins_at = str(hall.status("robot1")["joins_at"][0])
+        assert joins_at.endswith(f":{port + 3}"), "three ports behind its control session, as the page says"
+        text = examples(page, "python")[0]
+        for old, new in {"tcp/127.0.0.1:7460": joins_at, "range(1000)": "range(20)"}.items():
+            assert old in text
+            text = text.replace(old, new)
+        said = run_text(text)
+        owner = hall.status("robot1")["tasks"][0]["owner"]
     assert len(said) >= 17  # the first ones may be put too early, and the last answers come too late
     first = int(said[0].split()[1])
     last = first + len(said)

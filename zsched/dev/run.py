@@ -229,7 +229,8 @@ class Run:
                 del self._rollouts[task]
                 kept = ", ".join(rollout.waiting)
                 left = f"; {kept} keeps the worker that it has" if kept else ""
-                self._say(f"{task}: the new worker is not ready on {rollout.node}{left}")
+                why = f"{state or 'not there'} after {now - rollout.since:.0f} s"
+                self._say(f"{task}: the new worker is not ready on {rollout.node} ({why}){left}")
                 return
             rollout.node = None
         while rollout.waiting and not self._has_worker(rollout.waiting[0], task, status):

@@ -361,13 +361,21 @@ def test_an_order_becomes_the_event_that_says_all_of_it() -> None:
     assert kinds == [ev.MoveCommanded, ev.HoldCommanded, ev.TuneCommanded]
 
 
+def test_a_daemon_is_ended_for_good_on_its_own_machine_only(house: House) -> None:
+    ended: list[str] = []
+    desk = Desk("robot1", house.inbox, house.adapter, leave=lambda: ended.append("robot1"))
+    told = desk.answer({"verb": "leave", "node": "edge1"})
+    assert (told, ended) == ({"error": "edge1 leaves by a command on its own machine: zsched leave"}, [])
+    assert (desk.answer({"verb": "leave"}), ended) == ({"outcome": "ok"}, ["robot1"])
+
+
 def test_desk_refuses_what_is_no_request(house: House) -> None:
     weights = {"verb": "weights", "task": "merge", "cpu": 1, "memory": 0, "network": 0}
     order = {"task": "merge", "by": "ada@robot1"}
     for request, says in (
         (
             {"verb": "fly"},
-            "unknown verb 'fly'; known: access, certificate, change, explain, fleet, hold, keep, lines, log, move, ",
+            "unknown verb 'fly'; known: access, certificate, change, explain, fleet, hold, keep, leave, lines, log, ",
         ),
         ({"verb": "move", "task": "merge", "target": "edge1"}, "move: 'by' is missing"),
         ({**order, "verb": "move"}, "move: 'target' is missing"),
