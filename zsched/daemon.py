@@ -477,16 +477,20 @@ class Daemon:
 
     def _tend_sessions(self, node: Node, now: float) -> None:
         """Begin anew when it is this node's turn and what its sessions were opened with holds no more."""
+        if self.begins_anew:
+            return
         electors, alive = node.fleet.electors, node.membership.alive()
+        lives = {name: node.membership.incarnation(name) for name in alive}
         if now >= self._next_look:
             self._next_look = now + LOOK_S
             with contextlib.suppress(ConfigError):  # it is being replaced
                 node.set_problem(CERTIFICATE, renewal.ends_soon(self._fleet, renewal.now_utc()))
             if self._lets_in_others or self._has_another_certificate(node):
-                self._reopening.want(turns((*alive, node.me), electors), now)
+                self._reopening.want(turns((*alive, node.me), electors), lives, now)
             else:
                 self._reopening.forget()
-        if not self._reopening.is_due(electors, alive, now):
+        is_free = set(node.owned()) <= set(node.movable(now))
+        if not self._reopening.is_due(electors, lives, now, is_free=is_free):
             return
         why_not = self._why_not_anew(node)
         self._inbox.post(ev.ProblemReported(source=SESSIONS, problem=why_not))

@@ -2,26 +2,37 @@
 
 from __future__ import annotations
 
-from zsched.runtime.reopening import FIRST_S, PATIENCE_S, TURN_S, Reopening, turns
+from zsched.runtime.reopening import FIRST_S, PATIENCE_S, SETTLE_S, TURN_S, Reopening, turns
 
 ELECTORS = ("edge1", "robot1", "robot2")
 NODES = ("edge1", "edge2", "robot1", "robot2")
 ORDER = turns(NODES, ELECTORS)
+LIFE = 7
 
 
-def others(me: str) -> set[str]:
-    return set(NODES) - {me}
+def lives(*names: str, anew: tuple[str, ...] = ()) -> dict[str, int | None]:
+    """Who lives, and who of them in a new life."""
+    return {name: LIFE + (name in anew) for name in names}
+
+
+def others(me: str, *anew: str) -> dict[str, int | None]:
+    return lives(*(name for name in NODES if name != me), anew=anew)
+
+
+def wanting(me: str, now: float = 0.0) -> Reopening:
+    one = Reopening(me)
+    one.want(ORDER, others(me), now)
+    return one
 
 
 def test_electors_come_last() -> None:
     assert ORDER == ("edge2", "edge1", "robot1", "robot2")
 
 
-def test_no_two_have_the_same_turn() -> None:
+def test_no_two_have_the_same_latest_turn() -> None:
     due = []
     for name in NODES:
-        one = Reopening(name)
-        one.want(ORDER, 100.0)
+        one = wanting(name, 100.0)
         assert one.due_at is not None
         assert not one.is_due(ELECTORS, others(name), one.due_at - 0.1)
         assert one.is_due(ELECTORS, others(name), one.due_at)
@@ -30,37 +41,64 @@ def test_no_two_have_the_same_turn() -> None:
     assert all(after - before >= TURN_S for before, after in zip(sorted(due), sorted(due)[1:], strict=False))
 
 
+def test_the_next_one_follows_when_those_before_it_live_anew() -> None:
+    one = wanting("robot1")
+    assert not one.is_due(ELECTORS, others("robot1", "edge1", "edge2"), FIRST_S - 0.1), "the first one may still wait"
+    assert not one.is_due(ELECTORS, others("robot1", "edge2"), FIRST_S + 1.0), "edge1 has not begun anew"
+    both = others("robot1", "edge1", "edge2")
+    assert not one.is_due(ELECTORS, both, FIRST_S + 2.0)
+    assert not one.is_due(ELECTORS, both, FIRST_S + 1.9 + SETTLE_S), "their workers start"
+    assert one.is_due(ELECTORS, both, FIRST_S + 2.0 + SETTLE_S)
+    assert not one.is_due(ELECTORS, both, FIRST_S + 2.0 + SETTLE_S, is_free=False), "nobody could take its task"
+    assert one.due_at is not None
+    assert one.is_due(ELECTORS, both, one.due_at, is_free=False), "that is not waited for without end"
+
+
+def test_one_that_dies_again_is_waited_for_until_the_latest() -> None:
+    one = wanting("robot1")
+    assert not one.is_due(ELECTORS, others("robot1", "edge1", "edge2"), 4.0)
+    assert not one.is_due(ELECTORS, lives("edge1", "robot2", anew=("edge1",)), 4.5)
+    both = others("robot1", "edge1", "edge2")
+    assert not one.is_due(ELECTORS, both, 5.0 + SETTLE_S / 2), "it counts anew"
+    assert one.is_due(ELECTORS, both, 5.0 + 2 * SETTLE_S)
+
+
+def test_a_life_that_was_not_known_before_proves_nothing() -> None:
+    one = Reopening("edge1")
+    one.want(ORDER, lives("robot1", "robot2"), 0.0)
+    assert not one.is_due(ELECTORS, others("edge1", "edge2"), FIRST_S + 5.0)
+    assert one.due_at == FIRST_S + TURN_S
+
+
 def test_a_turn_that_is_set_stays_until_nothing_is_wanted_any_more() -> None:
     one = Reopening("edge2")
     assert not one.is_due(ELECTORS, others("edge2"), 1e9)
-    one.want(ORDER, 100.0)
-    one.want(ORDER, 102.0)
-    assert one.is_due(ELECTORS, others("edge2"), 103.0)
+    one.want(ORDER, others("edge2"), 100.0)
+    one.want(ORDER, others("edge2"), 101.5)
+    assert one.is_due(ELECTORS, others("edge2"), 100.0 + FIRST_S)
     one.forget()
     assert not one.is_due(ELECTORS, others("edge2"), 103.0)
 
 
 def test_an_elector_waits_for_the_others_but_not_for_ever() -> None:
-    one = Reopening("edge1")
-    one.want(ORDER, 0.0)
+    one = wanting("edge1")
     assert one.due_at is not None
-    assert not one.is_due(ELECTORS, {"edge2", "robot1"}, one.due_at)
-    assert one.is_due(ELECTORS, {"robot1", "robot2"}, one.due_at), "edge2 is no elector"
-    assert one.is_due(ELECTORS, {"robot1"}, one.due_at + PATIENCE_S)
-    edge = Reopening("edge2")
-    edge.want(ORDER, 0.0)
-    assert edge.is_due(ELECTORS, set(), FIRST_S), "who is no elector waits for nobody"
+    assert not one.is_due(ELECTORS, lives("edge2", "robot1"), one.due_at)
+    assert one.is_due(ELECTORS, lives("robot1", "robot2"), one.due_at), "edge2 is no elector"
+    assert one.is_due(ELECTORS, lives("robot1"), one.due_at + PATIENCE_S)
+    edge = wanting("edge2")
+    assert edge.is_due(ELECTORS, {}, FIRST_S), "who is no elector waits for nobody"
 
 
 def test_a_single_elector_waits_for_nobody() -> None:
     one = Reopening("robot1")
-    one.want(("robot1",), 0.0)
-    assert one.is_due(("robot1",), (), FIRST_S)
+    one.want(("robot1",), {}, 0.0)
+    assert one.is_due(("robot1",), {}, FIRST_S)
 
 
 def test_what_cannot_be_now_is_tried_again_later() -> None:
     one = Reopening("robot1")
-    one.want(("robot1",), 0.0)
+    one.want(("robot1",), {}, 0.0)
     one.put_off(FIRST_S)
-    assert not one.is_due(("robot1",), (), FIRST_S + PATIENCE_S - 1)
-    assert one.is_due(("robot1",), (), FIRST_S + PATIENCE_S)
+    assert not one.is_due(("robot1",), {}, FIRST_S + PATIENCE_S - 1)
+    assert one.is_due(("robot1",), {}, FIRST_S + PATIENCE_S)
