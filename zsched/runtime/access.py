@@ -43,14 +43,14 @@ class StreamAccess:
         dialled = dial_endpoint(spec.listen_data, spec.host) if spec.listen_data else ""
         is_direct = node == self._me or bool(dialled)
         connect = self._own if node == self._me or not dialled else (dialled,)
-        sides = {"fleet": self._config(connect)}
-        if node == self._me and spec.local is not None:
-            sides["local"] = self._config(_ways_to(spec.local))
+        sides = {"fleet": self._config(connect, self._operator_json5)}
+        if node == self._me and spec.local is not None:  # plain text and for this host, whatever the fleet's side is
+            sides["local"] = self._config(_ways_to(spec.local), "")
         return {"sides": sides, "via": node if is_direct else self._me, "endpoints": list(connect)}
 
-    def _config(self, connect: tuple[str, ...]) -> str:
+    def _config(self, connect: tuple[str, ...], operator_json5: str) -> str:
         return zenoh_config.client_config(
-            connect=connect, timing=self._fleet.timing, shared_memory=False, operator_json5=self._operator_json5
+            connect=connect, timing=self._fleet.timing, shared_memory=False, operator_json5=operator_json5
         )
 
 

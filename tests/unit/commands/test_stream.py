@@ -134,6 +134,13 @@ def test_the_own_relay_is_the_way_to_the_own_streams_and_the_local_side_is_anoth
     assert json.loads(found["sides"]["local"])["connect"]["endpoints"] == ["tcp/127.0.0.1:7447"]
 
 
+def test_the_local_side_of_a_secured_fleet_is_plain_text() -> None:
+    secured = StreamAccess(FLEET, "robot1", ("tls/127.0.0.1:9999",), '{transport: {link: {protocols: ["tls"]}}}')
+    sides = {name: json.loads(text) for name, text in secured.answer("robot1")["sides"].items()}
+    assert sides["fleet"]["transport"]["link"]["protocols"] == ["tls"]
+    assert not sides["local"].get("transport", {}).get("link", {}).get("protocols"), "it dials tcp"
+
+
 def test_another_node_is_dialled_where_the_file_says_how() -> None:
     found = access("robot1").answer("edge1")
     assert (found["via"], found["endpoints"]) == ("edge1", ["tcp/192.0.2.11:7458"])
