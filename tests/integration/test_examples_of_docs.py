@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 import sys
@@ -121,6 +122,10 @@ def test_the_first_fleet_by_its_verbs_answers_its_application(tmp_path: Path) ->
             text = text.replace(old, new)
         said = run_text(text)
         owner = hall.status("robot1")["tasks"][0]["owner"]
+        doctor = json.loads(hall.run("robot1", "doctor", "--fleet", "--json").stdout)
+    verdicts = {one["id"]: one["verdict"] for one in doctor["checks"]}
+    wanted = ("file.in_force", "file.warnings", "state.elector", "fleet.files", "worker.command", "stream.twice")
+    assert {name: verdicts[name] for name in wanted} == dict.fromkeys(wanted, "PASS"), doctor
     assert len(said) >= 17  # the first ones may be put too early, and the last answers come too late
     first = int(said[0].split()[1])
     last = first + len(said)
