@@ -53,6 +53,7 @@ STARTED_BEFORE = (
     "there: the session {owner}-{task}.zenoh.json5 has this robot's address since"
 )
 INIT_THERE = "stop zsched there, run `zsched init` (it asks the fleet, and refuses where that is unsafe), and start it"
+RECOVER = "stop zsched on one that has its state, run `zsched recover` there, and start it"
 UNREADY_SHOWN_S = 2.0
 """A slot that no worker takes for longer is a problem: a handover takes less."""
 
@@ -129,7 +130,10 @@ def _problems(node: Stages, quorum: QuorumStatus, now: float) -> tuple[str, ...]
             f"{len(quorum.apart)} of {quorum.electors}: {', '.join(quorum.apart)}; they and this node refuse each other"
         )
     if not quorum.ok:
-        problems.append(f"no quorum: {quorum.alive} of {quorum.electors} electors can answer, {quorum.needed} needed")
+        told = f"no quorum: {quorum.alive} of {quorum.electors} electors can answer, {quorum.needed} needed"
+        problems.append(
+            told + (f"; if the others are gone for good, {RECOVER}" if node.agreement.document_hash else "")
+        )
         if not is_alone:
             problems += [f"elector {told}" for name in node.fleet.electors if (told := _why_silent(node, name, now))]
     elif quorum.alive == quorum.needed < quorum.electors:
@@ -164,8 +168,10 @@ def _never_had_one(node: Stages, quorum: QuorumStatus) -> list[NodeId]:
 
 def _nothing_agreed(node: Stages, quorum: QuorumStatus, fresh: list[NodeId]) -> str:
     """The way out of too many missing states: `init` where it was forgotten, else a new generation."""
-    number = node.agreement.newest_generation + 1
     what = "nothing can be agreed: too many electors without their states"
+    if node.agreement.document_hash:
+        return f"{what} (each says why); if these are lost, {RECOVER}"
+    number = node.agreement.newest_generation + 1
     if quorum.electors - len(quorum.stateless) + len(fresh) < quorum.needed:
         return f"{what} (each says why); if these are lost, {way_out(number)}"
     return f"{what}. No state file on {', '.join(fresh)}: {INIT_THERE}. Only where it refuses, {way_out(number)}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from random import Random
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 
@@ -36,6 +37,7 @@ from zsched.core.values.model import (
 )
 from zsched.core.values.plan import StreamCount
 from zsched.core.values.snapshot import SCHEMA, Snapshot
+from zsched.core.vote.agreement import Agreement
 from zsched_lab.sim.simulator import Simulator
 
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
@@ -121,6 +123,18 @@ def test_electors_that_have_lost_their_state_are_named_and_count_for_nothing() -
     node.handle(ev.BeatReceived(beat=again), 100.5)
     quorum = build_snapshot(node, 100.5).quorum
     assert (quorum.alive, quorum.ok, quorum.stateless) == (2, True, ("robot3",))
+
+
+def test_where_a_document_is_agreed_a_lost_majority_is_recovered_on_one_node() -> None:
+    node = make()
+    for sequence, name in enumerate(("robot2", "robot3"), 2):
+        node.handle(ev.BeatReceived(beat=beat_of(name, sequence, incarnation=3, has_lost_state=True)), 100.0)
+    with patch.object(Agreement, "document_hash", "0d"):
+        problems = build_snapshot(node, 100.0).problems
+    assert problems[1].startswith("no quorum: 1 of 3 electors can answer, 2 needed; if the others are gone for good, ")
+    assert problems[2].startswith("nothing can be agreed: too many electors without their states (each says why); ")
+    assert problems[2].endswith("run `zsched recover` there, and start it")
+    assert not any("--generation" in one for one in problems)
 
 
 def forgotten(me: str = "robot1", *, lacks_file: bool = True, stateless: tuple[str, ...] = ROBOTS) -> Node:

@@ -131,8 +131,9 @@ class Agreement:
         self.is_elector = durable is not None and me in fleet.electors and not self._disputed and not self._lost
         self._problems: dict[str, str] = {}
         if durable is not None and self._lost:
-            text = _moved_text(durable) if durable.joins else _lost_text(self._lost, self.newest_generation)
-            self._problems["state"] = text
+            value = None if durable.fleet_register is None else durable.fleet_register.learnt
+            lost = _lost_text(self._lost, self.newest_generation, is_agreed=value is not None and bool(value.document))
+            self._problems["state"] = _moved_text(durable) if durable.joins else lost
         if self._disputed:
             self._problems["state"] = f"{self._disputed}; no elector until `zsched init --settle`"
         self.counters: Counter[str] = Counter()
@@ -746,7 +747,7 @@ class Agreement:
         if not why or self._lost or not self.is_elector:
             return
         self._lost = why
-        self._problems["state"] = _lost_text(why, self.newest_generation)
+        self._problems["state"] = _lost_text(why, self.newest_generation, is_agreed=bool(self.document_hash))
         self._stop_electing()
         todo.must_persist = True
 
@@ -887,8 +888,12 @@ def _moved_text(durable: DurableState) -> str:
     )
 
 
-def _lost_text(why: str, newest_generation: int) -> str:
+def _lost_text(why: str, newest_generation: int, *, is_agreed: bool) -> str:
+    """``is_agreed``: the fleet goes by an agreed document, in which another disk is another member."""
+    until = f"a new generation ({way_out(newest_generation + 1)})"
+    if is_agreed:
+        until = "it is added as one anew, which `electorate: auto` does by itself once another has its seat"
     return (
-        f"{why}: it was brought back from a backup, or its disk has lost what it said was written; "
-        f"no elector until a new generation ({way_out(newest_generation + 1)})"
+        f"{why}: it was brought back from a backup, or its disk has lost what it said was written; no elector until "
+        f"{until}"
     )

@@ -115,9 +115,15 @@ def objection(
     if any(answer.quorum.number and node not in answer.quorum.names for answer in current):
         knows = None  # its seat went with its disk, and a new disk is another member
     if newest >= generation and knows is not None:
+        again = f"To make it an elector again, {way_out(newest + 1)}"
+        if any(answer.quorum.number for answer in current):
+            again = (
+                "The others give its seat to another node that is fit (`zsched fleet show`); then `zsched init` makes "
+                "it a new member. Where nothing can be agreed any more: zsched recover, on another one"
+            )
         return (
             f"{knows} knows {node} as an elector that has voted; a blank state would let it vote twice. Without a "
-            f"state it works all the same and votes no more. To make it an elector again, {way_out(newest + 1)}"
+            f"state it works all the same and votes no more. {again}"
         )
     if newest > generation:
         return (

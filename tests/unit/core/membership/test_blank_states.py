@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from support.fleets import tuning_of
@@ -90,6 +92,16 @@ def test_nothing_lets_a_node_vote_twice_in_a_generation_or_stay_behind_it(forced
     assert "has voted" in (why(1, new, is_forced=forced) or "")
     assert "--generation 2 --force` on every node" in (why(1, new, is_forced=forced) or "")
     assert "join it with" in (why(1, says(revision=2 * GENERATION_STEP), is_forced=forced) or "")
+
+
+def test_where_electors_are_agreed_another_node_takes_the_seat_first() -> None:
+    agreed = says("robot2", voted=("robot3",))
+    agreed = replace(agreed, quorum=replace(agreed.quorum, number=4, names=("robot1", "robot2", "robot3")))
+    told = why(0, agreed) or ""
+    assert "would let it vote twice" in told
+    assert "The others give its seat to another node that is fit" in told
+    assert "--generation" not in told
+    assert why(0, replace(agreed, quorum=replace(agreed.quorum, names=("robot1", "robot2")))) is None, "it has no seat"
 
 
 def test_a_node_joins_a_new_generation_that_others_have_begun_whatever_the_rest_says() -> None:

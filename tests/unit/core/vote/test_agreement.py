@@ -16,6 +16,7 @@ from support.states import state_of
 from support.todos import agreed
 from zsched.core import events as ev
 from zsched.core import instructions as do
+from zsched.core.electorate.founding import founded
 from zsched.core.todo import ToDo
 from zsched.core.values.change import MoveOwner
 from zsched.core.values.fleet import TaskSpec
@@ -553,9 +554,14 @@ def test_a_state_that_was_brought_back_says_so_in_this_life_and_the_next() -> No
     again = Agreement(fleet=FLEET, me="robot1", durable=lost, incarnation=8, electorate="e", rng=Random(1), now=0.0)
     assert not again.is_elector
     assert again.problems["state"].startswith("peers remember 9 votes, here are 3: it was brought back from a backup")
+    assert "--generation" in again.problems["state"]
     kept = again.to_persist(100.0)
     assert kept is not None
     assert kept.lost == lost.lost
+    value = replace(founded(FLEET.name, 0, FLEET.electors), document="0d", revision=3)
+    agreed = replace(lost, fleet_register=RegisterState(task=FLEET.name, learnt=value))
+    other = Agreement(fleet=FLEET, me="robot1", durable=agreed, incarnation=8, electorate="e", rng=Random(1), now=0.0)
+    assert other.problems["state"].endswith("which `electorate: auto` does by itself once another has its seat")
 
 
 def test_another_generation_teaches_nothing_and_is_shown_until_it_is_gone() -> None:
