@@ -6,7 +6,7 @@ Machines come by the verbs, as an operator gives them (`zsched_lab.fleet.hall`);
 * join: from the start of `zsched invite` until the new node is alive for the first machine and counts by the newest
   value itself (two verbs and the start of a daemon are in it).
 * apply: from the start of `zsched apply` of another document until every node goes by it.
-* replace: from SIGKILL of an elector until the electors are settled without it, with ``replace_s: 2``.
+* replace: from the power cut of an elector until the electors are settled without it, with ``replace_s: 2``.
 * leave: of the newest machine, until its daemon has ended; `drain`, seat, document and file are in it.
 
 ``packets`` and ``kB`` are what left all nodes' interfaces meanwhile, less what they send at rest in that time.
@@ -163,7 +163,7 @@ class Fleet:
     def replace(self) -> None:
         """An elector dies; the others settle without it."""
         dead = next(name for name in reversed(self.quorum(self.names[0])["names"]) if name != self.names[0])
-        self.hall.kill(dead)
+        self.hall.power_off(dead)
         self.names.remove(dead)
         self.wait(lambda: dead not in self.quorum(self.names[0])["names"], f"{dead} is no elector any more")
         self.wait(lambda: bool(self.quorum(self.names[0])["ok"]), "settled")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import socket
 import ssl
 import subprocess
@@ -15,10 +16,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-import psutil
-
 from zsched.adapters.host.operator_socket import ask
 from zsched.errors import AdapterError
+from zsched_lab.fleet.netbed import stop_group
 from zsched_lab.fleet.netns import Network
 
 
@@ -86,15 +86,12 @@ class Hall:
     def _on(self, node: str, command: list[str | Path]) -> list[str | Path]:
         return command if self._network is None else self._network.wrap(node, command)
 
-    def kill(self, node: str) -> None:
-        """End a node's daemon and its relay as a power cut does."""
-        process = self._daemons.pop(node)
-        relays = [child for child in psutil.Process(process.pid).children(recursive=True) if child.is_running()]
-        process.kill()
-        process.wait()
-        for child in relays:
-            with contextlib.suppress(psutil.NoSuchProcess):
-                child.kill()
+    def power_off(self, node: str) -> None:
+        """The machine is gone at once: in a network nobody sees its sockets close."""
+        if self._network is not None:
+            self._network.link(node, is_up=False)
+        stop_group(self.pid(node), signal.SIGKILL)
+        self._daemons.pop(node).wait(10)
 
     def stop(self, *nodes: str) -> None:
         """Stop daemons (default: all)."""
