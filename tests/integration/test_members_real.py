@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import zenoh
@@ -95,8 +96,11 @@ def test_a_fleet_grows_from_one_machine_and_shrinks_to_none_while_a_stream_runs(
             reached = len(stream.back)
             until(lambda: len(stream.back) > reached + 20, "the last machine does the task alone")
             stream.end()
-            until(lambda: len(stream.back) >= stream.sent, "every sample is answered")
-            assert stream.back == list(range(stream.sent)), "nothing is lost or doubled"
+            with contextlib.suppress(AssertionError):
+                until(lambda: len(stream.back) >= stream.sent, "every sample is answered", 20.0)
+            missing = sorted(set(range(stream.sent)) - set(stream.back))
+            assert not missing, f"{missing} of {stream.sent}: {hall.status('robot1')['tasks'][0]}"
+            assert stream.back == list(range(stream.sent)), "nothing is doubled"
 
         refused = hall.run("robot1", "leave", "--yes")
         assert (refused.returncode, "--accept last-node" in refused.stderr) == (1, True), refused

@@ -21,10 +21,20 @@ from zsched.errors import AdapterError
 from zsched_lab.fleet.netbed import stop_group
 from zsched_lab.fleet.netns import Network
 
+FIRST_PORT, LAST_PORT, BLOCK = 21_000, 31_800, 40
+
 
 def block_of_ports(count: int) -> int:
-    """The first of ``count`` ports in a row that nobody has now."""
-    for first in range(21_000, 32_000, count):
+    """The first of ``count`` ports (at most `BLOCK`) in a row that nobody has now.
+
+    Processes that look at the same time begin at different places, or they would find the same ones.
+
+    Raises:
+        AssertionError: there are none.
+    """
+    blocks = tuple(range(FIRST_PORT, LAST_PORT, BLOCK))
+    begin = os.getpid() % len(blocks)
+    for first in (*blocks[begin:], *blocks[:begin]):
         with contextlib.ExitStack() as stack:
             try:
                 for port in range(first, first + count):
