@@ -143,7 +143,10 @@ def test_a_slam_that_moves_takes_its_map_along(tmp_path: Path) -> None:
         seen = len(maps)
 
         assert bed.wait_settled() == other
-        assert all(math.hypot(pose.x, pose.y) < 0.15 for _, pose in poses)
+        far = [(stamp, pose) for stamp, pose in poses if math.hypot(pose.x, pose.y) >= 0.15]
+        assert not far, (
+            f"{len(far)} of {len(poses)}, {sum(one[0] > stopped_ns for one in far)} of them after the move: {far[:3]}"
+        )
         assert decode_grid(maps[-1]).known_area_m2 >= 0.95 * decode_grid(maps[0]).known_area_m2
         assert seen > 1
         del kept

@@ -19,7 +19,7 @@ from support.states import state_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.membership.identity import QUIET_S
-from zsched.core.membership.knocking import KNOCKERS_KEPT
+from zsched.core.membership.knocking import KNOCKERS_KEPT, SHOWN_AFTER_S
 from zsched.core.node import Node
 from zsched.core.status import build_snapshot
 from zsched.core.values.document import Text
@@ -573,23 +573,35 @@ def test_another_fleet_file_is_a_problem_until_it_is_the_same() -> None:
 
 def test_a_node_that_our_file_does_not_name_is_told_while_it_beats() -> None:
     node = started()
-    for number in range(9):
-        knock = replace(beat(f"robot{number + 10}"), fleet_file="0123456789abcdef")
-        node.handle(ev.BeatReceived(beat=knock), 100.0)
-    said = [one for one in build_snapshot(node, 100.0 + QUIET_S - 0.01).problems if "beats in this fleet" in one]
+
+    def knock(now: float, *numbers: int) -> None:
+        for number in numbers:
+            beat_ = replace(beat(f"robot{number + 10}", round(now * 10)), fleet_file="0123456789abcdef")
+            node.handle(ev.BeatReceived(beat=beat_), now)
+
+    def told(now: float) -> list[str]:
+        return [one for one in build_snapshot(node, now).problems if "beats in this fleet" in one]
+
+    knock(100.0, *range(9))
+    assert told(100.0) == [], "one that has just been taken out ends in a moment"
+    last = 100.0 + SHOWN_AFTER_S
+    knock(last, *range(9))
+    said = told(last + QUIET_S - 0.01)
     assert len(said) == KNOCKERS_KEPT
     assert said[0].startswith(
         "fleet/robot10: robot10 beats in this fleet, goes by another fleet file (0123456789abcdef, "
     )
     assert "and is in no line of this one: compare them (`zsched check` tells a file's hash)" in said[0]
-    agreed = node.knocking.problems(100.0, is_agreed=True)
+    agreed = node.knocking.problems(last, is_agreed=True)
     assert agreed[0] == (
         "fleet/robot10: robot10 beats in this fleet, and the agreed document does not name it: `zsched leave` on that "
         "machine if it was taken out, `zsched invite robot10` here if it shall come"
     )
-    assert not any("robot1" in one for one in build_snapshot(node, 100.0 + QUIET_S).problems)
-    node.handle(ev.BeatReceived(beat=beat("robot99")), 100.0 + QUIET_S)
-    assert any("robot99" in one for one in build_snapshot(node, 100.0 + QUIET_S).problems), "the others made room"
+    assert told(last + QUIET_S) == []
+    again = last + QUIET_S
+    knock(again, 89)
+    knock(again + SHOWN_AFTER_S, 89)
+    assert any("robot99" in one for one in told(again + SHOWN_AFTER_S)), "the others made room"
 
 
 def test_our_own_token_is_no_problem() -> None:
