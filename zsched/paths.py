@@ -14,6 +14,7 @@ from pathlib import Path
 from zsched.core.values.model import NodeId
 
 SYSTEM_CONFIG = Path("/etc/zsched/fleet.yaml")
+SYSTEM_RUNTIME = Path("/run/zsched")
 SESSION_SUFFIX = ".zenoh.json5"
 """Of a worker's session file, ``<node>-<task>`` before it; other files of the worker stand beside it."""
 PID_SUFFIX = ".pid"
@@ -46,7 +47,17 @@ def state_folder(given: Path | None, env: Mapping[str, str]) -> Path:
 
 def runtime_folder(given: Path | None, env: Mapping[str, str]) -> Path:
     """Where the operator socket is: the argument, ``ZSCHED_RUNTIME_DIR``, systemd's, ``/run/zsched`` or the user's."""
-    return _folder(given, env, "ZSCHED_RUNTIME_DIR", "RUNTIME_DIRECTORY", Path("/run/zsched"), "XDG_RUNTIME_DIR")
+    return _folder(given, env, "ZSCHED_RUNTIME_DIR", "RUNTIME_DIRECTORY", SYSTEM_RUNTIME, "XDG_RUNTIME_DIR")
+
+
+def asked_folder(given: Path | None, env: Mapping[str, str], system: Path = SYSTEM_RUNTIME) -> Path:
+    """Where somebody who asks looks for a daemon: as `runtime_folder`, but the service's where there is none of theirs.
+
+    ``system``: but in tests the service's folder.
+    """
+    own = runtime_folder(given, env)
+    is_told = given is not None or bool(env.get("ZSCHED_RUNTIME_DIR"))
+    return system if not is_told and not local_sockets(own) and local_sockets(system) else own
 
 
 def authority_folder(given: Path | None, env: Mapping[str, str], fleet: str) -> Path:

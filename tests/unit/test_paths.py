@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 
@@ -88,3 +89,18 @@ def test_host_name_becomes_a_name_of_the_fleet_file(host: str, name: str, monkey
     monkeypatch.setattr("socket.gethostname", lambda: host)
     assert places.node_name(None, {}) == name
     assert NAME.fullmatch(name)
+
+
+def test_who_asks_finds_the_service_where_no_daemon_of_theirs_runs(tmp_path: Path) -> None:
+    own, system = tmp_path / "user" / "zsched", tmp_path / "run"
+    env = {"XDG_RUNTIME_DIR": str(tmp_path / "user")}
+    for folder in (own, system):
+        folder.mkdir(parents=True)
+    with patch("os.geteuid", return_value=1000):
+        assert places.asked_folder(None, env, system) == own, "nobody is anywhere"
+        (system / "robot1.sock").touch()
+        assert places.asked_folder(None, env, system) == system
+        told = {**env, "ZSCHED_RUNTIME_DIR": str(own)}
+        assert places.asked_folder(None, told, system) == places.asked_folder(own, env, system) == own
+        (own / "robot2.sock").touch()
+        assert places.asked_folder(None, env, system) == own, "their own come first"

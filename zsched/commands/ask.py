@@ -61,7 +61,7 @@ def find_door(
         if node is not None and not NAME.fullmatch(node):
             raise CliError(EXIT_USAGE, f"--node: {node!r} is not a name")
         return Door(socket=Path(), node=node, endpoint=endpoint_of(connect))
-    runtime = places.runtime_folder(runtime_dir, env)
+    runtime = places.asked_folder(runtime_dir, env)
     sockets = {path.stem: path for path in places.local_sockets(runtime)}
     if not sockets:
         why = "the folder cannot be read" if runtime.exists() and not os.access(runtime, os.R_OK) else "no socket there"
@@ -98,7 +98,7 @@ def name_here(given: str | None, runtime_dir: Path | None, env: Mapping[str, str
     Raises:
         CliError: there are several daemons, and none is meant (2).
     """
-    runtime, own = places.runtime_folder(runtime_dir, env), places.node_name(given, env)
+    runtime, own = places.asked_folder(runtime_dir, env), places.node_name(given, env)
     sockets = {path.stem: path for path in places.local_sockets(runtime)}
     if given or env.get("ZSCHED_NODE") or own in sockets or not sockets:
         return own

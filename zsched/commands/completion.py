@@ -123,7 +123,7 @@ def fleet_names(kind: str) -> list[str]:
 
 def _from_daemon(kind: str) -> list[str]:
     with contextlib.suppress(AdapterError, OSError, KeyError):
-        sockets = places.local_sockets(places.runtime_folder(None, os.environ))
+        sockets = places.local_sockets(places.asked_folder(None, os.environ))
         own = places.node_name(None, os.environ)
         for path in sorted(sockets, key=lambda path: path.stem != own)[:1]:
             answer: Json = ask(path, {"verb": "status"}, ANSWER_S)

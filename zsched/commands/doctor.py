@@ -40,7 +40,7 @@ def machine_of(config: Path | None, node: str | None, state_dir: Path | None, ru
     return Machine(
         file=places.config_path(config, os.environ),
         state_folder=places.state_folder(state_dir, os.environ),
-        runtime_folder=places.runtime_folder(runtime_dir, os.environ),
+        runtime_folder=places.asked_folder(runtime_dir, os.environ),
         node=name_here(node, runtime_dir),
     )
 

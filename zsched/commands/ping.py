@@ -70,7 +70,7 @@ def ping_node(
         ConfigError: the fleet file cannot be used.
     """
     me = name_here(me, runtime_dir)
-    socket = places.socket_path(places.runtime_folder(runtime_dir, os.environ), me)
+    socket = places.socket_path(places.asked_folder(runtime_dir, os.environ), me)
     here = _own_status(socket)
     fleet = load_fleet(places.config_path(config, os.environ))
     names = [spec.name for spec in fleet.nodes]

@@ -66,4 +66,4 @@ def rehearse(
     order = verb.RehearseOrder(
         task=task, steps=verb.parse_steps(steps), rounds=rounds, pause_s=pause, limit_s=limit, cut_s=cut
     )
-    raise typer.Exit(verb.rehearse(view, order, places.runtime_folder(runtime_dir, os.environ)))
+    raise typer.Exit(verb.rehearse(view, order, places.asked_folder(runtime_dir, os.environ)))
