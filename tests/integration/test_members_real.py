@@ -21,7 +21,7 @@ tasks:
     weights: {cpu: 0.5, memory: 0.5}
     scheduling: {score: paper, cool_down_s: 0}
     worker: {command: [python, -m, zsched.tasks.echo]}
-    inputs: [{from: "{robot}/in", to: "{target}/echo/{robot}/in", class: reliable}]
+    inputs: [{from: "{robot}/in", to: "{target}/echo/{robot}/in", class: reliable, on_crash: replay}]
     outputs:
       - {from: "{target}/echo/{epoch}/{robot}/out", to: "{robot}/out", class: reliable, handover: all}
 """
@@ -100,7 +100,9 @@ def test_a_fleet_grows_from_one_machine_and_shrinks_to_none_while_a_stream_runs(
                 until(lambda: len(stream.back) >= stream.sent, "every sample is answered", 20.0)
             missing = sorted(set(range(stream.sent)) - set(stream.back))
             assert not missing, f"{missing} of {stream.sent}: {hall.status('robot1')['tasks'][0]}"
-            assert stream.back == list(range(stream.sent)), "nothing is doubled"
+            # a worker that starts again may answer once more what it has answered in its last 0.1 s
+            again = len(stream.back) - stream.sent
+            assert 0 <= again <= 80, hall.status("robot1")["tasks"][0]
 
         refused = hall.run("robot1", "leave", "--yes")
         assert (refused.returncode, "--accept last-node" in refused.stderr) == (1, True), refused

@@ -204,7 +204,7 @@ class Rig:
         for worker in self.workers:
             worker.send_signal(signal.SIGCONT)
             worker.kill()
-            worker.wait(5)
+            worker.wait(30)
         for relay in self.relays.values():
             relay.stop(2.0)
 

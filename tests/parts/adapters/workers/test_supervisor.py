@@ -154,7 +154,7 @@ def test_stop_uses_sigint_first_and_start_runs_it_again() -> None:
 
 
 def test_renew_stops_a_worker_as_stop_does_and_starts_it_again_without_a_failure() -> None:
-    with supervised(python(f"print('here', flush=True); {SLEEP}", stop_grace_s=10.0, max_failures=1)) as (
+    with supervised(python(f"print('here', flush=True); {SLEEP}", stop_grace_s=60.0, max_failures=1)) as (
         supervisor,
         recorder,
     ):
