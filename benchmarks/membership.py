@@ -137,7 +137,7 @@ class Fleet:
         """One machine more."""
         name = self._next()
         kind = "edge" if self._made % 2 == 0 else "robot"
-        words = ("--kind", kind, *self._address(name), "--yes")
+        words = ("--kind", kind, *self._address(name), "--yes", "--accept", "pause-task")
         invitation = self.folder / f"{name}.invite"
         invitation.write_text(self.hall.zsched(self.names[0], "invite", name, *words))
         self.hall.zsched(name, "join", str(invitation))
@@ -224,7 +224,7 @@ def sizes(nodes: int) -> list[str]:
     plain = blank_state(fleet, "m01", 0, None, incarnation=17_955_504_466, hardware="h" * 16, disk="")
     content = Document(text=Text(text))
     value = created(fleet, "m01", disk=disk, generation_id="ab" * 16, document=document_hash(content))
-    seats = tuple(Elector(name=name, disk=disk, joining=3) for name in names[:5])
+    seats = tuple(Elector(name=name, disk=disk, joining=1) for name in names[:5])
     held = RegisterState(task=fleet.name, learnt=replace(value, electors=seats))
     full = replace(plain, disk=disk, fleet_register=held)
     return [
@@ -236,7 +236,7 @@ def sizes(nodes: int) -> list[str]:
 
 def _node(name: str) -> str:
     listen = 'listen: {control: "tcp/0.0.0.0:7457", data: "tcp/0.0.0.0:7458"}'
-    return f"  {name}: {{kind: robot, host: 192.0.2.1, {listen}}}\n"
+    return f"  {name}: {{kind: robot, host: 192.0.2.{int(name[1:])}, {listen}}}\n"
 
 
 def main() -> None:
