@@ -2,9 +2,10 @@
 
 Knows: chunks, their checksum, how long a new owner waits. Does not know: what is in a snapshot, when roles change.
 
-One query, many replies: each at most `CHUNK` bytes, its attachment a `SnapshotChunk` that names its place, the size of
-the whole and its checksum. A new owner waits `FIRST_S` for the first chunk and for each next one, and ``timeout_s`` for
-all of them; whatever goes wrong is a cold start with a reason, never an error.
+One query, many replies. The first says that the state is `COMING`: an owner that is left because it is busy is longer
+about it than a dead one is waited for. Each other one is a chunk of at most `CHUNK` bytes, its attachment a
+`SnapshotChunk` that names its place, the size of the whole and its checksum. A new owner waits `FIRST_S` for the first
+reply, and ``timeout_s`` for all of them. Whatever goes wrong is a cold start with a reason, never an error.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import math
 import queue
 import threading
 from collections.abc import Callable
@@ -30,8 +32,12 @@ from zsched.ipc.pipe import decode_chunk, encode_chunk
 CHUNK: Final = 256 * 1024
 MAX_SNAPSHOT: Final = 32 << 20
 """Bytes; a larger one is refused by both sides."""
+COMING: Final = b"coming"
+"""Attachment of the reply that says, before a worker is asked for its state, that somebody is there who has one."""
 FIRST_S: Final = 0.3
 """Silence after which the predecessor is taken for dead; a relay's flip waits as long for the new owner."""
+SLICE_S: Final = 0.02
+"""Silence is counted in pieces of this length: a time in which this process did not run is no silence of another."""
 TIMEOUT_S: Final = 2.0
 CONTEST_S: Final = 0.1
 """So long a whole state waits for whoever else answers the same question."""
@@ -110,6 +116,7 @@ class Offer:
             _log.info("a snapshot could not be sent (%s)", error)
 
     def _answer(self, query: zenoh.Query) -> None:
+        query.reply(self._key, b"", attachment=COMING)
         try:
             content = self._snapshot()
         except Exception as error:  # noqa: BLE001 - the worker's own bug is the successor's cold start
@@ -201,9 +208,9 @@ def _assembled(replies: queue.SimpleQueue[zenoh.Reply | None], until: float) -> 
     has_come, whole, problem = False, b"", ""
     is_whole = False
     while True:
-        left_s = until - monotonic_s()
+        patience_s = CONTEST_S if is_whole else math.inf if has_come else FIRST_S
         try:
-            reply = replies.get(timeout=max(0.0, min(left_s, CONTEST_S if is_whole else FIRST_S)))
+            reply = _next_reply(replies, patience_s, until)
         except queue.Empty:
             if is_whole:
                 break
@@ -211,17 +218,35 @@ def _assembled(replies: queue.SimpleQueue[zenoh.Reply | None], until: float) -> 
         if reply is None:
             break
         has_come = True
-        result = _added(assembly, reply)
+        result = None if _is_coming(reply) else _added(assembly, reply)
         if isinstance(result, bytes):
             is_whole, whole = True, result
         problem = result if isinstance(result, str) else problem
-        if left_s <= 0:
+        if monotonic_s() >= until:
             return "late: it had not come in time"
     if assembly.is_contested:
         return "contested: two different states are offered"
     if is_whole:
         return whole
     return problem or ("incomplete: its worker died meanwhile" if has_come else "nobody offers one")
+
+
+def _next_reply(replies: queue.SimpleQueue[zenoh.Reply | None], patience_s: float, until: float) -> zenoh.Reply | None:
+    """The next one, ``None``: there are no more. `queue.Empty`: a silence of ``patience_s``, or it is ``until``."""
+    quiet_s = 0.0
+    while True:
+        piece_s = max(0.0, min(SLICE_S, patience_s - quiet_s, until - monotonic_s()))
+        try:
+            return replies.get(timeout=piece_s)
+        except queue.Empty:
+            quiet_s += SLICE_S
+            if quiet_s >= patience_s or monotonic_s() >= until:
+                raise
+
+
+def _is_coming(reply: zenoh.Reply) -> bool:
+    sample = reply.ok
+    return sample is not None and sample.attachment is not None and sample.attachment.to_bytes() == COMING
 
 
 def _added(assembly: Assembly, reply: zenoh.Reply) -> bytes | str | None:

@@ -276,8 +276,9 @@ class Worker:
     def on_snapshot(self, restore: Callable[[bytes], None], timeout_s: float = TIMEOUT_S) -> None:
         """Take the predecessor's state over when this worker becomes the owner; call it before `subscribe`.
 
-        ``restore`` runs in the dispatch thread before any input of the new epoch, at most ``timeout_s`` (0.3 s if the
-        predecessor is silent) after the role came; until then `role` is idle. Without a snapshot it is not called.
+        ``restore`` runs in the dispatch thread before any input of the new epoch, at most ``timeout_s`` after the role
+        came (0.3 s if the predecessor gives no sign of life); until then `role` is idle. Without a snapshot it is not
+        called.
         """
         self._errands.put(self._state_link.open)  # before it is needed, not in a move
         self._restorer.register(restore, timeout_s)

@@ -161,10 +161,56 @@ def test_a_silent_predecessor_costs_a_third_of_a_second(
     silent.undeclare()
 
 
-def test_a_snapshot_that_stops_half_way_is_late(
+def test_a_worker_that_is_long_in_giving_its_state_is_waited_for(
     sessions: tuple[zenoh.Session, zenoh.Session], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(worker_snapshot, "FIRST_S", 4.0)
+    """It is there, and says so: an owner that is left because it is busy is not taken for a dead one."""
+    monkeypatch.setattr(worker_snapshot, "FIRST_S", 5.0)
+    key, content = f"{KEY}/long", content_of(2 * CHUNK)
+
+    def snapshot() -> bytes:
+        time.sleep(6.0)
+        return content
+
+    offer = Offer(sessions[0], key, snapshot)
+    until_offered(sessions[1], key)
+    assert asked(sessions[1], key=key)[0] == content
+    offer.undeclare()
+
+
+def test_a_snapshot_that_does_not_follow_its_announcement_is_late(
+    sessions: tuple[zenoh.Session, zenoh.Session],
+) -> None:
+    key = f"{KEY}/never"
+    goes_on = threading.Event()
+    offer = Offer(sessions[0], key, lambda: bytes(goes_on.wait(PATIENCE_S)))
+    until_offered(sessions[1], key)
+    reason, took_s = asked(sessions[1], timeout_s=2.0, key=key)
+    assert str(reason).startswith("late")
+    assert took_s < PATIENCE_S
+    goes_on.set()
+    offer.undeclare()
+
+
+def test_time_in_which_the_new_owner_does_not_run_is_no_silence(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its machine stood still for a second, and all that was sent meanwhile comes right behind it."""
+    monkeypatch.setattr(worker_snapshot, "FIRST_S", 0.3)
+    sent: list[Exception | object] = [*[queue.Empty()] * 5, object()]
+    got = iter(sent)
+
+    class Replies:
+        def get(self, timeout: float) -> object:
+            time.sleep(timeout + 0.1)
+            one = next(got)
+            if isinstance(one, Exception):
+                raise one
+            return one
+
+    reply = worker_snapshot._next_reply(Replies(), worker_snapshot.FIRST_S, time.monotonic() + PATIENCE_S)  # type: ignore[arg-type] # a queue of a machine that stands still
+    assert reply is sent[-1]
+
+
+def test_a_snapshot_that_stops_half_way_is_late(sessions: tuple[zenoh.Session, zenoh.Session]) -> None:
     key = f"{KEY}/half"
     half = sessions[0].declare_queryable(key, zenoh.handlers.FifoChannel(4))
     until_offered(sessions[1], key)
@@ -178,7 +224,7 @@ def test_a_snapshot_that_stops_half_way_is_late(
 
     thread = threading.Thread(target=answer, daemon=True)
     thread.start()
-    reason, took_s = asked(sessions[1], key=key)
+    reason, took_s = asked(sessions[1], timeout_s=4.0, key=key)
     assert str(reason).startswith("late")
     assert took_s < PATIENCE_S
     thread.join(PATIENCE_S)
