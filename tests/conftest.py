@@ -6,6 +6,8 @@ that a test starts would inherit that, and tests of Ctrl-C would wait for ever.
 A test that finds a measured time too long is run up to three times: a machine is busy once, a fault is slow each time.
 Only tests of modules that measure times are marked for that: it costs a marked test 40 ms beside other processes.
 
+Below a red test with real processes stands how the machine was meanwhile (`support.stalls`).
+
 The garbage collector does not look again at what the collection of tests has made, and looks more seldom at the rest:
 that is 8 % of the CPU time of tests that play schedules.
 """
@@ -13,12 +15,23 @@ that is 8 % of the CPU time of tests that play schedules.
 from __future__ import annotations
 
 import gc
+import os
 import signal
+import tempfile
+from collections.abc import Generator
+from pathlib import Path
 
 import pytest
 
+from support.stalls import Moment, Stalls, now
+
 MEASURES = ("TooSlowError", "between", "within")
 """Names of `support.waiting` that a module imports whose tests measure times."""
+
+REAL = ("integration", "system", "parts", "bench")
+"""Folders of tests with real processes."""
+BEGAN = pytest.StashKey[Moment]()
+STALLS = pytest.StashKey[Stalls]()
 
 
 def pytest_configure() -> None:
@@ -39,8 +52,37 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(again)
 
 
-def pytest_collection_finish() -> None:
+def pytest_collection_finish(session: pytest.Session) -> None:
     """All modules of tests are imported."""
+    if any(_is_real(item) for item in session.items) and not session.config.option.collectonly:
+        file = Path(tempfile.gettempdir()) / f"zsched-tests-{os.getpid()}"
+        session.config.stash[STALLS] = Stalls(file)
     gc.collect()
     gc.freeze()
     gc.set_threshold(20_000, 20, 20)
+
+
+def _is_real(item: pytest.Item) -> bool:
+    return item.path.relative_to(item.config.rootpath).parts[1:2] in {(one,) for one in REAL}
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """A test begins, with its fixtures."""
+    item.stash[BEGAN] = now()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Say of a red test how the machine was."""
+    report = yield
+    stalls = item.config.stash.get(STALLS, None)
+    if report.failed and stalls is not None and BEGAN in item.stash:
+        report.sections.append(("The machine meanwhile", stalls.told(item.stash[BEGAN])))
+    return report
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """This process runs no more tests."""
+    if STALLS in config.stash:
+        config.stash[STALLS].close()
