@@ -9,7 +9,8 @@ REAL_JOBS ?= 4
 # How the tests with real processes are run; `.ci/run` gives failed ones a second chance, alone.
 PYTEST_REAL ?= -m pytest
 
-.PHONY: help demo test test-quick lint types format man bench clean
+.PHONY: help demo test test-cpu test-real test-quick lint types format man bench clean
+.NOTPARALLEL:
 
 help:  ## Show the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -31,9 +32,13 @@ $(VENV)/.dev: pyproject.toml lab/pyproject.toml $(VENV)/.python
 demo: $(VENV)/.lab  ## Watch six machines merge laser maps (DEMO_ARGS="--headless --out DIR" to choose)
 	$(BIN)/zsched demo $(DEMO_ARGS)
 
-# Real fleets of the system tests keep real time and fill a machine: they have it to themselves.
-test: $(VENV)/.dev  ## All tests: unit, paper, simulator, parts, integration and system (real daemons on localhost)
+test: test-cpu test-real  ## All tests
+
+test-cpu: $(VENV)/.dev  ## Tests that only need a processor: unit, paper, simulator
 	$(BIN)/python -m pytest -q -n $(TEST_JOBS) --dist loadfile tests/unit tests/paper tests/sim tests/planted
+
+# Real fleets of the system tests keep real time and fill a machine: they have it to themselves.
+test-real: $(VENV)/.dev  ## Tests with real processes: system, integration, parts, bench (real daemons on localhost)
 	$(BIN)/python $(PYTEST_REAL) -q --durations=10 tests/system
 	$(BIN)/python $(PYTEST_REAL) -q -n $(REAL_JOBS) --dist loadfile --no-loadscope-reorder --durations=10 tests/integration tests/parts
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile tests/bench
