@@ -251,7 +251,7 @@ def recover(
     yes: YesOption = False,
     accept: AcceptOption = None,
 ) -> None:
-    """Begin anew on one survivor when a majority of the electors is lost for good: it becomes the only elector.
+    """Begin a new generation on one survivor when a majority of the electors is lost for good.
 
     Tasks keep their newest values of all states that are given, under higher epochs. Its daemon must be stopped. It is
     refused while a majority of the electors can agree. Every other node changes sides by `zsched rejoin` there.
@@ -314,7 +314,7 @@ def _write_example(example: Example, folder: Path) -> None:
 
 
 def _heard(heard: Heard, name: str, generation: int, *, is_elector: bool) -> str:
-    """Who was asked before a blank state was written, and what that says."""
+    """Which nodes were asked before a blank state was written, and what their answers say."""
     if not heard.asked:
         return "no other node has an address in the fleet file: nobody was asked"
     asked = f"asked {_count(heard.asked, 'other nodes')}"
@@ -702,7 +702,7 @@ def bugreport(
     state_dir: StateOption = None,
     runtime_dir: RuntimeOption = None,
 ) -> None:
-    """Write one file for who shall look for a fault: every node's status, the doctor's words, the journal.
+    """Write one file for the person who looks for a fault: every node's status, the doctor's words, the journal.
 
     Secrets that a name gives away are taken out. It prints what is in the file.
     """

@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from typing import NamedTuple
 
 READ_S = 20e-6
-"""Two clocks that are read within so long are read at the same time."""
+"""Two clocks that are read within this time are read at the same time."""
 READ_TRIES = 20
 NAP_S = 1e-3
 """A shorter sleep is none: it is how long this process was put aside between two readings."""

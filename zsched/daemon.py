@@ -82,14 +82,14 @@ LOOK_S = 30.0
 CERTIFICATE = "certificate"
 """Of the problem that this node's certificate ends soon."""
 SESSIONS = "sessions"
-"""Of the problem that sessions cannot be opened anew."""
+"""Of the problem that sessions cannot be opened again."""
 STDERR = 2
 RESTART_SIGNAL = signal.SIGUSR2
 """As SIGTERM, but the relay stays and carries the streams on for the daemon that follows (`systemctl restart`)."""
 RELOAD_SIGNAL = signal.SIGHUP
 """Read the fleet file again and go by it (`systemctl reload`)."""
 ALERT_S, ALERT_WAIT_S = 1.0, 0.01
-"""After a token went, beats are looked at so often and for so long: they tell whether its node lives."""
+"""After a token went, beats are looked at this often and for this long: they tell whether its node lives."""
 
 log = logging.getLogger("zsched.daemon")
 
@@ -465,7 +465,7 @@ class Daemon:
                 self._next_status = now + 1.0
                 self._notify.status(status_line(node))
 
-    # --- sessions that are opened anew -------------------------------------------------------------------------------
+    # --- sessions that are opened again -------------------------------------------------------------------------------
 
     def _note_rules(self, lets_in_others: bool) -> None:
         self._lets_in_others, self._next_look = lets_in_others, 0.0
@@ -476,7 +476,7 @@ class Daemon:
         return result
 
     def _tend_sessions(self, node: Node, now: float) -> None:
-        """Begin anew when it is this node's turn and what its sessions were opened with holds no more."""
+        """Begin again when it is this node's turn and what its sessions were opened with holds no more."""
         if self.begins_anew:
             return
         electors, alive = node.fleet.electors, node.membership.alive()

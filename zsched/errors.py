@@ -1,4 +1,4 @@
-"""The error tree: what may be raised, and who is at fault.
+"""The error tree: what may be raised, and whose fault it is.
 
 ZschedError
 ├── ConfigError          the operator's file or arguments; lists every fault with its place

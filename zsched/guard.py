@@ -2,7 +2,7 @@
 
 Knows: what happens when a thread's function raises. Does not know: what threads do.
 
-An exception is logged with its stack, counted under the thread's name, and told to whom `on_failure` names (the daemon
+An exception is logged with its stack, counted under the thread's name, and reported to `on_failure` (the daemon
 and the relay show it in `status`). A thread that serves as long as its process lives (``is_lasting``) then begins
 again, after a pause that doubles while it keeps failing; one that has a single errand ends.
 """
@@ -23,7 +23,7 @@ from zsched.clock import monotonic_s
 PAUSE_S: Final = 0.1
 MAX_PAUSE_S: Final = 5.0
 CALM_S: Final = 60.0
-"""Who has run for so long fails for the first time again."""
+"""A thread that has run for this long fails for the first time again."""
 
 NAME_BYTES: Final = 15
 """So much of a thread's name the kernel keeps."""
@@ -71,7 +71,7 @@ def tolerant(callback: Callable[[T], object], kind: str) -> Callable[[T], None]:
 
 
 def _named(name: str, begin: Callable[[], None]) -> None:
-    """Tell the kernel the thread's name, for `top -H` and for who asks what a process costs."""
+    """Tell the kernel the thread's name, for `top -H` and other tools that show what a process costs."""
     with contextlib.suppress(OSError):
         Path(f"/proc/self/task/{threading.get_native_id()}/comm").write_bytes(name.encode()[:NAME_BYTES])
     begin()

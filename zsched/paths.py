@@ -51,7 +51,7 @@ def runtime_folder(given: Path | None, env: Mapping[str, str]) -> Path:
 
 
 def asked_folder(given: Path | None, env: Mapping[str, str], system: Path = SYSTEM_RUNTIME) -> Path:
-    """Where somebody who asks looks for a daemon: as `runtime_folder`, but the service's where there is none of theirs.
+    """Where a tool looks for a daemon: as `runtime_folder`, but the service's where there is none of theirs.
 
     ``system``: but in tests the service's folder.
     """

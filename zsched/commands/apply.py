@@ -63,11 +63,11 @@ class ApplyView:
     """The only revision that may be changed; ``None``: whichever is in force."""
     reason: str = ""
     is_data: bool = False
-    """Stdout is for something else: what is told goes to stderr."""
+    """Stdout is for something else: messages go to stderr."""
 
     @property
     def out(self) -> TextIO:
-        """Where what is told goes."""
+        """Where messages go."""
         return sys.stderr if self.is_data else sys.stdout
 
     def again(self, *more: str) -> str:
@@ -365,7 +365,7 @@ def _steps(door: Door, plan: Plan) -> Iterator[Json]:
 
 
 def _disks(door: Door, names: list[str]) -> dict[str, str]:
-    """{node: id of the disk with which it shall be an elector}.
+    """{node: id of the disk with which it becomes an elector}.
 
     Raises:
         CliError: one does not answer, or has no state.

@@ -27,7 +27,7 @@ IN_FORCE_S = 10.0
 """How long a change that is agreed is waited for at the node that was asked."""
 CODES = {"invalid": EXIT_FAILED, "conflict": EXIT_FAILED, "no_quorum": EXIT_DEGRADED, "unknown": EXIT_TIMED_OUT}
 TELL_S = 1.0
-"""After so long it says what it waits for."""
+"""After this time it says what it waits for."""
 ADVICE = {
     "conflict": "the fleet was changed meanwhile; look at it again with --plan",
     "no_quorum": "nothing was changed; `zsched fleet show` names the electors",

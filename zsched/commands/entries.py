@@ -41,7 +41,7 @@ def drop_node(door: Door, view: ApplyView, node: str, *, is_lost: bool) -> int:
     """Take a node out of the document; the exit code.
 
     Args:
-        door: whom to ask.
+        door: the daemon to ask.
         view: how the change is shown and confirmed.
         node: which one.
         is_lost: it does not come back: only a node that is not there may be forgotten.

@@ -2,7 +2,7 @@
 
 With ``--at`` a judgement of the past, out of the decision log of the node that is asked.
 
-Knows: whom to ask, the text, the schema ``zsched.explain/1``. Does not know: how a sum comes about
+Knows: which daemon to ask, the text, the schema ``zsched.explain/1``. Does not know: how a sum comes about
 (`zsched.core.scheduler.explain`), where a log lies (`zsched.adapters.host.decision_log`).
 """
 
@@ -321,7 +321,7 @@ def _made(page: Page, body: Json) -> None:
 
 
 def _seen(page: Page, body: Json) -> None:
-    """One robot's terms of every candidate, and whom it hears."""
+    """One robot's terms of every candidate, and the nodes that it hears."""
     sight = body["robot"]
     robot = sight["robot"]
     if sight["is_own"]:

@@ -26,11 +26,11 @@ from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE
 SCHEMA: Final = "zsched.drain/1"
 DRAIN, INELIGIBLE, LEAVE = "drain", "ineligible", "leave"
 ENDS: Final = {DRAIN: (DRAIN, LEAVE), INELIGIBLE: (INELIGIBLE,)}
-"""{flag: which ones go when it is taken back}: who is not drained any more does not leave, either."""
+"""{flag: which ones go when it is taken back}: a node that is not drained any more does not leave, either."""
 PAUSE_S: Final = 0.2
 """Between two looks at a node that is drained."""
 STAYS_S: Final = 3.0
-"""A task that has not left after so long is told, with the reason; again when the reason changes."""
+"""A task that has not left after this time is reported, with the reason; again when the reason changes."""
 NO_OTHER: Final = "no-other-candidate"
 """The danger: a task would have no candidate left that may get it."""
 NOTHING: Final = "-"
@@ -347,7 +347,7 @@ def _watch(watch: _Watch, nodes: Sequence[str], revision: int, deadline_s: float
 
 
 def _look(watch: _Watch, nodes: Sequence[str], revision: int) -> list[str]:
-    """Tell what is new, and say what is missing yet; who does not answer now is asked again."""
+    """Tell what is new, and say what is missing yet; a node that does not answer now is asked again."""
     try:
         first = _status(watch.view.door)
         found = _statuses(watch.view.door, first, nodes)

@@ -314,7 +314,7 @@ def _alive(way: _Way) -> list[str]:
 
 
 def _wait_until_known(way: _Way, revision: int) -> None:
-    """Wait until the others have that document; whoever does not in time learns it from them."""
+    """Wait until the others have that document; a node that does not in time learns it from them."""
     until = monotonic_s() + LEARN_S
     waiting = _alive(way)
     while waiting and monotonic_s() < until:

@@ -23,7 +23,7 @@ PAUSE_S: Final = 0.5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LogsView:
-    """Whom to ask and how to show it."""
+    """Which daemon to ask, and how to show the answer."""
 
     runtime_dir: Path | None
     node: str | None

@@ -160,7 +160,7 @@ def _entry_of(name: str, kind: NodeKind, address: Address | None, protocol: str)
 
 
 SECURITY_TEXT: Final = """\
-# Who has no certificate of this fleet is not let in. `operators: [NAME]` are people who command from elsewhere.
+# Only holders of this fleet's certificates are let in. `operators: [NAME]` are people who command from elsewhere.
 security: {}
 """
 
@@ -321,7 +321,7 @@ def _fleet_of(text: str) -> Fleet:
 
 
 def _with_guest(held: InForce, guest: Guest, address: Address | None) -> str:
-    """The document with the node, at the end of who dials whom, and among the candidates."""
+    """The document with the node, as the last one to dial, and among the candidates."""
     text = document_text(held)
     fleet = _fleet_of(text)
     entry = _entry_of(guest.name, guest.kind, address, _protocol(fleet))

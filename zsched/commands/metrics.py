@@ -1,7 +1,7 @@
 """`zsched metrics`: a status as Prometheus text (version 0.0.4), on stdout or in a file for node_exporter.
 
 Names follow Prometheus' conventions: a unit as suffix, ``_total`` for what only rises. Epochs and revisions are gauges:
-a new generation sets them anew. Nothing listens here: a file is written by a timer of the operator's, and
+a new generation sets them again. Nothing listens here: a file is written by a timer of the operator's, and
 `zsched web` answers with the same text.
 
 Knows: names, labels, the format, atomic writing. Does not know: what a figure means for a decision.
@@ -190,7 +190,7 @@ def write_metrics(path: Path, runtime_dir: Path | None, node: str | None, connec
 
 
 def _replace(path: Path, text: str) -> None:
-    """Put a file in the place of another: who reads meanwhile sees the old or the new one."""
+    """Put a file in the place of another: a reader sees the old or the new one."""
     try:
         descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
         try:

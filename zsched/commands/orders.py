@@ -65,7 +65,7 @@ Row = tuple[str, str, str, str]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OrderView:
-    """Whom to ask, and what the operator has said beside the order itself."""
+    """Which daemon to ask, and what the operator has said beside the order itself."""
 
     door: Door
     is_json: bool = False

@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 STYLES = {"bold": "1", "dim": "2", "red": "31", "green": "32", "yellow": "33", "stage": "1;36", "alarm": "1;31"}
 
 DROPS_OVER_S = 60.0
-"""Drops that have not risen for so long are history."""
+"""Drops that have not risen for this long are over."""
 
 Cell: TypeAlias = tuple[str, str]
 """A text and its style ("" for none)."""

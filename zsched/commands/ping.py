@@ -152,7 +152,7 @@ def _through(socket: Path, question: Question) -> Pinged:
 
 
 def _hearing(node: NodeId, me: NodeId, ways: list[Way], here: Json | None) -> Json:
-    """Who hears whom: {listener: {speaker: state}}."""
+    """Which node hears which: {listener: {speaker: state}}."""
     heard: Json = {}
     if here is not None:
         heard[me] = {str(one["name"]): str(one["state"]) for one in here["nodes"] if one["name"] == node != me}

@@ -1,6 +1,7 @@
 """`zsched pki`: makes the fleet's authority and its certificates, and says where each file goes.
 
-Knows: folders, what an operator does next. Does not know: how certificates are made (`zsched.pki`), who is let in.
+Knows: folders, what an operator does next. Does not know: how certificates are made (`zsched.pki`), which names are
+let in.
 """
 
 from __future__ import annotations

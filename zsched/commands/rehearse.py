@@ -32,7 +32,7 @@ from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE
 LOOK_S: Final = 0.2
 """Between two looks at the fleet."""
 ANSWER_S: Final = 0.3
-"""A daemon begins so long after it has answered (`zsched.runtime.strikes`)."""
+"""A daemon begins this long after it has answered (`zsched.runtime.strikes`)."""
 CUT_MORE_S: Final = 2.0
 """A cut lasts so much longer than deciding may take, so that the task moves within it."""
 BACK_S: Final = 30.0

@@ -30,7 +30,7 @@ CAUSES = (NEVER_INITIALISED, "nothing can be agreed")
 WORDS_OF_SECURITY = {"secured": "secured", "encrypted": "TLS", "open": "NOT SECURED"}
 """What the first line says of a node's sessions; of one that only its own machine reaches nothing."""
 NO_ANSWER_TO = 100
-"""After so many inputs without one output, ever, the key of the output is doubted."""
+"""After this many inputs without one output, ever, the key of the output is doubted."""
 STATE_STYLES = {"alive": "green", "ready": "green"} | dict.fromkeys(
     ("draining", "drained", "no new", "starting", RESTARTING, "stopped", "suspect", "unknown"), "yellow"
 )

@@ -1,6 +1,6 @@
 """`zsched retry`: has a task's failures forgotten on every node that can be reached, and says where it was not.
 
-Knows: whom to ask, outcomes as exit codes. Does not know: what a node remembers, or how a worker is started.
+Knows: which daemon to ask, outcomes as exit codes. Does not know: what a node remembers, or how a worker is started.
 """
 
 from __future__ import annotations

@@ -17,13 +17,13 @@ from zsched.core.values.gauges import BY_NAME
 from zsched.core.values.model import PairReading, ScoreForm
 
 LEADS = (0.5, 0.1)
-"""The leads of which it is told how soon they are followed: a machine that is worth half, and a slight one."""
+"""The leads for which the report says how soon they are followed: a machine that is worth half, and a slight one."""
 STEP_S = 0.01
 LONGEST_S = 3600.0
 
 
 def told_once(specs: Iterable[TaskSpec], timing: Timing) -> list[list[str]]:
-    """What is told of every task, the names first, and once for all tasks of which the same is told."""
+    """The sentences about every task, the names first; tasks with the same sentences stand together."""
     alike: dict[tuple[str, ...], list[str]] = {}
     for spec in specs:
         alike.setdefault(tuple(told(spec, timing)), []).append(spec.name)

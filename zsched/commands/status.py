@@ -26,7 +26,7 @@ HOME, CLEAR, REST_OF_LINE, REST_OF_SCREEN = "\x1b[H", "\x1b[2J", "\x1b[K", "\x1b
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StatusView:
-    """Whom to ask and how to show it."""
+    """Which daemon to ask, and how to show the answer."""
 
     runtime_dir: Path | None
     node: str | None

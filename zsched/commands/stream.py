@@ -33,7 +33,7 @@ KINDS: Final = {"in": "input", "out": "output", "srv": "service"}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StreamView:
-    """Whom to ask and how to show it."""
+    """Which daemon to ask, and how to show the answer."""
 
     runtime_dir: Path | None
     node: str | None
@@ -42,9 +42,9 @@ class StreamView:
     connect: str | None = None
     """`list` only: a node's control endpoint, to be asked instead of a daemon here."""
     count: int | None = None
-    """So many windows (``tail``: samples), then the end; ``None``: until Ctrl-C."""
+    """How many windows (``tail``: samples) to show; ``None``: until Ctrl-C."""
     timeout_s: float | None = None
-    """``tail``: the end after so long; ``None``: until Ctrl-C."""
+    """``tail``: for how long; ``None``: until Ctrl-C."""
 
 
 # --- list ------------------------------------------------------------------------------------------------------------

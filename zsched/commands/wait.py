@@ -112,7 +112,7 @@ def _under_way(statuses: Mapping[str, Json], name: str, why: str) -> list[str]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WaitView:
-    """Whom to ask, for how long, and how to show it."""
+    """Which daemon to ask, for how long, and how to show the answer."""
 
     runtime_dir: Path | None
     node: str | None

@@ -109,7 +109,7 @@ class _Verdict:
 NOTHING: Final = _Verdict(effect=Effect.NOTHING, text="nothing notices")
 AT_ONCE: Final = _Verdict(effect=Effect.AT_ONCE, text="takes effect at once")
 _ORDER: Final = tuple(Effect)
-"""Of two effects of one place the later one is told first."""
+"""Of two effects of one place the later one comes first."""
 
 
 def names_electors(text: str) -> bool:
@@ -128,7 +128,7 @@ def warnings_in_force(text: str, warnings: tuple[Fault, ...]) -> tuple[Fault, ..
 
 
 def wanted_electors(agreed: Sequence[NodeId], new: Fleet, text: str) -> tuple[NodeId, ...]:
-    """The electors that a fleet shall have by its new file, sorted; ``agreed`` are those that it has.
+    """The electors that a fleet gets by its new file, sorted; ``agreed`` are those that it has.
 
     A file that names electors means them. Another one leaves them as they are, but for nodes that it does not have.
     """
@@ -149,7 +149,7 @@ def difference(
 
     Args:
         old: the fleet in force.
-        new: the one that shall be.
+        new: the wanted one.
         texts: the files of the two.
         owners: who owns each task now; without them nobody is said to move.
         electors: those that are agreed; none: the old file's.
@@ -180,7 +180,7 @@ def _meet(one: str, other: str) -> bool:
 def _joined(path: str, before: str | None, after: str | None, found: list[_Verdict]) -> Iterator[Change]:
     """One change of all that follows from one place; dangers beyond the first are changes of their own.
 
-    Where a setting begins or ceases to be written down, its default is told.
+    Where a setting begins or ceases to be written down, its default is shown.
     """
     whole = next((one for one in found if one.paths[:1] == (path,) and one.before and one.after), None)
     if whole is not None:
@@ -308,7 +308,7 @@ def _access(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
 
 
 def _nameless(security: Security) -> Security:
-    """The section without whom it lets in."""
+    """The section without the names that it lets in."""
     return replace(security, operators=(), guests=(), revoked=())
 
 

@@ -3,8 +3,8 @@
 Knows: block and flow style, which lines belong to an entry. Does not know: whether the result is a good fleet file
 (`zsched.config.load` tells), who wants it.
 
-The text is spliced, not written anew, so comments, quotes and the order of keys are the operator's. What comes of it is
-read again: unless it says exactly what was wanted, it is refused.
+The text is spliced, not written again, so comments, quotes and the order of keys are the operator's. What comes of it
+is read again: unless it says exactly what was wanted, it is refused.
 
 A comment belongs to an entry if it stands on a line of the entry, or below it and further in than its key. The comment
 lines above an entry stay when the entry goes: they may be about more than this one.

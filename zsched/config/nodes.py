@@ -1,4 +1,4 @@
-"""Decides what the `nodes:` of a fleet file say: machines, endpoints, links, and who is meant by a selection.
+"""Decides what the `nodes:` of a fleet file say: machines, endpoints, links, and which nodes a selection means.
 
 Knows: how the values of one node, and the nodes among each other, relate. Does not know: tasks.
 """

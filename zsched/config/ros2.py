@@ -36,7 +36,7 @@ _BRIDGES: Final = {str(graph): graph for graph in (RosGraph.RMW_ZENOH, RosGraph.
 _NAME: Final = Text("a ROS name", name_fault, 'for example "/{robot}/map"')
 _KEY: Final = Text("a key template", lambda text: None if len(text) <= 4096 else "it is too long")
 _MAX_TIMEOUT_S: Final = 3600.0
-"""Of a service (`zsched.core.values.plan.ServiceSettings`): a goal may work for so long before its result is there."""
+"""Of a service (`zsched.core.values.plan.ServiceSettings`): a goal may work this long before its result is there."""
 
 
 def ros2_record(rule: Record, service: Record) -> Record:

@@ -1,4 +1,4 @@
-"""Decides what the `security:` section of a fleet file says: where certificates lie, and who is let in besides nodes.
+"""Decides what the `security:` section of a fleet file says: where certificates lie, and which other names are let in.
 
 Knows: how names and endpoints relate to it. Does not know: certificates, zenoh's rules.
 """

@@ -167,7 +167,7 @@ class Nodes:
         return running is not None and not running.is_stopping and running.process.poll() is None
 
     def ended(self) -> dict[NodeId, tuple[int, bool]]:
-        """{node: (exit code, whether we have asked for it)} of daemons that have ended; each is told once."""
+        """{node: (exit code, whether we have asked for it)} of daemons that have ended; each is named once."""
         found = {}
         for node, running in tuple(self._running.items()):
             code = running.process.poll()

@@ -152,7 +152,7 @@ class Run:
         if self._is_verbose:
             self._say(f"{log.node} | {line}")
         elif text.startswith("worker_ended ") and any(one.node == log.node for one in self._rollouts.values()):
-            return  # we have ended it; one that fails again and again is told of when it has failed for good
+            return  # we have ended it; one that fails again and again is reported when it has failed for good
         elif name.startswith(f"{WORKER}.") or (name == WORKER and level in ("WARNING", "ERROR")):
             self._say(f"{log.node} | {text}")
 
@@ -172,7 +172,7 @@ class Run:
             self._say(f"{node} starts again")
             self._start(node)
 
-    # --- what is told ------------------------------------------------------------------------------------------------
+    # --- messages ---------------------------------------------------------------------------------------------------
 
     def _look(self, now: float) -> None:
         status = self._nodes.status()

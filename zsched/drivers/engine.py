@@ -27,13 +27,13 @@ from zsched.guard import guarded
 COMMAND_S: Final = 10.0
 """An engine that does not answer a command within this time has failed."""
 LAST_LINES_S: Final = 0.3
-"""So long the follower of the log gets for what the worker has printed last."""
+"""The follower of the log gets this long for what the worker has printed last."""
 FIRST_LOOK_S: Final = 0.1
 LOOK_S: Final = 10.0
 """How often the worker's process is looked up: an engine may start it again by itself."""
 
 KEEPER: Final = "trap '' INT TERM HUP; read -r said; [ \"$said\" = done ] || {{ {stop}; }}"
-"""Reads from the driver's pipe. It closes without a word when the driver is killed: then the engine is told to stop."""
+"""Reads from the driver's pipe. When it closes without a word, the driver was killed: the engine is asked to stop."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

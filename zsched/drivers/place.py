@@ -1,4 +1,4 @@
-"""What a driver is told by its daemon, and what it tells: the environment file of the worker, and its process.
+"""What a driver gets from its daemon, and what it reports: the environment file of the worker, and its process.
 
 Knows: the variables of a worker, the two files beside its session file. Does not know: engines.
 
@@ -39,7 +39,7 @@ class Place:
     session: Path
     """The file with the session that the worker opens."""
     variables: tuple[tuple[str, str], ...]
-    """All that the worker is told."""
+    """All that the worker gets."""
 
     @classmethod
     def from_env(cls, env: Mapping[str, str], names: Sequence[str] = ()) -> Place:

@@ -57,9 +57,9 @@ SOON_S: Final = 0.1
 """...while it is on its way, or has not answered yet."""
 ASK_S: Final = 2.0
 SILENT_S: Final = 10.0
-"""A node that has answered once, and then does not for so long, has failed."""
+"""A node that has answered once, and then does not for this long, has failed."""
 CHANGE_S: Final = {Transition.CONFIGURE: 60.0, Transition.ACTIVATE: 10.0, Transition.DEACTIVATE: 3.0}
-"""So long a node may take to change: one that is no owner any more, and stays active, is killed soon."""
+"""A node may take this long to change: one that is no owner any more, and stays active, is killed soon."""
 CLOSE_S: Final = 0.6
 DOMAIN: Final = "ROS_DOMAIN_ID"
 

@@ -1,4 +1,4 @@
-"""The frozen values by which a daemon and its relay know each other: who asks, who answers, that the relay lives.
+"""The frozen values by which a daemon and its relay know each other: question, answer, and a sign that the relay lives.
 
 Knows: the greeting between a relay and the successor of its daemon, the pulse. Does not know: pipes, frames, plans.
 """
@@ -12,7 +12,7 @@ from zsched.core.values.model import NodeId, check_counter, check_name, check_ra
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RelayPulse:
-    """The relay lives, though it has nothing to say; ``counted_s``: its streams were last counted so long ago."""
+    """The relay lives, though it has nothing to say; ``counted_s``: its streams were last counted this long ago."""
 
     counted_s: float
 

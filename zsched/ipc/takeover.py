@@ -38,7 +38,7 @@ _NOT_THE_RELAYS: Final = frozenset({"tasks", "examples", "dev", "commands", "cli
 PROTOCOL: Final = 1
 """Raised whenever an older relay would misunderstand a newer daemon."""
 GREETING_S: Final = 1.0
-"""A relay that does not answer so long is no relay to go on with."""
+"""A relay that does not answer for this long is no relay to go on with."""
 _ANSWERS: Final[tuple[type[Any], ...]] = (RelayHere, RelayRefused)
 _LOCK: Final = ".relay.lock"
 _TIMEVAL: Final = struct.Struct("ll")

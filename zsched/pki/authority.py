@@ -1,6 +1,7 @@
 """The fleet's authority in one folder: its key, its certificate, and the record of what it has issued and revoked.
 
-Knows: the folder's files. Does not know: sessions, who is let in (`zsched.runtime.access_rules`, by the fleet file).
+Knows: the folder's files. Does not know: sessions, which names are let in (`zsched.runtime.access_rules`, by the fleet
+file).
 
 ``ca-<number>.key`` is the one secret; with a passphrase it is encrypted. ``authority.json`` is the record, plain text:
 the certificates that nodes trust (two between `rotate` and `finish`), and every key that was certified, with its newest
@@ -172,7 +173,7 @@ class Authority:
         return self._certify(entry.holder, public, entry.hosts if hosts is None else tuple(hosts), passphrase, now)
 
     def revoke(self, label: str, now: datetime) -> Entry:
-        """Mark a key as revoked: it is never certified again. Who is let in is the fleet file's part.
+        """Mark a key as revoked: it is never certified again. The fleet file says which names are let in.
 
         Raises:
             AdapterError: there is no such key.

@@ -1,7 +1,7 @@
 """Signs bytes with a node's key, and checks signatures by certified keys: Ed25519 (RFC 8032), or ECDSA with P-256.
 
 Knows: the package ``cryptography``, of which it loads as little as it can (8 MiB, and with P-256 10). Does not know:
-what is signed, whom a certificate names.
+what is signed, which holder a certificate names.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Check = Callable[[bytes, bytes], bool]
 _PUBLIC: Final = bytes.fromhex("302a300506032b6570032100")
 """What stands before the 32 bytes of an Ed25519 key in its SubjectPublicKeyInfo (RFC 8410, section 4)."""
 _PRIVATE: Final = bytes.fromhex("302e020100300506032b657004220420")
-"""Likewise of a private key in PKCS #8 (section 7)."""
+"""The same of a private key in PKCS #8 (section 7)."""
 _RAW: Final = 32
 _PEM: Final = re.compile(rb"-----BEGIN PRIVATE KEY-----(.*?)-----END PRIVATE KEY-----", re.DOTALL)
 

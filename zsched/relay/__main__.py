@@ -40,7 +40,7 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _stop_soon)
     faulthandler.enable()
-    faulthandler.register(signal.SIGUSR1)  # where every thread stands, for whoever has to ask
+    faulthandler.register(signal.SIGUSR1)  # where every thread stands, for the reader of the journal
     os.environ["ZENOH_RUNTIME"] = relay_pools(arguments.threads)  # read once, when zenoh's runtime starts
     code = 1
     try:

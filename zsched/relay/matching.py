@@ -2,10 +2,10 @@
 
 Knows: what zenoh matches with the keys under this node's slots. Does not know: processes, what follows from it.
 
-It is this node's own relay that looks, under the keys of every robot: robots only ever publish there, so whoever takes
-something is the worker, and a node that owns nothing yet is seen to be ready, too. What zenoh does not tell is who
-matches. A subscription that would take any other node's inputs as well (a recorder of ``**``) hides the worker: so each
-rule has a stranger's key beside its own, and as long as somebody subscribes to that as well nothing is certain.
+It is this node's own relay that looks, under the keys of every robot: robots only ever publish there, so a subscriber
+that takes something is the worker, and a node that owns nothing yet is seen to be ready, too. What zenoh does not tell
+is who matches. A subscription that would take any other node's inputs as well (a recorder of ``**``) hides the worker:
+so each rule has a stranger's key beside its own, and as long as somebody subscribes to that as well nothing is certain.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from zsched.guard import guarded, tolerant
 from zsched.relay.streams.receive import Declared, undeclare
 
 SETTLE_S: Final = 1.5
-"""A relay that has just started has no links yet: so long it does not say that nobody is there."""
+"""A relay that has just started has no links yet: for this long it does not say that nobody is there."""
 
 _log = logging.getLogger("zsched.relay")
 
@@ -110,7 +110,7 @@ class Matching:
                 _log.exception("workers cannot be watched")
 
     def _patience(self) -> float | None:
-        """Until the next one has settled; for ever once all have: zenoh wakes us."""
+        """Until the next one has settled; without end once all have: zenoh wakes us."""
         now = monotonic_s()
         waiting = [one.settled_at - now for one in self._watched.values() if one.told is None]
         return max(min(waiting), 0.0) if waiting else None

@@ -3,7 +3,7 @@
 Knows: how commands become tasks' plans and roles, how reports leave, how to go on without a daemon for a while, how to
 end within a second. Does not know: how a stream is carried.
 
-Without a daemon the streams run on: plans are obeyed as they are. Two things do not: no worker is told a role (those of
+Without a daemon the streams run on: plans are obeyed as they are. Two things do not: no worker gets a role (those of
 this node died with the daemon, the next daemon says what the next ones are), and what an exclusive task puts out waits
 at the gate, for nobody here would learn that it has another owner.
 """
@@ -49,9 +49,9 @@ from zsched.wire.keyspace import Keyspace
 COUNT_S: Final = 1.0
 """Period of the counters."""
 PULSE_S: Final = 0.5
-"""A daemon that has heard nothing for so long is told that we live, whatever the streams' threads wait for."""
+"""After this long without a report we tell the daemon that we live, whatever the streams' threads wait for."""
 CLOSE_S: Final = 0.6
-"""Closing a session towards a stopped peer can take seconds: so long we wait, then the process ends anyway."""
+"""Closing a session towards a stopped peer can take seconds: we wait at most this long, then the process ends."""
 ALARM_S: Final = 0.9
 """...and should zenoh hold Python's global lock meanwhile, the kernel ends it."""
 MAX_REPORTS: Final = 4096
@@ -92,7 +92,7 @@ class Reporter:
             _log.error("the daemon does not read: a report was dropped (%s)", value)
 
     def attach(self, link: socket.socket, *, commands: int) -> None:
-        """Report to another daemon, and take ``commands`` from it; problems that last are told again."""
+        """Report to another daemon, and take ``commands`` from it; lasting problems are reported again."""
         with self._writing:  # no frame may begin on one link and end on another
             os.dup2(link.fileno(), self._descriptor)
             os.dup2(link.fileno(), commands)
@@ -102,7 +102,7 @@ class Reporter:
                 self.report(problem)
 
     def flush(self, deadline_s: float) -> None:
-        """Send what is queued, at most for so long."""
+        """Send what is queued, for at most this long."""
         with contextlib.suppress(queue.Full):
             self._queue.put_nowait(None)
         self._thread.join(deadline_s)
@@ -222,7 +222,7 @@ class RelayProcess:
             task.lose_daemon()
 
     def begin_again(self) -> None:
-        """Another daemon has come, and knows nothing of us: tell it who is there; its plans follow."""
+        """Another daemon has come, and knows nothing of us: name the workers that are there; its plans follow."""
         self._reporter.report(RelayStarted(pid=os.getpid(), zid=str(self._session.zid())))
         for seen in self._tokens.seen():
             self._reporter.report(seen)

@@ -40,7 +40,7 @@ class RoleServer:
         self._roles.clear()
 
     def end(self, task: TaskId) -> None:
-        """The task is no task any more: whoever asks for its role gets no answer."""
+        """The task is no task any more: a question for its role gets no answer."""
         self._roles.pop(task, None)
 
     def tell(self, task: TaskId) -> None:

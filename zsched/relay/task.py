@@ -41,18 +41,18 @@ from zsched.relay.streams.proofs import Stamps
 from zsched.relay.tokens import Tokens
 
 FLIP_WAIT_S: Final = 0.3
-"""A flip waits at most so long for a worker that is not ready, or has not heard yet that it is the owner."""
+"""A flip waits at most this long for a worker that is not ready, or has not heard yet that it is the owner."""
 GONE_GRACE_S: Final = 0.05
-"""An old owner whose token went has sent its last; what is still in our queues gets so long."""
+"""An old owner whose token went has sent its last; what is still in our queues gets this long."""
 SETTLE_S: Final = 1.5
 """An old owner that has ended has acknowledged all by then, also when one acknowledgement was dropped on the way, or a
 robot has just stalled that gets the same answers (`zsched.core.hop.shared.STALLED_S`)."""
 GATHER_S: Final = 0.5
-"""What a worker left that restarted in place is told of once, when each of its streams has met the new life."""
+"""What a worker left that restarted in place is reported once, when each of its streams has met the new life."""
 MAX_UNTAKEN: Final = 4
 """More keys than that are not told of."""
 LACK_S: Final = 1.0
-"""What a worker lacks that has just come is on its way; after so long it is told."""
+"""What a worker lacks that has just come is on its way; after this time it is reported."""
 BUSY_S, CARE_S, IDLE_S = 0.01, 0.2, 0.5
 
 _log = logging.getLogger("zsched.relay")

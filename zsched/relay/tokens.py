@@ -1,4 +1,4 @@
-"""Watches the workers' liveliness tokens on the data network: who is ready, who works in which epoch.
+"""Watches the workers' liveliness tokens on the data network: which are ready, and in which epoch they work.
 
 Knows: token keys, their coming and going. Does not know: slots, routes, what readiness leads to.
 

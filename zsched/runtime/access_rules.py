@@ -93,7 +93,7 @@ Rule = tuple[str, tuple[str, ...], list[str]]
 
 
 def _holders(fleet: Fleet, security: Security, side: Side) -> Iterator[tuple[str, list[str], list[Rule]]]:
-    """(id, common names, rules) of everybody who is let in."""
+    """(id, common names, rules) of every name that is let in."""
 
     def names(name: str, role: Role) -> list[str]:
         return [one.common_name(fleet.name) for one in accepted(name, role, security.revoked)]

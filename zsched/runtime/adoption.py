@@ -1,4 +1,4 @@
-"""Lets a running daemon's adapters follow another fleet file; what they cannot follow is told.
+"""Lets a running daemon's adapters follow another fleet file; what they cannot follow is reported.
 
 Knows: which adapter is made from which part of the file. Does not know: what the node makes of it
 (`zsched.core.handlers.fleet`).
@@ -39,7 +39,7 @@ class Adoption:
     me: NodeId
     started_with: Fleet
     points: Endpoints
-    """Where its sessions listen and whom they dial, since the start."""
+    """Where its sessions listen and which nodes they dial, since the start."""
     protocol: str
     recipes: Recipes
     crew: Crew

@@ -223,7 +223,7 @@ class Crew:
         return f"{since}: it may hang, be frozen or cut off; see its log{'' if pid is None else f' and process {pid}'}"
 
     def _start_it(self, task: TaskId, do: str = "start it") -> str:
-        """Of a worker that somebody else starts: that it is the operator who does, and with what."""
+        """Of a worker that somebody else starts: that the operator starts it, and with what."""
         session = self.sessions.get(task) or f"{self._node}-{task}.zenoh.json5"
         return f"{do} on {self._node} (the task has no `command`) with the session {session}"
 

@@ -2,7 +2,7 @@
 
 Knows: the process's limits. Does not know: who uses them up.
 
-The usual limit is 1024, for programs that call select(2); strangers' connections take so many in seconds.
+The usual limit is 1024, for programs that call select(2); strangers' connections take as many in seconds.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Decides where a node's sessions listen and whom they dial.
+"""Decides where a node's sessions listen and which nodes they dial.
 
-Knows: the fleet file's addresses, the seeds, who dials whom. Does not know: zenoh, what the links carry.
+Knows: the fleet file's addresses, the seeds, which node dials which. Does not know: zenoh, what the links carry.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ DATA_PORT: Final = 7458
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Endpoints:
-    """Where this node's sessions listen and whom they dial."""
+    """Where this node's sessions listen and which nodes they dial."""
 
     control_listen: tuple[str, ...]
     control_connect: tuple[str, ...]
@@ -36,7 +36,7 @@ class Endpoints:
     data_connect: tuple[str, ...]
     worker_connect: tuple[str, ...]
     control_by_gossip: bool
-    """Whether the control session dials whom it hears of by gossip; the same for the relay's and the workers'."""
+    """Whether the control session dials nodes that it hears of by gossip; the same for the relay's and the workers'."""
     data_by_gossip: bool
     worker_by_gossip: bool
 
@@ -54,8 +54,8 @@ def endpoints_for(
 
     A link is dialled by one side only: of two that redial each other one may take the other's new link for a part of
     its old session, and tells it nothing again (eclipse-zenoh/zenoh#2806). Who gives no address dials everybody who
-    does; only two that give none meet by gossip, and then zenoh's ids decide who dials. Workers dial their own relay
-    first, then the robots', and listen nowhere, so nobody dials them.
+    does; only two that give none meet by gossip, and then zenoh's ids decide which one dials. Workers dial their own
+    relay first, then the robots', and listen nowhere, so nobody dials them.
     Our own address on another machine (``is_here``) is dialled too: there a twin of ours may be, and must be heard.
     """
     robots = [node for node in fleet.nodes if node.kind is NodeKind.ROBOT and node.name != me.name]
@@ -86,7 +86,7 @@ def _data(node: NodeSpec) -> str:
 def _targets(
     fleet: Fleet, me: NodeSpec, endpoint: Callable[[NodeSpec], str], is_here: Callable[[str], bool] = lambda _host: True
 ) -> list[NodeSpec]:
-    """Whom this node dials: everybody dials the seeds; of other pairs the one whose name comes later, if it can."""
+    """The nodes that this one dials: the seeds, and those of the others that come before it by name, if it can."""
 
     def rank(node: NodeSpec) -> tuple[int, NodeId]:
         return (fleet.seeds.index(node.name) if node.name in fleet.seeds else len(fleet.seeds), node.name)

@@ -1,6 +1,6 @@
 """`zsched init`: creates a node's blank durable state, which states "this name has never voted here".
 
-Knows: what a blank state holds, and whom to ask whether that is true. Does not know: how daemons use it.
+Knows: what a blank state holds, and which nodes to ask whether that is true. Does not know: how daemons use it.
 """
 
 from __future__ import annotations

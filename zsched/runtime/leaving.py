@@ -1,6 +1,6 @@
 """When a daemon that was told to stop goes: once what it owns has moved, or when it has waited for long enough.
 
-Knows: how long each wait is, and that somebody who asks twice wants it now. Does not know: signals, clocks, what moves
+Knows: how long each wait is, and that a second signal means now. Does not know: signals, clocks, what moves
 a task.
 """
 

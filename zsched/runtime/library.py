@@ -27,9 +27,9 @@ from zsched.guard import guarded
 from zsched.wire.codec import decode_document, document_hash
 
 FETCH_S = 2.0
-"""So long one peer may take to send a document."""
+"""One peer may take this long to send a document."""
 RECENT = 8
-"""So many documents that were stored last are never deleted: the node may just be hearing of them."""
+"""The last documents that are never deleted: the node may just be hearing of them."""
 MAX_FAULT = 400
 
 Fetch = Callable[[NodeId, str, float], bytes | None]

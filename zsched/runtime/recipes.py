@@ -78,7 +78,7 @@ class Recipes:
 
         Args:
             fleet: the file.
-            connect: whom workers dial, their own relay first.
+            connect: what workers dial, their own relay first.
             dials_by_gossip: whether they dial robots without an address, too.
 
         Raises:

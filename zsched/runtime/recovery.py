@@ -1,10 +1,10 @@
 """`zsched recover` and `zsched rejoin`: read the states that are there, ask the others, write the new state.
 
-Knows: state files and documents on disk, whom to ask. Does not know: what speaks against it
+Knows: state files and documents on disk, which nodes to ask. Does not know: what speaks against it
 (`zsched.core.electorate.recovery`), how it is shown and confirmed.
 
 Both work on a node whose daemon is stopped. The daemon that starts by the new state is one that has just started:
-what a start does for ballots, leases and workers is thereby done.
+so a start does what ballots, leases and workers need.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def _read(content: Document, fleet: str, node: NodeId, config: Path) -> Fleet | 
     try:
         return read_document(content, fleet, node, config)
     except ConfigError:
-        return None  # as if it were not there: the operator is told so
+        return None  # as if it were not there: the operator hears so
 
 
 def _document_of(config: Path) -> Document:

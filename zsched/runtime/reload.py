@@ -34,7 +34,7 @@ class Reload:
         guarded(self._read, name="reload", is_lasting=False).start()
 
     def _read(self) -> None:
-        with self._reading:  # who reads later posts later
+        with self._reading:  # a later reader posts later
             try:
                 fleet = load_fleet(self._path)
                 require_node(fleet, self._node, self._path)

@@ -1,6 +1,6 @@
 """Takes a newer certificate for this node's key, which the holder of the fleet's authority has sent.
 
-Knows: what must stand in it, where it is kept. Does not know: who has sent it: the authority's signature counts, and
+Knows: what must stand in it, where it is kept. Does not know: its sender; the authority's signature counts, and
 nothing else; how it comes (`zsched.adapters.network.control_bus`), when sessions go by it (`zsched.daemon`).
 """
 
@@ -20,7 +20,7 @@ from zsched.runtime.secured import bytes_of, files_of, identity_of, renewed_in
 from zsched.sessions.certificate import ders_of, parts_of
 
 SOON: Final = timedelta(days=7)
-"""So long before its certificate ends a node says so: it is due since 3 days then, and nobody has renewed it."""
+"""This long before its certificate ends a node says so: it is due since 3 days then, and nobody has renewed it."""
 
 _log = logging.getLogger("zsched.daemon")
 
@@ -31,7 +31,7 @@ def now_utc() -> datetime:
 
 
 def take(fleet: Fleet, state: Path, pem: str) -> CommandResult:
-    """Keep a newer certificate of this node; the answer to who has sent it.
+    """Keep a newer certificate of this node; the answer to its sender.
 
     Args:
         fleet: by which the node goes.

@@ -1,10 +1,10 @@
-"""Decides when a daemon begins anew, so that its sessions go by other access rules or another certificate.
+"""Decides when a daemon begins again, so that its sessions go by other access rules or another certificate.
 
 An open session of zenoh keeps the access rules, and the certificate with which it listens, that it was opened with. So
-the nodes of a secured fleet begin anew one after another, electors last, and an elector only while the others live.
+the nodes of a secured fleet begin again one after another, electors last, and an elector only while the others live.
 
-Knows: the order of nodes, how long each of them has at most, whose lives are new. Does not know: who lives, what has
-changed, how a daemon begins anew (`zsched.daemon`).
+Knows: the order of nodes, how long each of them has at most, whose lives are new. Does not know: which nodes live,
+what has changed, how a daemon begins again (`zsched.daemon`).
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ from dataclasses import dataclass, field
 from zsched.core.values.model import NodeId
 
 FIRST_S = 2.0
-"""So long the first one waits: who has changed something may still ask it, and the others learn of it meanwhile."""
+"""The first one waits this long: the operator's tool may still ask it, and the others learn of the change meanwhile."""
 TURN_S = 10.0
-"""So long each has at most: a daemon that owns tasks gives them away (3 s), ends (2 s) and is heard again (3 s)."""
+"""Each has at most this long: a daemon that owns tasks gives them away (3 s), ends (2 s) and is heard again (3 s)."""
 SETTLE_S = 1.0
-"""Once all before it are heard in a new life, the next one waits so long: their workers start meanwhile."""
+"""Once all before it are heard in a new life, the next one waits this long: their workers start meanwhile."""
 PATIENCE_S = 120.0
-"""So long an elector waits for the others; one that is away for good must not keep a new node out."""
+"""An elector waits this long for the others; one that is away for good must not keep a new node out."""
 
 
 def turns(nodes: Collection[NodeId], electors: Collection[NodeId]) -> tuple[NodeId, ...]:
-    """The nodes in the order in which they begin anew.
+    """The nodes in the order in which they begin again.
 
     >>> turns(("edge1", "edge2", "robot1"), ("edge1", "robot1"))
     ('edge2', 'edge1', 'robot1')
@@ -35,11 +35,11 @@ def turns(nodes: Collection[NodeId], electors: Collection[NodeId]) -> tuple[Node
 
 @dataclass(slots=True)
 class Reopening:
-    """One node's turn: when all before it have begun anew, at the latest when the time of all of them is over."""
+    """One node's turn: when all before it have begun again, at the latest when the time of all of them is over."""
 
     me: NodeId
     due_at: float | None = None
-    """The latest of its turn (monotonic seconds); ``None``: nothing is to be opened anew."""
+    """The latest of its turn (monotonic seconds); ``None``: nothing is to be opened again."""
     _first_at: float = 0.0
     _before: Mapping[NodeId, int | None] = field(default_factory=dict)
     """{node whose turn comes first: its incarnation when something changed}."""
@@ -76,7 +76,7 @@ class Reopening:
         *,
         is_free: bool = True,
     ) -> bool:
-        """Whether to begin anew now.
+        """Whether to begin again now.
 
         Args:
             electors: of the fleet.
@@ -92,7 +92,7 @@ class Reopening:
         return self.me not in electors or not missing or now >= self.due_at + PATIENCE_S
 
     def _is_next(self, lives: Mapping[NodeId, int | None], now: float) -> bool:
-        """Whether all before it have begun anew, and have had time to start their workers."""
+        """Whether all before it have begun again, and have had time to start their workers."""
         if not all(_is_newer(lives.get(name), before) for name, before in self._before.items()):
             self._anew_at = None
             return False

@@ -39,7 +39,7 @@ def restarts(old: Fleet, new: Fleet, me: NodeId, *, is_agreed: bool = False) -> 
 def opens_anew(old: Fleet, new: Fleet) -> bool:
     """Whether sessions that are open by ``old`` let in others, or elsewhere, than ``new`` says; both are secured.
 
-    Such a daemon begins anew by itself (`zsched.runtime.reopening`).
+    Such a daemon begins again by itself (`zsched.runtime.reopening`).
     """
     before, after = old.security, new.security
     if before is None or after is None or _nameless(before) != _nameless(after):
@@ -48,7 +48,7 @@ def opens_anew(old: Fleet, new: Fleet) -> bool:
 
 
 def _nameless(security: Security | None) -> Security | None:
-    """The section without whom it lets in."""
+    """The section without the names that it lets in."""
     return None if security is None else replace(security, operators=(), guests=(), revoked=())
 
 
@@ -81,7 +81,7 @@ def _made(old: Fleet, new: Fleet, me: NodeId) -> Iterator[str]:
 
 
 def _links(old: Fleet, new: Fleet, me: NodeId) -> Iterator[str]:
-    """Whom the open sessions would have to dial, and do not."""
+    """The nodes that the open sessions would have to dial, and do not."""
     before, after = _points(old, me), _points(new, me)
     missing = [one for one in after.control_connect if one not in before.control_connect]
     missing += [one for one in after.data_connect if one not in before.data_connect]

@@ -1,6 +1,6 @@
 """Makes the seals of a session from this machine's certificate, where the fleet file asks for signatures.
 
-Knows: the three files, who is let in. Does not know: what is sealed (`zsched.adapters.network.seals`).
+Knows: the three files, which names are let in. Does not know: what is sealed (`zsched.adapters.network.seals`).
 
 This is the one place by which a daemon, or a tool, loads the package ``cryptography``: where nothing is signed it is
 not needed.

@@ -88,7 +88,7 @@ def _is_handed(path: Path) -> bool:
     except FileNotFoundError:
         return False
     except OSError:
-        return True  # who reads it says what is wrong with it
+        return True  # its reader says what is wrong with it
 
 
 def secured_text(fleet: Fleet, security: Security, side: Side, operator_json5: str) -> str:
@@ -119,7 +119,7 @@ def secured_text(fleet: Fleet, security: Security, side: Side, operator_json5: s
 
 
 def identity_of(fleet: Fleet, security: Security) -> Identity:
-    """Whom this machine's certificate names.
+    """The holder that this machine's certificate names.
 
     Raises:
         ConfigError: it cannot be read, or is no certificate of this fleet.

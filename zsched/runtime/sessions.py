@@ -1,6 +1,6 @@
-"""Remembers which session every worker that somebody else starts has read: one that has changed since is told of.
+"""Remembers which session every worker that somebody else starts has read: one that has changed since is reported.
 
-Such a worker reads `<node>-<task>.zenoh.json5` once, when it starts, and goes on when its node's daemon starts anew
+Such a worker reads `<node>-<task>.zenoh.json5` once, when it starts, and goes on when its node's daemon starts again
 with another fleet file: then it does not know the robots that have come, and zsched does not start it again. What the
 earlier daemon wrote is kept in the state folder, for this boot of the machine only: no process lives longer.
 
@@ -51,7 +51,7 @@ class SessionsRead:
         self._read.setdefault(task, _Read(text))
 
     def save(self) -> None:
-        """Keep what is known for the next daemon; without it nothing is told, and nothing else is missing."""
+        """Keep what is known for the next daemon; without it nothing is reported, and nothing else is missing."""
         kept = {task: {"text": one.text, "life": one.life} for task, one in self._read.items() if task in self._now}
         content = json.dumps({"boot": self._boot, "workers": kept})
         try:

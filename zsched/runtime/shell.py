@@ -74,7 +74,7 @@ INBOX_LIMIT = 20_000
 WAITING_LIMIT = 64
 ANSWER_TIMEOUT_S = 3.0
 PROBLEM_TTL_S = 60.0
-"""An instruction that failed and was never tried again is no problem any more after so long."""
+"""An instruction that failed and was never tried again is no problem any more after this time."""
 LOCAL_REQUESTS_FROM = 1 << 40
 """Numbers of questions that came over the operator socket; smaller ones came over the bus."""
 

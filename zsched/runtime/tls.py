@@ -86,7 +86,7 @@ def protocol_of(fleet: Fleet, text: str) -> str:
 
 
 def exposure(fleet: Fleet, protocol: str, listens: Iterable[str]) -> Exposure:
-    """Who is let in to the sessions of a node that listens with ``protocol``, or as the file says, at ``listens``."""
+    """The names that a node lets in, which listens with ``protocol``, or as the file says, at ``listens``."""
     if fleet.security is not None:
         return Exposure.SECURED
     plain = [end for end in listens if _scheme(end) not in ENCRYPTED]

@@ -1,4 +1,4 @@
-"""Reads of an X.509 certificate (RFC 5280, section 4.1) when it is valid, whom it names, its key and its signature.
+"""Reads of an X.509 certificate (RFC 5280, section 4.1) when it is valid, its holder, its key and its signature.
 
 Knows: PEM, as much DER as leads to these. Does not know: whether a signature is right, what trusts what. Daemons read
 certificates with this, for a library that reads all of one takes 16 MiB.

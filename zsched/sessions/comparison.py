@@ -1,6 +1,6 @@
-"""What somebody who has opened one session lacks of another one: the workers that were started before it changed.
+"""What the opener of one session lacks of another one: the workers that were started before it changed.
 
-Knows: the text of a zenoh configuration. Does not know: who has read which.
+Knows: the text of a zenoh configuration. Does not know: which worker has read which.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ OTHER_SETTINGS: Final = "new settings"
 
 
 def lacking(read: str, now: str) -> str:
-    """What who has read one session lacks of another, in words; empty: nothing.
+    """What the reader of one session lacks of another, in words; empty: nothing.
 
-    Whom it dials beyond that is gone, or joins by itself: no reason to start it again.
+    A node that it dials beyond that is gone, or joins by itself: no reason to start it again.
     """
     if read == now:
         return ""
@@ -29,7 +29,7 @@ def lacking(read: str, now: str) -> str:
 
 
 def _take_endpoints(session: dict[str, Any]) -> list[str]:
-    """Whom a session dials, taken out of it."""
+    """The endpoints that a session dials, taken out of it."""
     endpoints = session["connect"].pop("endpoints")
     if not isinstance(endpoints, list):
         raise TypeError

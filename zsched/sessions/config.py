@@ -37,7 +37,7 @@ SYN, 1 s (then 2 s or 3 s) after the first, and the rest of the handshake 0.2 s,
 ACCEPT_TIMEOUT_S: Final = 1.0
 """The other end, which begins with the connection, not with the SYN: between 0.6 s and 1.4 s."""
 RELAY_START_S: Final = 10.0
-"""A worker that is started together with its relay, on a busy machine, waits so long for it."""
+"""A worker that is started together with its relay, on a busy machine, waits this long for it."""
 FEWEST_THREADS: Final = 12
 """Of a pool: a fleet of one machine grows to five with one task before a daemon must be started again."""
 TX_THREADS: Final = 4
@@ -190,7 +190,7 @@ def client_config(
 
 
 def introduction_config(session: str) -> str | None:
-    """Of a session (its configuration) that meets others by gossip: one that dials whom it dials, and all they know.
+    """Of a session (its configuration) that meets others by gossip: one that dials the same nodes and their peers.
 
     ``None`` when the session does not dial by gossip, or nobody at all by its configuration: there is nothing to mend,
     or nobody to begin with. See `zsched.sessions.relink`.
@@ -201,7 +201,7 @@ def introduction_config(session: str) -> str | None:
     if json.loads(config.get_json("mode")) != "peer" or not json.loads(config.get_json("connect/endpoints")):
         return None
     if json.loads(config.get_json("scouting/gossip/autoconnect")) is not None:
-        return None  # our own setting for "only who is in `connect`"
+        return None  # our own setting for "only what is in `connect`"
     for path, value in {
         "listen/endpoints": [],
         "scouting/gossip/autoconnect": {"router": [], "peer": ["router", "peer"]},
@@ -285,7 +285,7 @@ def tls_files(operator_json5: str) -> dict[str, str]:
 
 
 def pool_threads(nodes: int, tasks: int = 0) -> int:
-    """How many threads zenoh's pools of one process need in a fleet of so many nodes and tasks (`FEWEST_THREADS`..64).
+    """How many threads zenoh's pools of one process need for so many nodes and tasks (`FEWEST_THREADS`..64).
 
     A link that falls silent holds one of them when its lease ends: about a second, or 10 s (zenoh's SO_LINGER) where
     something was still to be sent. With fewer threads than links, a split that takes all of them also silences those
@@ -296,7 +296,7 @@ def pool_threads(nodes: int, tasks: int = 0) -> int:
 
 
 def daemon_pools(nodes: int) -> str:
-    """The value of ``ZENOH_RUNTIME`` for a daemon with links to so many nodes (zenoh reads it once).
+    """The value of ``ZENOH_RUNTIME`` for a daemon with links to this many nodes (zenoh reads it once).
 
     What receives, transmits, closes links and shakes hands shares one pool: with a pool each, every packet wakes twice
     as many threads (decision 0060). Closing a link that is dead one way holds a thread for zenoh's SO_LINGER, 10 s, and
@@ -308,10 +308,10 @@ def daemon_pools(nodes: int) -> str:
 
 
 def worker_pools(nodes: int, tasks: int) -> str:
-    """The value of ``ZENOH_RUNTIME`` for a worker in a fleet of so many nodes and tasks.
+    """The value of ``ZENOH_RUNTIME`` for a worker in a fleet with this many nodes and tasks.
 
-    ``net`` closes links and dials, ``acc`` shakes hands with who dials us; both have one thread by default. Closing a
-    link that is dead one way holds a thread for zenoh's SO_LINGER, 10 s, in which no other link came or went.
+    ``net`` closes links and dials, ``acc`` shakes hands with peers that dial us; both have one thread by default.
+    Closing a link that is dead one way holds a thread for zenoh's SO_LINGER, 10 s, in which no other link came or went.
     """
     threads = pool_threads(nodes, tasks)
     return _pools(rx=threads, tx=TX_THREADS, net=threads, acc=threads)

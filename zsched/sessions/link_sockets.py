@@ -100,7 +100,7 @@ class LinkSockets:
 
 
 def with_room(links: Iterable[LinkSocket], wait_s: float) -> set[int]:
-    """The descriptors with room (or gone), waiting at most so long for the first one."""
+    """The descriptors with room (or gone), waiting at most this long for the first one."""
     poll = select.poll()
     for link in links:
         poll.register(link.fd, select.POLLOUT)

@@ -1,6 +1,7 @@
-"""Says why a zenoh session could not be opened, in the words of who has to mend it: which endpoint, why, what to do.
+"""Says why a zenoh session could not be opened, for the operator: which endpoint, why, what to do.
 
-Knows: the configuration's endpoints, the shape of zenoh's error texts. Does not know: sessions, who is told.
+Knows: the configuration's endpoints, the shape of zenoh's error texts. Does not know: sessions, where the words are
+shown.
 
 Zenoh's own text names the endpoint with our options on it and the line of its source that noticed; of an address that
 cannot be looked up it names nothing at all.

@@ -5,7 +5,7 @@ the link between the two ends and their links to the seeds stay up (a short or a
 peer that opens, dials the seeds and whomever it hears of through them tells each of all others, and of two that may
 dial by gossip the one whose turn it is does so. It declares nothing and closes after a second.
 
-Knows: zenoh sessions. Does not know: who misses whom, and when it is worth the effort
+Knows: zenoh sessions. Does not know: which node misses which, and when it is worth the effort
 (`zsched.core.membership.relink`).
 """
 

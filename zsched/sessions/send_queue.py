@@ -24,9 +24,9 @@ from zsched.guard import guarded
 
 MAX_BYTES: Final = 64 << 20
 STALL_S: Final = 0.1
-"""A put that takes so long means a stalled receiver or a slow radio: from then on only the newest samples wait."""
+"""A put that takes this long means a stalled receiver or a slow radio: from then on only the newest samples wait."""
 PATIENCE_S: Final = 0.25
-"""A receiver that takes nothing for so long is stalled, not slow: nobody waits for it."""
+"""A receiver that takes nothing for this long is stalled, not slow: nobody waits for it."""
 POLL_S: Final = 0.05
 JOIN_S: Final = 0.3
 
@@ -180,7 +180,7 @@ class SendQueue:
         return left
 
     def join(self, timeout_s: float = JOIN_S) -> None:
-        """Wait at most so long for the thread's end."""
+        """Wait at most this long for the thread's end."""
         if self._thread is not threading.current_thread():
             self._thread.join(timeout_s)
 

@@ -30,7 +30,7 @@ TICK_S: Final = 0.1
 QUICK_TICK_S: Final = 0.05
 """While a put is under way."""
 REST_S: Final = 2.0
-"""Nothing was put for so long: the thread rests."""
+"""Nothing was put for this long: the thread rests."""
 
 _log = logging.getLogger("zsched.streams")
 
@@ -41,7 +41,7 @@ class StalledLinks(contextlib.AbstractContextManager[None]):
     def __init__(self, session: Session, lease_s: float, patience_s: float = math.inf) -> None:
         """The thread starts with the first put. ``lease_s`` is zenoh's, on these links.
 
-        ``patience_s``: who is heard, and has taken nothing for so long while a put waits, is stalled, too.
+        ``patience_s``: a receiver that is heard, and takes nothing for this long while a put waits, is stalled, too.
         """
         self._patience_s = patience_s
         self._sockets = LinkSockets(session)

@@ -116,6 +116,6 @@ def _papers(body: dict[str, Any]) -> Papers | None:
 
 
 def _digest(body: dict[str, Any]) -> str:
-    """Of all that stands beside it: a file that was edited or cut off is told from a whole one."""
+    """Of all that stands beside it: a file that was edited or cut off is seen to differ from a whole one."""
     plain = json.dumps(body, ensure_ascii=True, sort_keys=True, separators=(",", ":"))
     return hashlib.blake2s(plain.encode(), digest_size=16, person=b"zsched1", salt=b"invite").hexdigest()

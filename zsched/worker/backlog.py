@@ -11,7 +11,7 @@ Every sample has a *turn*, its place among all that were ever taken. What is giv
 later turn may be answered before it: neither the sample that is in hand when the worker becomes the owner, nor what was
 given back already when the role comes a second time.
 
-A robot counts what a slot left open as lost when the slot closes, or gives it to the next owner; then nobody shall do
+A robot counts what a slot left open as lost when the slot closes, or gives it to the next owner; then nobody may do
 it later, behind newer work. It says so to the worker that had it; a word that does not arrive (the link was broken, the
 robot's relay died) is replaced by `STALE_S`.
 """
@@ -35,7 +35,7 @@ MAX_BACKLOG_BYTES: Final = 32 << 20
 """Of such an input, whose output was withheld, that are kept for the day this worker becomes the owner; older ones are
 lost, and said to be."""
 STALE_S: Final = 2.5
-"""What was withheld so long before a newer epoch than its own begins is given up; until then the robot may still be at
+"""What was withheld for this long before a newer epoch begins is given up; until then the robot may still be at
 its slot (as `zsched.worker.epochs.CARRY_S`)."""
 QUIET_S: Final = 10.0
 """What was processed longer ago than this came with another move, or the predecessor had it, too."""

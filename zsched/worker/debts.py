@@ -1,11 +1,11 @@
 """Holds back that an input is done until its answers have reached the robots.
 
-Knows: locks, whom to tell what is done. Does not know: which input waits for what (`zsched.core.hop.held`), how far a
-robot is (`zsched.worker.lanes`), what an acknowledgement says (`zsched.hop.acknowledger`).
+Knows: locks, where to report what is done. Does not know: which input waits for what (`zsched.core.hop.held`), how far
+a robot is (`zsched.worker.lanes`), what an acknowledgement says (`zsched.hop.acknowledger`).
 
 An acknowledgement overtakes the answers: on a full link it would call an input done whose answer is lost with the
 machine that holds it. So an input of class ``reliable`` *owes* the answers of class ``reliable`` that its callback has
-put, and counts as processed when everybody has them for whom it waits (`KeptLane.settled`). A callback that puts
+put, and counts as processed when all robots for which it waits have them (`KeptLane.settled`). A callback that puts
 nothing owes nothing, and so does one whose answers another thread puts.
 
 Where an answer was withheld, since the worker was not the owner, its input waits until it has been processed again.
@@ -29,7 +29,7 @@ class Debts:
     """The inputs whose answers are on their way. Its lock is held around lanes' locks, and around nothing else."""
 
     def __init__(self, acks: Acknowledger) -> None:
-        """``acks`` is told what is processed, in the order of each source."""
+        """``acks`` hears what is processed, in the order of each source."""
         self._acks = acks
         self._lock = threading.Lock()
         self._held = HeldInputs[KeptLane]()

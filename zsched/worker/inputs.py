@@ -37,7 +37,7 @@ from zsched.worker.troubles import Troubles
 END_GRACE_S: Final = 0.1
 JOIN_S: Final = 0.2
 NAME_S: Final = 0.2
-"""So long the first sample of a source waits for the marker that names its slot. That was put before it, but comes in
+"""The first sample of a source waits this long for the marker that names its slot. That was put before it, but comes in
 another thread of zenoh's."""
 
 _log = logging.getLogger("zsched.worker")
@@ -75,7 +75,7 @@ class Dispatcher:
         self._slots: dict[SourceName, int] = {}
         """The epochs of sources that have named theirs, the oldest first."""
         self._given_up: dict[SourceName, tuple[float, int]] = {}
-        """Sources of which nothing shall be done any more, the oldest first: (when we heard, how much that took)."""
+        """Sources of which nothing may be done any more, the oldest first: (when we heard, how much that took)."""
         self._epoch = 0
         self._begun = 0
         self._is_begin_due = False

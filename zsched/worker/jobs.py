@@ -22,9 +22,9 @@ from zsched.guard import guarded
 from zsched.procfs import parse_schedstat, read_file
 
 TELL_S: Final = 0.2
-"""The node is told no more often: as often as it measures itself."""
+"""Shortest time between two reports to the node: it measures itself as often."""
 LONG_S: Final = 1e-3
-"""Behind a job that took so long, the process's CPU clock is read as well: it costs more, by the number of threads."""
+"""Behind a job that took this long, the process's CPU clock is read as well: it costs more with more threads."""
 PARALLEL, ALONE = 1.5, 1.3
 """From so many times a thread's own CPU time on, the process's time during its jobs is the jobs'; up to so many it is
 somebody else's in the process."""
@@ -167,7 +167,7 @@ class JobBook:
         return timer
 
     def job(self, skipped: int, came_s: float | None) -> Job:
-        """One job of the calling thread; ``skipped``: so many before it were left undone for it."""
+        """One job of the calling thread; ``skipped``: this many before it were left undone for it."""
         thread = threading.get_ident()
         with self._lock:
             timer = self._own.get(thread)

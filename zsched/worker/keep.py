@@ -46,7 +46,7 @@ _log = logging.getLogger("zsched.worker")
 
 
 class _Bell(threading.Event):
-    """Set while something is kept; whoever sets it also wakes a thread that waits for a frame."""
+    """Set while something is kept; its setter also wakes a thread that waits for a frame."""
 
     def __init__(self, frames: queue.SimpleQueue[Sample | None]) -> None:
         super().__init__()

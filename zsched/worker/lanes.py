@@ -1,6 +1,6 @@
 """One output's answers that are kept: the lock and the ways to single relays around `zsched.core.hop.shared`.
 
-Knows: threads, zenoh's publishers. Does not know: what is owed to whom (`SharedSender`), when it is put
+Knows: threads, zenoh's publishers. Does not know: what is owed to which relay (`SharedSender`), when it is put
 (`zsched.worker.keep`), which inputs wait (`zsched.worker.debts`).
 """
 

@@ -64,7 +64,7 @@ class Output:
         stamp_now: Callable[[], zenoh.Timestamp | None],
         owe: Callable[[KeptLane, int], None],
     ) -> None:
-        """``owe`` is told of an answer of class ``reliable`` before it is put: (its lane, its number)."""
+        """``owe`` hears of an answer of class ``reliable`` before it is put: (its lane, its number)."""
         self._session = session
         self._template = template
         self.is_latest = latest

@@ -1,4 +1,4 @@
-"""Hears from this node's daemon what the worker shall be, and shows in which epoch it works.
+"""Hears from this node's daemon what role the worker has, and shows in which epoch it works.
 
 Knows: role keys, the question asked until there is an answer, the role's token. Does not know: what a role changes.
 """
@@ -28,7 +28,7 @@ _log = logging.getLogger("zsched.worker")
 class RoleWatch:
     """The roles told under one key. ``on_role`` is called in a thread of its own.
 
-    Whoever reaches the data network can put under that key, in anybody's name. So a put is only a reason to ask, and
+    Any program on the data network can put under that key, in anybody's name. So a put is only a reason to ask, and
     an answer counts when it is of the session at the other end of our link to this node's relay.
     """
 
@@ -86,7 +86,7 @@ class RoleWatch:
             is_answered = self._is_answered()
             if is_answered:
                 pause_s = RETRY_S
-                self._stop.wait(ASK_EVERY_S)  # who is flooded with puts does not ask for each of them
+                self._stop.wait(ASK_EVERY_S)  # a worker that is flooded with puts does not ask for each of them
             else:
                 pause_s = min(2 * pause_s, MAX_RETRY_S)
 
@@ -119,7 +119,7 @@ class RoleWatch:
         return False
 
     def _relays(self) -> frozenset[str]:
-        """Who is at the other end of our link to the relay; nobody: we dial none, or it is the relay that has dialled.
+        """The session at the other end of our link to the relay; none: we dial nobody, or the relay has dialled.
 
         Then any answer counts.
         """

@@ -40,10 +40,10 @@ SLICE_S: Final = 0.02
 """Silence is counted in pieces of this length: a time in which this process did not run is no silence of another."""
 TIMEOUT_S: Final = 2.0
 CONTEST_S: Final = 0.1
-"""So long a whole state waits for whoever else answers the same question."""
+"""A whole state waits this long for another answer to the same question."""
 MAX_OFFERS: Final = 2
 RELAY_S: Final = 5.0
-"""So long a worker that starts waits for its node's relay, which may start later than it does (or again)."""
+"""A worker that starts waits this long for its node's relay, which may start later than it does (or again)."""
 
 _log = logging.getLogger("zsched.worker")
 
@@ -313,7 +313,7 @@ class Restorer:
             if not self.is_pending or not is_ours or noted is None or noted.predecessor is None:
                 return False
             if self._has_begun:
-                return self._result is None  # under way: who asks again (a lease was renewed) waits like the first
+                return self._result is None  # under way: a second asker (a lease was renewed) waits like the first
             self._has_begun = True
             predecessor = noted.predecessor
         arguments = (role.epoch, predecessor, then)

@@ -33,7 +33,7 @@ class Surroundings:
     zenoh_config: str
     is_standalone: bool = False
     deadline_s: float | None = None
-    """The task's (`objective: latency`); ``None``: it has none, or whoever started the worker has not told."""
+    """The task's (`objective: latency`); ``None``: it has none, or the starter of the worker has not said."""
     output_keys: tuple[str, ...] = ()
     """What the task's output rules take of this node; empty: there are none, or nobody has told."""
 

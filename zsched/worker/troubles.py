@@ -22,10 +22,10 @@ from zsched.core.values.model import MAX_REASON
 from zsched.guard import guarded
 
 TELL_S: Final = 1.0
-"""The node is told no more often."""
+"""Shortest time between two reports to the node."""
 LOG_S: Final = 10.0
 MAX_KINDS: Final = 32
-"""Kinds of errors that are told apart in the log."""
+"""At most this many kinds of errors are kept apart in the log."""
 _ROOM: Final = 60
 """Of `MAX_REASON`, for the words before the error's own."""
 MAX_NAME: Final = 60
@@ -82,7 +82,7 @@ class Troubles:
             self._timer, self._told_at = None, monotonic_s()
             count, newest, self._newest = self._count, self._newest, None
         text = "" if newest is None else _told(newest)
-        with contextlib.suppress(Exception):  # the session closes: whoever is left without a word sees the worker's end
+        with contextlib.suppress(Exception):  # the session closes: an asker without an answer sees the worker's end
             self._tell(count, text)
 
 

@@ -61,7 +61,7 @@ from zsched.worker.start import open_session, relay_endpoint, surroundings
 from zsched.worker.troubles import Troubles
 
 CLOSE_S: Final = 0.6
-"""Closing a session towards a stopped peer can take seconds; so long we wait."""
+"""Closing a session towards a stopped peer can take seconds; we wait for at most this long."""
 ALARM_S: Final = 0.9
 """...and should zenoh hold Python's global lock meanwhile, the kernel ends a process that was told to stop."""
 
@@ -106,7 +106,7 @@ class Worker:
         self._outputs: list[Output] = []
         self._output_keys = output_keys
         self._untaken = ""
-        """What is told of the first output that no rule of the task takes."""
+        """The report about the first output that no rule of the task takes."""
         self._is_ready = False
         self._declared: list[Any] = []
         self._errands = Errands(self._stop)
@@ -184,7 +184,7 @@ class Worker:
         """Take an input; call it before `ready`. ``{prefix}`` is filled in.
 
         ``on_sample`` runs in the dispatch thread. When it falls behind, samples wait: of an input of class ``reliable``
-        all, of any other the newest per key. ``keep_last`` says otherwise: so many of the newest per key, ``None``:
+        all, of any other the newest per key. ``keep_last`` says otherwise: this many of the newest per key, ``None``:
         all. Of all, at most ``depth`` per key wait, then the oldest go. What goes of a ``reliable`` input is counted
         `lost` in `zsched status`; of others, what gives way to something newer counts as processed.
 
@@ -210,7 +210,7 @@ class Worker:
         keep_last: int = 1,
         depth: int = OUTPUT_DEPTH,
     ) -> Output:
-        """An output; ``{prefix}`` and ``{epoch}`` are filled in, the epoch anew whenever this worker becomes the owner.
+        """An output; ``{prefix}`` and ``{epoch}`` are filled in, the epoch at each time this worker becomes the owner.
 
         ``latest``: the last ``keep_last`` values are cached for who comes late; a put never waits, behind a stalled
         receiver the newest wait. ``reliable``: a put waits for a slow receiver (up to a lease) instead of dropping, and
@@ -300,14 +300,14 @@ class Worker:
             raise RuntimeError(f"Worker.{call} after Worker.ready: relays may send already; declare it before")
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Sleep at most so long; ``False`` as soon as the worker shall end."""
+        """Sleep at most this long; ``False`` as soon as the worker is asked to end."""
         return not self._stop.wait(timeout_s)
 
     def job(self, *, skipped: int = 0, came_s: float | None = None) -> Job:
         """A piece of work that is not done in a callback: ``with worker.job(): ...``, in whatever thread does it.
 
-        The daemon is told how long jobs take, how much CPU, and how many are left undone (docs/guide/worker.md); from
-        the first one on, callbacks are no jobs any more. ``skipped``: so many were left undone for this one.
+        The daemon hears how long jobs take, how much CPU, and how many are left undone (docs/guide/worker.md); from
+        the first one on, callbacks are no jobs any more. ``skipped``: this many were left undone for this one.
         ``came_s``: when what it works on came, by ``time.monotonic``.
         """
         return self._jobs.job(skipped, came_s)

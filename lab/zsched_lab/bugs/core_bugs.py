@@ -4,7 +4,7 @@ Knows: which text of which module each bug replaces, and which tests may find it
 bugs in relays and workers (`zsched_lab.bugs.stream_bugs`).
 
 A bug is a few words of source. When the source changes so that the words are no longer there, planting fails and says
-so: then the bug is written anew for the new source.
+so: then the bug is written again for the new source.
 """
 
 from __future__ import annotations

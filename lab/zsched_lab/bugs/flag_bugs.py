@@ -1,4 +1,4 @@
-"""Bugs of operators' flags: whom they keep out, who hands over, how long they last.
+"""Bugs of operators' flags: which nodes they keep out, which hand over, how long they last.
 
 Knows: as `zsched_lab.bugs.core_bugs`. Does not know: the same.
 """

@@ -144,7 +144,7 @@ class KeyFuzz:
         )
 
     def run(self, rounds: int) -> None:
-        """So many rounds of everything."""
+        """This many rounds of everything."""
         for number in range(rounds):
             for part in self._parts:
                 try:

@@ -285,7 +285,7 @@ class Fuzz:
         self._node.start(self.now)
 
     def run(self, frames: int) -> None:
-        """Damage and feed so many frames."""
+        """Damage and feed this many frames."""
         for number in range(frames):
             frame = damaged(self._frames, self._rng)
             try:

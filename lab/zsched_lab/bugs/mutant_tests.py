@@ -47,10 +47,10 @@ TESTS = (
     "tests/unit/wire/test_codec.py",
 )
 SCHEDULES = 24
-"""What no test has found is looked for by so many schedules."""
+"""What no test has found is looked for by this many schedules."""
 SLOWER = 20.0
 LEAST_CPU_S = 10.0
-"""A test that takes so many times its usual CPU time and so much more does not end."""
+"""A test that takes this many times its usual CPU time and this much more does not end."""
 MORE_MEMORY = 2 << 30
 KILLED, SURVIVED, TIMEOUT = "killed", "survived", "timeout"
 UNJUDGED = "not judged"

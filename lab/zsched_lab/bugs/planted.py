@@ -62,7 +62,7 @@ MAX_SEEDS = 100_000
 
 
 class PlantError(Exception):
-    """The text that a bug replaces is not in its module exactly once: write the bug anew."""
+    """The text that a bug replaces is not in its module exactly once: write the bug again."""
 
 
 def changed(bug: Bug, source: str) -> str:

@@ -179,7 +179,7 @@ def foresights(world: World) -> tuple[Entry, ...]:
 
 
 def costly(world: World, move_cost_s: float) -> tuple[Entry, ...]:
-    """What to do when a move costs so many seconds of work: other bonuses, and a patience by the cost."""
+    """What to do when a move costs this many seconds of work: other bonuses, and a patience by the cost."""
     return (
         *ours(world),
         *(Entry(name=f"timer, bonus {bonus:g}", make=timed(world, bonus=bonus)) for bonus in (0.05, 0.15, 0.2, 0.3)),

@@ -184,7 +184,7 @@ def sizes(rows: Sequence[Row], path: Path) -> None:
 
 
 def drives(world: World, moves: Mapping[str, list[Move]], shown: Sequence[str], title: str, path: Path) -> None:
-    """As the paper's real-world figure: the signals, and who has the task, for a few rules."""
+    """As the paper's real-world figure: the signals, and the owner of the task, for a few rules."""
     figure, axes = plt.subplots(
         1 + len(shown), 1, figsize=(10, 3.4 + 1.25 * len(shown)), layout="constrained", sharex=True,
         gridspec_kw={"height_ratios": [3, *(1 for _ in shown)]},

@@ -1,6 +1,6 @@
 """The rules that are compared: zsched's own judges, the paper's schemes, and yardsticks without any view.
 
-Knows: when each rule looks, and whom it then chooses. Does not know: the truth, what a choice is worth.
+Knows: when each rule looks, and which node it then chooses. Does not know: the truth, what a choice is worth.
 
 `CoreRule` is the production's decision: one `Judge` per robot, a called vote, the tally, flap damping. It does what
 `zsched.core.scheduler.rounds` does when no message is lost; `tests/unit/lab/decisions/test_same_as_nodes.py` holds the

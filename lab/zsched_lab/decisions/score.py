@@ -17,7 +17,7 @@ from zsched_lab.decisions.rules import Move
 from zsched_lab.decisions.world import DT_S, World, bad, true_utility
 
 MOVE_COST_S: Final = 1.0
-"""A move costs as much as so many seconds without the task. Measured gaps of planned moves are one period of the
+"""A move costs as much as this many seconds without the task. Measured gaps of planned moves are one period of the
 worker (1 s for map merging); what is dearer is counted here as well."""
 BACK_WITHIN_S: Final = 30.0
 

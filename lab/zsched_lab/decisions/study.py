@@ -1,4 +1,4 @@
-"""Which histories are played to whom, and what comes of it: results as lines of JSON that a later run goes on from.
+"""Plays histories to rules; results are lines of JSON that a later run goes on from.
 
 Knows: experiments, seeds (those that defaults are chosen by, and those that are only looked at afterwards), resuming.
 Does not know: how a rule decides, how results are shown.
@@ -27,7 +27,7 @@ COSTS_S: Final = (1.0, 5.0, 15.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Case:
-    """One history to be played: ``build(seed, hours)`` makes it, ``cast`` says to whom."""
+    """One history to be played: ``build(seed, hours)`` makes it, ``cast`` names the rules."""
 
     name: str
     build: Callable[[int, float], World]

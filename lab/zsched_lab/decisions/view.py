@@ -3,7 +3,7 @@
 Knows: sampling, smoothing, publication, gathers without loss. Does not know: rules, and the truth behind readings.
 
 Every robot receives every profile at once, so one gateway stands for all; each robot has its own utilities, for its
-links are its own. What is seen does not depend on who has the task (its own load is subtracted), so all rules that want
+links are its own. What is seen does not depend on the owner (its own load is subtracted), so all rules that want
 the same smoothing, weights and limits share one `View`.
 """
 
@@ -120,7 +120,7 @@ class View:
         self._version = -1
 
     def standing(self, now: float) -> Standing:
-        """The joint view of a gather now; computed anew only when a profile has come."""
+        """The joint view of a gather now; computed again only when a profile has come."""
         if self._standing is None or self._version != self.gateway.version:
             self._version = self.gateway.version
             vectors = self.vectors(now)

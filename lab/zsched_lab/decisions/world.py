@@ -70,8 +70,8 @@ class World:
     def between(self) -> Array | None:
         """True signals [T, R, C] between robots and candidates.
 
-        Through one access point the delays of both ways add up. The robots' own ways are part of that whoever has the
-        task; what is decided about is the candidate's way, so that is what counts (docs/decisions/0018).
+        Through one access point the delays of both ways add up. The robots' own ways are part of that whichever node
+        has the task; what is decided about is the candidate's way, so that is what counts (docs/decisions/0018).
         """
         if self.signal is None or self.signal.ndim == 3:
             return self.signal
@@ -209,7 +209,7 @@ def robots_world(*, seed: int, hours: float, robots: int = 3) -> World:
 def drives_world(drives: tuple[radio.Drive, ...], *, are_robots: bool) -> World:
     """A history in which every candidate's link follows one recorded drive.
 
-    With ``are_robots`` the candidates are the robots, each of whom reaches the others through one access point by its
+    With ``are_robots`` the candidates are the robots, each of which reaches the others through one access point by its
     own link (the paper's Sec. VII-C). Otherwise they are edges on wheels, and the robots stand still beside the access
     point, so that a candidate's drive is all that counts.
     The true signal is the drive's mean over 11 s about each moment: what single readings scatter about.

@@ -21,7 +21,7 @@ from zsched_lab.fleet.view import FleetView, MapView, NodeView, TaskView
 
 PROGRESS_PERIOD_S = 10.0
 WIDE = 96
-"""From so many columns on the kinds are spelled out and the bars are long."""
+"""From this many columns on the kinds are spelled out and the bars are long."""
 
 
 class View(Protocol):

@@ -153,7 +153,7 @@ def paint(grid: Grid, colour: str) -> Picture:
 
 
 def wider(mask: Mask, cells: int) -> Mask:
-    """The mask grown by so many cells in each direction."""
+    """The mask grown by this many cells in each direction."""
     kernel = np.ones((2 * cells + 1, 2 * cells + 1), dtype=np.uint8)
     grown: Mask = cv2.dilate(mask.astype(np.uint8), kernel).astype(np.bool_)
     return grown

@@ -38,9 +38,9 @@ DRIVE_END_RATIO = 0.86
 """The robots' drives end here, so that their last maps are merged and come back before the run ends."""
 MIN_DRIVE_S = 8.0
 REASON_S = 0.8
-"""A move is told so late, that the daemon that knows why has been asked too (the others learnt it from a peer)."""
+"""A move is reported this late, so that the daemon that knows why has been asked too."""
 TRUTH_S = 90.0
-"""So long the truth may still take after the run (long logs on slow machines)."""
+"""The truth may still take this long after the run (long logs on slow machines)."""
 EDGE_CORES = (0.4, 0.5, 0.5)
 """CPU quotas of the edges in turn: the first is the weak one, as in the paper."""
 EDGE_MEMORY_MB = 768.0

@@ -24,7 +24,7 @@ from zsched_lab.maps.mapping import RESOLUTION_M
 MAP_PERIOD_S = 0.5
 CLAIM_PERIOD_S = 0.5
 STILL_PERIOD_S = 1.0
-"""A robot that stands maps once in so long: the same scan twice tells nothing new."""
+"""A robot that stands maps once in this time: the same scan twice tells nothing new."""
 MOVED_M, TURNED_RAD = 0.02, 0.02
 
 

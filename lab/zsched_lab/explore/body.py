@@ -19,7 +19,7 @@ RADIUS_M = 0.105
 """TurtleBot3 Burger (ROBOTIS e-manual: 138 mm x 178 mm)."""
 STEP_S = 0.05
 LONGEST_S = 0.5
-"""A robot whose process was held up drives on for so long at most; then its base's watchdog stops it."""
+"""A robot whose process was held up drives on for at most this long; then its base's watchdog stops it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

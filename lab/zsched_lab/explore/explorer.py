@@ -28,7 +28,7 @@ PLAN_PERIOD_S = 0.5
 """Plans at most so often, and only for a reason: a new map, a reached goal, a wall."""
 REACHED_M = 0.4
 AVOID_S = 8.0
-"""A frontier that the robot has been at, or could not get to, does not count for so long, ..."""
+"""A frontier that the robot has been at, or could not get to, does not count for this long, ..."""
 AVOID_M = 8.0
 """... or for as long as a slow robot needs for this way: else it is back before it has got anywhere."""
 CLAIM_LIFE_S = 3.0
@@ -102,7 +102,7 @@ class Explorer:
         self._map, self._is_due = grid, True
 
     def look_again(self) -> None:
-        """Plan anew on the map that it has."""
+        """Plan again on the map that it has."""
         self._is_due = self._map is not None
 
     def take_transform(self, merged_t_map: Pose2) -> None:
@@ -150,7 +150,7 @@ class Explorer:
         field = distances(self._plan, (here.x, here.y))
         claims = [claim for _, claim in self._claims.values()]
         mine = self.claim
-        # Of two that go to one place the nearer one stays. If both gave way, both would come back, and so on for ever.
+        # Of two that go to one place the nearer one stays. If both gave way, both would come back, again and again.
         taken = [one for one in claims if mine is None or not one.contests(mine) or one.goes_before(mine)]
         frontiers = find_frontiers(self._plan, field, [(claim.x, claim.y) for claim in taken])
         before = self.goal

@@ -15,7 +15,7 @@ Point = tuple[float, float]
 CORNER_M = 0.15
 TURN_FIRST_RAD = 0.9
 BACK_S = 0.6
-"""After a bump it backs off for so long, ..."""
+"""After a bump it backs off for this long, ..."""
 BACK_SPEED = -0.3
 """... at this share of its speed."""
 

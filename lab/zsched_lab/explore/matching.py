@@ -40,7 +40,7 @@ ROUND = 64
 LEAST_ROUNDS = 4
 CLOSEST_M, CLOSEST_RAD = 0.004, 0.002
 SHARPNESS = 12.0
-"""How much a better fit weighs: a scan's echoes are not independent, so it counts as so many, not as 360."""
+"""How much a better fit weighs: a scan's echoes are not independent, so it counts as this many, not as 360."""
 LEAST_ECHOES = 12
 """With fewer, odometry is all there is."""
 

@@ -1,7 +1,7 @@
 """The explorers' own messages as bytes: claims, scans for mapping elsewhere, and what comes back: poses and ways.
 
-Knows: these layouts, and where a robot's map stands among the merger's transforms. Does not know: zenoh, who sends what
-when. Maps and transforms are ROS messages (`zsched.tasks.map_merge.cdr`).
+Knows: these layouts, and where a robot's map stands among the merger's transforms. Does not know: zenoh, which program
+sends what when. Maps and transforms are ROS messages (`zsched.tasks.map_merge.cdr`).
 
 A claim is JSON: ``{"robot", "x", "y", "way_m"}`` in the merged frame, without ``x`` when the robot goes nowhere. A scan
 is, little endian: ``ZSC1``, the stamp in ns (int64), the robot's pose in its map frame x, y, yaw (float64), the number

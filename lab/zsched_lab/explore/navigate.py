@@ -46,7 +46,7 @@ from zsched_lab.fleet.signals import StopFlag
 
 POLL_S = 0.05
 AGAIN_S = 1.0
-"""A way is told again so often, changed or not: the robot may have missed it."""
+"""A way is sent again this often, changed or not: the robot may have missed it."""
 SAVED_S = 1.0
 """CPU that was not used for longer than this is not caught up."""
 

@@ -104,7 +104,7 @@ class ChaosBed(Netbed):
     # --- mending -----------------------------------------------------------------------------------------------------
 
     def calm(self, timeout_s: float = 60.0) -> NodeId:
-        """End every fault, start who is down, wait until all is well; the owner of ``echo``."""
+        """End every fault, start the nodes that are down, wait until all is well; the owner of ``echo``."""
         self.network.heal()
         for node in self.names:
             self.network.narrow(node, None)

@@ -18,7 +18,7 @@ from collections.abc import Iterator
 import zenoh
 
 HEARD_S = 30.0
-"""So long it waits until somebody hears it."""
+"""It waits this long until somebody hears it."""
 
 
 def frames(session: zenoh.Session, key: str, payload: bytes, count: int) -> None:

@@ -160,5 +160,5 @@ class Hall:
             return ""
 
     def alive(self, node: str) -> set[str]:
-        """Whom a node takes for alive; empty: it does not answer yet."""
+        """The nodes that a node takes for alive; empty: it does not answer yet."""
         return {str(one["name"]) for one in self.status(node).get("nodes", ()) if one["state"] == "alive"}

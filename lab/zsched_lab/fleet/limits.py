@@ -19,7 +19,7 @@ from zsched.errors import AdapterError
 
 
 class LimitKind(StrEnum):
-    """How the edges are told apart."""
+    """How the edges differ."""
 
     CGROUP = "cgroup"
     AFFINITY = "affinity"

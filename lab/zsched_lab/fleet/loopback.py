@@ -45,7 +45,7 @@ def own_address() -> str:
 
 
 def free_endpoints(count: int) -> list[str]:
-    """So many different zenoh endpoints on `own_address` where nobody listens; none is given a second time."""
+    """This many different zenoh endpoints on `own_address` where nobody listens; none is given a second time."""
     lease = _lease()
     return [f"tcp/{lease.address}:{_free_port(lease)}" for _ in range(count)]
 

@@ -150,7 +150,7 @@ class Network:
     # --- faults ------------------------------------------------------------------------------------------------------
 
     def cut(self, *names: str) -> None:
-        """Nothing goes in or out any more; nobody is told (packets vanish)."""
+        """Nothing goes in or out any more; nobody notices by itself (packets vanish)."""
         for name in names:
             self._set(name, "cut", f"in iifname {INTERFACE} drop", f"out oifname {INTERFACE} drop")
 
@@ -169,12 +169,12 @@ class Network:
             self._set(name, "split", f"in ip saddr {{ {addresses} }} drop", f"out ip daddr {{ {addresses} }} drop")
 
     def lose(self, percent: int, *names: str) -> None:
-        """So many of 100 packets that come to each of ``names`` are lost, at random."""
+        """This many of 100 packets that come to each of ``names`` are lost, at random."""
         for name in names:
             self._set(name, "loss", f"in iifname {INTERFACE} numgen random mod 100 < {percent} drop")
 
     def narrow(self, name: str, mbit: float | None) -> None:
-        """Limit what leaves a namespace to so many Mbit/s (``None``: no limit) behind a queue of 100 ms."""
+        """Limit what leaves a namespace to this many Mbit/s (``None``: no limit) behind a queue of 100 ms."""
         if mbit is None:
             with contextlib.suppress(NetworkError):
                 run("tc", "-n", self.name_of(name), "qdisc", "del", "dev", INTERFACE, "root")

@@ -1,6 +1,6 @@
 """Runs a whole fleet on this machine: real daemons with their own state, sockets, ports and shares of the CPU.
 
-Knows: the fleet file, the command line, who is up. Does not know: robots' applications, schedules, pictures.
+Knows: the fleet file, the command line, which nodes are up. Does not know: robots' applications, schedules, pictures.
 """
 
 from __future__ import annotations

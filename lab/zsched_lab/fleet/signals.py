@@ -19,7 +19,7 @@ LOOK_AGAIN_S = 0.2
 
 
 class StopFlag:
-    """Set by the first stop signal; whoever holds it looks between two pieces of work."""
+    """Set by the first stop signal; its holder looks between two pieces of work."""
 
     def __init__(self) -> None:
         self.is_set = False

@@ -4,7 +4,7 @@ Knows: fleet files, daemon processes, signals, waiting for a condition. Does not
 
 Everything that was started is gone when the context ends, whatever happened inside; an end without an error checks that
 the relays' counters account for every sample. Workers die with their daemons; a
-relay outlives one that crashed, so `Testbed.kill` ends it, too, unless it is told otherwise.
+relay outlives one that crashed, so `Testbed.kill` ends it, too, unless its caller says otherwise.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ SCHEDULING: Mapping[str, float | str] = {
 next to nothing while the machine is busy; what is left over still tells the nodes apart."""
 POLL_S = 0.01
 COUNTS_S = 30.0
-"""So long a daemon that runs may take to tell its counters."""
+"""A daemon that runs may take this long to tell its counters."""
 
 Json = dict[str, Any]
 T = TypeVar("T")
@@ -176,7 +176,7 @@ class Testbed:
         return True
 
     def relay_pid(self, node: NodeId) -> int | None:
-        """The process id of a node's relay, whoever started it."""
+        """The process id of a node's relay, whichever daemon started it."""
         note = Door(self.folder, node).note()
         return None if note is None or note.pid == 0 else note.pid
 
@@ -200,7 +200,7 @@ class Testbed:
                 code = process.wait(max(start + within_s - time.monotonic(), 0.1))
             except subprocess.TimeoutExpired:
                 process.kill()
-                code = process.wait(90)  # whoever waits for a slow disk cannot be killed
+                code = process.wait(90)  # a process that waits for a slow disk cannot be killed
             results[node] = (code, time.monotonic() - start)
         return results
 
@@ -316,7 +316,7 @@ class Testbed:
         return self.wait(settled, timeout_s, "an owner on all nodes") or ""
 
     def wait_whole(self, timeout_s: float = 60.0) -> NodeId:
-        """Start who is down, wait until everybody is alive to everybody and the streams are settled; the owner."""
+        """Start the nodes that are down, wait until all are alive to all and the streams are settled; the owner."""
         self.start()
 
         def whole() -> bool:

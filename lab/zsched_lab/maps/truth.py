@@ -23,7 +23,7 @@ def main(arguments: list[str] | None = None) -> int:
     os.nice(19)
     log, out = Path(given[0]), Path(given[1])
     payload = encode_grid(truth_grid(load_log(log)))
-    # Whoever waits for the file must never see half of it.
+    # A process that waits for the file must never see half of it.
     half = out.with_suffix(".part")
     half.write_bytes(payload)
     half.rename(out)

@@ -25,7 +25,7 @@ OURS = {"zsched": "#111111", "zsched_slam": "#8a1c1c"}
 Curve = tuple[list[float], list[float], list[float | None]]
 """(t_s, mean share, half of its 95 % interval or ``None`` of one run)."""
 MARKS = 5
-"""So many instants of the run stand in the table."""
+"""This many instants of the run stand in the table."""
 STATES = (
     ("idle", "SLAM and navigation alone"),
     ("merge", "and the merger"),

@@ -18,7 +18,7 @@ from zsched_lab.fleet.recorder import read_records
 from zsched_lab.paper.arrivals import Arrival, Streams
 
 CURVE_S = 5.0
-"""Coverage over time is told so often."""
+"""Coverage over time is recorded this often."""
 Json = dict[str, Any]
 
 

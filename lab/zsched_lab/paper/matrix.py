@@ -4,7 +4,7 @@ Knows: which cells there are, which are done, what makes a run invalid. Does not
 
 A cell is done when its ``metrics.json`` is there; figures by older definitions are made again from its records.
 A run whose host was short of CPU, or one of whose processes failed, is moved aside (``NAME.invalid-N``) and repeated,
-at most `ATTEMPTS` times in all; what stays invalid is told, not counted. A run that was cut (a signal, a kill) is
+at most `ATTEMPTS` times in all; what stays invalid is reported, not counted. A run that was cut (a signal, a kill) is
 moved aside (``NAME.interrupted-N``) and made again.
 """
 
@@ -28,7 +28,7 @@ ATTEMPTS = 3
 IDLE_FLOOR = 0.05
 """Where pressure cannot be measured: a host that was less idle than this was short of CPU."""
 GIVE_UP = 3
-"""So many cells in a row that stay invalid: the machine or the fleet is at fault, and the rest would fail as well."""
+"""This many cells in a row stay invalid: the machine or the fleet is at fault, and the rest would fail as well."""
 METRICS = "metrics.json"
 DEFINITIONS = 4
 """Raise it when a figure's definition changes: figures of finished runs are then made again."""

@@ -35,7 +35,7 @@ from zsched_lab.paper.roles import role_figures
 from zsched_lab.paper.scenario import Scenario
 
 WASTED_S = 30.0
-"""A move back to the node that was left within so long was for nothing."""
+"""A move back to the node that was left within this time was for nothing."""
 HELD_EVERY_S = 5.0
 Json = dict[str, Any]
 
@@ -272,7 +272,7 @@ def transfers(streams: Streams) -> Iterator[tuple[float, int]]:
 
 
 def owners_within(allocations: Iterable[Mapping[str, Any]], duration_s: float) -> list[tuple[float, NodeId]]:
-    """(from when, who) of the robots' drive; whoever had the task when they started has it from 0.
+    """(from when, owner) of the robots' drive; the owner when they started has it from 0.
 
     What was decided before, while the workers started, and after the drive is nobody's merit or fault.
     """

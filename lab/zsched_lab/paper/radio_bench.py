@@ -1,4 +1,4 @@
-"""Robot to robot, the paper's real-world demonstration: three robots, no edges, the radio decides who holds the task.
+"""Robot to robot, the paper's real-world demonstration: three robots, no edges, the radio decides.
 
 Knows: which schemes are run on the radio, and their figures. Does not know: how a run is made.
 

@@ -240,7 +240,7 @@ def record(endpoints: Mapping[NodeId, str], out: Path, stop: StopFlag) -> int:
 
 
 def _into(heard: queue.SimpleQueue[Heard], topic: str) -> Callable[[zenoh.Sample], None]:
-    # In the callback only the copy: whoever works there stalls every stream of the process.
+    # In the callback only the copy: work there stalls every stream of the process.
     return lambda sample: heard.put(Heard(topic, bytes(sample.payload), time.time_ns()))
 
 

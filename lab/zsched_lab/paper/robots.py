@@ -25,7 +25,7 @@ ODOMETRY = Drift(yaw=0.02, way=0.02)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Place:
-    """One robot of a run: who it is, its number of how many, the seed, where it is connected and what it is told."""
+    """One robot of a run: who it is, its number of how many, the seed, where it is connected and what it gets."""
 
     robot: NodeId
     index: int

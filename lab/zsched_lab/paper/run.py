@@ -48,10 +48,10 @@ from zsched_lab.paper.spaces import NodeChildren, narrow_links, spaced
 TICK_S = 0.1
 SAMPLE_S = 0.5
 OWNED_S = 40.0
-"""The task must have its first owner, and every node its worker ready, within so long."""
+"""The task must have its first owner, and every node its worker ready, within this time."""
 RECORDER_S = 20.0
 CALM_S = 8.0
-"""So long at most the robots wait for the start-up's CPU to fade from the nodes' smoothed figures."""
+"""The robots wait for at most this long for the start-up's CPU to fade from the nodes' smoothed figures."""
 LEAD_S = 2.0
 """From the start of the robots' programs to their begin: by then they are up (0.4 to 0.8 s here)."""
 SETTLE_S = 2.0
@@ -175,7 +175,7 @@ class CellRun:
         robots = sorted(name for name, node in tree["nodes"].items() if node["kind"] == "robot")
         frames = dict(zip(robots, self._inputs.robots.frames(len(robots), self._seed), strict=True))
         merge = merge_of(self._scenario, self._cell)
-        # Where nothing but the first robot's start is told, merged maps still lie in the truth's frame.
+        # Where the merger knows the first robot's start only, merged maps still lie in the truth's frame.
         told = dict(list(frames.items())[:1]) if merge.mode == Mode.ESTIMATE else frames
         options = worker_options(Mode.KNOWN, told) | {
             "--mode": (merge.mode,),

@@ -1,4 +1,4 @@
-"""Reads a scenario: which fleet, who is weak, what is injected where and when, which radio each link follows.
+"""Reads a scenario: which fleet, which nodes are weak, what is injected where and when, which radio each link follows.
 
 Knows: the scenario file's keys, units and ranges. Does not know: schemes, processes, figures.
 
@@ -53,7 +53,7 @@ class NodeShare:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoadLevel:
-    """How strong one injected load is: so many models (camera ``streams``), each taking ``share`` of an edge's CPU.
+    """How strong one injected load is: how many models (camera ``streams``), each taking ``share`` of an edge's CPU.
 
     ``share`` is of the largest quota among the nodes (0: all that it can get), so a weak edge is filled by what a
     strong one bears. ``side`` is the frame's side in pixels (a multiple of 32); ``memory_mb`` what such a process
@@ -163,7 +163,7 @@ class MergeTask:
     """The task itself: the merger's ``mode``, at most ``rate_hz`` maps a second, ``resolution_m`` of maps and merge.
 
     ``min_agreeing``: the wall cells (of 0.05 m) that must agree before two maps are joined; small worlds have few.
-    With ``mode: estimate`` the merger is told where the first robot started, and nothing of the others.
+    With ``mode: estimate`` the merger knows where the first robot started, and nothing of the others.
     """
 
     mode: str = "known"
@@ -180,7 +180,7 @@ class MergeTask:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Block:
-    """Rows of their own beside the matrix: these schemes, so many runs, and what is different there."""
+    """Rows of their own beside the matrix: these schemes, how many runs, and what is different there."""
 
     schemes: tuple[str, ...] = ()
     runs: int = 2
@@ -200,7 +200,7 @@ class Block:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sweep:
-    """The strength of the injected load over all levels: these schemes, so many runs each."""
+    """The strength of the injected load over all levels: these schemes, how many runs each."""
 
     schemes: tuple[str, ...] = ()
     runs: int = 2

@@ -24,7 +24,7 @@ from zsched_lab.fleet.runner import LabFleet, read_tree
 
 @contextlib.contextmanager
 def narrow_links(nodes: Sequence[NodeId], bandwidth_mbit: float | None) -> Iterator[Network | None]:
-    """A namespace per node behind a link of so many Mbit/s; ``None`` without a limit: all nodes share this machine's.
+    """A namespace per node behind a link of this many Mbit/s; ``None`` without a limit: all nodes share this machine's.
 
     Raises:
         NetworkError: this user may not; `zsched_lab.fleet.netns.why_not` tells beforehand.

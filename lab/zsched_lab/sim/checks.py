@@ -229,7 +229,7 @@ class Invariants:
         self.ballots[task, ballot] = (life, value or carried)
 
     def _check_cap(self, machine: Machine, proposal: Proposal) -> None:
-        """Who has seen a minute's planned moves in this life proposes no further one: counted from what it learnt.
+        """A robot that has seen a minute's planned moves in this life proposes no more: counted from what it learnt.
 
         An operator's moves are not counted: by what a node learns, the order (`Allocation.asked`) is part of the value.
         """

@@ -1,7 +1,7 @@
 """What has been chosen, seen from above: the judge of machines whose electors change.
 
-Knows: which elector has had which acceptance on disk, and with whom its ballot counts. Does not know: why a machine did
-anything.
+Knows: which elector has had which acceptance on disk, and with which electors its ballot counts. Does not know: why a
+machine did anything.
 
 A value is chosen the moment a majority of the electorate of its ballot has it on disk, whether anybody learns that or
 not. What must hold:
@@ -120,7 +120,7 @@ class Chosen:
     def _is_late(self, key: tuple[Name, Ballot], value: Value) -> bool:
         """Whether a value that was chosen before is chosen once more, in a ballot below that of the newest choice.
 
-        Who proposed the newer one has read it, so nothing is forgotten. The fleet register begins anew under each
+        The proposer of the newer one has read it, so nothing is forgotten. The fleet register begins again under each
         number: there a later ballot of an earlier number is below, too.
         """
         name, ballot = key

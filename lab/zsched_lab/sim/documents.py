@@ -154,7 +154,7 @@ class Documents:
         machine.disk.documents[:] = [one for one in machine.disk.documents if one in documents or one in recent]
 
     def content(self, machine: Machine, document: str) -> Document | None:
-        """What a machine answers who asks for a document."""
+        """What a machine answers to a question for a document."""
         if document not in machine.disk.documents:
             return None
         return self.contents[document]

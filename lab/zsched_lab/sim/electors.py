@@ -268,7 +268,7 @@ class Machines:
     # --- what they are asked to do -----------------------------------------------------------------------------------
 
     def move(self, machine: Machine, task: TaskId) -> str:
-        """It proposes another owner, whom nobody has proposed before; the owner's name."""
+        """It proposes another owner, one that nobody has proposed before; the owner's name."""
         self.owners += 1
         owner = f"w{self.owners}"
         register = machine.registers.get(task)

@@ -38,9 +38,9 @@ BEYOND = "beyond what is promised"
 EVENTS_PER_S = 500.0
 """A node handles about 50 a second; ten times that, on average over a whole schedule, is a storm."""
 EVENTS_PER_TASK_S = 25.0
-"""Each task adds so many. A node handles about 10 a second for a task that all nodes vote on again after each fault."""
+"""Each task adds this many. A node handles about 10 a second for a task that is voted on again after each fault."""
 LOST_S = 3.0
-"""So long a fleet that cannot agree is watched before the operator starts it anew."""
+"""A fleet that cannot agree is watched for this long before the operator starts it again."""
 AFTERMATH_S = 1.0
 """What was under way when the faults ended has arrived."""
 STOP_S = 0.8
@@ -146,7 +146,7 @@ class Stage:
         self.calm()
         at = sim.now
         if self.scene.is_memory_false:
-            sim.run(sim.behind_s + AFTERMATH_S)  # a node that has lost some of its state is told so
+            sim.run(sim.behind_s + AFTERMATH_S)  # a node that has lost some of its state hears so
         if not self.can_agree():
             sim.run(LOST_S)  # nothing may be agreed meanwhile that a majority does not remember
             self._start_generation()

@@ -1,6 +1,6 @@
 """What two fleet files of one fleet may differ in: one function for each, by chance.
 
-Knows: fleet files. Does not know: who has which (`zsched_lab.sim.rollout`).
+Knows: fleet files. Does not know: which node has which (`zsched_lab.sim.rollout`).
 """
 
 from __future__ import annotations

@@ -204,7 +204,7 @@ class Schedule:
         """A disk is lost for good: the machine comes back with a blank one, as another member.
 
         An elector of the file is left alone, for its first seat names no disk: `zsched init` asks the fleet before it
-        makes such a state anew.
+        makes such a state again.
         """
         name = self.rng.choice([one for one in sorted(self.sim.machines) if one not in self.fleet.electors])
         value = self._newest()

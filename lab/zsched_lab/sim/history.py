@@ -287,7 +287,7 @@ class History:
         return found
 
     def save(self, path: Path) -> None:
-        """One JSON object a line, sorted by time: for whoever must read it after a failure."""
+        """One JSON object a line, sorted by time: to be read after a failure."""
         lines = [
             json.dumps({"kind": type(one).__name__.lower(), **asdict(one)})
             for one in sorted(self.records, key=lambda one: one.at)

@@ -15,7 +15,7 @@ from zsched_lab.sim.swarm import Fault
 
 SMALL_DELAY_S = (0.0005, 0.003)
 SPIKES = 0.02
-"""So many messages of a hundred are late while there are spikes."""
+"""This many messages of a hundred are late while there are spikes."""
 
 
 @dataclass(slots=True)
@@ -91,7 +91,7 @@ class LinkFaults:
         self.scene.then(fault.seconds, lambda: sim.cuts.difference_update(pairs))
 
     def _links_end(self, pairs: set[Pair]) -> None:
-        """Links that are still cut end with zenoh's lease: whoever hears nothing loses the other's token."""
+        """Links that are still cut end with zenoh's lease: a node that hears nothing loses the other's token."""
         sim = self.scene.sim
         for source, target in sorted(pairs):
             node = sim.machines[source].node

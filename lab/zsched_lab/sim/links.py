@@ -1,6 +1,6 @@
 """The ways between simulated machines: delays, losses, cuts, and links that hold back and then deliver all at once.
 
-Knows: who reaches whom and when, machine by machine (a twin has links of its own). Does not know: what is said, what a
+Knows: which machine reaches which, and when (a twin has links of its own). Does not know: what is said, what a
 hostile network makes of a frame (`zsched_lab.sim.network`), how a loop takes an event (`zsched_lab.sim.loops`).
 
 A link that holds back keeps its order, as TCP does: what it has taken arrives, later, and nothing overtakes it.

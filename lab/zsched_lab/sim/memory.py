@@ -3,8 +3,8 @@
 That is not found out, and two values may be chosen (docs/design/failures.md). What such a schedule does to the
 agreement is no violation; where somebody in reach remembers, it is one.
 
-Knows: how many votes each disk has stood for, who remembers them, who reaches whom. Does not know: what was voted, how
-a disk forgets.
+Knows: how many votes each disk has stood for, which nodes remember them, which reach each other. Does not know: what
+was voted, how a disk forgets.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Memory:
             self.beyond = f"{machine.key} began with {votes} of {self._most[key]} votes; nobody in reach knows better"
 
     def _witnesses(self, machine: Machine, votes: int) -> frozenset[str]:
-        """Who is awake, reaches a machine and is reached, and remembers more of it than its state knew."""
+        """The nodes that are awake, reach a machine and are reached, and remember more of it than its state knew."""
         return frozenset(
             other.key
             for other in self.links.machines.values()

@@ -1,7 +1,7 @@
 """What a hostile network makes of one frame: copies, late ones, old ones again, damaged and forged ones.
 
-Knows: frames and the events they become; the production codec decides what is a frame. Does not know: who is up, when
-anything arrives, cuts (the simulator's).
+Knows: frames and the events they become; the production codec decides what is a frame. Does not know: which nodes are
+up, when anything arrives, cuts (the simulator's).
 
 A frame that was damaged and still reads as *another* valid value is not delivered: that takes an insider's key, and
 against insiders zsched does not protect (docs/design/failures.md).
@@ -22,7 +22,7 @@ from zsched.wire import codec as wire
 from zsched_lab.sim.checks import FORGED
 
 GHOST = "ghost"
-"""A name that no fleet file holds: whoever sends in it is a stranger."""
+"""A name that no fleet file holds: its sender is a stranger."""
 SENDER_FIELDS = ("node", "voter", "elector")
 KEPT = 300
 

@@ -102,7 +102,7 @@ class Disk:
         return self._go_back(rng.randint(0, len(self.past)))
 
     def _go_back(self, writes: int) -> bool:
-        """To what the file held so many writes ago."""
+        """To what the file held this many writes ago."""
         self._unsynced = None
         if not 0 < writes <= len(self.past):
             return False

@@ -58,7 +58,7 @@ class Schedule:
         self.counts = self.world.counts
         self.deaf: set[tuple[NodeId, NodeId]] = set()
         self.until: dict[tuple[str, str], float] = {}
-        """{(fault, at whom): when it is over}."""
+        """{(fault, node): when it is over}."""
         self.churning: dict[NodeId, float] = {}
         """{machine: since when it is away 3 s in 6}."""
         self.faults: tuple[Callable[[Machine], None], ...] = tuple(

@@ -20,7 +20,7 @@ QUANTILES_S: Mapping[str, Mapping[int, float]] = {
 }
 """{timing profile: {percent of the schedules: when they must be at rest}}."""
 FEWEST = {90: 30, 99: 300}
-"""{percent: so many schedules of a profile tell it}."""
+"""{percent: how many schedules of a profile tell it}."""
 
 
 def quantile(times: Sequence[float], percent: int) -> float:

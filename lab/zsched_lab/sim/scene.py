@@ -32,7 +32,7 @@ class Scene:
     """The newest generation that the operator has begun."""
     done: Counter[str] = field(default_factory=Counter)
     initialised: set[NodeId] = field(default_factory=set)
-    """Who has been brought into the newest generation."""
+    """The nodes that were brought into the newest generation."""
     is_over: bool = False
     is_memory_false: bool = False
     """Whether a disk has come back with less than it had said that it holds."""
@@ -46,7 +46,7 @@ class Scene:
         return self.sim.machines[fault.nodes[0]]
 
     def start_later(self, fault: Fault) -> None:
-        """Whoever went down comes back when the fault is over."""
+        """A node that went down comes back when the fault is over."""
         self.then(fault.seconds, lambda: self.sim.start(*fault.nodes))
 
     def restart(self, machine: Machine, fleet: Fleet) -> None:

@@ -30,7 +30,7 @@ CHUNK = 10
 STORIES_SHOWN = 40
 PROGRESS_EVERY = 500
 GARBAGE = (100_000, 10, 10)
-"""So many new values before the collector looks at them."""
+"""This many new values before the collector looks at them."""
 STOPPED = 143
 """Exit code after SIGTERM; what was played is in the file that ``--resume`` names."""
 
@@ -128,7 +128,7 @@ def _play(job: Job) -> tuple[Job, Result]:
 
 
 def play_all(jobs: Iterable[Job], processes: int) -> Iterator[tuple[Job, Result]]:
-    """Play many schedules, in order, in so many processes."""
+    """Play many schedules, in order, in this many processes."""
     if processes <= 1:
         yield from map(_play, jobs)
         return
@@ -139,7 +139,7 @@ def play_all(jobs: Iterable[Job], processes: int) -> Iterator[tuple[Job, Result]
 
 
 def _end_at_once() -> None:
-    """A pool ends its processes by SIGTERM: our own handler, inherited, may wait for ever for one of its locks."""
+    """A pool ends its processes by SIGTERM: our own handler, inherited, may wait without end for one of its locks."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 

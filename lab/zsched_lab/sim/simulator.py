@@ -53,7 +53,7 @@ QUESTIONS_KEPT = 4000
 
 
 def idle(_node: NodeId, _now: float) -> tuple[float, float]:
-    """Every machine a quarter busy, for ever."""
+    """Every machine a quarter busy, all the time."""
     return 1.0, 1000.0
 
 

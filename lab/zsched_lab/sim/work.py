@@ -22,7 +22,7 @@ from zsched_lab.sim.parts import Machine
 
 WORKER_START_S = 0.4
 COMPARED_S = 0.01
-"""A supervisor has compared its processes so long after it heard of another file."""
+"""A supervisor has compared its processes this long after it heard of another file."""
 FLIP_S = 0.005
 WORKER_STOP_S = (0.002,)
 LOOK_AGAIN_S = 0.05

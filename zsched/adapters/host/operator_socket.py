@@ -24,7 +24,7 @@ from zsched.guard import guarded
 MAX_LINE = 1 << 20
 MAX_CONNECTIONS = 16
 IDLE_S = 10.0
-"""A connection that says nothing for so long, or does not take its answer, is closed..."""
+"""A connection that says nothing for this long, or does not take its answer, is closed..."""
 RETRY_S = 0.2
 """Pause after a connection that could not be taken (no descriptors, no memory, no thread)."""
 
@@ -35,7 +35,7 @@ log = logging.getLogger("zsched.operator")
 class OperatorSocket:
     """Serves ``answer(request) -> response`` on a unix socket, one thread per connection, at most 16.
 
-    ...or at once when another wants its place: who asks nothing keeps nobody from asking.
+    ...or at once when another wants its place: a silent connection keeps nobody from asking.
     """
 
     def __init__(self, path: Path, answer: Callable[[Json], Json]) -> None:

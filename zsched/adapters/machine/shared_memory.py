@@ -3,7 +3,7 @@
 Knows: /dev/shm, control groups' quotas, network namespaces. Does not know: zenoh, which streams there are.
 
 zenoh maps a pool of 16 MiB per process, and a receiver that gets no processor for some tenths of a second loses what it
-was sent by this way without a trace: hence none of it under a CPU quota.
+was sent by this way without a trace, so it stays off under a CPU quota.
 """
 
 from __future__ import annotations

@@ -70,7 +70,7 @@ RING = 1024
 """Periodic frames that wait for the loop; if it does not come, the oldest go, and zenoh need not wait."""
 
 MAX_LIVES = 1024
-"""So many nodes' incarnations and sessions are remembered: commands to them are sealed for the former."""
+"""At most this many nodes' incarnations and sessions are remembered: commands to them are sealed for the former."""
 
 Answer = Snapshot | CommandResult | Explanation | WorkerLines | FleetTold | RehearsalsTold
 Post = Callable[[ev.Event], None]
@@ -341,7 +341,7 @@ class ControlBus:
         return event if owner == key.owner else ev.FrameDropped(kind=key.kind, reason="foreign")
 
     def _on_link(self, event: zenoh.LinkEvent) -> None:
-        """A frame's sender is held against the link's certificate by zenoh (access rules); here only who is linked."""
+        """Only linked nodes' names count here; zenoh's access rules check a frame's sender against its link."""
         name = event.link.auth_identifier
         if event.kind != zenoh.SampleKind.PUT or self._members is None or name in self._members:
             return
@@ -386,7 +386,7 @@ class ControlBus:
         query.reply(self._keys.command(self._node, asker), wire.encode(result))
 
     def _question(self, kind: str, asker: str, query: zenoh.Query) -> ev.Event:
-        """The event of one query; whoever answers it does so by number."""
+        """The event of one query; the answer names its number."""
         if not NAME.fullmatch(asker):
             raise WireError("key", "no asker")
         payload = b"" if query.payload is None else query.payload.to_bytes()
@@ -477,7 +477,7 @@ class ControlBus:
         self._ask(self._keys.register("*", self._node), wire.encode(question), deadline_s, kinds, on_answer)
 
     def ask_fleet(self, question: FleetQuestion, deadline_s: float) -> None:
-        """One query to every node, ourselves included: who is an elector answers; answers are posted as they come."""
+        """One query to every node, ourselves included: electors answer; answers are posted as they come."""
 
         def on_answer(owner: NodeId, value: FleetAnswer, _zid: str) -> None:
             if owner == value.content.elector:

@@ -26,7 +26,7 @@ from zsched.wire.keyspace import Keyspace
 from zsched.wire.seal import Act
 
 ANSWER_S = 3.0
-"""So long a question is asked again, as a daemon waits for another node."""
+"""A question is asked again for this long, as a daemon waits for another node."""
 ROUND_S = 1.0
 """After which it is asked again; a command that changes something is not, for the first one may yet have its effect."""
 PAUSE_S = 0.1

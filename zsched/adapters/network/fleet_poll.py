@@ -42,7 +42,7 @@ def ask_fleet(fleet: str, asker: NodeId, zenoh_configs: Sequence[str]) -> tuple[
     end = monotonic_s() + CONNECT_S + ANSWER_S
     for errand in errands:
         errand.join(max(end - monotonic_s(), 0.0))
-    answers = dict(found)  # who is later may still come in
+    answers = dict(found)  # later answers may still come in
     return tuple(answers[name] for name in sorted(answers))
 
 

@@ -18,10 +18,10 @@ from zsched.core.values.fleet import Fleet, Timing
 from zsched.wire.keyspace import Keyspace
 
 ROOM: Final = 20.0
-"""A peer may send so many times what the timing profile lets it send at rest."""
+"""A peer may send this many times what the timing profile lets it send at rest."""
 LEAST_HZ: Final = 100.0
 BURST_S: Final = 2.0
-"""After a silence a peer may send what so many seconds allow at once."""
+"""After a silence a peer may send what this many seconds allow at once."""
 PER_TASK_HZ: Final = 10.0
 """For each task: proposals, two phases of a round, their answers, what was learnt."""
 EVERYBODY_ELSE: Final = ""

@@ -129,7 +129,7 @@ class Seals:
             raise self._fault(SealFault.REPLAY, kind, owner)
 
     def question(self, kind: str, key: str, frame: bytes, attachment: bytes, asker: NodeId) -> Holder | None:
-        """Judge a question, or a command; returns who asks, ``None`` where it is unsigned and taken.
+        """Judge a question, or a command; returns the asker, ``None`` where it is unsigned and taken.
 
         Raises:
             WireError: as `put`.

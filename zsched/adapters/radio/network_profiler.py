@@ -29,7 +29,7 @@ NO_SAMPLE = frozenset({-2.0, -256.0})
 MAX_TRACE_BYTES = 32 << 20
 """A recorded drive, unpacked: a day at 5 Hz takes 20 MB."""
 TRACE_HOLD_S = 2.0
-"""A recorded value stands for so long when the rows behind it have none; then nothing is measured."""
+"""A recorded value stands for this long when the rows behind it have none; then nothing is measured."""
 
 
 class LinkReader(Protocol):
@@ -206,7 +206,7 @@ def retry_ratio(before: Station | None, after: Station) -> float | None:
 
 
 def _increase(before: int | None, after: int | None) -> int | None:
-    """How far a counter went on; ``None`` when it is missing or started again (the radio joined anew)."""
+    """How far a counter went on; ``None`` when it is missing or started again (the radio joined again)."""
     return None if before is None or after is None or after < before else after - before
 
 

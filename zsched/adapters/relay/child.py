@@ -49,7 +49,7 @@ class RelayChild:
             if self._has_ended:
                 return True
             if not self.is_child:
-                with contextlib.suppress(ChildProcessError):  # it may be one of this process before it began anew
+                with contextlib.suppress(ChildProcessError):  # it may be one of this process before it began again
                     os.waitpid(self.pid, os.WNOHANG)
                 note = None if self._door is None else self._door.note()
                 self._has_ended = note is None or note.pid not in (0, self.pid)

@@ -37,17 +37,17 @@ BACKOFF_MIN_S: Final = 0.1
 BACKOFF_MAX_S: Final = 5.0
 BACKOFF_FACTOR: Final = 2.0
 CALM_S: Final = 10.0
-"""A relay that lived so long is replaced at once; one that did not waits for its backoff."""
+"""A relay that lived at least this long is replaced at once; one that did not waits for its backoff."""
 SILENCE_S: Final = 1.5
-"""A relay says something twice a second; after so long without a word it is wedged, unless it lacks a processor."""
+"""A relay says something twice a second; after this long without a word it is wedged, unless it lacks a processor."""
 START_S: Final = 5.0
 """The same for its first word."""
 OPEN_S: Final = 30.0
 """The same for its session, which may have to wait for peers."""
 STARVED_S: Final = 15.0
-"""After so long without a word `status` says that it lacks a processor."""
+"""After this long without a word `status` says that it lacks a processor."""
 STILL_S: Final = 8.0
-"""Its streams are counted every second; after so long without a count they hang on something, though it lives."""
+"""Its streams are counted every second; after this long without a count they hang on something, though it lives."""
 EVICT_S: Final = 2.0
 
 _log = logging.getLogger("zsched.streams")
@@ -93,7 +93,7 @@ class Bequest:
 
     door: Door
     orphan_s: float
-    """The relay goes on without a daemon for so long."""
+    """The relay goes on without a daemon for this long."""
     incarnation: int
     """This daemon's; only a later one may take the relay over."""
     digest: str
@@ -122,7 +122,7 @@ class RelayHandle:
 
         ``local_config`` is the session of the host's own side; empty: the data session serves the host, too. Without
         ``bequest`` the relay dies with this process. ``silence_s`` should be over zenoh's lease: a call of zenoh that
-        waits for a frozen peer may hold Python's lock so long.
+        waits for a frozen peer may hold Python's lock that long.
         """
         self._configs = tuple(text.encode() for text in (zenoh_config, local_config) if text)
         self._on_report = on_report
@@ -167,7 +167,7 @@ class RelayHandle:
         self._tell(("watch", watch.task), watch)
 
     def end(self, task: TaskId) -> None:
-        """Let the relay end everything of a task; a relay that starts later is told nothing of it."""
+        """Let the relay end everything of a task; a relay that starts later hears nothing of it."""
         with self._lock:
             for kind in _KINDS:
                 self._newest.pop((kind, task), None)

@@ -1,6 +1,6 @@
 """The newest lines that a worker has printed, kept for operators; written by one thread, read by another.
 
-Knows: how many lines are kept, how many go into one answer. Does not know: processes, who asks.
+Knows: how many lines are kept, how many go into one answer. Does not know: processes, askers.
 """
 
 from __future__ import annotations

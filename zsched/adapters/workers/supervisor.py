@@ -14,7 +14,7 @@ A failure is any end of a worker that is wanted, but for one that `renew` asked 
 failure in the window, with jitter.
 
 Knows: phases, deadlines, the order of signals. Does not know: why a task starts or stops, zenoh, readiness itself
-(it is told), or how a process is made (`zsched.adapters.workers.process`).
+(its caller says so), or how a process is made (`zsched.adapters.workers.process`).
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ NOT_INHERITED = frozenset({"NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID", "LI
 
 
 class WorkerEvents(Protocol):
-    """Whom the supervisor tells; called from its thread, so an implementation only enqueues."""
+    """The receiver of the supervisor's reports; called from its thread, so an implementation only enqueues."""
 
     def on_started(self, task: TaskId, pid: int, incarnation: int) -> None:
         """A worker process runs; it is not ready yet."""
@@ -72,7 +72,7 @@ class WorkerEvents(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorkerContext:
-    """What every worker of this daemon is told through its environment."""
+    """What every worker of this daemon gets through its environment."""
 
     fleet: str
     node: NodeId
@@ -182,7 +182,7 @@ class WorkerSupervisor:
 
         Args:
             specs: one per task; an empty command means somebody else runs the worker: only the ``mark_*`` calls act.
-            context: what all workers are told.
+            context: what all workers get.
             events: told about starts, ends and failures.
             environment: called at every start (in the supervisor's thread) for the task's own variables, such as
                 ``ZSCHED_ZENOH_CONFIG``.
@@ -244,7 +244,7 @@ class WorkerSupervisor:
         """Keep these workers from now on, with these settings.
 
         No process ends by it but one whose task has no ``command`` any more: a worker that is not among ``specs`` goes
-        with its next `stop`, one that runs by an old recipe is told of (`WorkerEvents.on_compared`). Failures of a
+        with its next `stop`, one that runs by an old recipe is reported (`WorkerEvents.on_compared`). Failures of a
         worker whose recipe has changed are forgotten.
         """
         self._command(self._on_adopt, dict(specs))
@@ -508,7 +508,7 @@ class WorkerSupervisor:
             self._tell(self._events.on_exited, worker.task, worker.incarnation, returncode, reason)
             return
         reason = worker.failure or _describe_exit(returncode, process.last_line)
-        is_last = self._count_failure(worker, reason, returncode, now)  # who is told of the end asks what follows
+        is_last = self._count_failure(worker, reason, returncode, now)  # the receiver of this report asks what follows
         self._tell(self._events.on_exited, worker.task, worker.incarnation, returncode, reason)
         self._after_failure(worker, reason, now, is_last=is_last)
 

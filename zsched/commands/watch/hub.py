@@ -1,7 +1,7 @@
 """Asks one daemon for all who look at `zsched web`, and passes what is new on to each of them.
 
 However many look, the daemon is asked once in `PERIOD_S`, and once in `IDLE_S` while nobody looks and it answers.
-A client that takes its messages too slowly is dropped: it comes again by itself and gets everything anew.
+A client that takes its messages too slowly is dropped: it comes again by itself and gets everything again.
 
 Knows: the feed, the past, clients with their queues, messages as bytes. Does not know: HTTP.
 """
@@ -76,7 +76,7 @@ class Hub:
     # --- who looks ---------------------------------------------------------------------------------------------------
 
     def join(self) -> Client | None:
-        """A new client, which is told everything so far first; ``None``: there are as many as may be."""
+        """A new client, which gets everything so far first; ``None``: there are as many as may be."""
         client = Client()
         with self._lock:
             if self._closing.is_set() or len(self._clients) >= self._most:

@@ -37,7 +37,7 @@ LIBRARY: Final = "zsched"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordView:
-    """Whom to ask and what to write."""
+    """Which daemon to ask, and what to write."""
 
     runtime_dir: Path | None
     node: str | None
@@ -45,7 +45,7 @@ class RecordView:
     file: Path
     interval_s: float
     for_s: float | None
-    """So long; ``None``: until Ctrl-C."""
+    """For how long; ``None``: until Ctrl-C."""
     maps: tuple[str, ...] = ()
     """Key expressions whose samples are maps, besides those that say so by their ROS type."""
 
@@ -139,7 +139,7 @@ class Tape:
 
     @property
     def messages(self) -> int:
-        """So many have been written."""
+        """How many have been written."""
         return self._numbers.total()
 
     def put(self, message: tracks.Message) -> None:

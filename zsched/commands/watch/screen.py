@@ -40,7 +40,7 @@ STEPS: Final = {"\x1b[A": -1, "\x1b[B": 1, "k": -1, "j": 1, "\x1b[5~": -10, "\x1
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TopView:
-    """Whom to ask and how to show it."""
+    """Which daemon to ask, and how to show the answer."""
 
     runtime_dir: Path | None
     node: str | None

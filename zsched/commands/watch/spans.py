@@ -15,7 +15,7 @@ from typing import Final
 from zsched.commands.common import Json
 
 PATIENCE_S: Final = 60.0
-"""A move that is not settled by then is told as far as it came."""
+"""A move that is not settled by then is reported as far as it came."""
 MOST_LINES: Final = 100
 
 

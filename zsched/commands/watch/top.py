@@ -24,14 +24,14 @@ TOP: Final = 1.0
 MOST_CANDIDATES: Final = 5
 """Of a task with more, the owner and the best are shown."""
 GAP: Final = 2
-"""For so many columns a judgement stays when no other follows it."""
+"""A judgement stays for this many columns when no other follows it."""
 LEAST_MOVES: Final = 3
-"""So many moves are shown before streams are."""
+"""This many moves are shown before streams are."""
 MIN_WIDTH, MIN_HEIGHT = 60, 12
 
 
 class Detail(IntEnum):
-    """How much is told of each task."""
+    """How much is shown of each task."""
 
     LINE = 0
     BARS = 1

@@ -1,7 +1,7 @@
 """`zsched web`: serves one page, what it shows, and Prometheus' figures; reads only.
 
-A connection answers one request and ends. At most `MOST_CONNECTIONS` are open; who has not said within `REQUEST_S` what
-it wants, or takes its answer too slowly, is cut off. Requests are not logged.
+A connection answers one request and ends. At most `MOST_CONNECTIONS` are open; one that has not said within
+`REQUEST_S` what it wants, or takes its answer too slowly, is cut off. Requests are not logged.
 
 Knows: HTTP, connections, signals, the page's files. Does not know: who may ask (`zsched.commands.watch.gate`), what is
 told (`zsched.commands.watch.hub`).
@@ -50,7 +50,7 @@ MOST_TOKEN_BYTES: Final = 4096
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WebView:
-    """Whom to ask, where to listen, who may look."""
+    """Which daemon to ask, where to listen, and who may look."""
 
     runtime_dir: Path | None
     node: str | None
@@ -240,7 +240,7 @@ class _Server(http.server.HTTPServer):
                 request.shutdown(socket.SHUT_RDWR)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A client that went away is no error; our own faults are told by the thread's guard."""
+        """A client that went away is no error; the thread's guard reports our own faults."""
 
     def _serve(self, request: socket.socket, client_address: Any) -> None:
         try:

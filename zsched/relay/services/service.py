@@ -46,7 +46,7 @@ from zsched.relay.streams.receive import undeclare
 LOOK_AGAIN_S: Final = 0.02
 """How often a waiting request looks for an owner; a flip wakes it at once."""
 UNSERVED_GRACE_S: Final = 0.2
-"""A request whose owner answers no more under its key gets so long: its last words may still be in our queues."""
+"""A request whose owner answers no more under its key gets this long: last answers may still be in our queues."""
 JOIN_S: Final = 0.3
 MAX_KEYS: Final = 256
 """Keys of a wildcard service that are looked after; of further ones it is only known when a request has no answer."""
@@ -134,7 +134,7 @@ class ServiceStream:
         """
         forwards = rewriter(route.from_expr, route.to_expr)
         slot = _ServiceSlot(session=self._session, owner_key=route.to_expr, forwards=forwards)
-        slot.serves(route.to_expr)  # zenoh learns who is there from now on
+        slot.serves(route.to_expr)  # zenoh learns from now on which servers are there
         with self._lock:
             self._slots[epoch] = slot
 

@@ -2,8 +2,8 @@
 
 Knows: timestamps, times. Does not know: who answered, what follows.
 
-An answer that has its input's timestamp (the library's do, and a foreign worker's that copies it) is told exactly, the
-network included. Any other one is at least as old as the newest input before it.
+An answer that has its input's timestamp (the library's do, and a foreign worker's that copies it) is measured exactly,
+the network included. Any other one is at least as old as the newest input before it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from zenoh import Timestamp
 from zsched.clock import monotonic_s
 
 MAX_SENT: Final = 256
-"""So many inputs may wait for their answer; who is slower is told by the newest one."""
+"""At most this many inputs wait for their answer; a slower worker is measured by the newest one."""
 
 
 class AnswerTimes:

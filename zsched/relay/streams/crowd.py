@@ -7,7 +7,7 @@ receives something.
 zenoh hands a sample to one receiver after the other: a put that waits (BLOCK) for a frozen one makes all of them wait,
 for seconds. So, where there are two or more, each put first waits until every link has room. A receiver whose link has
 none is *left behind*, while another one is ready, when it has taken nothing for `PATIENCE_S`, or when the others have
-waited so long for it and the queue before the put runs full. As long as somebody is left behind, puts do not wait
+waited this long for it and the queue before the put runs full. As long as somebody is left behind, puts do not wait
 (DROP): zenoh drops for this receiver alone. What it may have missed is counted. After a rest, and when its link has
 room again, it is waited for like the others; of class ``latest`` the newest sample is then put once more.
 
@@ -40,7 +40,7 @@ SLICE_S: Final = 0.02
 """How long to wait for room before looking again at everything else."""
 FORGIVEN_RATIO: Final = 0.5
 REST_S, MAX_REST_S = 1.0, 8.0
-"""A receiver is left behind for so long at least; twice as long when it is left again soon."""
+"""A receiver is left behind for at least this long; for twice as long when it is left again soon."""
 FITS_BYTES: Final = 96 << 10
 """So much still fits into zenoh's queue of a link whose socket is full (two batches of 48 KiB)."""
 OVERHEAD_BYTES: Final = 48
@@ -126,7 +126,7 @@ class Crowd:
         self._missed = 0
 
     def put(self, lane: Lane, sample: Sample, stamp: Timestamp | None, size: int) -> None:
-        """Put a sample, waiting for everybody who is not left behind."""
+        """Put a sample, waiting for every receiver that is not left behind."""
         is_alone = self._look(monotonic_s())
         left = () if is_alone else self._wait()
         began = self._putting_since = monotonic_s()
@@ -161,7 +161,7 @@ class Crowd:
         return [(lane, sample, stamp) for lane, (sample, stamp) in owed.items()]
 
     def look_after(self) -> None:
-        """See whom a put waits for that is under way; call it a few times a second.
+        """See for which receiver a put under way waits; call it a few times a second.
 
         A receiver that froze in the middle of a sample loses its link, if others wait for it.
         """
@@ -190,7 +190,7 @@ class Crowd:
             return len(self._readers) < 2
 
     def _wait(self) -> tuple[Reader, ...]:
-        """Wait for room at everybody's link; answers who is left behind and has none."""
+        """Wait for room at every link; returns the receivers that are left behind and have none."""
         began = looked_at = monotonic_s()
         while True:
             full = self._full()
@@ -205,7 +205,7 @@ class Crowd:
         return tuple(reader for reader in full if reader.left_until is not None)
 
     def _full(self) -> list[Reader]:
-        """Whose link has no room now; whoever has rested and has room is waited for again."""
+        """The receivers without room now; one that has rested and has room is waited for again."""
         with self._lock:
             readers = tuple(self._readers.values())
             ready = _ready(readers, 0.0)  # one that is closed is ready, too: nothing waits for it
@@ -220,9 +220,9 @@ class Crowd:
             return [reader for reader in readers if reader.is_full]
 
     def _charge(self, full: list[Reader], waited_s: float) -> None:
-        """Leave behind who is stalled, or has cost the others more than they can wait; ``full``: who has no room."""
+        """Leave behind receivers that are stalled, or have cost the others too much; ``full``: those without room."""
         if not full or len(full) == len(self._readers):
-            return  # nobody who is ready waits for them
+            return  # no ready receiver waits for them
         now, is_pressed = monotonic_s(), self._is_pressed()
         for reader in full:
             reader.cost_s += waited_s

@@ -14,7 +14,7 @@ from zenoh import Timestamp
 from zsched.clock import monotonic_s
 
 FENCE_S: Final = 2.0
-"""So long after a new owner took over, its answers to values older than what has passed are dropped."""
+"""For this long after a new owner took over, its answers to values older than what has passed are dropped."""
 MAX_STAMPS: Final = 4096
 
 

@@ -4,7 +4,7 @@ Knows: which lanes nobody has answered for yet, how long to wait for an answer. 
 answer leads to (`zsched.core.hop.sender`).
 
 A start marker (an end marker of epoch 0) says the lowest number that may still come; `zsched.worker` acknowledges it at
-once. Whoever subscribes and never answers is no `zsched.worker`: after `FOREIGN_S`, longer than any lease of a frozen
+once. A subscriber that never answers is no `zsched.worker`: after `FOREIGN_S`, longer than any lease of a frozen
 process, or after `STRANGE_S` where the worker answers for other keys, its samples go out and are counted ``uncounted``.
 The outlet's lock guards what it holds; `greet` is called in the queue's thread only, because its puts may block.
 """
@@ -57,7 +57,7 @@ class Greetings:
         self._is_away = True
 
     def is_there(self, lanes: dict[tuple[str, str], Lane], *, is_matching: bool) -> bool:
-        """Whether there is somebody to greet; one who was away is greeted again."""
+        """Whether there is somebody to greet; a worker that was away is greeted again."""
         if not is_matching or self._is_parted:
             self._is_away = True
             return False

@@ -1,7 +1,7 @@
 """Fetches what publishers still hold of a key: the cached values that a late subscriber has missed.
 
 Knows: the tokens and caches of advanced publishers, how long to wait for an answer. Does not know: streams, slots,
-who is asked next (`Questions`).
+which publisher is asked next (`Questions`).
 
 Zenoh's own advanced subscriber would do it too, but holds back every live sample of the stream while such a query is
 open, for 10 s when the publisher is frozen (1.10.2; the time has no parameter in Python). Here live samples never wait:
@@ -218,7 +218,7 @@ def _source(sample: Sample, info: zenoh.SourceInfo) -> _Source:
 
 
 def _publisher(sample: Sample, replier: zenoh.EntityGlobalId | None) -> Publisher:
-    """Who has answered, as its token names it."""
+    """The publisher that has answered, as its token names it."""
     info = sample.source_info
     if info is not None:
         return str(sample.key_expr), str(info.source_id.zid), str(info.source_id.eid)

@@ -37,7 +37,7 @@ MAX_KEYS: Final = 4096
 """Concrete keys of one wildcard stream whose values are kept; the oldest give way."""
 
 HOLD_S: Final = 1.0
-"""So long an owner that was left may take to end its slot; who hangs is not waited for."""
+"""An owner that was left may take this long to end its slot; nobody waits for one that hangs."""
 MAX_HELD: Final = MAX_OWED // 2
 """More samples than that are not held either: the next owner's queue has to take them."""
 
@@ -116,7 +116,7 @@ class InputStream:
     def open(self, epoch: int, route: Route, acks: WorkerAcks | None = None, stamps: Stamps | None = None) -> None:
         """Declare the publishers of a slot; it carries nothing yet. With ``acks`` its worker counts what it gets.
 
-        ``stamps`` is told every sample's timestamp: an input of the task is of `OnCrash.REPLAY`.
+        ``stamps`` gets every sample's timestamp: an input of the task is of `OnCrash.REPLAY`.
 
         Raises:
             ValueError, zenoh.ZError: the route makes no sense (see `Outlet`).

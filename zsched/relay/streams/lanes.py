@@ -31,7 +31,7 @@ class Lane(Sender):
     eid: int
 
     def put(self, sample: Sample, stamp: Timestamp | None) -> None:
-        """Put a sample on under the next number (whoever calls it counts), with everything that zenoh lets us keep."""
+        """Put a sample on under the next number (the caller counts), with everything that zenoh lets us keep."""
         publisher = self.publisher
         if sample.kind == _DELETE:
             self._delete(sample, stamp)

@@ -44,7 +44,7 @@ from zsched.relay.streams.tally import Tally
 from zsched.sessions.send_queue import SendQueue
 
 QUEUE_DEPTH: Final = 1024
-"""A reliable outlet's queue holds at least so many samples, whatever its depth says."""
+"""A reliable outlet's queue holds at least this many samples, whatever its depth says."""
 MAX_LANES: Final = 4096
 """Publishers of one wildcard stream towards one place: keys come from the applications, memory is ours."""
 MAX_OWED: Final = 4096
@@ -82,7 +82,7 @@ class Outlet:
         """Declare the publishers. With ``acks`` the receiver is `zsched.worker`, which says what it has processed.
 
         ``has_crowd``: the receivers are applications, as many as like to. ``epoch`` is that of the slot it belongs to,
-        which its worker is told.
+        which its worker hears.
 
         Raises:
             ValueError: ``to_expr`` cannot be filled from ``from_expr``.
@@ -174,7 +174,7 @@ class Outlet:
     def wait_for_room(self, size: int) -> None:
         """Class ``reliable``: wait while the queue is full and its receiver takes something now and then.
 
-        That stops whoever feeds this stream, the application's link in the end; so only `MAX_PATIENT` streams of this
+        That stops the feeder of this stream, the application's link in the end; so only `MAX_PATIENT` streams of this
         process do so at one time, and none for a stalled receiver. Never under a lock that a flip needs.
         """
         if self._queue is None or not self._is_reliable or self._queue.has_room(size):
@@ -249,7 +249,7 @@ class Outlet:
             return said
 
     def look_after(self) -> None:
-        """Have sent again what was not acknowledged in time, and greet who has not answered; call it now and then."""
+        """Have sent again what was not acknowledged in time, and greet silent workers; call it now and then."""
         if self._crowd is not None:
             self._look_after_crowd(self._crowd)
             return
@@ -370,7 +370,7 @@ class Outlet:
                 put_marker(self._session, lane.key, lane.source_id, lane.publisher.priority, marker)
 
     def _leave(self) -> None:
-        """The last words to a worker of class ``reliable``: what it still has it shall not do any more."""
+        """The last words to a worker of class ``reliable``: it must not do any more what it still has."""
         with self._lock:
             open_lanes = [lane for lane in self._lanes.values() if self._greetings is not None and lane.in_flight]
         try:
@@ -424,7 +424,7 @@ class Outlet:
         self.tally.unconfirmed += 1
 
     def _is_open(self) -> bool:
-        """Class ``reliable``: nothing goes out to who has not been greeted, and no more than can be sent again."""
+        """Class ``reliable``: nothing goes out to a worker that was not greeted, and no more than can be sent again."""
         greetings = self._greetings
         if greetings is not None:
             if not greetings.is_there(self._lanes, is_matching=self.is_matching):

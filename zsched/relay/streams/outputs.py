@@ -284,7 +284,7 @@ class OutputStream:
                 self._counter.seen(len(sample.payload))
                 self._counter.dropped("loop")
                 return
-            if slot.is_closed:  # our thread waited for the lock; a count of it would begin anew, from 0
+            if slot.is_closed:  # our thread waited for the lock; a count of it would begin again, from 0
                 self._counter.seen(len(sample.payload))
                 self._counter.dropped("stale_epoch")
                 return

@@ -1,6 +1,6 @@
 """Decides which of the samples that an owner left open its answers prove done (`OnCrash.REPLAY`).
 
-Knows: the timestamps of a task's inputs. Does not know: streams, slots, which answers have passed (it is told).
+Knows: the timestamps of a task's inputs. Does not know: streams, slots, which answers have passed (its caller says so).
 
 An answer has its input's timestamp. One that has passed proves little by itself: its callback may have died before it
 put the next answer, and another sample may have had the same timestamp. So a sample is done when its answer has passed

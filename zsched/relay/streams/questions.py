@@ -1,12 +1,12 @@
 """Decides which publishers are asked next for what they hold, until each has answered.
 
-Knows: the tokens of publishers, who has answered how much, when a question is repeated. Does not know: zenoh, threads,
+Knows: the tokens of publishers, how much each has answered, when a question is repeated. Does not know: zenoh, threads,
 clocks, samples.
 
 A question can go unanswered although its publisher is well: it stood still for a moment, or zenoh dropped the question
 ("Received Query for unknown key_expr"). An answer can be empty although a value is there: the question overtook the
 declaration of the cache. So an answer that failed to come is asked for again while the token lives, and an empty one is
-believed at the third time. Who has answered is not asked again.
+believed at the third time. A publisher that has answered is not asked again.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class _Unanswered:
 
 
 class Questions:
-    """Those of one key expression. Whoever shares them between threads holds a lock."""
+    """Those of one key expression. Callers that share them between threads hold a lock."""
 
     def __init__(self, expr: str, depth: int) -> None:
         """``depth`` is how many samples of each publisher are wanted."""
@@ -100,7 +100,7 @@ class Questions:
         return None if earliest == math.inf else earliest
 
     def ended(self, question: Question, now: float, *, is_whole: bool) -> None:
-        """Nothing more comes of a question; ``is_whole``: nobody who was asked failed to answer."""
+        """Nothing more comes of a question; ``is_whole``: every publisher that was asked has answered."""
         if question.is_for_all:
             self._all_open.remove(question)
         self._forget(self._unanswered, question, at_least=1 if is_whole else self._depth)

@@ -31,7 +31,7 @@ JOIN_S: Final = 0.3
 QUEUE_DEPTH: Final = 256
 """Samples that zenoh's thread can leave for ours without waiting, at least; also as many as we take in one go."""
 BEHIND_S: Final = 0.01
-"""Class ``best_effort``: who has put so long without looking at what came meanwhile waits for a link."""
+"""Class ``best_effort``: a thread that puts for this long without looking at newer samples waits for a link."""
 
 _log = logging.getLogger("zsched.relay")
 
@@ -64,7 +64,7 @@ class Receiver:
     ) -> None:
         """Subscribe and start; by default without what ``session`` itself puts (``origin``).
 
-        ``give_way`` is told of a sample of class ``best_effort`` that is not carried, since newer ones wait (our
+        ``give_way`` hears of a sample of class ``best_effort`` that is not carried, since newer ones wait (our
         thread, as ``carry``).
         ``with_history`` asks the publishers of class ``latest`` for what they still hold; wrong where a key outlives
         an owner's epoch (the old epoch's value would come back as the new one's).

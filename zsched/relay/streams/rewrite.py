@@ -1,6 +1,6 @@
 """Decides under which key a stream's samples go on towards one place: `zsched.core.route.wildcards`, for several.
 
-Knows: the ``from`` of the newest owners. Does not know: zenoh, streams, who asks. The outlet's thread alone uses it.
+Knows: the ``from`` of the newest owners. Does not know: zenoh, streams, callers. The outlet's thread alone uses it.
 """
 
 from __future__ import annotations

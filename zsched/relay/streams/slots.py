@@ -23,9 +23,9 @@ from zsched.relay.streams.counter import StreamCounter
 from zsched.relay.streams.receive import Receiver
 
 END_GRACE_S: Final = 0.1
-"""A marker travels behind its data on one link; so long after it, what is still missing was dropped on the way."""
+"""A marker travels behind its data on one link; what is still missing this long after it was dropped on the way."""
 QUIET_S: Final = 1.0
-"""Who has put nothing here may end what others put when nothing has come for so long: a worker that was restarted."""
+"""A worker that has put nothing here (it was restarted) may end others' slots when nothing has come for this long."""
 
 
 @dataclass(slots=True)

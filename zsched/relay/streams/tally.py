@@ -25,11 +25,11 @@ class Tally:
     reordered: int = 0
     resent: int = 0
     at_most_lost: int = 0
-    """In flight to a worker when it died: so many at most had no result."""
+    """In flight to a worker when it died: at most this many had no result."""
     errors: int = 0
     """Refused by zenoh in a queue's thread."""
     uncounted: int = 0
-    """Put on to whoever subscribes beside the worker, who acknowledges nothing."""
+    """Put on to subscribers beside the worker, which acknowledge nothing."""
     unconfirmed: int = 0
     """Put on to a worker that acknowledges nothing."""
 

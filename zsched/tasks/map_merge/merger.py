@@ -1,6 +1,6 @@
 """Merges the robots' newest grids: which are attached, where they lie, and the one map that comes of it.
 
-Knows: modes, the reference robot, the canvas, what every robot is told about its map. Does not know: messages, time,
+Knows: modes, the reference robot, the canvas, what every robot hears about its map. Does not know: messages, time,
 threads or zenoh.
 
 Modes: ``known`` trusts the given poses; ``track`` refines from given poses or one search; ``estimate`` searches, tracks
@@ -207,7 +207,7 @@ class Merger:
         self._pairs.finish_search(job, found)
 
     def snapshot(self) -> bytes:
-        """The transforms as bytes, for the next owner: it then tracks instead of searching anew."""
+        """The transforms as bytes, for the next owner: it then tracks instead of searching again."""
         edges = [{"pair": edge.pair, "margin": edge.margin, "fit": asdict(edge.fit)} for edge in self._pairs.accepted]
         state = {
             "schema": SNAPSHOT_SCHEMA,

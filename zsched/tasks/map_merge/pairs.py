@@ -36,7 +36,7 @@ CHECK_GROWTH = 1.3
 """An accepted pair is searched again (mode estimate) when either map has grown so much."""
 CONTRADICTION = 0.5
 CONTRADICTIONS_TO_DROP = 5
-"""A kept alignment under this score, so many times in a row, is dropped: the maps say that it is wrong."""
+"""A kept alignment under this score, this many times in a row, is dropped: the maps say that it is wrong."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

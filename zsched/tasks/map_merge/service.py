@@ -229,7 +229,7 @@ class MapMergeService:
     def _awaits_fresh_maps(self, now: float) -> bool:
         with self._lock:
             if now >= self._active_s + FRESH_GRACE_S:
-                self._stale.clear()  # who has sent nothing since then is merged as it was last seen
+                self._stale.clear()  # a robot that has sent nothing since then is merged as it was last seen
             return bool(self._stale)
 
     def _merge(self) -> None:

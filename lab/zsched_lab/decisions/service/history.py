@@ -31,9 +31,9 @@ EDGES: Final = {1: 3, 3: 4}
 RATES_HZ: Final = (0.5, 5.0)
 MEMORY_SHARES: Final = (0.05, 0.3)
 SLOW_TIMES: Final = 2.0
-"""A job is slow when it takes so many times as long as on the median machine while that is idle."""
+"""A job is slow when it takes this many times as long as on the median machine while that is idle."""
 DEADLINE_PERIODS: Final = 1.5
-"""A job is late when it takes longer than so many periods of its task."""
+"""A job is late when it takes longer than this many periods of its task."""
 LEAST_PAUSE_S: Final = (10.0, 20.0)
 """Between two loads of a machine: the least pause and the mean of what is added, each the load's length at least."""
 IDLE_SHARE: Final = 0.02

@@ -212,6 +212,6 @@ def _changes(history: History, owners: list[int], steps: list[int]) -> list[Move
 
 
 def fixed(history: History) -> list[list[list[Move]]]:
-    """Every way to place the tasks for ever."""
+    """Every way to place the tasks for the whole history."""
     names = history.fleet.tasks[0].candidates
     return [[[Move(at_s=0.0, owner=names[where], left=None)] for where in placed] for placed in history.placements]

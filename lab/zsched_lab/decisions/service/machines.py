@@ -1,6 +1,6 @@
 """Decides what a task gets on a machine that it shares: cores and memory by fair shares, then service and late jobs.
 
-Knows: cores, speed, processes, jobs. Does not know: histories, who has a task, how anybody decides.
+Knows: cores, speed, processes, jobs. Does not know: histories, owners, how anybody decides.
 
 Time is a fluid here: within 0.2 s nothing waits for anything. A job is a given number of CPU seconds on a machine of
 speed 1; on a machine of speed 0.5 it costs twice as many.
@@ -26,7 +26,7 @@ class Machine:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Work:
-    """A task: so many jobs a second, each of so many CPU seconds at speed 1, by so many processes."""
+    """A task: jobs a second, CPU seconds of each at speed 1, and how many processes do them."""
 
     name: str
     cpu_s: float
@@ -76,7 +76,7 @@ def share_out(capacity: float, wanted: Array, heads: Array) -> Array:
 
 
 def alone_s(cpu_s: float, processes: int, machine: Machine) -> float:
-    """How long a job of ``cpu_s`` takes by so many processes on a machine that is idle.
+    """How long a job of ``cpu_s`` takes by this many processes on a machine that is idle.
 
     >>> alone_s(0.4, 3, Machine(cores=2.0, speed=0.5, memory_mb=4000.0))
     0.4

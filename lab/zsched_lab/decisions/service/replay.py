@@ -3,8 +3,8 @@
 Knows: sampling, smoothing, publication, gathers without loss, bookings. Does not know: what a choice is worth.
 
 On a machine that is short, a task's use is no longer its demand and readings end at the machine's size, so what is
-seen depends on who has the task: every rule gets profilers and a gateway of its own. Every task has a rule of its own;
-the tasks' rounds follow each other, and each sees the bookings of those before (`zsched.core.scheduler.turns`).
+seen depends on the owner of the task: every rule gets profilers and a gateway of its own. Every task has a rule of its
+own; the tasks' rounds follow each other, and each sees the bookings of those before (`zsched.core.scheduler.turns`).
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Player:
 
 
 class Scene:
-    """The fleet under one rule: the readings of its machines, the profiles, and who has which task."""
+    """The fleet under one rule: the readings of its machines, the profiles, and the owner of each task."""
 
     def __init__(self, history: History, player: Player) -> None:
         timing = replace(history.fleet.timing, smoothing_s=max(player.look.smoothing_s, 1e-9))
@@ -171,13 +171,13 @@ class _Book:
         self._is_serial = False
 
     def work(self, work: Work, machine: Machine, cores: float, service: float, comes: float) -> None:
-        """One step with so many cores: of all jobs the share ``comes`` comes, and ``service`` of that is done."""
+        """One step with this many cores: of all jobs the share ``comes`` comes, and ``service`` of that is done."""
         cpu_s, served = work.cpu_s / machine.speed, min(service, 1.0)
         before = int(self._done)
         rate_hz = comes * work.rate_hz
         self._done += served * rate_hz * DT_S
         self._undone += (1.0 - served) * rate_hz * DT_S
-        # Whoever does not do all of them is always at work.
+        # A worker that does not do all of them is always at work.
         is_behind = served < 0.999
         time_s = 1.0 / max(served * rate_hz, 1e-3) if is_behind else cpu_s / work.processes
         is_starved = cores < 0.99 * min(comes * work.demand(machine), work.processes)
@@ -211,7 +211,7 @@ class TaskView:
         self._standing: Standing | None = None
 
     def standing(self, now: float) -> Standing:
-        """The joint view of a gather now; computed anew only when a profile has come or a task has moved."""
+        """The joint view of a gather now; computed again only when a profile has come or a task has moved."""
         seen = self.gateway.version, tuple(value.owner for value in self._scene.values.values())
         if self._standing is None or seen != self._seen:
             self._seen, self._standing = seen, self._compare(now)

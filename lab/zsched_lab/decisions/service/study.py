@@ -1,4 +1,4 @@
-"""Which histories are played to whom, and what comes of it: results as lines of JSON that a later run goes on from.
+"""Plays histories to rules; results are lines of JSON that a later run goes on from.
 
 Knows: seeds for choosing and seeds for checking, what is played already. Does not know: how a rule decides, tables.
 """
@@ -31,7 +31,7 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Case:
-    """One history, and who is still to be played on it."""
+    """One history, and the rules that are still to be played on it."""
 
     seed: int
     hours: float
@@ -105,7 +105,7 @@ def play(case: Case) -> list[Row]:
 
 
 def _mean(every: list[Figures]) -> Figures:
-    """The mean over all fixed placements; whom a load meets is another question for each, so nobody reacts."""
+    """The mean over all fixed placements; each meets other loads, so nobody reacts."""
     return Figures(
         price_s=every[0].price_s,
         hours=every[0].hours,

@@ -4,7 +4,7 @@ Knows: what the relay's threads do with the sender (`zsched.relay.streams.outlet
 (`zsched.worker.inputs`); what must hold. Does not know: how the numbers work (`zsched.core.hop`).
 
 What must hold of both classes: nothing is processed twice in one life; every sample is in exactly one counter, at any
-time; what was never processed is told as lost, left open or overtaken in the queue. ``reliable``: while the receiver
+time; what was never processed is counted as lost, left open or overtaken in the queue. ``reliable``: while the receiver
 lives, nothing is lost. ``latest``: nothing older is taken behind something newer; once the links stay whole, the newest
 value is there.
 """

@@ -56,7 +56,7 @@ class Scene:
         again()
 
     def some(self, what: Action, most: int = 3) -> None:
-        """Do something at most so many times while there are faults."""
+        """Do something at most this many times while there are faults."""
         for _ in range(self.rng.randrange(most + 1)):
             self.after(self.rng.uniform(0.0, FAULTS_END_S), what)
 

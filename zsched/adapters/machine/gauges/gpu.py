@@ -33,7 +33,7 @@ class Reader:
         self._nvml: _Nvml | None = None
 
     def read(self) -> float | None:
-        """``None`` without a GPU whose use is told."""
+        """``None`` without a GPU that reports its use."""
         loads = [load / 1000.0 for file in self._found(*JETSON) if (load := number(file)) is not None]
         loads += [busy / 100.0 for file in self._found(AMD) if (busy := number(file)) is not None]
         if not loads and (self._root / DRIVER).exists():
