@@ -206,7 +206,7 @@ def init(
     from zsched.adapters.machine import core_speed  # noqa: PLC0415 - likewise
     from zsched.config.load import load_fleet, require_node  # noqa: PLC0415 - ruamel.yaml is slow to import
     from zsched.core.vote.belief import MAX_GENERATION  # noqa: PLC0415 - likewise
-    from zsched.runtime.init import check_blank, init_state, settle_dispute, standing_state  # noqa: PLC0415 - imports zenoh
+    from zsched.runtime.init import begin_anew, check_blank, init_state, settle_dispute, standing_state  # noqa: PLC0415 - imports zenoh
 
     if generation > MAX_GENERATION:
         raise CliError(EXIT_USAGE, f"--generation {generation}: at most {MAX_GENERATION}")
@@ -232,9 +232,14 @@ def init(
         typer.echo(f"{state}: {text}")
         return
     heard = check_blank(fleet, name, state, generation, standing, is_forced=force)
-    path = init_state(fleet, name, state, generation)
+    side = heard.side
+    path = init_state(fleet, name, state, generation) if side is None else begin_anew(fleet, name, state, side)
     _say(_heard(heard, name, generation, is_elector=name in fleet.electors))
     typer.echo(f"a core of this machine has speed {core_speed.kept_or_new(state):.2f}")
+    if side is not None:
+        text = "the others know it as an elector with another disk: it is a new member, and no elector until"
+        typer.echo(f"{path}: blank state of {name} in fleet {fleet.name}; {text} it is added as one")
+        return
     typer.echo(f"{path}: blank state of {name} in fleet {fleet.name}, generation {generation}")
 
 

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from random import Random
+
+import pytest
 
 from support.fleets import fleet_of, tuning_of
 from zsched.core import events as ev
+from zsched.core.electorate.recovery import NEW_DISK, Sides, rejoined
 from zsched.core.status import build_snapshot
 from zsched.core.values.document import Flag, FlagKind
 from zsched.core.values.electorate import FleetValue
@@ -106,6 +110,62 @@ def test_an_elector_that_has_lost_its_disk_is_replaced_and_the_log_says_why() ->
     assert "edge3 becomes an elector: heard without a break for " in told
     robot = [story for story in play.sim.stories if " robot1 vote number " in story]
     assert any("edge3 is no elector any more (electors: edge1, robot1)" in story for story in robot)
+
+
+def without_spare() -> Fleet:
+    """Three robots, which are the electors, and nobody else."""
+    plain = fleet(ROBOTS)
+    nodes = tuple(node for node in plain.nodes if node.name in ROBOTS)
+    return replace(plain, nodes=nodes, tasks=(replace(plain.tasks[0], candidates=ROBOTS),))
+
+
+def blank(play: Play, name: NodeId) -> None:
+    """`zsched init` on a machine with a blank disk, whose name the others know as an elector."""
+    machine, value = play.sim.machines[name], play.values()[0]
+    side = Sides(
+        generation_id=value.generation_id, generation=0, nodes=(), recovered_by="", electors=value.electorate.names
+    )
+    machine.disk.wipe()
+    machine.disk.write(rejoined(machine.fleet, name, None, side, disk="99", incarnation=1, hardware="", why=NEW_DISK))
+    machine.disk.sync()
+    machine.is_durable = False
+
+
+@pytest.mark.parametrize("how", ["init", "blank", "backup"])
+def test_a_lost_disk_among_three_electors_without_a_spare_heals_by_itself(how: str) -> None:
+    """The one that lost it is the spare: it gives its old seat up, and is added as another member."""
+    play = Play(without_spare())
+    machine = play.sim.machines["robot3"]
+    play.sim.crash("robot3")
+    votes = play.sim.disk("robot3").votes  # type: ignore[union-attr]
+    if how == "init":
+        blank(play, "robot3")
+    elif how == "blank":
+        play.sim.initialise(machine)
+        machine.is_durable = False
+    else:
+        while machine.disk.state is not None and machine.disk.state.votes == votes:
+            machine.disk.restore(Random(1))
+        machine.is_durable = False
+    play.sim.start("robot3")
+    assert play.sim.run_until(lambda: "state" in play.sim.node("robot3").agreement.problems, 5)
+    assert not play.sim.node("robot3").agreement.is_elector
+    play.reaches(("robot1", "robot2"))
+    assert play.sim.run_until(lambda: not play.sim.node("robot3").agreement.problems, 5), "that seat is gone"
+    play.reaches(ROBOTS)
+    assert play.sim.node("robot3").agreement.is_elector
+    play.sim.crash("robot1")
+    play.owner_is_alive()
+    assert "robot3 is removed as an elector: gone for robot1, robot2, on revision " in "\n".join(play.sim.stories)
+
+
+def test_three_electors_stay_three_when_one_is_gone_and_nobody_may_follow_it() -> None:
+    play = Play(without_spare())
+    play.sim.crash("robot3")
+    play.sim.machines["robot3"].disk.wipe()
+    play.sim.machines["robot3"].is_durable = False
+    play.sim.start("robot3")
+    assert not play.sim.run_until(lambda: len(play.electors()) != 3, 6 * REPLACE_S), "it has no state to elect with"
 
 
 def test_robots_that_are_away_for_long_do_not_count_and_the_rest_decides() -> None:

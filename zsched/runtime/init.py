@@ -12,6 +12,7 @@ from pathlib import Path
 from zsched.adapters.host.state_file import StateFile, hardware_id
 from zsched.adapters.network.fleet_poll import ask_fleet
 from zsched.clock import wall_tenths
+from zsched.core.electorate.recovery import NEW_DISK, Sides, new_member, rejoined
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet, dial_endpoint, electorate_hash
 from zsched.core.values.model import NodeId
@@ -30,6 +31,8 @@ class Heard:
 
     asked: int
     answers: tuple[Snapshot, ...]
+    side: Sides | None = None
+    """The generation that knows this node by a seat which it must not answer for: see `begin_anew`."""
 
 
 def init_state(fleet: Fleet, node: NodeId, folder: Path, generation: int) -> Path:
@@ -47,6 +50,32 @@ def init_state(fleet: Fleet, node: NodeId, folder: Path, generation: int) -> Pat
         fleet, node, generation, before, incarnation=wall_tenths(), hardware=hardware_id(), disk=secrets.token_hex(8)
     )
     with StateFile(folder, fleet=fleet.name, node=node) as file:
+        file.create(state)
+        return file.path
+
+
+def begin_anew(fleet: Fleet, node: NodeId, folder: Path, side: Sides) -> Path:
+    """Write the blank state of a node whose disk is lost, and whose name has a seat; returns the file's path.
+
+    As another member it answers nobody until its old seat is given up and it is added anew.
+
+    Raises:
+        AdapterError: there is a state file already, or the folder cannot be written.
+    """
+    state = rejoined(
+        fleet,
+        node,
+        None,
+        side,
+        disk=secrets.token_hex(8),
+        incarnation=wall_tenths(),
+        hardware=hardware_id(),
+        why=NEW_DISK,
+    )
+    with StateFile(folder, fleet=fleet.name, node=node) as file:
+        if file.path.exists():
+            advice = f"if this machine is {node} and no other one is, move the file away, then again"
+            raise AdapterError(f"{file.path} exists already, and is not usable here; {advice}")
         file.create(state)
         return file.path
 
@@ -94,6 +123,9 @@ def check_blank(
         with StateFile(folder, fleet=fleet.name, node=node):
             pass  # in use, or not to be written: said before anybody is asked
     heard = ask_others(fleet, node)
+    side = None if standing is not None or is_forced else new_member(node, generation, heard.answers)
+    if side is not None:
+        return replace(heard, side=side)
     is_elector = node in fleet.electors
     good = standing if standing is not None and not standing.lost else None
     why = objection(node, generation, good, heard.answers, is_elector=is_elector, is_forced=is_forced)

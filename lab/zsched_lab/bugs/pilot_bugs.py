@@ -88,7 +88,7 @@ PILOT_BUGS: tuple[Bug, ...] = (
     ),
     _bug(
         "who leaves becomes an elector",
-        ("name in kept or name in course.leaving or not peer.word.disk", "name in kept or not peer.word.disk"),
+        ("if peer is None or name in kept or name in course.leaving:", "if peer is None or name in kept:"),
     ),
     _node_bug(
         "the pilot is not told who leaves",
@@ -96,6 +96,18 @@ PILOT_BUGS: tuple[Bug, ...] = (
         (
             "        leaving=tuple(flag.subject for flag in flags if flag.kind is FlagKind.LEAVE),\n",
             "        leaving=(),\n",
+        ),
+    ),
+    _bug(
+        "who has lost its disk is no spare for its own seat",
+        (" and not (name == instead and peer.word.may_return)", ""),
+    ),
+    _node_bug(
+        "nobody says that it lost its disk and may return",
+        AGREEMENT,
+        (
+            "return bool(self._durable is not None and self._lost and",
+            "return bool(self._durable is None and self._lost and",
         ),
     ),
     _bug("electors that the operator has named are replaced", ("if not course.is_auto:", "if not course.members:")),

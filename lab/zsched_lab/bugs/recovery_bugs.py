@@ -85,8 +85,20 @@ RECOVERY_BUGS: tuple[Bug, ...] = (
     _bug(
         "a node that changes sides is an elector at once",
         RECOVERY,
-        ('        lost=MOVED if has_name else "",\n', '        lost="",\n'),
+        ('        lost=why if has_name else "",\n', '        lost="",\n'),
         test=f"{_UNIT}test_recovery.py",
+    ),
+    _bug(
+        "a blank disk comes back into one of two halves by itself",
+        RECOVERY,
+        ("    if len(sides) != 1 or generation not in", "    if not sides or generation not in"),
+        test=f"{_UNIT}test_recovery.py",
+    ),
+    _bug(
+        "a blank disk answers for the seat of its name",
+        "zsched.runtime.init",
+        ("        why=NEW_DISK,\n", '        why="",\n'),
+        test="tests/unit/runtime/test_init.py",
     ),
     _bug(
         "a node that is to join follows any generation",

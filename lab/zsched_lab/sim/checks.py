@@ -238,7 +238,7 @@ class Invariants:
         task = node.rounds.tasks[proposal.task]
         owner = node.registers[proposal.task].value.owner
         drained = {flag.subject for flag in node.agreement.flags if flag.kind in HANDS_OVER}
-        if owner in (None, proposal.candidate, *drained):
+        if owner in (None, proposal.candidate) or owner in drained:
             return
         moves = sum(
             new.value.epoch > old.value.epoch

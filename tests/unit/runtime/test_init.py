@@ -9,13 +9,14 @@ import pytest
 
 from zsched.adapters.host.state_file import StateFile, hardware_id
 from zsched.config.load import check_bytes
+from zsched.core.electorate.recovery import NEW_DISK, Sides
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet, electorate_hash
 from zsched.core.values.model import MAX_COUNTER, NO_BALLOT, RegisterState
 from zsched.core.vote.belief import GENERATION_STEP, MAX_GENERATION
 from zsched.core.vote.register import MAX_REVISION
 from zsched.errors import AdapterError
-from zsched.runtime.init import init_state
+from zsched.runtime.init import begin_anew, init_state
 
 TEXT = b"""
 fleet: hall
@@ -149,3 +150,13 @@ def test_a_generation_after_an_owner_that_needed_no_lease_is_not_leased_from_the
     init_state(new, "robot1", tmp_path, 1)
     found = {register.task: register.learnt for register in load(new, tmp_path).registers}
     assert {name: value is not None and value.leased for name, value in found.items()} == {"merge": False, "slam": True}
+
+
+def test_a_new_member_s_state_names_its_generation_and_is_no_elector_s(fleet: Fleet, tmp_path: Path) -> None:
+    side = Sides(generation_id="ab12", generation=0, nodes=("robot2",), recovered_by="", electors=("robot1", "robot2"))
+    begin_anew(fleet, "robot1", tmp_path, side)
+    state = load(fleet, tmp_path)
+    assert (state.joins, state.lost, state.hardware) == ("ab12", NEW_DISK, hardware_id())
+    with pytest.raises(AdapterError, match="move the file away, then again"):
+        begin_anew(fleet, "robot1", tmp_path, side)
+    assert load(fleet, tmp_path) == state

@@ -46,7 +46,14 @@ class Helm:
         value = self._numbers.changed
         course = None if value is None else self._course(value)
         if value is not None and course is not None:
-            word = Word(node=beat.node, disk=beat.disk, is_current=is_current, gone=beat.gone, away=beat.away)
+            word = Word(
+                node=beat.node,
+                disk=beat.disk,
+                is_current=is_current,
+                gone=beat.gone,
+                away=beat.away,
+                may_return=beat.may_return,
+            )
             self._pilot.hear(word, value, course, now)
 
     def opinion(self, disk: str, now: float) -> tuple[tuple[NodeId, ...], tuple[NodeId, ...]]:

@@ -76,6 +76,8 @@ class Word:
     """Electors that its sender takes for gone."""
     away: tuple[NodeId, ...] = ()
     """Robots that its sender takes for away."""
+    may_return: bool = False
+    """Its sender has lost what belongs to its seat, and can be added anew once that is given up."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -268,13 +270,18 @@ class Pilot:
         return (alive.index(self.me) + value.revision) % len(alive)
 
     def _fit(self, value: FleetValue, course: Course, now: float, instead: NodeId = "") -> list[NodeId]:
-        """Nodes that may be added, the best first; ``instead`` of an elector that goes."""
+        """Nodes that may be added, the best first; ``instead`` of an elector that goes.
+
+        That elector itself is one of them if it is there with another disk, or without what belongs to its seat.
+        """
         kinds = dict(course.members)
         kept = [name for name in value.electorate.names if name != instead]
         found = []
         for name, kind in course.members:
             peer = self._peers.get(name)
-            if peer is None or name in kept or name in course.leaving or not peer.word.disk:
+            if peer is None or name in kept or name in course.leaving:
+                continue
+            if not peer.word.disk and not (name == instead and peer.word.may_return):
                 continue
             is_steady = now - peer.at < course.silence_s and now - peer.since >= STEADY * course.silence_s
             if is_steady and peer.word.is_current:

@@ -24,6 +24,8 @@ from zsched.core.values.snapshot import Snapshot
 
 MOVED = "it has changed sides to another generation, and has no seat there"
 """Why a node that rejoins is no elector until it is added as one."""
+NEW_DISK = "its disk is new, and has no seat"
+"""Why a node that begins with a blank disk, where others know its name as an elector, is none until it is added."""
 
 
 class Danger(StrEnum):
@@ -314,6 +316,24 @@ def choose_side(own: DurableState | None, sides: Sequence[Sides], wanted: str) -
     return f"all nodes that answer are of this node's generation: start zsched, it follows by itself ({told})"
 
 
+def new_member(me: NodeId, generation: int, answers: Sequence[Snapshot]) -> Sides | None:
+    """The generation that a node with a blank disk comes back into as another member; ``None``: it is not known there.
+
+    Its name has a seat by an agreed document, and the fleet lives in one generation. With `NEW_DISK` in its state it
+    cannot answer for that seat, so no vote is given twice.
+
+    Args:
+        me: the node.
+        generation: as the operator counts it; 0: not named.
+        answers: of the other nodes.
+    """
+    sides = sides_of(answers)
+    if len(sides) != 1 or generation not in (0, sides[0].generation):
+        return None
+    is_known = any(one.quorum.number and me in one.quorum.names and me in one.quorum.voted for one in answers)
+    return sides[0] if is_known else None
+
+
 def rejoined(
     fleet: Fleet,
     me: NodeId,
@@ -323,6 +343,7 @@ def rejoined(
     disk: str,
     incarnation: int,
     hardware: str,
+    why: str = MOVED,
 ) -> DurableState:
     """The blank state of a node that changes sides: it knows the generation that it is to follow, and no more.
 
@@ -336,6 +357,7 @@ def rejoined(
         disk: random: as a member of that generation it is another one.
         incarnation: of this start, by the wall clock.
         hardware: of this machine.
+        why: it is no elector, though its file or that generation names it as one.
     """
     has_name = me in fleet.electors or me in side.electors
     return DurableState(
@@ -348,5 +370,5 @@ def rejoined(
         lease_s=0.0 if own is None else own.lease_s,
         disk=disk,
         joins=side.generation_id,
-        lost=MOVED if has_name else "",
+        lost=why if has_name else "",
     )

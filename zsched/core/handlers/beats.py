@@ -53,6 +53,7 @@ def send_beat(node: Stages, todo: ToDo, now: float) -> None:
         disk=node.agreement.disk,
         gone=gone,
         away=away,
+        may_return=node.agreement.may_return,
     )
     node.loop_lag_s = 0.0
     node.beat_at = now + node.fleet.timing.beat_s

@@ -802,6 +802,8 @@ class Beat:
     """Electors that this elector takes for gone (`zsched.core.electorate.pilot`)."""
     away: tuple[NodeId, ...] = ()
     """Robots that this elector takes for away."""
+    may_return: bool = False
+    """With `has_lost_state`: once its seat is given up, this node can be added as an elector again."""
 
     def __post_init__(self) -> None:
         check_name("beat.node", self.node)

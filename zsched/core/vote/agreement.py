@@ -132,8 +132,7 @@ class Agreement:
         self._problems: dict[str, str] = {}
         if durable is not None and self._lost:
             value = None if durable.fleet_register is None else durable.fleet_register.learnt
-            lost = _lost_text(self._lost, self.newest_generation, is_agreed=value is not None and bool(value.document))
-            self._problems["state"] = _moved_text(durable) if durable.joins else lost
+            self._complain_of_loss(is_agreed=value is not None and bool(value.document))
         if self._disputed:
             self._problems["state"] = f"{self._disputed}; no elector until `zsched init --settle`"
         self.counters: Counter[str] = Counter()
@@ -547,6 +546,11 @@ class Agreement:
         durable = self._durable
         return "" if durable is None or self._disputed or self._lost else durable.disk
 
+    @property
+    def may_return(self) -> bool:
+        """Whether this node answers no more for its seat, and can be added anew once that is given up."""
+        return bool(self._durable is not None and self._lost and not self._disputed and self.document_hash)
+
     def hear_pilot(self, beat: Beat, now: float) -> None:
         """What a peer's newest beat says of electors and robots."""
         terms = beat.lease_terms.partition(",")[0]  # behind it a clock is in doubt
@@ -598,6 +602,8 @@ class Agreement:
             self._lost = ""  # as any other member it begins blank
             self._problems.pop("state", None)
             self._numbers.roll.may_elect_again(todo)
+        elif self._lost:
+            self._complain_of_loss(is_agreed=bool(self.document_hash))
 
     def _is_of_our_seat(self, learnt: Learnt) -> bool:
         """Whether a peer that speaks of this node's votes knows it by the seat that it has."""
@@ -747,9 +753,15 @@ class Agreement:
         if not why or self._lost or not self.is_elector:
             return
         self._lost = why
-        self._problems["state"] = _lost_text(why, self.newest_generation, is_agreed=bool(self.document_hash))
+        self._complain_of_loss(is_agreed=bool(self.document_hash))
         self._stop_electing()
         todo.must_persist = True
+
+    def _complain_of_loss(self, *, is_agreed: bool) -> None:
+        """Say that this node is no elector, and until when: by an agreed document another disk is another member."""
+        lost = _lost_text(self._lost, self.newest_generation, is_agreed=is_agreed)
+        joins = "" if self._durable is None else self._durable.joins
+        self._problems["state"] = lost if not joins else _moved_text(self._lost, joins)
 
     def compare(self, beat: Beat, todo: ToDo, now: float) -> None:
         """A peer's beat may show that it has learnt more than we have, or has voted: then ask it."""
@@ -880,10 +892,10 @@ def _newest(register: TaskRegister) -> Allocation | None:
     return accepted.value if learnt is None or accepted.value.revision > learnt.revision else learnt
 
 
-def _moved_text(durable: DurableState) -> str:
-    """Why a node that was told to join another generation is no elector."""
+def _moved_text(why: str, joins: str) -> str:
+    """Why a node that was told which generation to join is no elector."""
     return (
-        f"{durable.lost} yet (generation {durable.joins[:SAID_DIGITS]}): no elector until it is added as one, which "
+        f"{why} yet (generation {joins[:SAID_DIGITS]}): no elector until it is added as one, which "
         "`electorate: auto` does by itself"
     )
 
@@ -892,7 +904,7 @@ def _lost_text(why: str, newest_generation: int, *, is_agreed: bool) -> str:
     """``is_agreed``: the fleet goes by an agreed document, in which another disk is another member."""
     until = f"a new generation ({way_out(newest_generation + 1)})"
     if is_agreed:
-        until = "it is added as one anew, which `electorate: auto` does by itself once another has its seat"
+        until = "it is added as one anew, which `electorate: auto` does by itself once its old seat is given up"
     return (
         f"{why}: it was brought back from a backup, or its disk has lost what it said was written; no elector until "
         f"{until}"

@@ -118,8 +118,8 @@ def objection(
         again = f"To make it an elector again, {way_out(newest + 1)}"
         if any(answer.quorum.number for answer in current):
             again = (
-                "The others give its seat to another node that is fit (`zsched fleet show`); then `zsched init` makes "
-                "it a new member. Where nothing can be agreed any more: zsched recover, on another one"
+                "Where the fleet lives in several generations (`zsched status`), `zsched rejoin GENERATION` makes it a "
+                "new member of one. Where nothing can be agreed any more: zsched recover, on another one"
             )
         return (
             f"{knows} knows {node} as an elector that has voted; a blank state would let it vote twice. Without a "

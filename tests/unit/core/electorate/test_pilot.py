@@ -107,6 +107,24 @@ def test_a_node_that_may_not_elect_shows_no_disk_and_is_gone() -> None:
     assert ear.gone() == ("b", "c"), "a seat of a fleet file names no disk, and still needs one"
 
 
+def test_an_elector_that_lost_its_state_is_the_spare_for_its_own_seat() -> None:
+    """Among three without another spare: it is there, and as another member it may be added."""
+    ear = Ear(value("abc"))
+    ear.hear("bc", T)
+    for _ in range(int(STEADY * T)):
+        ear.hear("b", 1.0, gone=("c",))
+        ear.say("c", disk="")
+    assert ear.wish.endswith("two electors are no better than three"), "it does not say that it may return"
+    for _ in range(int(STEADY * T)):
+        assert ear.wish != "-c" or ear.now >= STEADY * T
+        ear.hear("b", 1.0, gone=("c",))
+        ear.say("c", disk="", may_return=True)
+    assert ear.wish == "-c"
+    ear.value = value("ab", revision=8, number=4)
+    ear.say("c", disk="", may_return=True)
+    assert ear.wish.startswith("2 electors"), "it is added once it shows a disk"
+
+
 def test_a_pilot_that_has_paused_listens_anew() -> None:
     ear = Ear(value("abc"))
     ear.hear("bc", 20.0)

@@ -12,11 +12,13 @@ from zsched.core.electorate.changes import AdoptDocument, RemoveElector, SetLeas
 from zsched.core.electorate.founding import founded, newest_fleet
 from zsched.core.electorate.recovery import (
     MOVED,
+    NEW_DISK,
     Danger,
     Found,
     Recovery,
     choose_side,
     consider,
+    new_member,
     rejoined,
     sides_of,
 )
@@ -290,3 +292,37 @@ def test_who_changes_sides_starts_blank_as_another_member_and_is_no_elector() ->
     assert (state.registers, state.fleet_register, state.votes, state.lease_s) == ((), None, 0, 2.0)
     assert state.lost == MOVED
     assert rejoined(FLEET, "edge1", None, side, disk="99", incarnation=2, hardware="h").lost == ""
+
+
+# --- a blank disk ----------------------------------------------------------------------------------------------------
+
+
+def voter_of(node: str, value: FleetValue = ADOPTED, **quorum: object) -> Snapshot:
+    answer, said = answer_of(node, value), {"voted": ("robot3",), **quorum}
+    return replace(answer, quorum=replace(answer.quorum, **said))  # type: ignore[arg-type]
+
+
+def test_a_blank_disk_whose_name_has_a_seat_is_another_member_and_answers_nobody() -> None:
+    side = new_member("robot3", 0, [voter_of("robot1"), answer_of("robot2")])
+    assert side is not None
+    state = rejoined(FLEET, "robot3", None, side, disk="99", incarnation=7, hardware="h", why=NEW_DISK)
+    assert (state.joins, state.lost, state.disk) == (ADOPTED.generation_id, NEW_DISK, "99")
+    assert (state.registers, state.fleet_register) == ((), None)
+
+
+@pytest.mark.parametrize(
+    ("me", "generation", "answers"),
+    [
+        ("robot3", 0, []),
+        ("robot3", 0, [voter_of("robot1", voted=())]),
+        ("edge1", 0, [voter_of("robot1", voted=("edge1", "robot3"))]),
+        ("robot3", 1, [voter_of("robot1")]),
+        ("robot3", 0, [voter_of("robot1"), voter_of("robot2", replace(ADOPTED, generation_id="ab"))]),
+        ("robot3", 0, [voter_of("robot1", FIRST, number=0)]),
+    ],
+    ids=["nobody answers", "it never voted", "it has no seat", "another generation", "two halves", "no document"],
+)
+def test_a_blank_disk_is_a_member_of_one_generation_that_knows_its_name(
+    me: str, generation: int, answers: list[Snapshot]
+) -> None:
+    assert new_member(me, generation, answers) is None

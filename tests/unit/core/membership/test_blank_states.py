@@ -94,12 +94,12 @@ def test_nothing_lets_a_node_vote_twice_in_a_generation_or_stay_behind_it(forced
     assert "join it with" in (why(1, says(revision=2 * GENERATION_STEP), is_forced=forced) or "")
 
 
-def test_where_electors_are_agreed_another_node_takes_the_seat_first() -> None:
+def test_where_electors_are_agreed_no_generation_by_hand_is_advised() -> None:
     agreed = says("robot2", voted=("robot3",))
     agreed = replace(agreed, quorum=replace(agreed.quorum, number=4, names=("robot1", "robot2", "robot3")))
     told = why(0, agreed) or ""
     assert "would let it vote twice" in told
-    assert "The others give its seat to another node that is fit" in told
+    assert "`zsched rejoin GENERATION` makes it a new member" in told
     assert "--generation" not in told
     assert why(0, replace(agreed, quorum=replace(agreed.quorum, names=("robot1", "robot2")))) is None, "it has no seat"
 

@@ -561,7 +561,7 @@ def test_a_state_that_was_brought_back_says_so_in_this_life_and_the_next() -> No
     value = replace(founded(FLEET.name, 0, FLEET.electors), document="0d", revision=3)
     agreed = replace(lost, fleet_register=RegisterState(task=FLEET.name, learnt=value))
     other = Agreement(fleet=FLEET, me="robot1", durable=agreed, incarnation=8, electorate="e", rng=Random(1), now=0.0)
-    assert other.problems["state"].endswith("which `electorate: auto` does by itself once another has its seat")
+    assert other.problems["state"].endswith("which `electorate: auto` does by itself once its old seat is given up")
 
 
 def test_another_generation_teaches_nothing_and_is_shown_until_it_is_gone() -> None:
