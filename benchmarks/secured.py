@@ -59,7 +59,7 @@ class Application:
     def __init__(self, bed: Testbed) -> None:
         local = bed.fleet.node(ROBOT).local
         assert local is not None
-        self._session = zenoh.open(zenoh.Config.from_json5(client_config(connect=local.listen, patience_s=20.0)))
+        self._session = zenoh.open(zenoh.Config.from_json5(client_config(connect=local.listen, connect_s=20.0)))
         self.sent: dict[int, float] = {}
         self.answered: dict[int, float] = {}
         self._came = threading.Condition()

@@ -104,7 +104,7 @@ class Yard:
 
     @contextlib.contextmanager
     def session(
-        self, victim: Victim, tls: dict[str, Any] | None, *, is_plain: bool = False, patience_s: float = 5.0
+        self, victim: Victim, tls: dict[str, Any] | None, *, is_plain: bool = False, connect_s: float = 5.0
     ) -> Iterator[zenoh.Session]:
         """A client's session to a victim.
 
@@ -112,7 +112,7 @@ class Yard:
             zenoh.ZError: it is not let in.
         """
         endpoint = victim.endpoint.replace("tls/", "tcp/") if is_plain else victim.endpoint
-        config = json.loads(zenoh_config.client_config(connect=(endpoint,), patience_s=patience_s))
+        config = json.loads(zenoh_config.client_config(connect=(endpoint,), connect_s=connect_s))
         if tls is not None:
             config["transport"]["link"]["tls"] = tls
         with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as session:
@@ -199,14 +199,14 @@ OUTSIDE: dict[str, Callable[[Yard], dict[str, Any] | None]] = {
 @pytest.mark.parametrize("which", ["control", "data"])
 def test_who_has_no_valid_certificate_gets_no_link(fresh: Yard, attack: str, which: str) -> None:
     victim: Victim = getattr(fresh, which)
-    with pytest.raises(zenoh.ZError), fresh.session(victim, OUTSIDE[attack](fresh), patience_s=REFUSED_S):
+    with pytest.raises(zenoh.ZError), fresh.session(victim, OUTSIDE[attack](fresh), connect_s=REFUSED_S):
         pass
     assert not victim.links()
 
 
 def test_plain_text_gets_no_link(fresh: Yard) -> None:
     for victim in (fresh.control, fresh.data):
-        with pytest.raises(zenoh.ZError), fresh.session(victim, None, is_plain=True, patience_s=REFUSED_S):
+        with pytest.raises(zenoh.ZError), fresh.session(victim, None, is_plain=True, connect_s=REFUSED_S):
             pass
 
 
@@ -371,7 +371,7 @@ def test_a_link_ends_with_its_certificate(fresh: Yard) -> None:
     with fresh.session(fresh.control, fresh.tls("short")):
         assert fresh.control.links() == {"robot2.yard.zsched.internal"}
         until_alone(fresh.control)
-    with pytest.raises(zenoh.ZError), fresh.session(fresh.control, fresh.tls("short"), patience_s=REFUSED_S):
+    with pytest.raises(zenoh.ZError), fresh.session(fresh.control, fresh.tls("short"), connect_s=REFUSED_S):
         pass
 
 
@@ -398,7 +398,7 @@ def test_between_two_authorities_certificates_of_both_are_let_in(fresh: Yard, tm
             with fresh.session(victim, fresh.tls(holder, root_ca_certificate=bundle)):
                 assert victim.links() == {f"{holder.split()[1]}.yard.zsched.internal"}
             until_alone(victim)
-        with pytest.raises(zenoh.ZError), fresh.session(victim, fresh.tls("robot2"), patience_s=REFUSED_S):
+        with pytest.raises(zenoh.ZError), fresh.session(victim, fresh.tls("robot2"), connect_s=REFUSED_S):
             pass
 
 

@@ -41,10 +41,10 @@ def test_two_machines_are_a_secured_fleet_by_four_commands_and_nobody_restarts_a
     assert "sessions node=robot1 are opened anew" in (hall.folder / "robot1" / "log").read_text()
 
     with pytest.raises(zenoh.ZError):
-        zenoh.open(zenoh.Config.from_json5(client_config(connect=(f"tcp/127.0.0.1:{port}",), patience_s=0.4)))
+        zenoh.open(zenoh.Config.from_json5(client_config(connect=(f"tcp/127.0.0.1:{port}",), connect_s=0.4)))
     local = hall.status("robot1")["joins_at"]
     assert local == [f"tcp/127.0.0.1:{port + LOCAL_AFTER}"]
-    with zenoh.open(zenoh.Config.from_json5(client_config(connect=tuple(local), patience_s=20.0))) as session:
+    with zenoh.open(zenoh.Config.from_json5(client_config(connect=tuple(local), connect_s=20.0))) as session:
         until(session.info.links, "an application at the local side")
     hall.zsched("robot1", "pki", "renew", "robot2", "--deliver")
     hall.zsched("robot1", "pki", "renew", "robot1", "--deliver")

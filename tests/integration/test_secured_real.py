@@ -187,7 +187,7 @@ def test_a_link_that_belongs_to_nobody_is_counted_and_named(bed: Testbed) -> Non
     assert fleet.security is not None
     stranger = replace(fleet, security=replace(fleet.security, folder=str(bed.folder / "mallory" / "pki")))
     endpoint = bed.fleet.node("robot1").listen_control
-    config = client_config(connect=(endpoint,), operator_json5=session_text(stranger, Side.VISIT), patience_s=5.0)
+    config = client_config(connect=(endpoint,), operator_json5=session_text(stranger, Side.VISIT), connect_s=5.0)
     with zenoh.open(zenoh.Config.from_json5(config)):
         bed.wait(
             lambda: bed.status("robot1")["counters"].get("dropped_link_stranger"), 60, "the stranger to be counted"

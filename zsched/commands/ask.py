@@ -211,7 +211,7 @@ def _client(endpoint: str) -> FleetClient:
     from zsched.sessions.config import client_config  # noqa: PLC0415 - as above
 
     visit = _visit(endpoint)
-    config = client_config(connect=(endpoint,), operator_json5=visit.text, patience_s=CONNECT_S)
+    config = client_config(connect=(endpoint,), operator_json5=visit.text, connect_s=CONNECT_S)
     client = FleetClient(endpoint, config, visit.asker, visit.fleet, visit.seals)
     atexit.register(client.close)
     return client

@@ -129,7 +129,7 @@ class Door:
             link.settimeout(GREETING_S)
             link.connect(str(self._socket))
             link.settimeout(None)
-            set_patience(link, GREETING_S)
+            set_timeout(link, GREETING_S)
             write_frame(link.fileno(), wire.encode(hello))
             if not _is_answered(link, goes_on):
                 raise TimeoutError(f"nothing for {GREETING_S:g} s")
@@ -139,7 +139,7 @@ class Door:
             link.close()
             return f"it does not answer ({error})"
         if isinstance(answer, RelayHere):
-            set_patience(link, 0.0)
+            set_timeout(link, 0.0)
             return link, answer
         link.close()
         return "it went away" if answer is None else answer.reason
@@ -196,7 +196,7 @@ def _is_answered(link: socket.socket, goes_on: Callable[[float, float], bool]) -
             return False
 
 
-def set_patience(link: socket.socket, seconds: float) -> None:
+def set_timeout(link: socket.socket, seconds: float) -> None:
     """Bound every read and write on ``link`` (0: unbounded); over it they raise `BlockingIOError`."""
     value = _TIMEVAL.pack(int(seconds), int(seconds % 1 * 1e6))
     for option in (socket.SO_RCVTIMEO, socket.SO_SNDTIMEO):

@@ -97,7 +97,7 @@ class Matching:
     def _run(self) -> None:
         while True:
             try:
-                watch = self._queue.get(timeout=self._patience())
+                watch = self._queue.get(timeout=self._wait_s())
             except queue.Empty:
                 watch = None
             try:
@@ -109,7 +109,7 @@ class Matching:
             except Exception:  # noqa: BLE001 - a probe that zenoh refuses must not end the watch
                 _log.exception("workers cannot be watched")
 
-    def _patience(self) -> float | None:
+    def _wait_s(self) -> float | None:
         """Until the next one has settled; without end once all have: zenoh wakes us."""
         now = monotonic_s()
         waiting = [one.settled_at - now for one in self._watched.values() if one.told is None]

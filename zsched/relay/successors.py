@@ -20,7 +20,7 @@ from zsched.clock import monotonic_s
 from zsched.errors import WireError
 from zsched.ipc.pipe import read_frame, write_frame
 from zsched.ipc.protocol import RelayHello, RelayHere, RelayRefused
-from zsched.ipc.takeover import set_patience, user_of
+from zsched.ipc.takeover import set_timeout, user_of
 from zsched.wire import codec as wire
 
 HELLO_S: Final = 0.5
@@ -36,9 +36,9 @@ class Successors:
         self._listener = listener
         self._daemon = daemon
 
-    def wait(self, patience_s: float) -> socket.socket | None:
-        """The link to the next daemon, or ``None`` when none came within ``patience_s``."""
-        until = monotonic_s() + patience_s
+    def wait(self, timeout_s: float) -> socket.socket | None:
+        """The link to the next daemon, or ``None`` when none came within ``timeout_s``."""
+        until = monotonic_s() + timeout_s
         poller = select.poll()
         poller.register(self._listener, select.POLLIN)
         while (left := until - monotonic_s()) > 0:
@@ -53,7 +53,7 @@ class Successors:
 
     def _greet(self, link: socket.socket) -> str | None:
         """Let the daemon behind ``link`` in (``None``), or tell it why not."""
-        set_patience(link, HELLO_S)
+        set_timeout(link, HELLO_S)
         try:
             frame = read_frame(link.fileno())
             if frame is None:
@@ -66,7 +66,7 @@ class Successors:
             return f"no greeting ({error})"
         if reason is None:
             self._daemon = replace(self._daemon, incarnation=hello.incarnation)
-            set_patience(link, 0.0)
+            set_timeout(link, 0.0)
         return reason
 
     def _objection(self, hello: RelayHello, user: int) -> str | None:

@@ -165,7 +165,7 @@ class TaskRelay:
     def _run(self) -> None:
         while True:
             try:
-                plan = self._queue.get(timeout=self._patience())
+                plan = self._queue.get(timeout=self._wait_s())
             except queue.Empty:
                 plan = None
             try:
@@ -183,7 +183,7 @@ class TaskRelay:
                 _log.exception("task %s", self._task)
                 self._problem(f"{type(error).__name__}: {error}")
 
-    def _patience(self) -> float:
+    def _wait_s(self) -> float:
         current = self._current()
         if current is None:
             return IDLE_S

@@ -20,7 +20,7 @@ TURN_S = 10.0
 """Each has at most this long: a daemon that owns tasks gives them away (3 s), ends (2 s) and is heard again (3 s)."""
 SETTLE_S = 1.0
 """Once all before it are heard in a new life, the next one waits this long: their workers start meanwhile."""
-PATIENCE_S = 120.0
+LONGEST_WAIT_S = 120.0
 """An elector waits this long for the others; one that is away for good must not keep a new node out."""
 
 
@@ -66,7 +66,7 @@ class Reopening:
 
     def put_off(self, now: float) -> None:
         """It cannot be now."""
-        self.due_at = self._first_at = now + PATIENCE_S
+        self.due_at = self._first_at = now + LONGEST_WAIT_S
 
     def is_due(
         self,
@@ -89,7 +89,7 @@ class Reopening:
         if now < self.due_at and not (is_free and self._is_next(lives, now)):
             return False
         missing = {name for name in electors if name not in lives} - {self.me}
-        return self.me not in electors or not missing or now >= self.due_at + PATIENCE_S
+        return self.me not in electors or not missing or now >= self.due_at + LONGEST_WAIT_S
 
     def _is_next(self, lives: Mapping[NodeId, int | None], now: float) -> bool:
         """Whether all before it have begun again, and have had time to start their workers."""

@@ -145,7 +145,7 @@ def worker_config(
             timing=timing,
             shared_memory=shared_memory,
             operator_json5=operator_json5,
-            patience_s=RELAY_START_S,
+            connect_s=RELAY_START_S,
         )
     settings = _peer(_small_buffers(listen), _small_buffers(connect), timing)
     _set_shared_memory(settings, is_on=shared_memory)
@@ -172,11 +172,11 @@ def client_config(
     timing: Timing = DEFAULT_TIMING,
     shared_memory: bool = False,
     operator_json5: str = "",
-    patience_s: float = 0.0,
+    connect_s: float = 0.0,
 ) -> str:
     """A session that hangs on one node: an application, the command line, a worker with ``link: client``.
 
-    A client's ``open`` fails when nobody listens for ``patience_s`` (a peer's goes on trying in the background).
+    A client's ``open`` fails when nobody listens for ``connect_s`` (a peer's goes on trying in the background).
 
     Raises:
         ValueError: the operator's JSON5 is not a zenoh configuration.
@@ -184,7 +184,7 @@ def client_config(
     settings = _common(timing)
     settings["mode"] = "client"
     settings["connect/endpoints"] = list(connect)
-    settings["connect/timeout_ms"] = round(patience_s * 1000)
+    settings["connect/timeout_ms"] = round(connect_s * 1000)
     _set_shared_memory(settings, is_on=shared_memory)
     return _render(settings, operator_json5)
 

@@ -25,7 +25,7 @@ from zsched.guard import guarded
 MAX_BYTES: Final = 64 << 20
 STALL_S: Final = 0.1
 """A put that takes this long means a stalled receiver or a slow radio: from then on only the newest samples wait."""
-PATIENCE_S: Final = 0.25
+NO_ROOM_S: Final = 0.25
 """A receiver that takes nothing for this long is stalled, not slow: nobody waits for it."""
 POLL_S: Final = 0.05
 JOIN_S: Final = 0.3
@@ -141,7 +141,7 @@ class SendQueue:
         """Wait until a sample of ``size`` bytes would be taken; ``False`` as soon as the receiver is stalled."""
         with self._room:
             while self._is_full(size) and not self._is_closed:
-                rest = PATIENCE_S - (monotonic_s() - self._left_at)
+                rest = NO_ROOM_S - (monotonic_s() - self._left_at)
                 if rest <= 0:
                     return False
                 self._room.wait(rest)

@@ -38,12 +38,12 @@ _log = logging.getLogger("zsched.streams")
 class StalledLinks(contextlib.AbstractContextManager[None]):
     """The links of one session. ``with`` it around every put that may wait (any thread, not nested)."""
 
-    def __init__(self, session: Session, lease_s: float, patience_s: float = math.inf) -> None:
+    def __init__(self, session: Session, lease_s: float, full_s: float = math.inf) -> None:
         """The thread starts with the first put. ``lease_s`` is zenoh's, on these links.
 
-        ``patience_s``: a receiver that is heard, and takes nothing for this long while a put waits, is stalled, too.
+        ``full_s``: a receiver that is heard, and takes nothing for this long while a put waits, is stalled, too.
         """
-        self._patience_s = patience_s
+        self._full_s = full_s
         self._sockets = LinkSockets(session)
         self._silent_s = SILENT_RATIO * lease_s
         self._puts: dict[int, float] = {}
@@ -108,7 +108,7 @@ class StalledLinks(contextlib.AbstractContextManager[None]):
             taken = link.taken()
             has_taken, at = before.get(link, (-1, now))
             self._full[link] = (taken, at if taken == has_taken else now)
-            is_stalled = link.silent_s() >= self._silent_s or now - self._full[link][1] >= self._patience_s
+            is_stalled = link.silent_s() >= self._silent_s or now - self._full[link][1] >= self._full_s
             if is_stalled and link.cut():
                 self.ended += 1
                 _log.warning("%s takes nothing: its link is ended", link.name)

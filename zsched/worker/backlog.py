@@ -90,7 +90,7 @@ class Done(NamedTuple, Generic[SourceT]):
         return self.quiet_at is None and 0 < self.slot < epoch and now - self.at > STALE_S
 
 
-class Backlog(Generic[SourceT]):
+class StandbyInputs(Generic[SourceT]):
     """Samples that are *kept* until the worker becomes the owner, and samples that are to be processed *again*."""
 
     def __init__(self) -> None:

@@ -27,7 +27,7 @@ from zsched.core.hop.receiver import GIVE_UP_S, MAX_SOURCES, SourceName
 from zsched.core.hop.serial import number_near, serial_of
 from zsched.guard import guarded
 from zsched.hop.acknowledger import Acknowledger
-from zsched.worker.backlog import Backlog, Done
+from zsched.worker.backlog import Done, StandbyInputs
 from zsched.worker.debts import Debts, Held
 from zsched.worker.jobs import JobBook
 from zsched.worker.lanes import KeptLane
@@ -84,7 +84,7 @@ class Dispatcher:
         self._is_whole = False
         """Of the input in hand everything is wanted; of any other the gates drop what comes too late."""
         self._has_withheld = False
-        self._backlog = Backlog[Input]()
+        self._backlog = StandbyInputs[Input]()
         self._is_standby: Callable[[], bool] = _never
         self._is_closed = False
         self._is_held = False

@@ -208,9 +208,9 @@ def _assembled(replies: queue.SimpleQueue[zenoh.Reply | None], until: float) -> 
     has_come, whole, problem = False, b"", ""
     is_whole = False
     while True:
-        patience_s = CONTEST_S if is_whole else math.inf if has_come else FIRST_S
+        silence_s = CONTEST_S if is_whole else math.inf if has_come else FIRST_S
         try:
-            reply = _next_reply(replies, patience_s, until)
+            reply = _next_reply(replies, silence_s, until)
         except queue.Empty:
             if is_whole:
                 break
@@ -231,16 +231,16 @@ def _assembled(replies: queue.SimpleQueue[zenoh.Reply | None], until: float) -> 
     return problem or ("incomplete: its worker died meanwhile" if has_come else "nobody offers one")
 
 
-def _next_reply(replies: queue.SimpleQueue[zenoh.Reply | None], patience_s: float, until: float) -> zenoh.Reply | None:
-    """The next one, ``None``: there are no more. `queue.Empty`: a silence of ``patience_s``, or it is ``until``."""
+def _next_reply(replies: queue.SimpleQueue[zenoh.Reply | None], silence_s: float, until: float) -> zenoh.Reply | None:
+    """The next one, ``None``: there are no more. `queue.Empty`: a silence of ``silence_s``, or it is ``until``."""
     quiet_s = 0.0
     while True:
-        piece_s = max(0.0, min(SLICE_S, patience_s - quiet_s, until - monotonic_s()))
+        piece_s = max(0.0, min(SLICE_S, silence_s - quiet_s, until - monotonic_s()))
         try:
             return replies.get(timeout=piece_s)
         except queue.Empty:
             quiet_s += SLICE_S
-            if quiet_s >= patience_s or monotonic_s() >= until:
+            if quiet_s >= silence_s or monotonic_s() >= until:
                 raise
 
 

@@ -99,7 +99,7 @@ def test_who_is_not_heard_and_has_no_room_loses_its_link_and_nobody_else(links: 
 
 def test_who_is_heard_and_takes_nothing_is_waited_for_no_longer_than_that(links: Links) -> None:
     heard, alive = links.add()
-    stalled = StalledLinks(cast("Any", links), 1000.0, patience_s=0.3)
+    stalled = StalledLinks(cast("Any", links), 1000.0, full_s=0.3)
     with stalled:
         until(lambda: stalled.ended == 1, "its link is ended")
     assert heard.recv(1) == b""
@@ -109,7 +109,7 @@ def test_who_is_heard_and_takes_nothing_is_waited_for_no_longer_than_that(links:
 
 def test_while_nothing_is_put_no_link_is_ended(links: Links) -> None:
     _, theirs = links.add()
-    stalled = StalledLinks(cast("Any", links), 0.1, patience_s=0.1)
+    stalled = StalledLinks(cast("Any", links), 0.1, full_s=0.1)
     for _ in range(30):
         with stalled:
             pass

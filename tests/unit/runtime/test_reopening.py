@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from zsched.runtime.reopening import FIRST_S, PATIENCE_S, SETTLE_S, TURN_S, Reopening, turns
+from zsched.runtime.reopening import FIRST_S, LONGEST_WAIT_S, SETTLE_S, TURN_S, Reopening, turns
 
 ELECTORS = ("edge1", "robot1", "robot2")
 NODES = ("edge1", "edge2", "robot1", "robot2")
@@ -85,7 +85,7 @@ def test_an_elector_waits_for_the_others_but_not_for_ever() -> None:
     assert one.due_at is not None
     assert not one.is_due(ELECTORS, lives("edge2", "robot1"), one.due_at)
     assert one.is_due(ELECTORS, lives("robot1", "robot2"), one.due_at), "edge2 is no elector"
-    assert one.is_due(ELECTORS, lives("robot1"), one.due_at + PATIENCE_S)
+    assert one.is_due(ELECTORS, lives("robot1"), one.due_at + LONGEST_WAIT_S)
     edge = wanting("edge2")
     assert edge.is_due(ELECTORS, {}, FIRST_S), "who is no elector waits for nobody"
 
@@ -100,5 +100,5 @@ def test_what_cannot_be_now_is_tried_again_later() -> None:
     one = Reopening("robot1")
     one.want(("robot1",), {}, 0.0)
     one.put_off(FIRST_S)
-    assert not one.is_due(("robot1",), {}, FIRST_S + PATIENCE_S - 1)
-    assert one.is_due(("robot1",), {}, FIRST_S + PATIENCE_S)
+    assert not one.is_due(("robot1",), {}, FIRST_S + LONGEST_WAIT_S - 1)
+    assert one.is_due(("robot1",), {}, FIRST_S + LONGEST_WAIT_S)

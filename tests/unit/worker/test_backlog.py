@@ -9,7 +9,7 @@ import pytest
 import zenoh
 
 from zsched.worker import backlog as worker_backlog
-from zsched.worker.backlog import QUIET_S, STALE_S, Backlog, Done
+from zsched.worker.backlog import QUIET_S, STALE_S, Done, StandbyInputs
 from zsched.worker.samples import Input, KeepLast
 
 
@@ -30,7 +30,7 @@ def done(
     return Done(source, cast("zenoh.Sample", Sample(key)), turn, epoch=0, quiet_at=quiet_at, name=(key, "zid", 1))
 
 
-def turns(backlog: Backlog[Input]) -> list[int]:
+def turns(backlog: StandbyInputs[Input]) -> list[int]:
     taken = []
     while (one := backlog.take()) is not None:
         taken.append(one.turn)
@@ -38,7 +38,7 @@ def turns(backlog: Backlog[Input]) -> list[int]:
 
 
 def test_nothing_is_processed_again_before_the_worker_is_the_owner() -> None:
-    backlog = Backlog[Input]()
+    backlog = StandbyInputs[Input]()
     assert backlog.keep(done(1)) == []
     assert (backlog.take(), backlog.is_due, backlog.is_before(2)) == (None, False, False)
     backlog.begin()
@@ -47,7 +47,7 @@ def test_nothing_is_processed_again_before_the_worker_is_the_owner() -> None:
 
 
 def test_keys_are_given_back_in_the_order_in_which_they_came() -> None:
-    backlog = Backlog[Input]()
+    backlog = StandbyInputs[Input]()
     for turn, key in ((1, "a"), (2, "b"), (3, "a"), (4, "b")):
         backlog.keep(done(turn, key))
     backlog.begin()
@@ -55,7 +55,7 @@ def test_keys_are_given_back_in_the_order_in_which_they_came() -> None:
 
 
 def test_a_role_that_goes_and_comes_back_in_the_middle_changes_no_order() -> None:
-    backlog = Backlog[Input]()
+    backlog = StandbyInputs[Input]()
     for turn in (1, 2, 3):
         backlog.keep(done(turn))
     backlog.begin()
@@ -71,7 +71,7 @@ def test_a_role_that_goes_and_comes_back_in_the_middle_changes_no_order() -> Non
 
 def test_what_was_answered_is_processed_again_only_for_a_state_that_took_the_place_of_ours() -> None:
     for is_restored, expected in ((True, [2, 3]), (False, [3])):
-        backlog = Backlog[Input]()
+        backlog = StandbyInputs[Input]()
         backlog.keep(done(1, quiet_at=100.0 - QUIET_S))
         backlog.keep(done(2, quiet_at=99.0))
         backlog.keep(done(3))
@@ -81,7 +81,7 @@ def test_what_was_answered_is_processed_again_only_for_a_state_that_took_the_pla
 
 
 def test_of_an_input_that_keeps_the_newest_only_those_wait_and_nothing_is_lost() -> None:
-    backlog, newest = Backlog[Input](), Input(on_sample=lambda _: None, keep_last=2)
+    backlog, newest = StandbyInputs[Input](), Input(on_sample=lambda _: None, keep_last=2)
     assert [backlog.keep(done(turn, source=newest)) for turn in range(4)] == [[], [], [], []]
     backlog.begin()
     assert turns(backlog) == [2, 3]
@@ -94,7 +94,7 @@ def test_of_an_input_that_keeps_the_newest_only_those_wait_and_nothing_is_lost()
 def test_how_much_is_kept_goes_by_the_class_and_what_gives_way_of_a_reliable_source_is_lost(
     keep_last: KeepLast, is_whole: bool, kept: list[int], lost: int
 ) -> None:
-    backlog, source = Backlog[Input](), Input(on_sample=lambda _: None, keep_last=keep_last)
+    backlog, source = StandbyInputs[Input](), Input(on_sample=lambda _: None, keep_last=keep_last)
     gone = [one.name for turn in (1, 2) for one in backlog.keep(done(turn, source=source)._replace(is_whole=is_whole))]
     backlog.begin()
     assert (turns(backlog), len(gone)) == (kept, lost)
@@ -105,7 +105,7 @@ def from_slot(turn: int, slot: int, at: float, key: str = "a") -> Done[Input]:
 
 
 def test_what_an_older_epoch_left_long_ago_is_stale_and_its_publisher_with_it() -> None:
-    backlog = Backlog[Input]()
+    backlog = StandbyInputs[Input]()
     backlog.keep(from_slot(1, slot=2, at=0.0, key="old"))
     backlog.keep(from_slot(2, slot=2, at=10.0, key="young"))
     backlog.keep(from_slot(3, slot=4, at=0.0, key="now"))
@@ -119,7 +119,7 @@ def test_what_an_older_epoch_left_long_ago_is_stale_and_its_publisher_with_it() 
 
 
 def test_what_a_publisher_gives_up_is_forgotten_wherever_it_waits() -> None:
-    backlog = Backlog[Input]()
+    backlog = StandbyInputs[Input]()
     for turn, key in ((1, "a"), (2, "b")):
         backlog.keep(done(turn, key))
     backlog.begin()
@@ -134,7 +134,7 @@ def test_what_a_publisher_gives_up_is_forgotten_wherever_it_waits() -> None:
 
 def test_what_is_forgotten_makes_room(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worker_backlog, "MAX_BACKLOG_BYTES", 2)
-    backlog = Backlog[Input]()
+    backlog = StandbyInputs[Input]()
     for turn in (1, 2):
         backlog.keep(done(turn, "a"))
     backlog.forget(("a", "zid", 1))

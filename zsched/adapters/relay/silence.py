@@ -27,8 +27,8 @@ LOOKS, LOOK_APART_S = 5, 0.02
 class Silence:
     """How long one process has been silent for, while we listened."""
 
-    def __init__(self, pid: int, patience_s: float) -> None:
-        self.patience_s = patience_s
+    def __init__(self, pid: int, limit_s: float) -> None:
+        self.limit_s = limit_s
         self.silent_s = 0.0
         self._pid = pid
         self._awake_s = 0.0
@@ -43,8 +43,8 @@ class Silence:
         A relay that speaks in time is not looked at, which would cost more than its words. So the first half of a
         silence is not measured, but for a new relay's.
         """
-        patience_s = self.patience_s / 2 if self._seen is None else self.patience_s
-        return max(LOOK_S, patience_s - (self.silent_s - self._awake_s))
+        limit_s = self.limit_s / 2 if self._seen is None else self.limit_s
+        return max(LOOK_S, limit_s - (self.silent_s - self._awake_s))
 
     def end(self) -> None:
         """It has said something."""
@@ -65,14 +65,14 @@ class Silence:
             worked_s = use.processor_s - seen.processor_s
             self._work_s += worked_s
             self._awake_s = min(self.silent_s, self._awake_s + worked_s + max(0.0, use.waited_s - seen.waited_s))
-        if has_stood_still or self.silent_s < self.patience_s:
+        if has_stood_still or self.silent_s < self.limit_s:
             return ""
         verdict = f"no sign of life for {self.silent_s:.1f} s"
         if use is None:
             return verdict
         if self._work_s >= WORK_S:
             return f"{verdict}, {self._work_s:.1f} s of them on a processor"
-        has_slept = self.silent_s - self._awake_s >= self.patience_s
+        has_slept = self.silent_s - self._awake_s >= self.limit_s
         return verdict if has_slept and is_idle(self._pid) else ""
 
 

@@ -322,7 +322,7 @@ class RelayHandle:
             if isinstance(report, ProblemReported) and opening is not None:
                 last_word = report.problem or ""
             if isinstance(report, RelayStarted):
-                silence.patience_s, opening, last_word = self._silence_s, None, ""
+                silence.limit_s, opening, last_word = self._silence_s, None, ""
                 self._on_report(RelayChanged(is_running=True, reason=f"pid {report.pid}"))
             self._on_report(report)
 

@@ -14,7 +14,7 @@ from typing import Final
 
 from zsched.commands.common import Json
 
-PATIENCE_S: Final = 60.0
+OVERDUE_S: Final = 60.0
 """A move that is not settled by then is reported as far as it came."""
 MOST_LINES: Final = 100
 
@@ -74,8 +74,8 @@ class Moves:
                 self._wait(task, entry)
 
     def overdue(self, now: float) -> Iterator[Span]:
-        """The moves that have waited for their end for `PATIENCE_S`; ``now``: the node's clock."""
-        for task in [task for task, one in self._open.items() if now - one.entry["at"] > PATIENCE_S]:
+        """The moves that have waited for their end for `OVERDUE_S`; ``now``: the node's clock."""
+        for task in [task for task, one in self._open.items() if now - one.entry["at"] > OVERDUE_S]:
             yield from self._close(task)
 
     def rest(self) -> Iterator[Span]:

@@ -23,7 +23,7 @@ from zsched.core.values.model import NodeId
 STEP = 0.03
 MAX_PENALTY = 0.35
 HALF_LIFE_S = 60.0
-PROBATION_S = 30.0
+EARLY_FAILURE_S = 30.0
 """A node that fails so soon after it got the task pays more for it."""
 FORGET_BELOW = 0.05
 WINDOW_S = 60.0
@@ -66,7 +66,7 @@ class Damping:
         """
         if left is not None and not is_ordered:
             if has_failed and not was_draining:
-                gained = 2.0 + float(now - self._owner_since < PROBATION_S)
+                gained = 2.0 + float(now - self._owner_since < EARLY_FAILURE_S)
                 self._points[left] = (self.points(left, now) + gained, now)
             self._moves.append((now, has_failed))
         self._owner_since = now

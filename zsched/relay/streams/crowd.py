@@ -6,7 +6,7 @@ receives something.
 
 zenoh hands a sample to one receiver after the other: a put that waits (BLOCK) for a frozen one makes all of them wait,
 for seconds. So, where there are two or more, each put first waits until every link has room. A receiver whose link has
-none is *left behind*, while another one is ready, when it has taken nothing for `PATIENCE_S`, or when the others have
+none is *left behind*, while another one is ready, when it has taken nothing for `NO_ROOM_S`, or when the others have
 waited this long for it and the queue before the put runs full. As long as somebody is left behind, puts do not wait
 (DROP): zenoh drops for this receiver alone. What it may have missed is counted. After a rest, and when its link has
 room again, it is waited for like the others; of class ``latest`` the newest sample is then put once more.
@@ -31,7 +31,7 @@ from zsched.core.hop.serial import serial_of
 from zsched.relay.streams.lanes import Lane
 from zsched.sessions.config import DROP_WAIT_S
 from zsched.sessions.link_sockets import LinkSocket, LinkSockets, with_room
-from zsched.sessions.send_queue import PATIENCE_S
+from zsched.sessions.send_queue import NO_ROOM_S
 
 LOOK_S: Final = 1.0
 """How old our knowledge of the links may be."""
@@ -199,7 +199,7 @@ class Crowd:
             looked_at = now
             waiting = [reader for reader in full if reader.left_until is None]
             is_nobody_ready = len(full) == len(self._readers)
-            if not waiting or (is_nobody_ready and now - began > PATIENCE_S):
+            if not waiting or (is_nobody_ready and now - began > NO_ROOM_S):
                 break
             _ready(waiting, SLICE_S)
         return tuple(reader for reader in full if reader.left_until is not None)
@@ -226,8 +226,8 @@ class Crowd:
         now, is_pressed = monotonic_s(), self._is_pressed()
         for reader in full:
             reader.cost_s += waited_s
-            is_stalled = now - reader.moved_at > PATIENCE_S
-            if reader.left_until is None and (is_stalled or (is_pressed and reader.cost_s > PATIENCE_S)):
+            is_stalled = now - reader.moved_at > NO_ROOM_S
+            if reader.left_until is None and (is_stalled or (is_pressed and reader.cost_s > NO_ROOM_S)):
                 reader.leave(now)
                 what = "stalled" if is_stalled else "too slow"
                 _log.info("%s: %s is %s: nobody waits for it", self._expr, reader.link.name, what)

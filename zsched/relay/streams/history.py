@@ -39,8 +39,8 @@ _turn = threading.BoundedSemaphore(MAX_FETCHES)
 _Source = tuple[str, str, int]
 
 
-class History:
-    """The caches behind one key expression. ``deliver`` is called under `History.lock`, from several threads."""
+class HeldValues:
+    """The caches behind one key expression. ``deliver`` is called under `HeldValues.lock`, from several threads."""
 
     def __init__(
         self,

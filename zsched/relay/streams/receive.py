@@ -25,7 +25,7 @@ from zenoh import Sample, Session
 from zsched.clock import awake_s
 from zsched.core.values.plan import StreamClass, StreamSettings
 from zsched.guard import guarded, tolerant
-from zsched.relay.streams.history import History
+from zsched.relay.streams.history import HeldValues
 
 JOIN_S: Final = 0.3
 QUEUE_DEPTH: Final = 256
@@ -73,9 +73,9 @@ class Receiver:
             zenoh.ZError: ``expr`` is no key expression.
         """
         is_latest = settings.stream_class is StreamClass.LATEST
-        self._history: History | None = None
+        self._history: HeldValues | None = None
         if with_history and is_latest and settings.keep_last:
-            self._history = History(session, expr, settings.keep_last, carry, origin)
+            self._history = HeldValues(session, expr, settings.keep_last, carry, origin)
         self._carry = carry if self._history is None else self._history.live
         self._depth, self._give_way = settings.depth, give_way
         self._ended = threading.Event()

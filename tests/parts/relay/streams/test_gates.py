@@ -179,7 +179,7 @@ def test_a_slow_receiver_slows_the_publisher_down_and_nothing_is_dropped(
 ) -> None:
     """More than every buffer on the way holds: the relay's thread waits, zenoh and TCP hand that back to the source."""
     monkeypatch.setattr(outlet, "QUEUE_DEPTH", 8)
-    monkeypatch.setattr(send_queue, "PATIENCE_S", 60.0)
+    monkeypatch.setattr(send_queue, "NO_ROOM_S", 60.0)
     settings = StreamSettings(stream_class=StreamClass.RELIABLE, depth=1)
     route = replace(way_in(StreamClass.RELIABLE), settings=settings)
     stream = bench.input(route)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from zsched.commands.watch.spans import PATIENCE_S, Moves, Span, trace_id
+from zsched.commands.watch.spans import OVERDUE_S, Moves, Span, trace_id
 
 
 def line(at: float, stage: str, epoch: int, text: str, **more: Any) -> dict[str, Any]:
@@ -81,8 +81,8 @@ def test_lines_one_at_a_time_make_the_same_spans() -> None:
 def test_a_move_without_an_end_is_told_when_the_next_comes_or_its_time_is_over() -> None:
     moves = Moves()
     assert not list(moves.take(PLANNED[:6]))
-    assert not list(moves.overdue(31.0 + PATIENCE_S))
-    (late,) = moves.overdue(31.1 + PATIENCE_S)
+    assert not list(moves.overdue(31.0 + OVERDUE_S))
+    (late,) = moves.overdue(31.1 + OVERDUE_S)
     assert (late.epoch, late.switched_s, late.end) == (4, None, 31.067)
     assert [span.epoch for span in moves.take([*PLANNED[4:7], FAILOVER[1]])] == [4]
     assert [span.epoch for span in moves.rest()] == [5]

@@ -9,7 +9,7 @@ import pytest
 
 from support.allocations import allocation_of
 from support.fleets import tuning_of
-from zsched.core.scheduler.damping import MAX_PENALTY, PROBATION_S, STEP, WINDOW_S, Damping
+from zsched.core.scheduler.damping import EARLY_FAILURE_S, MAX_PENALTY, STEP, WINDOW_S, Damping
 from zsched.core.scheduler.judge import Judge, Outcome
 from zsched.core.scheduler.scoring import Standing
 from zsched.core.values.fleet import TaskSpec
@@ -57,11 +57,11 @@ def test_penalty_halves_its_points_with_the_half_life_and_is_forgotten() -> None
 
 def test_to_fail_on_probation_costs_more_than_later() -> None:
     early, late = Damping(), Damping()
-    for damping, stay in ((early, PROBATION_S / 2), (late, PROBATION_S * 2)):
+    for damping, stay in ((early, EARLY_FAILURE_S / 2), (late, EARLY_FAILURE_S * 2)):
         damping.note_move(None, has_failed=False, now=0.0)
         damping.note_move("edge1", has_failed=True, now=stay)
-    assert early.points("edge1", PROBATION_S / 2) == 3.0
-    assert late.points("edge1", PROBATION_S * 2) == 2.0
+    assert early.points("edge1", EARLY_FAILURE_S / 2) == 3.0
+    assert late.points("edge1", EARLY_FAILURE_S * 2) == 2.0
 
 
 def test_a_node_that_is_left_for_a_better_one_pays_nothing_however_soon_it_is_left_again() -> None:

@@ -177,7 +177,7 @@ def run(tmp_path: Path, tests: Path, *mutants: Mutant) -> str:
 
 
 def test_the_command_plants_into_functions_and_into_what_the_import_runs(tmp_path: Path) -> None:
-    """Both ways: `majority` is called, `PROBATION_S` is made at the import; an empty test finds neither."""
+    """Both ways: `majority` is called, `EARLY_FAILURE_S` is made at the import; an empty test finds neither."""
     quorum, damping = (
         mutants_of(f"zsched.core.{name}".replace("/", "."), (CORE / f"{name}.py").read_text(encoding="utf-8"))
         for name in ("values/quorum", "scheduler/damping")
@@ -188,10 +188,10 @@ def test_the_command_plants_into_functions_and_into_what_the_import_runs(tmp_pat
     assert made
     good = tmp_path / "test_good.py"
     good.write_text(
-        "from zsched.core.scheduler.damping import PROBATION_S\n"
+        "from zsched.core.scheduler.damping import EARLY_FAILURE_S\n"
         "from zsched.core.values.quorum import majority\n"
         "def test_majority():\n    assert [majority(n) for n in range(1, 6)] == [1, 2, 2, 3, 3]\n"
-        "def test_made():\n    assert PROBATION_S == 30.0\n",
+        "def test_made():\n    assert EARLY_FAILURE_S == 30.0\n",
         encoding="utf-8",
     )
     text = run(tmp_path, good, found[0], made[0])
