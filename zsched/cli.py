@@ -27,6 +27,7 @@ from zsched.commands.example import Example, write_example
 from zsched.commands.flag_verbs import add_flag_verbs
 from zsched.commands.fleet_verbs import (
     AcceptOption,
+    PauseAfterOption,
     PlanOption,
     ReasonOption,
     RevisionOption,
@@ -859,6 +860,7 @@ def apply(
     yes: YesOption = False,
     revision: RevisionOption = None,
     accept: AcceptOption = None,
+    pause_after: PauseAfterOption = None,
     reason: ReasonOption = "",
     json_: JsonOption = False,
     node: AskedOption = None,
@@ -876,7 +878,16 @@ def apply(
     from zsched.commands.fleet_verbs import view_of  # noqa: PLC0415 - as above
 
     words = ("apply", file)
-    view = view_of(words, plan=plan, yes=yes, revision=revision, accept=accept, reason=reason, is_json=json_)
+    view = view_of(
+        words,
+        plan=plan,
+        yes=yes,
+        revision=revision,
+        accept=accept,
+        reason=reason,
+        is_json=json_,
+        pause_after=pause_after,
+    )
     door = find_door(runtime_dir, node, connect=connect)
     text = read_text(file)
     raise typer.Exit(change(door, view, lambda _held: text, file))
@@ -887,6 +898,7 @@ def edit(
     plan: PlanOption = False,
     yes: YesOption = False,
     accept: AcceptOption = None,
+    pause_after: PauseAfterOption = None,
     reason: ReasonOption = "",
     node: AskedOption = None,
     runtime_dir: RuntimeOption = None,
@@ -900,7 +912,16 @@ def edit(
     from zsched.commands.fleet import edit as open_document  # noqa: PLC0415 - as above
     from zsched.commands.fleet_verbs import view_of  # noqa: PLC0415 - as above
 
-    view = view_of(("edit",), plan=plan, yes=yes, revision=None, accept=accept, reason=reason, is_json=False)
+    view = view_of(
+        ("edit",),
+        plan=plan,
+        yes=yes,
+        revision=None,
+        accept=accept,
+        reason=reason,
+        is_json=False,
+        pause_after=pause_after,
+    )
     raise typer.Exit(open_document(find_door(runtime_dir, node, connect=connect), view))
 
 

@@ -28,7 +28,9 @@ from zsched.commands.document import (
     status_of,
     wait_until_settled,
 )
+from zsched.commands.orders import asker
 from zsched.commands.page import cut, harmless
+from zsched.commands.rollout import Wave, begun, kept_rollouts, told_in
 from zsched.config.difference import Change, Danger, difference, wanted_electors, warnings_in_force
 from zsched.config.load import check_bytes
 from zsched.config.reader import MAX_FILE_BYTES, render_all
@@ -64,6 +66,8 @@ class ApplyView:
     reason: str = ""
     is_data: bool = False
     """Stdout is for something else: messages go to stderr."""
+    pause_after: int | None = None
+    """The number of candidates of each task that run a changed worker while the others wait; ``None``: none waits."""
 
     @property
     def out(self) -> TextIO:
@@ -75,6 +79,7 @@ class ApplyView:
         kept = [part for name in self.accepted for part in ("--accept", name)]
         kept += ["-m", self.reason] if self.reason else []
         kept += ["--revision", str(self.revision)] if self.revision is not None else []
+        kept += ["--pause-after", str(self.pause_after)] if self.pause_after is not None else []
         return shlex.join(("zsched", *self.words, *kept, *more))
 
 
@@ -93,6 +98,8 @@ class Plan:
     warnings: str = ""
     note: str = ""
     """One line above the table."""
+    rollouts: tuple[Json, ...] = ()
+    """The changed workers that wait for a look afterwards."""
 
     @property
     def is_nothing(self) -> bool:
@@ -130,9 +137,20 @@ def apply(door: Door, view: ApplyView, make: Callable[[InForce], str], file: str
     _check_accepted(view)
     check_reason(view.reason)
     held = in_force(door)
+    return agree(door, view, make_plan(door, held, make(held), file, view))
+
+
+def agree(door: Door, view: ApplyView, plan: Plan) -> int:
+    """Show a plan, ask, have it agreed; the exit code.
+
+    Raises:
+        CliError: it is refused, overtaken, or not accepted.
+    """
+    _check_accepted(view)
+    check_reason(view.reason)
+    held = plan.held
     if view.revision is not None and view.revision != held.revision:
         raise CliError(EXIT_FAILED, f"revision {view.revision} is overtaken: {held.fleet} has revision {held.revision}")
-    plan = make_plan(door, held, make(held), file)
     if plan.warnings and not view.is_json:
         sys.stderr.write(harmless(plan.warnings) + "\n")
     if plan.is_nothing:
@@ -150,11 +168,12 @@ def apply(door: Door, view: ApplyView, make: Callable[[InForce], str], file: str
     return _commit(door, view, plan)
 
 
-def make_plan(door: Door, held: InForce, text: str, file: str) -> Plan:
-    """What ``text`` would change, and which dangers are in it.
+def make_plan(door: Door, held: InForce, text: str, file: str, view: ApplyView | None = None) -> Plan:
+    """What ``text`` would change, and which dangers are in it; ``view`` says which changed workers wait for a look.
 
     Raises:
-        CliError: it is another fleet's file, or the document in force is not there or cannot be read here.
+        CliError: it is another fleet's file, the document in force is not there or cannot be read here, or no changed
+            worker can wait.
         ConfigError: it has faults.
     """
     result = check_bytes(text.encode(), file)
@@ -167,7 +186,10 @@ def make_plan(door: Door, held: InForce, text: str, file: str) -> Plan:
             EXIT_FAILED, f"{file} is the file of fleet {fleet.name}, and this is fleet {held.fleet}; {advice}"
         )
     warnings = render_all(file, result.warnings, "warning")
+    pause_after = None if view is None else view.pause_after
     if not held.document:
+        if pause_after is not None:
+            raise CliError(EXIT_FAILED, f"--pause-after: {held.fleet} has no document yet; agree its file first")
         return _first(door, held, text, fleet, warnings)
     warnings = render_all(file, warnings_in_force(text, result.warnings), "warning")
     old = check_bytes(document_text(held).encode(), file).fleet
@@ -180,6 +202,12 @@ def make_plan(door: Door, held: InForce, text: str, file: str) -> Plan:
     changes = difference(old, fleet, (held.text, text), owners, electors)
     if not wanted_electors(electors, fleet, text):
         raise CliError(EXIT_FAILED, f"{file}: no elector would be left; keep one of {', '.join(electors)}")
+    rollouts = kept_rollouts(held.rollouts, fleet)
+    if view is not None and pause_after is not None:
+        texts, revision = (held.text, text), held.revision + 1
+        wave = Wave(old=old, new=fleet, texts=texts, status=status, electors=electors, revision=revision)
+        rollouts = (*rollouts, *begun(wave, pause_after, rollouts, by=asker(door), reason=view.reason))
+    changes = tuple(told_in(one, rollouts) for one in changes)
     dangers = [(one.danger.value, one.warning()) for one in changes if one.danger is not None]
     note = "" if changes or text == held.text else "only comments, blanks or the order of keys differ: nothing notices"
     return Plan(
@@ -191,6 +219,7 @@ def make_plan(door: Door, held: InForce, text: str, file: str) -> Plan:
         restarts=_restarts(old, fleet),
         warnings=warnings,
         note=note,
+        rollouts=tuple(sorted(rollouts, key=lambda one: str(one["task"]))),
     )
 
 
@@ -358,8 +387,9 @@ def _steps(door: Door, plan: Plan) -> Iterator[Json]:
     nodes = {node.name for node in plan.fleet.nodes}
     leave = [name for name in go if name not in nodes]
     yield from ({"remove_elector": name} for name in leave)
-    if plan.text != plan.held.text:
-        yield {"text": plan.text, "flags": [flag for flag in plan.held.flags if flag["subject"] in nodes]}
+    if plan.text != plan.held.text or plan.rollouts != plan.held.rollouts:
+        flags = [flag for flag in plan.held.flags if flag["subject"] in nodes]
+        yield {"text": plan.text, "flags": flags, "rollouts": list(plan.rollouts)}
     yield from ({"add_elector": name, "disk": disks[name]} for name in come)
     yield from ({"remove_elector": name} for name in go if name not in leave)
 

@@ -30,7 +30,7 @@ def task_rows(page: Page, status: Json, at: float | None) -> None:
     """Titles and a line per task; ``at``: now, for wall times beside ages."""
     tasks: list[Json] = status["tasks"]
     task_room = min(max([10, *(len(task["name"]) for task in tasks)]), 20)
-    names = [len(task["owner"] or "nobody") + (0 if task.get("pin") is None else 6) for task in tasks]
+    names = [len(task["owner"] or "nobody") + len(_marks(task)) for task in tasks]
     owner_room = min(max([6, *names]), 20)
     columns = (task_room, owner_room, 8, 15 if at is not None else 6, 9, -7, -7, page.width)
     page.row(*((t, w, "dim" if i else "stage") for i, (t, w) in enumerate(zip(TITLES, columns, strict=True))))
@@ -45,7 +45,7 @@ def _cells(task: Json, at: float | None) -> list[Cell]:
     dropped, is_new = _dropped(task)
     return [
         (task["name"], "bold"),
-        ((owner or "nobody") + ("" if task.get("pin") is None else " (pin)"), "bold" if owner else "red"),
+        ((owner or "nobody") + _marks(task), "bold" if owner else "red"),
         (state, STATE_STYLES.get(state, "red")),
         (since, ""),
         (str(task["phase"]), "" if task["phase"] in ("idle", "settled") else "yellow"),
@@ -53,6 +53,11 @@ def _cells(task: Json, at: float | None) -> list[Cell]:
         (_flow(task, "out"), ""),
         (dropped, "yellow" if is_new else "dim"),
     ]
+
+
+def _marks(task: Json) -> str:
+    """What an operator has ordered, in a word each; both are later fields of the schema's major version."""
+    return "".join(f" ({word})" for key, word in (("pin", "pin"), ("rollout", "rollout")) if task.get(key) is not None)
 
 
 def _flow(task: Json, way: str) -> str:

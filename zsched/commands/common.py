@@ -23,7 +23,7 @@ from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE
 Json = dict[str, Any]
 NAMED_OTHERWISE: Final = {
     "events": "event",
-    **dict.fromkeys(("task.add", "task.remove", "node.add", "node.remove", "node.forget"), "apply"),
+    **dict.fromkeys(("task.add", "task.remove", "task.promote", "node.add", "node.remove", "node.forget"), "apply"),
     **dict.fromkeys(("fleet.create", "join", "leave"), "member"),
     "tune": "tuning",
     **dict.fromkeys(("pin", "unpin", "pause", "resume"), "task"),

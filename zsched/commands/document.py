@@ -53,6 +53,8 @@ class InForce:
     """Of the document; empty while none is agreed, or while this node is still fetching it."""
     flags: tuple[Json, ...] = ()
     """What operators have said of nodes: a document that takes this one's place keeps them."""
+    rollouts: tuple[Json, ...] = ()
+    """Changed workers that wait for a look: kept alike."""
 
 
 def in_force(door: Door) -> InForce:
@@ -75,6 +77,7 @@ def in_force(door: Door) -> InForce:
         document=str(told["document"]),
         text=str(told["text"]),
         flags=tuple(told["flags"]),
+        rollouts=tuple(told.get("rollouts", ())),  # a daemon of an older program tells none
     )
 
 

@@ -312,8 +312,8 @@ def _commit(view: OrderView, held: InForce, flags: Sequence[Json], what: str) ->
         return held.revision
     asked = view.asked
     reason = f"{what}, by {asked['by']}" + (f": {asked['reason']}" if asked["reason"] else "")
-    text = {"text": held.text, "flags": list(flags), "base_revision": held.revision, "reason": reason}
-    answer = change(view.door, text)
+    text = {"text": held.text, "flags": list(flags), "rollouts": list(held.rollouts), "reason": reason}
+    answer = change(view.door, {**text, "base_revision": held.revision})
     return int(answer["revision"])
 
 

@@ -42,6 +42,16 @@ RuntimeOption = Annotated[
     Path | None,
     typer.Option("--runtime-dir", metavar="DIR", help="Operator sockets. [ZSCHED_RUNTIME_DIR, else /run/zsched]"),
 ]
+PauseAfterOption = Annotated[
+    int | None,
+    typer.Option(
+        "--pause-after",
+        min=1,
+        max=1000,
+        metavar="N",
+        help="Changed workers start on N candidates, and wait for `zsched task promote`.",
+    ),
+]
 ConnectOption = Annotated[
     str | None,
     typer.Option("--connect", metavar="ENDPOINT", help="No daemon here: ask at this node's control endpoint."),
@@ -58,6 +68,7 @@ def view_of(
     reason: str,
     is_json: bool,
     is_data: bool = False,
+    pause_after: int | None = None,
 ) -> ApplyView:
     """The options of every verb that changes the document."""
     from zsched.commands.apply import ApplyView  # noqa: PLC0415 - each verb imports what it needs
@@ -71,6 +82,7 @@ def view_of(
         revision=revision,
         reason=reason,
         is_data=is_data,
+        pause_after=pause_after,
     )
 
 
@@ -139,6 +151,32 @@ def task_remove(
     words = ("task", "remove", task)
     view = view_of(words, plan=plan, yes=yes, revision=revision, accept=accept, reason=reason, is_json=json_)
     raise typer.Exit(drop_task(find_door(runtime_dir, node, connect=connect), view, task))
+
+
+@task_app.command("promote", cls=Verb)
+def task_promote(
+    tasks: Annotated[
+        list[str] | None, typer.Argument(metavar="[TASK]...", help="Tasks that wait; none: only show what waits.")
+    ] = None,
+    plan: PlanOption = False,
+    yes: YesOption = False,
+    revision: RevisionOption = None,
+    reason: ReasonOption = "",
+    json_: JsonOption = False,
+    node: AskedOption = None,
+    runtime_dir: RuntimeOption = None,
+    connect: ConnectOption = None,
+) -> None:
+    """Let a changed worker go on to all nodes, after `zsched apply --pause-after` and a look at the first ones.
+
+    To take it back instead, apply the file of before.
+    """
+    from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.promote import promote  # noqa: PLC0415 - as above
+
+    words = ("task", "promote", *(tasks or ()))
+    view = view_of(words, plan=plan, yes=yes, revision=revision, accept=None, reason=reason, is_json=json_)
+    raise typer.Exit(promote(find_door(runtime_dir, node, connect=connect), view, tasks or []))
 
 
 @node_app.command("add", cls=Verb)

@@ -79,14 +79,15 @@ def history(door: Door, task: str | None, *, is_json: bool, about: str | None = 
     node, now, entries, _ = read_log(door, is_moves=True)
     moves = [move for move in moves_of(entries, now, task) if about in (None, move["from"], move["to"])]
     rehearsals = list(rehearsals_of(entries, now, task)) if about is None else []
+    rollouts = list(rollouts_of(entries, now, task)) if about is None else []
     if is_json:
-        print_json({"schema": SCHEMA, "node": node, "moves": moves, "rehearsals": rehearsals})
+        print_json({"schema": SCHEMA, "node": node, "moves": moves, "rehearsals": rehearsals, "rollouts": rollouts})
         return EXIT_OK
-    if not moves and not rehearsals:
+    if not moves and not rehearsals and not rollouts:
         whose = (f" of {task}" if task else "") + (f" to {about} or away from it" if about else "")
         sys.stdout.write(f"no move{whose} in the log of {node}\n")
     lines = [(move["age_s"], _move_line(printable(move))) for move in moves]
-    lines += [(one["age_s"], _rehearsal_line(printable(one))) for one in rehearsals]
+    lines += [(one["age_s"], _told_line(printable(one))) for one in (*rehearsals, *rollouts)]
     sys.stdout.writelines(line for _, line in sorted(lines, key=lambda line: -line[0]))
     return EXIT_OK
 
@@ -174,7 +175,15 @@ def rehearsals_of(entries: Iterable[Json], now: float, task: str | None) -> Iter
             yield {"at": wall_text(entry["at"]), "age_s": age_s, **told}
 
 
-def _rehearsal_line(one: Json) -> str:
+def rollouts_of(entries: Iterable[Json], now: float, task: str | None) -> Iterator[Json]:
+    """What was said of changed workers that wait for a look, among a log's entries."""
+    for entry in entries:
+        if entry.get("is_rollout") and task in (None, entry["task"]):
+            told = {"task": entry["task"], "text": entry["text"]}
+            yield {"at": wall_text(entry["at"]), "age_s": max(now - entry["at"], 0.0), **told}
+
+
+def _told_line(one: Json) -> str:
     return f"{span(one['age_s']):>6} ago  {one['at']}  {one['task']} {one['text']}\n"
 
 

@@ -293,8 +293,8 @@ def _go_out(way: _Way) -> None:
         try:
             held = in_force(way.door.to(others[count % len(others)]) if others else way.door)
             flags = [flag for flag in held.flags if flag["subject"] != way.me]
-            text = {"text": _without_me(document_text(held), way.me), "flags": flags, "reason": _reason(way)}
-            answer = change(way.door.to(held.node), {**text, "base_revision": held.revision})
+            text = {"text": _without_me(document_text(held), way.me), "flags": flags, "rollouts": list(held.rollouts)}
+            answer = change(way.door.to(held.node), {**text, "base_revision": held.revision, "reason": _reason(way)})
         except CliError as error:
             way.check_time(str(error))
             time.sleep(PAUSE_S)

@@ -370,7 +370,8 @@ def _invitation(door: Door, guest: Guest) -> Invitation:
     told = ask_door(door, {"verb": "fleet"})
     try:
         value = from_plain(told["value"], FleetValue)
-        document = from_plain({"text": told["text"], "flags": told["flags"]}, Document)
+        parts = {"text": told["text"], "flags": told["flags"], "rollouts": told.get("rollouts", [])}
+        document = from_plain(parts, Document)
     except (KeyError, WireError) as error:
         raise CliError(EXIT_FAILED, f"{told['node']} does not tell its fleet value: update zsched there") from error
     fleet = _fleet_of(document.text)

@@ -21,7 +21,7 @@ from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, check_reason, nearest, print_json
 from zsched.commands.page import harmless, span
-from zsched.commands.report import FLAGS, millis, told_flag, told_hold
+from zsched.commands.report import FLAGS, millis, told_flag, told_hold, told_rollout
 from zsched.commands.wait import Condition, missing
 from zsched.commands.weights import NAMES, shares
 from zsched.core.values.fleet import TUNED_LINKS, TUNED_RULES
@@ -59,6 +59,7 @@ ADVICE: Final = {
     "unknown": "; it may or may not have been agreed: `zsched status` shows which",
 }
 NOTHING: Final = "-"
+ROLLOUT: Final = "rollout"
 Row = tuple[str, str, str, str]
 """(task, what, before, after)."""
 
@@ -78,8 +79,13 @@ class OrderView:
     @property
     def asked(self) -> Json:
         """Who gives the order, as a request carries it."""
-        place = self.door.socket.stem or socket.gethostname()  # no daemon of this machine is asked
-        return {"by": f"{user_name()}@{place}"[:MAX_ASKER], "reason": self.reason}
+        return {"by": asker(self.door), "reason": self.reason}
+
+
+def asker(door: Door) -> str:
+    """user@node of who runs this program, as orders carry it."""
+    place = door.socket.stem or socket.gethostname()  # no daemon of this machine is asked
+    return f"{user_name()}@{place}"[:MAX_ASKER]
 
 
 def user_name(env: Mapping[str, str] = os.environ) -> str:
@@ -552,6 +558,11 @@ def maint(door: Door, *, is_json: bool) -> int:
         for node in status["nodes"]
         for flag in node.get("flags", ())
     ]
+    found += [
+        {"kind": ROLLOUT, "subject": task["name"], "for_s": None, "node": None, "is_hard": False, **task[ROLLOUT]}
+        for task in status["tasks"]
+        if task.get(ROLLOUT) is not None
+    ]
     stopping = [str(node["name"]) for node in status["nodes"] if node["draining"] and node["state"] == "alive"]
     if is_json:
         print_json({"schema": MAINT_SCHEMA, "node": status["node"], "orders": found, "stopping": stopping})
@@ -560,7 +571,7 @@ def maint(door: Door, *, is_json: bool) -> int:
         (
             str(order["subject"]),
             str(order["kind"]),
-            told_flag(order) if order["kind"] in FLAGS else told_hold(str(order["kind"]), order),
+            _told_order(order),
             f"known for {span(order['known_s'])}",
         )
         for order in found
@@ -570,6 +581,13 @@ def maint(door: Door, *, is_json: bool) -> int:
         sys.stdout.write(f"no order is in force, as {status['node']} knows\n")
     _table(("WHAT", "KIND", "ORDER", "SINCE"), rows)
     return EXIT_OK
+
+
+def _told_order(order: Json) -> str:
+    kind = str(order["kind"])
+    if kind == ROLLOUT:
+        return told_rollout(order)
+    return told_flag(order) if kind in FLAGS else told_hold(kind, order)
 
 
 # --- what they share -------------------------------------------------------------------------------------------------

@@ -297,6 +297,8 @@ def _task(page: Page, status: Json, task: Json) -> None:
     counts = [(f"epoch {task['epoch']}", ""), (f"revision {task['revision']}", "")]
     pin = task.get("pin")  # a later field of the schema's major version
     held = [] if pin is None else [(f"pinned to {told_hold('pin', pin)}", "yellow")]
+    rollout = task.get("rollout")
+    held += [] if rollout is None else [(f"changed worker: {told_rollout(rollout)}", "yellow")]
     page.block(f"TASK {task['name']}", *parts, *counts, *held)
     _work(page, status, task)
     _scheduler(page, status, task)
@@ -317,6 +319,17 @@ def told_hold(kind: str, order: Json) -> str:
     who = order["by"] or "an unknown operator"
     words.append(f"{who}: {order['reason']}" if order["reason"] else who)
     return ", ".join(words)
+
+
+def told_rollout(rollout: Json) -> str:
+    """A changed worker that waits for a look, in a few words; ``rollout``: of a status.
+
+    >>> told_rollout({"first": ["edge2"], "waiting": ["edge1", "robot1"], "by": "ada@robot1", "reason": "new net"})
+    'edge2 first, edge1, robot1 wait, ada@robot1: new net'
+    """
+    first, waiting = (", ".join(rollout[key]) or "nobody" for key in ("first", "waiting"))
+    who, reason = rollout["by"] or "an unknown operator", rollout["reason"]
+    return f"{first} first, {waiting} wait, {f'{who}: {reason}' if reason else who}"
 
 
 FLAGS: Final = {"drain": "drained", "ineligible": "gets nothing new", "leave": "leaving the fleet"}

@@ -315,6 +315,8 @@ class RecordStory:
     answered."""
     rehearsal: str = ""
     """With it, an operator has rehearsed; this is the rehearsal's name."""
+    is_rollout: bool = False
+    """It tells of a changed worker that waits for an operator's look, or waits no more."""
 
 
 # --- of the fleet register -------------------------------------------------------------------------------------------

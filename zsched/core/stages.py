@@ -18,6 +18,7 @@ from zsched.core.events import SlotReady
 from zsched.core.executor.handover import Executor
 from zsched.core.executor.progress import HangWatch
 from zsched.core.executor.renewing import Renewing
+from zsched.core.executor.rollouts import Rollouts
 from zsched.core.executor.sealing import Sealing
 from zsched.core.executor.tenure import Tenure
 from zsched.core.executor.workers import Workers
@@ -41,7 +42,7 @@ from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts
 from zsched.core.todo import ToDo
 from zsched.core.values.document import Flag
 from zsched.core.values.durable import DurableState
-from zsched.core.values.fleet import Fleet, TaskSpec, fleet_hash
+from zsched.core.values.fleet import Fleet, TaskSpec, file_hash, fleet_hash
 from zsched.core.values.model import Allocation, NodeId, NodeKind, PeerState, Profile, TaskId
 from zsched.core.values.plan import StreamCount
 from zsched.core.vote.agreement import Agreement
@@ -112,9 +113,11 @@ class Stages:
         self.told_fleet = fleet
         """The newest fleet file that was given to the runtime; what of it is in force is `fleet`."""
         self.fleet_file = fleet_hash(fleet)
+        self.text_hash = file_hash(fleet)
+        """Hash of it as its text says it, without rollouts."""
         self.fleet_path = ""
         """Where that file lies, for the status."""
-        self.by_file = self.fleet_file
+        self.by_file = self.text_hash
         """Hash of what that file says; once a document is agreed, the node does not go by the file."""
         self.copied_file = ""
         """Hash of the file that was written here as a copy of an earlier document; empty: it is the operator's own."""
@@ -163,6 +166,8 @@ class Stages:
         self.workers = Workers.of(fleet, me)
         self.worker_states = self.workers.states
         self.renewing = Renewing(me)
+        self.rollouts = Rollouts()
+        self.rollouts.take(fleet, now)
         self.hangs = HangWatch(fleet)
         self.tenure = Tenure(fleet, me, self.agreement.leases, self.executors)
         self.sealing = Sealing(fleet, me, self.executors, self.agreement.leases.over_at)

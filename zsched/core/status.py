@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from zsched.core.executor.handover import Executor, Phase
+from zsched.core.executor.rollouts import waiting
 from zsched.core.scheduler.judge import by
 from zsched.core.scheduler.rounds import TaskRound
 from zsched.core.scheduler.scoring import joined
@@ -41,6 +42,7 @@ from zsched.core.values.snapshot import (
     NodeStatus,
     PastAllocation,
     QuorumStatus,
+    RolloutStatus,
     Snapshot,
     TaskStatus,
     VoteStatus,
@@ -73,7 +75,7 @@ def build_snapshot(node: Stages, now: float) -> Snapshot:
         quorum=quorum,
         nodes=tuple(_node_status(node, spec, now) for spec in node.fleet.nodes),
         tasks=tuple(_task_status(node, spec, now) for spec in node.fleet.tasks),
-        fleet_file=node.fleet_file,
+        fleet_file=node.text_hash,
         fleet_revision=node.agreement.fleet_revision,
         document=node.agreement.document_hash,
         joins_at=node.joins_at,
@@ -323,6 +325,7 @@ def _task_status(node: Stages, spec: TaskSpec, now: float) -> TaskStatus:
         problems=tuple(_task_problems(node, spec, value, now)),
         pause=_hold(node, value, "pause", now),
         pin=_hold(node, value, "pin", now),
+        rollout=_rollout(node, spec, now),
         file_tuning=spec.in_force(spec.tuning),
         switched_s=executor.switched_s,
         gap_s=_move_gap(node, executor),
@@ -362,6 +365,20 @@ def _hold(node: Stages, value: Allocation, kind: str, now: float) -> HoldStatus 
     )
 
 
+def _rollout(node: Stages, spec: TaskSpec, now: float) -> RolloutStatus | None:
+    rollout = spec.rollout
+    if rollout is None:
+        return None
+    since = node.rollouts.since(spec.name)
+    return RolloutStatus(
+        by=rollout.by,
+        reason=rollout.reason,
+        known_s=now - (node.started_at if since is None else since),
+        first=rollout.first,
+        waiting=waiting(node.fleet, spec),
+    )
+
+
 def _round_trips(node: Stages, spec: TaskSpec) -> tuple[tuple[NodeId, float], ...]:
     return tuple(
         (name, round_trip_s) for name, round_trip_s in node.round_trips.seconds().items() if name in spec.candidates
@@ -376,6 +393,12 @@ def _task_problems(node: Stages, task: TaskSpec, value: Allocation, now: float) 
         yield (
             f"paused by {by(value.pause)}: nothing moves it by itself, and a dead owner is not replaced; "
             f"`zsched resume {task.name}`"
+        )
+    if task.rollout is not None:
+        held, first = waiting(node.fleet, task), ", ".join(task.rollout.first)
+        yield (
+            f"the changed worker runs on {first or 'no node'} first, {', '.join(held) or 'no node'} waits with that of "
+            f"before: `zsched task promote {task.name}` goes on"
         )
     if executor.is_local:
         yield f"cut off from {owner}: this robot works alone, degraded"

@@ -19,7 +19,7 @@ from zsched.config.load import check_bytes
 from zsched.config.reader import render_all
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.values.document import Document
+from zsched.core.values.document import Document, Rollout
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId
 from zsched.errors import AdapterError, ConfigError, WireError
@@ -161,4 +161,10 @@ def read_document(content: Document, fleet: str, node: NodeId, config: Path) -> 
     if all(one.name != node for one in result.fleet.nodes):
         advice = "this machine was taken out, and goes on by its last one until `zsched leave`"
         raise ConfigError(f"the document names no node {node!r}: {advice}")
-    return result.fleet
+    return with_rollouts(result.fleet, content.rollouts)
+
+
+def with_rollouts(fleet: Fleet, rollouts: tuple[Rollout, ...]) -> Fleet:
+    """The fleet with what its document says of workers that not all nodes run yet; a task that is gone has none."""
+    said = {one.task: one for one in rollouts}
+    return replace(fleet, tasks=tuple(replace(task, rollout=said.get(task.name)) for task in fleet.tasks))

@@ -110,7 +110,7 @@ class Recipes:
             self.read.save()
         pools = self._pools or zenoh_config.worker_pools(len(fleet.nodes), len(fleet.tasks))
         self._made = _Made(
-            specs={task.name: task.worker for task in mine},
+            specs={task.name: task.worker_on(self._me) for task in mine},
             sessions=sessions,
             environments={task.name: self._environment(task, pools) for task in mine},
         )

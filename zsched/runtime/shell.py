@@ -38,7 +38,7 @@ from zsched.core.relay_protocol import (
 )
 from zsched.core.report import snapshot_json
 from zsched.core.values.decision import Explanation
-from zsched.core.values.document import Document, Flag, Text
+from zsched.core.values.document import Document, Flag, Rollout, Text
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.gauges import GAUGES
 from zsched.core.values.messages import (
@@ -305,10 +305,11 @@ def _change_of(request: dict[str, Any]) -> ChangeFleet:
         raise ValueError(f"text: expected the text of a fleet file, not {text!r:.80}")
     try:
         flags = tuple(wire.from_plain(flag, Flag) for flag in request.get("flags", ()))
+        rollouts = tuple(wire.from_plain(one, Rollout) for one in request.get("rollouts", ()))
     except WireError as error:
-        raise ValueError(f"flags: {error}") from error
+        raise ValueError(f"flags, or rollouts: {error}") from error
     return ChangeFleet(
-        document=None if text is None else Document(text=Text(text), flags=flags),
+        document=None if text is None else Document(text=Text(text), flags=flags, rollouts=rollouts),
         add_elector=str(request.get("add_elector") or ""),
         disk=str(request.get("disk") or ""),
         remove_elector=str(request.get("remove_elector") or ""),
@@ -400,6 +401,7 @@ def _fleet_json(told: FleetTold) -> dict[str, Any]:
         return {**body, "revision": None}
     electors = [{"name": one.name, "disk": one.disk, "joining": one.joining} for one in value.electors]
     flags = [] if content is None else [wire.as_plain(flag) for flag in content.flags]
+    rollouts = [] if content is None else [wire.as_plain(one) for one in content.rollouts]
     return {
         **body,
         "fleet": value.fleet,
@@ -411,6 +413,7 @@ def _fleet_json(told: FleetTold) -> dict[str, Any]:
         "document": value.document,
         "text": "" if content is None else content.text,
         "flags": flags,
+        "rollouts": rollouts,
         "value": wire.as_plain(value),
     }
 

@@ -49,6 +49,7 @@ class Node:
         self.outcome = "ok"
         self.is_fetching = False
         self.drained: list[str] = []
+        self.rollouts: list[Json] = []
         self.refused = "nothing"
         """The kind of change that another operator has overtaken."""
 
@@ -70,6 +71,7 @@ class Node:
                 "document": self.document,
                 "text": self.text if self.document and not self.is_fetching else "",
                 "flags": FLAGS,
+                "rollouts": self.rollouts,
             }
             return {**body, **told, "fleet_file": digest_of(self.text), "disk": f"d{node}"}
         assert verb == "change"
@@ -79,6 +81,7 @@ class Node:
         if self.outcome != "ok":
             return {"outcome": self.outcome, "detail": "it was so", "revision": None}
         self.revision += 1
+        self.rollouts = request.get("rollouts", self.rollouts)
         self.text, self.document = request.get("text", self.text), self.document or "cd34" * 8
         if removed := request.get("remove_elector"):
             self.electors.remove(removed)
@@ -411,3 +414,100 @@ def test_a_reason_that_is_not_one_short_line_is_refused(node: Node, tmp_path: Pa
     assert done.exit_code == 2
     assert "--reason: " in done.stderr
     assert node.changes == []
+
+
+# --- apply --pause-after, task promote ------------------------------------------------------------------------------
+
+ROLLED = TEXT.replace(
+    "    weights: {cpu: 0.5, memory: 0.5}\n",
+    "    weights: {cpu: 0.5, memory: 0.5}\n    worker: {command: [/opt/merge, -a], env: {GAIN: '1'}}\n",
+).replace("{kind: robot}   #", "[edge1, robot1, robot2]   #")
+
+
+def rolled(tmp_path: Path, node: Node, old: str = "-a", new: str = "-b", more: tuple[str, str] = ("", "")) -> Path:
+    """A file whose worker differs from the document in force."""
+    if not node.rollouts:
+        node.text = ROLLED
+    file = tmp_path / "new.yaml"
+    file.write_text(node.text.replace(old, new).replace(*more))
+    return file
+
+
+def test_with_a_pause_the_first_candidates_get_the_changed_worker_and_the_document_keeps_the_other(
+    node: Node, tmp_path: Path
+) -> None:
+    node.owner, node.drained = "edge1", []
+    file = rolled(tmp_path, node)
+    result = run("apply", file, "--pause-after", 1, "-m", "new net", "--yes")
+    assert result.exit_code == 0, result.stderr
+    assert "robot1 first; the others wait for `zsched task promote merge`" in result.stdout
+    (change,) = node.changes
+    assert change["text"] == file.read_text()
+    (held,) = change["rollouts"]
+    assert held.pop("by").endswith("@robot1")
+    assert held == {
+        "task": "merge",
+        "first": ["robot1"],
+        "command": ["/opt/merge", "-a"],
+        "env": [["GAIN", "1"]],
+        "reason": "new net",
+        "revision": 8,
+    }
+
+
+def test_those_go_first_that_could_get_the_task_by_name_and_the_owner_last(node: Node, tmp_path: Path) -> None:
+    node.owner, node.drained = "edge1", ["robot1"]
+    run("apply", rolled(tmp_path, node), "--pause-after", 2, "--yes")
+    assert node.changes[-1]["rollouts"][0]["first"] == ["edge1", "robot2"]
+    node.rollouts, node.states["robot2"], node.drained = [], "gone", []
+    run("apply", rolled(tmp_path, node), "--pause-after", 1, "--yes")
+    assert node.changes[-1]["rollouts"][0]["first"] == ["robot1"]
+
+
+@pytest.mark.parametrize(
+    ("count", "change", "said"),
+    [
+        (1, ("cpu: 0.5, memory: 0.5", "cpu: 0.6, memory: 0.4"), "no command or environment of a worker changes here"),
+        (3, ("-a", "-b"), "merge has 3 candidates: nobody would be left to wait"),
+        (1, ("command: [/opt/merge, -a], ", ""), "starts the workers of merge before or after only"),
+        (1, ("command: [/opt/merge, -a]", "link: client, command: [/opt/merge, -b]"), "tasks.merge.worker.link would"),
+    ],
+)
+def test_what_cannot_wait_is_refused_and_nothing_is_changed(
+    node: Node, tmp_path: Path, count: int, change: tuple[str, str], said: str
+) -> None:
+    result = run("apply", rolled(tmp_path, node, *change), "--pause-after", count, "--yes")
+    assert result.exit_code != 0
+    assert said in result.stderr
+    assert node.changes == []
+
+
+def test_what_waits_waits_on_through_other_changes_until_the_worker_of_before_is_back(
+    node: Node, tmp_path: Path
+) -> None:
+    run("apply", rolled(tmp_path, node), "--pause-after", 1, "--yes")
+    waits = list(node.rollouts)
+    run("apply", rolled(tmp_path, node, "cpu: 0.5, memory: 0.5", "cpu: 0.6, memory: 0.4"), "--yes")
+    assert node.changes[-1]["rollouts"] == waits
+    run("apply", rolled(tmp_path, node, "-b", "-c"), "--yes")
+    assert node.changes[-1]["rollouts"] == waits, "the first ones get the newest, the others wait on"
+    run("apply", rolled(tmp_path, node, "-c", "-a"), "--yes")
+    assert node.changes[-1]["rollouts"] == [], "all run the worker of before"
+
+
+def test_promote_lets_the_changed_worker_go_on_and_without_a_task_shows_what_waits(node: Node, tmp_path: Path) -> None:
+    node.owner = "edge1"
+    run("apply", rolled(tmp_path, node), "--pause-after", 1, "--yes")
+    shown = run("task", "promote")
+    assert (shown.exit_code, len(node.changes)) == (0, 1)
+    assert "tasks.merge.worker  on robot1 -> everywhere  workers of merge restart one after another" in shown.stdout
+    assert run("task", "promote", "merge").exit_code == 2, "off a terminal it takes --yes"
+    assert run("task", "promote", "mergo", "--yes").exit_code == 2
+    planned = json.loads(run("task", "promote", "merge", "--plan", "--json").stdout)
+    assert (faults(planned), planned["outcome"]) == ([], "planned")
+    done = run("task", "promote", "merge", "--yes", "--revision", node.revision)
+    assert done.exit_code == 0, done.stderr
+    assert (node.changes[-1]["rollouts"], node.changes[-1]["text"], node.changes[-1]["flags"]) == ([], node.text, FLAGS)
+    again = run("task", "promote", "merge", "--yes")
+    assert (again.exit_code, len(node.changes)) == (1, 2)
+    assert "merge waits for nothing" in again.stderr

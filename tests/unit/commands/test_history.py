@@ -63,7 +63,7 @@ class Pages:
             raise CliError(EXIT_UNREACHABLE, "no daemon")
         first = int(request["cursor"] or 0)
         page = self.entries[first : first + 2]
-        wanted = [one for one in page if not request["moves"] or "move" in one or "took_s" in one or "gap_s" in one]
+        wanted = [one for one in page if not request["moves"] or {"move", "took_s", "gap_s", "is_rollout"} & {*one}]
         at = first + len(page)
         return {"node": "robot1", "now": NOW, "entries": wanted, "cursor": str(at), "more": at < len(self.entries)}
 
@@ -102,6 +102,20 @@ def test_moves_are_told_with_age_wall_time_votes_and_how_long_the_streams_took(
     ]
 
 
+def test_a_changed_worker_that_waits_for_a_look_is_part_of_the_history(
+    pages: Pages, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pages.entries = [entry("changed worker: edge2 first, the others wait", 50.0, is_rollout=True)]
+    assert history(HERE, "merge", is_json=False) == 0
+    line = "   50s ago  2026-09-21T14:12:30.000Z  merge changed worker: edge2 first, the others wait"
+    assert capsys.readouterr().out.splitlines() == [line]
+    assert history(HERE, "merge", is_json=True) == 0
+    body = json.loads(capsys.readouterr().out)
+    assert (faults(body), [one["task"] for one in body["rollouts"]]) == ([], ["merge"])
+    assert history(HERE, "other", is_json=False) == 0
+    assert capsys.readouterr().out == "no move of other in the log of robot1\n"
+
+
 @pytest.mark.usefixtures("pages")
 def test_moves_of_one_task_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert history(HERE, "merge", is_json=True) == 0
@@ -126,6 +140,7 @@ def test_moves_of_one_task_as_json(capsys: pytest.CaptureFixture[str]) -> None:
             }
         ],
         "rehearsals": [],
+        "rollouts": [],
     }
     assert history(HERE, "nothing", is_json=False) == 0
     assert capsys.readouterr().out == "no move of nothing in the log of robot1\n"

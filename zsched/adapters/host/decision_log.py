@@ -58,6 +58,7 @@ class Entry:
     took_s: float | None = None
     gap_s: float | None = None
     rehearsal: str = ""
+    is_rollout: bool = False
     decision: Decision | None = None
     """Last, for readers that do without it."""
 
@@ -139,6 +140,7 @@ class DecisionLog:
             took_s=story.took_s,
             gap_s=story.gap_s,
             rehearsal=story.rehearsal,
+            is_rollout=story.is_rollout,
             decision=story.decision,
         )
         return json.dumps(as_plain(entry), separators=(",", ":")).encode() + b"\n"
@@ -187,7 +189,8 @@ def _parsed(line: bytes) -> Json | None:
 
 
 def _is_of_move(line: bytes) -> bool:
-    return any(mark in line for mark in (b',"move":', b',"took_s":', b',"gap_s":', b',"rehearsal":'))
+    marks = (b',"move":', b',"took_s":', b',"gap_s":', b',"rehearsal":', b',"is_rollout":')
+    return any(mark in line for mark in marks)
 
 
 def judged_before(lines: list[bytes], wish: Json) -> Json:

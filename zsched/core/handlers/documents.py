@@ -68,7 +68,7 @@ def _on_refused(node: Stages, event: ev.DocumentRefused, todo: ToDo, _now: float
 
 def _on_read(node: Stages, event: ev.FleetReadAsked, todo: ToDo, _now: float) -> None:
     agreement = node.agreement
-    told = FleetTold(node=node.me, value=agreement.fleet_value, fleet_file=node.fleet_file, disk=agreement.disk)
+    told = FleetTold(node=node.me, value=agreement.fleet_value, fleet_file=node.text_hash, disk=agreement.disk)
     wanted = event.command.with_document
     todo.add(do.AnswerFleetRead(request=event.request, told=told, with_document=wanted))
 

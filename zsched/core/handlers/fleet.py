@@ -22,7 +22,7 @@ from zsched.core.stages import HISTORY, Handler, Stages
 from zsched.core.todo import ToDo
 from zsched.core.values.adoption import in_force, obstacle
 from zsched.core.values.electorate import CREATION_STEP
-from zsched.core.values.fleet import Fleet, fleet_hash
+from zsched.core.values.fleet import Fleet, file_hash, fleet_hash
 from zsched.core.values.model import Allocation, NodeKind
 from zsched.core.values.plan import WorkerRole
 
@@ -45,13 +45,15 @@ def adopt(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
     is_new = any(_is_of_before(executor, values[name]) for name, executor in node.executors.items() if name in values)
     if _is_refused(node, fleet) or (fleet == before and not is_new):
         return
-    node.fleet, node.fleet_file = fleet, fleet_hash(fleet)
+    node.fleet, node.fleet_file, node.text_hash = fleet, fleet_hash(fleet), file_hash(fleet)
     _adopt_nodes(node, fleet)
     _adopt_choice(node, fleet, todo, now)
     _adopt_work(node, fleet, todo, now)
     node.retuning.adopt(before, fleet, node.values(), now)
     text = f"goes by another fleet file: {node.fleet_file}"
     todo.add(do.RecordStory(stage="membership", text=text))
+    for task, change in node.rollouts.take(fleet, now):
+        todo.add(do.RecordStory(stage="executor", text=f"changed worker: {change}", task=task, is_rollout=True))
     todo.must_beat = todo.must_decide = True
 
 
@@ -144,7 +146,7 @@ def compare_file(node: Stages) -> None:
     """
     agreed = node.agreement.document
     complaint = None
-    if agreed is not None and node.by_file not in (fleet_hash(agreed), node.copied_file):
+    if agreed is not None and node.by_file not in (file_hash(agreed), node.copied_file):
         complaint = (
             f"the fleet file here differs from the agreed document, by which this node goes; what it would change: "
             f"`zsched apply {node.fleet_path} --plan`; to take the document: `zsched fleet export -o {node.fleet_path}`"

@@ -1,4 +1,4 @@
-"""The fleet's document: the fleet file's text as its operator wrote it, and what operators have said of nodes since.
+"""The fleet's document: the fleet file's text as its operator wrote it, and what operators have said since.
 
 Knows: the fields of a document and their sizes. Does not know: what the text means (`zsched.config`), its hash
 (`zsched.wire.codec`), who agrees on it (`zsched.core.electorate`).
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import NewType
 
-from zsched.core.values.model import MAX_REASON, NodeId, check_counter, check_name, check_range
+from zsched.core.values.model import MAX_REASON, NodeId, TaskId, check_counter, check_name, check_range
 
 Text = NewType("Text", str)
 """A string that may be longer than any other on the wire: at most `MAX_DOCUMENT_BYTES` in UTF-8."""
@@ -18,6 +18,9 @@ MAX_DOCUMENT_BYTES = 192 * 1024
 """Of a document's text in UTF-8: with its flags it fits into one frame."""
 MAX_FLAGS = 64
 MAX_FLAG_S = 366 * 86_400
+MAX_ROLLOUTS = 64
+MAX_HELD_BYTES = 16 * 1024
+"""Of the command and the environment that one rollout keeps, in UTF-8."""
 
 
 class FlagKind(StrEnum):
@@ -53,15 +56,50 @@ class Flag:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Rollout:
+    """A changed worker that a few nodes run already; all others run the one of before, until an operator goes on."""
+
+    task: TaskId
+    first: tuple[NodeId, ...]
+    """The nodes that run the worker as the text has it; sorted."""
+    command: tuple[Text, ...]
+    """What every other node runs: program and arguments..."""
+    env: tuple[tuple[Text, Text], ...] = ()
+    """...and environment."""
+    reason: str = ""
+    by: str = ""
+    """The operator, as the program that began it names the person."""
+    revision: int = 0
+    """Of the fleet value that brought it."""
+
+    def __post_init__(self) -> None:
+        check_name("rollout.task", self.task)
+        check_counter("rollout.revision", self.revision)
+        for node in self.first:
+            check_name("rollout.first", node)
+        for what in ("reason", "by"):
+            if len(getattr(self, what)) > MAX_REASON:
+                raise ValueError(f"rollout.{what}: longer than {MAX_REASON} characters")
+        words = (*self.command, *(word for pair in self.env for word in pair))
+        if sum(len(word.encode("utf-8", "surrogatepass")) for word in words) > MAX_HELD_BYTES:
+            raise ValueError(f"rollout.command: with its environment larger than {MAX_HELD_BYTES} bytes")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Document:
     """What all machines of a fleet go by, once it is agreed."""
 
     text: Text
     """The fleet file, comments and all."""
     flags: tuple[Flag, ...] = ()
+    rollouts: tuple[Rollout, ...] = ()
+    """At most one of a task; sorted."""
 
     def __post_init__(self) -> None:
         if len(self.text.encode("utf-8", "surrogatepass")) > MAX_DOCUMENT_BYTES:
             raise ValueError(f"document.text: larger than {MAX_DOCUMENT_BYTES} bytes")
         if len(self.flags) > MAX_FLAGS:
             raise ValueError(f"document.flags: more than {MAX_FLAGS}")
+        tasks = [one.task for one in self.rollouts]
+        if len(tasks) > MAX_ROLLOUTS or len(set(tasks)) < len(tasks):
+            raise ValueError(f"document.rollouts: more than {MAX_ROLLOUTS}, or two of one task")

@@ -15,6 +15,7 @@ from enum import StrEnum
 from functools import lru_cache
 from typing import Any
 
+from zsched.core.values.document import Rollout
 from zsched.core.values.gauges import check_limits
 from zsched.core.values.limits import Range, check_ranges, key
 from zsched.core.values.model import (
@@ -238,9 +239,17 @@ class TaskSpec:
     drain_s: float = key(2.0, "How long the old owner may finish what it has in work.", Range(0, 600, "s"))
     worker: WorkerSpec = WorkerSpec()
     rules: tuple[StreamRule, ...] = ()
+    rollout: Rollout | None = None
+    """Who runs this worker already, and what the others run; ``None``: all run it. The document says it, no file."""
 
     def __post_init__(self) -> None:
         check_limits(self.gauge_limits)
+
+    def worker_on(self, node: NodeId) -> WorkerSpec:
+        """The worker that a node runs: while a rollout waits, that of before on all nodes but the first ones."""
+        if self.rollout is None or node in self.rollout.first:
+            return self.worker
+        return replace(self.worker, command=self.rollout.command, env=self.rollout.env)
 
     def under(self, tuning: Tuning) -> TaskSpec:
         """This task as operators have tuned it: what they have not set is the file's.
@@ -414,6 +423,11 @@ def fleet_hash(fleet: Fleet) -> str:
     return _digest("fleet", fleet)
 
 
+def file_hash(fleet: Fleet) -> str:
+    """`fleet_hash` of the text alone: what the document says beside it (rollouts) is left out."""
+    return fleet_hash(replace(fleet, tasks=tuple(replace(task, rollout=None) for task in fleet.tasks)))
+
+
 def electorate_hash(fleet: Fleet) -> str:
     """16 hex digits over the fleet's name and its electors: every prepare and accept carries it (design section 6)."""
     return _digest("electorate", (fleet.name, fleet.electors))
@@ -440,7 +454,7 @@ _PATHS = frozenset({("Fleet", "zenoh_config"), ("LinkSpec", "value"), ("Security
 
 
 _LATER = frozenset(
-    {("Weights", "gauges"), ("Demand", "gpu"), ("TaskSpec", "gauge_limits")}
+    {("Weights", "gauges"), ("Demand", "gpu"), ("TaskSpec", "gauge_limits"), ("TaskSpec", "rollout")}
     | {("Tuning", name) for name in (*TUNED_RULES, *TUNED_LINKS)}
 )
 """Fields that came later: left out where they say nothing, so that nodes of two versions see the same file."""

@@ -123,6 +123,21 @@ class HoldStatus:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class RolloutStatus:
+    """A task whose changed worker only some nodes run, until an operator goes on, as the answering node knows it."""
+
+    by: str
+    """user@node."""
+    reason: str
+    known_s: float
+    """Seconds since the answering node learnt it, or since it started."""
+    first: tuple[NodeId, ...] = ()
+    """These run the changed worker, or start it now."""
+    waiting: tuple[NodeId, ...] = ()
+    """These run the worker of before."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PastAllocation:
     """One allocation that this node has learnt since it started."""
 
@@ -162,6 +177,8 @@ class TaskStatus:
     pause: HoldStatus | None = None
     """Nothing moves the task but an operator's move; ``None``: it is not paused."""
     pin: HoldStatus | None = None
+    rollout: RolloutStatus | None = None
+    """The task's changed worker waits for a look; ``None``: all its nodes run the same worker."""
     file_tuning: Tuning | None = None
     """The tuning that the answering node's fleet file gives it."""
     switched_s: float | None = None
