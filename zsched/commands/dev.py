@@ -6,7 +6,10 @@ Knows: options, what is printed. Does not know: how nodes are run (`zsched.dev`)
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
+import sys
+import textwrap
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -158,16 +161,28 @@ def _introduce(
     robot = next((name for name in nodes.names if fleet.node(name).kind is NodeKind.ROBOT), nodes.names[0])
     for task in fleet.tasks:
         _say_streams(task, robot)
-    config = json5(addresses[robot].joins)
-    print(f"\nAn application of {robot} in Python:\n")
-    print(f"    import zenoh\n    session = zenoh.open(zenoh.Config.from_json5('{config}'))")
-    print(f"\nAny other zenoh program, as its JSON5 file:\n\n    {config}\n")
-    _say(f"another terminal: zsched status --runtime-dir {nodes.folder} --node {robot}")
+    print(f"\nAn application of {robot} joins by this configuration of zenoh (JSON5):\n")
+    print(textwrap.indent(json5(addresses[robot].joins), "    "))
+    print('\nIn Python: zenoh.open(zenoh.Config.from_json5("""..."""))\n')
+    _say(f"another terminal begins with: {_entrance(nodes.work_folder)}")
+    _say(f"this fleet there: zsched status --runtime-dir {nodes.folder} --node {robot}")
+
+
+def _entrance(folder: Path) -> str:
+    """The command line after which ``zsched`` and ``python`` are this run's, in the folder of its fleet file."""
+    activate = Path(sys.prefix) / "bin" / "activate"
+    enter = f"cd {shlex.quote(str(folder))}"
+    return f"{enter} && source {shlex.quote(str(activate))}" if activate.is_file() else enter
 
 
 def json5(endpoint: str) -> str:
     """The zenoh configuration of an application that joins at ``endpoint``."""
-    return f'{{mode: "client", connect: {{endpoints: ["{endpoint}"]}}, scouting: {{multicast: {{enabled: false}}}}}}'
+    lines = (
+        f'{{mode: "client", connect: {{endpoints: ["{endpoint}"]}},',
+        " scouting: {multicast: {enabled: false}},",
+        " transport: {shared_memory: {enabled: false}}}",
+    )
+    return "\n".join(lines)
 
 
 def _say_streams(task: TaskSpec, robot: NodeId) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import selectors
 import signal
 from collections import deque
@@ -34,6 +35,10 @@ KEPT_LINES: Final = 8
 READ_BYTES: Final = 65_536
 END_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 WORKER: Final = "zsched.worker"
+ENDED: Final = re.compile(
+    r"worker_(?:ended|failed) task=(?P<task>\S+) failures=(?P<count>\d+)(?: restart_in_s=(?P<wait>[\d.]+))? "
+    r"reason=(?P<quote>['\"])(?P<reason>.*)(?P=quote)"
+)
 KEYS: Final = "m moves the task, k kills its owner, l loads its owner, s shows the status, q ends"
 
 
@@ -154,7 +159,7 @@ class Run:
         elif text.startswith("worker_ended ") and any(one.node == log.node for one in self._rollouts.values()):
             return  # we have ended it; one that fails again and again is reported when it has failed for good
         elif name.startswith(f"{WORKER}.") or (name == WORKER and level in ("WARNING", "ERROR")):
-            self._say(f"{log.node} | {text}")
+            self._say(_of_a_worker(log.node, text))
 
     def _reap(self, now: float) -> None:
         """Take notice of daemons that have ended, and start those whose time has come."""
@@ -307,6 +312,15 @@ def stopped_by_signal() -> Iterator[Event]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _of_a_worker(node: NodeId, text: str) -> str:
+    """What a daemon's log tells of a worker, in words; a line of the worker's own as it is, behind its node."""
+    match = ENDED.fullmatch(text)
+    if match is None:
+        return f"{node} | {text}"
+    again = "" if match["wait"] is None else f"; it is started again after {float(match['wait']):.1f} s"
+    return f"{match['task']}: its worker on {node} has ended, failure {match['count']}: {match['reason']}{again}"
 
 
 def _parts(line: str) -> tuple[str, str, str]:

@@ -7,14 +7,16 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import zenoh
 from typer.testing import CliRunner
 
 from zsched.cli import app
 from zsched.commands.common import CliError
 from zsched.commands.dev import DevOptions, _commands, dev, json5
 from zsched.config.load import load_fleet
+from zsched.core.values.model import NodeId
 from zsched.dev.nodes import shares
-from zsched.dev.run import _parts
+from zsched.dev.run import _of_a_worker, _parts
 from zsched.dev.watch import Watched
 
 EXAMPLE = Path(__file__).parents[3] / "zsched" / "examples" / "python" / "fleet.yaml"
@@ -98,4 +100,26 @@ def test_a_faulty_file_is_told_as_check_tells_it(tmp_path: Path) -> None:
 
 
 def test_the_snippet_is_the_configuration_of_a_client() -> None:
-    assert json5("tcp/127.0.0.1:7458").startswith('{mode: "client", connect: {endpoints: ["tcp/127.0.0.1:7458"]}')
+    config = zenoh.Config.from_json5(json5("tcp/127.0.0.1:7458"))
+    assert config.get_json("mode") == '"client"'
+    assert config.get_json("connect/endpoints") == '["tcp/127.0.0.1:7458"]'
+    assert config.get_json("transport/shared_memory/enabled") == "false"  # some containers may lock no memory
+    assert max(map(len, json5("tcp/127.0.0.1:65535").splitlines())) <= 76  # indented, on a terminal of 80 columns
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            "worker_ended task=shout failures=1 restart_in_s=0.09 reason='exited with 1'",
+            "shout: its worker on edge1 has ended, failure 1: exited with 1; it is started again after 0.1 s",
+        ),
+        (
+            'worker_failed task=shout failures=3 reason="it\'s gone"',
+            "shout: its worker on edge1 has ended, failure 3: it's gone",
+        ),
+        ("a line of the worker", "edge1 | a line of the worker"),
+    ],
+)
+def test_what_becomes_of_a_worker_is_told_in_words(text: str, said: str) -> None:
+    assert _of_a_worker(NodeId("edge1"), text) == said

@@ -11,7 +11,13 @@ import time
 import zenoh
 
 ENDPOINT = sys.argv[1] if len(sys.argv) > 1 else "tcp/127.0.0.1:7458"
-CONFIG = {"mode": "client", "connect": {"endpoints": [ENDPOINT]}, "scouting": {"multicast": {"enabled": False}}}
+CONFIG = {
+    "mode": "client",
+    "connect": {"endpoints": [ENDPOINT]},
+    "scouting": {"multicast": {"enabled": False}},
+    # zenoh's default does not open where a container may lock no memory
+    "transport": {"shared_memory": {"enabled": False}},
+}
 
 
 def main() -> None:
