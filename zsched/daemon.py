@@ -208,11 +208,13 @@ class Daemon:
         if loaded.state.electorate != electorate_hash(self._fleet) and not _is_agreed(loaded.state):
             generation = loaded.state.generation + 1
             self._has_foreign_state = True
-            return None, (
+            why = (
                 "the fleet file names another electorate than the state file, which is whole and stays; this node is "
                 f"no elector. If the file is right, give it to all, stop all, `zsched init --generation {generation} "
                 "--force` on each, and start all"
             )
+            log.warning("other_electorate %s", why)
+            return None, why
         # Not just one more: a folder that was brought back from a backup must not live one of its lives again.
         state = replace(
             loaded.state,

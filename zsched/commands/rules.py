@@ -107,9 +107,9 @@ def left_after_s(lead: float, bonus: float, patience: float, timing: Timing) -> 
 
 def _bounds(spec: TaskSpec) -> Iterator[str]:
     """How often it moves at most."""
-    yield f"after a move it stays {spec.tuning.cool_down_s:g} s at least (cool_down_s), unless its owner fails"
-    capped = f"it moves {spec.max_moves_per_minute} times a minute at most (max_moves_per_minute)"
-    yield f"{capped}, failures aside, from which it moves {ESCAPES_PER_MINUTE} times at most"
+    yield f"after a move it stays at least {spec.tuning.cool_down_s:g} s (cool_down_s), unless its owner fails"
+    capped = f"it moves at most {spec.max_moves_per_minute} times a minute (max_moves_per_minute)"
+    yield f"{capped}, and away from failures at most {ESCAPES_PER_MINUTE} times"
 
 
 def _links(spec: TaskSpec) -> Iterator[str]:

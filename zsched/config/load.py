@@ -98,6 +98,8 @@ def _unread_hint(file: Path, error: OSError | ValueError) -> str:
         return f"{owner_of(file)}; run as that user, or let others read it (chmod a+r), on the way there too"
     if number == errno.EFBIG:
         return "a rule stands for every robot and candidate: write {robot} and {target} in place of their names"
+    if number == errno.ENOENT:
+        return "name the fleet file, or begin with `zsched init --example python`"
     return "give the path of a fleet file"
 
 

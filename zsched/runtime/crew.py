@@ -90,7 +90,8 @@ class Crew:
         if task not in self._matching:
             return self._no_token(task)
         match = self._matches.get(task)
-        return f"{match.missing}; {OTHER_NETWORK}" if match is not None and match.missing else "not seen by the relay"
+        missing = match.missing if match is not None else ""
+        return f"{missing or 'nobody is seen to subscribe to all its inputs'}; {OTHER_NETWORK}"
 
     def _no_token(self, task: TaskId) -> str:
         """The key that it should be at, and one of the task that is at another: who declared it by hand errs there."""

@@ -73,6 +73,8 @@ class StateFile:
         except OSError as error:
             is_file = error.errno in (errno.EEXIST, errno.ENOTDIR)
             advice = "a file is where a folder should be: see --state-dir" if is_file else "check its owner"
+            if error.errno in (errno.ENOENT, errno.EROFS):
+                advice = "name a folder that can be made with --state-dir"
             if error.errno in (errno.ELOOP, errno.EMLINK):
                 advice = f"delete {self.folder / LOCK_NAME}: it leads to another file, and zsched makes none such"
             raise AdapterError(f"cannot use the state folder {self.folder}: {error.strerror}; {advice}") from error
