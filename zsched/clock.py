@@ -3,7 +3,7 @@
 Decisions go by CLOCK_MONOTONIC_RAW, which no time service slews (chrony does by up to 8.3 %, and a lease may err by
 0.1 %), plus the time that the machine has slept, so that a laptop that was shut for a minute does not think its lease,
 its peers' beats or its samples are fresh. `ClockWatch` holds it against CLOCK_BOOTTIME, which is slewed.
-Who waits for a process of this machine asks `awake_s`: that one slept, too.
+A wait for a process of this machine goes by `awake_s`: that process slept, too.
 """
 
 from __future__ import annotations

@@ -602,7 +602,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _begin_anew() -> None:
-    """Become the next daemon: the same process, so that nobody who watches it starts a second one."""
+    """Become the next daemon: the same process, so that its supervisor starts no second one."""
     sys.stdout.flush()
     sys.stderr.flush()
     signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGTERM, signal.SIGINT))  # it takes what comes while it loads

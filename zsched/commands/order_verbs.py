@@ -174,7 +174,7 @@ def tune(
 
 
 def maint(json_: JsonOption = False, node: AskedOption = None, runtime_dir: RuntimeOption = None) -> None:
-    """List every order in force: pauses and pins, with who gave them and why, and the nodes that stop."""
+    """List every order in force: pauses and pins, with author and reason, and the nodes that stop."""
     from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
     from zsched.commands.orders import maint as show  # noqa: PLC0415 - as above
 

@@ -83,13 +83,13 @@ class OrderView:
 
 
 def asker(door: Door) -> str:
-    """user@node of who runs this program, as orders carry it."""
+    """user@node of the person that runs this program, as orders carry it."""
     place = door.socket.stem or socket.gethostname()  # no daemon of this machine is asked
     return f"{user_name()}@{place}"[:MAX_ASKER]
 
 
 def user_name(env: Mapping[str, str] = os.environ) -> str:
-    """Who runs this program; under sudo the one who called it.
+    """The user that runs this program; under sudo the caller.
 
     >>> user_name({"SUDO_USER": "ada"}) if os.getuid() == 0 else "ada"
     'ada'

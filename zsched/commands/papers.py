@@ -1,6 +1,6 @@
 """The certificates of machines that found a fleet or join one, and what is refused where there are none.
 
-Knows: who makes them, which addresses are open to strangers. Does not know: which files a machine keeps
+Knows: how they are made, which addresses are open to strangers. Does not know: which files a machine keeps
 (`zsched.runtime.membership`), how certificates are made (`zsched.commands.pki`).
 """
 

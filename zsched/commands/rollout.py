@@ -1,7 +1,7 @@
 """A changed worker that waits for a look: which candidates run it first, and what a plan says of that.
 
-Knows: who goes first, what can wait and what cannot. Does not know: how a change is agreed (`zsched.commands.apply`),
-how a node runs the worker of before (`zsched.core.values.fleet.TaskSpec.worker_on`).
+Knows: which worker goes first, what can wait and what cannot. Does not know: how a change is agreed
+(`zsched.commands.apply`), how a node runs the worker of before (`zsched.core.values.fleet.TaskSpec.worker_on`).
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def begun(wave: Wave, count: int, kept: Sequence[Json], *, by: str, reason: str)
         wave: what changes.
         count: so many candidates of each task; at least 1.
         kept: rollouts that wait already; a worker that changes once more goes on to wait with its own first ones.
-        by: who asks, user@node.
+        by: the operator, user@node.
         reason: why.
 
     Raises:

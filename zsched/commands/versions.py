@@ -1,6 +1,6 @@
 """The versions that matter when something is wrong.
 
-Knows: zsched, its wire format, zenoh, Python. Does not know: who asks.
+Knows: zsched, its wire format, zenoh, Python. Does not know: callers.
 """
 
 from __future__ import annotations

@@ -151,7 +151,7 @@ def difference(
         old: the fleet in force.
         new: the wanted one.
         texts: the files of the two.
-        owners: who owns each task now; without them nobody is said to move.
+        owners: the owner of each task now; without them nobody is said to move.
         electors: those that are agreed; none: the old file's.
     """
     (before, _), (after, _) = (read_yaml(text.encode()) for text in texts)

@@ -37,7 +37,7 @@ ASK_S: Final = 5.0
 AT_ONCE: Final = 8
 """Nodes asked at a time; the socket has 16 places."""
 TRIES: Final = 3
-"""A slow answer is asked for again so often: the shortest counts."""
+"""A slow answer is asked for again this many times: the shortest counts."""
 AGAIN_S: Final = 1.0
 """A move that was under way is over by then."""
 

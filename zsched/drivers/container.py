@@ -38,7 +38,7 @@ NOT_FOUND: Final = 127
 SIGNALLED: Final = 128
 MOST_LINE: Final = 160
 CLEARED_WITHIN: Final = 3
-"""So often a container of the last life is removed before the worker counts as failed."""
+"""This many times a container of the last life is removed before the worker counts as failed."""
 
 
 def container_name(place: Place, driver: int) -> str:

@@ -20,7 +20,7 @@ from zsched.core.relay_protocol import StreamAck, StreamAcks
 from zsched.guard import guarded
 
 ACK_S: Final = 0.05
-"""Acknowledgements leave so often while anything changes (20 Hz)..."""
+"""Acknowledgements leave this often while anything changes (20 Hz)..."""
 ACK_SAMPLES: Final = 256
 ACK_BYTES: Final = 1 << 20
 """...or when so much was processed."""

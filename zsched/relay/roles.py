@@ -1,6 +1,6 @@
 """Tells this node's workers their roles: put on change, answered on demand.
 
-Knows: the newest role per task, the role keys of this node. Does not know: who decided, what a worker does with it.
+Knows: the newest role per task, the role keys of this node. Does not know: decisions, what a worker does with it.
 """
 
 from __future__ import annotations

@@ -94,7 +94,7 @@ class Crew:
         return f"{missing or 'nobody is seen to subscribe to all its inputs'}; {OTHER_NETWORK}"
 
     def _no_token(self, task: TaskId) -> str:
-        """The key that it should be at, and one of the task that is at another: who declared it by hand errs there."""
+        """The key that it should be at, and one of the task that is at another: a worker by hand has an error there."""
         key = self._keys.worker(self._node, task, self._lives.get(task) or "NUMBER")
         stray = self._strays.get(task)
         if stray is None:
@@ -115,7 +115,7 @@ class Crew:
     # --- the relay's handle ------------------------------------------------------------------------------------------
 
     def on_relay_started(self) -> None:
-        """A relay runs: who joins it in the next moments may have been there before it."""
+        """A relay runs: workers that join it in the next moments may have been there before it."""
         self._relay_at = monotonic_s()
 
     def on_token(self, seen: WorkerSeen) -> None:
@@ -145,7 +145,7 @@ class Crew:
             self._matches[task] = match
             self._doubt(match)
             life = self._lives.get(task, 0)
-            if life or task in self._foreign:  # without its process nobody who matches is the worker
+            if life or task in self._foreign:  # without its process no matching subscriber is the worker
                 self._tell(supervisor, task, life, is_ready=match.is_matched, reason=match.missing)
 
     def on_trouble(self, trouble: WorkerTrouble) -> None:

@@ -1,6 +1,6 @@
 """Takes as many file descriptors as the daemon may have.
 
-Knows: the process's limits. Does not know: who uses them up.
+Knows: the process's limits. Does not know: their users.
 
 The usual limit is 1024, for programs that call select(2); strangers' connections take as many in seconds.
 """

@@ -53,8 +53,8 @@ def endpoints_for(
     What the fleet file does not say listens with ``protocol`` (`zsched.runtime.tls`).
 
     A link is dialled by one side only: of two that redial each other one may take the other's new link for a part of
-    its old session, and tells it nothing again (eclipse-zenoh/zenoh#2806). Who gives no address dials everybody who
-    does; only two that give none meet by gossip, and then zenoh's ids decide which one dials. Workers dial their own
+    its old session, and tells it nothing again (eclipse-zenoh/zenoh#2806). A node without an address dials every node
+    that has one; two without one meet by gossip, and zenoh's ids decide which one dials. Workers dial their own
     relay first, then the robots', and listen nowhere, so nobody dials them.
     Our own address on another machine (``is_here``) is dialled too: there a twin of ours may be, and must be heard.
     """

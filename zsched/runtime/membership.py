@@ -487,7 +487,7 @@ def _advice(error: OSError, path: Path) -> str:
 
 
 def _make_folder(path: Path) -> None:
-    """A folder that the service's user may look into, whatever the umask of who calls."""
+    """A folder that the service's user may look into, whatever the caller's umask."""
     missing = [one for one in (path, *path.parents) if not one.exists()]
     path.mkdir(parents=True, exist_ok=True)
     for one in missing:

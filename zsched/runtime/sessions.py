@@ -46,7 +46,7 @@ class SessionsRead:
         self._now: dict[TaskId, str] = {}
 
     def begin(self, task: TaskId, text: str) -> None:
-        """The task's session has been written; who starts from now on reads this one."""
+        """The task's session has been written; a worker that starts from now on reads this one."""
         self._now[task] = text
         self._read.setdefault(task, _Read(text))
 

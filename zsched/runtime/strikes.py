@@ -1,6 +1,6 @@
 """Does to this daemon what an operator rehearses: ends it, or cuts its links for a while; or says why it cannot.
 
-Knows: who would start this daemon again, nftables. Does not know: whether the fleet can bear it
+Knows: what would start this daemon again, nftables. Does not know: whether the fleet can bear it
 (`zsched.core.handlers.rehearsal`).
 
 The kernel ends a cut: the rules drop what goes to or comes from the ports of a set, and the ports leave the set by a

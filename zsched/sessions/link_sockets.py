@@ -5,7 +5,7 @@ about a slow receiver.
 
 zenoh tells nobody that a receiver takes nothing: a put waits, or drops, in silence. The kernel knows it for every link:
 whether there is room in its send buffer, and how many bytes the other end has taken. The descriptors are zenoh's; they
-are only looked at, and `cut` looks twice. Who subscribes would be said by zenoh's admin space; but a question to it
+are only looked at, and `cut` looks twice. zenoh's admin space names subscribers; but a question to it
 from within its own process stops for ever when somebody declares something at the same moment (1.10.2).
 """
 

@@ -4,7 +4,7 @@ Knows: order, bounds, which sample gives way to a newer one. Does not know: zeno
 
 Every stream that may wait for its receiver (classes ``latest`` and ``reliable``) has one per place it goes to. With
 ``sheds`` the oldest samples of a lane give way: beyond ``depth``, or, once a put has blocked for `STALL_S`, beyond
-``keep_last``. Without it a full queue refuses the newest; who wants to may `wait_for_room` before, as long as the
+``keep_last``. Without it a full queue refuses the newest; a caller may `wait_for_room` before, as long as the
 receiver takes something now and then. What gave way was never numbered, so receivers see no gap.
 """
 

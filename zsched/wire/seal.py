@@ -1,4 +1,4 @@
-"""The seal of a frame: who signed it, for which key of the network, in which order, in answer to what.
+"""The seal of a frame: its signer, for which key of the network, in which order, in answer to what.
 
 Knows: the bytes of a seal and the bytes that its signature is over. Does not know: keys, certificates, who may say what
 (`zsched.adapters.network.seals`).

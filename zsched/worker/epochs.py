@@ -21,7 +21,7 @@ from zsched.core.values.plan import Role, WorkerRole
 CARRY_S: Final = 2.5
 """The older epoch's inputs that have not come by then never will..."""
 CARRY_LOOK_S: Final = 0.2
-"""...and those that have come are processed first: the worker looks so often whether one still waits."""
+"""...and those that have come are processed first: the worker looks this often whether one still waits."""
 
 
 class Epochs:

@@ -68,7 +68,7 @@ class Output:
         self._session = session
         self._template = template
         self.is_latest = latest
-        """Whether the last value is kept for who comes late."""
+        """Whether the last value is kept for late subscribers."""
         self._keep_last = max(1, keep_last)
         self._keeper = keeper if latest or reliable else None
         self._stalled = keeper.stalled

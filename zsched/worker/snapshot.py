@@ -203,7 +203,7 @@ def fetch(session: zenoh.Session, key: str, timeout_s: float) -> bytes | str:
 
 
 def _assembled(replies: queue.SimpleQueue[zenoh.Reply | None], until: float) -> bytes | str:
-    """The one state that is offered. Who answers beside it is waited for, shortly: two states are one too many."""
+    """The one state that is offered. Another answer is waited for, shortly: two states are one too many."""
     assembly = Assembly()
     has_come, whole, problem = False, b"", ""
     is_whole = False

@@ -212,7 +212,7 @@ class Worker:
     ) -> Output:
         """An output; ``{prefix}`` and ``{epoch}`` are filled in, the epoch at each time this worker becomes the owner.
 
-        ``latest``: the last ``keep_last`` values are cached for who comes late; a put never waits, behind a stalled
+        ``latest``: the last ``keep_last`` values are cached for late subscribers; a put never waits, behind a stalled
         receiver the newest wait. ``reliable``: a put waits for a slow receiver (up to a lease) instead of dropping, and
         the last ``depth`` answers (at most `zsched.core.hop.shared.SHARED_BYTES`) are kept until the robots' relays
         have acknowledged them: what a broken link lost is sent again. An output that no rule of the task takes is

@@ -1,4 +1,4 @@
-"""The recorded drives: who follows the best signal, how often it moves, and what that costs in delay.
+"""The recorded drives: which rule follows the best signal, how often it moves, and what that costs in delay.
 
 Knows: recorded signals and delays, the paper's real-world figure. Does not know: simulated radio.
 

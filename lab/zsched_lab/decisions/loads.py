@@ -1,6 +1,6 @@
 """Decides when which machine is busy: injected loads, a slow background, and what a profiler reads of both.
 
-Knows: seeded histories of true use, the scatter of readings. Does not know: who runs the task, what use is worth.
+Knows: seeded histories of true use, the scatter of readings. Does not know: owners, what use is worth.
 """
 
 from __future__ import annotations

@@ -60,7 +60,7 @@ class Outputs:
 class Agent:
     """The robot. ``phase`` (0..1) of a map period: robots are not in step.
 
-    A robot that maps itself sends its maps so much later; one whose scans are mapped elsewhere begins so much later.
+    A robot that maps itself sends its maps this much later; one whose scans go elsewhere begins this much later.
     """
 
     def __init__(self, settings: RobotSettings, world: World, *, phase: float = 0.0) -> None:

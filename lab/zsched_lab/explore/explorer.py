@@ -25,7 +25,7 @@ from zsched_lab.explore.frontier import Claim, Frontier, choose, find_frontiers
 from zsched_lab.explore.planner import PlanMap, Point, distances, plan_map, way_to
 
 PLAN_PERIOD_S = 0.5
-"""Plans at most so often, and only for a reason: a new map, a reached goal, a wall."""
+"""Plans at most this often, and only for a reason: a new map, a reached goal, a wall."""
 REACHED_M = 0.4
 AVOID_S = 8.0
 """A frontier that the robot has been at, or could not get to, does not count for this long, ..."""

@@ -1,6 +1,6 @@
 """Tells how much of the world a merged map knows: the lab's instrument, which no robot looks at.
 
-Knows: the truth's known cells. Does not know: who drives where.
+Knows: the truth's known cells. Does not know: ways.
 
 Coverage is the share of the truth's known cells that the map knows, as in `zsched_lab.maps.metrics`, but looked up cell
 by cell: a millisecond, so that it can be taken of every map that comes.

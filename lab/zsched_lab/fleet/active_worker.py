@@ -1,6 +1,6 @@
 """A worker of an exclusive task that writes down every moment at which it passed its own check: is the lease mine?
 
-Knows: `zsched.worker`. Does not know: who else works; `zsched_lab.fleet.chaos` compares the files of all workers.
+Knows: `zsched.worker`. Does not know: other workers; `zsched_lab.fleet.chaos` compares the files of all workers.
 
 ``python -m zsched_lab.fleet.active_worker FOLDER``: a hundred times a second it puts ``NUMBER NOW EPOCH`` on
 ``{node}/{task}/{epoch}/tick``; when that was admitted it adds a line ``EPOCH NOW`` to ``FOLDER/<node>-<pid>.ticks``,

@@ -1,6 +1,6 @@
 """Gives each process of lab and tests a loopback address of its own, and ports there.
 
-Knows: that Linux has all of 127/8, process ids, what the kernel gives back by itself. Does not know: who listens there.
+Knows: that Linux has all of 127/8, process ids, what the kernel gives back by itself. Does not know: listeners.
 
 Two runs on one machine never ask for the same endpoint: an address is leased by the name of an abstract socket, which
 lives in the same network namespace as the address and ends with the process, however it ends.

@@ -1,6 +1,6 @@
 """Watches the fleet through its daemons' operator sockets, from a thread of its own: a wedged daemon stalls nothing.
 
-Knows: who answered when, and which allocations were ever told. Does not know: what is done with it.
+Knows: which worker answered when, and which allocations were ever told. Does not know: what is done with it.
 """
 
 from __future__ import annotations

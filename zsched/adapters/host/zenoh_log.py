@@ -2,7 +2,7 @@
 
 zenoh writes its log to standard output and offers no other way. Its errors are often the only word on why a link does
 not come about (a certificate, a refused handshake), and the same one comes with every attempt to dial. So standard
-output becomes a pipe that a thread of this process reads. Who sets ``RUST_LOG`` gets zenoh's own log, untouched.
+output becomes a pipe that a thread of this process reads. With ``RUST_LOG`` set, zenoh's own log stays untouched.
 
 Knows: file descriptors, the look of zenoh's lines. Does not know: sessions, nodes.
 """

@@ -34,7 +34,7 @@ MIN_INTERVAL_S = 0.02
 """Two samples closer than this would divide one tick by nothing: the previous figure stands."""
 RESTING_CORES = 0.05
 RESTING_LOOK_S = 1.0
-"""Threads and children of a worker that uses less are read so often: there may be dozens, with two files each."""
+"""Threads and children of a worker that uses less are read this often: there may be dozens, with two files each."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -194,7 +194,7 @@ class ControlBus:
             "allocation": self._publisher(session, keys.allocation(node), zenoh.Priority.INTERACTIVE_HIGH),
         }
         token = keys.alive(node, self._incarnation)
-        # The token goes last: who sees it may ask, and must find the queryable.
+        # The token goes last: a node that sees it may ask, and must find the queryable.
         self._kept = [
             *self._watch_links(session),
             session.declare_subscriber(keys.all_puts(), tolerant(self._on_sample, "put")),

@@ -20,7 +20,7 @@ from zsched.errors import AdapterError
 from zsched.guard import guarded
 
 DEPTH: Final = 10_000
-"""Samples that may wait for who looks at them; beyond it the oldest go, and `StreamTap.missed` stays honest."""
+"""Samples that may wait for the reader; beyond it the oldest go, and `StreamTap.missed` stays honest."""
 CLOSE_S: Final = 0.5
 """Closing a session towards a stopped peer can take seconds; we wait for at most this long."""
 

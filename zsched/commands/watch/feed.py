@@ -1,7 +1,7 @@
 """Asks one daemon again and again for its status and for new entries of its decision log.
 
 Knows: the door, where the log was read to, that a daemon may be away for a while.
-Does not know: who looks at the answers.
+Does not know: how the answers are shown.
 """
 
 from __future__ import annotations

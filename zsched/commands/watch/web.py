@@ -3,8 +3,8 @@
 A connection answers one request and ends. At most `MOST_CONNECTIONS` are open; one that has not said within
 `REQUEST_S` what it wants, or takes its answer too slowly, is cut off. Requests are not logged.
 
-Knows: HTTP, connections, signals, the page's files. Does not know: who may ask (`zsched.commands.watch.gate`), what is
-told (`zsched.commands.watch.hub`).
+Knows: HTTP, connections, signals, the page's files. Does not know: which requests may ask
+(`zsched.commands.watch.gate`), what they get (`zsched.commands.watch.hub`).
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ REQUEST_S: Final = 5.0
 SEND_S: Final = 10.0
 """For a receiver that takes nothing."""
 PING_S: Final = 15.0
-"""A live connection says something at least so often, so that one whose other end is gone is noticed."""
+"""A live connection says something at least this often, so that one whose other end is gone is noticed."""
 MOST_TOKEN_BYTES: Final = 4096
 
 

@@ -1,6 +1,6 @@
 """How long a task's answers take at this robot: from an input as it left to an output as it came.
 
-Knows: timestamps, times. Does not know: who answered, what follows.
+Knows: timestamps, times. Does not know: workers, what follows.
 
 An answer that has its input's timestamp (the library's do, and a foreign worker's that copies it) is measured exactly,
 the network included. Any other one is at least as old as the newest input before it.

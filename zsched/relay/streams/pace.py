@@ -15,7 +15,7 @@ MAX_KEYS: Final = 4096
 
 
 class Pace(Generic[T]):
-    """At most ``max_hz`` per key, on average: who comes early by less than a period is let off."""
+    """At most ``max_hz`` per key, on average: a sample that is early by less than a period passes."""
 
     def __init__(self, max_hz: float, *, remembers: bool) -> None:
         """``remembers``: passed over values are kept for `overdue` (streams that keep the newest)."""

@@ -42,7 +42,7 @@ FRESH_GRACE_S = 0.3
 It holds maps of its former tenure; merged with the first new ones they would show the robots the past for a moment.
 """
 STATUS_PERIOD_S = 1.0
-"""Status at least so often while active: the ages in it go on."""
+"""Status at least this often while active: the ages in it go on."""
 _LOG = logging.getLogger("zsched.tasks.map_merge")
 
 
