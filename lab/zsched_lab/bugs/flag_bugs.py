@@ -117,8 +117,8 @@ FLAG_BUGS: tuple[Bug, ...] = (
     _bug(
         "another document forgets the flags",
         APPLY,
-        '"flags": [flag for flag in plan.held.flags if flag["subject"] in nodes]',
-        '"flags": []',
+        'flags = [flag for flag in plan.held.flags if flag["subject"] in nodes]',
+        "flags = []",
         ("tests/unit/commands/test_apply.py",),
     ),
 )
