@@ -79,6 +79,8 @@ CLOSE_WORKERS_S = 0.7
 LOOP_MAX_WAIT_S = 1.0
 LOOK_S = 30.0
 """How often the certificate's files are looked at."""
+SPARE_NODES = 2
+"""A relay is carried on while its fleet grows by so many nodes."""
 CERTIFICATE = "certificate"
 """Of the problem that this node's certificate ends soon."""
 SESSIONS = "sessions"
@@ -357,13 +359,17 @@ class Daemon:
 
     def _relay(self, shell: Shell, incarnation: int, points: Endpoints) -> RelayHandle:
         fleet = self._fleet
-        certificate = "" if fleet.security is None else f"/{digest_of(fleet.security)}"
+        size, tasks = len(fleet.nodes), tuple(task.name for task in fleet.tasks)
+        threads = zenoh_config.pool_threads(size, len(tasks))
         bequest = Bequest(
             door=self._door,
             orphan_s=fleet.relay_orphan_s,
             incarnation=incarnation,
-            digest=f"{fleet_hash(fleet)}{certificate}",  # a relay listens with the certificate that it began with
+            digest="",
             listen=points.data_listen[0],
+            certificate="" if fleet.security is None else digest_of(fleet.security),
+            tasks=tasks,
+            spare_threads=zenoh_config.pool_threads(size + SPARE_NODES, len(tasks)) - threads,
         )
         return RelayHandle(
             fleet=fleet.name,
@@ -377,7 +383,7 @@ class Daemon:
                 dials_by_gossip=points.data_by_gossip,
             ),
             on_report=shell.on_report,
-            threads=zenoh_config.pool_threads(len(fleet.nodes), len(fleet.tasks)),
+            threads=threads,
             local_config=zenoh_config.local_config(side, timing=fleet.timing) if (side := self._spec.local) else "",
             silence_s=max(SILENCE_S, fleet.timing.zenoh_lease_s + 0.5),
             bequest=bequest if fleet.relay_orphan_s > 0 else None,

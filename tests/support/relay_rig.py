@@ -119,10 +119,19 @@ class Rig:
             connect = () if node == ROBOT else (seed,)
             # no shared memory: a stalled target must fill its socket
             text = data_config(listen=(self.endpoint(node),), connect=connect, timing=self.timing, shared_memory=False)
-            self.relays[node] = RelayHandle(fleet=FLEET, node=node, zenoh_config=text, on_report=self.reports[node].add)
+            self.relays[node] = self.handle(node, text)
             self.relays[node].start()
         until(lambda: all(r.find(RelayChanged, is_running=True) for r in self.reports.values()), "the relays run")
-        self.app = zenoh.open(zenoh.Config.from_json5(worker_config(connect=(seed,), shared_memory=False)))
+        self.app = self.application()
+
+    def handle(self, node: str, text: str) -> RelayHandle:
+        """The daemon's hold on a node's relay, whose data session opens by ``text``."""
+        return RelayHandle(fleet=FLEET, node=node, zenoh_config=text, on_report=self.reports[node].add)
+
+    def application(self) -> zenoh.Session:
+        """The session of the robot's application."""
+        text = worker_config(connect=(self.endpoint(ROBOT),), shared_memory=False)
+        return zenoh.open(zenoh.Config.from_json5(text))
 
     def endpoint(self, node: str) -> str:
         return self.endpoints[node]

@@ -183,6 +183,12 @@ class Acknowledger:
             if source is not None and source.done(number):
                 self._note_done(name, size)
 
+    def say_again(self) -> None:
+        """Send everything once more, soon: who listens may not have heard of it."""
+        with self._wake:
+            self._dirty.update(self._sources)
+            self._wake.notify()
+
     def flush(self) -> None:
         """Send what changed at once (the caller's thread)."""
         with self._sending:

@@ -29,7 +29,7 @@ _REGISTERED: Final[tuple[tuple[str, type, int], ...]] = (
     ("task_ended", relay_protocol.TaskEnded, _SMALL),
     ("relay_started", relay_protocol.RelayStarted, _SMALL),
     ("relay_pulse", protocol.RelayPulse, _SMALL),
-    ("relay_hello", protocol.RelayHello, _SMALL),
+    ("relay_hello", protocol.RelayHello, wire.LARGE),
     ("relay_here", protocol.RelayHere, _SMALL),
     ("relay_refused", protocol.RelayRefused, _SMALL),
     ("worker_seen", relay_protocol.WorkerSeen, _SMALL),

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from zsched.core.values.model import NodeId, check_counter, check_name, check_range
+from zsched.core.values.model import NodeId, TaskId, check_counter, check_name, check_range
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,12 +29,19 @@ class RelayHello:
     incarnation: int
     """Of the daemon's durable state: it rises with every start."""
     digest: str
-    """Over the fleet file, the sessions and the version (`zsched.ipc.takeover.digest_of`)."""
+    """Over the code, the host's own side and all else that a process keeps for its life (`digest_of`)."""
+    session: str = ""
+    """A digest over what its data session is opened with: access rules, certificate, addresses."""
+    threads: int = 0
+    """So many threads it needs, each to receive, to transmit, and to close links."""
+    tasks: tuple[TaskId, ...] | None = None
+    """Of its fleet: what an earlier daemon's relay carries beside these has ended. ``None``: it ends nothing."""
 
     def __post_init__(self) -> None:
         check_name("hello.fleet", self.fleet)
         check_name("hello.node", self.node)
         check_counter("hello.incarnation", self.incarnation)
+        check_counter("hello.threads", self.threads)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,6 +49,8 @@ class RelayHere:
     """The relay obeys this daemon from now on."""
 
     pid: int
+    reopens: bool = False
+    """Its data session is not the daemon's: it waits for the configuration of one, and opens that."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -48,7 +48,12 @@ def main() -> None:
 
         pipes = (sys.stdin.fileno(), sys.stdout.fileno())
         me = RelayHello(
-            fleet=arguments.fleet, node=arguments.node, incarnation=arguments.incarnation, digest=arguments.digest
+            fleet=arguments.fleet,
+            node=arguments.node,
+            incarnation=arguments.incarnation,
+            digest=arguments.digest,
+            session=arguments.session,
+            threads=arguments.threads,
         )
         code = run(me, *pipes, has_local_side=arguments.local, door=arguments.door, orphan_s=arguments.orphan)
     except SystemExit:
@@ -72,6 +77,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--orphan", type=float, default=0.0, help="seconds to go on without a daemon (with --door)")
     parser.add_argument("--incarnation", type=int, default=0, help="of the daemon that starts us")
     parser.add_argument("--digest", default="", help="what the next daemon must have been started with")
+    parser.add_argument("--session", default="", help="a digest over what the data session is opened with")
     parser.add_argument("--log-level", default="WARNING")
     return parser.parse_args()
 

@@ -30,6 +30,7 @@ MAX_TOKENS: Final = 20_000
 
 _log = logging.getLogger("zsched.relay")
 
+_Item = tuple[TaskId, tuple[Route, ...]] | tuple["_Side", Sample] | tuple[None, Session]
 _Wanted = dict[tuple[RosGraph, Endpoint | str], None]
 
 
@@ -87,9 +88,17 @@ class GraphMirror:
         self._local = self._fleet if local is None else _Side(local, str(local.zid()))
         self._own_ids = frozenset({self._fleet.zid, self._local.zid})
         self._routes: dict[TaskId, tuple[Route, ...]] = {}
-        self._queue: queue.SimpleQueue[tuple[TaskId, tuple[Route, ...]] | tuple[_Side, Sample]] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[_Item] = queue.SimpleQueue()
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
+
+    def rejoin(self, fleet: Session) -> None:
+        """Another session serves the fleet's side, the one before is closed; the host's own side stays."""
+        with self._lock:
+            if self._thread is None:
+                self._take((None, fleet))
+            else:
+                self._queue.put((None, fleet))
 
     def set_routes(self, task: TaskId, routes: tuple[Route, ...]) -> None:
         """Take the routes of all open slots of a task; they replace the ones before."""
@@ -114,8 +123,15 @@ class GraphMirror:
             except Exception:  # noqa: BLE001 - a token that trips a bug must not end the mirror
                 _log.exception("the ROS graph cannot be mirrored")
 
-    def _take(self, item: tuple[TaskId, tuple[Route, ...]] | tuple[_Side, Sample]) -> None:
+    def _take(self, item: _Item) -> None:
         first, second = item
+        if isinstance(second, Session):
+            graphs = tuple(self._fleet.watches)
+            self._fleet = _Side(second, str(second.zid()))
+            self._own_ids = frozenset({self._fleet.zid, self._local.zid})
+            for graph in graphs:
+                self._watch(graph)
+            return
         if isinstance(first, _Side) and isinstance(second, Sample):
             first.note(str(second.key_expr), is_present=second.kind == SampleKind.PUT, own_ids=self._own_ids)
         elif isinstance(first, str) and isinstance(second, tuple):

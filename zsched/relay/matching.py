@@ -69,7 +69,7 @@ class Matching:
         """Nothing is declared, and no thread runs, before the first `watch`."""
         self._session = session
         self._report = report
-        self._queue: queue.SimpleQueue[WorkerWatch | TaskId | None] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[WorkerWatch | TaskId | Session | None] = queue.SimpleQueue()
         self._watched: dict[TaskId, _Watched] = {}
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
@@ -88,6 +88,14 @@ class Matching:
             if self._thread is not None:
                 self._queue.put(task)
 
+    def rejoin(self, session: Session) -> None:
+        """Watch on another session, by the watches that come from now on; the one before is closed."""
+        with self._lock:
+            if self._thread is None:
+                self._session = session
+            else:
+                self._queue.put(session)
+
     def _wake(self, _status: Any) -> None:
         """Something matches, or does not any more (zenoh's thread: it must only enqueue)."""
         self._queue.put(None)
@@ -101,7 +109,10 @@ class Matching:
             except queue.Empty:
                 watch = None
             try:
-                if isinstance(watch, WorkerWatch):
+                if isinstance(watch, Session):
+                    self._session = watch
+                    self._watched.clear()
+                elif isinstance(watch, WorkerWatch):
                     self._take(watch)
                 elif watch is not None and (known := self._watched.pop(watch, None)) is not None:
                     known.close()

@@ -17,6 +17,8 @@ import queue
 import signal
 import socket
 import threading
+import time
+from collections.abc import Collection
 from typing import Final
 
 import zenoh
@@ -36,7 +38,7 @@ from zsched.relay.local_side import LocalSide
 from zsched.relay.matching import Matching
 from zsched.relay.roles import RoleServer
 from zsched.relay.streams.acks import DEFAULT_LEASE_S, Acks
-from zsched.relay.successors import Successors
+from zsched.relay.successors import Successor, Successors
 from zsched.relay.task import TaskRelay
 from zsched.relay.tokens import Tokens
 from zsched.relay.troubles import Troubles
@@ -50,6 +52,13 @@ COUNT_S: Final = 1.0
 """Period of the counters."""
 PULSE_S: Final = 0.5
 """After this long without a report we tell the daemon that we live, whatever the streams' threads wait for."""
+LEAVE_S: Final = 1.5
+"""Before the data session is opened anew, what is under way arrives; when nothing has for so long, it is given up..."""
+LEAVE_MAX_S: Final = 8.0
+"""...and in any case after so long."""
+END_S: Final = 3.0
+"""So long the session has to close, and its port to be free."""
+RETRY_S: Final = 0.05
 CLOSE_S: Final = 0.6
 """Closing a session towards a stopped peer can take seconds: we wait at most this long, then the process ends."""
 ALARM_S: Final = 0.9
@@ -179,6 +188,55 @@ class RelayProcess:
         if self._introducer is not None:
             self._introducer.close()
         self._session.close()
+
+    def reopen(self, config: str) -> None:
+        """Open the data session anew, by another configuration; the host's own side, and what comes there, stays.
+
+        What is under way arrives first, what comes meanwhile waits (`TaskRelay.leave`).
+
+        Raises:
+            zenoh.ZError, ValueError, TimeoutError: it cannot be; then this relay has to end.
+        """
+        began = awake_s()
+        with self._lock:
+            tasks = tuple(self._tasks.values())
+            for has_left in [task.leave(LEAVE_S, LEAVE_MAX_S) for task in tasks]:
+                has_left.wait(LEAVE_MAX_S + END_S)
+            self._acks.flush()
+            self._tokens.leave()
+            self._close_data()
+            left_at = awake_s()
+            self._session = session = _opened(config)
+            lease = lease_s(config)
+            self._introducer = None if self._introducer is None else Introducer(config)
+            self._own_ids = frozenset({str(one.zid()) for one in (session, self._local) if one is not None})
+            self._acks.rejoin(session, lease)
+            for part in (self._roles, self._matching, self._troubles, self._tokens, self._graph):
+                if part is not None:
+                    part.rejoin(session)
+            for task in tasks:
+                task.rejoin(session, self._own_ids)
+        _log.warning(
+            "the data session is opened anew: streams waited %.2f s for what was under way, it took %.2f s",
+            left_at - began,
+            awake_s() - left_at,
+        )
+
+    def _close_data(self) -> None:
+        if self._introducer is not None:
+            self._introducer.close()
+        closing = guarded(self._session.close, name="close", is_lasting=False)
+        closing.start()
+        closing.join(END_S)
+        if closing.is_alive():
+            raise TimeoutError(f"the session before does not close within {END_S:g} s")
+
+    def keep(self, tasks: Collection[TaskId]) -> None:
+        """End what is carried for other tasks: they have left the fleet."""
+        with self._lock:
+            known = {*self._tasks, *self._waiting, *self._standbys, *self._unowned}
+        for name in sorted(known - set(tasks)):
+            self._end(name)
 
     def _begin(self, local: zenoh.Session | None) -> None:
         """Both sides are there: carry out the plans that have come meanwhile."""
@@ -324,6 +382,22 @@ def _standbys_of(task: TaskId) -> str:
     return f"{task}@standbys"
 
 
+def _opened(config: str) -> zenoh.Session:
+    """A session; its port may be free a moment later only.
+
+    Raises:
+        zenoh.ZError, ValueError: it cannot be opened.
+    """
+    until = awake_s() + END_S
+    while True:
+        try:
+            return zenoh.open(zenoh.Config.from_json5(config))
+        except zenoh.ZError:
+            if awake_s() >= until:
+                raise
+            time.sleep(RETRY_S)
+
+
 def run(
     me: RelayHello,
     commands: int,
@@ -352,14 +426,18 @@ def run(
         reporter.flush(CLOSE_S)
         return 1
     relay = RelayProcess(session, me.fleet, me.node, reporter, local.decode(), Introducer(config), lease_s(config))
-    successors = None if door is None else Successors(socket.socket(fileno=door), me)
+    successors = None if door is None else Successors(socket.socket(fileno=door), me, reopens=has_local_side)
     wakeups = _signals_wake()
     try:
         while not relay.obey(commands, wakeups) and successors is not None:
-            link = _bridge(relay, successors, orphan_s)
-            if link is None:
+            successor = _bridge(relay, successors, orphan_s)
+            if successor is None:
                 break
-            reporter.attach(link, commands=commands)
+            reporter.attach(successor.link, commands=commands)
+            if successor.reopens and not _reopen(relay, reporter, commands):
+                return 1
+            if successor.tasks is not None:
+                relay.keep(successor.tasks)
             relay.begin_again()
     finally:
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
@@ -380,17 +458,33 @@ def _signals_wake() -> int:
     return wakeups
 
 
-def _bridge(relay: RelayProcess, successors: Successors, orphan_s: float) -> socket.socket | None:
+def _reopen(relay: RelayProcess, reporter: Reporter, commands: int) -> bool:
+    """Open the data session by what the daemon says first; ``False``, and told why: it cannot be."""
+    text = None
+    try:
+        text = read_frame(commands)
+        if text is None:
+            return False
+        relay.reopen(text.decode())
+    except (zenoh.ZError, WireError, OSError, ValueError) as error:
+        problem = f"its data session is not opened anew: {why_not_open((text or b'').decode(), error)}"
+        reporter.report(ProblemReported(source=SOURCE, problem=problem[:400]))
+        reporter.flush(CLOSE_S)
+        return False
+    return True
+
+
+def _bridge(relay: RelayProcess, successors: Successors, orphan_s: float) -> Successor | None:
     """Carry on without a daemon until the next one comes; ``None`` when it does not."""
     if signal.getitimer(signal.ITIMER_REAL)[0] > 0:
         return None  # we have been told to stop
     _log.warning("the daemon is gone: carrying on for %g s", orphan_s)
     relay.go_on_alone()
     before = signal.signal(signal.SIGTERM, _end)
-    link = successors.wait(orphan_s)
+    successor = successors.wait(orphan_s)
     signal.signal(signal.SIGTERM, before)
-    _log.warning("%s", "no daemon came: ends" if link is None else "another daemon has taken over")
-    return link
+    _log.warning("%s", "no daemon came: ends" if successor is None else "another daemon has taken over")
+    return successor
 
 
 def _end(_signal: int, _frame: object) -> None:

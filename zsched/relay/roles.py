@@ -18,11 +18,17 @@ class RoleServer:
     """Serves ``role/<node>/*`` on the data session; a worker that starts late asks and knows at once."""
 
     def __init__(self, session: Session, keyspace: Keyspace, node: NodeId) -> None:
-        self._session = session
         self._keyspace = keyspace
         self._node = node
         self._roles: dict[TaskId, Role] = {}
-        self._queryable = session.declare_queryable(keyspace.role(node, "*"), tolerant(self._answer, "roles"))
+        self.rejoin(session)
+
+    def rejoin(self, session: Session) -> None:
+        """Serve on this session."""
+        self._session = session
+        self._queryable = session.declare_queryable(
+            self._keyspace.role(self._node, "*"), tolerant(self._answer, "roles")
+        )
 
     def set(self, role: Role) -> None:
         """Take and tell a task's newest role."""

@@ -4,7 +4,8 @@ Knows: the listening socket in the runtime folder, who may take this relay over.
 what is carried meanwhile.
 
 A successor is the same user's, of the same fleet and node, was started later (its incarnation is higher) and would
-start a relay with the very same sessions, fleet file and version: anything else makes a new relay necessary.
+start a relay of the same version, with the same session on the host's own side: anything else makes a new relay
+necessary. Its data session may be another one where the host has a side of its own (docs/decisions/0071).
 """
 
 from __future__ import annotations
@@ -13,10 +14,11 @@ import logging
 import os
 import select
 import socket
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 from zsched.clock import monotonic_s
+from zsched.core.values.model import TaskId
 from zsched.errors import WireError
 from zsched.ipc.pipe import read_frame, write_frame
 from zsched.ipc.protocol import RelayHello, RelayHere, RelayRefused
@@ -28,16 +30,26 @@ HELLO_S: Final = 0.5
 _log = logging.getLogger("zsched.relay")
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Successor:
+    """The next daemon: the link to it, the tasks of its fleet (if it says), whether it wants another data session."""
+
+    link: socket.socket
+    tasks: frozenset[TaskId] | None
+    reopens: bool
+
+
 class Successors:
     """The way by which another daemon reaches this relay."""
 
-    def __init__(self, listener: socket.socket, daemon: RelayHello) -> None:
-        """``daemon`` is the one that started this relay."""
+    def __init__(self, listener: socket.socket, daemon: RelayHello, *, reopens: bool = False) -> None:
+        """``daemon`` is the one that started this relay; ``reopens``: it can open another data session."""
         self._listener = listener
         self._daemon = daemon
+        self._reopens = reopens
 
-    def wait(self, timeout_s: float) -> socket.socket | None:
-        """The link to the next daemon, or ``None`` when none came within ``timeout_s``."""
+    def wait(self, timeout_s: float) -> Successor | None:
+        """The next daemon, or ``None`` when none came within ``timeout_s``."""
         until = monotonic_s() + timeout_s
         poller = select.poll()
         poller.register(self._listener, select.POLLIN)
@@ -45,14 +57,15 @@ class Successors:
             if not poller.poll(left * 1000):
                 continue
             link, _ = self._listener.accept()
-            if (reason := self._greet(link)) is None:
-                return link
-            _log.warning("a daemon was not let in: %s", reason)
+            found = self._greet(link)
+            if isinstance(found, Successor):
+                return found
+            _log.warning("a daemon was not let in: %s", found)
             link.close()
         return None
 
-    def _greet(self, link: socket.socket) -> str | None:
-        """Let the daemon behind ``link`` in (``None``), or tell it why not."""
+    def _greet(self, link: socket.socket) -> Successor | str:
+        """Let the daemon behind ``link`` in, or tell it why not."""
         set_timeout(link, HELLO_S)
         try:
             frame = read_frame(link.fileno())
@@ -60,14 +73,16 @@ class Successors:
                 return "it went away"
             hello = wire.decode(frame, RelayHello)
             reason = self._objection(hello, user_of(link))
-            answer = RelayHere(pid=os.getpid()) if reason is None else RelayRefused(reason=reason)
+            reopens = reason is None and hello.session != self._daemon.session
+            answer = RelayHere(pid=os.getpid(), reopens=reopens) if reason is None else RelayRefused(reason=reason)
             write_frame(link.fileno(), wire.encode(answer))
         except (OSError, WireError) as error:
             return f"no greeting ({error})"
-        if reason is None:
-            self._daemon = replace(self._daemon, incarnation=hello.incarnation)
-            set_timeout(link, 0.0)
-        return reason
+        if reason is not None:
+            return reason
+        self._daemon = replace(self._daemon, incarnation=hello.incarnation, session=hello.session)
+        set_timeout(link, 0.0)
+        return Successor(link=link, tasks=None if hello.tasks is None else frozenset(hello.tasks), reopens=reopens)
 
     def _objection(self, hello: RelayHello, user: int) -> str | None:
         mine = self._daemon
@@ -78,5 +93,9 @@ class Successors:
         if hello.incarnation <= mine.incarnation:
             return f"incarnation {hello.incarnation} is not after {mine.incarnation}, whose relay this is"
         if hello.digest != mine.digest:
-            return "the fleet file, the sessions or the version are others than those this relay was started with"
+            return "the host's own side or the version are others than those this relay was started with"
+        if hello.threads > mine.threads:
+            return f"the fleet has grown: {hello.threads} threads are needed, this relay has {mine.threads}"
+        if hello.session != mine.session and not self._reopens:
+            return "its data session is another one, and the host's applications are on that of this relay"
         return None

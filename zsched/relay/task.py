@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import queue
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
@@ -47,6 +48,10 @@ GONE_GRACE_S: Final = 0.05
 SETTLE_S: Final = 1.5
 """An old owner that has ended has acknowledged all by then, also when one acknowledgement was dropped on the way, or a
 robot has just stalled that gets the same answers (`zsched.core.hop.shared.STALLED_S`)."""
+REJOIN_S: Final = 5.0
+"""Behind another data session a worker's link has so long to come back, before what has waited goes on its way."""
+SAY_AGAIN_S: Final = 1.0
+"""...and a worker may learn of us so much later than we of it."""
 GATHER_S: Final = 0.5
 """What a worker left that restarted in place is reported once, when each of its streams has met the new life."""
 MAX_UNTAKEN: Final = 4
@@ -81,6 +86,34 @@ class _Orphaned:
     """In the queue of plans: those behind it are another daemon's."""
 
 
+@dataclass(slots=True, eq=False, kw_only=True)
+class _Leave:
+    """In the queue of plans: the data session is about to close."""
+
+    has_left: threading.Event
+    began_at: float
+    patience_s: float
+    """When nothing of what is under way has arrived for so long, it is given up..."""
+    at_most_s: float
+    """...and in any case after so long."""
+    under_way: int | None = None
+    moved_at: float = 0.0
+
+    def is_over(self, under_way: int, now: float) -> bool:
+        """Whether to wait no longer for so much that is under way."""
+        if self.under_way is None or under_way < self.under_way:
+            self.under_way, self.moved_at = under_way, now
+        return now - self.moved_at >= self.patience_s or now - self.began_at >= self.at_most_s
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rejoin:
+    """In the queue of plans: another data session is there."""
+
+    session: Session
+    own_ids: frozenset[str]
+
+
 class _Ended:
     """In the queue of plans: the task left the fleet file, nothing follows."""
 
@@ -90,6 +123,9 @@ class _Unowned:
     """In the queue of plans: inputs that are taken whether or not there is an owner."""
 
     routes: tuple[Route, ...]
+
+
+_Item = RoutePlan | _Orphaned | _Unowned | _Leave | _Rejoin | _Ended | None
 
 
 class TaskRelay:
@@ -115,7 +151,7 @@ class TaskRelay:
         self._acks = acks
         self._own_ids = own_ids
         self._report = report
-        self._queue: queue.SimpleQueue[RoutePlan | _Orphaned | _Unowned | _Ended | None] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[_Item] = queue.SimpleQueue()
         self._plan: RoutePlan | None = None
         self._slots: dict[int, _OpenSlot] = {}
         self._inputs: dict[str, InputStream] = {}
@@ -124,6 +160,12 @@ class TaskRelay:
         self._stamps = Stamps()
         self._times = AnswerTimes()
         self._flip_by: float | None = None
+        self._leaving: _Leave | None = None
+        self._is_away = False
+        """Between two data sessions: what comes waits."""
+        self._resume_by: float | None = None
+        """What has waited goes out when the owner's worker is there again, at the latest then."""
+        self._say_again_at: float | None = None
         self._is_inherited = False
         """What we carry is the work of a daemon that is gone; the next one may not know of an older slot."""
         guarded(self._run, name=f"task {task}").start()
@@ -143,6 +185,21 @@ class TaskRelay:
     def lose_daemon(self) -> None:
         """Nobody would tell us of another owner from now on, until the next plan."""
         self._queue.put(_Orphaned())
+
+    def leave(self, patience_s: float, at_most_s: float) -> threading.Event:
+        """Let what is under way arrive, and close all that is on the data session; answers what is set then.
+
+        Samples and requests that come wait. When nothing has arrived for ``patience_s``, and after ``at_most_s``, what
+        is under way is given up, counted.
+        """
+        has_left = threading.Event()
+        leave = _Leave(has_left=has_left, began_at=monotonic_s(), patience_s=patience_s, at_most_s=at_most_s)
+        self._queue.put(leave)
+        return has_left
+
+    def rejoin(self, session: Session, own_ids: frozenset[str]) -> None:
+        """Carry on by another data session; ``own_ids`` are those of all sessions of this process."""
+        self._queue.put(_Rejoin(session, own_ids))
 
     def end(self) -> None:
         """The task left the fleet file: close everything, and end."""
@@ -176,6 +233,10 @@ class TaskRelay:
                     self._pause()
                 elif isinstance(plan, _Unowned):
                     self._listen(plan.routes)
+                elif isinstance(plan, _Leave):
+                    self._leaving = plan
+                elif isinstance(plan, _Rejoin):
+                    self._rejoin(plan.session, plan.own_ids)
                 elif plan is not None:
                     self._take(plan)
                 self._step()
@@ -185,7 +246,9 @@ class TaskRelay:
 
     def _wait_s(self) -> float:
         current = self._current()
-        if current is None:
+        if self._leaving is not None or self._resume_by is not None:
+            return BUSY_S
+        if current is None or self._is_away:
             return IDLE_S
         is_moving = not current.is_ready or self._flip_by is not None or self._draining() is not None
         if is_moving:
@@ -193,6 +256,8 @@ class TaskRelay:
         return CARE_S if self._is_counted() else IDLE_S
 
     def _step(self) -> None:
+        if self._is_away:
+            return
         for state in tuple(self._slots.values()):
             self._refresh(state)
             self._tell_left(state)
@@ -203,9 +268,71 @@ class TaskRelay:
         for sink in self._outputs.values():
             sink.look_after()
         self._services.look_after()
+        if self._leaving is not None:
+            self._leave_when_still(self._leaving)
+        elif self._resume_by is not None:
+            self._resume_when_ready(self._resume_by)
+        elif self._say_again_at is not None and monotonic_s() >= self._say_again_at:
+            self._say_again_at = None
+            self._say_again()
 
     def _problem(self, text: str) -> None:
         self._report(ProblemReported(source=f"relay/{self._task}", problem=text[:400]))
+
+    # --- another data session ----------------------------------------------------------------------------------------
+
+    def _leave_when_still(self, leaving: _Leave) -> None:
+        under_way = sum(source.under_way() for source in self._inputs.values())
+        is_over = leaving.is_over(under_way, monotonic_s())
+        if not is_over and (self._flip_by is not None or self._draining() is not None):
+            return  # a handover first
+        for source in self._inputs.values():
+            source.hold()
+        self._services.hold()
+        under_way = sum(source.under_way() for source in self._inputs.values())
+        if not is_over and (under_way or not all(self._services.has_ended(epoch) for epoch in self._slots)):
+            return
+        self._leaving, self._is_away = None, True
+        lost, carrier = sum(source.leave() for source in self._inputs.values()), self._carrier()
+        if lost and carrier is not None:
+            self._report(SlotLost(task=self._task, epoch=carrier.slot.epoch, owner=carrier.slot.owner, samples=lost))
+        for sink in self._outputs.values():
+            sink.leave()
+        leaving.has_left.set()
+
+    def _rejoin(self, session: Session, own_ids: frozenset[str]) -> None:
+        self._session, self._own_ids = session, own_ids
+        self._is_away, self._resume_by = False, monotonic_s() + REJOIN_S
+        for state in self._slots.values():
+            state.is_ready, state.seen, state.gone_at = False, frozenset(), None
+            state.lacks_since = state.lack = None
+        streams: list[InputStream | OutputStream] = [*self._inputs.values(), *self._outputs.values()]
+        for stream in streams:
+            try:
+                stream.rejoin(session, own_ids)
+            except (ValueError, zenoh.ZError) as error:
+                self._problem(f"{stream.route.stream}: {error}")
+        self._services.rejoin(session, self._slots)
+        for state in self._slots.values():
+            for route in state.slot.routes:
+                if route.direction is Direction.SERVICE:
+                    self._try_route(state.slot, route, is_from_start=False)
+        carrier = self._carrier()
+        if carrier is not None:
+            self._services.flip(carrier.slot.epoch)
+
+    def _resume_when_ready(self, until: float) -> None:
+        carrier, now = self._carrier(), monotonic_s()
+        if carrier is not None and not carrier.is_ready and now < until:
+            return
+        self._resume_by, self._say_again_at = None, now + SAY_AGAIN_S
+        for source in self._inputs.values():
+            source.resume()
+        self._say_again()
+
+    def _say_again(self) -> None:
+        for sink in self._outputs.values():
+            sink.say_again()
 
     # --- plans -------------------------------------------------------------------------------------------------------
 
@@ -392,11 +519,12 @@ class TaskRelay:
         slot = state.slot
         needs_token = slot.ready_when is ReadyWhen.TOKEN
         tokens = self._tokens.workers(slot.owner, self._task) if needs_token else frozenset()
-        state.gone_at = None if tokens or not needs_token else state.gone_at or monotonic_s()
+        is_rejoining = self._resume_by is not None
+        state.gone_at = None if tokens or not needs_token or is_rejoining else state.gone_at or monotonic_s()
         # a worker with a token has declared its services before it; of a foreign one only the match tells
         has_services = needs_token or self._services.is_matching(slot.epoch)
         is_ready = (bool(tokens) or not needs_token) and has_services and self._is_matching(slot)
-        is_new = is_ready and (not state.is_ready or bool(tokens - state.tokens))
+        is_new = is_ready and ((not state.is_ready and not is_rejoining) or bool(tokens - state.tokens))
         if needs_token and tokens != state.seen:
             state.seen = tokens
             for source in self._inputs.values():

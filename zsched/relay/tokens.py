@@ -9,6 +9,7 @@ sees the token has also learnt of the subscriptions. (Zenoh's "matching" alone i
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 from zenoh import Sample, SampleKind, Session
 
@@ -40,9 +41,22 @@ class Tokens:
         self._on_role_ended = on_role_ended
         self._wake = wake
         self._present: frozenset[str] = frozenset()  # replaced whole: readers need no lock
-        selector = keyspace.worker("*", "*", "*").replace(f"/{WORKER}/", "/*/")
+        self._sessions = 0
+        """How many we have had, so that what an earlier one still says is told apart."""
+        self.rejoin(session)
+
+    def leave(self) -> None:
+        """The session is about to close: what goes with it has not gone."""
+        self._sessions += 1
+        self._present = frozenset()
+
+    def rejoin(self, session: Session) -> None:
+        """Watch on this session, with no token to begin with."""
+        self.leave()
+        hear = partial(self._hear, self._sessions)
+        selector = self._keyspace.worker("*", "*", "*").replace(f"/{WORKER}/", "/*/")
         # a callback: its thread sleeps until a token comes, one that waits at a handler wakes up ten times a second
-        self._watch = session.liveliness().declare_subscriber(selector, tolerant(self._hear, "tokens"), history=True)
+        self._watch = session.liveliness().declare_subscriber(selector, tolerant(hear, "tokens"), history=True)
 
     def workers(self, node: NodeId, task: TaskId) -> frozenset[str]:
         """The tokens of the node's workers for the task: one, or two while one restarts."""
@@ -62,8 +76,9 @@ class Tokens:
         found = (_worker(key, is_present=True) for key in sorted(self._present))
         return tuple(worker for worker in found if worker is not None)
 
-    def _hear(self, sample: Sample) -> None:
-        self._note(str(sample.key_expr), is_present=sample.kind == SampleKind.PUT)
+    def _hear(self, of: int, sample: Sample) -> None:
+        if of == self._sessions:
+            self._note(str(sample.key_expr), is_present=sample.kind == SampleKind.PUT)
 
     def _note(self, key: str, *, is_present: bool) -> None:
         if is_present and len(self._present) >= MAX_TOKENS:

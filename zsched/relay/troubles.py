@@ -34,7 +34,12 @@ class Troubles:
     def __init__(self, session: Session, keyspace: Keyspace, node: NodeId, report: Callable[[Word], None]) -> None:
         self._report = report
         self._reported_at: dict[tuple[str, type[Word]], float] = {}
-        self._subscriber = session.declare_subscriber(keyspace.trouble(node, "*", "*"), tolerant(self._hear, "trouble"))
+        self._key = keyspace.trouble(node, "*", "*")
+        self.rejoin(session)
+
+    def rejoin(self, session: Session) -> None:
+        """Hear on this session."""
+        self._subscriber = session.declare_subscriber(self._key, tolerant(self._hear, "trouble"))
 
     def _hear(self, sample: Sample) -> None:
         parsed = parse(str(sample.key_expr))

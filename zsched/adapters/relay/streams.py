@@ -97,9 +97,15 @@ class Bequest:
     incarnation: int
     """This daemon's; only a later one may take the relay over."""
     digest: str
-    """Over everything beside the sessions that a running relay must agree with (`digest_of`)."""
+    """Over everything beside sessions and code that a running relay must agree with (`digest_of`)."""
     listen: str = ""
     """Where the data session listens, for the next daemon."""
+    certificate: str = ""
+    """A digest over the files that the data session reads when it opens."""
+    tasks: tuple[TaskId, ...] | None = None
+    """Of the fleet; a relay that is taken over ends what it carries for others (``None``: it ends nothing)."""
+    spare_threads: int = 0
+    """A relay that is started gets so many more, for a fleet that grows."""
 
 
 class RelayHandle:
@@ -129,17 +135,29 @@ class RelayHandle:
         self._silence_s = min(silence_s, STARVED_S)
         self._bequest = bequest
         self._command = [python, "-m", "zsched.relay", "--fleet", fleet, "--node", node]
-        self._command += ["--threads", str(threads), "--parent", str(os.getpid())]
+        spare = 0 if bequest is None else bequest.spare_threads
+        self._command += ["--threads", str(threads + spare), "--parent", str(os.getpid())]
         self._command += ["--local"] if local_config else []
         if bequest is not None:
-            digest = digest_of(bequest.digest, code_digest(), python, str(threads), zenoh_config, local_config)
-            self._hello = RelayHello(fleet=fleet, node=node, incarnation=bequest.incarnation, digest=digest)
-            self._command += ["--orphan", str(bequest.orphan_s), "--digest", digest]
+            digest = digest_of(bequest.digest, code_digest(), python, local_config)
+            session = digest_of(zenoh_config, bequest.certificate)
+            self._hello = RelayHello(
+                fleet=fleet,
+                node=node,
+                incarnation=bequest.incarnation,
+                digest=digest,
+                session=session,
+                threads=threads,
+                tasks=bequest.tasks,
+            )
+            self._command += ["--orphan", str(bequest.orphan_s), "--digest", digest, "--session", session]
             self._command += ["--incarnation", str(bequest.incarnation)]
         self._lock = threading.Lock()
         self._newest: dict[_Key, _Told] = {}
         self._outbox = _Outbox()
         self._relay: RelayChild | None = None
+        self._reopens = False
+        """The relay that was taken over waits for the configuration of its data session."""
         self._stopping = threading.Event()
         self._is_leaving = False
         self._thread = guarded(self._supervise, name="relay")
@@ -236,7 +254,9 @@ class RelayHandle:
             RelayChild(pid=note.pid, link=None, door=bequest.door).end(EVICT_S)
             return None
         link, here = found
-        _log.info("the relay that runs here (pid %d) is taken over", here.pid)
+        self._reopens = here.reopens
+        how = ", and opens its data session anew" if here.reopens else ""
+        _log.info("the relay that runs here (pid %d) is taken over%s", here.pid, how)
         return RelayChild(pid=here.pid, link=link, door=bequest.door)
 
     def _run_once(self, found: RelayChild | None) -> str:
@@ -281,7 +301,8 @@ class RelayHandle:
 
     def _write(self, relay: RelayChild, outbox: _Outbox) -> None:
         try:
-            for text in self._configs if relay.is_child else ():
+            texts = self._configs if relay.is_child else self._configs[: int(self._reopens)]
+            for text in texts:
                 write_frame(relay.descriptor, text)
             while (value := outbox.take()) is not None:
                 try:

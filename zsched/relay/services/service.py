@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final
@@ -148,6 +149,15 @@ class ServiceStream:
         with self._lock:
             self._active = self._slots.get(epoch, self._active)
             self._lock.notify_all()
+
+    def hold(self) -> None:
+        """Ask nobody any more until the next `flip`: requests that come wait, as long as their rule says."""
+        with self._lock:
+            self._active = None
+
+    def rejoin(self, session: Session) -> None:
+        """Ask by another session; every slot is closed."""
+        self._session = session
 
     def has_ended(self, epoch: int) -> bool:
         """True when the slot has answered every request."""
@@ -369,6 +379,22 @@ class Services:
     def has_ended(self, epoch: int) -> bool:
         """True when the epoch's owner has answered every request."""
         return all(stream.has_ended(epoch) for stream in self._streams.values())
+
+    def hold(self) -> None:
+        """Let requests that come from now on wait for an owner."""
+        for stream in self._streams.values():
+            stream.hold()
+
+    def rejoin(self, session: Session, epochs: Iterable[int]) -> None:
+        """Go on by another session, with no slot; what the owners have not answered gets an error.
+
+        ``epochs``: of the slots that are open.
+        """
+        for epoch in epochs:
+            self.close_slot(epoch)
+        self._session = session
+        for stream in self._streams.values():
+            stream.rejoin(session)
 
     def look_after(self) -> None:
         """End the requests whose owner is gone without a word."""

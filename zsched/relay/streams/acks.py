@@ -51,18 +51,27 @@ class Acks:
         lease_s: float = DEFAULT_LEASE_S,
     ) -> None:
         """Subscribe and start. ``has_token`` (node, task, incarnation) says whether such a worker is there."""
-        self.stalled = StalledLinks(session, lease_s)
         self._has_token = has_token
-        self._session = session
-        self._keyspace, self._node, self._own_id = keyspace, node, str(session.zid())
+        self._keyspace, self._node, self._lease_s = keyspace, node, lease_s
         self._born_at = monotonic_s()
         self._answers: WeakSet[Acknowledger] = WeakSet()
         self._lock = threading.Lock()
         self._listeners: dict[int, tuple[NodeId, TaskId, Listener]] = {}
         self.strangers = 0
         """Acknowledgements of workers that the stream does not go to."""
-        key = keyspace.ack("*", "*", "*", str(session.zid()))
+        self._join(session)
+
+    def _join(self, session: Session) -> None:
+        self.stalled = StalledLinks(session, self._lease_s)
+        self._session, self._own_id = session, str(session.zid())
+        key = self._keyspace.ack("*", "*", "*", self._own_id)
         self._subscriber = session.declare_subscriber(key, tolerant(self._hear, "acks"))
+
+    def rejoin(self, session: Session, lease_s: float) -> None:
+        """Go on by another session; the one before may be closed. What we have of answers is said there, too."""
+        self.stalled.close()
+        self._lease_s = lease_s
+        self._join(session)
 
     def answers(self) -> Acknowledger:
         """How far one output stream is with the answers that come numbered; two may be given the same ones."""

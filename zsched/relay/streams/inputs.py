@@ -6,6 +6,7 @@ Everything happens under the stream's lock, the sample that just came included: 
 sends and the first sample behind it there is no gap. A kept value reaches a new owner at least once; it may have
 reached the old one too. With ``on_crash: replay`` the same holds for what an owner that died had not acknowledged,
 unless its answers prove it done (`zsched.relay.streams.proofs`); and what comes while there is no owner waits for one.
+While the data session is opened anew (`InputStream.hold` .. `resume`) what comes waits, and goes out behind the rest.
 An owner that is left may stop before it has done all that was on its way to it (an exclusive one does so at once): so
 with ``replay`` what comes behind a flip is held until its slot has ended, and goes out behind what it leaves.
 """
@@ -26,7 +27,7 @@ from zsched.core.values.plan import OnCrash, Route, StreamClass, StreamCount
 from zsched.relay.streams.acks import WorkerAcks
 from zsched.relay.streams.answer_times import AnswerTimes
 from zsched.relay.streams.counter import StreamCounter
-from zsched.relay.streams.outlet import MAX_OWED, Outlet, Unsent
+from zsched.relay.streams.outlet import MAX_OWED, QUEUE_DEPTH, Outlet, Unsent
 from zsched.relay.streams.pace import Pace
 from zsched.relay.streams.proofs import LeftOpen, Stamps, unproven
 from zsched.relay.streams.receive import Receiver
@@ -38,6 +39,8 @@ MAX_KEYS: Final = 4096
 
 HOLD_S: Final = 1.0
 """An owner that was left may take this long to end its slot; nobody waits for one that hangs."""
+MAX_PAUSED: Final = QUEUE_DEPTH
+"""Samples that wait while the data session is opened anew; a queue must take them behind what it has."""
 MAX_HELD: Final = MAX_OWED // 2
 """More samples than that are not held either: the next owner's queue has to take them."""
 
@@ -51,10 +54,23 @@ def _never(_stamp: Timestamp) -> bool:
 @dataclass(slots=True)
 class _InputSlot:
     outlet: Outlet
-    is_counted: bool
-    """Its worker acknowledges what it has processed."""
+    route: Route
+    epoch: int
+    acks: WorkerAcks | None
+    """Its worker acknowledges what it has processed; ``None``: it does not."""
+    said: Tally | None = None
+    """The last counts of the outlet, once that is closed and until the next one is there."""
     sent: int = 0
     """Number of the newest sample that went into this slot; kept values above it are still owed."""
+
+    @property
+    def is_counted(self) -> bool:
+        """Whether its worker acknowledges what it has processed."""
+        return self.acks is not None
+
+    def tally(self) -> Tally:
+        """The outlet's counts (under the stream's lock)."""
+        return self.outlet.counted() if self.said is None else self.said
 
 
 class InputStream:
@@ -93,6 +109,10 @@ class InputStream:
         self._held: list[Unsent] = []
         self._held_bytes = 0
         self._hold_until = 0.0
+        self._is_paused = False
+        self._paused: deque[Unsent] = deque()
+        """What has come since `hold`; of class ``latest`` the kept values say it."""
+        self._paused_bytes = 0
         self._is_patient = route.settings.stream_class is StreamClass.RELIABLE
         self._number = 0
         self._keep_last = route.settings.keep_last if is_latest else 0
@@ -101,7 +121,7 @@ class InputStream:
         self._is_counted = False
         """Some worker has acknowledged what it has processed, or will."""
         self._stamps: Stamps | None = None
-        side = local or session
+        side = self._clock = local or session  # the fleet's may be closed for a moment
         self._loop_ids = own_ids - {str(side.zid())}
         self._receiver = Receiver(
             side,
@@ -125,7 +145,7 @@ class InputStream:
         with self._lock:
             self._is_counted |= acks is not None
             self._stamps = stamps
-            self._slots[epoch] = _InputSlot(outlet=outlet, is_counted=acks is not None)
+            self._slots[epoch] = _InputSlot(outlet=outlet, route=route, epoch=epoch, acks=acks)
 
     def is_matching(self, epoch: int) -> bool:
         """True when somebody subscribes to the slot's keys."""
@@ -241,8 +261,81 @@ class InputStream:
     def close(self) -> None:
         """Unsubscribe and close every slot."""
         self._receiver.close()
+        with self._lock:
+            self._counter.dropped("closed", len(self._paused))
+            self._paused.clear()
         for epoch in tuple(self._slots):
             self.close_slot(epoch)
+
+    # --- another data session ----------------------------------------------------------------------------------------
+
+    def hold(self) -> None:
+        """Let what comes wait from now on, and what is under way arrive."""
+        with self._lock:
+            self._end_hold()
+            self._is_paused = True
+
+    def under_way(self) -> int:
+        """How many samples have been taken before `hold` and have not arrived, as far as we know."""
+        with self._lock:
+            tallies = [(slot.tally(), slot.is_counted) for slot in self._slots.values()]
+        return sum(said.waiting + (max(0, said.in_flight) if is_counted else 0) for said, is_counted in tallies)
+
+    def leave(self) -> int:
+        """Close every slot's publishers, behind `hold`; answers how many samples workers had not acknowledged.
+
+        With `OnCrash.REPLAY` those are sent again, by `resume`. The slots stay.
+        """
+        left = 0
+        with self._lock:
+            for slot in self._slots.values():
+                if self._replays and slot.is_counted:
+                    slot.said, owed = slot.outlet.abandon()
+                    self._owe(owed)
+                else:
+                    waiting = slot.outlet.take_back()
+                    if slot is self._active:
+                        self._paused.extendleft(reversed(waiting))
+                    else:
+                        self._counter.dropped("closed", len(waiting))
+                    slot.said = slot.outlet.undeclare()
+                    self._counter.dropped("closed", slot.said.waiting)
+                said = slot.said
+                gone = max(0, said.in_flight) if slot.is_counted else 0
+                said.at_most_lost += gone
+                said.unconfirmed += max(0, said.in_flight) - gone
+                said.in_flight = said.waiting = 0
+                left += gone
+        return left
+
+    def rejoin(self, session: Session, own_ids: frozenset[str]) -> None:
+        """Declare every slot's publishers on another session; nothing goes out before `resume`.
+
+        Raises:
+            ValueError, zenoh.ZError: as `open`.
+        """
+        with self._lock:
+            self._session = session
+            self._loop_ids = own_ids - {str(self._clock.zid())}
+            for slot in self._slots.values():
+                route = slot.route
+                outlet = Outlet(session, route.from_expr, route.to_expr, route.settings, slot.acks, epoch=slot.epoch)
+                if slot.said is not None:
+                    self._closed.add(slot.said)
+                slot.outlet, slot.said = outlet, None
+
+    def resume(self) -> None:
+        """Send what has waited, in order, and carry on."""
+        with self._lock:
+            if not self._is_paused:
+                return
+            self._is_paused = False
+            if self._active is not None:
+                self._catch_up(self._active)
+                self._replay(self._active, _never)
+            paused, self._paused, self._paused_bytes = self._paused, deque(), 0
+            for sample, stamp in paused:
+                self._route_on(sample, stamp, len(sample.payload))
 
     # --- a crash, with `OnCrash.REPLAY` (under the lock) --------------------------------------------------------------
 
@@ -327,16 +420,16 @@ class InputStream:
         with self._lock:
             total = Tally()
             total.add(self._closed)
-            total.waiting += len(self._owed) + len(self._held)
+            total.waiting += len(self._owed) + len(self._held) + len(self._paused)
             for slot in self._slots.values():
-                total.add(slot.outlet.counted())
+                total.add(slot.tally())
             return self._counter.value(total, has_acks=self._is_counted)
 
     # --- one sample --------------------------------------------------------------------------------------------------
 
     def _carry(self, sample: Sample) -> None:
         active, size = self._active, len(sample.payload)
-        if active is not None and self._is_patient:
+        if active is not None and self._is_patient and not self._is_paused:
             active.outlet.wait_for_room(size)
         with self._lock:
             self._counter.seen(size)
@@ -350,20 +443,31 @@ class InputStream:
             pace = self._pace
             if pace is not None and not pace.passes(str(sample.key_expr), (sample, stamp), monotonic_s()):
                 self._counter.dropped("thinned")
-            elif self._active is not None:
-                self._active.sent = self._number
-                self._send(sample, stamp, size)
-            elif self._next is not None:
-                self._held.append((sample, stamp))
-                self._held_bytes += size
-                if len(self._held) >= MAX_HELD or self._held_bytes >= MAX_BYTES // 2:
-                    self._end_hold()
-            elif self._replays:
-                self._owe([LeftOpen(sample, stamp)])
-            elif not self._keep_last:
-                self._counter.dropped("no_route")
-            else:
+            elif not self._is_paused:
+                self._route_on(sample, stamp, size)
+            elif self._keep_last:
                 self._counter.unsent += 1
+            elif len(self._paused) < MAX_PAUSED and self._paused_bytes + size <= MAX_BYTES // 2:
+                self._paused.append((sample, stamp))
+                self._paused_bytes += size
+            else:
+                self._counter.dropped("overflow")
+
+    def _route_on(self, sample: Sample, stamp: Timestamp | None, size: int) -> None:
+        if self._active is not None:
+            self._active.sent = self._number
+            self._send(sample, stamp, size)
+        elif self._next is not None:
+            self._held.append((sample, stamp))
+            self._held_bytes += size
+            if len(self._held) >= MAX_HELD or self._held_bytes >= MAX_BYTES // 2:
+                self._end_hold()
+        elif self._replays:
+            self._owe([LeftOpen(sample, stamp)])
+        elif not self._keep_last:
+            self._counter.dropped("no_route")
+        else:
+            self._counter.unsent += 1
 
     def _give_way(self, sample: Sample) -> None:
         """A sample that newer ones overtook before it was carried."""
@@ -384,11 +488,11 @@ class InputStream:
 
     def _stamp(self, sample: Sample) -> Timestamp | None:
         """With `OnCrash.REPLAY` every sample has a timestamp, by which its answers are known."""
-        return sample.timestamp or self._session.new_timestamp() if self._replays else None
+        return sample.timestamp or self._clock.new_timestamp() if self._replays else None
 
     def _keep(self, sample: Sample) -> Timestamp | None:
         """Keep a value, with a timestamp of ours where it has none: outputs made of it inherit that, for the gate."""
-        stamp = sample.timestamp or self._session.new_timestamp()
+        stamp = sample.timestamp or self._clock.new_timestamp()
         key = str(sample.key_expr)
         values = self._kept.get(key)
         if values is None:

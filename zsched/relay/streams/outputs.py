@@ -117,25 +117,56 @@ class OutputStream:
             if any(other.expr == slot.expr for other in self._slots.values() if other is not slot):
                 return  # the same owner once more, without {epoch}: what comes cannot belong to both
         feed = slot.feed = Feed(slot=slot)
-        self._listen_for_ends(epoch, route.from_expr)
-        listen_to = _with_epoch(route.from_expr, epoch, f"$*{epoch}")
+        self._subscribe(feed, epoch, has_history=has_epoch)
+
+    def _subscribe(self, feed: Feed, epoch: int, *, has_history: bool) -> None:
+        route_from, settings = feed.slot.expr, self.route.settings
+        self._listen_for_ends(epoch, route_from)
+        listen_to = _with_epoch(route_from, epoch, f"$*{epoch}")
         feed.receiver = Receiver(
             self._session,
             listen_to,
-            route.settings,
+            settings,
             lambda sample: self._carry(feed.slot, sample),
-            with_history=has_epoch,
+            with_history=has_history,
             give_way=self._give_way,
         )
-        if slot.answers is not None:
+        if feed.slot.answers is not None:
             feed.again = Receiver(
                 self._session,
                 f"{listen_to}/{AGAIN_CHUNK}/{self._session.zid()}",
-                replace(route.settings, stream_class=StreamClass.RELIABLE),
+                replace(settings, stream_class=StreamClass.RELIABLE),
                 lambda sample: self._carry_again(feed.slot, sample),
                 with_history=False,
                 give_way=self._give_way,
             )
+
+    def leave(self) -> None:
+        """Unsubscribe from every owner; slots, and how far they came, stay for `rejoin`."""
+        for slot in tuple(self._slots.values()):
+            if slot.feed is not None:
+                slot.feed.close()
+        for ends in self._ends.values():
+            undeclare(ends)
+        self._ends.clear()
+
+    def rejoin(self, session: Session, own_ids: frozenset[str]) -> None:
+        """Subscribe on another session; workers send what we have not had once they hear of us (`say_again`).
+
+        Raises:
+            zenoh.ZError: the session is closed.
+        """
+        with self._lock:
+            self._session, self._own_ids = session, own_ids
+            slots = tuple(self._slots.values())
+        for slot in slots:
+            if slot.feed is not None:
+                self._subscribe(slot.feed, slot.epoch, has_history=False)
+
+    def say_again(self) -> None:
+        """Tell every worker how far we are: by that it knows a session that is new."""
+        if self._acks is not None:
+            self._acks.say_again()
 
     def _listen_for_ends(self, epoch: int, from_expr: str) -> None:
         """One subscription for all epochs of an owner: they are few, and told apart by what is in them."""
