@@ -56,6 +56,8 @@ LEAVE_S: Final = 1.5
 """Before the data session is opened anew, what is under way arrives; when nothing has for so long, it is given up..."""
 LEAVE_MAX_S: Final = 8.0
 """...and in any case after so long."""
+ANEW_S: Final = 60.0
+"""A daemon whose process goes on begins anew in it: it is waited for so long, however slow the machine is."""
 END_S: Final = 3.0
 """So long the session has to close, and its port to be free."""
 RETRY_S: Final = 0.05
@@ -427,10 +429,10 @@ def run(
         return 1
     relay = RelayProcess(session, me.fleet, me.node, reporter, local.decode(), Introducer(config), lease_s(config))
     successors = None if door is None else Successors(socket.socket(fileno=door), me, reopens=has_local_side)
-    wakeups = _signals_wake()
+    wakeups, parent = _signals_wake(), os.getppid()
     try:
         while not relay.obey(commands, wakeups) and successors is not None:
-            successor = _bridge(relay, successors, orphan_s)
+            successor = _bridge(relay, successors, orphan_s, parent)
             if successor is None:
                 break
             reporter.attach(successor.link, commands=commands)
@@ -474,14 +476,23 @@ def _reopen(relay: RelayProcess, reporter: Reporter, commands: int) -> bool:
     return True
 
 
-def _bridge(relay: RelayProcess, successors: Successors, orphan_s: float) -> Successor | None:
+def _wait_for_process(successors: Successors, patience_s: float, daemon: int) -> Successor | None:
+    """Wait on for who becomes the next daemon in the process of the one before."""
+    until = awake_s() + patience_s
+    while os.getppid() == daemon and awake_s() < until:
+        if (successor := successors.wait(PULSE_S)) is not None:
+            return successor
+    return None
+
+
+def _bridge(relay: RelayProcess, successors: Successors, orphan_s: float, parent: int) -> Successor | None:
     """Carry on without a daemon until the next one comes; ``None`` when it does not."""
     if signal.getitimer(signal.ITIMER_REAL)[0] > 0:
         return None  # we have been told to stop
     _log.warning("the daemon is gone: carrying on for %g s", orphan_s)
     relay.go_on_alone()
     before = signal.signal(signal.SIGTERM, _end)
-    successor = successors.wait(orphan_s)
+    successor = successors.wait(orphan_s) or _wait_for_process(successors, max(0.0, ANEW_S - orphan_s), parent)
     signal.signal(signal.SIGTERM, before)
     _log.warning("%s", "no daemon came: ends" if successor is None else "another daemon has taken over")
     return successor

@@ -230,8 +230,8 @@ def test_a_daemon_that_stops_takes_its_relay_with_it(tmp_path: Path) -> None:
 
 
 def test_a_relay_with_a_daemon_lets_no_other_in(first: First, tmp_path: Path) -> None:
-    digest = digest_of("fleet", code_digest(), sys.executable, "6", CONFIG, "")
-    hello = RelayHello(fleet="test", node="robot1", incarnation=9, digest=digest)
+    digest = digest_of("fleet", code_digest(), sys.executable, "")
+    hello = RelayHello(fleet="test", node="robot1", incarnation=9, digest=digest, session=digest_of(CONFIG, ""))
     found = Door(tmp_path, "robot1").connect(hello)
     assert isinstance(found, str)
     assert "does not answer" in found
