@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
@@ -23,10 +24,15 @@ from cryptography.hazmat.primitives.asymmetric import ec
 
 from support.authorities import install, make_authority
 from support.waiting import free_endpoint, until
+from zsched.adapters.network.control_bus import ControlBus
+from zsched.adapters.network.expulsion import MAX_SHOWN
+from zsched.adapters.network.limits import limit_for
 from zsched.config.load import check_file
+from zsched.core import events as ev
 from zsched.core.values.certificates import Role
+from zsched.core.values.fleet import Fleet
 from zsched.pki.authority import Authority
-from zsched.runtime.access_rules import Side
+from zsched.runtime.access_rules import Side, common_names_of, names_of
 from zsched.runtime.tls import session_text
 from zsched.sessions import config as zenoh_config
 from zsched.wire.keyspace import Keyspace
@@ -51,6 +57,7 @@ KEYS = Keyspace("yard")
 REFUSED_S = 0.4
 """Who is let in is so within some milliseconds; zenoh tries again until this time is over."""
 ANSWER_S = 0.5
+TOKENS = 5000
 SHORT_S = 3
 """So long a certificate lives that shall end: long enough for a handshake on a busy machine."""
 
@@ -93,6 +100,18 @@ class Yard:
     authority: Authority
     control: Victim
     data: Victim
+
+    def fleet(self, node: str) -> Fleet:
+        """The fleet as a node has it: with its own certificate."""
+        (self.folder / "fleet.yaml").write_text(FLEET.replace("FOLDER", node))
+        fleet = check_file(self.folder / "fleet.yaml").fleet
+        assert fleet is not None
+        return fleet
+
+    def text(self, node: str, *, listen: tuple[str, ...] = (), connect: tuple[str, ...] = ()) -> str:
+        """The configuration of a node's control session."""
+        rules = session_text(self.fleet(node), Side.CONTROL)
+        return zenoh_config.control_config(listen=listen, connect=connect, operator_json5=rules)
 
     def tls(self, holder: str, **more: Any) -> dict[str, Any]:
         """TLS settings of who holds a certificate in a folder, and goes by no rules."""
@@ -237,6 +256,106 @@ def test_a_certificate_that_the_file_does_not_let_in_speaks_and_hears_nothing(
     assert {key.split("/")[3] if key.startswith("@") else key.split("/")[2] for key in victim.heard} == {"robot3"}
     assert victim.heard.count(KEYS.beat("robot3")) == 1, "the revoked key has sent one, too"
     assert len(victim.tokens) == 2, "the token of the member came and went"
+
+
+def test_who_is_certified_by_another_trusted_authority_under_a_public_name_says_and_hears_nothing(
+    fresh: Yard, tmp_path: Path
+) -> None:
+    """As any authority of the public web, which zenoh trusts when it dials; addresses are not checked."""
+    public = make_authority(tmp_path / "public", "example")
+    install(public, fresh.folder / "public", "robot2")
+    bundle = fresh.folder / "public" / "ca.pem"
+    bundle.write_bytes(bundle.read_bytes() + (fresh.folder / "robot1" / "ca.pem").read_bytes())
+    files = {"listen_certificate": "certificate.pem", "listen_private_key": "key.pem"}
+    tls = {name: str(fresh.folder / "public" / file) for name, file in files.items()}
+    listening = free_endpoint().replace("tcp/", "tls/")
+    config = json.loads(zenoh_config.control_config(listen=(listening,), connect=()))
+    config["transport"]["link"]["tls"] = fresh.tls("public", root_ca_certificate=str(bundle), **tls)
+    heard: list[str] = []
+    with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as impostor:
+        note_keys(impostor, heard)
+        dialler = json.loads(fresh.text("robot1", connect=(listening,)))
+        dialler["transport"]["link"]["tls"]["root_ca_certificate"] = str(bundle)
+        with zenoh.open(zenoh.Config.from_json5(json.dumps(dialler))) as session:
+            victim = Victim(session, listening)
+            victim.listen()
+            until(lambda: victim.links() == {"robot2.example.zsched.internal"}, "it is dialled")
+            impostor.put(KEYS.beat("robot2"), b"forged", congestion_control=zenoh.CongestionControl.BLOCK)
+            assert not list(impostor.get(KEYS.status("robot1", "robot2"), timeout=ANSWER_S))
+            session.put(KEYS.beat("robot1"), b"", allowed_destination=zenoh.Locality.REMOTE)
+        until(lambda: not impostor.info.links(), "the link to end")
+    assert (victim.heard, victim.asked, victim.tokens, heard) == ([], [], [], [])
+
+
+def test_who_is_dialled_because_a_member_named_its_address_says_and_hears_nothing(fresh: Yard) -> None:
+    """Gossip passes no rule: a member tells of a peer that is none, and the victim dials it."""
+    meeting = free_endpoint().replace("tcp/", "tls/")
+    heard: list[str] = []
+    with contextlib.ExitStack() as stack:
+
+        def peer(holder: str, listen: str, *connect: str) -> zenoh.Session:
+            config = json.loads(zenoh_config.control_config(listen=(listen,), connect=connect))
+            files = {"listen_certificate": "certificate.pem", "listen_private_key": "key.pem"}
+            own = {name: str(fresh.folder / holder / file) for name, file in files.items()}
+            config["transport"]["link"]["tls"] = fresh.tls(holder, **own)
+            return stack.enter_context(zenoh.open(zenoh.Config.from_json5(json.dumps(config))))
+
+        liar = peer("robot2", meeting)
+        foreign = peer("mallory", free_endpoint().replace("tcp/", "tls/"), meeting)
+        note_keys(foreign, heard)
+        until(liar.info.links, "the peer that is none is at the member")
+        text = fresh.text("robot1", connect=(meeting,))
+        victim = Victim(stack.enter_context(zenoh.open(zenoh.Config.from_json5(text))), meeting)
+        victim.listen()
+        strangers = {"mallory.yard.zsched.internal"}
+        until(lambda: strangers < victim.links(), "both are linked: the member, and whom it told of")
+        foreign.put(KEYS.beat("edge1"), b"forged", congestion_control=zenoh.CongestionControl.BLOCK)
+        assert not list(foreign.get(KEYS.status("robot1", "edge1"), timeout=ANSWER_S))
+        liar.put(KEYS.beat("robot2"), b"own")
+        until(lambda: victim.heard, "the member's own frame")
+        victim.session.put(KEYS.beat("robot1"), b"", allowed_destination=zenoh.Locality.REMOTE)
+    assert victim.heard == [KEYS.beat("robot2")]
+    assert KEYS.beat("robot1") not in heard
+
+
+def _dropped(bus: ControlBus, events: list[ev.Event]) -> set[str]:
+    """What has been dropped, ``kind/reason``."""
+    events.extend(bus.waiting())
+    return {f"{event.kind}/{event.reason}" for event in events if isinstance(event, ev.FrameDropped)}
+
+
+@pytest.mark.parametrize(("holder", "counted"), [("robot2", "alive/too_many"), ("mallory", "link/stranger")])
+def test_who_shows_thousands_of_tokens_loses_its_link(
+    fresh: Yard, holder: str, counted: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A member, and somebody with a certificate who is none; tokens that were seen are taken back with the link."""
+    endpoint = free_endpoint().replace("tcp/", "tls/")
+    fleet, events = fresh.fleet("robot1"), list[ev.Event]()
+    assert fleet.security is not None
+    bus = ControlBus(
+        fleet="yard",
+        node="robot1",
+        incarnation=1,
+        zenoh_config=fresh.text("robot1", listen=(endpoint,)),
+        post=events.append,
+        members=common_names_of(fleet, fleet.security),
+        limit=limit_for(fleet.timing, 1),
+        names=names_of(fleet),
+    )
+    bus.open()
+    try:
+        victim = Victim(fresh.control.session, endpoint.partition("#")[0])
+        with fresh.member(holder, victim) as session:
+            held = [session.liveliness().declare_token(KEYS.alive(holder, number)) for number in range(TOKENS)]
+            until(lambda: counted in _dropped(bus, events), f"{counted} to be counted")
+            assert len(held) == TOKENS
+            until(lambda: "is ended" in caplog.text, "the link is ended")
+        until(lambda: not bus.peers(), "the link to end")
+    finally:
+        bus.close()
+    here = Counter(event.node for event in events if isinstance(event, ev.TokenSeen))
+    here.subtract(event.node for event in events if isinstance(event, ev.TokenLost))
+    assert max(here.values(), default=0) <= MAX_SHOWN
 
 
 # --- members that speak for others -----------------------------------------------------------------------------------

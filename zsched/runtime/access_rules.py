@@ -24,7 +24,8 @@ from zsched.wire.keyspace import ROOT, Keyspace
 
 Json = dict[str, Any]
 
-SPEAK: Final = ("put", "delete", "reply", "declare_queryable", "liveliness_token")
+TOKEN: Final = "liveliness_token"
+SPEAK: Final = ("put", "delete", "reply", "declare_queryable", TOKEN)
 ASK: Final = ("query",)
 LISTEN: Final = ("declare_subscriber", "declare_liveliness_subscriber", "liveliness_query")
 GET: Final = ("put", "delete", "reply", "liveliness_token")
@@ -115,7 +116,8 @@ def _node_rules(fleet: Fleet, node: NodeSpec, side: Side) -> Iterator[Rule]:
     if side is Side.CONTROL:
         # The last: a node passes on the questions of those that hang on it (`zsched status --connect`).
         asked = [keys.all_questions("*").removesuffix("*") + node.name, keys.status("*", "*")]
-        yield "ingress", SPEAK, [own]
+        yield "ingress", tuple(one for one in SPEAK if one != TOKEN), [own]
+        yield "ingress", (TOKEN,), [keys.alive(node.name, "*")]
     else:
         speaks, asks = _stream_keys(fleet, node)
         asked = [*_with_suffixes(asks), keys.role("*", "*"), keys.snapshot("*", "*")]

@@ -20,6 +20,7 @@ from typing import Any
 import zenoh
 
 from zsched.adapters.network import seals as sealing
+from zsched.adapters.network.expulsion import Expulsion
 from zsched.adapters.network.limits import Buckets, Drops, Limit
 from zsched.adapters.network.open_questions import Questions
 from zsched.adapters.network.seals import Seals
@@ -145,7 +146,7 @@ class ControlBus:
     ) -> None:
         """``members``: the names of certificates that belong to the fleet, ``None`` where none are asked for.
 
-        A link of another name says nothing that zenoh would let in; it is counted and logged. ``is_voter``: peers
+        A link of another name says nothing that zenoh would let in; it is counted, logged, ended. ``is_voter``: peers
         gather utilities here. Periodic frames are posted at once, or wait for `waiting`. ``seals``: ``None`` where
         nothing is sealed. ``limit``: what each of ``names`` may send, and all others together; ``None``: no limit.
         """
@@ -155,7 +156,9 @@ class ControlBus:
         """{node: its newest incarnation}, by the tokens."""
         self._is_voter, self._hears_all_at_once = is_voter, hears_all_beats_at_once
         self._ring: zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]] | None = None
-        self._keys, self._members = Keyspace(fleet), members
+        self._keys, self._members, self._fleet = Keyspace(fleet), members, fleet
+        self._expulsion: Expulsion | None = None
+        """Where certificates are asked for: elsewhere anybody can speak in anybody's name."""
         self._node, self._incarnation = node, incarnation
         self._config = zenoh_config
         self._introducer = Introducer(zenoh_config)
@@ -182,6 +185,7 @@ class ControlBus:
         except zenoh.ZError as error:
             raise AdapterError(f"the control session {why_not_open(self._config, error)}") from error
         self._session, self._sockets = session, LinkSockets(session)
+        self._expulsion = None if self._members is None else Expulsion(session, self._fleet)
         keys, node = self._keys, self._node
         self._publishers = {
             "beat": self._publisher(session, keys.beat(node), zenoh.Priority.REAL_TIME),
@@ -347,10 +351,17 @@ class ControlBus:
             return
         log.warning("stranger certificate=%r address=%s: it may nothing here", name, event.link.dst)
         self._post(ev.FrameDropped(kind="link", reason="stranger"))
+        if self._expulsion is not None:
+            self._expulsion.expel(str(event.link.zid))
 
     def _on_token(self, sample: zenoh.Sample) -> None:
         key = parse(str(sample.key_expr))
         incarnation = counter(key.rest[0]) if key is not None and len(key.rest) == 1 else None
+        if key is not None and self._expulsion is not None:
+            is_fit = self._expulsion.shows(key.owner, is_present=sample.kind == zenoh.SampleKind.PUT)
+            if not is_fit:
+                self._drops.add("alive", "too_many")
+                return
         if not self._is_let_in("token", "alive", key.owner if key is not None else ""):
             return
         if key is None or key.kind != "alive" or incarnation is None:
