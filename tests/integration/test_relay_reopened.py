@@ -57,7 +57,7 @@ class Host(Rig):
         return data_config(listen=(self.endpoint(ROBOT),), connect=nobody, timing=self.timing, shared_memory=False)
 
     def application(self) -> zenoh.Session:
-        return zenoh.open(zenoh.Config.from_json5(client_config(connect=(self.side,), patience_s=20.0)))
+        return zenoh.open(zenoh.Config.from_json5(client_config(connect=(self.side,), connect_s=20.0)))
 
     def begin_anew(self, plan: Slot) -> None:
         """Another daemon, whose data session is configured otherwise, takes the relay over and plans as before."""

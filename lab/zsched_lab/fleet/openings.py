@@ -48,7 +48,7 @@ class Stream:
 
     def __init__(self, endpoint: str, robot: str, hz: float) -> None:
         """Join at ``endpoint``; `start` sends."""
-        self._session = zenoh.open(zenoh.Config.from_json5(client_config(connect=(endpoint,), patience_s=20.0)))
+        self._session = zenoh.open(zenoh.Config.from_json5(client_config(connect=(endpoint,), connect_s=20.0)))
         self.sent = 0
         self.answers: list[tuple[int, float]] = []
         self._session.declare_subscriber(f"{robot}/out", self._take)
