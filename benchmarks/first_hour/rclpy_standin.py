@@ -52,6 +52,7 @@ class _Publisher:
 
 class _Node:
     def __init__(self, name: str, namespace: str) -> None:
+        os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")  # the library looks for git, which a clean machine lacks
         self._sdk: Any = importlib.import_module("zenoh_ros2_sdk")
         self._name, self._namespace = name, namespace
         self._kept: list[Any] = []
