@@ -18,6 +18,7 @@ from threading import Event
 from typing import IO, Final
 
 from zsched.clock import monotonic_s
+from zsched.core.values.fleet import Standby
 from zsched.core.values.model import NodeId, TaskId
 from zsched.dev.nodes import Json, Nodes
 from zsched.dev.terminal import Keys
@@ -290,6 +291,8 @@ class Run:
             self._say(f"load: {count} busy processes on {owner}; l ends them")
         elif not self._nodes.is_up(owner):
             self._say(f"{owner} is on its way out already")
+        elif key == "m" and (why := self._why_no_other(owner)):
+            self._say(f"move: {self._task} stays on {owner}: {why}")
         elif key == "m":
             self._nodes.stop(owner)
             self._say(f"move: {owner} is told to stop, hands {self._task} over, and starts again")
@@ -297,6 +300,21 @@ class Run:
             self._start_at[owner] = monotonic_s() + AWAY_S
             self._nodes.kill(owner)
             self._say(f"kill: {owner} is dead, daemon, relay and worker; it starts again in {AWAY_S:g} s")
+
+    def _why_no_other(self, owner: NodeId) -> str:
+        """What keeps every other candidate from the task, if none has a worker that is ready."""
+        others = [node for node in self._specs[self._task].candidates if node != owner]
+        if not others:
+            return "it has no other candidate"
+        is_cold = self._specs[self._task].worker.standby is Standby.COLD
+        fit = ("ready", "stopped") if is_cold else ("ready",)
+        told = []
+        for node in others:
+            state = _worker_state(self._status, node, self._task) if self._status and self._nodes.is_up(node) else ""
+            if state in fit:
+                return ""
+            told.append(f"the worker on {node} is {state or 'away'}")
+        return ", ".join(told)
 
     def _owner(self, task: TaskId) -> NodeId | None:
         return self._owners.get(task, (None, 0))[0]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 from pathlib import Path
+from threading import Event
 
 import pytest
 import zenoh
@@ -16,7 +17,7 @@ from zsched.commands.dev import DevOptions, _commands, dev, json5
 from zsched.config.load import load_fleet
 from zsched.core.values.model import NodeId
 from zsched.dev.nodes import shares
-from zsched.dev.run import _of_a_worker, _parts
+from zsched.dev.run import Run, _of_a_worker, _parts
 from zsched.dev.watch import Watched
 
 EXAMPLE = Path(__file__).parents[3] / "zsched" / "examples" / "python" / "fleet.yaml"
@@ -123,3 +124,38 @@ def test_the_snippet_is_the_configuration_of_a_client() -> None:
 )
 def test_what_becomes_of_a_worker_is_told_in_words(text: str, said: str) -> None:
     assert _of_a_worker(NodeId("edge1"), text) == said
+
+
+class _Nodes:
+    """Nodes that only tell what is asked of them."""
+
+    def __init__(self) -> None:
+        self.fleet = load_fleet(EXAMPLE)
+        self.stopped: list[NodeId] = []
+
+    def is_up(self, _node: NodeId) -> bool:
+        return True
+
+    def loaded(self) -> tuple[NodeId, ...]:
+        return ()
+
+    def stop(self, node: NodeId) -> None:
+        self.stopped.append(node)
+
+
+@pytest.mark.parametrize(
+    ("state", "said", "stopped"),
+    [
+        ("ready", "move: edge1 is told to stop, hands shout over, and starts again", ["edge1"]),
+        ("starting", "move: shout stays on edge1: the worker on edge2 is starting", []),
+        ("stopped", "move: shout stays on edge1: the worker on edge2 is stopped", []),
+    ],
+)
+def test_a_task_is_moved_only_to_a_worker_that_is_ready(state: str, said: str, stopped: list[str]) -> None:
+    nodes, told = _Nodes(), list[str]()
+    run = Run(nodes, Watched({}, EXAMPLE.parent), say=told.append, show=lambda _: None, stop=Event())  # type: ignore[arg-type]
+    run._owners = {"shout": (NodeId("edge1"), 1)}
+    run._status = {"nodes": [{"name": "edge2", "workers": [{"task": "shout", "state": state}]}]}
+    run._obey("m")
+    assert told == [said]
+    assert nodes.stopped == stopped
