@@ -697,3 +697,12 @@ def test_command_line_has_no_side_effect_on_import() -> None:
     command = [sys.executable, "-c", "import zsched.cli"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
     assert (done.stdout, done.stderr) == ("", "")
+
+
+def test_the_list_of_verbs_cuts_no_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    text = CliRunner().invoke(app, ["--help"]).stdout
+    _, listed = text.split("Commands:\n")
+    assert "..." not in listed
+    assert max(map(len, text.splitlines())) <= 80
+    assert "Run this machine's daemon in the foreground (what systemd runs)." in listed

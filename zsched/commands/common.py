@@ -29,6 +29,8 @@ NAMED_OTHERWISE: Final = {
     **dict.fromkeys(("pin", "unpin", "pause", "resume"), "task"),
     **dict.fromkeys(("undrain", "eligible"), "drain"),
 }
+LONGEST_SENTENCE: Final = 1000
+"""Characters."""
 SCHEMAS: Final = Path(__file__).parents[1] / "schemas"
 """A JSON Schema per kind of output and major version."""
 
@@ -131,6 +133,14 @@ class Verbs(TyperGroup):
     def get_help_option(self, ctx: Any) -> Any:
         """As typer's."""
         return no_help_yet(super().get_help_option(ctx))
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Each verb with its whole first sentence, over several lines if need be: typer's own cuts it at the width."""
+        verbs = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
+        rows = [(name, verb.get_short_help_str(LONGEST_SENTENCE)) for name, verb in verbs if verb and not verb.hidden]
+        if rows:
+            with formatter.section("Commands"):
+                formatter.write_dl(rows)
 
     def invoke(self, ctx: Any) -> Any:
         """Run the verb."""
