@@ -74,7 +74,9 @@ def drain(
 
 
 def undrain(
-    nodes: Annotated[list[str], typer.Argument(metavar="NODE...", help="Nodes of the fleet.")],
+    nodes: Annotated[
+        list[str] | None, typer.Argument(metavar="[NODE]...", help="Nodes; without one: list the drained ones.")
+    ] = None,
     reason: ReasonOption = "",
     revision: RevisionOption = None,
     plan: PlanOption = False,
@@ -84,11 +86,14 @@ def undrain(
     runtime_dir: RuntimeOption = None,
     connect: ConnectOption = None,
 ) -> None:
-    """End the drain of nodes: they may get tasks again, when the fleet finds them better."""
+    """End the drain of nodes: they may get tasks again, when the fleet finds them better.
+
+    Without a node it lists those that are drained.
+    """
     from zsched.commands.flags import undrain as give  # noqa: PLC0415 - each verb imports what it needs
 
     view = _view(node, runtime_dir, connect, reason, revision, None, json_=json_, yes=yes, plan=plan)
-    raise typer.Exit(give(view, nodes))
+    raise typer.Exit(give(view, nodes or ()))
 
 
 def eligible(

@@ -115,6 +115,8 @@ def undrain(view: OrderView, nodes: Sequence[str]) -> int:
     Raises:
         CliError: as of `drain`.
     """
+    if not nodes:
+        return _list(view, _status(view.door), DRAIN)
     return _set(view, DRAIN, tuple(dict.fromkeys(nodes)), is_on=False)
 
 
@@ -315,6 +317,39 @@ def _commit(view: OrderView, held: InForce, flags: Sequence[Json], what: str) ->
     text = {"text": held.text, "flags": list(flags), "rollouts": list(held.rollouts), "reason": reason}
     answer = change(view.door, {**text, "base_revision": held.revision})
     return int(answer["revision"])
+
+
+def drain_quietly(view: OrderView, node: str) -> int:
+    """Have a node drained for ``view.for_s``, without a question; the revision that has it.
+
+    Raises:
+        CliError: nobody answers, no document is agreed, the node has an order already, or the drain is not agreed.
+    """
+    held = _held(view)
+    if any(flag["subject"] == node for flag in held.flags):
+        raise CliError(EXIT_FAILED, f"{node} has an order already; see `zsched maint`")
+    return _commit(view, held, _with(view, held, DRAIN, [node]), f"drain {node}")
+
+
+def lift_quietly(view: OrderView, since: int) -> tuple[str, ...]:
+    """End the drains with this view's author and reason, and nobody else's; their nodes.
+
+    Raises:
+        CliError: nobody answers, the node asked does not know revision ``since`` yet, or the end is not agreed.
+    """
+    held = in_force(view.door)
+    if held.revision < since:
+        raise CliError(EXIT_FAILED, f"{held.node} has not learnt revision {since} yet")
+    ours = tuple(str(flag["subject"]) for flag in held.flags if is_given_by(view.asked, flag))
+    if ours:
+        left = [flag for flag in held.flags if not is_given_by(view.asked, flag)]
+        _commit(view, held, left, f"undrain {', '.join(ours)}")
+    return ours
+
+
+def is_given_by(asked: Json, flag: Json) -> bool:
+    """Whether a flag is a drain by this operator for this reason."""
+    return flag["kind"] == DRAIN and (flag["by"], flag["reason"]) == (asked["by"], asked["reason"])
 
 
 # --- watching --------------------------------------------------------------------------------------------------------

@@ -9,25 +9,29 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import sys
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from zsched import paths as places
 from zsched.clock import monotonic_s, wall_s
 from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, nearest, print_json
+from zsched.commands.document import IN_FORCE_S, document_text, in_force
+from zsched.commands.flags import drain_quietly, is_given_by, lift_quietly
 from zsched.commands.orders import OrderView, Row, begin, user_name
 from zsched.commands.page import harmless
 from zsched.commands.rehearse_report import SCHEMA, as_json, table
 from zsched.commands.wait import Condition, missing
-from zsched.core.rehearsal.programme import MIN_CALM_S, Do, Look, Over, Programme, Result, Sight
+from zsched.core.rehearsal.programme import MIN_CALM_S, Do, Lift, Look, Over, Programme, Result, Sight
 from zsched.core.values.model import MAX_ASKED
 from zsched.core.values.rehearsal import FAULTS, MAX_CUT_S, Promised, Step
-from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE
+from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE
 
 LOOK_S: Final = 0.2
 """Between two looks at the fleet."""
@@ -37,14 +41,22 @@ CUT_MORE_S: Final = 2.0
 """A cut lasts so much longer than deciding may take, so that the task moves within it."""
 BACK_S: Final = 30.0
 """How long the way back may take."""
+DRAIN_MORE_S: Final = 60.0
+"""A drain that nobody ends is over so long after the step's limit: the fleet itself sees to that."""
+UNSURE_S: Final = IN_FORCE_S
+"""So long it is looked for a drain of which nobody has said whether it is agreed."""
+REFUSED: Final = (EXIT_FAILED, EXIT_USAGE, EXIT_DEGRADED)
+"""Exit codes that say: nothing was changed."""
 DEFAULT_PAUSE_S: Final = 12.0
 DEFAULT_LIMIT_S: Final = 60.0
 DOES: Final = {
     Step.MOVE: "is moved to another candidate",
+    Step.DRAIN: "its owner is drained: every task leaves it",
     Step.WORKER: "its owner's worker is killed",
     Step.DAEMON: "its owner's daemon is killed",
     Step.LINK: "its owner's links are cut",
 }
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -125,7 +137,7 @@ def rehearse(view: OrderView, order: RehearseOrder, runtime: Path) -> int:
         raise CliError(EXIT_FAILED, look.hold)
     planned = {step: stage.why_not(step, look.owner or "") for step in dict.fromkeys(order.steps)}
     rows: list[Row] = [
-        (order.task, step.value, DOES[step], f"left out: {planned[step]}" if planned[step] else "it recovers")
+        (order.task, step.value, DOES[step], f"left out: {planned[step]}" if planned[step] else _after(step))
         for step in planned
     ]
     doable = [step for step in planned if not planned[step]]
@@ -140,6 +152,10 @@ def rehearse(view: OrderView, order: RehearseOrder, runtime: Path) -> int:
     return _play(view, order, stage)
 
 
+def _after(step: Step) -> str:
+    return "it is undrained" if step is Step.DRAIN else "it recovers"
+
+
 def _why_unfit(look: Look) -> str:
     return "; ".join(look.lacks) or "`zsched explain` says why"
 
@@ -148,14 +164,18 @@ def _play(view: OrderView, order: RehearseOrder, stage: Stage) -> int:
     programme = Programme(order.steps, stage.promised, rounds=order.rounds, calm_s=order.pause_s, limit_s=order.limit_s)
     interrupted = ""
     over = Over(is_kept=False, why="interrupted")
-    try:
-        over = _run(programme, stage)
-    except KeyboardInterrupt:
-        interrupted = "interrupted"
-        sys.stderr.write("\ninterrupted: nothing more is done\n")
-    except CliError as error:
-        over = Over(is_kept=False, why=str(error))
-    way_back = stage.go_back()
+    still_drained = way_back = ""
+    with _ends_as_by_ctrl_c():
+        try:
+            over = _run(programme, stage)
+        except KeyboardInterrupt:
+            interrupted = "interrupted"
+            sys.stderr.write("\ninterrupted: nothing more is done\n")
+        except CliError as error:
+            over = Over(is_kept=False, why=str(error))
+        finally:
+            still_drained = stage.lift()
+        way_back = still_drained or stage.go_back()
     body = as_json(
         name=stage.name,
         at=stage.at,
@@ -184,6 +204,20 @@ def _play(view: OrderView, order: RehearseOrder, stage: Stage) -> int:
     return EXIT_FAILED if any(result.broken for result in programme.results) and not interrupted else EXIT_TIMED_OUT
 
 
+@contextmanager
+def _ends_as_by_ctrl_c() -> Iterator[None]:
+    """A terminal that closes and a `kill` end this as Ctrl-C does: nothing stays as a step has made it."""
+    before = {}
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            before[number] = signal.signal(number, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 def _run(programme: Programme, stage: Stage) -> Over:
     """Look and act until the programme is over."""
     told, known = "", 0
@@ -202,6 +236,10 @@ def _run(programme: Programme, stage: Stage) -> Over:
                 programme.leave_out(why)
             else:
                 programme.struck(at)
+            continue
+        if isinstance(action, Lift):
+            stage.lift_once()
+            time.sleep(LOOK_S)
             continue
         if action.why != told and not action.why.startswith("calm"):
             told = action.why
@@ -272,6 +310,14 @@ class Stage:
             ready=frozenset(_ready(self.first, order.task)),
             owner=str(task["owner"] or ""),
         )
+        if view.revision is not None and view.revision != task["revision"]:
+            now = f"{order.task} has revision {task['revision']}"
+            raise CliError(EXIT_FAILED, f"revision {view.revision} is overtaken: {now}")
+        self._drains = replace(
+            view, revision=None, reason=str(self.asked["reason"]), for_s=order.limit_s + DRAIN_MORE_S
+        )
+        self._has_drained = self._is_unsure = False
+        self._since = 0
 
     # --- looking -----------------------------------------------------------------------------------------------------
 
@@ -315,7 +361,14 @@ class Stage:
             lacks=tuple(lacks),
             fit=() if lacks else self._fit(task),
             sights=tuple(_sights(tasks)),
+            drained=tuple(sorted({name for status in statuses.values() for name in self._drained(status)})),
         )
+
+    def _drained(self, status: Json) -> list[str]:
+        """The nodes with a drain of this rehearsal, as one node knows them."""
+        asked = self._drains.asked
+        nodes = status["nodes"]
+        return [str(node["name"]) for node in nodes if any(is_given_by(asked, flag) for flag in node.get("flags", ()))]
 
     def _lacks(self, statuses: Mapping[str, Json], first: Json) -> list[str]:
         """What is missing at full strength, by what was there at the beginning."""
@@ -346,12 +399,16 @@ class Stage:
         return self._ask({"verb": "move", "task": self._order.task, "target": target, "plan": is_plan, **self.asked})
 
     def _ask(self, request: Json) -> Json:
-        """The answer of the first node that gives one: the door's own daemon may be down."""
+        """The answer of the first node that gives one."""
+        return self._through(lambda door: ask_door(door, request))
+
+    def _through(self, act: Callable[[Door], T]) -> T:
+        """What comes of it at the first node that answers: the door's own daemon may be down."""
         doors = [self._view.door, *(Door(socket=path) for path in self._sockets.values())]
         failure: CliError | None = None
         for door in doors:
             try:
-                return ask_door(door, request)
+                return act(door)
             except CliError as error:
                 failure = failure or error
         assert failure is not None
@@ -361,11 +418,22 @@ class Stage:
 
     def why_not(self, step: Step, owner: str) -> str:
         """Why a step cannot be done to this owner now; empty: it can."""
+        if step not in self.promised:
+            return f"the program of {self.first['node']} is older, and does not know this step"
+        if step is Step.DRAIN:
+            return self._why_no_drain(owner)
         if step not in FAULTS:
             return ""
         if step is not Step.WORKER and not self._has_other_eye(owner):
             return f"this rehearsal looks at the fleet through {owner}: give it another node by --connect"
         return self._strike(step, owner, is_plan=True)
+
+    def _why_no_drain(self, owner: str) -> str:
+        try:
+            document_text(in_force(self._view.door))
+        except CliError as error:
+            return str(error)
+        return self._strike(Step.DRAIN, owner, is_plan=True)
 
     def _has_other_eye(self, owner: str) -> bool:
         """Whether the fleet can still be seen without this node."""
@@ -391,13 +459,61 @@ class Stage:
                 return at, ""
             return at, str(result["detail"])
         try:
-            why = self.why_not(do.step, do.node) or self._strike(do.step, do.node, is_plan=False)
+            why = self.why_not(do.step, do.node)
+            if do.step is Step.DRAIN and not why:
+                self._drain(do.node)
+                return at, ""
+            why = why or self._strike(do.step, do.node, is_plan=False)
         except CliError as error:
             why = str(error)
         if why:
             return at, why
         self._base.moved = True
         return (at if do.step is Step.WORKER else monotonic_s() + ANSWER_S), ""
+
+    def _drain(self, node: str) -> None:
+        """Have the owner drained.
+
+        Raises:
+            CliError: it is not agreed, or nobody tells whether it is.
+        """
+        self._has_drained = self._is_unsure = self._base.moved = True
+        try:
+            self._since = drain_quietly(self._drains, node)
+        except CliError as error:
+            self._is_unsure = error.code not in REFUSED
+            raise
+        self._is_unsure = False
+
+    def lift_once(self) -> bool:
+        """End the drains of this rehearsal; whether there were any.
+
+        Raises:
+            CliError: nobody answers, or it is not agreed.
+        """
+        nodes = self._through(lambda door: lift_quietly(replace(self._drains, door=door), self._since))
+        for node in nodes:
+            _say(f"  {node} is undrained")
+        return bool(nodes)
+
+    def lift(self) -> str:
+        """See to it that no drain of this rehearsal is left, also when it is interrupted; what is left, or empty."""
+        began, why = monotonic_s(), "it takes too long"
+        while self._has_drained and monotonic_s() - began < BACK_S:
+            try:
+                is_lifted = self.lift_once()
+                if is_lifted or not self._is_unsure or monotonic_s() - began >= UNSURE_S:
+                    return ""
+                time.sleep(LOOK_S)
+            except CliError as error:
+                why = str(error)
+                time.sleep(LOOK_S)
+            except KeyboardInterrupt:
+                _say("the drain is ended first")
+        if not self._has_drained:
+            return ""
+        ends = f"it ends by itself within {self._drains.for_s or 0.0:.0f} s"
+        return f"a node may still be drained: {why}; `zsched maint` tells, and {ends}"
 
     def go_back(self) -> str:
         """Bring the task back to the node that had it, if it is elsewhere; what became of that."""
@@ -415,12 +531,13 @@ class Stage:
                 if not look.lacks:
                     result = self._move(owner)
                     why = "" if result["outcome"] in ("ok", "unchanged") else str(result["detail"])
+                time.sleep(LOOK_S)
             except CliError as error:
                 why = str(error)
+                time.sleep(LOOK_S)
             except KeyboardInterrupt:
                 why = "interrupted"
                 break
-            time.sleep(LOOK_S)
         return f"{self._order.task} is not back on {owner}: {why or 'it takes too long'}; `zsched move` brings it there"
 
     def keep(self, body: Json) -> str:

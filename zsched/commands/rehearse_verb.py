@@ -11,7 +11,15 @@ from typing import Annotated
 import typer
 
 from zsched.commands.common import CliError, Verb
-from zsched.commands.order_verbs import AskedOption, JsonOption, PlanOption, ReasonOption, RuntimeOption, YesOption
+from zsched.commands.order_verbs import (
+    AskedOption,
+    JsonOption,
+    PlanOption,
+    ReasonOption,
+    RevisionOption,
+    RuntimeOption,
+    YesOption,
+)
 from zsched.exits import EXIT_USAGE
 
 
@@ -23,8 +31,8 @@ def add_rehearse_verb(app: typer.Typer) -> None:
 def rehearse(
     task: Annotated[str | None, typer.Argument(metavar="[TASK]", help="A task of the fleet file.")] = None,
     steps: Annotated[
-        str, typer.Option(metavar="STEPS", help="What is done, in this order: move, worker, daemon, link.")
-    ] = "move,worker,daemon,link",
+        str, typer.Option(metavar="STEPS", help="What is done, in this order: move, drain, worker, daemon, link.")
+    ] = "move,drain,worker,daemon,link",
     rounds: Annotated[int, typer.Option(min=1, max=100, metavar="N", help="How often all of it.")] = 1,
     pause: Annotated[float, typer.Option(metavar="S", help="Seconds of calm before each step; at least 11.")] = 12.0,
     limit: Annotated[
@@ -36,6 +44,7 @@ def rehearse(
     kept: Annotated[bool, typer.Option("--list", help="List the rehearsals that the node has kept.")] = False,
     show: Annotated[str | None, typer.Option(metavar="ID", help="Show one of them.")] = None,
     reason: ReasonOption = "",
+    revision: RevisionOption = None,
     plan: PlanOption = False,
     yes: YesOption = False,
     json_: JsonOption = False,
@@ -62,7 +71,7 @@ def rehearse(
         raise typer.Exit(verb.show_kept(door, show, is_json=json_))
     if task is None:
         raise CliError(EXIT_USAGE, "name a task, or --list: `zsched rehearse TASK`")
-    view = OrderView(door=door, is_json=json_, is_yes=yes, is_plan=plan, reason=reason)
+    view = OrderView(door=door, is_json=json_, is_yes=yes, is_plan=plan, reason=reason, revision=revision)
     order = verb.RehearseOrder(
         task=task, steps=verb.parse_steps(steps), rounds=rounds, pause_s=pause, limit_s=limit, cut_s=cut
     )

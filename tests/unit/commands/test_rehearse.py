@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import copy
 import json
-from collections.abc import Iterator
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -13,13 +16,19 @@ from typer.testing import CliRunner, Result
 from support.schemas import faults
 from zsched.adapters.host.operator_socket import Json, OperatorSocket
 from zsched.cli import app
+from zsched.commands import rehearse
+from zsched.commands.ask import Door
 from zsched.commands.common import CliError
-from zsched.commands.rehearse import parse_steps
+from zsched.commands.orders import OrderView
+from zsched.commands.rehearse import RehearseOrder, Stage, parse_steps
+from zsched.core.rehearsal.programme import Do, Over, Programme
 from zsched.core.values.rehearsal import Step
+from zsched.exits import EXIT_TIMED_OUT
 
 STATUS = json.loads((Path(__file__).parent / "recorded_status" / "healthy.json").read_text())
 PROMISED = {
     "move": {"step": "move", "gap_s": 0.3, "decide_s": 1.0, "whole": ["echo/in/0"]},
+    "drain": {"step": "drain", "gap_s": 0.3, "decide_s": None, "whole": []},
     "worker": {"step": "worker", "gap_s": 3.0, "decide_s": None, "whole": []},
     "daemon": {"step": "daemon", "gap_s": 3.0, "decide_s": 2.0, "whole": []},
     "link": {"step": "link", "gap_s": 4.0, "decide_s": 3.0, "whole": []},
@@ -45,6 +54,9 @@ class Daemon:
         self.done: list[Json] = []
         self.refusal = ""
         self.kept: dict[str, str] = {}
+        self.document, self.revision = "", 4
+        self.flags: list[Json] = []
+        self.on_change: Callable[[], None] = lambda: None
         self.socket = OperatorSocket(folder / "robot1.sock", self.answer)
 
     def answer(self, request: Json) -> Json:
@@ -53,8 +65,18 @@ class Daemon:
         if request["verb"] == "rehearsals":
             body = self.kept.get(request.get("name", ""), "")
             return {"node": "robot1", "timing": "wifi", "promised": PROMISED, "names": list(self.kept), "body": body}
+        if request["verb"] == "fleet":
+            held = {"node": "robot1", "fleet": "lab", "revision": self.revision, "number": 1, "settled": True}
+            text = "fleet: lab" if self.document else ""
+            return {**held, "electors": [], "document": self.document, "text": text, "flags": self.flags}
         if not request.get("plan"):
             self.done.append(request)
+        if request["verb"] == "change":
+            if request["base_revision"] != self.revision:
+                return {"outcome": "conflict", "detail": "overtaken", "revision": self.revision}
+            self.on_change()
+            self.flags, self.revision = request["flags"], self.revision + 1
+            return {"outcome": "ok", "detail": "", "revision": self.revision}
         if request["verb"] == "move" and self.refusal:
             return {"outcome": "invalid", "detail": self.refusal, "revision": 7}
         return {"outcome": "ok", "detail": "it can be done", "revision": 7}
@@ -146,6 +168,83 @@ def test_a_plan_says_what_is_left_out_and_does_nothing(daemon: Daemon) -> None:
     assert (move["step"], move["left_out"]) == ("move", None)
     assert "give it another node by --connect" in killed["left_out"]
     assert daemon.done == []
+
+
+# --- the drain -------------------------------------------------------------------------------------------------------
+
+
+DRAIN = Do(round=1, step=Step.DRAIN, node="edge1", target="edge2")
+
+
+@pytest.fixture
+def stage(daemon: Daemon, tmp_path: Path) -> Stage:
+    """A rehearsal that may drain."""
+    daemon.document = "0123456789abcdef"
+    view = OrderView(door=Door(socket=tmp_path / "robot1.sock"), is_yes=True, reason="new fan")
+    return Stage(view, RehearseOrder(task="echo", steps=(Step.DRAIN,)), tmp_path)
+
+
+def seen(daemon: Daemon) -> None:
+    """The nodes' statuses show the document's flags."""
+    for one in daemon.status["nodes"]:
+        one["flags"] = [flag for flag in daemon.flags if flag["subject"] == one["name"]]
+
+
+def test_a_fleet_without_a_document_leaves_the_drain_out(daemon: Daemon) -> None:
+    result = run("echo", "--plan", "--json", "--steps", "drain,move")
+    drain, move = json.loads(result.stdout)["plan"]
+    assert "has no document yet; agree one" in drain["left_out"]
+    assert (move["left_out"], result.exit_code) == (None, 10)
+    assert daemon.done == []
+
+
+def test_a_drain_is_ours_ends_by_itself_and_is_lifted_without_touching_others(daemon: Daemon, stage: Stage) -> None:
+    theirs = {"kind": "ineligible", "subject": "edge2", "by": "eve@robot2", "reason": "", "for_s": None, "revision": 2}
+    daemon.flags = [theirs]
+    _, why = stage.act(DRAIN)
+    assert why == ""
+    ours = next(flag for flag in daemon.flags if flag != theirs)
+    assert (ours["kind"], ours["subject"], ours["for_s"]) == ("drain", "edge1", 120.0)
+    assert ours["reason"].startswith("rehearsal ")
+    seen(daemon)
+    assert stage.look().drained == ("edge1",), "that of somebody else is not ours"
+    assert stage.lift() == ""
+    assert daemon.flags == [theirs]
+    assert stage.lift() == "", "once more changes nothing"
+    assert [one["verb"] for one in daemon.done] == ["change", "change"]
+
+
+def test_an_owner_with_an_order_is_not_drained(daemon: Daemon, stage: Stage) -> None:
+    daemon.flags = [{"kind": "drain", "subject": "edge1", "by": "eve", "reason": "", "for_s": None, "revision": 2}]
+    assert stage.act(DRAIN)[1] == "edge1 has an order already; see `zsched maint`"
+    assert stage.lift() == ""
+    assert len(daemon.flags) == 1
+    assert daemon.done == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_an_interrupted_drain_is_lifted(
+    daemon: Daemon, stage: Stage, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
+    """The signal comes while the drain is being agreed, and its answer never arrives here."""
+
+    def play(_programme: Programme, at: Stage) -> Over:
+        at.act(DRAIN)
+        raise AssertionError("the signal came too late")
+
+    def interrupt() -> None:
+        daemon.on_change = lambda: None
+        signal.pthread_kill(threading.main_thread().ident or 0, number)
+        time.sleep(0.5)  # it is agreed later than the first look for it
+
+    daemon.on_change = interrupt
+    monkeypatch.setattr(rehearse, "_run", play)
+    before = signal.getsignal(number)
+    order = RehearseOrder(task="echo", steps=(Step.DRAIN,))
+    assert rehearse._play(stage._view, order, stage) == EXIT_TIMED_OUT
+    assert [one["verb"] for one in daemon.done][:2] == ["change", "change"], "drained, and undrained"
+    assert daemon.flags == []
+    assert signal.getsignal(number) is before
 
 
 # --- kept ones -------------------------------------------------------------------------------------------------------

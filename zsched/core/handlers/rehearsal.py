@@ -24,6 +24,8 @@ from zsched.core.values.model import Allocation, PeerState, TaskId, WorkerState,
 from zsched.core.values.quorum import majority
 from zsched.core.values.rehearsal import RehearsalsTold, Step, Strike
 
+_ENDS: Final = (Step.DAEMON, Step.LINK)
+"""What ends the node itself, for a while or until somebody starts it again."""
 _DONE: Final = {
     Step.WORKER: "the worker of {task} here is killed",
     Step.DAEMON: "this daemon is killed",
@@ -42,13 +44,14 @@ def _on_strike(node: Stages, event: ev.StrikeCommanded, todo: ToDo, now: float) 
         text = f"{told_by(strike.asked)} rehearses: {_DONE[strike.step].format(task=strike.task, cut_s=strike.cut_s)}"
         epoch = node.registers[strike.task].value.epoch
         todo.add(do.RecordStory(stage="executor", text=text, task=strike.task, epoch=epoch))
-    if strike.step is not Step.WORKER:
+    if strike.step in _ENDS:
         todo.add(do.StrikeDaemon(request=event.request, strike=strike, fleet=node.fleet))
         return
     if not strike.is_plan:
         node.killed_at[strike.task] = now
         todo.add(do.RestartWorker(task=strike.task, reason=f"killed by {strike.asked.by}, who rehearses"))
-    _answer(event.request, CommandOutcome.OK, "its worker can be killed" if strike.is_plan else "it is killed", todo)
+    can = "it can be drained" if strike.step is Step.DRAIN else "its worker can be killed"
+    _answer(event.request, CommandOutcome.OK, can if strike.is_plan else "it is killed", todo)
 
 
 def _refusal(node: Stages, event: ev.StrikeCommanded, now: float) -> str:
@@ -59,7 +62,7 @@ def _refusal(node: Stages, event: ev.StrikeCommanded, now: float) -> str:
     if node.registers[strike.task].value.owner != node.me:
         return f"{node.me} does not own {strike.task}"
     is_operator = event.is_near or node.fleet.security is not None
-    if strike.step is not Step.WORKER and not is_operator:
+    if strike.step in _ENDS and not is_operator:
         return (
             f"this fleet is not secured, so only an operator at {node.me} itself may end its daemon or its links: "
             "run it there, with --connect to another node"
@@ -69,17 +72,27 @@ def _refusal(node: Stages, event: ev.StrikeCommanded, now: float) -> str:
         return f"{', '.join(sorted(others))} is suspect: one fault at a time"
     if node.is_draining:
         return f"{node.me} drains"
-    if strike.step is not Step.WORKER:
-        return _no_end(node, now)
+    if strike.step is Step.DRAIN:
+        return _flagged(node) or _no_leave(node, now)
+    if strike.step in _ENDS:
+        return _no_leave(node, now) or _no_end(node)
     return _alone(node, strike.task, now) or _no_kill(node, strike, now)
 
 
-def _no_end(node: Stages, now: float) -> str:
-    """Why this node must not go: each of its tasks needs another place, and the electors their majority."""
-    for task in node.owned():
-        why = _alone(node, task, now)
-        if why:
-            return why
+def _no_leave(node: Stages, now: float) -> str:
+    """Why its tasks must not leave this node: each of them needs another place."""
+    return next((why for task in node.owned() if (why := _alone(node, task, now))), "")
+
+
+def _flagged(node: Stages) -> str:
+    """The order that an operator has given about this node already."""
+    if node.me not in node.flags.closed:
+        return ""
+    return f"{node.me} {'is ' if node.me in node.flags.drained else ''}{node.flags.closed[node.me]}"
+
+
+def _no_end(node: Stages) -> str:
+    """Why this node must not go: the electors need their majority."""
     electors = node.fleet.electors
     alive = [name for name in electors if name != node.me and node.membership.state(name) is PeerState.ALIVE]
     if node.me in electors and len(alive) < majority(len(electors)):

@@ -7,6 +7,7 @@ in         when                                              then
 =========  ================================================  =====================================================
 calm       the task was whole for ``calm_s`` without a       `Strike` (the next step), or a step that a guard rail
            change of owner                                   was refused is left out
+calm       the node that a step drained is drained yet       `Lift` (that drain), again until it is lifted
 calm       the task is paused or bound, no other node is     stopped
            fit, or it is not calm within ``limit_s``
 struck     the task is whole again and every stream that     judged: the next step, or the end
@@ -16,7 +17,7 @@ struck     a promise is broken, or it is not whole within    broken: the end
 =========  ================================================  =====================================================
 
 So there is never a second fault while one is under way, and never one without a second fit candidate. A step that was
-refused is left out and told.
+refused is left out and told. Whoever runs the programme lifts its drain also when it ends within that step.
 """
 
 from __future__ import annotations
@@ -33,6 +34,8 @@ COUNTED_S: Final = 2.2
 """So long after the end of a step its counters have come: relays count once a second."""
 MIN_CALM_S: Final = 11.0
 """A shorter calm would take the gap of one step for the usual one of the next (`zsched.core.route.gaps`)."""
+PLANNED: Final = (Step.MOVE, Step.DRAIN)
+"""Steps that take nothing from the task: it is whole all the time."""
 TELLS_S: Final = 0.05
 """What a look at a daemon may add to a measured time."""
 
@@ -71,6 +74,8 @@ class Look:
     """What the task still lacks at full strength."""
     fit: tuple[NodeId, ...] = ()
     """The other nodes that could have the task at once."""
+    drained: tuple[NodeId, ...] = ()
+    """The nodes that this rehearsal has drained."""
     sights: tuple[Sight, ...] = ()
 
 
@@ -127,6 +132,13 @@ class Do:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Lift:
+    """End the drains of this rehearsal now."""
+
+    nodes: tuple[NodeId, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Wait:
     """Look again soon."""
 
@@ -142,7 +154,7 @@ class Over:
     why: str
 
 
-Action = Do | Wait | Over
+Action = Do | Lift | Wait | Over
 
 
 @dataclass(slots=True)
@@ -227,6 +239,12 @@ class Programme:
         """Wait for calm, then name the next step."""
         now = look.now
         self._waits_since = now if self._waits_since is None else self._waits_since
+        if look.drained:
+            self._calm_since = None
+            if now - self._waits_since >= self._limit_s:
+                why = f"{', '.join(look.drained)} is still drained after {self._limit_s:g} s"
+                return self._end(is_kept=False, why=why)
+            return Lift(nodes=look.drained)
         if not self._left:
             return self._end(is_kept=True, why="every step is done")
         if look.hold:
@@ -270,7 +288,7 @@ class Programme:
                 struck.decide_s = max(0.0, after_s - look.since_s)
             struck.hand_over_s = look.switched_s
         struck.was_hurt |= bool(look.lacks)
-        is_hurt = struck.was_hurt or struck.do.step is Step.MOVE
+        is_hurt = struck.was_hurt or struck.do.step in PLANNED
         if look.lacks or not is_hurt or (struck.do.step is not Step.WORKER and look.epoch == struck.before.epoch):
             struck.whole_at = struck.whole = None
         elif struck.whole_at is None:

@@ -32,11 +32,13 @@ def promises(fleet: Fleet, task: TaskSpec) -> tuple[Promised, ...]:
     decide_s = timing.gather_s + 2 * timing.gather_s + VOTE_S + commit_s + (timing.lease_s if task.exclusive else 0.0)
     gone_s = max(timing.confirm_s, 1.5 * timing.beat_s)
     hand_over_s = FLIP_S if task.worker.standby is Standby.WARM else FLIP_S + task.worker.start_deadline_s
+    # how soon a drain is in force, and whether other tasks leave first, is measured and not promised
     planned, crashed = tuple(_whole(task, is_planned=True)), tuple(_whole(task, is_planned=False))
     in_place_s = task.worker.start_deadline_s + decide_s + hand_over_s
     dead_s, silent_s = gone_s + decide_s, _silent_s(timing) + gone_s + decide_s
     return (
         Promised(step=Step.MOVE, gap_s=hand_over_s, decide_s=commit_s, whole=planned),
+        Promised(step=Step.DRAIN, gap_s=hand_over_s, whole=planned),
         Promised(step=Step.WORKER, gap_s=in_place_s, whole=crashed),
         Promised(step=Step.DAEMON, gap_s=dead_s + hand_over_s, decide_s=dead_s, whole=crashed),
         Promised(step=Step.LINK, gap_s=silent_s + hand_over_s, decide_s=silent_s, whole=crashed),

@@ -22,6 +22,7 @@ class Step(StrEnum):
     """One thing that a rehearsal does to the task's owner."""
 
     MOVE = "move"  # the task is handed over by order
+    DRAIN = "drain"  # the owner is drained until the step is over
     WORKER = "worker"  # the owner's worker is killed
     DAEMON = "daemon"  # the owner's daemon is killed; something must start it again
     LINK = "link"  # the owner's links carry nothing for a while
@@ -54,12 +55,12 @@ class Strike:
     cut_s: float = 0.0
     """How long the links are cut."""
     is_plan: bool = False
-    """Only say whether it could be done."""
+    """Only say whether it could be done; a drain itself is agreed by the fleet's document."""
 
     def __post_init__(self) -> None:
         check_name("strike.task", self.task)
         check_range("strike.cut_s", self.cut_s, 0.0, MAX_CUT_S)
-        if self.step not in FAULTS:
+        if self.step not in FAULTS and not (self.step is Step.DRAIN and self.is_plan):
             raise ValueError(f"strike.step: {self.step} is not done by a node to itself")
 
 

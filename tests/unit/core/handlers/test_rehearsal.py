@@ -16,7 +16,7 @@ from support.states import state_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.node import Node
-from zsched.core.values.document import Text
+from zsched.core.values.document import Flag, FlagKind, Text
 from zsched.core.values.fleet import Fleet, Security, TaskSpec, WorkerSpec, electorate_hash
 from zsched.core.values.messages import CommandOutcome, CommandResult
 from zsched.core.values.model import (
@@ -91,7 +91,7 @@ class Owner:
         return [*[one for one in batch if isinstance(one, kinds)], *told]
 
     def refusal(self, step: Step, *, is_near: bool = True) -> str:
-        (answer,) = self.strike(step, is_near=is_near)
+        (answer,) = self.strike(step, is_near=is_near, is_plan=step is Step.DRAIN)
         assert isinstance(answer, do.AnswerCommand)
         assert answer.result.outcome is CommandOutcome.INVALID
         return answer.result.detail
@@ -169,6 +169,25 @@ def test_one_fault_at_a_time() -> None:
         owner.now += 0.2
         owner.tell(ev.DeadlineReached())
     assert owner.refusal(Step.DAEMON) == "edge1, edge2, robot2 is suspect: one fault at a time"
+
+
+def test_a_drain_is_only_checked_here_and_agreed_by_the_document() -> None:
+    (answer,) = Owner().strike(Step.DRAIN, is_plan=True)
+    assert isinstance(answer, do.AnswerCommand)
+    assert answer.result == CommandResult(outcome=CommandOutcome.OK, detail="it can be drained")
+    assert Owner().strike(Step.DRAIN, is_near=False, is_plan=True), "it ends no node, so it may come over the network"
+    with pytest.raises(ValueError, match="drain is not done by a node to itself"):
+        Strike(task="merge", step=Step.DRAIN, asked=ADA)
+
+
+def test_a_node_that_has_an_order_is_not_drained_once_more() -> None:
+    for kind, said in (
+        (FlagKind.DRAIN, "robot1 is drained by eve@robot2"),
+        (FlagKind.INELIGIBLE, "robot1 takes nothing new, by eve@robot2"),
+    ):
+        owner = Owner()
+        owner.node.flags.take((Flag(kind=kind, subject="robot1", by="eve@robot2"),), owner.now)
+        assert owner.refusal(Step.DRAIN) == said
 
 
 def test_a_node_that_is_not_the_owner_or_goes_already_refuses() -> None:

@@ -8,13 +8,14 @@ from typing import Any
 
 import pytest
 
-from zsched.core.rehearsal.programme import MIN_CALM_S, Action, Do, Look, Over, Programme, Sight, Wait
+from zsched.core.rehearsal.programme import MIN_CALM_S, Action, Do, Lift, Look, Over, Programme, Sight, Wait
 from zsched.core.route.gaps import GAP_WINDOW_S
 from zsched.core.values.rehearsal import Promised, Step
 
 STEP_S = 0.25
 PROMISED = {
     Step.MOVE: Promised(step=Step.MOVE, gap_s=0.3, decide_s=0.7, whole=("echo/in/0",)),
+    Step.DRAIN: Promised(step=Step.DRAIN, gap_s=0.3),
     Step.WORKER: Promised(step=Step.WORKER, gap_s=20.0),
     Step.DAEMON: Promised(step=Step.DAEMON, gap_s=1.8, decide_s=1.5),
 }
@@ -33,6 +34,8 @@ class Fleet:
     flows: bool = True
     after: Callable[[Look], Look] = field(default=lambda look: look)
     done: list[Do] = field(default_factory=list)
+    lifts: bool = True
+    lifted: list[float] = field(default_factory=list)
     whole_since: float = 0.0
     _heals_at: float | None = None
 
@@ -43,7 +46,12 @@ class Fleet:
             action = self.programme.advance(self.after(self.look))
             if isinstance(action, Over):
                 return action
+            if isinstance(action, Lift):
+                assert action.nodes == self.look.drained
+                self.lifted.append(self.look.now)
+                self.look = replace(self.look, drained=() if self.lifts else self.look.drained)
             if isinstance(action, Do):
+                assert not self.look.drained, "never a step while another one's drain is in force"
                 assert not self.look.lacks, "never a second fault"
                 assert self.look.now - self.whole_since >= MIN_CALM_S
                 self.done.append(action)
@@ -54,6 +62,8 @@ class Fleet:
 
     def _strike(self, do: Do) -> None:
         self._heals_at = self.look.now + self.heals_s
+        if do.step is Step.DRAIN:
+            self.look = replace(self.look, drained=(do.node,))
         self.look = replace(self.look, lacks=("its owner is gone",))
         if self.moves and do.step is not Step.WORKER:
             self.look = replace(self.look, owner=do.target, epoch=self.look.epoch + 1, since_s=0.0, fit=())
@@ -99,6 +109,23 @@ def test_every_step_of_every_round_is_done_in_its_order_and_measured() -> None:
     (gap,) = move.gaps
     assert (gap.robot, gap.usual_s, gap.gap_s) == ("robot1", 0.05, 0.2)
     assert gap.more_s == pytest.approx(0.15)
+
+
+def test_a_drain_is_judged_as_a_move_and_lifted_before_the_next_step() -> None:
+    played = fleet(Step.DRAIN, Step.MOVE)
+    over = played.play()
+    assert over == Over(is_kept=True, why="every step is done")
+    drain, move = played.programme.results
+    assert (drain.node, drain.taker, move.node) == ("edge1", "edge2", "edge2")
+    assert len(played.lifted) == 1
+    assert [one.step for one in played.done] == [Step.DRAIN, Step.MOVE]
+
+
+def test_a_drain_that_nobody_can_lift_ends_the_rehearsal() -> None:
+    played = fleet(Step.DRAIN, Step.MOVE, lifts=False)
+    assert played.play() == Over(is_kept=False, why="edge1 is still drained after 30 s")
+    assert [one.step for one in played.done] == [Step.DRAIN]
+    assert len(played.lifted) > 10, "it is tried again and again"
 
 
 def test_nothing_is_done_without_another_fit_candidate() -> None:

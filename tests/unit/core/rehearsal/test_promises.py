@@ -49,6 +49,7 @@ def test_the_limits_are_those_of_the_timing_page() -> None:
     assert found[Step.LINK].gap_s == pytest.approx(1.84 + 1.4), "silence first, noticed up to a beat late"
     assert found[Step.MOVE].gap_s == 0.3
     assert found[Step.MOVE].decide_s == pytest.approx(0.69)
+    assert (found[Step.DRAIN].gap_s, found[Step.DRAIN].decide_s) == (0.3, None)
     assert found[Step.WORKER].gap_s > 20.0, "it starts in place"
     assert found[Step.WORKER].decide_s is None
     wired = of(replace(FLEET, timing=PROFILES["wired"]))
@@ -64,7 +65,7 @@ def test_an_exclusive_task_waits_for_its_lease_and_a_cold_one_for_its_worker() -
 
 def test_what_loses_nothing_is_named_by_its_stream() -> None:
     found = of()
-    assert found[Step.MOVE].whole == ("merge/in/0", "merge/in/1", "merge/out/0")
+    assert found[Step.MOVE].whole == found[Step.DRAIN].whole == ("merge/in/0", "merge/in/1", "merge/out/0")
     assert found[Step.DAEMON].whole == ("merge/in/1",), "what was not acknowledged is replayed"
     foreign = of(task=replace(TASK, worker=replace(TASK.worker, ready_when=ReadyWhen.MATCHING)))
     assert all(one.whole == () for one in foreign.values()), "nobody numbers what a foreign worker takes"
