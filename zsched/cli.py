@@ -535,19 +535,22 @@ def history(
     about: Annotated[
         str | None, typer.Option("--for", metavar="node/NAME", help="Only moves to this node or away from it.")
     ] = None,
+    since: Annotated[str | None, typer.Option("--since", metavar="AGE", help="Not older: 90s, 10m, 2h, 1d.")] = None,
     json_: JsonOption = False,
     node: HereOption = None,
     runtime_dir: RuntimeOption = None,
 ) -> None:
     """Show every change of owner in the decision log: when, from where to where, why, and who voted for it."""
     from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.history import duration_s, subject_of  # noqa: PLC0415 - as above
     from zsched.commands.history import history as show_moves  # noqa: PLC0415 - as above
-    from zsched.commands.history import subject_of  # noqa: PLC0415 - as above
 
     of_task, of_node = (None, None) if about is None else subject_of(about)
+    since_s = None if since is None else duration_s(since)
     if task is not None and of_task not in (None, task):
         raise CliError(EXIT_USAGE, f"{task} and --for {about} are two tasks; name one")
-    raise typer.Exit(show_moves(find_door(runtime_dir, node), task or of_task, about=of_node, is_json=json_))
+    door = find_door(runtime_dir, node)
+    raise typer.Exit(show_moves(door, task or of_task, about=of_node, since_s=since_s, is_json=json_))
 
 
 @app.command(cls=Verb)
@@ -557,13 +560,16 @@ def events(
     about: Annotated[
         str | None, typer.Option("--for", metavar="task/NAME", help="Or node/NAME: only what is about it.")
     ] = None,
+    types: Annotated[
+        str | None, typer.Option("--types", metavar="A,B", help="Only moves, or stages: move, vote, executor, ...")
+    ] = None,
     json_: Annotated[bool, typer.Option("--json", help="One JSON object per line.")] = False,
     node: HereOption = None,
     runtime_dir: RuntimeOption = None,
 ) -> None:
     """Show what the decision log tells: judgements that changed, votes, moves, steps of handovers, workers, peers."""
     from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
-    from zsched.commands.history import EventsView, duration_s, subject_of  # noqa: PLC0415 - as above
+    from zsched.commands.history import EventsView, duration_s, subject_of, types_of  # noqa: PLC0415 - as above
     from zsched.commands.history import events as show_events  # noqa: PLC0415 - as above
 
     of_task, of_node = (None, None) if about is None else subject_of(about)
@@ -571,6 +577,7 @@ def events(
         task=of_task,
         node=of_node,
         since_s=None if since is None else duration_s(since),
+        types=() if types is None else types_of(types),
         is_following=follow,
         is_json=json_,
     )
@@ -588,67 +595,10 @@ def replay(
     raise typer.Exit(make_again(file, is_json=json_))
 
 
-@app.command(cls=Verb)
-def weights(
-    task: Annotated[str, typer.Argument(metavar="TASK", help="A task of the fleet file.")],
-    pairs: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="[NAME=NUMBER]", help="New weights: cpu, memory, network, gauges; left out is 0, the sum is 1."
-        ),
-    ] = None,
-    revision: Annotated[
-        int | None, typer.Option("--revision", min=0, metavar="N", help="Only if this is still the task's revision.")
-    ] = None,
-    json_: JsonOption = False,
-    node: AskedOption = None,
-    runtime_dir: RuntimeOption = None,
-    connect: ConnectOption = None,
-) -> None:
-    """Show a task's weights, or change them on the whole running fleet.
-
-    A change is agreed like an allocation: it holds for every robot, or for none (exit 4 without a quorum).
-    """
-    from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
-    from zsched.commands.weights import change_weights, parse_weights, show_weights  # noqa: PLC0415 - as above
-
-    if not pairs:
-        if revision is not None:
-            raise CliError(EXIT_USAGE, "--revision goes with new weights, e.g. cpu=0.6 memory=0.4")
-        show_weights(find_door(runtime_dir, node, connect=connect), task, is_json=json_)
-        return
-    if connect is not None and not connect.startswith(("tls/", "quic/")):
-        raise CliError(EXIT_USAGE, "--connect only asks without a certificate: write tls/NODE, or run this on a node")
-    wanted = parse_weights(pairs)
-    raise typer.Exit(
-        change_weights(find_door(runtime_dir, node, connect=connect), task, wanted, revision, is_json=json_)
-    )
-
-
 add_order_verbs(app)
 add_flag_verbs(app)
 add_member_verbs(app)
 add_rehearse_verb(app)
-
-
-@app.command(cls=Verb)
-def retry(
-    task: Annotated[str, typer.Argument(metavar="TASK", help="A task of the fleet file.")],
-    whose: Annotated[
-        str | None, typer.Argument(metavar="[NODE]", help="Whose failures are forgotten; without it everybody's.")
-    ] = None,
-    json_: JsonOption = False,
-    node: AskedOption = None,
-    runtime_dir: RuntimeOption = None,
-) -> None:
-    """Forget a task's failures: a failed worker is started again, and nodes pay no penalty any more.
-
-    Exits with 5 when some nodes could not be asked: they remember.
-    """
-    from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
-    from zsched.commands.retry import retry as ask_all  # noqa: PLC0415 - as above
-
-    raise typer.Exit(ask_all(find_door(runtime_dir, node), task, whose, is_json=json_))
 
 
 @app.command(cls=Verb)
@@ -777,6 +727,9 @@ def logs(
     whose: Annotated[str | None, typer.Argument(metavar="[NODE]", help="Whose worker; without it the owner's.")] = None,
     follow: Annotated[bool, typer.Option("--follow", "-f", help="Also what it prints from now on.")] = False,
     lines: Annotated[int, typer.Option("--lines", min=0, max=400, metavar="N", help="The newest N.")] = 100,
+    level: Annotated[
+        str | None, typer.Option("--level", metavar="LEVEL", help="At least: debug, info, warning, error, critical.")
+    ] = None,
     json_: JsonOption = False,
     node: AskedOption = None,
     runtime_dir: RuntimeOption = None,
@@ -788,27 +741,16 @@ def logs(
     """
     from zsched.commands.logs import LogsView, show_logs  # noqa: PLC0415 - each verb imports what it needs
 
-    view = LogsView(runtime_dir=runtime_dir, node=node, connect=connect, is_json=json_, is_followed=follow, most=lines)
+    view = LogsView(
+        runtime_dir=runtime_dir,
+        node=node,
+        connect=connect,
+        is_json=json_,
+        is_followed=follow,
+        most=lines,
+        level=level,
+    )
     raise typer.Exit(show_logs(view, task, whose))
-
-
-@app.command(cls=Verb)
-def restart(
-    task: Annotated[str, typer.Argument(metavar="TASK", help="A task of the fleet file.")],
-    whose: Annotated[str | None, typer.Argument(metavar="[NODE]", help="Whose worker; without it the owner's.")] = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask, also of the owner.")] = False,
-    json_: JsonOption = False,
-    node: AskedOption = None,
-    runtime_dir: RuntimeOption = None,
-) -> None:
-    """Stop a task's worker and start it again; that counts as no failure.
-
-    The task pauses if it is the owner's, so that is asked first; without a terminal it needs --yes.
-    """
-    from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
-    from zsched.commands.restart import restart as ask_node  # noqa: PLC0415 - as above
-
-    raise typer.Exit(ask_node(find_door(runtime_dir, node), task, whose, is_sure=yes, is_json=json_))
 
 
 # --- the fleet file --------------------------------------------------------------------------------------------------
@@ -887,6 +829,7 @@ def apply(
         reason=reason,
         is_json=json_,
         pause_after=pause_after,
+        at=(node, runtime_dir, connect),
     )
     door = find_door(runtime_dir, node, connect=connect)
     text = read_text(file)
@@ -897,6 +840,7 @@ def apply(
 def edit(
     plan: PlanOption = False,
     yes: YesOption = False,
+    revision: RevisionOption = None,
     accept: AcceptOption = None,
     pause_after: PauseAfterOption = None,
     reason: ReasonOption = "",
@@ -916,10 +860,11 @@ def edit(
         ("edit",),
         plan=plan,
         yes=yes,
-        revision=None,
+        revision=revision,
         accept=accept,
         reason=reason,
         is_json=False,
+        at=(node, runtime_dir, connect),
         pause_after=pause_after,
     )
     raise typer.Exit(open_document(find_door(runtime_dir, node, connect=connect), view))

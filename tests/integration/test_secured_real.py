@@ -82,7 +82,7 @@ def test_an_operator_commands_from_elsewhere_and_a_guest_only_looks(bed: Testbed
     assert bed.status("robot1")["security"] == "secured"
     before = bed.task("robot1")["tuning"]
 
-    change = ["weights", TASK, "cpu=0.25", "memory=0.75", "--connect", endpoint]
+    change = ["weights", TASK, "cpu=0.25", "memory=0.75", "--yes", "--connect", endpoint]
     refused = zsched(bed, "screen", *change)
     assert "did not answer" in refused.stderr, refused.stderr
     assert bed.task("robot1")["tuning"] == before
@@ -128,7 +128,7 @@ def test_who_has_a_member_s_link_and_not_its_key_says_nothing_where_it_counts(be
 
         def repeats() -> bool:
             for node, cpu in (("robot1", 0.5), ("robot2", 0.25)):  # each of them asks the electors, and tells
-                assert zsched(bed, node, "weights", TASK, f"cpu={cpu}", f"memory={1 - cpu}").returncode == 0
+                assert zsched(bed, node, "weights", TASK, f"cpu={cpu}", f"memory={1 - cpu}", "--yes").returncode == 0
             for sample in tuple(said):
                 frame, seal = sample.payload.to_bytes(), sample.attachment
                 assert seal is not None, "members sign what they have learnt"

@@ -40,7 +40,18 @@ def worker(bed: Testbed, node: str) -> dict[str, Any]:
 
 def retry(bed: Testbed, *arguments: str) -> tuple[int, dict[str, Any]]:
     folder = str(bed.folder)
-    command = [sys.executable, "-m", "zsched.cli", "retry", TASK, *arguments, "--json", "--runtime-dir", folder]
+    command = [
+        sys.executable,
+        "-m",
+        "zsched.cli",
+        "retry",
+        TASK,
+        *arguments,
+        "--yes",
+        "--json",
+        "--runtime-dir",
+        folder,
+    ]
     done = subprocess.run(
         command, capture_output=True, text=True, timeout=60, check=False, env={"ZSCHED_NODE": "robot1"}
     )

@@ -31,7 +31,7 @@ from zsched.commands.ask import ask_door, endpoint_of, find_door
 from zsched.commands.common import CliError, nearest
 from zsched.commands.report import render_status
 from zsched.commands.status import _fitted
-from zsched.commands.weights import parse_weights
+from zsched.commands.weight_words import parse_weights
 
 RECORDED = Path(__file__).parent / "commands" / "recorded_status"
 CLI = (sys.executable, "-m", "zsched.cli")
@@ -212,13 +212,10 @@ def test_every_verb_that_asks_a_daemon_takes_the_node_that_several_daemons_make_
         "invite": ["edge9", "--plan"],
         "logs": ["echo"],
         "restart": ["echo", "--yes"],
+        "weights": ["echo", "cpu=1", "--yes"],
         "explain": ["echo"],
         "move": ["echo", "edge1", "--plan"],
-        "undrain": ["edge1", "--plan"],
-        "unpin": ["echo", "--plan"],
-        "resume": ["--all", "--plan"],
-        "weights": ["echo"],
-        "retry": ["echo"],
+        "retry": ["echo", "--yes"],
         "bw": ["in/0"],
         "hz": ["in/0"],
         "tail": ["in/0"],
@@ -400,14 +397,15 @@ def test_screen_that_is_high_enough_shows_all(monkeypatch: pytest.MonkeyPatch) -
 def test_retry_asks_every_node_that_is_there_and_names_the_others(daemon: Daemon) -> None:
     daemon.status["nodes"][-1]["state"] = "gone"
     names = [node["name"] for node in daemon.status["nodes"]]
-    result = run("retry", "echo", "edge1")
+    result = run("retry", "echo", "edge1", "--yes", "-m", "new lens")
     assert result.exit_code == 5
     asked = sorted((request for request in daemon.asked if request["verb"] == "retry"), key=lambda one: one["node"])
-    assert asked == [{"verb": "retry", "task": "echo", "whose": "edge1", "node": name} for name in names[:-1]]
+    wish = {"verb": "retry", "task": "echo", "whose": "edge1", "by": asked[0]["by"], "reason": "new lens"}
+    assert asked == [{**wish, "node": name} for name in names[:-1]]
     assert result.stdout.splitlines()[-1] == f"echo on {names[-1]}: not asked, it is gone"
-    assert faults(json.loads(run("retry", "echo", "edge1", "--json").stdout)) == []
+    assert faults(json.loads(run("retry", "echo", "edge1", "--yes", "--json").stdout)) == []
     daemon.status["nodes"][-1]["state"] = "alive"
-    assert run("retry", "echo").exit_code == 0
+    assert run("retry", "echo", "--yes").exit_code == 0
 
 
 @pytest.mark.parametrize(
@@ -477,26 +475,57 @@ def test_logs_followed_prints_what_comes_and_starts_anew_with_another_daemon(fol
     assert (process.returncode, error) == (0, "")
 
 
-def test_restart_of_another_s_worker_is_not_asked_about(daemon: Daemon) -> None:
+def test_logs_of_a_level_keep_a_traceback_whole(daemon: Daemon) -> None:
+    texts = (
+        "it starts",
+        "2026-11-24 INFO ready",
+        "2026-11-24 ERROR no map",
+        "Traceback (most recent call last):",
+        '  File "worker.py", line 3',
+        "[WARN] [camera]: late",
+        "DEBUG done",
+        '{"level": "info", "msg": "error 7 is over"}',
+        "{'severity': 'fatal'}",
+    )
+    daemon.lines = [{"number": number, "age_s": 1.0, "text": text} for number, text in enumerate(texts, 1)]
+
+    def shown(*words: str) -> list[int]:
+        lines = run("logs", "echo", "--json", *words).stdout.splitlines()
+        return [json.loads(line)["number"] for line in lines]
+
+    assert shown() == shown("--level", "debug") == list(range(1, 10))
+    assert shown("--level", "warning") == [1, 3, 4, 5, 6, 9], "a line before the first level is shown"
+    assert shown("--level", "error") == [1, 3, 4, 5, 9]
+    assert shown("--level", "error", "--lines", "2") == [5, 9]
+    refused = run("logs", "echo", "--level", "warn")
+    assert (refused.exit_code, "did you mean warning" in refused.stderr) == (2, True)
+
+
+def test_restart_shows_what_becomes_of_the_worker_and_says_who_wants_it(daemon: Daemon) -> None:
     daemon.result = {"outcome": "ok", "detail": "its worker is started again, it was ready", "revision": None}
-    result = run("restart", "echo", "edge2")
+    result = run("restart", "echo", "edge2", "--yes", "-m", "new code")
     assert (result.exit_code, result.stderr) == (0, "")
-    assert result.stdout == "echo on edge2: its worker is started again, it was ready\n"
-    assert daemon.asked[-1] == {"verb": "restart", "task": "echo", "node": "edge2"}
+    heads, row, told = result.stdout.splitlines()
+    assert heads.split() == ["TASK", "WHAT", "NOW", "AFTER"]
+    assert re.split(r"  +", row) == ["echo", "worker on edge2", "ready", "started again"]
+    assert told == "echo on edge2: its worker is started again, it was ready"
+    asked = daemon.asked[-1]
+    assert (asked["verb"], asked["task"], asked["node"], asked["reason"]) == ("restart", "echo", "edge2", "new code")
+    assert asked["by"].endswith("@robot1")
 
 
-def test_restart_of_the_owner_s_worker_needs_a_yes(daemon: Daemon) -> None:
+def test_restart_of_the_owner_s_worker_says_that_the_task_pauses(daemon: Daemon) -> None:
     refused = run("restart", "echo")
     assert (refused.exit_code, [asked["verb"] for asked in daemon.asked]) == (2, ["status"])
-    assert "edge1 owns echo, which pauses meanwhile; if that may be: zsched restart echo edge1 --yes" in refused.stderr
+    assert "started again; the task pauses until it is ready" in refused.stdout
     assert run("restart", "echo", "--yes").exit_code == 0
-    assert daemon.asked[-1] == {"verb": "restart", "task": "echo", "node": "edge1"}
+    assert daemon.asked[-1]["node"] == "edge1"
 
 
 def test_restart_that_is_refused_exits_with_1(daemon: Daemon) -> None:
     daemon.result = {"outcome": "invalid", "detail": "its worker does not run", "revision": None}
-    text, as_json = run("restart", "echo", "edge2"), run("restart", "echo", "edge2", "--json")
-    assert (text.exit_code, text.stdout, as_json.exit_code) == (1, "", 1)
+    text, as_json = run("restart", "echo", "edge2", "--yes"), run("restart", "echo", "edge2", "--yes", "--json")
+    assert (text.exit_code, as_json.exit_code) == (1, 1)
     assert "echo on edge2: its worker does not run" in text.stderr
     assert faults(json.loads(as_json.stdout)) == []
 
@@ -507,7 +536,7 @@ def test_restart_that_is_refused_exits_with_1(daemon: Daemon) -> None:
 def test_retry_waits_for_silent_nodes_all_at_once(daemon: Daemon) -> None:
     daemon.delay_s = 1.0
     began = time.monotonic()
-    assert run("retry", "echo").exit_code == 0
+    assert run("retry", "echo", "--yes").exit_code == 0
     assert len([request for request in daemon.asked if request["verb"] == "retry"]) == 5
     within(time.monotonic() - began, 5.0, "instead of one second for the status, one for the five nodes")
 
@@ -532,11 +561,33 @@ def test_weights_of_an_unknown_task_is_a_usage_error(daemon: Daemon) -> None:
 
 
 def test_new_weights_are_sent_and_the_revision_is_shown(daemon: Daemon) -> None:
-    result = run("weights", "echo", "cpu=0.6", "memory=0.4", "--revision", "1")
+    result = run("weights", "echo", "cpu=0.6", "memory=0.4", "--revision", "1", "--yes", "-m", "calm")
     assert (result.exit_code, result.stderr) == (0, "")
-    assert result.stdout == "echo: cpu=0.6 memory=0.4 network=0 (revision 2)\n"
+    heads, *rows, told = result.stdout.splitlines()
+    assert heads.split() == ["TASK", "WHAT", "NOW", "AFTER"]
+    assert [row.split()[1:] for row in rows] == [
+        ["cpu", "0.3", "0.6"],
+        ["memory", "0.3", "0.4"],
+        ["network", "0.4", "0"],
+    ]
+    assert told == "echo: cpu=0.6 memory=0.4 network=0 (revision 2)"
+    asked = daemon.asked[-1]
     expected = {"verb": "weights", "task": "echo", "cpu": 0.6, "memory": 0.4, "network": 0.0, "base_revision": 1}
-    assert daemon.asked == [expected]
+    assert {key: asked[key] for key in expected} == expected
+    assert (asked["reason"], asked["by"].endswith("@robot1")) == ("calm", True)
+
+
+def test_the_weights_in_force_change_nothing(daemon: Daemon) -> None:
+    same = ("cpu=0.3", "memory=0.3", "network=0.4")
+    assert run("weights", "echo", *same).stdout == "Nothing would change.\n"
+    assert {asked["verb"] for asked in daemon.asked} == {"status"}
+
+
+@pytest.mark.usefixtures("daemon")
+def test_all_weights_are_listed_when_no_task_is_given() -> None:
+    assert run("weights").stdout == "echo: cpu=0.3 memory=0.3 network=0.4 (revision 1)\n"
+    (line,) = run("weights", "--json").stdout.splitlines()
+    assert faults(json.loads(line)) == []
 
 
 @pytest.mark.parametrize(
@@ -545,12 +596,12 @@ def test_new_weights_are_sent_and_the_revision_is_shown(daemon: Daemon) -> None:
 )
 def test_outcome_of_a_change_is_the_exit_code(daemon: Daemon, outcome: str, code: int) -> None:
     daemon.result = {"outcome": outcome, "detail": "because", "revision": None}
-    text, as_json = run("weights", "echo", "cpu=1"), run("weights", "echo", "cpu=1", "--json")
+    text, as_json = run("weights", "echo", "cpu=1", "--yes"), run("weights", "echo", "cpu=1", "--yes", "--json")
     assert (text.exit_code, as_json.exit_code) == (code, code)
     body = json.loads(as_json.stdout)
     assert (body["schema"], body["outcome"], body["detail"]) == ("zsched.weights/1", outcome, "because")
     assert faults(body) == []
-    assert bool(text.stdout) is (code == 0)
+    assert ("echo: cpu=1" in text.stdout) is (code == 0)
     assert ("because" in text.stderr) is (code != 0)
 
 
@@ -618,10 +669,8 @@ def test_what_is_no_endpoint_is_a_usage_error(folder: Path, text: str) -> None:
     assert "is no endpoint; write tcp/robot1:7457" in result.stderr
 
 
-def test_connect_only_asks(daemon: Daemon) -> None:
-    result = run("weights", "echo", "cpu=1", "--connect", "robot1")
-    assert (result.exit_code, daemon.asked) == (2, [])
-    assert "--connect only asks" in result.stderr
+@pytest.mark.usefixtures("folder")
+def test_connect_takes_the_name_of_a_node() -> None:
     assert run("status", "--connect", "robot1", "--node", "*").exit_code == 2
 
 

@@ -68,6 +68,8 @@ class ApplyView:
     """Stdout is for something else: messages go to stderr."""
     pause_after: int | None = None
     """The number of candidates of each task that run a changed worker while the others wait; ``None``: none waits."""
+    where: tuple[str, ...] = ()
+    """The words that say which daemon is asked."""
 
     @property
     def out(self) -> TextIO:
@@ -80,7 +82,7 @@ class ApplyView:
         kept += ["-m", self.reason] if self.reason else []
         kept += ["--revision", str(self.revision)] if self.revision is not None else []
         kept += ["--pause-after", str(self.pause_after)] if self.pause_after is not None else []
-        return shlex.join(("zsched", *self.words, *kept, *more))
+        return shlex.join(("zsched", *self.words, *kept, *self.where, *more))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -19,7 +19,7 @@ from zsched.commands.common import CliError, Json, nearest, print_json
 from zsched.commands.history import age_s_of, wall_text
 from zsched.commands.page import Cell, Page, memory, span
 from zsched.commands.report import printable
-from zsched.commands.weights import shares
+from zsched.commands.weight_words import shares
 from zsched.core.report import plain
 from zsched.core.scheduler.explain import explained, judged_again, seen_by, without
 from zsched.core.values.decision import Decision, Explanation

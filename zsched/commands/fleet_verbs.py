@@ -67,10 +67,11 @@ def view_of(
     accept: list[str] | None,
     reason: str,
     is_json: bool,
+    at: tuple[str | None, Path | None, str | None],
     is_data: bool = False,
     pause_after: int | None = None,
 ) -> ApplyView:
-    """The options of every verb that changes the document."""
+    """The options of every verb that changes the document; ``at`` are --node, --runtime-dir and --connect."""
     from zsched.commands.apply import ApplyView  # noqa: PLC0415 - each verb imports what it needs
 
     return ApplyView(
@@ -83,6 +84,12 @@ def view_of(
         reason=reason,
         is_data=is_data,
         pause_after=pause_after,
+        where=tuple(
+            word
+            for option, value in zip(("--node", "--runtime-dir", "--connect"), at, strict=True)
+            if value is not None
+            for word in (option, str(value))
+        ),
     )
 
 
@@ -149,7 +156,16 @@ def task_remove(
     from zsched.commands.entries import drop_task  # noqa: PLC0415 - as above
 
     words = ("task", "remove", task)
-    view = view_of(words, plan=plan, yes=yes, revision=revision, accept=accept, reason=reason, is_json=json_)
+    view = view_of(
+        words,
+        plan=plan,
+        yes=yes,
+        revision=revision,
+        accept=accept,
+        reason=reason,
+        is_json=json_,
+        at=(node, runtime_dir, connect),
+    )
     raise typer.Exit(drop_task(find_door(runtime_dir, node, connect=connect), view, task))
 
 
@@ -175,7 +191,16 @@ def task_promote(
     from zsched.commands.promote import promote  # noqa: PLC0415 - as above
 
     words = ("task", "promote", *(tasks or ()))
-    view = view_of(words, plan=plan, yes=yes, revision=revision, accept=None, reason=reason, is_json=json_)
+    view = view_of(
+        words,
+        plan=plan,
+        yes=yes,
+        revision=revision,
+        accept=None,
+        reason=reason,
+        is_json=json_,
+        at=(node, runtime_dir, connect),
+    )
     raise typer.Exit(promote(find_door(runtime_dir, node, connect=connect), view, tasks or []))
 
 
@@ -251,7 +276,16 @@ def _add(
     from zsched.commands.entries import add  # noqa: PLC0415 - as above
 
     words = (what, "add", str(file))
-    view = view_of(words, plan=plan, yes=yes, revision=revision, accept=accept, reason=reason, is_json=json_)
+    view = view_of(
+        words,
+        plan=plan,
+        yes=yes,
+        revision=revision,
+        accept=accept,
+        reason=reason,
+        is_json=json_,
+        at=(node, runtime_dir, connect),
+    )
     raise typer.Exit(add(find_door(runtime_dir, node, connect=connect), view, section, file))
 
 
@@ -272,5 +306,14 @@ def _drop(
     from zsched.commands.entries import drop_node  # noqa: PLC0415 - as above
 
     words = ("node", "forget" if is_lost else "remove", name)
-    view = view_of(words, plan=plan, yes=yes, revision=revision, accept=accept, reason=reason, is_json=json_)
+    view = view_of(
+        words,
+        plan=plan,
+        yes=yes,
+        revision=revision,
+        accept=accept,
+        reason=reason,
+        is_json=json_,
+        at=(node, runtime_dir, connect),
+    )
     raise typer.Exit(drop_node(find_door(runtime_dir, node, connect=connect), view, name, is_lost=is_lost))

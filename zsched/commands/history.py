@@ -10,18 +10,23 @@ from __future__ import annotations
 import re
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from typing import Final
 
 from zsched.commands.ask import Door, ask_door
-from zsched.commands.common import CliError, Json, print_json
+from zsched.commands.common import CliError, Json, nearest, print_json
 from zsched.commands.page import harmless, span
 from zsched.commands.report import millis, printable
 from zsched.exits import EXIT_OK, EXIT_UNREACHABLE, EXIT_USAGE
 
 SCHEMA = "zsched.history/1"
 FOLLOW_S = 0.5
+MOVE: Final = "move"
+STAGES: Final = ("scheduler", "vote", "executor", "route", "membership", "log")
+"""As a line names what has told it (`zsched.core.instructions.RecordStory`)."""
+TYPES: Final = (MOVE, *STAGES)
 _DURATION = re.compile(r"([0-9]{1,12}(?:\.[0-9]{1,9})?)(s|m|h|d)")
 _UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 
@@ -36,6 +41,8 @@ class EventsView:
     is_json: bool
     node: str | None = None
     """Only lines that name this node."""
+    types: tuple[str, ...] = ()
+    """Only these types; empty: all."""
 
 
 def duration_s(text: str) -> float:
@@ -71,12 +78,31 @@ def subject_of(word: str) -> tuple[str | None, str | None]:
     return (name, None) if kind == "task" else (None, name)
 
 
-def history(door: Door, task: str | None, *, is_json: bool, about: str | None = None) -> int:
+def types_of(text: str) -> tuple[str, ...]:
+    """The types of events that a list of words names.
+
+    >>> types_of("move,vote")
+    ('move', 'vote')
+
+    Raises:
+        CliError: a word is no type.
+    """
+    words = tuple(word.strip() for word in text.split(",") if word.strip())
+    for word in words:
+        if word not in TYPES:
+            raise CliError(EXIT_USAGE, f"--types: no event is of type {word!r}{nearest(word, TYPES)}")
+    return words
+
+
+def history(
+    door: Door, task: str | None, *, is_json: bool, about: str | None = None, since_s: float | None = None
+) -> int:
     """Print the moves that the log knows, the newest last; returns the exit code.
 
-    ``about``: only moves to this node or away from it.
+    ``about``: only moves to this node or away from it. ``since_s``: none that are older.
     """
     node, now, entries, _ = read_log(door, is_moves=True)
+    entries = [entry for entry in entries if since_s is None or entry["at"] >= now - since_s]
     moves = [move for move in moves_of(entries, now, task) if about in (None, move["from"], move["to"])]
     rehearsals = list(rehearsals_of(entries, now, task)) if about is None else []
     rollouts = list(rollouts_of(entries, now, task)) if about is None else []
@@ -85,6 +111,7 @@ def history(door: Door, task: str | None, *, is_json: bool, about: str | None = 
         return EXIT_OK
     if not moves and not rehearsals and not rollouts:
         whose = (f" of {task}" if task else "") + (f" to {about} or away from it" if about else "")
+        whose += "" if since_s is None else f" of the last {span(since_s)}"
         sys.stdout.write(f"no move{whose} in the log of {node}\n")
     lines = [(move["age_s"], _move_line(printable(move))) for move in moves]
     lines += [(one["age_s"], _told_line(printable(one))) for one in (*rehearsals, *rollouts)]
@@ -206,6 +233,8 @@ def _print(entries: list[Json], view: EventsView) -> None:
     for entry in entries:
         if view.task not in (None, entry.get("task", "")) or not (view.node is None or names(entry, view.node)):
             continue
+        if view.types and not _is_of(entry, view.types):
+            continue
         if view.is_json:
             print_json({**entry, "at": wall_text(entry["at"])}, is_line=True)
             continue
@@ -213,6 +242,10 @@ def _print(entries: list[Json], view: EventsView) -> None:
         where = f"task={shown['task']} epoch={shown.get('epoch', 0)} " if shown.get("task") else ""
         sys.stdout.write(f"{wall_text(entry['at'])} {shown['stage']:<10} {where}{shown['text']}\n")
     sys.stdout.flush()
+
+
+def _is_of(entry: Json, types: Container[str]) -> bool:
+    return entry["stage"] in types or (MOVE in types and entry.get("move") is not None)
 
 
 def names(entry: Json, node: str) -> bool:

@@ -5,8 +5,10 @@ Knows: which node is meant, how lines are followed. Does not know: how they are 
 
 from __future__ import annotations
 
+import re
 import sys
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -19,6 +21,47 @@ from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE
 
 SCHEMA: Final = "zsched.logs/1"
 PAUSE_S: Final = 0.5
+LEVELS: Final = ("debug", "info", "warning", "error", "critical")
+_SAME: Final = {"warn": "warning", "fatal": "critical"}
+_LOOKED_AT: Final = 200
+"""Characters of a line in which a level is looked for; behind them is what the line is about."""
+_WORD: Final = re.compile(r"\b(DEBUG|INFO|WARN|WARNING|ERROR|CRITICAL|FATAL)\b")
+_FIELD: Final = re.compile(r"""["']?\b(?:level|levelname|severity)["']?\s*[=:]\s*["']?(\w+)""", re.IGNORECASE)
+
+
+def level_of(text: str) -> str:
+    """The level that a line tells of itself, as Python, ROS, and JSON or logfmt loggers write it; empty: none.
+
+    >>> level_of("2026-11-24 12:00:00 WARNING camera lost"), level_of('{"level": "error", "msg": "no map"}')
+    ('warning', 'error')
+    >>> level_of("[FATAL] [node]: out of memory"), level_of("Traceback (most recent call last):"), level_of("ready")
+    ('critical', 'error', '')
+    """
+    head = text[:_LOOKED_AT]
+    if head.startswith("Traceback (most recent call last)"):
+        return "error"
+    field, word = _FIELD.search(head), _WORD.search(head)
+    found = next((one[1].lower() for one in (field, word) if one is not None), "")
+    found = _SAME.get(found, found)
+    return found if found in LEVELS else ""
+
+
+class Sieve:
+    """Lines of at least a level; a line that tells none goes with the one before, and with none before it is shown."""
+
+    def __init__(self, least: str | None) -> None:
+        self._least = 0 if least is None else LEVELS.index(least)
+        self._is_shown = True
+
+    def of(self, lines: Iterable[Json]) -> list[Json]:
+        """Those that are shown."""
+        return [line for line in lines if self._passes(str(line["text"]))]
+
+    def _passes(self, text: str) -> bool:
+        level = level_of(text)
+        if level:
+            self._is_shown = LEVELS.index(level) >= self._least
+        return self._is_shown
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,6 +74,8 @@ class LogsView:
     is_json: bool
     is_followed: bool
     most: int
+    level: str | None = None
+    """Only lines of at least this level."""
 
 
 def show_logs(view: LogsView, task: str, whose: str | None) -> int:
@@ -39,10 +84,14 @@ def show_logs(view: LogsView, task: str, whose: str | None) -> int:
     Raises:
         CliError: nobody answers, there is no such task or node, or no worker's output there.
     """
+    if view.level is not None and view.level not in LEVELS:
+        raise CliError(EXIT_USAGE, f"--level: there is no level {view.level!r}{nearest(view.level, LEVELS)}")
+    sieve = Sieve(view.level)
     door = find_door(view.runtime_dir, view.node, connect=view.connect)
     node = worker_node(ask_door(door, {"verb": "status"}), task, whose)
     asked = door.to(node)
     lines, after = _all_lines(asked, task, 0)
+    lines = sieve.of(lines)
     _print(view, node, task, lines[len(lines) - min(view.most, len(lines)) :])
     try:
         while view.is_followed:
@@ -52,7 +101,7 @@ def show_logs(view: LogsView, task: str, whose: str | None) -> int:
             except CliError as error:
                 sys.stderr.write(f"zsched logs: {harmless(str(error))}; asking again until Ctrl-C\n")
                 continue
-            _print(view, node, task, lines)
+            _print(view, node, task, sieve.of(lines))
     except KeyboardInterrupt:
         pass
     return EXIT_OK

@@ -179,7 +179,15 @@ def invite(
     words += ["--output", str(output)] if output is not None else []
     words += ["--csr", str(csr)] if csr is not None else []
     view = view_of(
-        tuple(words), plan=plan, yes=yes, revision=revision, accept=accept, reason=reason, is_json=False, is_data=True
+        tuple(words),
+        plan=plan,
+        yes=yes,
+        revision=revision,
+        accept=accept,
+        reason=reason,
+        is_json=False,
+        is_data=True,
+        at=(node, runtime_dir, connect),
     )
     guest = Guest(name=name, kind=NodeKind(kind.value), address=address, tasks=tasks, authority=authority, request=csr)
     raise typer.Exit(bring(find_door(runtime_dir, node, connect=connect), view, guest, output))

@@ -38,12 +38,16 @@ RevisionOption = Annotated[
 ForOption = Annotated[
     str | None, typer.Option("--for", metavar="DURATION", help="End it by itself: 90s, 10m, 2h, 1d. [until taken back]")
 ]
+ConnectOption = Annotated[
+    str | None,
+    typer.Option("--connect", metavar="ENDPOINT", help="No daemon here: ask at this node's control endpoint."),
+]
 AllOption = Annotated[bool, typer.Option("--all", help="Every task.")]
 
 
 def add_order_verbs(app: typer.Typer) -> None:
     """Add the verbs to the program."""
-    verbs: tuple[Callable[..., None], ...] = (move, pin, unpin, pause, resume, tune, maint)
+    verbs: tuple[Callable[..., None], ...] = (move, pin, unpin, pause, resume, tune, weights, maint, restart, retry)
     for verb in verbs:
         app.command(cls=Verb)(verb)
 
@@ -61,6 +65,7 @@ def move(
     json_: JsonOption = False,
     node: AskedOption = None,
     runtime_dir: RuntimeOption = None,
+    connect: ConnectOption = None,
 ) -> None:
     """Hand a task over to a node, and wait until its streams have settled there.
 
@@ -70,7 +75,7 @@ def move(
     from zsched.commands.orders import MoveOrder  # noqa: PLC0415 - each verb imports what it needs
     from zsched.commands.orders import move as give  # noqa: PLC0415 - as above
 
-    view = _view(node, runtime_dir, reason, revision, None, json_=json_, yes=yes, plan=plan)
+    view = _view(node, runtime_dir, connect, reason, revision, None, json_=json_, yes=yes, plan=plan)
     order = MoveOrder(task=task, node=to, origin=origin, is_detached=detach, timeout_s=timeout)
     raise typer.Exit(give(view, order))
 
@@ -87,17 +92,18 @@ def pin(
     json_: JsonOption = False,
     node: AskedOption = None,
     runtime_dir: RuntimeOption = None,
+    connect: ConnectOption = None,
 ) -> None:
     """Keep a task on a node: it moves for an escape only, and comes back when that node is fit again.
 
     Without a task it lists the pins.
     """
-    view = _view(node, runtime_dir, reason, revision, for_, json_=json_, yes=yes, plan=plan)
+    view = _view(node, runtime_dir, connect, reason, revision, for_, json_=json_, yes=yes, plan=plan)
     _hold(view, "pin", [task] if task else [], to, is_hard=hard)
 
 
 def unpin(
-    task: TaskArgument,
+    task: Annotated[str | None, typer.Argument(metavar="[TASK]", help="A task; without it: list the pins.")] = None,
     reason: ReasonOption = "",
     revision: RevisionOption = None,
     plan: PlanOption = False,
@@ -105,14 +111,22 @@ def unpin(
     json_: JsonOption = False,
     node: AskedOption = None,
     runtime_dir: RuntimeOption = None,
+    connect: ConnectOption = None,
 ) -> None:
-    """End a task's pin: the fleet places it again."""
-    _hold(_view(node, runtime_dir, reason, revision, None, json_=json_, yes=yes, plan=plan), "unpin", [task])
+    """End a task's pin: the fleet places it again. Without a task it lists the pins."""
+    _hold(
+        _view(node, runtime_dir, connect, reason, revision, None, json_=json_, yes=yes, plan=plan),
+        "unpin",
+        [task] if task else [],
+    )
 
 
 def pause(
     tasks: TasksArgument = None,
     all_: AllOption = False,
+    wait: Annotated[
+        bool, typer.Option("--wait", help="Until every node that is alive knows it; at most 30 s.")
+    ] = False,
     for_: ForOption = None,
     reason: ReasonOption = "",
     revision: RevisionOption = None,
@@ -121,13 +135,14 @@ def pause(
     json_: JsonOption = False,
     node: AskedOption = None,
     runtime_dir: RuntimeOption = None,
+    connect: ConnectOption = None,
 ) -> None:
     """Let nothing move tasks but `zsched move`: a dead owner is not replaced.
 
     Without a task it lists the pauses.
     """
-    view = _view(node, runtime_dir, reason, revision, for_, json_=json_, yes=yes, plan=plan)
-    _hold(view, "pause", tasks or [], is_all=all_)
+    view = _view(node, runtime_dir, connect, reason, revision, for_, json_=json_, yes=yes, plan=plan)
+    _hold(view, "pause", tasks or [], is_all=all_, is_waiting=wait)
 
 
 def resume(
@@ -140,9 +155,10 @@ def resume(
     json_: JsonOption = False,
     node: AskedOption = None,
     runtime_dir: RuntimeOption = None,
+    connect: ConnectOption = None,
 ) -> None:
-    """End the pause of tasks."""
-    view = _view(node, runtime_dir, reason, revision, None, json_=json_, yes=yes, plan=plan)
+    """End the pause of tasks. Without a task it lists the pauses."""
+    view = _view(node, runtime_dir, connect, reason, revision, None, json_=json_, yes=yes, plan=plan)
     _hold(view, "resume", tasks or [], is_all=all_)
 
 
@@ -162,6 +178,7 @@ def tune(
     json_: JsonOption = False,
     node: AskedOption = None,
     runtime_dir: RuntimeOption = None,
+    connect: ConnectOption = None,
 ) -> None:
     """Show a task's tuning, or change it on the whole running fleet.
 
@@ -169,21 +186,102 @@ def tune(
     """
     from zsched.commands.orders import tune as give  # noqa: PLC0415 - each verb imports what it needs
 
-    view = _view(node, runtime_dir, reason, revision, None, json_=json_, yes=yes, plan=plan)
+    view = _view(node, runtime_dir, connect, reason, revision, None, json_=json_, yes=yes, plan=plan)
     raise typer.Exit(give(view, task, pairs or []))
 
 
-def maint(json_: JsonOption = False, node: AskedOption = None, runtime_dir: RuntimeOption = None) -> None:
+def weights(
+    task: Annotated[str | None, typer.Argument(metavar="[TASK]", help="A task; without it: show all.")] = None,
+    pairs: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[NAME=NUMBER]...", help="New weights: cpu, memory, network, gauges; left out is 0, the sum is 1."
+        ),
+    ] = None,
+    reason: ReasonOption = "",
+    revision: RevisionOption = None,
+    plan: PlanOption = False,
+    yes: YesOption = False,
+    json_: JsonOption = False,
+    node: AskedOption = None,
+    runtime_dir: RuntimeOption = None,
+    connect: ConnectOption = None,
+) -> None:
+    """Show a task's weights, or change them on the whole running fleet.
+
+    A change is agreed like an allocation: it holds for every robot, or for none (exit 4 without a quorum).
+    """
+    from zsched.commands.weights import weights as give  # noqa: PLC0415 - each verb imports what it needs
+
+    if revision is not None and not pairs:
+        raise CliError(EXIT_USAGE, "--revision goes with new weights, e.g. cpu=0.6 memory=0.4")
+    view = _view(node, runtime_dir, connect, reason, revision, None, json_=json_, yes=yes, plan=plan)
+    raise typer.Exit(give(view, task, pairs or []))
+
+
+def restart(
+    task: TaskArgument,
+    whose: Annotated[str | None, typer.Argument(metavar="[NODE]", help="Whose worker; without it the owner's.")] = None,
+    reason: ReasonOption = "",
+    plan: PlanOption = False,
+    yes: YesOption = False,
+    json_: JsonOption = False,
+    node: AskedOption = None,
+    runtime_dir: RuntimeOption = None,
+    connect: ConnectOption = None,
+) -> None:
+    """Stop a task's worker and start it again; that counts as no failure.
+
+    The task pauses meanwhile if it is the owner's.
+    """
+    from zsched.commands.restart import restart as give  # noqa: PLC0415 - each verb imports what it needs
+
+    raise typer.Exit(
+        give(_view(node, runtime_dir, connect, reason, None, None, json_=json_, yes=yes, plan=plan), task, whose)
+    )
+
+
+def retry(
+    task: TaskArgument,
+    whose: Annotated[
+        str | None, typer.Argument(metavar="[NODE]", help="Whose failures are forgotten; without it everybody's.")
+    ] = None,
+    reason: ReasonOption = "",
+    plan: PlanOption = False,
+    yes: YesOption = False,
+    json_: JsonOption = False,
+    node: AskedOption = None,
+    runtime_dir: RuntimeOption = None,
+    connect: ConnectOption = None,
+) -> None:
+    """Forget a task's failures: a failed worker is started again, and nodes pay no penalty any more.
+
+    Exits with 5 when some nodes could not be asked: they remember.
+    """
+    from zsched.commands.retry import retry as give  # noqa: PLC0415 - each verb imports what it needs
+
+    raise typer.Exit(
+        give(_view(node, runtime_dir, connect, reason, None, None, json_=json_, yes=yes, plan=plan), task, whose)
+    )
+
+
+def maint(
+    json_: JsonOption = False,
+    node: AskedOption = None,
+    runtime_dir: RuntimeOption = None,
+    connect: ConnectOption = None,
+) -> None:
     """List every order in force: pauses and pins, with author and reason, and the nodes that stop."""
     from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
     from zsched.commands.orders import maint as show  # noqa: PLC0415 - as above
 
-    raise typer.Exit(show(find_door(runtime_dir, node), is_json=json_))
+    raise typer.Exit(show(find_door(runtime_dir, node, connect=connect), is_json=json_))
 
 
 def _view(
     node: str | None,
     runtime_dir: Path | None,
+    connect: str | None,
     reason: str,
     revision: int | None,
     for_: str | None,
@@ -198,7 +296,7 @@ def _view(
 
     for_s = None if for_ is None else duration_s(for_)
     return OrderView(
-        door=find_door(runtime_dir, node),
+        door=find_door(runtime_dir, node, connect=connect),
         is_json=json_,
         is_yes=yes,
         is_plan=plan,
@@ -216,9 +314,11 @@ def _hold(
     *,
     is_hard: bool = False,
     is_all: bool = False,
+    is_waiting: bool = False,
 ) -> None:
     from zsched.commands.orders import HoldOrder, hold  # noqa: PLC0415 - as above
 
     if tasks and is_all:
         raise CliError(EXIT_USAGE, "--all goes without tasks")
-    raise typer.Exit(hold(view, HoldOrder(hold=verb, node=node, is_hard=is_hard), tasks, is_all=is_all))
+    order = HoldOrder(hold=verb, node=node, is_hard=is_hard, is_waiting=is_waiting)
+    raise typer.Exit(hold(view, order, tasks, is_all=is_all))

@@ -23,7 +23,7 @@ from zsched.commands.common import CliError, Json, check_reason, nearest, print_
 from zsched.commands.page import harmless, span
 from zsched.commands.report import FLAGS, millis, told_flag, told_hold, told_rollout
 from zsched.commands.wait import Condition, missing
-from zsched.commands.weights import NAMES, shares
+from zsched.commands.weight_words import NAMES, shares
 from zsched.core.values.fleet import TUNED_LINKS, TUNED_RULES
 from zsched.core.values.model import (
     MAX_ASKER,
@@ -43,6 +43,8 @@ TUNING_SCHEMA: Final = "zsched.tuning/1"
 MAINT_SCHEMA: Final = "zsched.maint/1"
 PAUSE_S: Final = 0.2
 """Between two looks at a move."""
+KNOWN_S: Final = 30.0
+"""How long `pause --wait` may take."""
 GAP_S: Final = 3.0
 """How long a settled move is watched for the new owner's first answers; the relays count once a second."""
 CODES: Final = {
@@ -124,6 +126,8 @@ class HoldOrder:
     hold: str
     node: str | None = None
     is_hard: bool = False
+    is_waiting: bool = False
+    """Until every node that is alive knows it."""
 
 
 def hold(view: OrderView, order: HoldOrder, names: Sequence[str], *, is_all: bool) -> int:
@@ -156,11 +160,41 @@ def hold(view: OrderView, order: HoldOrder, names: Sequence[str], *, is_all: boo
         return code
     results = {name: _give_hold(view, order, known[name]) for name in changing}
     after = {str(task["name"]): task for task in _status(view.door)["tasks"]}
+    lacks = _wait_known(view, results) if order.is_waiting else []
+    late = EXIT_TIMED_OUT if lacks else EXIT_OK
     if view.is_json:
         tasks = [{**_held(after[name]), **results.get(name, {"outcome": "unchanged", "detail": ""})} for name in chosen]
-        print_json({"schema": TASK_SCHEMA, "tasks": tasks})
-        return max([CODES.get(str(result["outcome"]), EXIT_FAILED) for result in results.values()], default=EXIT_OK)
-    return _tell_results(results)
+        print_json({"schema": TASK_SCHEMA, "tasks": tasks, "missing": lacks})
+        return max([late, *[CODES.get(str(result["outcome"]), EXIT_FAILED) for result in results.values()]])
+    code = _tell_results(results)
+    sys.stdout.writelines(f"  {harmless(lack)}\n" for lack in lacks)
+    return max(code, late)
+
+
+def _wait_known(view: OrderView, results: Mapping[str, Json]) -> list[str]:
+    """Wait until every node that is alive has learnt what was agreed; what is missing when that takes too long."""
+    revisions = {name: int(one["revision"]) for name, one in results.items() if one["outcome"] == "ok"}
+    began = monotonic_s()
+    while True:
+        lacks = _not_known(view.door, revisions)
+        if not lacks or monotonic_s() - began >= KNOWN_S:
+            return lacks
+        time.sleep(PAUSE_S)
+
+
+def _not_known(door: Door, revisions: Mapping[str, int]) -> list[str]:
+    lacks = []
+    first = _status(door)
+    for node in [str(one["name"]) for one in first["nodes"] if one["state"] == "alive"]:
+        try:
+            status = first if node == first["node"] else _status(door.to(node))
+        except CliError as error:
+            lacks.append(f"{node} does not answer: {error}")
+            continue
+        known = {str(task["name"]): int(task["revision"]) for task in status["tasks"]}
+        late = [name for name, revision in revisions.items() if known.get(name, -1) < revision]
+        lacks += [f"{node} has not learnt revision {revisions[name]} of {name}" for name in late]
+    return lacks
 
 
 def _warning(order: HoldOrder) -> str:
@@ -210,8 +244,7 @@ def _held(task: Json) -> Json:
 
 def _list_holds(view: OrderView, verb: str, tasks: Sequence[Json]) -> int:
     """The orders of one kind that are in force."""
-    if verb in ("resume", "unpin"):
-        raise CliError(EXIT_USAGE, f"name a task, or --all: `zsched {verb} TASK`")
+    verb = {"resume": "pause", "unpin": "pin"}.get(verb, verb)
     held = [task for task in tasks if task.get(verb) is not None]
     if view.is_json:
         print_json({"schema": TASK_SCHEMA, "tasks": [_held(task) for task in held]})

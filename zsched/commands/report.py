@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from zsched.commands.page import Cell, Page, cut, memory, none_for, since_drop, size, span
-from zsched.commands.weights import shares
+from zsched.commands.weight_words import shares
 from zsched.core.values.gauges import BY_NAME
 from zsched.core.values.model import NEVER_INITIALISED, RESTARTING, WAS_READY, WorkerState, told_of_worker
 

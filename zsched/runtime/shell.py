@@ -223,6 +223,7 @@ def _weights_of(request: dict[str, Any]) -> SetWeights:
         network=network,
         base_revision=base,
         gauges=tuple(sorted(gauges)),
+        asked=_asked_of(request) if "by" in request else None,
     )
 
 
@@ -274,7 +275,8 @@ def _tune_of(request: dict[str, Any]) -> TuneTask:
 
 
 def _retry_of(request: dict[str, Any]) -> RetryTask:
-    return RetryTask(task=str(request["task"]), node=str(request.get("whose") or ""))
+    asked = _asked_of(request) if "by" in request else None
+    return RetryTask(task=str(request["task"]), node=str(request.get("whose") or ""), asked=asked)
 
 
 def _explain_of(request: dict[str, Any]) -> ExplainTask:
@@ -282,7 +284,7 @@ def _explain_of(request: dict[str, Any]) -> ExplainTask:
 
 
 def _restart_of(request: dict[str, Any]) -> RestartTask:
-    return RestartTask(task=str(request["task"]))
+    return RestartTask(task=str(request["task"]), asked=_asked_of(request) if "by" in request else None)
 
 
 def _certificate_of(request: dict[str, Any]) -> TakeCertificate:

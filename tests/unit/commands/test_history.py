@@ -16,7 +16,7 @@ from zsched.cli import app
 from zsched.commands import history as verb
 from zsched.commands.ask import Door
 from zsched.commands.common import CliError
-from zsched.commands.history import EventsView, duration_s, events, history, subject_of
+from zsched.commands.history import EventsView, duration_s, events, history, subject_of, types_of
 from zsched.core.instructions import RecordStory
 from zsched.core.scheduler.decision import decide_again, verdict_of
 from zsched.core.values.decision import Decision, Figures, Move, Rules
@@ -307,3 +307,31 @@ def test_what_is_no_log_is_refused_with_its_line(tmp_path: Path, line: str) -> N
     assert done.exit_code == EXIT_USAGE
     assert f"{file}:3: no line of a decision log" in done.stderr
     assert run("replay", tmp_path / "nothing").exit_code == EXIT_USAGE
+
+
+# --- what is chosen --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("pages")
+def test_moves_of_the_last_time_only(capsys: pytest.CaptureFixture[str]) -> None:
+    assert history(HERE, None, is_json=False, since_s=95.0) == 0
+    assert "edge1 -> edge2" in capsys.readouterr().out
+    assert history(HERE, "merge", is_json=False, since_s=60.0) == 0
+    assert capsys.readouterr().out == "no move of merge of the last 1m00s in the log of robot1\n"
+
+
+def test_events_of_some_types_only(pages: Pages, capsys: pytest.CaptureFixture[str]) -> None:
+    pages.entries = [entry("a peer came", 9.0, stage="membership"), entry("learnt", 8.0, move=MOVE), entry("won", 7.0)]
+    assert events(HERE, view(types=("move",))) == 0
+    assert [line.split()[-1] for line in capsys.readouterr().out.splitlines()] == ["learnt"]
+    assert events(HERE, view(types=("membership", "scheduler"))) == 0
+    assert [line.split()[-1] for line in capsys.readouterr().out.splitlines()] == ["came"]
+
+
+def test_a_type_that_there_is_not_is_named_with_those_there_are() -> None:
+    assert types_of("move, vote") == ("move", "vote")
+    with pytest.raises(CliError, match="did you mean vote") as refused:
+        types_of("votes")
+    assert refused.value.code == EXIT_USAGE
+    with pytest.raises(CliError, match="no event is of type 'warning'; there are move, scheduler, vote"):
+        types_of("warning")

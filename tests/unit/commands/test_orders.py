@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -51,7 +51,11 @@ class Daemon:
         self.status["tasks"] = [task("echo", "edge1"), task("merge", "edge2")]
         self.orders: list[Json] = []
         self.outcome = "ok"
-        self.socket = OperatorSocket(folder / "robot1.sock", self.answer)
+        self.answers: Callable[[Json], Json] = self.answer
+        self.socket = OperatorSocket(folder / "robot1.sock", self.answer_now)
+
+    def answer_now(self, request: Json) -> Json:
+        return self.answers(request)
 
     def answer(self, request: Json) -> Json:
         if request["verb"] == "status":
@@ -140,12 +144,45 @@ def test_a_pause_carries_who_why_and_how_long_and_is_listed(daemon: Daemon) -> N
     assert faults(json.loads(run("maint", "--json").stdout)) == []
 
 
+def test_a_pause_that_waits_ends_when_every_node_knows_it(daemon: Daemon) -> None:
+    late = {"edge2": 3}
+
+    def answer(request: Json) -> Json:
+        told = Daemon.answer(daemon, request)
+        name = request.get("node", "robot1")
+        if request["verb"] != "status" or name == "robot1":
+            return told
+        late[name] = late.get(name, 0) - 1
+        tasks = [{**one, "revision": 7} if late[name] >= 0 else one for one in told["tasks"]]
+        return {**told, "node": name, "tasks": tasks}
+
+    daemon.answers = answer
+    result = run("pause", "echo", "--wait", "--yes", "--json")
+    body = json.loads(result.stdout)
+    assert (result.exit_code, faults(body), body["missing"]) == (0, [], [])
+    assert late["edge2"] < 0, "it was asked until it knew"
+
+
+def test_a_pause_that_some_node_never_learns_says_which(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
+    def answer(request: Json) -> Json:
+        told = Daemon.answer(daemon, request)
+        is_late = request["verb"] == "status" and request.get("node") == "edge2"
+        return {**told, "tasks": [{**one, "revision": 7} for one in told["tasks"]]} if is_late else told
+
+    daemon.answers = answer
+    monkeypatch.setattr("zsched.commands.orders.KNOWN_S", 0.1)
+    result = run("pause", "echo", "--wait", "--yes")
+    assert result.exit_code == 5
+    assert result.stdout.splitlines()[-1] == "  edge2 has not learnt revision 8 of echo"
+
+
 def test_all_pauses_every_task_and_resume_ends_it(daemon: Daemon) -> None:
     assert run("pause", "--all", "--yes").exit_code == 0
     assert [order["task"] for order in daemon.orders] == ["echo", "merge"]
     body = json.loads(run("resume", "--all", "--yes", "--json").stdout)
     assert (faults(body), [one["pause"] for one in body["tasks"]]) == ([], [None, None])
-    assert run("resume").exit_code == 2
+    assert run("resume").stdout == "no task is paused\n"
+    assert run("unpin").stdout == "no task is pinned\n"
 
 
 def test_a_pin_names_its_node_and_says_when_it_is_hard(daemon: Daemon) -> None:

@@ -16,7 +16,7 @@ from zsched.core.status import build_explanation, build_snapshot
 from zsched.core.todo import ToDo
 from zsched.core.values.fleet import runs_worker
 from zsched.core.values.messages import CommandOutcome, CommandResult
-from zsched.core.values.model import NodeId, TaskId, WorkerState
+from zsched.core.values.model import Asked, NodeId, TaskId, WorkerState, told_by
 
 
 def _on_status(node: Stages, event: ev.StatusAsked, todo: ToDo, now: float) -> None:
@@ -36,12 +36,19 @@ def _on_retry(node: Stages, event: ev.RetryCommanded, todo: ToDo, now: float) ->
         todo.add(do.AnswerCommand(request=event.request, result=result))
         return
     node.rounds.forgive(task, whose or None, now)
+    _record(node, task, event.command.asked, f"has the failures of {whose or 'every node'} forgotten", todo)
     state = node.worker_states.get(task) if whose in ("", node.me) else None
     if state is not None:
         todo.add(do.ResetWorker(task=task))
     detail = _forgiven(node, whose) if state is None else f"its failures are forgotten, it was {state}"
     result = CommandResult(outcome=CommandOutcome.OK, detail=detail)
     todo.add(do.AnswerCommand(request=event.request, result=result))
+
+
+def _record(node: Stages, task: TaskId, asked: Asked | None, what: str, todo: ToDo) -> None:
+    """Tell the history who has ordered it, and why."""
+    who = "an operator" if asked is None else told_by(asked)
+    todo.add(do.RecordStory(stage="executor", text=f"{who} {what}", task=task, epoch=node.executors[task].epoch))
 
 
 def _may_work(node: Stages, task: TaskId, whose: NodeId) -> bool:
@@ -72,6 +79,7 @@ def _on_restart(node: Stages, event: ev.RestartCommanded, todo: ToDo, _now: floa
     refusal = _why_no_restart(node, task, state)
     outcome, detail = CommandOutcome.INVALID, refusal
     if not refusal:
+        _record(node, task, event.command.asked, "has its worker here started again", todo)
         todo.add(do.RenewWorker(task=task))
         outcome, detail = CommandOutcome.OK, f"its worker is started again, it was {state}"
     todo.add(do.AnswerCommand(request=event.request, result=CommandResult(outcome=outcome, detail=detail)))

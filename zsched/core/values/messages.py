@@ -257,6 +257,8 @@ class SetWeights:
     base_revision: int | None = None
     gauges: Readings = ()
     """Weights of gauges."""
+    asked: Asked | None = None
+    """``None``: by an older program."""
 
     def __post_init__(self) -> None:
         check_name("weights.task", self.task)
@@ -272,6 +274,8 @@ class RetryTask:
 
     task: TaskId
     node: NodeId = ""
+    asked: Asked | None = None
+    """``None``: by an older program."""
 
     def __post_init__(self) -> None:
         check_name("retry.task", self.task)
@@ -294,6 +298,8 @@ class RestartTask:
     """Operator command to one node: stop its worker for the task, and start it again."""
 
     task: TaskId
+    asked: Asked | None = None
+    """``None``: by an older program."""
 
     def __post_init__(self) -> None:
         check_name("restart.task", self.task)

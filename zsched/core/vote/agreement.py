@@ -827,7 +827,8 @@ class Agreement:
             _refuse(request, CommandOutcome.UNCHANGED, _ENDED[RoundOutcome.UNCHANGED][1], todo)
         else:
             tuning = replace(value.tuning, weights=weights)
-            change = Retune(base_revision=value.revision, tuning=tuning, request=request)
+            asked = command.asked
+            change = Retune(base_revision=value.revision, tuning=tuning, request=request, asked=asked)
             self.propose(command.task, change, todo, now)
 
     def tick(self, todo: ToDo, now: float) -> None:
