@@ -11,6 +11,8 @@ PYTEST_REAL ?= -m pytest
 
 .PHONY: help demo test test-cpu test-real test-quick lint types format man bench clean
 .NOTPARALLEL:
+# Where it is set, each daemon, relay and worker of a test compiles all its modules anew: half of its start.
+unexport PYTHONDONTWRITEBYTECODE
 
 help:  ## Show the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14

@@ -10,6 +10,8 @@ Below a red test with real processes stands how the machine was meanwhile (`supp
 
 The garbage collector does not look again at what the collection of tests has made, and looks more seldom at the rest:
 that is 8 % of the CPU time of tests that play schedules.
+
+Bytecode is kept, whatever the environment says: else each process that a test starts compiles all its modules anew.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from __future__ import annotations
 import gc
 import os
 import signal
+import sys
 import tempfile
 from collections.abc import Generator
 from pathlib import Path
@@ -36,6 +39,8 @@ STALLS = pytest.StashKey[Stalls]()
 
 def pytest_configure() -> None:
     """In each process that runs tests, before any does."""
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    sys.dont_write_bytecode = False
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     for number in (signal.SIGQUIT, signal.SIGHUP):
