@@ -6,6 +6,9 @@ Inputs and outputs pass through the robots' relays, never through the owner's. T
 library and for any other zenoh program. So each robot reports in its profile whether a task answers it (`Progress`),
 and the owner's daemon combines these reports (`HangJudge`).
 
+A robot that sees the worker come back (it was restarted in place) forgets how long it has waited for the life before:
+on a busy machine that complaint would reach the owner behind the new life's first answers, and end that, too.
+
 A robot that was out of reach and is back has waited for a link, not for the worker. Its complaints count again after
 links have had time to heal (`zsched.core.scheduler.probation`) and the worker has had time to answer.
 
@@ -107,6 +110,12 @@ class Progress:
         seen = self._seen.get(task)
         if seen is not None and seen.waits_since is not None:
             seen.waits_since = now
+
+    def on_new_life(self, task: TaskId) -> None:
+        """The owner's worker is back: what the one before owed is not this one's."""
+        seen = self._seen.get(task)
+        if seen is not None:
+            seen.waits_since = None  # the next counters tell whether it owes something
 
     def reports(self, now: float) -> tuple[TaskProgress, ...]:
         """This robot's reports: served, or waiting for longer than the deadline while inputs flow."""
@@ -215,6 +224,10 @@ class HangWatch:
         """A worker of this node has changed."""
         if task in self._specs:
             self._judge.note_worker(task, state, now)
+
+    def on_ready_again(self, task: TaskId) -> None:
+        """Our relay lacked the owner's worker, and has it again."""
+        self._progress.on_new_life(task)
 
     def note_lag(self, lag_s: float, now: float) -> None:
         """This node stood still for this many seconds; a pause of half a deadline or more starts all waits again."""

@@ -143,7 +143,9 @@ def _on_slot_ready(node: Stages, event: ev.SlotReady, todo: ToDo, now: float) ->
         since = known.since if known is not None and known.slot.epoch == event.epoch else now
         node.unready[event.task] = Unready(slot=event, since=since)
         return
-    node.unready.pop(event.task, None)
+    known = node.unready.pop(event.task, None)
+    if known is not None and known.slot.epoch == event.epoch:
+        node.hangs.on_ready_again(event.task)
     node.executors[event.task].on_ready(event.epoch, todo)
 
 

@@ -265,14 +265,55 @@ def test_a_suspended_owner_takes_no_complaint_about_its_sleep(*, is_suspended: b
 
 def owner_node() -> Node:
     """The whole daemon of the only candidate, which owns the task and whose worker became ready at 100 s."""
+    node = node_of("edge1")
+    node.handle(ev.WorkerChanged(task="merge", state=WorkerState.READY), 100.0)
+    return node
+
+
+def node_of(name: str) -> Node:
+    """A whole daemon that knows, at 100 s, that edge1 owns the task."""
     fleet = Owner().fleet
     learnt = allocation_of(3, tuning=SPEC.tuning)
     electorate = electorate_hash(fleet)
-    state = state_of("edge1", RegisterState(task="merge", learnt=learnt), electorate=electorate)
-    node = Node(fleet=fleet, me="edge1", durable=state, incarnation=7, electorate=electorate, rng=Random(1), now=100.0)
+    state = state_of(name, RegisterState(task="merge", learnt=learnt), electorate=electorate)
+    node = Node(fleet=fleet, me=name, durable=state, incarnation=7, electorate=electorate, rng=Random(1), now=100.0)
     node.start(100.0)
-    node.handle(ev.WorkerChanged(task="merge", state=WorkerState.READY), 100.0)
     return node
+
+
+def test_a_robot_forgets_its_wait_when_the_worker_is_back_and_complains_of_the_new_life_alone() -> None:
+    """Else a complaint of the life before, which is long on its way on a busy machine, ends the new one, too."""
+    node = node_of("robot1")
+    for done in (ev.SlotReady(task="merge", epoch=3), ev.SlotFlipped(task="merge", epoch=3, replayed=0)):
+        node.handle(done, 100.0)
+    reports: list[tuple[TaskProgress, ...]] = []
+    given = 0
+
+    def run(seconds: int) -> tuple[TaskProgress, ...]:
+        for _ in range(seconds):
+            second = len(reports) + 1
+            counts = (
+                StreamCount(stream="merge/in/0", messages=10 * second),
+                StreamCount(stream="merge/out/0", messages=given),
+            )
+            node.handle(ev.StreamsCounted(counts=counts), 100.0 + second)
+            reports.append(node.hangs.reports(100.0 + second))
+        return reports[-1]
+
+    assert run(10) == (UNSERVED,)
+    node.handle(ev.SlotReady(task="merge", epoch=3), 110.1)  # told again: it was there all the time
+    assert run(1) == (UNSERVED,)
+    node.handle(ev.SlotReady(task="merge", epoch=3, is_ready=False), 111.1)
+    assert run(5) == (UNSERVED,), "it is away, and what it owes stays"
+    node.handle(ev.SlotReady(task="merge", epoch=3), 116.1)
+    assert node.hangs.reports(116.2) == ()
+    assert run(4) == ()
+    assert run(2) == (UNSERVED,), "the new life hangs, too"
+    node.handle(ev.SlotReady(task="merge", epoch=2, is_ready=False), 122.1)
+    node.handle(ev.SlotReady(task="merge", epoch=3), 122.2)
+    assert run(1) == (UNSERVED,), "that was another owner's"
+    given = 1
+    assert run(1) == (SERVED,)
 
 
 class Fates:
