@@ -378,7 +378,12 @@ def _invitation(door: Door, guest: Guest) -> Invitation:
     addresses = [dial_endpoint(node.listen_control, node.host) for node in fleet.nodes if node.name != guest.name]
     papers = papers_for(fleet, guest.name, guest.authority, guest.request)
     return Invitation(
-        node=guest.name, value=value, document=document, addresses=tuple(filter(None, addresses)), papers=papers
+        node=guest.name,
+        value=value,
+        document=document,
+        addresses=tuple(filter(None, addresses)),
+        generation=int(status_of(door)["quorum"].get("generation", 0)),
+        papers=papers,
     )
 
 

@@ -199,6 +199,7 @@ def join(invitation: Invitation, places: Places, *, is_plan: bool) -> tuple[Flee
         invitation.document,
         places,
         disk,
+        generation=invitation.generation,
         papers=papers,
         listed=() if papers is None else (CERTIFICATE, TRUSTED, *((KEY,) if papers.key else ())),
         is_plan=is_plan,
@@ -412,14 +413,15 @@ def _write(
     places: Places,
     disk: str,
     *,
+    generation: int = 0,
     papers: Papers | None,
     listed: tuple[str, ...],
     is_plan: bool,
 ) -> tuple[Written, ...]:
     """Write all of it, the state last."""
     text = content.text.encode()
-    plain = blank_state(fleet, me, 0, None, incarnation=wall_tenths(), hardware=hardware_id(), disk=disk)
-    state = replace(plain, fleet_register=RegisterState(task=fleet.name, learnt=value))
+    plain = blank_state(fleet, me, generation, None, incarnation=wall_tenths(), hardware=hardware_id(), disk=disk)
+    state = replace(plain, registers=(), fleet_register=RegisterState(task=fleet.name, learnt=value))
     written = [Written(path=places.config, what="the fleet file, as a copy of the agreed document")]
     old = _other_text(places.config, text)
     if old is not None:

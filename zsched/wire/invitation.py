@@ -17,6 +17,7 @@ from typing import Any, Final
 from zsched.core.values.document import Document
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.model import NAME, NodeId
+from zsched.core.vote.belief import MAX_GENERATION
 from zsched.errors import WireError
 from zsched.wire.codec import as_plain, document_hash, from_plain
 
@@ -49,6 +50,8 @@ class Invitation:
     """The document of that value."""
     addresses: tuple[str, ...] = ()
     """Where nodes of the fleet can be dialled."""
+    generation: int = 0
+    """As operators have counted it with the fleet's files: nodes of another one count for each other as apart."""
     papers: Papers | None = None
     """``None``: the fleet is not secured, or its certificate comes by another way."""
 
@@ -69,6 +72,8 @@ def encode_invitation(invitation: Invitation) -> str:
         "value": as_plain(invitation.value),
         "document": as_plain(invitation.document),
     }
+    if invitation.generation:
+        body["generation"] = invitation.generation
     if invitation.papers is not None:
         body |= {name: pem for name in PEMS if (pem := getattr(invitation.papers, name))}
     return json.dumps({**body, "digest": _digest(body)}, ensure_ascii=False, indent=2) + "\n"
@@ -101,7 +106,17 @@ def decode_invitation(data: bytes) -> Invitation:
         raise WireError("type", "it names no node")
     if not isinstance(addresses, list) or not all(isinstance(one, str) for one in addresses):
         raise WireError("type", "its addresses are no list")
-    return Invitation(node=node, value=value, document=document, addresses=tuple(addresses), papers=_papers(body))
+    generation = body.get("generation", 0)
+    if type(generation) is not int or not 0 <= generation <= MAX_GENERATION:
+        raise WireError("type", f"its generation is no number from 0 to {MAX_GENERATION}")
+    return Invitation(
+        node=node,
+        value=value,
+        document=document,
+        addresses=tuple(addresses),
+        generation=generation,
+        papers=_papers(body),
+    )
 
 
 def _papers(body: dict[str, Any]) -> Papers | None:

@@ -27,12 +27,29 @@ MEMBER_BUGS: tuple[Bug, ...] = (
     _bug(
         "a machine that joins is not told the generation",
         MEMBERSHIP,
-        ("state = replace(plain, fleet_register=RegisterState(task=fleet.name, learnt=value))", "state = plain"),
+        (
+            "state = replace(plain, registers=(), fleet_register=RegisterState(task=fleet.name, learnt=value))",
+            "state = plain",
+        ),
+    ),
+    _bug(
+        "a machine joins in generation 0 whatever operators have counted",
+        MEMBERSHIP,
+        ("        generation=invitation.generation,\n", ""),
     ),
     _bug(
         "a machine of another generation takes itself for joined",
         MEMBERSHIP,
         ("value.generation_id == invitation.value.generation_id", "value.fleet == invitation.value.fleet"),
+    ),
+    Bug(
+        name="a copied disk is this machine's own",
+        module="zsched.adapters.host.state_file",
+        changes=(
+            ("        if not is_same_hardware(state.hardware, self._hardware):\n", "        if not state.node:\n"),
+        ),
+        tests=("tests/unit/adapters/host/test_state_file.py",),
+        has_schedules=False,
     ),
     _bug(
         "an invitation replaces another fleet's file",

@@ -248,3 +248,10 @@ def test_a_certificate_of_somebody_else_is_refused(second: Places, invitation: I
     papers = Papers(certificate="c", key="k", trusted="t")
     with pytest.raises(ConfigError, match="certificate names None, and its node is robot2"):
         join(replace(invitation, document=content, value=value, papers=papers), second, is_plan=False)
+
+
+def test_who_joins_counts_by_the_generation_that_operators_have_counted(second: Places, invitation: Invitation) -> None:
+    join(replace(invitation, generation=2), second, is_plan=False)
+    state = StateFile(second.state, fleet="hall", node="robot2").load().state
+    assert state is not None
+    assert (state.generation, state.registers) == (2, ())
