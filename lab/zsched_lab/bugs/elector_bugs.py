@@ -156,10 +156,17 @@ ELECTOR_BUGS: tuple[Bug, ...] = (
         REGISTER,
         ("        if is_identity and newest is None:\n", "        if is_identity:\n"),
     ),
+    Bug(
+        name="all electors settle at once",
+        module=ROLL,
+        changes=(("self._jitter(), 0 if is_ours else 1 + self._rank())", "self._jitter(), 0)"),),
+        tests=("tests/sim/test_members.py",),
+        has_schedules=False,
+    ),
     _bug(
         "no guard before settled",
         SETTLING,
-        ("(hold_s(value.guard_lease_s) if value.is_exclusive else 0.0)", "0.0"),
+        ("return hold_s(value.guard_lease_s) if value.is_exclusive else 0.0", "return 0.0"),
         has_schedules=False,
     ),
     _bug(

@@ -101,7 +101,7 @@ class Roll:
         self._list(ToDo(), now)
         self._count(is_blank=False, is_new=False, now=now)
         if not self.value.settled:
-            self._settling.begin(self.value, now + self._jitter())
+            self._settling.begin(self.value, now + self._jitter(), self._rank())
 
     # --- queries -----------------------------------------------------------------------------------------------------
 
@@ -148,6 +148,11 @@ class Roll:
     def _seat_in(self, value: FleetValue) -> Elector | None:
         seat = value.electorate.seat(self._me)
         return seat if seat is not None and seat.is_held_by(self._me, self._disk) else None
+
+    def _rank(self) -> int:
+        """How many electors settle before this one, if all of them have learnt the value."""
+        names = self.value.electorate.names
+        return names.index(self._me) if self._me in names else len(names)
 
     def _jitter(self) -> float:
         return self._stagger_s * (0.5 + self._rng.random())
@@ -251,8 +256,11 @@ class Roll:
         elif answer.refusal is Refusal.NUMBER and answer.number < self.value.number:
             todo.fleet.append(TellFleet(to=(answer.elector,), value=self.value))
 
-    def _follow(self, todo: ToDo, now: float) -> None:
-        """Count by the newest learnt value, before anything is answered or asked under another one."""
+    def _follow(self, todo: ToDo, now: float, *, is_ours: bool = False) -> None:
+        """Count by the newest learnt value, before anything is answered or asked under another one.
+
+        ``is_ours``: a round of this node has found it chosen, so it settles before all others.
+        """
         value = self._register.value
         if value.revision == self.value.revision:
             return
@@ -262,7 +270,7 @@ class Roll:
         self._list(todo, now)
         if value.number != number:
             self._count(is_blank=seat != self.seat, is_new=True, now=now)
-        self._settling.begin(value, now + self._jitter())
+        self._settling.begin(value, now + self._jitter(), 0 if is_ours else 1 + self._rank())
 
     def _list(self, todo: ToDo, now: float) -> None:
         """Remove the registers that the document does not list, and begin those that are new."""
@@ -308,7 +316,7 @@ class Roll:
         if isinstance(answer, Refused):
             self.hear(answer, todo, now)
         self._register.on_answer(answer, todo, now)
-        self._follow(todo, now)
+        self._follow(todo, now, is_ours=True)
         if self.value is not before and not (isinstance(answer, Refused) and answer.fleet is self.value):
             names = {*before.electorate.names, *self.value.electorate.names} - {self._me}
             todo.fleet.append(TellFleet(to=tuple(sorted(names)), value=self.value))

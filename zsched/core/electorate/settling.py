@@ -1,7 +1,7 @@
 """When the electors of a new number are settled: what an elector does for it, and how far it is.
 
-Knows: the registers of the document, what was written under which number, the guard time. Does not know: how a round
-goes (`zsched.core.vote.register`), who else settles (several do no harm).
+Knows: the registers of the document, what was written under which number, the guard time, whose turn it is. Does not
+know: how a round goes (`zsched.core.vote.register`), whether somebody else settles (several do no harm).
 
 1. An identity round of every task's register under the new number. It writes what it reads: from then on a majority of
    the new electors holds it, and no majority of the old ones can choose anything any more. A blank register needs no
@@ -35,11 +35,16 @@ class Settling:
         self._ask_at = self._say_at = math.inf
         """When identity rounds that are missing, and the word that all is settled, are tried (again)."""
 
-    def begin(self, value: FleetValue, at: float) -> None:
-        """A fleet value is learnt: work for its number, from ``at`` on, unless it is settled."""
+    def begin(self, value: FleetValue, at: float, rank: int) -> None:
+        """A fleet value is learnt: work for its number, from ``at`` on, unless it is settled.
+
+        The first in ``rank`` begins then. The others would only ask the same again, so they wait until it should be
+        done, one after another.
+        """
         if value.settled:
             self._of, self._whole_at = None, None
         elif self._of != value.electorate:
+            at += rank * self._pause_s + (_guard_s(value) if rank else 0.0)
             self._of, self._whole_at, self._ask_at, self._say_at = value.electorate, None, at, at
 
     def due(self, value: FleetValue, registers: Iterable[TaskRegister]) -> float:
@@ -60,11 +65,16 @@ class Settling:
             return None
         if self._whole_at is None:
             self._whole_at = now
-            self._say_at = now + (hold_s(value.guard_lease_s) if value.is_exclusive else 0.0)
+            self._say_at = now + _guard_s(value)
         if now < self._say_at:
             return None
         self._say_at = now + self._pause_s
         return Settle(base_revision=value.revision, number=value.number)
+
+
+def _guard_s(value: FleetValue) -> float:
+    """What electors granted under the number before has ended after this time (seconds)."""
+    return hold_s(value.guard_lease_s) if value.is_exclusive else 0.0
 
 
 def _missing(value: FleetValue, registers: Iterable[TaskRegister]) -> list[TaskRegister]:
