@@ -28,10 +28,10 @@ FLEET = fleet_of(
 class Play:
     """A fleet that runs by its file, and what operators tell it."""
 
-    def __init__(self, seed: int = 1, fleet: Fleet = FLEET) -> None:
+    def __init__(self, seed: int = 1, fleet: Fleet = FLEET, generation: int = 0) -> None:
         self.fleet = fleet
-        self.sim = Simulator(fleet=fleet, seed=seed)
-        self.sim.documents.judge_from(fleet, 0)
+        self.sim = Simulator(fleet=fleet, seed=seed, generation=generation)
+        self.sim.documents.judge_from(fleet, generation)
         self.sim.start()
         assert self.sim.run_until(lambda: not self.sim.unsettled(), 20), self.sim.unsettled()
         self._number = 0

@@ -66,6 +66,10 @@ class Invariants:
     """{(machine, task): the newest revision that it ever learnt}."""
     ballots: dict[tuple[tuple[TaskId, int], Ballot], tuple[str, Allocation | None]] = field(default_factory=dict)
     """{((task, creation), ballot): (whose it is, what it carries)}."""
+    sides: dict[str, str] = field(default_factory=dict)
+    """{machine: its half}, where two halves of the fleet were recovered apart: their values are not compared."""
+    recovered: set[tuple[TaskId, int]] = field(default_factory=set)
+    """(task, revision) of the values with which a recovered generation begins: nobody chose them."""
     _counted: dict[str, int] = field(default_factory=dict)
     """{machine: the revision of its newest fleet value}."""
     _floors: dict[str, dict[TaskId, Ballot]] = field(default_factory=dict)
@@ -119,7 +123,8 @@ class Invariants:
             accepted = register.accepted
             if accepted is not None and (known is None or known.accepted != accepted):
                 ballot, revision = str(accepted), accepted.value.revision
-                self.take(Stored(at=now, node=machine.key, task=register.task, revision=revision, ballot=ballot))
+                task = self._sided(machine, register.task)
+                self.take(Stored(at=now, node=machine.key, task=task, revision=revision, ballot=ballot))
             if register.learnt is not None and (known is None or known.learnt != register.learnt):
                 self.on_learnt(machine, register.learnt, now)
 
@@ -127,26 +132,36 @@ class Invariants:
         """A node knows a committed value, for good (or, without a state file, for this life)."""
         if value.revision == 0:
             return
-        key = (machine.key, value.task)
+        key, task = (machine.key, value.task), self._sided(machine, value.task)
         self.newest[key] = max(self.newest.get(key, 0), value.revision)
-        if value.revision % GENERATION_STEP:  # a generation's first value was made by the operator, nobody chose it
+        is_chosen = value.revision % GENERATION_STEP and (value.task, value.revision) not in self.recovered
+        if is_chosen:  # a generation's first value was made by the operator, nobody chose it
             detail = f"{value.tuning} {value.pin} {value.pause} {value.asked}"
             self.take(
                 Learnt(
                     at=now,
                     node=machine.key,
-                    task=value.task,
+                    task=task,
                     revision=value.revision,
                     epoch=value.epoch,
                     owner=value.owner,
                     detail=detail,
                 )
             )
-        self.told.setdefault((value.task, value.revision), value)
+        self.told.setdefault((task, value.revision), value)
         for revision in (value.revision - 1, value.revision):
-            before, after = self.told.get((value.task, revision)), self.told.get((value.task, revision + 1))
+            before, after = self.told.get((task, revision)), self.told.get((task, revision + 1))
             if before is not None and after is not None:
                 _check_orders(before, after)
+
+    def _sided(self, machine: Machine, task: TaskId) -> TaskId:
+        """A task's name, and the half of its machine."""
+        side = self.sides.get(machine.key)
+        return task if side is None else f"{task} of {side}"
+
+    def stop_working(self, machine: Machine, task: TaskId, at: float, life: int) -> None:
+        """A worker was seen to have stopped before the end that was told of it."""
+        self.checker.stop_working(machine.key, self._sided(machine, task), at, life)
 
     # --- what a batch says -------------------------------------------------------------------------------------------
 
@@ -213,7 +228,8 @@ class Invariants:
         value = self.ballots.get((name, answer.ballot), ("", None))[1]
         if value is not None:
             ballot = str(Acceptance(ballot=answer.ballot, value=value))
-            stored = Stored(at=now, node=machine.key, task=answer.task, revision=value.revision, ballot=ballot)
+            task = self._sided(machine, answer.task)
+            stored = Stored(at=now, node=machine.key, task=task, revision=value.revision, ballot=ballot)
             self.take(stored)
 
     def _check_ballot(
@@ -271,7 +287,8 @@ class Invariants:
         if plan.current is not None:
             epoch, owner = plan.current.epoch, plan.current.owner
             self._check_epoch(machine, plan.task, epoch)
-            self.take(Routed(at=now, node=machine.key, task=plan.task, epoch=epoch, owner=owner))
+            task = self._sided(machine, plan.task)
+            self.take(Routed(at=now, node=machine.key, task=task, epoch=epoch, owner=owner))
 
     def on_worked(self, machine: Machine, role: Role, now: float, until: float) -> None:
         """A worker may work until a true time; without a lease that is infinity."""
@@ -279,7 +296,7 @@ class Invariants:
         work = Worked(
             at=now,
             node=machine.key,
-            task=role.task,
+            task=self._sided(machine, role.task),
             epoch=role.epoch,
             until=until,
             life=machine.life,

@@ -1,13 +1,15 @@
-"""Schedules of whole nodes whose fleet changes under faults: documents, electors, lost disks, cuts, crashes.
+"""Schedules of whole nodes whose fleet changes under faults: machines, documents, electors, disks, cuts, crashes.
 
 ``python -m zsched_lab.sim.fleets --seeds N``.
 
 Knows: what operators and faults do in a schedule, by its seed. Does not know: the rules (`zsched.core.electorate`),
 what must hold after every write (`zsched_lab.sim.chosen`, `zsched_lab.sim.checks`).
 
-After the faults every node runs. If a majority of the electors in force has its state, the fleet must come to rest:
-all nodes have learnt one settled value, and the exclusive task has one owner with a lease. A further change must then
-be carried out. The last line is ``N schedules, V violations``; the exit code is 1 when there is any.
+After the faults every node runs that is not lost for good. If no majority of the electors is left, one survivor is
+recovered, and the others change sides. The fleet must come to rest: whoever was invited is there, and who leaves or is
+dead is in no document; all nodes have learnt one settled value, and the exclusive task has one owner with a lease. A
+further change must then be carried out. The last line is ``N schedules, V violations``; the exit code is 1 when there
+is any.
 """
 
 from __future__ import annotations
@@ -15,19 +17,23 @@ from __future__ import annotations
 import argparse
 import sys
 from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from random import Random
 
 from zsched.core import events as ev
+from zsched.core.electorate.founding import founded_id
 from zsched.core.scheduler.flags import HANDS_OVER
 from zsched.core.values.document import Flag, FlagKind
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.messages import ChangeFleet, CommandOutcome
 from zsched.core.values.model import NodeId, NodeKind, ScoreForm, Tuning, Weights
-from zsched.core.values.quorum import majority
 from zsched_lab.sim.checks import unsettled
 from zsched_lab.sim.links import Pair
+from zsched_lab.sim.members import GUESTS
+from zsched_lab.sim.recoveries import Recoveries
 from zsched_lab.sim.simulator import Simulator
 
 FAULTS_S, REST_S = 25.0, 40.0
@@ -37,6 +43,20 @@ STEPS = ("change", "change", "change", "kill", "kill", "power", "cut", "pause", 
 FLAGGED = 0.5
 """So often a step of the faults is followed by an operator's order about nodes."""
 FLAG_S = (None, None, 3.0, 10.0)
+COMING = 0.35
+"""So often a step of the faults is followed by one of machines that come and go (`zsched_lab.sim.members`)."""
+HALVES = 0.1
+"""So many schedules end with two halves."""
+AUTO = 0.4
+"""In so many schedules electors are replaced by themselves."""
+GENERATIONS = (0, 0, 0, 2)
+"""As operators have counted them with the fleet's files."""
+STAND_DOWN_S = 4.0
+"""A node that has met a copy of its disk stands down at most so much later."""
+
+
+RECOVERIES = 4
+"""So often at most a schedule loses its majority after the faults."""
 
 
 class ScheduleError(AssertionError):
@@ -52,18 +72,31 @@ class Schedule:
     rng: Random = field(init=False)
     fleet: Fleet = field(init=False)
     done: Counter[str] = field(default_factory=Counter)
+    members: Recoveries = field(init=False)
     lost: int = 0
     """Disks that were lost."""
     _number: int = 0
     _says_flags: Random = field(init=False)
+    _comes: Random = field(init=False)
 
     def __post_init__(self) -> None:
         self.rng = Random(f"fleets {self.seed}")
         self._says_flags = Random(f"flags {self.seed}")
+        self._comes = Random(f"members {self.seed}")
         self.fleet = fleet_of(self.rng)
-        self.sim = Simulator(fleet=self.fleet, seed=self.seed)
+        if self._comes.random() < AUTO:
+            self.fleet = replace(self.fleet, is_auto=True, replace_s=2.0, away_s=6.0)
+        generation = self._comes.choice(GENERATIONS)
+        self.sim = Simulator(fleet=self.fleet, seed=self.seed, generation=generation)
         self.sim.work.stop_s = (0.002, 0.02, 0.1, 0.4)
-        self.sim.documents.judge_from(self.fleet, 0)
+        self.sim.documents.judge_from(self.fleet, generation)
+        self.members = Recoveries(
+            sim=self.sim,
+            rng=self._comes,
+            tell=self._tell,
+            done=self.done,
+            generation_id=founded_id(self.fleet.name, generation),
+        )
 
     def play(self) -> None:
         """Run it all.
@@ -79,25 +112,42 @@ class Schedule:
             getattr(self, f"_{rng.choice(STEPS)}")()
             if self._says_flags.random() < FLAGGED:
                 self._flag()
+            if self._comes.random() < COMING:
+                self.members.step()
+            self.members.go_on()
             sim.run(rng.choice((0.01, 0.1, 0.5, 2.0, 4.0)))
         self._calm()
-        if not self._can_agree():
+        if not self._comes_to_rest():
             self.done["no majority is left"] += 1
             return
-        if not sim.run_until(self._is_at_rest, REST_S):
-            if not self._can_agree():  # a removal of before the faults' end was chosen after it
-                self.done["no majority is left"] += 1
-                return
-            raise ScheduleError(f"not at rest {REST_S:g} s after the faults: {self._why()}")
+        if self._comes.random() < HALVES:
+            self.members.halves()
+            if not self._comes_to_rest():
+                raise ScheduleError("a half that was recovered cannot agree")
         # The end of a flag is a change, too: the last change would be in conflict with it.
         if not sim.run_until(lambda: not self._timed() and self._is_at_rest(), REST_S):
             raise ScheduleError(f"not at rest without the flags whose time is over, {self._timed()}: {self._why()}")
         self._change_once_more()
 
+    def _comes_to_rest(self) -> bool:
+        """Whether the fleet comes to rest; where no majority is left, one survivor is recovered first.
+
+        Raises:
+            ScheduleError: it does not, though it could.
+        """
+        for _ in range(RECOVERIES):
+            if self.members.can_agree() and self.sim.run_until(self._is_at_rest, REST_S):
+                return True
+            if self.members.can_agree():
+                raise ScheduleError(f"not at rest {REST_S:g} s after the faults: {self._why()}")
+            if not self.members.recover():  # or a removal of before the faults' end was chosen after it
+                return False
+        raise ScheduleError("the fleet has lost its majority again and again")
+
     # --- operators ---------------------------------------------------------------------------------------------------
 
     def _tell(self, command: ChangeFleet, node: NodeId | None = None) -> int:
-        running = self.sim.running()
+        running = [name for name in self.members.names() if self.sim.machines[name].node is not None]
         if not running:
             return 0
         self._number += 1
@@ -110,13 +160,13 @@ class Schedule:
 
     def _change(self) -> None:
         """An elector comes or goes, or the first document is agreed."""
-        name = self.rng.choice([node.name for node in self.fleet.nodes])
+        name = self.rng.choice(self.members.names())
         value = self._newest()
         if value is None or not value.document:
             self._document()
         elif value.electorate.seat(name) is None or self.rng.random() < 0.2:
             state = self.sim.disk(name)
-            if state is not None:
+            if state is not None and not state.lost:
                 self._tell(ChangeFleet(add_elector=name, disk=state.disk))
                 self.done["elector added"] += 1
         else:
@@ -126,14 +176,17 @@ class Schedule:
     def _document(self) -> None:
         """Another document, with tasks that come and go; now and then with another length of leases."""
         lease_s = self.rng.choice((self.fleet.timing.lease_s, self.fleet.timing.lease_s, 0.7, 1.6))
+        value = self._newest()
+        fleet = self.fleet if value is None else self.sim.documents.says.get(value.document, self.fleet)
         timing = replace(self.fleet.timing, lease_s=lease_s)
-        first = self.fleet.tasks[0]
+        first = fleet.tasks[0]
         extra = tuple(
             replace(first, name=name, exclusive=False) for name in ("other", "third") if self.rng.random() < 0.4
         )
         tasks = (first, *extra)
-        said = replace(self.fleet, relay_orphan_s=float(self.rng.randint(1, 20)), timing=timing, tasks=tasks)
-        self._tell(ChangeFleet(document=self.sim.documents.write(said, self._flags())))
+        said = replace(fleet, relay_orphan_s=float(self.rng.randint(1, 20)), timing=timing, tasks=tasks)
+        base = None if value is None or not value.document else value.revision
+        self._tell(ChangeFleet(document=self.sim.documents.write(said, self._flags()), base_revision=base))
         self.done["document"] += 1
 
     def _flags(self) -> tuple[Flag, ...]:
@@ -148,7 +201,7 @@ class Schedule:
         said = None if value is None else self.sim.documents.says.get(value.document)
         if value is None or said is None:
             return
-        names = sorted(self.sim.machines)
+        names = self.members.names()
         kind, chosen = rng.choice(list(FlagKind)), set(rng.sample(names, rng.randint(1, len(names) - 1)))
         kept = [flag for flag in self._flags() if flag.kind is not kind or flag.subject not in chosen]
         for_s, revision = rng.choice(FLAG_S), value.revision + 1
@@ -166,16 +219,16 @@ class Schedule:
         """Some document is not valid on one machine until the faults end."""
         known = list(self.sim.documents.says)
         if known and self.rng.random() < 0.3:
-            self.sim.documents.unfit.add((self.rng.choice(sorted(self.sim.machines)), self.rng.choice(known)))
+            self.sim.documents.unfit.add((self.rng.choice(self.members.names()), self.rng.choice(known)))
             self.done["unfit document"] += 1
 
     # --- faults ------------------------------------------------------------------------------------------------------
 
     def _kill(self) -> None:
-        self._end(self.rng.choice(sorted(self.sim.machines)), is_power_lost=False)
+        self._end(self.rng.choice(self.members.names()), is_power_lost=False)
 
     def _power(self) -> None:
-        self._end(self.rng.choice(sorted(self.sim.machines)), is_power_lost=True)
+        self._end(self.rng.choice(self.members.names()), is_power_lost=True)
 
     def _blackout(self) -> None:
         if self.rng.random() < 0.3:
@@ -184,7 +237,7 @@ class Schedule:
 
     def _end(self, name: NodeId, *, is_power_lost: bool) -> None:
         self.sim.crash(name, is_power_lost=is_power_lost)
-        self.sim.later(self.rng.choice((0.05, 0.5, 3.0, 12.0)), self.sim.start, name)
+        self.sim.later(self.rng.choice((0.05, 0.5, 3.0, 12.0)), self.members.start, name)
         self.done["crash"] += 1
 
     def _cut(self) -> None:
@@ -197,7 +250,7 @@ class Schedule:
         self.done["cut"] += 1
 
     def _pause(self) -> None:
-        self.sim.pause(self.sim.machines[self.rng.choice(sorted(self.sim.machines))], self.rng.choice((0.3, 1.0, 5.0)))
+        self.sim.pause(self.sim.machines[self.rng.choice(self.members.names())], self.rng.choice((0.3, 1.0, 5.0)))
         self.done["pause"] += 1
 
     def _lose(self) -> None:
@@ -206,15 +259,17 @@ class Schedule:
         An elector of the file is left alone, for its first seat names no disk: `zsched init` asks the fleet before it
         makes such a state again.
         """
-        name = self.rng.choice([one for one in sorted(self.sim.machines) if one not in self.fleet.electors])
+        spared = [*self.fleet.electors, *(one for one in GUESTS if self.done["joined"])]
+        name = self.rng.choice([one for one in self.members.names() if one not in spared] or [""])
         value = self._newest()
         seat = None if value is None else value.electorate.seat(name)
-        if seat is not None and self.lost:
+        if not name or (seat is not None and self.lost):
             return
         self.sim.crash(name)
-        self.sim.initialise(self.sim.machines[name], incarnation=self.sim.wall_count)
-        self.sim.machines[name].is_durable = False  # what it once knew is gone
-        self.sim.later(1.0, self.sim.start, name)
+        machine = self.sim.machines[name]
+        self.sim.initialise(machine, incarnation=self.sim.wall_count, generation=self.sim.generation)
+        machine.is_durable = False  # what it once knew is gone
+        self.sim.later(1.0, self.members.start, name)
         self.lost += seat is not None
         self.done["disk lost"] += 1
 
@@ -224,33 +279,27 @@ class Schedule:
         sim = self.sim
         sim.documents.unfit.clear()
         sim.heal()
+        self.members.calm()
         for machine in tuple(sim.machines.values()):
             sim.unpause(machine, machine.life)
             if machine.node is not None and machine.node.agreement.problems.get("fleet/document"):
                 sim.crash(machine.key)  # the operator has put it right: it looks at the document again
-        sim.start()
+        self.members.start_all()
+        if self.done["cloned"]:
+            sim.run(STAND_DOWN_S)
+            self.members.settle_disputes()
+            self.members.start_all()
 
     def _newest(self) -> FleetValue | None:
-        judge = self.sim.documents.judge
-        assert judge is not None
-        (generation,) = {name[0] for name in judge.values if name[1] == ""}
-        return judge.newest_fleet(generation)
-
-    def _can_agree(self) -> bool:
-        value = self._newest()
-        assert value is not None
-        held = [self.sim.disk(one.name) for one in value.electors]
-        fit = [
-            one
-            for one, state in zip(value.electors, held, strict=True)
-            if state and one.is_held_by(one.name, state.disk)
-        ]
-        return len(fit) >= majority(len(value.electors))
+        return self.members.newest()
 
     def _is_at_rest(self) -> bool:
         return not self._why()
 
     def _why(self) -> str:
+        self.members.go_on()
+        if not self.members.is_done():
+            return "somebody is on the way in or out"
         values = {name: self.sim.node(name).agreement.fleet_value for name in self.sim.running()}
         first = next(iter(values.values()))
         if first is None or any(value != first for value in values.values()):
@@ -276,9 +325,13 @@ class Schedule:
 
     def _change_once_more(self) -> None:
         """What is at rest can be changed again."""
-        said, outcome = replace(self.fleet, relay_orphan_s=99.0), None
+        outcome = None
         for _ in range(6):  # an operator's change of before may still come first, once its document is fetched
-            command = ChangeFleet(document=self.sim.documents.write(said, self._flags()))
+            value = self._newest()
+            assert value is not None
+            said = replace(self.sim.documents.says.get(value.document, self.fleet), relay_orphan_s=99.0)
+            base = value.revision if value.document else None
+            command = ChangeFleet(document=self.sim.documents.write(said, self._flags()), base_revision=base)
             number = self._tell(command)
             if not self.sim.run_until(lambda number=number: self._outcome(number) is not None, REST_S):  # type: ignore[misc]
                 raise ScheduleError("no answer to a change at rest")
@@ -320,8 +373,20 @@ def play(seed: int) -> tuple[str, Counter[str]]:
     try:
         schedule.play()
     except Exception as error:  # noqa: BLE001 - whatever escapes is what is looked for
+        if schedule.sim.memory.beyond:  # votes that nobody remembers: docs/design/failures.md
+            schedule.done["beyond what is promised"] += 1
+            return "", schedule.done
         return f"{type(error).__name__}: {error}", schedule.done
     return "", schedule.done
+
+
+def _played(seeds: range, jobs: int) -> Iterator[tuple[str, Counter[str]]]:
+    """What came of each seed, in their order."""
+    if jobs == 1:
+        yield from map(play, seeds)
+        return
+    with ProcessPoolExecutor(jobs) as pool:
+        yield from pool.map(play, seeds, chunksize=4)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -329,10 +394,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m zsched_lab.sim.fleets", description=__doc__)
     parser.add_argument("--seeds", type=int, default=100)
     parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=1, help="processes")
     given = parser.parse_args(arguments)
     found, done = [], Counter[str]()
-    for seed in range(given.first, given.first + given.seeds):
-        violation, did = play(seed)
+    seeds = range(given.first, given.first + given.seeds)
+    for seed, (violation, did) in zip(seeds, _played(seeds, given.jobs), strict=True):
         done += did
         if violation:
             found.append(violation)

@@ -23,15 +23,15 @@ class Memory:
     links: Links
     beyond: str = ""
     """Which votes were the first that nothing could keep back; empty: there are none."""
-    _most: dict[tuple[str, int], int] = field(default_factory=dict)
-    """{(machine, generation): of how many votes its disk knew when it gave the newest one}."""
+    _most: dict[tuple[str, int, str], int] = field(default_factory=dict)
+    """{(machine, generation, its disk): of how many votes its disk knew when it gave the newest one}."""
     _forgotten: dict[str, tuple[int, int, frozenset[str]]] = field(default_factory=dict)
     """{machine whose life began with less: (the life, votes it began with, who in its reach remembered more)}."""
 
     def on_started(self, machine: Machine, state: DurableState | None) -> None:
         """A daemon starts from this state."""
         self._forgotten.pop(machine.key, None)
-        if state is not None and state.votes < self._most.get((machine.key, state.generation), 0):
+        if state is not None and state.votes < self._most.get((machine.key, state.generation, state.disk), 0):
             self._forgotten[machine.key] = (machine.life, state.votes, self._witnesses(machine, state.votes))
 
     def on_vote(self, machine: Machine) -> None:
@@ -39,7 +39,7 @@ class Memory:
         state = machine.disk.state
         if state is None:
             return
-        key = (machine.key, state.generation)
+        key = (machine.key, state.generation, state.disk)
         self._most[key] = max(self._most.get(key, 0), state.votes)
         life, votes, witnesses = self._forgotten.get(machine.key, (-1, 0, frozenset()))
         if life == machine.life and not self.beyond and not witnesses & self._witnesses(machine, votes):

@@ -103,7 +103,7 @@ class Simulator(Links):
     def initialise(self, machine: Machine, *, incarnation: int = 0, generation: int = 0) -> None:
         """`zsched init`: a blank durable state, which says that this name has never voted."""
         before = machine.disk.state
-        disk = f"{next(self._disks):04x}"
+        disk = self.disk_id()
         blank = blank_state(
             machine.fleet, machine.name, generation, before, incarnation=incarnation, hardware="", disk=disk
         )
@@ -111,6 +111,10 @@ class Simulator(Links):
         self.invariants.expect(generation, machine.fleet.electors)
         machine.disk.write(blank)
         machine.disk.sync()
+
+    def disk_id(self) -> str:
+        """The id of another disk."""
+        return f"{next(self._disks):04x}"
 
     # --- what a test does --------------------------------------------------------------------------------------------
 
@@ -477,7 +481,9 @@ class Simulator(Links):
         def make(value: Any) -> ev.Event:
             return ev.UtilityReceived(gather=gather, utilities=value)
 
-        for name in self.fleet.voters:
+        assert me.node is not None
+        come = [name for name in me.node.fleet.voters if name not in self.fleet.voters]
+        for name in (*self.fleet.voters, *come):
             for other in self.named(name) if name != me.name else ():
                 number = self.ask(other, me, make)
                 self.send(me, other, Message(ev.UtilityAsked(request=number, asker=me.name)))

@@ -239,12 +239,12 @@ class Work:
     def _stopped_free(self, machine: Machine, life: int, task: TaskId) -> None:
         if machine.life == life and not _is_free(machine.roles[task]):
             self._free.discard((machine.key, task))
-            self._sim.invariants.checker.stop_working(machine.key, task, self._sim.now, life)
+            self._sim.invariants.stop_working(machine, task, self._sim.now, life)
 
     def freeze(self, machine: Machine) -> None:
         """The machine stands still, and its workers with it."""
         for task in machine.roles:
-            self._sim.invariants.checker.stop_working(machine.key, task, self._sim.now, machine.life)
+            self._sim.invariants.stop_working(machine, task, self._sim.now, machine.life)
 
     def thaw(self, machine: Machine, lease_s: float) -> None:
         """It goes on: what is left of a lease by its own clock lies later in true time."""
@@ -258,13 +258,13 @@ class Work:
         for task in machine.roles:
             if (machine.key, task) in self._free:
                 self._free.discard((machine.key, task))
-                self._sim.invariants.checker.stop_working(machine.key, task, self._sim.now, machine.life)
+                self._sim.invariants.stop_working(machine, task, self._sim.now, machine.life)
 
     def _stopped(self, machine: Machine, life: int, role: Role, begun: int) -> None:
         if machine.life != life:
             return
         if role.lease_until_s is not None and begun == self._begun[machine.key, role.task]:
-            self._sim.invariants.checker.stop_working(machine.key, role.task, self._sim.now, life)
+            self._sim.invariants.stop_working(machine, role.task, self._sim.now, life)
             working = self.working.get(role.task)
             if working is not None and working[0] == machine.key:
                 self.working[role.task] = (machine.key, min(working[1], self._sim.now))
