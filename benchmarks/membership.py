@@ -1,10 +1,13 @@
 """How long a fleet takes to change, and what it sends for it: a machine joins, leaves, is replaced; a document changes.
 
-``python -m benchmarks.membership [--nodes 3 6 12 24] [--rounds 3]``; root, for each machine has a network namespace.
+``python -m benchmarks.membership [--nodes 3 6 12 24] [--rounds 3] [--secured]``; root, for each machine has a network
+namespace. ``--secured``: with certificates, as a fleet is without ``--insecure``; the others then begin again in turns.
 Machines come by the verbs, as an operator gives them (`zsched_lab.fleet.hall`); half are robots, half edges.
 
 * join: from the start of `zsched invite` until the new node is alive for the first machine and counts by the newest
   value itself (two verbs and the start of a daemon are in it).
+* heard: from the start of that `zsched invite` until every node hears every other one (secured: until all have begun
+  again).
 * apply: from the start of `zsched apply` of another document until every node goes by it.
 * replace: from the power cut of an elector until the electors are settled without it, with ``replace_s: 2``.
 * leave: of the newest machine, until its daemon has ended; `drain`, seat, document and file are in it.
@@ -18,6 +21,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -65,8 +69,9 @@ class Change:
 class Fleet:
     """Machines in namespaces; it grows and shrinks by the verbs."""
 
-    def __init__(self, folder: Path, network: Network) -> None:
+    def __init__(self, folder: Path, network: Network, *, is_secured: bool) -> None:
         self.hall, self.network, self.folder = Hall(folder, network), network, folder
+        self._open = () if is_secured else ("--insecure",)
         self.names: list[str] = []
         self._made = 0
         self._rate = 0.0, 0.0
@@ -117,7 +122,7 @@ class Fleet:
     def found(self) -> None:
         """The first machine, its daemon, a task, and a quick replacement of electors."""
         name = self._next()
-        self.hall.zsched(name, "fleet", "create", "hall", "--insecure", "--timing", "wired", *self._address(name))
+        self.hall.zsched(name, "fleet", "create", "hall", *self._open, "--timing", "wired", *self._address(name))
         self.hall.start(name)
         self.names.append(name)
         self.wait(lambda: self.hall.alive(name) == {name}, "the first daemon")
@@ -150,6 +155,11 @@ class Fleet:
 
         self.wait(is_ready, f"{name} is ready")
         self.names.append(name)
+
+    def hear_all(self) -> None:
+        """Wait until every node hears every other one."""
+        names = set(self.names)
+        self.wait(lambda: all(self.hall.alive(name) >= names for name in self.names), "everybody to hear everybody")
 
     def apply(self, text: str | None = None) -> None:
         """Another document, until all nodes go by it."""
@@ -188,21 +198,26 @@ class Fleet:
         return Change(what=what, seconds=seconds, packets=packets, kilobytes=size / 1000)
 
 
-def one_fleet(nodes: int, rounds: int) -> Iterator[Change]:
+def one_fleet(nodes: int, rounds: int, *, is_secured: bool) -> Iterator[Change]:
     """Every change, some times, of a fleet of so many nodes."""
     with tempfile.TemporaryDirectory() as folder, Network(()) as network:
-        fleet = Fleet(Path(folder), network)
+        fleet = Fleet(Path(folder), network, is_secured=is_secured)
         with fleet.hall:
             fleet.found()
             while len(fleet.names) < nodes:
                 progress(f"{nodes} nodes: {len(fleet.names)} are there")
                 fleet.join()
+                fleet.hear_all()
             wanted = min(5, nodes - 1 + nodes % 2)
             fleet.wait(lambda: len(fleet.quorum(fleet.names[0])["names"]) == wanted, f"{wanted} electors")
             time.sleep(REST_S)
             for number in range(rounds):
                 progress(f"{nodes} nodes, round {number + 1}: join, apply, leave")
-                yield fleet.measure("join", fleet.join)
+                began = monotonic_s()
+                joined = fleet.measure("join", fleet.join)
+                fleet.hear_all()
+                yield joined
+                yield Change(what="heard", seconds=monotonic_s() - began - REST_S, packets=math.nan, kilobytes=math.nan)
                 yield fleet.measure("apply", fleet.apply)
                 yield fleet.measure("leave", fleet.leave)
             if nodes > 3:  # three electors are not made two by silence
@@ -244,15 +259,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--nodes", type=int, nargs="+", default=[3, 6, 12, 24])
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--secured", action="store_true")
     given = parser.parse_args()
-    print(machine())
+    print(machine(), "secured" if given.secured else "without certificates", sep="; ")
     print(
         "| nodes | change | n | s, p50 | s, max | packets, p50 | kB, p50 |",
         "| ---: | --- | ---: | ---: | ---: | ---: | ---: |",
         sep="\n",
     )
     for nodes in given.nodes:
-        changes = list(one_fleet(nodes, given.rounds))
+        changes = list(one_fleet(nodes, given.rounds, is_secured=given.secured))
         for what in dict.fromkeys(one.what for one in changes):
             ours = [one for one in changes if one.what == what]
             seconds, packets, size = (
