@@ -20,6 +20,8 @@ from zsched.commands.report import render_status
 STATUS = json.loads((Path(__file__).parent / "recorded_status" / "healthy.json").read_text())
 TEXT = "fleet: lab\n"
 NODES = ("edge1", "edge2", "robot1")
+ROLLOUT: Json = {"task": "echo", "first": ["edge1"], "command": ["/opt/echo"]}
+"""A changed worker that waits for a look: no flag ends that."""
 
 
 def task(name: str, owner: str) -> Json:
@@ -66,6 +68,7 @@ class Daemon:
         if request["verb"] == "fleet":
             body = {"node": "robot1", "fleet": "lab", "revision": self.status["fleet_revision"], "number": 2}
             told = {"settled": True, "electors": [], "document": self.document, "text": TEXT, "flags": self.flags}
+            told["rollouts"] = [ROLLOUT]
             return {**body, **told}
         assert request["verb"] == "change"
         self.changes.append(request)
@@ -137,7 +140,7 @@ def test_several_nodes_are_flagged_by_one_change_that_keeps_the_other_flags(daem
     result = run("drain", "edge2", "edge1", "--yes", "--detach", "-m", "hall", "--accept", "no-other-candidate")
     assert (result.exit_code, len(daemon.changes)) == (0, 1), result.stderr
     (change,) = daemon.changes
-    assert (change["base_revision"], change["text"]) == (4, TEXT)
+    assert (change["base_revision"], change["text"], change["rollouts"]) == (4, TEXT, [ROLLOUT])
     assert [(flag["subject"], flag["kind"], flag["revision"]) for flag in change["flags"]] == [
         ("edge1", "drain", 5),
         ("edge2", "drain", 5),

@@ -20,10 +20,10 @@ from zsched.commands import membership, papers
 from zsched.commands.common import CliError
 from zsched.commands.membership import Address, address_of, dial_order, own_address
 from zsched.config.load import check_bytes, load_fleet
-from zsched.core.values.document import Document, Text
+from zsched.core.values.document import Document, Rollout, Text
 from zsched.core.values.electorate import Elector, FleetValue
 from zsched.runtime.secured import require_own
-from zsched.wire.codec import as_plain, document_hash
+from zsched.wire.codec import as_plain, document_hash, from_plain
 from zsched.wire.invitation import decode_invitation
 
 Json = dict[str, Any]
@@ -47,6 +47,7 @@ class Node:
         self.states = {"robot1": "alive", "edge1": "alive", "robot3": "gone"}
         self.changes: list[Json] = []
         self.is_old = False
+        self.rollouts: list[Json] = []
 
     def answer(self, request: Json) -> Json:
         if request["verb"] == "status":
@@ -58,7 +59,8 @@ class Node:
             self.revision += 1
             self.text = request["text"]
             return {"outcome": "ok", "detail": "agreed", "revision": self.revision}
-        content = Document(text=Text(self.text))
+        waiting = tuple(from_plain(one, Rollout) for one in self.rollouts)
+        content = Document(text=Text(self.text), rollouts=waiting)
         value = FleetValue(
             fleet="hall",
             generation_id="ab" * 16,
@@ -79,7 +81,13 @@ class Node:
             "disk": "01",
         }
         told = {"electors": [{"name": "robot1", "disk": "01"}], "document": value.document, "text": self.text}
-        return {**body, **told, "flags": [], **({} if self.is_old else {"value": as_plain(value)})}
+        return {
+            **body,
+            **told,
+            "flags": [],
+            "rollouts": self.rollouts,
+            **({} if self.is_old else {"value": as_plain(value)}),
+        }
 
 
 @pytest.fixture
@@ -330,6 +338,15 @@ def test_a_node_that_was_never_there_gets_its_file_once_more(node: Node, tmp_pat
     failed = run("invite", "robot3", "-o", tmp_path / "none" / "file")
     assert failed.exit_code == 1
     assert "write its invitation elsewhere" in failed.stderr
+
+
+def test_a_machine_that_joins_knows_which_changed_worker_waits_for_a_look(node: Node, tmp_path: Path) -> None:
+    node.rollouts = [{"task": "merge", "first": ["robot1"], "command": ["/opt/merge"]}]
+    file = tmp_path / "robot3.invite"
+    assert run("invite", "robot3", "-o", file).exit_code == 0
+    invitation = decode_invitation(file.read_bytes())
+    assert [one.first for one in invitation.document.rollouts] == [("robot1",)]
+    assert document_hash(invitation.document) == invitation.value.document, "else it could not be stored there"
 
 
 def test_a_node_of_an_older_version_is_named(node: Node) -> None:
