@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -57,3 +58,34 @@ def test_electors_die_one_after_another_and_the_task_goes_on_down_to_two(tmp_pat
         assert "robot1 is no elector any more" in bed.log("robot3"), "every node's log has that"
         told = "".join(bed.log(name) for name in every)
         assert "robot1 is removed as an elector: gone for " in told, "the proposer's has the reason"
+
+
+def test_every_original_elector_is_replaced_while_one_of_them_sleeps(tmp_path: Path) -> None:
+    tree = {**echo_fleet(edges=4), "replace_s": 1, "away_s": 2}
+    edges = ["edge1", "edge2", "edge3", "edge4"]
+    with Testbed(tmp_path, tree) as bed:
+        bed.init()
+        bed.start()
+        owner = bed.wait_settled()
+        adopt(bed)
+
+        def quorum(node: str) -> dict[str, Any]:
+            found: dict[str, Any] = bed.status(node)["quorum"]
+            return found
+
+        bed.wait(lambda: len(quorum("edge1")["names"]) == 5, 60, "five electors")
+        number = quorum("robot3")["number"]
+        bed.send("robot3", signal.SIGSTOP)
+        bed.wait(lambda: "robot3" not in quorum("edge1")["names"], 60, "the sleeper to be replaced")
+        for dead in ("robot1", "robot2"):
+            bed.kill(dead)
+            bed.wait(lambda dead=dead: dead not in quorum("edge1")["names"], 90, f"{dead} to be replaced")  # type: ignore[misc]
+        bed.wait(lambda: quorum("edge1")["names"] == edges, 90, "edges alone to agree")
+
+        bed.send("robot3", signal.SIGCONT)
+        bed.wait(lambda: quorum("robot3")["number"] == quorum("edge1")["number"], 60, "the sleeper to learn all of it")
+        assert quorum("robot3")["number"] >= number + 3
+        bed.wait(lambda: bed.owner("robot3", "edge1"), 60, "one owner")
+        bed.kill(owner)
+        living = [name for name in edges if name != owner]
+        bed.wait(lambda: bed.owner("robot3", *living) in living, 90, "the one robot and the new electors to decide")
