@@ -65,7 +65,7 @@ from zsched.runtime.membership import copied_file
 from zsched.runtime.memory import shared_memory_objection
 from zsched.runtime.recipes import Recipes
 from zsched.runtime.reload import Reload
-from zsched.runtime.reopening import Reopening, turns
+from zsched.runtime.reopening import Moved, Reopening, turns
 from zsched.runtime.sampler import Sampler
 from zsched.runtime.sealing import seals_of
 from zsched.runtime.secured import digest_of, require_own
@@ -124,6 +124,8 @@ class Daemon:
         self._reopening = Reopening(options.node)
         self._lets_in_others = False
         """Open sessions go by other access rules than the fleet in force."""
+        self._moved, self._left = Moved(), frozenset[NodeId]()
+        """Whom open sessions dial where it is not any more; those of them that are gone from there."""
         self._certificate = ""
         """Digest of the certificate that open sessions listen with."""
         self._next_look = 0.0
@@ -345,7 +347,7 @@ class Daemon:
             bus=bus,
             access=access,
             sampler=sampler,
-            lets_in_others=self._note_rules,
+            compare_sessions=self._note_sessions,
             post=self._inbox.post,
         )
         adoption.begin()
@@ -461,7 +463,7 @@ class Daemon:
                 alert_until = now + ALERT_S
             if isinstance(event, ev.StopRequested) and leaving.ask(node.owned(), now) and not self.begins_anew:
                 self._notify.stopping()
-            if self._fleet.security is not None and leaving.asked_at is None:
+            if self._may_begin_again and leaving.asked_at is None:
                 self._tend_sessions(node, now)
             if leaving.asked_at is not None and leaving.is_over(node.owned(), node.movable(now), now):
                 self._say_goodbye(node, leaving.last_words(node.owned(), now))
@@ -475,8 +477,13 @@ class Daemon:
 
     # --- sessions that are opened again -------------------------------------------------------------------------------
 
-    def _note_rules(self, lets_in_others: bool) -> None:
+    def _note_sessions(self, lets_in_others: bool, moved: tuple[NodeId, ...]) -> None:
         self._lets_in_others, self._next_look = lets_in_others, 0.0
+        self._moved.take(moved)
+
+    @property
+    def _may_begin_again(self) -> bool:
+        return self._fleet.security is not None or self._moved.is_any or self._reopening.due_at is not None
 
     def _take_certificate(self, pem: str) -> CommandResult:
         result = renewal.take(self._fleet, self._options.state_dir, pem)
@@ -489,23 +496,30 @@ class Daemon:
             return
         electors, alive = node.fleet.electors, node.membership.alive()
         lives = {name: node.membership.incarnation(name) for name in alive}
-        if now >= self._next_look:
+        left, before = self._moved.left(lives), self._left
+        self._left = left
+        if now >= self._next_look or left != before:
             self._next_look = now + LOOK_S
             with contextlib.suppress(ConfigError):  # it is being replaced
                 node.set_problem(CERTIFICATE, renewal.ends_soon(self._fleet, renewal.now_utc()))
-            if self._lets_in_others or self._has_another_certificate(node):
-                self._reopening.want(turns((*alive, node.me), electors), lives, now)
+            if self._lets_in_others or left or self._has_another_certificate(node):
+                candidates = [task.candidates for task in node.fleet.tasks]
+                order = turns((*alive, node.me), electors, node.tenure.voters, candidates)
+                self._reopening.want(order, lives, now)
             else:
                 self._reopening.forget()
         is_free = set(node.owned()) <= set(node.movable(now))
-        if not self._reopening.is_due(electors, lives, now, is_free=is_free):
+        awaited = [name for name in electors if name not in left]  # who has left is heard again only afterwards
+        if not self._reopening.is_due(awaited, lives, now, is_free=is_free):
             return
         why_not = self._why_not_anew(node)
         self._inbox.post(ev.ProblemReported(source=SESSIONS, problem=why_not))
         if why_not is not None:
             self._reopening.put_off(now)
             return
-        log.info("sessions node=%s are opened anew: others are let in, or its certificate is another", node.me)
+        log.info(
+            "sessions node=%s are opened anew: others are let in or dialled, or its certificate is another", node.me
+        )
         self._is_restart = self.begins_anew = True
         self._inbox.post(ev.StopRequested())
 
@@ -526,7 +540,7 @@ class Daemon:
             for side in Side:
                 daemon_tls.session_text(node.fleet, side)
         except ConfigError as error:
-            return f"its sessions let in others than the fleet says, and cannot be opened anew: {error}"
+            return f"its sessions let in or dial others than the fleet says, and cannot be opened anew: {error}"
         return None
 
     def _say_goodbye(self, node: Node, last_words: str) -> None:

@@ -34,7 +34,7 @@ from zsched.core.values.fleet import (
 from zsched.core.values.model import NodeId, NodeKind, TaskId, Weights
 
 EVERY_DAEMON: Final = "every daemon must be restarted"
-OPENED_ANEW: Final = "daemons begin anew, one after another: a robot's streams stop for that moment"
+OPENED_ANEW: Final = "daemons begin again in turns: a robot's streams stop for that moment"
 
 
 class Effect(StrEnum):
@@ -338,7 +338,7 @@ def _node(old: NodeSpec, new: NodeSpec) -> Iterator[_Verdict]:
     if old.kind is not new.kind:
         yield _restart(restart, f"{path}.kind", old.kind, new.kind)
     if old.host != new.host:
-        text = f"the others dial {old.name} there from their next start on"
+        text = f"the others dial {old.name} there once it is gone from where it was"
         yield _restart(text, f"{path}.host", old.host, new.host)
     for name in ("control", "data"):
         before, after = getattr(old, f"listen_{name}"), getattr(new, f"listen_{name}")

@@ -23,7 +23,7 @@ from zsched.runtime.access_rules import names_of
 from zsched.runtime.crew import Crew
 from zsched.runtime.endpoints import Endpoints, endpoints_for
 from zsched.runtime.recipes import Recipes
-from zsched.runtime.restarts import opens_anew, restarts
+from zsched.runtime.restarts import moved, opens_anew, restarts
 from zsched.runtime.sampler import Sampler
 
 SOURCE = "restart"
@@ -49,8 +49,8 @@ class Adoption:
     access: StreamAccess
     post: Callable[[ev.Event], None]
     sampler: Sampler
-    lets_in_others: Callable[[bool], None]
-    """Told whether the open sessions let in others than the file that is gone by says."""
+    compare_sessions: Callable[[bool, tuple[NodeId, ...]], None]
+    """Told whether the open sessions let in others than the file that is gone by says, and whom they dial elsewhere."""
     _watches: dict[TaskId, WorkerWatch | None] = field(default_factory=dict)
 
     def begin(self) -> None:
@@ -80,7 +80,7 @@ class Adoption:
         if any(task.exclusive for task in fleet.tasks):
             self.bus.hear_all_at_once()
         self._tell_watches(fleet)
-        self.lets_in_others(opens_anew(self.started_with, fleet))
+        self.compare_sessions(opens_anew(self.started_with, fleet), moved(self.started_with, fleet, self.me))
         needs = restarts(self.started_with, fleet, self.me, is_agreed=is_agreed)
         text = f"until this daemon is restarted: {'; '.join(needs)}" if needs else None
         self.post(ev.ProblemReported(source=SOURCE, problem=text))

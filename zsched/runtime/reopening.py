@@ -1,7 +1,7 @@
 """Decides when a daemon begins again, so that its sessions go by other access rules or another certificate.
 
-An open session of zenoh keeps the access rules, and the certificate with which it listens, that it was opened with. So
-the nodes of a secured fleet begin again one after another, electors last, and an elector only while the others live.
+An open session of zenoh keeps the access rules, the certificate with which it listens, and the addresses that it dials,
+that it was opened with. So nodes begin again in turns: electors first, each while the others live, then the others.
 
 Knows: the order of nodes, how long each of them has at most, whose lives are new. Does not know: which nodes live,
 what has changed, how a daemon begins again (`zsched.daemon`).
@@ -9,7 +9,7 @@ what has changed, how a daemon begins again (`zsched.daemon`).
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from zsched.core.values.model import NodeId
@@ -24,13 +24,46 @@ LONGEST_WAIT_S = 120.0
 """An elector waits this long for the others; one that is away for good must not keep a new node out."""
 
 
-def turns(nodes: Collection[NodeId], electors: Collection[NodeId]) -> tuple[NodeId, ...]:
-    """The nodes in the order in which they begin again.
+def turns(
+    nodes: Collection[NodeId],
+    electors: Collection[NodeId],
+    robots: Collection[NodeId] = (),
+    tasks: Collection[Collection[NodeId]] = (),
+) -> tuple[tuple[NodeId, ...], ...]:
+    """The nodes in the turns in which they begin again: electors one at a time, the others several at once.
 
-    >>> turns(("edge1", "edge2", "robot1"), ("edge1", "robot1"))
-    ('edge2', 'edge1', 'robot1')
+    A new node counts as soon as it hears a majority of the electors. So only one turn of others comes before them, and
+    the new node waits for the same number of turns in a fleet of any size. In one turn are fewer robots than would be
+    missed in a vote, and never all candidates of a task.
+
+    Args:
+        nodes: that live.
+        electors: of the fleet.
+        robots: whose votes count; those without one that begins again have to be a majority.
+        tasks: the candidates of each task.
+
+    >>> turns(("edge1", "edge2", "edge3", "robot1"), ("edge1", "robot1"), tasks=[("edge2", "edge3")])
+    (('edge2',), ('edge1',), ('robot1',), ('edge3',))
     """
-    return tuple(sorted(nodes, key=lambda name: (name in electors, name)))
+    most = max((len(robots) - 1) // 2, 1)
+    waves: list[list[NodeId]] = []
+    for name in sorted(set(nodes).difference(electors)):
+        fitting = (wave for wave in waves if _fits(name, wave, nodes, tasks))
+        wave = next((one for one in fitting if name not in robots or len(set(robots) & {*one, name}) <= most), None)
+        if wave is None:
+            waves.append(wave := [])
+        wave.append(name)
+    singly = ((name,) for name in sorted(set(nodes).intersection(electors)))
+    first, *later = map(tuple, waves or [[]])
+    return (*((first,) if first else ()), *singly, *later)
+
+
+def _fits(
+    name: NodeId, wave: Collection[NodeId], nodes: Collection[NodeId], tasks: Collection[Collection[NodeId]]
+) -> bool:
+    """Whether each task that the node may have has another candidate that lives and stays meanwhile."""
+    living = ({one for one in task if one in nodes} for task in tasks if name in task)
+    return all(task == {name} or task - {name, *wave} for task in living)
 
 
 @dataclass(slots=True)
@@ -42,23 +75,23 @@ class Reopening:
     """The latest of its turn (monotonic seconds); ``None``: nothing is to be opened again."""
     _first_at: float = 0.0
     _before: Mapping[NodeId, int | None] = field(default_factory=dict)
-    """{node whose turn comes first: its incarnation when something changed}."""
+    """{node of an earlier turn: its incarnation when something changed}."""
     _anew_at: float | None = None
     """Since when all of them are heard in a new life."""
 
-    def want(self, order: Collection[NodeId], lives: Mapping[NodeId, int | None], now: float) -> None:
+    def want(self, order: Sequence[Collection[NodeId]], lives: Mapping[NodeId, int | None], now: float) -> None:
         """Something has changed for all of ``order``, this node among them; a turn that is set stays.
 
         Args:
-            order: the nodes, by their turns.
+            order: the nodes of each turn (`turns`).
             lives: {node: its incarnation, as far as it was heard}.
             now: monotonic seconds.
         """
         if self.due_at is None:
-            names = list(order)
-            count = names.index(self.me)
+            count = next(number for number, names in enumerate(order) if self.me in names)
             self._first_at, self.due_at = now + FIRST_S, now + FIRST_S + TURN_S * count
-            self._before, self._anew_at = {name: lives.get(name) for name in names[:count]}, None
+            self._before = {name: lives.get(name) for names in order[:count] for name in names}
+            self._anew_at = None
 
     def forget(self) -> None:
         """The sessions are right as they are."""
@@ -103,3 +136,31 @@ class Reopening:
 
 def _is_newer(life: int | None, before: int | None) -> bool:
     return life is not None and before is not None and life > before
+
+
+@dataclass(slots=True)
+class Moved:
+    """The nodes that open sessions dial where they are no more, by the fleet in force."""
+
+    _lives: dict[NodeId, int | None] = field(default_factory=dict)
+    """{node: its incarnation when it was first looked at}."""
+    _names: tuple[NodeId, ...] = ()
+
+    @property
+    def is_any(self) -> bool:
+        """Whether there is one at all."""
+        return bool(self._names)
+
+    def take(self, names: tuple[NodeId, ...]) -> None:
+        """Another fleet is in force: these nodes have other addresses by it."""
+        self._names = names
+        self._lives = {name: life for name, life in self._lives.items() if name in names}
+
+    def left(self, lives: Mapping[NodeId, int | None]) -> frozenset[NodeId]:
+        """Those of them that have left their former address: they are not heard, or in another life only.
+
+        ``lives``: {other node that lives: its incarnation}. Who is still heard is dialled where it is.
+        """
+        for name in self._names:
+            self._lives.setdefault(name, lives.get(name))
+        return frozenset(name for name, life in self._lives.items() if life is None or lives.get(name) != life)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
-from zsched.core.values.fleet import Fleet, NodeSpec, Security
+from zsched.core.values.fleet import Fleet, NodeSpec, Security, dial_endpoint
 from zsched.core.values.model import NodeId
 from zsched.runtime.access_rules import Side, access_control
 from zsched.runtime.endpoints import Endpoints, endpoints_for
@@ -45,6 +45,26 @@ def opens_anew(old: Fleet, new: Fleet) -> bool:
     if before is None or after is None or _nameless(before) != _nameless(after):
         return False
     return any(access_control(old, before, side) != access_control(new, after, side) for side in Side)
+
+
+def moved(old: Fleet, new: Fleet, me: NodeId) -> tuple[NodeId, ...]:
+    """The nodes of both files that ``me`` would dial elsewhere by ``new`` than its open sessions do.
+
+    Such a daemon begins again by itself once it hears one of them no more (`zsched.runtime.reopening`).
+    """
+    before, after = _dialled(old, me), _dialled(new, me)
+    return tuple(name for name, ends in after.items() if name in before and ends - before[name])
+
+
+def _dialled(fleet: Fleet, me: NodeId) -> dict[NodeId, set[str]]:
+    """{other node: where this one dials it}."""
+    points = _points(fleet, me)
+    dialled = {*points.control_connect, *points.data_connect}
+    return {
+        node.name: {dial_endpoint(end, node.host) for end in (node.listen_control, node.listen_data) if end} & dialled
+        for node in fleet.nodes
+        if node.name != me
+    }
 
 
 def _nameless(security: Security | None) -> Security | None:
@@ -86,10 +106,11 @@ def _links(old: Fleet, new: Fleet, me: NodeId) -> Iterator[str]:
     missing = [one for one in after.control_connect if one not in before.control_connect]
     missing += [one for one in after.data_connect if one not in before.data_connect]
     if missing:
-        yield (
-            f"{', '.join(missing)} would be dialled from here, and an open session dials nobody else (a new node "
-            "itself dials those that are named under `seeds`)"
-        )
+        others = moved(old, new, me)
+        how = "a new node itself dials those that are named under `seeds`"
+        if others:
+            how = f"this daemon begins again by itself once it does not hear {' or '.join(others)} where it was"
+        yield f"{', '.join(missing)} would be dialled from here, and an open session dials nobody else ({how})"
     if (after.control_by_gossip, after.data_by_gossip) != (before.control_by_gossip, before.data_by_gossip):
         yield "sessions find other nodes by gossip, or not any more: open ones stay as they are"
 

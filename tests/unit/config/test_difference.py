@@ -82,7 +82,12 @@ def test_the_same_file_and_other_comments_are_no_change() -> None:
         (
             "host: 192.0.2.11 ",
             "host: 192.0.2.13 ",
-            ("nodes.edge1.host", "192.0.2.11", "192.0.2.13", "the others dial edge1 there from their next start on"),
+            (
+                "nodes.edge1.host",
+                "192.0.2.11",
+                "192.0.2.13",
+                "the others dial edge1 there once it is gone from where it was",
+            ),
         ),
         (
             "  robot3: {kind: robot, wifi: wlan0}\n",
@@ -240,7 +245,7 @@ def test_no_field_of_a_fleet_changes_unnoticed() -> None:
 def test_what_a_secured_fleet_lets_in_follows_when_its_daemons_begin_anew() -> None:
     plain = TEXT.replace("tcp/", "tls/")
     secured = f"{plain}\nsecurity: {{}}\n"
-    anew = "daemons begin anew, one after another: a robot's streams stop for that moment"
+    anew = "daemons begin again in turns: a robot's streams stop for that moment"
     assert told(secured, plain)[0][3] == "every daemon must be restarted"
     folder = secured.replace("{}", "{folder: /etc/other}")
     assert told(folder, secured)[0][3] == "every daemon must be restarted"
@@ -252,9 +257,9 @@ def test_what_a_secured_fleet_lets_in_follows_when_its_daemons_begin_anew() -> N
     )
     assert any(anew in one[3] for one in told(node, secured) if one[0] == "nodes.robot9")
     without = node.replace("\nsecurity: {}\n", "\n")
-    assert not any("begin anew" in one[3] for one in told(without, plain))
+    assert not any("begin again" in one[3] for one in told(without, plain))
     task = secured.replace("tasks:\n", f"tasks:\n{EXCLUSIVE}", 1)
-    assert any("begin anew" in one[3] for one in told(task, secured) if one[0] == "tasks.pick")
+    assert any("begin again" in one[3] for one in told(task, secured) if one[0] == "tasks.pick")
 
 
 # --- who dials whom --------------------------------------------------------------------------------------------------

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from zsched.runtime.reopening import FIRST_S, LONGEST_WAIT_S, SETTLE_S, TURN_S, Reopening, turns
+from zsched.runtime.reopening import FIRST_S, LONGEST_WAIT_S, SETTLE_S, TURN_S, Moved, Reopening, turns
 
 ELECTORS = ("edge1", "robot1", "robot2")
 NODES = ("edge1", "edge2", "robot1", "robot2")
@@ -19,14 +19,37 @@ def others(me: str, *anew: str) -> dict[str, int | None]:
     return lives(*(name for name in NODES if name != me), anew=anew)
 
 
+SINGLY = (("edge2",), ("edge1",), ("robot1",), ("robot2",))
+
+
 def wanting(me: str, now: float = 0.0) -> Reopening:
     one = Reopening(me)
-    one.want(ORDER, others(me), now)
+    one.want(SINGLY, others(me), now)
     return one
 
 
-def test_electors_come_last() -> None:
-    assert ORDER == ("edge2", "edge1", "robot1", "robot2")
+def test_one_turn_of_others_comes_before_the_electors_so_a_new_node_waits_as_long_in_any_fleet() -> None:
+    assert ORDER == (("edge2",), ("edge1",), ("robot1",), ("robot2",))
+    assert turns(("robot1", "robot2"), ("robot1", "robot2")) == (("robot1",), ("robot2",))
+    large = [f"m{number:02d}" for number in range(1, 25)]
+    order = turns(large, large[:5], robots=large[::2], tasks=[large[10:14]])
+    assert order[1:6] == tuple((name,) for name in large[:5])
+    assert len(order) <= 5 + 3, "the other nineteen take as many turns as votes and tasks ask for"
+    assert sorted(name for wave in order for name in wave) == large
+
+
+def test_a_turn_leaves_a_majority_of_the_robots_and_a_candidate_of_every_task() -> None:
+    robots = tuple(f"robot{number}" for number in range(1, 8))
+    edges = ("edge1", "edge2", "edge3")
+    tasks = [("edge1", "edge2", "gone"), ("edge3",), ("edge3", "robot7")]
+    order = turns((*edges, *robots), ("robot1",), robots, tasks)
+    for wave in order:
+        assert len(set(robots) - set(wave)) > len(robots) / 2
+        assert not {"edge1", "edge2"} <= set(wave), "who is gone cannot have it meanwhile"
+        assert not {"edge3", "robot7"} <= set(wave)
+    assert len(order) == 3, "robot1, and two turns of all others"
+    alone = turns(("edge1", "robot1"), (), ("robot1",), [("edge1",)])
+    assert alone == (("edge1", "robot1"),), "a task with one candidate keeps nobody waiting"
 
 
 def test_no_two_have_the_same_latest_turn() -> None:
@@ -65,7 +88,7 @@ def test_one_that_dies_again_is_waited_for_until_the_latest() -> None:
 
 def test_a_life_that_was_not_known_before_proves_nothing() -> None:
     one = Reopening("edge1")
-    one.want(ORDER, lives("robot1", "robot2"), 0.0)
+    one.want(SINGLY, lives("robot1", "robot2"), 0.0)
     assert not one.is_due(ELECTORS, others("edge1", "edge2"), FIRST_S + 5.0)
     assert one.due_at == FIRST_S + TURN_S
 
@@ -73,8 +96,8 @@ def test_a_life_that_was_not_known_before_proves_nothing() -> None:
 def test_a_turn_that_is_set_stays_until_nothing_is_wanted_any_more() -> None:
     one = Reopening("edge2")
     assert not one.is_due(ELECTORS, others("edge2"), 1e9)
-    one.want(ORDER, others("edge2"), 100.0)
-    one.want(ORDER, others("edge2"), 101.5)
+    one.want(SINGLY, others("edge2"), 100.0)
+    one.want(SINGLY, others("edge2"), 101.5)
     assert one.is_due(ELECTORS, others("edge2"), 100.0 + FIRST_S)
     one.forget()
     assert not one.is_due(ELECTORS, others("edge2"), 103.0)
@@ -92,13 +115,33 @@ def test_an_elector_waits_for_the_others_but_not_for_ever() -> None:
 
 def test_a_single_elector_waits_for_nobody() -> None:
     one = Reopening("robot1")
-    one.want(("robot1",), {}, 0.0)
+    one.want((("robot1",),), {}, 0.0)
     assert one.is_due(("robot1",), {}, FIRST_S)
 
 
 def test_what_cannot_be_now_is_tried_again_later() -> None:
     one = Reopening("robot1")
-    one.want(("robot1",), {}, 0.0)
+    one.want((("robot1",),), {}, 0.0)
     one.put_off(FIRST_S)
     assert not one.is_due(("robot1",), {}, FIRST_S + LONGEST_WAIT_S - 1)
     assert one.is_due(("robot1",), {}, FIRST_S + LONGEST_WAIT_S)
+
+
+def test_a_node_that_moves_is_waited_for_where_it_was_until_it_is_gone_there() -> None:
+    book = Moved()
+    assert book.left({"edge1": 7}) == frozenset(), "nobody has moved"
+    book.take(("edge1", "edge2"))
+    assert book.left({"edge1": 7, "edge2": 8}) == frozenset(), "both are heard where they were"
+    book.take(("edge1", "edge2"))
+    assert book.left({"edge1": 7}) == {"edge2"}, "it is gone"
+    assert book.left({"edge1": 9, "edge2": 8}) == {"edge1"}, "it has begun again elsewhere: its data session is there"
+    book.take(("edge1",))
+    assert book.left({"edge1": 7}) == frozenset()
+    book.take(())
+    assert book.left({}) == frozenset()
+
+
+def test_who_was_gone_before_it_was_known_to_move_has_left() -> None:
+    book = Moved()
+    book.take(("edge1",))
+    assert book.left({}) == {"edge1"}

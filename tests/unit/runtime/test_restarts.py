@@ -9,7 +9,7 @@ import pytest
 from support.fleets import fleet_of, task_of
 from zsched.core.values.fleet import Fleet, NodeSpec, Security, SharedMemory
 from zsched.core.values.model import NodeKind
-from zsched.runtime.restarts import opens_anew, restarts
+from zsched.runtime.restarts import moved, opens_anew, restarts
 
 
 def addressed(name: str, kind: NodeKind = NodeKind.EDGE, host: str = "") -> NodeSpec:
@@ -91,3 +91,14 @@ def test_who_is_let_in_by_other_names_begins_anew_by_itself() -> None:
 
 def test_agreed_electors_need_no_generation() -> None:
     assert restarts(OLD, replace(OLD, electors=("robot1",)), "robot1", is_agreed=True) == ()
+
+
+def test_who_dials_a_node_that_moves_begins_again_and_nobody_else() -> None:
+    there = with_node(addressed("edge2", host="10.9.9.9"))
+    assert moved(OLD, there, "robot1") == moved(OLD, there, "robot2") == ("edge2",)
+    assert moved(OLD, there, "edge1") == (), "edge2 dials it"
+    assert moved(OLD, there, "edge2") == (), "its own address"
+    assert any("begins again by itself once it does not hear edge2" in one for one in restarts(OLD, there, "robot1"))
+    data = with_node(replace(NODES[0], listen_data="tcp/0.0.0.0:9"))
+    assert moved(OLD, data, "robot1") == ("edge1",)
+    assert moved(OLD, with_node(addressed("edge3", host="10.9.9.9")), "robot1") == (), "a new node dials"
