@@ -71,7 +71,9 @@ class Fleet:
 
     def __init__(self, folder: Path, network: Network, *, is_secured: bool) -> None:
         self.hall, self.network, self.folder = Hall(folder, network), network, folder
-        self._open = () if is_secured else ("--insecure",)
+        self._is_secured = is_secured
+        self._lives: dict[str, int] = {}
+        """{node: its incarnation before the newest change}: in a secured fleet it begins again."""
         self.names: list[str] = []
         self._made = 0
         self._rate = 0.0, 0.0
@@ -122,12 +124,14 @@ class Fleet:
     def found(self) -> None:
         """The first machine, its daemon, a task, and a quick replacement of electors."""
         name = self._next()
-        self.hall.zsched(name, "fleet", "create", "hall", *self._open, "--timing", "wired", *self._address(name))
+        self.hall.zsched(name, "fleet", "create", "hall", *self._open(), "--timing", "wired", *self._address(name))
         self.hall.start(name)
         self.names.append(name)
         self.wait(lambda: self.hall.alive(name) == {name}, "the first daemon")
         text = self.hall.zsched(name, "fleet", "export").replace("tasks: {}", f"replace_s: 2\n{TASK}")
+        self.note_lives()
         self.apply(text.replace("[m01, m02]", "[m01]"))
+        self.hear_all()
 
     def _next(self) -> str:
         self._made += 1
@@ -143,23 +147,44 @@ class Fleet:
         name = self._next()
         kind = "edge" if self._made % 2 == 0 else "robot"
         words = ("--kind", kind, *self._address(name), "--yes", "--accept", "pause-task")
+        self.note_lives()
         invitation = self.folder / f"{name}.invite"
         invitation.write_text(self.hall.zsched(self.names[0], "invite", name, *words))
         self.hall.zsched(name, "join", str(invitation))
         self.hall.start(name)
-        revision = self.revision()
+        revision = 0
 
         def is_ready() -> bool:
+            nonlocal revision
+            revision = revision or self.revision()  # the first machine may just begin again
             is_there = name in self.hall.alive(self.names[0])
             return is_there and self.hall.status(name).get("fleet_revision", -1) >= revision and self.quorum(name)["ok"]
 
         self.wait(is_ready, f"{name} is ready")
         self.names.append(name)
 
+    def _open(self) -> tuple[str, ...]:
+        return () if self._is_secured else ("--insecure",)
+
+    def note_lives(self) -> None:
+        """A change comes after which daemons of a secured fleet begin again."""
+        if self._is_secured:
+            self._lives = {name: self.incarnation(name) for name in self.names}
+
+    def incarnation(self, name: str) -> int:
+        """Of a node's daemon; 0 while it does not answer."""
+        return int(self.hall.status(name).get("incarnation", 0))
+
     def hear_all(self) -> None:
-        """Wait until every node hears every other one."""
+        """Wait until every node hears every other one, and those that begin again have done so."""
         names = set(self.names)
-        self.wait(lambda: all(self.hall.alive(name) >= names for name in self.names), "everybody to hear everybody")
+
+        def do_all_hear() -> bool:
+            are_new = all(self.incarnation(name) > life for name, life in self._lives.items() if name in names)
+            return are_new and all(self.hall.alive(name) >= names for name in names)
+
+        self.wait(do_all_hear, "everybody to hear everybody")
+        self._lives = {}
 
     def apply(self, text: str | None = None) -> None:
         """Another document, until all nodes go by it."""
@@ -219,7 +244,9 @@ def one_fleet(nodes: int, rounds: int, *, is_secured: bool) -> Iterator[Change]:
                 yield joined
                 yield Change(what="heard", seconds=monotonic_s() - began - REST_S, packets=math.nan, kilobytes=math.nan)
                 yield fleet.measure("apply", fleet.apply)
+                fleet.note_lives()
                 yield fleet.measure("leave", fleet.leave)
+                fleet.hear_all()
             if nodes > 3:  # three electors are not made two by silence
                 progress(f"{nodes} nodes: replace")
                 yield fleet.measure("replace", fleet.replace)
