@@ -318,6 +318,8 @@ class Daemon:
         desk = Desk(me, self._inbox, bus, access.answer, decisions.answer, self._leave)
         operators = OperatorSocket(places.socket_path(self._options.runtime_dir, me), desk.answer)
         operators.open()
+        with contextlib.suppress(OSError):
+            places.again_path(self._options.runtime_dir, me).unlink(missing_ok=True)
         stack.callback(operators.close)
         bus.open()
         stack.callback(bus.close)
@@ -520,6 +522,8 @@ class Daemon:
         log.info(
             "sessions node=%s are opened anew: others are let in or dialled, or its certificate is another", node.me
         )
+        with contextlib.suppress(OSError):  # without it an operator's command says that there is no daemon
+            places.again_path(self._options.runtime_dir, node.me).touch()
         self._is_restart = self.begins_anew = True
         self._inbox.post(ev.StopRequested())
 

@@ -87,6 +87,16 @@ def socket_path(runtime: Path, node: NodeId) -> Path:
     return runtime / f"{node}.sock"
 
 
+def again_path(runtime: Path, node: NodeId) -> Path:
+    """The mark of a daemon on this machine that begins again in its process, until its operator socket is there."""
+    return runtime / f"{node}.again"
+
+
+def local_marks(runtime: Path) -> tuple[Path, ...]:
+    """Every such mark in the runtime folder, sorted."""
+    return tuple(sorted(runtime.glob("*.again")))
+
+
 def local_sockets(runtime: Path) -> tuple[Path, ...]:
     """Every operator socket in the runtime folder, sorted: usually one, several in a lab."""
     return tuple(sorted(runtime.glob("*.sock")))

@@ -6,7 +6,9 @@ Knows: which of several sockets is meant, what each refusal means as an exit cod
 from __future__ import annotations
 
 import atexit
+import contextlib
 import os
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -15,6 +17,7 @@ from typing import TYPE_CHECKING
 
 from zsched import paths as places
 from zsched.adapters.host.operator_socket import ask
+from zsched.clock import wall_s
 from zsched.commands.common import CliError, Json, nearest
 from zsched.core.values.model import NAME
 from zsched.errors import AdapterError
@@ -26,6 +29,8 @@ if TYPE_CHECKING:
 
 CONTROL_PORT = 7457
 """Where a node's control session listens by the guides."""
+AGAIN_S, LOOK_S = 30.0, 0.05
+"""A daemon that begins again is waited for this long from when it said so, with a look this often."""
 CONNECT_S = 3.0
 ASK_TIMEOUT_S = 5.0
 """Above the daemon's own limits (3 s for its loop, 3 s for another node), so that their reasons arrive."""
@@ -62,6 +67,7 @@ def find_door(
             raise CliError(EXIT_USAGE, f"--node: {node!r} is not a name")
         return Door(socket=Path(), node=node, endpoint=endpoint_of(connect))
     runtime = places.asked_folder(runtime_dir, env)
+    await_beginners(runtime)
     sockets = {path.stem: path for path in places.local_sockets(runtime)}
     if not sockets:
         why = "the folder cannot be read" if runtime.exists() and not os.access(runtime, os.R_OK) else "no socket there"
@@ -87,6 +93,18 @@ def find_door(
     if is_told:
         raise CliError(EXIT_USAGE, f"ZSCHED_NODE: fleet {fleet} has no node {own!r}{nearest(own, names)}")
     raise CliError(EXIT_USAGE, f"several daemons in {runtime}: {here}; say which one with --node or ZSCHED_NODE")
+
+
+def await_beginners(runtime: Path) -> None:
+    """Wait until the daemons on this machine that begin again in their processes have their sockets again."""
+    while any(map(_is_fresh, places.local_marks(runtime))):
+        time.sleep(LOOK_S)
+
+
+def _is_fresh(mark: Path) -> bool:
+    with contextlib.suppress(OSError):
+        return abs(wall_s() - mark.stat().st_mtime) < AGAIN_S
+    return False
 
 
 def name_here(given: str | None, runtime_dir: Path | None, env: Mapping[str, str] = os.environ) -> str:
@@ -148,6 +166,7 @@ def ask_door(door: Door, request: Json, timeout_s: float = ASK_TIMEOUT_S) -> Jso
         return _ask_elsewhere(door, request)
     if door.node is not None:
         request = {**request, "node": door.node}
+    await_beginners(door.socket.parent)
     try:
         answer = ask(door.socket, request, timeout_s)
     except AdapterError as error:

@@ -1,0 +1,47 @@
+"""A command that comes while a daemon begins again waits for it, and for nothing else."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from zsched.adapters.host.operator_socket import OperatorSocket
+from zsched.commands import ask
+from zsched.commands.ask import AGAIN_S, Door, ask_door, find_door
+from zsched.commands.common import CliError
+from zsched.exits import EXIT_UNREACHABLE
+from zsched.paths import again_path, socket_path
+
+ENV = {"ZSCHED_NODE": "robot1"}
+
+
+def test_a_daemon_that_begins_again_is_waited_for(tmp_path: Path) -> None:
+    mark = again_path(tmp_path, "robot1")
+    mark.touch()
+    door = OperatorSocket(socket_path(tmp_path, "robot1"), lambda request: {"verb": request["verb"]})
+    found: list[Door] = []
+    asking = threading.Thread(target=lambda: found.append(find_door(tmp_path, None, ENV)), daemon=True)
+    asking.start()
+    time.sleep(4 * ask.LOOK_S)
+    assert not found, "it waits"
+    door.open()
+    mark.unlink()
+    asking.join(30)
+    assert [one.socket for one in found] == [socket_path(tmp_path, "robot1")]
+    assert ask_door(found[0], {"verb": "status"}) == {"verb": "status"}
+    door.close()
+
+
+@pytest.mark.parametrize("ago_s", [AGAIN_S + 1.0, None])
+def test_one_that_never_came_back_is_no_daemon(tmp_path: Path, ago_s: float | None) -> None:
+    if ago_s is not None:
+        mark = again_path(tmp_path, "robot1")
+        mark.touch()
+        os.utime(mark, (time.time() - ago_s,) * 2)
+    with pytest.raises(CliError, match="no daemon in") as caught:
+        find_door(tmp_path, None, ENV)
+    assert caught.value.code == EXIT_UNREACHABLE
