@@ -1,7 +1,7 @@
-"""`zsched status` wall time, process start included, on a fleet of six.
+"""Wall time of the verbs that are asked most, process start included, on a fleet of six.
 
-``python -m benchmarks.status [--n 40]``. Beside it in the same run: a bare interpreter, the floor under any Python
-command.
+``python -m benchmarks.status [--n 40]``: `status`, `explain` and `history`. Beside them in the same run: a bare
+interpreter, the floor under any Python command. The history has the moves that the run makes before it measures.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 
 from benchmarks.common import line, machine
-from zsched_lab.fleet.testbed import Testbed, echo_fleet
+from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 
 
 def wall_ms(command: list[str]) -> float:
@@ -34,19 +34,27 @@ def main() -> None:
         bed.init()
         bed.start()
         bed.wait_settled()
-        status = [sys.executable, "-m", "zsched.cli", "status", "--runtime-dir", folder, "--node", "robot1"]
+        zsched = [sys.executable, "-m", "zsched.cli"]
+        here = ["--runtime-dir", folder, "--node", "robot1"]
+        for target in ("edge1", "edge2", "edge3", "edge1"):
+            move = [*zsched, "move", TASK, target, "--yes", *here]
+            subprocess.run(move, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, timeout=60, check=False)
+        status = [*zsched, "status", *here]
         commands = {
             "python -c pass": [sys.executable, "-c", "pass"],
             "zsched status": status,
             "zsched status --json": [*status, "--json"],
+            "zsched status -v": [*status, "-v"],
             "zsched status --node edge3 (over the mesh)": [*status[:-1], "edge3"],
+            "zsched explain": [*zsched, "explain", TASK, *here],
+            "zsched history": [*zsched, "history", *here],
         }
         times: dict[str, list[float]] = {name: [] for name in commands}
         for _ in range(arguments.n):
             for name, command in commands.items():
                 times[name].append(wall_ms(command))
     for name, values in times.items():
-        print(line(name, values, "ms", "200 ms" if "status" in name else "-"))
+        print(line(name, values, "ms", "200 ms" if "zsched" in name else "-"))
 
 
 if __name__ == "__main__":

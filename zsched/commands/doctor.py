@@ -86,7 +86,8 @@ def as_text(results: Results, width: int, *, is_colored: bool) -> str:
             page.lines.append(" " * (INDENT + NAME_COLUMNS) + page.paint(line, "bold"))
     counts = _counts(results)
     parts = ", ".join(f"{counts[verdict]} {verdict.value}" for verdict in Verdict if counts[verdict])
-    page.lines.append(f"{len(results)} checks: {parts}")
+    wrong = [check.name for check, result in results if result.verdict in (Verdict.WARN, Verdict.FAIL)]
+    page.lines += _wrapped([f"{len(results)} checks: {parts}{': ' if wrong else ''}{', '.join(wrong)}"], width)
     return "".join(f"{line}\n" for line in page.lines)
 
 

@@ -31,6 +31,8 @@ from zsched.wire.keyspace import MAX_DIGITS
 
 SCHEMA = "zsched.explain/1"
 MIN_WIDTH, MAX_WIDTH = 60, 160
+COLUMNS = {"memory": "mem", "network": "net"}
+"""The short titles of columns."""
 OUTCOMES = {"stay": "green", "none": "red"}
 
 
@@ -374,6 +376,30 @@ def _tuning(page: Page, body: Json) -> None:
         (f"owner known for {span(body['known_for_s'])}, cool-down {tuning['cool_down_s']:g}s", ""),
         *deadline,
     )
+    if formula := formula_of(body):
+        page.block("UTILITY", (formula, "dim"))
+
+
+def formula_of(body: Json) -> str:
+    """How the terms of a robot's row make its utility, in the names of the columns; empty: nothing is measured.
+
+    A metric that nobody measured has no part in it (`zsched.core.scheduler.utility.total_utility`).
+    """
+    views = [view for one in body["candidates"] for view in one["robots"]]
+    weights = {
+        name: weight
+        for name, weight in shares(body["tuning"]["weights"]).items()
+        if weight > 0.0
+        and any((view.get(name) if name in PAPER_METRICS else view["gauges"].get(name)) is not None for view in views)
+    }
+    if not weights:
+        return ""
+    named = [(COLUMNS.get(name, name), weight) for name, weight in weights.items()]
+    if body["tuning"]["score"] == "paper":
+        whole = sum(weights.values())
+        return " + ".join(f"{weight / whole:.4g} {name}" for name, weight in named)
+    most = max(weights.values())
+    return " x ".join(name if weight == most else f"{name}^{weight / most:.4g}" for name, weight in named)
 
 
 def _robots(page: Page, body: Json) -> None:

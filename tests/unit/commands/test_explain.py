@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -15,11 +16,12 @@ from zsched.adapters.host.decision_log import NAME, DecisionLog
 from zsched.commands import explain as verb
 from zsched.commands.ask import Door
 from zsched.commands.common import CliError
-from zsched.commands.explain import SCHEMA, ExplainView, explain
+from zsched.commands.explain import SCHEMA, ExplainView, explain, formula_of
 from zsched.core.instructions import RecordStory
 from zsched.core.scheduler.decision import decide_again, verdict_of
+from zsched.core.scheduler.utility import total_utility
 from zsched.core.values.decision import Decision, Explanation, Figures, Move, Need, Rules
-from zsched.core.values.model import Allocation, PeerState, Reach, Tuning, Utility, UtilityVector, Weights
+from zsched.core.values.model import Allocation, PeerState, Reach, ScoreForm, Tuning, Utility, UtilityVector, Weights
 from zsched.core.values.snapshot import VoteStatus
 from zsched.exits import EXIT_FAILED, EXIT_UNREACHABLE, EXIT_USAGE, EXIT_WOULD_CHANGE
 from zsched.wire.codec import as_plain
@@ -118,6 +120,36 @@ def asked(node: str | None = None, task: str = "merge", *, is_json: bool = False
     return explain(Door(socket=Path("s"), node=node), task, view)
 
 
+def by_formula(text: str, **terms: float) -> float:
+    """What a reader gets who puts a row's terms into the line UTILITY."""
+    found = re.search(r"^UTILITY +(.*)$", text, re.MULTILINE)
+    assert found is not None
+    if " x " in found[1] or "^" in found[1]:
+        parts = [one.partition("^") for one in found[1].split(" x ")]
+        return float(math.prod(terms[name] ** float(power or 1) for name, _, power in parts))
+    return sum(float(weight) * terms[name] for weight, name in (one.split() for one in found[1].split(" + ")))
+
+
+@pytest.mark.parametrize(
+    ("score", "said"),
+    [("paper", "0.4 cpu + 0.4 mem + 0.2 gpu"), ("service", "cpu x mem x gpu^0.5")],
+)
+def test_the_line_of_the_utility_is_what_the_core_reckons(score: str, said: str) -> None:
+    """Nobody measured the network, so its weight is shared out by the paper's score, and left out by service."""
+    weights = Weights.of({"cpu": 0.3, "memory": 0.3, "network": 0.25, "gpu": 0.15})
+    view = {"cpu": 0.5, "memory": 0.8, "network": None, "gauges": {"gpu": 0.9}}
+    tuning = {"score": score, "weights": {"cpu": 0.3, "memory": 0.3, "network": 0.25, "gauges": {"gpu": 0.15}}}
+    told = formula_of({"tuning": tuning, "candidates": [{"robots": [view]}, {"robots": []}]})
+    assert told == said
+    measured = frozenset({"cpu", "memory", "gpu"})
+    form = ScoreForm(score)
+    utility = total_utility(
+        weights, cpu=0.5, memory=0.8, network=None, measured=measured, form=form, gauges={"gpu": 0.9}
+    )
+    assert by_formula(f"UTILITY    {told}", cpu=0.5, mem=0.8, gpu=0.9) == pytest.approx(utility)
+    assert formula_of({"tuning": tuning, "candidates": []}) == ""
+
+
 @pytest.mark.usefixtures("fleet")
 def test_what_is_printed_adds_up(capsys: pytest.CaptureFixture[str]) -> None:
     assert asked() == 0
@@ -130,6 +162,7 @@ def test_what_is_printed_adds_up(capsys: pytest.CaptureFixture[str]) -> None:
         name = candidate or name
         cpu, memory, network, utility = map(float, numbers)
         assert utility == pytest.approx(0.5 * cpu + 0.3 * memory + 0.2 * network, abs=1e-4)
+        assert utility == pytest.approx(by_formula(text, cpu=cpu, mem=memory, net=network), abs=2e-4)
         utilities.setdefault(name, []).append(utility)
     assert list(utilities) == ["edge1", "edge2"]
     for column, (joint, bonus, penalty, total) in zip(utilities.values(), sums, strict=True):

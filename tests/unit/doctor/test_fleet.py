@@ -185,7 +185,7 @@ def test_results_as_text_and_as_json(tmp_path: Path) -> None:
     assert text.splitlines()[0] == f"PASS {'a.good':<21} fine"
     assert "\x1b" not in text
     assert max(map(len, text.splitlines())) <= 80
-    assert text.splitlines()[-2:] == [f"{'':27}fix: mend it", "2 checks: 1 PASS, 1 FAIL"]
+    assert text.splitlines()[-2:] == [f"{'':27}fix: mend it", "2 checks: 1 PASS, 1 FAIL: a.bad"]
     body = as_json(fleet_scene(tmp_path), results)
     assert (body["schema"], body["verdict"], body["counts"]) == ("zsched.doctor/1", "FAIL", {"PASS": 1, "FAIL": 1})
     assert body["checks"][1]["id"] == "a.bad"
