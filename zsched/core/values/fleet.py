@@ -104,7 +104,7 @@ class LocalSide:
     """A network of the host's applications, apart from the fleet's: inputs come from it, outputs go to it."""
 
     mode: LocalMode = key(LocalMode.CLIENT, "`client`: of the host's router; `peer`: among the host's peers.")
-    connect: tuple[str, ...] = key((), "Whom to dial, such as the host's `rmw_zenohd`.")
+    connect: tuple[str, ...] = key((), "Endpoints to dial, such as the host's `rmw_zenohd`.")
     listen: tuple[str, ...] = key((), "Where the host's applications dial us (`peer` only).")
 
 
@@ -160,7 +160,7 @@ class WorkerSpec:
     )
     stop_grace_s: float = key(2.0, "Between SIGINT, SIGTERM and SIGKILL.", SECONDS)
     output_deadline_s: float | None = key(
-        None, "No output for so long while inputs flow counts as hung.", SECONDS, shown="not watched"
+        None, "No output for this long while inputs flow counts as hung.", SECONDS, shown="not watched"
     )
     max_failures: int = key(3, "So many failures in the window make the node ineligible.", Range(1, 100))
     failure_window_s: float = key(
@@ -351,12 +351,12 @@ class Fleet:
     """Whether electors are replaced by themselves (`electorate: auto`, or none named) once a document is agreed."""
     replace_s: float = key(
         10.0,
-        "An elector that is not heard for so long is replaced, where the electors are not named.",
+        "An elector that is not heard for this long is replaced, where the electors are not named.",
         Range(1, 3600, "s"),
     )
     away_s: float = key(
         60.0,
-        "A robot that the electors have not heard for so long does not count in votes until it is heard again; "
+        "A robot that the electors have not heard for this long does not count in votes until it is heard again; "
         "at least `replace_s`.",
         Range(1, 604800, "s"),
     )
