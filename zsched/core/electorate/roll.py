@@ -81,6 +81,7 @@ class Roll:
         self._stagger_s, self._rng = stagger_s, rng
         self._may_elect = may_elect
         self.value = state.learnt
+        self._seated = self.value, self._seat_in(self.value)
         self.strangers: set[str] = set()
         """Generations of this fleet's name that have asked this node, or told it their value."""
         self._register = FleetRegister(
@@ -113,7 +114,9 @@ class Roll:
     @property
     def seat(self) -> Elector | None:
         """The seat for which this node answers."""
-        return self._seat_in(self.value)
+        if self._seated[0] is not self.value:  # it is asked for at every deadline
+            self._seated = self.value, self._seat_in(self.value)
+        return self._seated[1]
 
     @property
     def is_elector(self) -> bool:
