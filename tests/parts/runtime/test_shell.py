@@ -396,7 +396,7 @@ def test_desk_refuses_what_is_no_request(house: House) -> None:
         ({"verb": "change"}, "change: fleet: expected one of document, add_elector and remove_elector"),
         ({"verb": "change", "text": 7}, "change: text: expected the text of a fleet file, not 7"),
         ({"verb": "change", "text": "x" * 200_000}, "change: document.text: larger than 196608 bytes"),
-        ({"verb": "change", "text": "x", "flags": [{"kind": "sleep"}]}, "change: flags: "),
+        ({"verb": "change", "text": "x", "flags": [{"kind": "sleep"}]}, "change: flags, or rollouts: "),
         ({"verb": "change", "text": "x", "base_revision": "7"}, "change: base_revision: expected a whole number"),
         ({"verb": "change", "add_elector": "edge1"}, "change: fleet.disk: edge1 needs the id of its disk"),
         ({"verb": "retry", "task": "merge", "whose": "No Name"}, "retry: retry.node: 'No Name' is not a name"),
