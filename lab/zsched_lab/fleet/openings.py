@@ -26,7 +26,8 @@ from zsched_lab.fleet.hall import Hall, block_of_ports
 from zsched_lab.fleet.testbed import TASK, echo_fleet
 
 ROBOT, EDGES, GUEST = "robot1", ("edge1", "edge2"), "robot2"
-DEADLINE_S = 90.0
+DEADLINE_S = 240.0
+"""An elector waits 2 min for one that is away, as a revoked one is."""
 QUIET_S = 3.0
 """Behind a step its stream runs on for so long."""
 
