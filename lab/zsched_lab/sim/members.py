@@ -252,6 +252,9 @@ class Members:
         if held is None:
             return
         value, fleet, flags = held
+        stay = {node.name for node in fleet.nodes} - {*self._leaving, *self.dead}
+        if stay <= {flag.subject for flag in flags} and self._is_due(""):
+            self._write(value, fleet, tuple(flag for flag in flags if flag.subject not in stay))  # else nobody works
         for node in fleet.nodes:
             if node.name not in self.sim.machines and node.name not in self.dead:
                 self._bring(node.name, fleet)

@@ -111,6 +111,8 @@ class Recoveries(Members):
     def _bring_over(self, names: list[NodeId]) -> None:
         """`zsched rejoin` on each of these, in some order."""
         self.rng.shuffle(names)
+        sides = self.sim.invariants.sides
+        half = next((sides.get(one) for one in self.names() if self._generation(one) == self.generation_id), None)
         for name in names:
             if self._generation(name) == self.generation_id:
                 continue
@@ -122,7 +124,9 @@ class Recoveries(Members):
             if isinstance(side, str):
                 raise DisagreementError(f"{name} cannot change sides: {side}")
             machine.is_durable = False
-            self.sim.invariants.sides.pop(name, None)
+            sides.pop(name, None)
+            if half is not None:
+                sides[name] = half
             state = rejoined(
                 machine.fleet, name, own, side, disk=self.sim.disk_id(), incarnation=self.sim.wall_count, hardware=""
             )
