@@ -150,6 +150,8 @@ def _dataclass(cls: Any, rng: Random) -> Any:
 
 
 def _in_range(name: str, hint: Any, rng: Random) -> Any:
+    if get_origin(hint) is tuple:
+        return ()
     if hint is int or int in get_args(hint):
         return 1
     if hint is str:

@@ -20,6 +20,7 @@ from typing import Any, Self
 
 import zenoh
 
+from zsched.guard import guarded
 from zsched.ipc.takeover import Door
 from zsched.sessions.config import client_config
 from zsched_lab.fleet.hall import Hall, block_of_ports
@@ -56,7 +57,7 @@ class Stream:
         block = zenoh.CongestionControl.BLOCK
         self._publisher = self._session.declare_publisher(f"{robot}/in", congestion_control=block)
         self._period_s, self._halt = 1 / hz, threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread = guarded(self._run, name="stream", is_lasting=False)
 
     def start(self) -> None:
         """Send from now on."""
