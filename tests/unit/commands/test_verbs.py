@@ -72,7 +72,10 @@ def test_check_tells_the_hash_by_which_a_daemon_names_the_file(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("scheduling", "words"),
     [
-        ("{}", ["share of its work", "more than 0.05 (bonus)", "learns (0.05 to 1.5 s of its work)", "stays at least 2 s"]),
+        (
+            "{}",
+            ["share of its work", "more than 0.05 (bonus)", "learns (0.05 to 1.5 s of its work)", "stays at least 2 s"],
+        ),
         ("{patience: 0.7}", ["staying has cost 0.7 s of its work (patience)"]),
         ("{score: paper}", ["Eq. 1 and 2", "0.55 utility seconds", "less than 5 % of its memory free is left at once"]),
         ("{max_moves_per_minute: 9, reach: all, aggregate: median}", ["9 times", "all robots reach", "median decides"]),

@@ -347,7 +347,7 @@ class Rounds:
         now: float,
     ) -> Figures:
         """Everything that the judgement goes by, read once."""
-        name, owner, is_called = task.spec.name, allocation.owner, task.is_called
+        name, owner, is_called, gone = task.spec.name, allocation.owner, task.is_called, PeerState.GONE
         profile = None if owner is None else self._gateway.fresh(owner, now)
         if owner is not None:
             self._gateway.learn_demand(name, owner, now)
@@ -357,12 +357,12 @@ class Rounds:
             rules=task.rules,
             allocation=allocation,
             voters=self.voters,
-            present=tuple([voter for voter in self.voters if states[voter] is not PeerState.GONE]),
+            present=tuple([voter for voter in self.voters if states[voter] is not gone]),
             vectors=vectors,
             electors=self.electors,
-            electors_heard=tuple([one for one in self.electors if states[one] is not PeerState.GONE]),
+            electors_heard=tuple([one for one in self.electors if states.get(one, gone) is not gone]),
             settled_for_s=now - task.settled_at,
-            owner_state=PeerState.GONE if owner is None else states.get(owner, PeerState.GONE),
+            owner_state=gone if owner is None else states.get(owner, gone),
             owner_profile=profile,
             is_called=is_called,
             is_called_escape=task.is_called_escape,

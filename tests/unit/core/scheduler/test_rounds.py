@@ -334,6 +334,16 @@ def test_what_too_few_electors_could_agree_to_is_not_called_for() -> None:
     assert proposed(robot.round(edge1=0.0)) == ["edge2"]
 
 
+def test_an_elector_that_has_left_the_document_is_silent() -> None:
+    """It keeps its seat until the electors have agreed to remove it, and is no peer any more."""
+    robot = Robot()
+    robot.rounds.electors = ("gone1", "robot1", "robot2")
+    robot.states.update(edge1=PeerState.GONE, robot2=PeerState.GONE, robot3=PeerState.GONE)
+    assert proposed(robot.tick()) == []
+    assert robot.task.judgement is not None
+    assert robot.task.judgement.reason == "edge1 is gone; 1 of 3 electors heard"
+
+
 def test_suspect_owner_is_left_only_when_another_robot_calls_an_escape() -> None:
     robot = Robot()
     robot.states["edge1"] = PeerState.SUSPECT
