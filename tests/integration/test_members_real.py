@@ -72,6 +72,9 @@ def test_a_fleet_grows_from_one_machine_and_shrinks_to_none_while_a_stream_runs(
                 bring(hall, name, port + 10 * count)
             until(lambda: elects(hall, "robot1", "robot2", "robot3"), "one elector has become three")
             hall.zsched("robot1", "wait", "--for", "healthy", "--timeout", "60")
+            # robot1's fleet file is the copy of a document with robot1 alone
+            assert "robot3" in hall.zsched("robot1", "ping", "robot3", "--count", "1", "--timeout", "20")
+            assert "FAIL net.ports" not in hall.run("robot1", "doctor").stdout
             hall.zsched("robot1", "move", "echo", "robot3", "--yes")
 
             # it owns the task and is an elector: both go, then its name, then its daemon, then its files

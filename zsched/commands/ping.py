@@ -20,8 +20,8 @@ from zsched.adapters.network.node_ping import Pinged, ping
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door, name_here
 from zsched.commands.common import CliError, Json, nearest, print_json
+from zsched.commands.document import fleet_here
 from zsched.commands.page import harmless
-from zsched.config.load import load_fleet
 from zsched.core.values.fleet import Fleet, NodeSpec, dial_endpoint
 from zsched.core.values.model import NodeId
 from zsched.core.values.snapshot import Snapshot
@@ -67,12 +67,12 @@ def ping_node(
 
     Raises:
         CliError: there is no such node, or no way to it; or several daemons run here, and nothing says which asks.
-        ConfigError: the fleet file cannot be used.
+        ConfigError: no document is agreed, and the fleet file cannot be used.
     """
     me = name_here(me, runtime_dir)
     socket = places.socket_path(places.asked_folder(runtime_dir, os.environ), me)
     here = _own_status(socket)
-    fleet = load_fleet(places.config_path(config, os.environ))
+    fleet = fleet_here(None if here is None else Door(socket=socket), places.config_path(config, os.environ))
     names = [spec.name for spec in fleet.nodes]
     if question.node not in names:
         raise CliError(EXIT_USAGE, f"fleet {fleet.name} has no node {question.node!r}{nearest(question.node, names)}")

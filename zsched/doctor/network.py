@@ -169,7 +169,7 @@ def _port(scene: Scene, port: int, session: str, inodes: set[str]) -> Result:
 
 
 def _is_ours(words: list[str], node: str) -> bool:
-    return any(module in words for module in OURS) and node in words
+    return any(module in words for module in OURS) and not {node, f"--node={node}"}.isdisjoint(words)
 
 
 def _listeners() -> dict[int, list[tuple[str, str]]]:
