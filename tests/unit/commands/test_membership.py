@@ -53,7 +53,8 @@ class Node:
         if request["verb"] == "status":
             nodes = [{"name": name, "state": state} for name, state in self.states.items()]
             tasks = [{"name": "merge", "owner": "robot1"}]
-            return {"fleet": "hall", "nodes": nodes, "tasks": tasks, "fleet_file": "", "schema": "zsched.status/1"}
+            told = {"fleet": "hall", "nodes": nodes, "tasks": tasks, "fleet_file": "", "schema": "zsched.status/1"}
+            return {**told, "quorum": {"generation": 0}}
         if request["verb"] == "change":
             self.changes.append(request)
             self.revision += 1
