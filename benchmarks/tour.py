@@ -46,12 +46,13 @@ ESCAPES: Final = re.compile(r"\x1b(?:\[[0-9;?>]*[ -/]*[@-~]|\][^\x07]*\x07|[()][
 PER_NODE: Final = 5
 """Ports of one node: its sessions, its local side, and what it dials from."""
 TASK: Final = """\
-echo:
-  candidates: [robot1]
-  weights: {cpu: 0.5, memory: 0.5}
-  worker: {command: [python, -m, zsched.tasks.echo]}
-  inputs: [{from: "{robot}/in", to: "{target}/echo/{robot}/in"}]
-  outputs: [{from: "{target}/echo/{epoch}/{robot}/out", to: "{robot}/out"}]
+tasks:
+  echo:
+    candidates: [robot1]
+    weights: {cpu: 0.5, memory: 0.5}
+    worker: {command: [python, -m, zsched.tasks.echo]}
+    inputs: [{from: "{robot}/in", to: "{target}/echo/{robot}/in"}]
+    outputs: [{from: "{target}/echo/{epoch}/{robot}/out", to: "{robot}/out"}]
 """
 OTHER_TASK: Final = TASK.replace("echo:", "second:").replace("/echo/", "/second/").replace("/in", "/scan")
 

@@ -17,9 +17,13 @@ class Watched:
     """The files that the commands of some tasks name, looked at whenever somebody asks."""
 
     def __init__(self, commands: Mapping[TaskId, Sequence[str]], folder: Path) -> None:
-        """Relative names are meant from ``folder``; a program that is found by PATH is not watched."""
+        """Relative names are meant from ``folder``; a program that is found by PATH is not watched.
+
+        A Python file that is not there yet is: its name may be wrong, or it is still to be written.
+        """
         self.files: dict[TaskId, tuple[Path, ...]] = {
-            task: tuple(path for word in words if (path := folder / word).is_file()) for task, words in commands.items()
+            task: tuple(path for word in words if (path := folder / word).is_file() or path.suffix == ".py")
+            for task, words in commands.items()
         }
         self._stamps = {path: _stamp(path) for paths in self.files.values() for path in paths}
 

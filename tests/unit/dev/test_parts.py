@@ -131,6 +131,7 @@ class _Nodes:
 
     def __init__(self) -> None:
         self.fleet = load_fleet(EXAMPLE)
+        self.folder = Path()
         self.stopped: list[NodeId] = []
 
     def is_up(self, _node: NodeId) -> bool:
@@ -159,3 +160,20 @@ def test_a_task_is_moved_only_to_a_worker_that_is_ready(state: str, said: str, s
     run._obey("m")
     assert told == [said]
     assert nodes.stopped == stopped
+
+
+def test_a_worker_s_file_that_is_written_later_is_noticed(tmp_path: Path) -> None:
+    watched = Watched({"shout": ("python", "worker.py"), "echo": ("python", "-m", "zsched.tasks.echo")}, tmp_path)
+    assert watched.changed() == {}
+    (tmp_path / "worker.py").write_text("1")
+    assert watched.changed() == {"shout": "worker.py"}
+    assert watched.files["echo"] == ()
+
+
+def test_a_failed_worker_whose_file_is_not_watched_is_tried_again_by_a_verb(tmp_path: Path) -> None:
+    nodes, told = _Nodes(), list[str]()
+    nodes.folder = tmp_path
+    command = ("python", "-m", "shout")
+    run = Run(nodes, Watched({"shout": command}, tmp_path), say=told.append, show=lambda _: None, stop=Event())  # type: ignore[arg-type]
+    run._tell_worker(NodeId("edge1"), "shout", "failed")
+    assert f"then `zsched retry shout edge1 --runtime-dir {tmp_path} --node edge1`" in told[0]
