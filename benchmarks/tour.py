@@ -204,24 +204,32 @@ def played(hall: Hall, step: Step, size: tuple[int, int]) -> Seen:
     return Seen(step=step, code=code, seconds=time.monotonic() - began, events=events)
 
 
+def patiently(hall: Hall, *words: str) -> str:
+    """A verb on robot1, given again while its daemon begins again after the change before; what it printed."""
+    end = time.monotonic() + LONGEST_S
+    while (done := hall.run("robot1", *words)).returncode != 0:
+        if time.monotonic() > end:
+            raise SystemExit(f"zsched {' '.join(words)}: {done.stdout}{done.stderr}")
+        time.sleep(0.5)
+    return done.stdout
+
+
 def found_fleet(hall: Hall, port: int) -> None:
     """Six machines by the verbs."""
     hall.zsched("robot1", "fleet", "create", "hall", "--address", f"127.0.0.1:{port}")
     hall.start("robot1")
-    hall.zsched("robot1", "wait", "--for", "quorum", "--timeout", "60")
     (hall.folder / "echo.yaml").write_text(TASK)
-    hall.zsched("robot1", "task", "add", str(hall.folder / "echo.yaml"), "--yes")
+    patiently(hall, "task", "add", str(hall.folder / "echo.yaml"), "--yes")
     for at, name in enumerate(NODES[1:], 1):
         where = ["--kind", name.rstrip("0123456789"), "--address", f"127.0.0.1:{port + PER_NODE * at}"]
         where += ["--candidate-for", "echo"] if name.startswith("edge") else []
         invitation = hall.folder / f"{name}.invite"
-        invitation.write_text(hall.zsched("robot1", "invite", name, *where, "--yes"))
+        invitation.write_text(patiently(hall, "invite", name, *where, "--yes"))
         hall.zsched(name, "join", str(invitation))
         hall.start(name)
-        hall.zsched("robot1", "wait", "--for", "quorum", "--timeout", "60")
-    hall.zsched("robot1", "wait", "--for", "healthy", "--timeout", "90")
+    patiently(hall, "wait", "--for", "healthy", "--timeout", "60")
     home = hall.folder / "robot1"
-    (home / "fleet.yaml").write_text(hall.zsched("robot1", "fleet", "export"))
+    (home / "fleet.yaml").write_text(patiently(hall, "fleet", "export"))
     (home / "second.yaml").write_text(OTHER_TASK)
     log = min((home / "state").rglob("*.ndjson*"))
     (home / "decisions.ndjson").symlink_to(log)
@@ -230,7 +238,7 @@ def found_fleet(hall: Hall, port: int) -> None:
 @contextlib.contextmanager
 def application(hall: Hall) -> Iterator[None]:
     """Something that asks robot1's task ten times a second."""
-    joins_at = tuple(hall.status("robot1")["joins_at"])
+    joins_at = tuple(json.loads(patiently(hall, "status", "--json"))["joins_at"])
     stop = threading.Event()
     with zenoh.open(zenoh.Config.from_json5(client_config(connect=joins_at, connect_s=20.0))) as session:
         publisher = session.declare_publisher("robot1/in")

@@ -1,8 +1,8 @@
 """Plays the first hour in a clean Debian: own tasks in Python and by zenoh, the ROS 2 example; each owner is killed.
 
-``python -m benchmarks.first_hour [--report FILE]``; root, debootstrap and systemd-nspawn, and once the network or a
-package index (`tests/support/debian.py`). The machine has Debian's minimum, python3 and python3-venv, a clone of this
-checkout's last commit, and no network. The commands are those of docs/guide/first-task.md, read from there.
+``python -m benchmarks.first_hour [--only ros2] [--report FILE]``; root, debootstrap and systemd-nspawn, and once the
+network or a package index (`tests/support/debian.py`). The machine has Debian's minimum, python3 and python3-venv, a
+clone of this checkout's last commit, and no network. The commands are those of docs/guide/first-task.md, from there.
 
 Packages come from a folder that is filled beforehand, so downloading is not in the minutes. Typing and reading are not
 either: the words of the guide are printed instead. There is no ROS: `rclpy_standin.py` takes rclpy's place.
@@ -116,7 +116,7 @@ def blocks(page: Path) -> list[list[str]]:
     return [[line.partition("  #")[0].rstrip() for line in text.splitlines()] for text in found]
 
 
-def the_play() -> dict[str, Any]:
+def the_play(only: str | None) -> dict[str, Any]:
     """The guide's commands, and the tasks."""
     install, begin, run, ask = blocks(GUIDE)[:4]
     tasks = {
@@ -124,6 +124,8 @@ def the_play() -> dict[str, Any]:
         "zenoh": {"files": own_files("zenoh", ZENOH_FLEET, ZENOH_WORKER), "answer": r"\d\.\d\d \(by \w+\)"},
         "ros2": {"files": {}, "answer": r"QUESTION \d+ \(by \w+\)", "ask": f"/usr/bin/python3 {ask[-1].split()[-1]}"},
     }
+    if only:
+        tasks = {only: tasks[only]}
     return {"install": install, "begin": begin, "run": run[-1], "ask": ask[-1], "tasks": tasks}
 
 
@@ -141,17 +143,17 @@ def fill(wheels: Path) -> None:
         checked([sys.executable, "-m", "pip", "download", "-q", "-d", str(wheels), "-f", str(wheels), *wanted])
 
 
-def furnish(root: Path) -> None:
+def furnish(root: Path, only: str | None) -> None:
     """Give the machine its clone, the play, and what takes the place of ROS."""
     checked(["git", "clone", "-q", str(REPO), str(root / "root" / "zsched")])
-    (root / "opt" / "play.json").write_text(json.dumps(the_play()))
+    (root / "opt" / "play.json").write_text(json.dumps(the_play(only)))
     (root / "opt" / "drive.py").write_text((HERE / "drive.py").read_text())
     (root / SITE).mkdir(parents=True, exist_ok=True)
     (root / SITE / "rclpy.py").write_text((HERE / "rclpy_standin.py").read_text())
     (root / SITE / "ros.pth").write_text("/opt/ros\n")
 
 
-def play(folder: Path, wheels: Path) -> dict[str, Any]:
+def play(folder: Path, wheels: Path, only: str | None) -> dict[str, Any]:
     """Boot nothing: one container whose first process plays."""
     from support.debian import debian_root  # noqa: PLC0415 - the tests' folder is added to the path by main
     from support.machine import overlaid  # noqa: PLC0415 - likewise
@@ -159,7 +161,7 @@ def play(folder: Path, wheels: Path) -> dict[str, Any]:
     result = folder / "result"
     result.mkdir()
     with overlaid(debian_root(), folder) as root:
-        furnish(root)
+        furnish(root, only)
         inside = ["systemd-nspawn", "-q", "-D", str(root), "--as-pid2", "--register=no", "--keep-unit"]
         inside += ["--private-network", f"--bind-ro={wheels}:/wheels", f"--bind={result}:/result"]
         inside += ["--setenv=PIP_NO_INDEX=1", "--setenv=PIP_FIND_LINKS=/wheels"]
@@ -200,6 +202,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--report", type=Path, help="where to write all that was seen, as JSON")
     parser.add_argument("--wheels", type=Path, help="a folder for the packages, kept for the next run")
+    parser.add_argument("--only", choices=["python", "zenoh", "ros2"], help="one of the three")
     parser.add_argument("--fetch", action="store_true", help="only fill that folder")
     options = parser.parse_args()
     sys.path.insert(0, str(REPO / "tests"))
@@ -210,7 +213,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="zsched-first-hour-") as name:
         wheels = options.wheels or Path(name) / "wheels"
         fill(wheels)
-        report = play(Path(name), wheels)
+        report = play(Path(name), wheels, options.only)
     if options.report:
         options.report.write_text(json.dumps(report, indent=1))
     print(textwrap.dedent("\n".join(told(report))))
