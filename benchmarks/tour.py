@@ -27,9 +27,11 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import reduce
 from pathlib import Path
 from typing import Any, Final
 
+import typer
 import zenoh
 
 from benchmarks.common import machine
@@ -54,7 +56,8 @@ tasks:
     inputs: [{from: "{robot}/in", to: "{target}/echo/{robot}/in"}]
     outputs: [{from: "{target}/echo/{epoch}/{robot}/out", to: "{robot}/out"}]
 """
-OTHER_TASK: Final = TASK.replace("echo:", "second:").replace("/echo/", "/second/").replace("/in", "/scan")
+_OTHER_WORDS: Final = (("echo:", "second:"), ("/echo/", "/second/"), ("/in", "/scan"), ("/out", "/seen"))
+OTHER_TASK: Final = reduce(lambda text, words: text.replace(*words), _OTHER_WORDS, TASK)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -103,12 +106,12 @@ def the_tour(port: int) -> list[Step]:
         "events",
         "replay decisions.ndjson",
         "top --once",
-        "ping edge1 --count 3",
+        "ping edge1 -c 3",
         "stream list --window 1",
         "stream hz robot1/in --window 1 --count 1",
         "stream tail robot1/out --count 3",
         "weights echo",
-        "weights echo cpu=0.7 memory=0.3",
+        "weights echo cpu=0.7 memory=0.3 --yes",
         "tune echo",
         "tune echo bonus=0.1 --yes -m trial",
         "move echo edge2 --yes -m tour",
@@ -123,17 +126,17 @@ def the_tour(port: int) -> list[Step]:
         "undrain edge2 --yes",
         "restart echo --yes",
         "logs echo",
-        "retry echo edge1",
+        "retry echo edge1 --yes",
         "wait --for healthy --timeout 30",
         "doctor",
         "doctor --fleet",
         "rehearse echo --steps move,drain --yes",
         "metrics write zsched.prom",
-        "bugreport -o report.tar.gz",
+        "bugreport report.tar.gz",
         "fleet show",
         "pki show",
         "task add second.yaml --plan",
-        "node forget edge3 --plan",
+        "node remove edge3 --plan",
         "check fleet.yaml",
         "apply fleet.yaml --plan",
         "record -o run.mcap --for 3s",
@@ -224,6 +227,7 @@ def found_fleet(hall: Hall, port: int) -> None:
         where = ["--kind", name.rstrip("0123456789"), "--address", f"127.0.0.1:{port + PER_NODE * at}"]
         where += ["--candidate-for", "echo"] if name.startswith("edge") else []
         invitation = hall.folder / f"{name}.invite"
+        where += ["--accept", "pause-task"]  # the only candidate's worker starts again for another robot
         invitation.write_text(patiently(hall, "invite", name, *where, "--yes"))
         hall.zsched(name, "join", str(invitation))
         hall.start(name)
@@ -311,8 +315,8 @@ def main() -> None:
     for one in seen:
         for line in too_wide(one, options.columns):
             print(f"too wide  zsched {one.step.words}: {line.rstrip()[:200]}")
-    verbs = {command.name or command.callback.__name__ for command in app.registered_commands if command.callback}
-    verbs |= {str(group.name) for group in app.registered_groups}
+    group: Any = typer.main.get_command(app)
+    verbs = {name for name, command in group.commands.items() if not command.hidden}
     print(f"not played: {', '.join(sorted(verbs - {one.step.verb for one in seen})) or 'none'}")
 
 
