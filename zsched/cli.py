@@ -899,9 +899,9 @@ def completion(shell: Annotated[Shell, typer.Argument(metavar="SHELL", help="bas
 
     For bash: zsched completion bash > /etc/bash_completion.d/zsched
     """
-    from zsched.commands.completion import SCRIPTS  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.completion import script_file  # noqa: PLC0415 - each verb imports what it needs
 
-    typer.echo(SCRIPTS[shell.value], nl=False)
+    typer.echo(script_file(shell.value).read_text(encoding="utf-8"), nl=False)
 
 
 @app.command(cls=Verb, hidden=True)
@@ -916,13 +916,39 @@ def complete(
         typer.echo(word)
 
 
+RootOption = Annotated[
+    Path, typer.Option("--root", metavar="DIR", help="Below this folder instead; starts, stops and asks nothing.")
+]
+PlanOnlyOption = Annotated[
+    bool, typer.Option("--plan", "--dry-run", help="Only show what would be done; exits with 10 if anything.")
+]
+
+
+@app.command(cls=Verb)
+def install(plan: PlanOnlyOption = False, root: RootOption = Path("/")) -> None:
+    """Let the system find a zsched that pip installed: units, the user, completion, manual pages, the program.
+
+    It links or copies, says each step, and starts and enables nothing. Once more, it renews what is old.
+    """
+    from zsched.commands.install import install as do  # noqa: PLC0415 - each verb imports what it needs
+
+    raise typer.Exit(do(root.absolute(), is_plan=plan))
+
+
+@app.command(cls=Verb)
+def uninstall(plan: PlanOnlyOption = False, root: RootOption = Path("/")) -> None:
+    """Stop the services and take away what `zsched install` made. Fleet file, state and the program stay."""
+    from zsched.commands.install import uninstall as do  # noqa: PLC0415 - each verb imports what it needs
+
+    raise typer.Exit(do(root.absolute(), is_plan=plan))
+
+
 @app.command(cls=Verb)
 def man(folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where to.")]) -> None:
     """Write the manual pages of all verbs, as files for man."""
-    from zsched import __version__  # noqa: PLC0415 - each verb imports what it needs
-    from zsched.commands.manual import pages  # noqa: PLC0415 - as above
+    from zsched.commands.manual import pages  # noqa: PLC0415 - each verb imports what it needs
 
-    found = pages(typer.main.get_command(app), __version__)
+    found = pages(typer.main.get_command(app))
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name, text in found.items():

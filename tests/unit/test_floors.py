@@ -24,7 +24,7 @@ LAB: Final = ROOT / "lab" / "zsched_lab"
 
 FLOORS: Final[tuple[tuple[str, int, str], ...]] = (
     # pattern of the module's name below "zsched.", floor, room (\1: the group)
-    (r"__init__", 0, "version"),
+    (r"(__init__|_version)", 0, "version"),
     (r"core(\..+)?", 1, "core"),
     (r"(clock|errors|exits|files|guard|log_limit|paths|procfs)", 2, "common"),
     (r"(config|hop|sessions|wire)(?:\..+)?", 3, "\\1"),
@@ -298,10 +298,15 @@ def test_unit_tests_open_no_session() -> None:
 
 
 def folders_without_code(tests: Path) -> list[str]:
-    """Folders with tests that mirror no folder of the code: ``lab`` is the lab, everything else the package."""
+    """Folders with tests that mirror no folder of the code.
+
+    ``lab`` is the lab, ``package`` what builds packages, everything else the package.
+    """
     found = []
     for folder in sorted({path.parent.relative_to(tests) for path in tests.rglob("test_*.py")}):
-        code = LAB.joinpath(*folder.parts[1:]) if folder.parts[:1] == ("lab",) else PACKAGE / folder
+        others = {"lab": LAB, "package": ROOT / "package"}
+        first = folder.parts[0] if folder.parts else ""
+        code = others[first].joinpath(*folder.parts[1:]) if first in others else PACKAGE / folder
         if not code.is_dir():
             found.append(str(folder))
     return found

@@ -11,6 +11,7 @@ import contextlib
 import os
 from collections.abc import Sequence
 from enum import Enum
+from pathlib import Path
 from typing import Any, Final
 
 from zsched import paths as places
@@ -23,34 +24,13 @@ ANSWER_S: Final = 0.5
 CONDITIONS: Final = ("healthy", "quorum", "owner=", "settled=", "empty=")
 """Of `zsched wait --for`."""
 
-SCRIPTS: Final = {
-    "bash": """\
-_zsched() {
-    local IFS=$'\\n'
-    COMPREPLY=($("$1" complete -- "${COMP_WORDS[@]:1:COMP_CWORD}" 2>/dev/null))
-    [[ ${#COMPREPLY[@]} == 1 && ${COMPREPLY[0]} == *= ]] && compopt -o nospace
-    return 0
-}
-complete -o default -F _zsched zsched
-""",
-    "zsh": """\
-#compdef zsched
-_zsched() {
-    local -a found
-    found=("${(@f)$("${words[1]}" complete -- "${(@)words[2,CURRENT]}" 2>/dev/null)}")
-    if [[ -n "${found[1]}" ]]; then compadd -- "${found[@]}"; else _files; fi
-}
-if [[ ${zsh_eval_context[-1]} == loadautofunc ]]; then _zsched "$@"; else compdef _zsched zsched; fi
-""",
-    "fish": """\
-function __zsched_complete
-    set -l words (commandline -opc)
-    set -l last (commandline -ct)
-    $words[1] complete -- $words[2..-1] "$last" 2>/dev/null
-end
-complete -c zsched -a '(__zsched_complete)'
-""",
-}
+SCRIPTS: Final = {"bash": "zsched", "zsh": "_zsched", "fish": "zsched.fish"}
+"""{shell: its script's file, called as the shell looks for it}."""
+
+
+def script_file(shell: str) -> Path:
+    """The file that teaches a shell."""
+    return Path(__file__).parent / "completions" / SCRIPTS[shell]
 
 
 def next_words(program: Any, ctx: Any, words: Sequence[str]) -> list[str]:

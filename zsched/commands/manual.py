@@ -10,9 +10,9 @@ from collections.abc import Iterator
 from typing import Any
 
 
-def pages(program: Any, version: str) -> dict[str, str]:
+def pages(program: Any) -> dict[str, str]:
     """{file name: page} of ``program`` and all its own verbs but hidden ones."""
-    return {f"{'-'.join(words)}.1": _page(words, one, version) for words, one in _commands(program, (program.name,))}
+    return {f"{'-'.join(words)}.1": _page(words, one) for words, one in _commands(program, (program.name,))}
 
 
 def _commands(command: Any, words: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
@@ -22,14 +22,14 @@ def _commands(command: Any, words: tuple[str, ...]) -> Iterator[tuple[tuple[str,
             yield from _commands(below, (*words, name))
 
 
-def _page(words: tuple[str, ...], command: Any, version: str) -> str:
+def _page(words: tuple[str, ...], command: Any) -> str:
     title, spoken = "-".join(words), " ".join(words)
     text = inspect.cleandoc(command.help or "")
     first = text.partition("\n\n")[0]
     arguments = [param for param in command.params if param.param_type_name == "argument"]
     options = [param for param in command.params if param.param_type_name == "option"]
     lines = [
-        f'.TH "{title.upper()}" "1" "" "zsched {version}" "zsched"',
+        f'.TH "{title.upper()}" "1" "" "zsched" "zsched"',
         ".SH NAME",
         f"{_roff(title)} \\- {_roff(_joined(first).rstrip('.'))}",
         ".SH SYNOPSIS",

@@ -1,0 +1,116 @@
+"""`zsched install` and `zsched uninstall`, below a folder."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from zsched.cli import app
+
+REPO = Path(__file__).parents[3]
+
+
+@pytest.fixture
+def prefix(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An environment that pip has installed into."""
+    folder = tmp_path / "env"
+    shutil.copytree(REPO / "systemd", folder / "share/zsched")
+    shutil.copytree(REPO / "man", folder / "share/man/man1")
+    monkeypatch.setattr(sys, "prefix", str(folder))
+    return folder
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    (tmp_path / "root").mkdir()
+    return tmp_path / "root"
+
+
+def run(verb: str, root: Path, *options: str) -> Result:
+    return CliRunner().invoke(app, [verb, "--root", str(root), *options])
+
+
+def files_in(root: Path) -> set[str]:
+    return {str(path.relative_to(root)) for path in root.rglob("*") if not path.is_dir()}
+
+
+def test_install_lays_out_what_the_system_looks_for(prefix: Path, root: Path) -> None:
+    result = run("install", root)
+    assert result.exit_code == 0, result.output
+    unit = (root / "etc/systemd/system/zsched.service").read_text()
+    assert f"ExecStart={prefix}/bin/zsched up" in unit
+    assert "/opt/zsched" not in unit
+    assert (root / "usr/local/bin/zsched").readlink() == prefix / "bin/zsched"
+    for name in (
+        "bash-completion/completions/zsched",
+        "zsh/site-functions/_zsched",
+        "fish/vendor_completions.d/zsched.fish",
+    ):
+        assert (root / "usr/local/share" / name).is_file()
+    assert (root / "usr/local/share/man/man1/zsched-install.1").is_file()
+    assert (root / "etc/sysusers.d/zsched.conf").read_text().splitlines()[-1].startswith("u zsched ")
+    for name in files_in(root):
+        assert str(root / name) in result.output, "every step is said"
+
+
+def test_uninstall_takes_away_all_of_it(prefix: Path, root: Path) -> None:
+    assert prefix.exists()
+    run("install", root)
+    assert run("uninstall", root).exit_code == 0
+    assert files_in(root) == set()
+    assert "nothing of it was there" in run("uninstall", root).output
+
+
+def test_a_plan_writes_nothing_and_tells_by_its_exit_code(prefix: Path, root: Path) -> None:
+    assert prefix.exists()
+    result = run("install", root, "--plan")
+    assert (result.exit_code, files_in(root)) == (10, set())
+    assert "would make" in result.output
+    run("install", root)
+    before = files_in(root)
+    assert run("install", root, "--plan").exit_code == 0
+    assert (run("uninstall", root, "--plan").exit_code, files_in(root)) == (10, before)
+
+
+def test_a_second_time_it_renews_what_is_old(prefix: Path, root: Path) -> None:
+    run("install", root)
+    unit = root / "etc/systemd/system/zsched.service"
+    unit.write_text(unit.read_text() + "# of an older version\n")
+    result = run("install", root)
+    assert (result.exit_code, result.output.count(f"{root}")) == (0, 2), result.output
+    assert unit.read_text() == (prefix / "share/zsched/zsched.service").read_text().replace("/opt/zsched", str(prefix))
+    assert "everything is there already" in run("install", root).output
+
+
+def test_what_is_not_zscheds_is_left_alone_and_stops_install_before_it_writes(prefix: Path, root: Path) -> None:
+    assert prefix.exists()
+    stranger = root / "usr/local/bin/zsched"
+    stranger.parent.mkdir(parents=True)
+    stranger.write_text("#!/bin/sh\n")
+    result = run("install", root)
+    assert result.exit_code == 1
+    assert f"{stranger}: is there and not zsched's" in result.output
+    assert files_in(root) == {"usr/local/bin/zsched"}
+    result = run("uninstall", root)
+    assert (result.exit_code, files_in(root)) == (0, {"usr/local/bin/zsched"})
+    assert f"left {stranger}: not zsched's" in result.output
+
+
+def test_without_an_installation_it_says_how_one_is_made(
+    tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "prefix", str(tmp_path / "nowhere"))
+    result = run("install", root)
+    assert result.exit_code == 1
+    assert "pip install . makes one" in result.output
+
+
+def test_a_home_is_no_place_for_a_service(prefix: Path) -> None:
+    assert prefix.is_relative_to("/tmp"), "pytest's folder is one that the unit hides, too"  # noqa: S108 - as it says
+    result = run("install", Path("/"), "--plan")
+    assert result.exit_code == 1
+    assert "the service cannot see" in result.output

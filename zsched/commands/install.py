@@ -1,0 +1,255 @@
+"""`zsched install` and `zsched uninstall`: what a machine's system finds of a pip installation, and takes away again.
+
+Knows: where systemd, the shells and man look, what of it is ours. Does not know: what the units do, the fleet, the
+state (`zsched uninstall` leaves both). The Debian package brings the same to other places (`package/deb/build.py`).
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, distribution
+from pathlib import Path
+from typing import Final
+
+from zsched.commands.common import CliError
+from zsched.commands.completion import SCRIPTS, script_file
+from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_WOULD_CHANGE
+
+UNITS: Final = ("zsched.service", "zsched-web.service", "zsched-renew.service", "zsched-renew.timer")
+DROP_INS: Final = ("zsched.service.d/10-user.conf", "zsched-web.service.d/10-user.conf")
+OPT: Final = "/opt/zsched"
+"""The installation that the units as shipped are for."""
+USER: Final = "zsched"
+HIDDEN: Final = ("/home", "/root", "/tmp", "/var/tmp", "/run/user")  # noqa: S108 - what the unit hides from the service
+COMPLETIONS: Final = {
+    "bash": "usr/local/share/bash-completion/completions",
+    "zsh": "usr/local/share/zsh/site-functions",
+    "fish": "usr/local/share/fish/vendor_completions.d",
+}
+TOOL_S: Final = 60.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Piece:
+    """One file that the system finds: a text, or a link into the installation."""
+
+    path: Path
+    what: str
+    text: str = ""
+    target: Path | None = None
+
+    def is_there(self) -> bool:
+        """Whether it is as we would make it."""
+        if self.target is not None:
+            return self.path.is_symlink() and self.path.readlink() == self.target
+        return self.path.is_file() and not self.path.is_symlink() and _read(self.path) == self.text
+
+    def is_ours(self) -> bool:
+        """Whether we made it, of this version or another: a link into the installation, or a unit that starts it."""
+        if self.path.is_symlink():
+            leads_to = self.path.readlink()
+            return self.target is not None and (leads_to == self.target or leads_to.is_relative_to(sys.prefix))
+        return self.path.is_file() and self.target is None and _first_line(self.path) == self.text.split("\n", 1)[0]
+
+    def is_in_the_way(self) -> bool:
+        """Whether something else has this name."""
+        return (self.path.exists() or self.path.is_symlink()) and not self.is_ours()
+
+    def make(self) -> None:
+        """Write it; what stood there is replaced at once, or not at all."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        part = self.path.with_name(f".{self.path.name}.{os.getpid()}")
+        try:
+            if self.target is not None:
+                part.symlink_to(self.target)
+            else:
+                part.write_text(self.text, encoding="utf-8")
+                part.chmod(0o644)
+            part.replace(self.path)
+        except OSError:
+            part.unlink(missing_ok=True)
+            raise
+
+
+def install(root: Path, *, is_plan: bool) -> int:
+    """Make what is missing below ``root`` (``/``: this machine), and say each step; nothing is started or enabled.
+
+    Raises:
+        CliError: it cannot be done here; nothing is written.
+    """
+    prefix = Path(sys.prefix)
+    _check(prefix, root)
+    pieces = list(_pieces(prefix, root))
+    if blocked := [piece.path for piece in pieces if piece.is_in_the_way()]:
+        raise CliError(
+            EXIT_FAILED,
+            f"{blocked[0]}: is there and not zsched's{_and_others(len(blocked))}; move it away. Nothing was written",
+        )
+    missing = [piece for piece in pieces if not piece.is_there()]
+    needs_user = _is_this_machine(root) and not _has_user()
+    if is_plan:
+        _print(f"would make {piece.path}: {piece.what}" for piece in missing)
+        _print([f"would make the user and group {USER}"] if needs_user else [])
+        return EXIT_WOULD_CHANGE if missing or needs_user else EXIT_OK
+    _need_rights(root)
+    for piece in missing:
+        _carefully(piece.path, piece.make)
+        _print([f"{piece.path}: {piece.what}"])
+    if needs_user:
+        _make_user(root)
+        _print([f"user and group {USER}: the daemon's; members of the group may ask it and give orders"])
+    _reload(root)
+    if not missing and not needs_user:
+        _print(["everything is there already"])
+    _print([f"next: {_next(root)}"])
+    return EXIT_OK
+
+
+def uninstall(root: Path, *, is_plan: bool) -> int:
+    """Stop the services and take away what `install` made; what else has these names stays.
+
+    Raises:
+        CliError: it cannot be done here.
+    """
+    prefix = Path(sys.prefix)
+    _check(prefix, root)
+    pieces = list(_pieces(prefix, root))
+    ours = [piece for piece in pieces if piece.is_ours()]
+    if is_plan:
+        _print(f"would stop, disable and remove {piece.path}" for piece in ours if piece.path.suffix == ".service")
+        _print(f"would remove {piece.path}" for piece in ours if piece.path.suffix != ".service")
+        return EXIT_WOULD_CHANGE if ours else EXIT_OK
+    _need_rights(root)
+    if _has_systemd(root):
+        found = [piece.path.name for piece in ours if piece.path.name in UNITS]
+        if found:
+            _tool("systemctl", "disable", "--now", "--quiet", *found)
+    for piece in ours:
+        _carefully(piece.path, piece.path.unlink)
+        _print([f"removed {piece.path}"])
+    _print(f"left {piece.path}: not zsched's" for piece in pieces if piece.is_in_the_way())
+    _reload(root)
+    _print(["nothing of it was there"] if not ours else [])
+    kept = [path for path in ("/etc/zsched", "/var/lib/zsched", str(prefix)) if Path(path).exists()]
+    if _is_this_machine(root) and kept:
+        _print([f"what is left: {', '.join(kept)}, and the user {USER}; docs/guide/install.md says how it goes, too"])
+    return EXIT_OK
+
+
+def _check(prefix: Path, root: Path) -> None:
+    """Raise `CliError` where the service could not run from here, or somebody else looks after these files."""
+    try:
+        installer = (distribution("zsched").read_text("INSTALLER") or "").strip()
+    except PackageNotFoundError:
+        installer = ""
+    if installer == "dpkg":
+        raise CliError(EXIT_FAILED, "this zsched is a Debian package, which has done all that; apt removes it")
+    if not (prefix / "share/zsched/zsched.service").is_file():
+        raise CliError(
+            EXIT_FAILED,
+            f"{prefix}/share/zsched: no units there, so this is no installation (an editable one?); "
+            f"sudo python3 -m venv {OPT} && sudo {OPT}/bin/pip install . makes one",
+        )
+    hidden = next((place for place in HIDDEN if prefix.is_relative_to(place)), None)
+    if hidden is not None and _is_this_machine(root):
+        raise CliError(
+            EXIT_FAILED, f"{prefix}: the service cannot see {hidden} (ProtectHome, PrivateTmp); install zsched to {OPT}"
+        )
+
+
+def _pieces(prefix: Path, root: Path) -> Iterator[Piece]:
+    share = prefix / "share"
+    for unit in (*UNITS, *DROP_INS):
+        text = _read(share / "zsched" / unit).replace(OPT, str(prefix))
+        yield Piece(path=root / "etc/systemd/system" / unit, what=f"unit of {prefix}", text=text)
+    users = _read(share / "zsched/zsched.sysusers")
+    yield Piece(path=root / "etc/sysusers.d/zsched.conf", what=f"the user and group {USER}", text=users)
+    yield Piece(path=root / "usr/local/bin/zsched", what="the program", target=prefix / "bin/zsched")
+    for shell, folder in COMPLETIONS.items():
+        path = root / folder / SCRIPTS[shell]
+        yield Piece(path=path, what=f"completion in {shell}", target=script_file(shell))
+    for page in sorted((share / "man/man1").glob("*.1")):
+        yield Piece(path=root / "usr/local/share/man/man1" / page.name, what="manual page", target=page)
+
+
+def _next(root: Path) -> str:
+    if not _is_this_machine(root):
+        return f"take {root} where it belongs"
+    if not Path("/etc/zsched/fleet.yaml").exists():
+        return "sudo zsched fleet create NAME (or: sudo zsched join FILE), then sudo systemctl enable --now zsched"
+    return "sudo systemctl enable --now zsched"
+
+
+def _and_others(count: int) -> str:
+    return f", and {count - 1} more" if count > 1 else ""
+
+
+def _is_this_machine(root: Path) -> bool:
+    return root == Path("/")
+
+
+def _has_systemd(root: Path) -> bool:
+    return _is_this_machine(root) and Path("/run/systemd/system").is_dir()
+
+
+def _need_rights(root: Path) -> None:
+    if _is_this_machine(root) and os.geteuid() != 0:
+        raise CliError(EXIT_FAILED, "this writes to /etc and /usr/local; run it by sudo (--plan shows what it does)")
+
+
+def _has_user() -> bool:
+    import pwd  # noqa: PLC0415 - the only use
+
+    try:
+        pwd.getpwnam(USER)
+    except KeyError:
+        return False
+    return True
+
+
+def _make_user(root: Path) -> None:
+    if shutil.which("systemd-sysusers"):
+        _tool("systemd-sysusers", str(root / "etc/sysusers.d/zsched.conf"))
+        return
+    _tool("useradd", "--system", "--user-group", "--no-create-home", "--home-dir=/nonexistent", USER)
+
+
+def _reload(root: Path) -> None:
+    if _has_systemd(root):
+        _tool("systemctl", "daemon-reload")
+
+
+def _tool(*command: str) -> None:
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=TOOL_S, check=False)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise CliError(EXIT_FAILED, f"{command[0]}: {error}; do it by hand, and run this again") from error
+    if done.returncode != 0:
+        raise CliError(EXIT_FAILED, f"{' '.join(command)}: {done.stderr.strip()}; mend that, and run this again")
+
+
+def _carefully(path: Path, act: Callable[[], None]) -> None:
+    try:
+        act()
+    except OSError as error:
+        raise CliError(
+            EXIT_FAILED, f"{error.filename or path}: {error.strerror}; what was done before stays. Run this again"
+        ) from error
+
+
+def _read(path: Path) -> str:
+    return path.read_text(encoding="utf-8", errors="replace")
+
+
+def _first_line(path: Path) -> str:
+    return _read(path).split("\n", 1)[0]
+
+
+def _print(lines: Iterable[str]) -> None:
+    for line in lines:
+        print(line)
