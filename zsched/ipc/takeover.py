@@ -25,7 +25,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
-from zsched import __version__
 from zsched.clock import awake_s
 from zsched.core.values.model import NodeId
 from zsched.errors import AdapterError, WireError
@@ -34,7 +33,26 @@ from zsched.ipc.protocol import RelayHello, RelayHere, RelayRefused
 from zsched.wire import codec as wire
 
 PACKAGE: Final = Path(__file__).parents[1]
-_NOT_THE_RELAYS: Final = frozenset({"tasks", "examples", "dev", "commands", "cli.py", "__main__.py"})
+THE_RELAYS: Final = (
+    "relay",
+    "ipc",
+    "hop",
+    "sessions",
+    "wire",
+    "core/__init__.py",
+    "core/events.py",
+    "core/hop",
+    "core/membership",
+    "core/relay_protocol.py",
+    "core/route",
+    "core/values",
+    "__init__.py",
+    "clock.py",
+    "errors.py",
+    "guard.py",
+    "log_limit.py",
+)
+"""What a relay may load, of this package: a test holds it to the imports."""
 PROTOCOL: Final = 1
 """Raised whenever an older relay would misunderstand a newer daemon."""
 GREETING_S: Final = 1.0
@@ -160,20 +178,23 @@ def relays_in(folder: Path) -> tuple[int, ...]:
 def digest_of(*parts: str) -> str:
     """16 hex digits over all that a relay was started with; another one means: start a new relay."""
     state = blake2s(digest_size=8)
-    for part in (__version__, str(PROTOCOL), *parts):
+    for part in (str(PROTOCOL), *parts):
         state.update(len(part).to_bytes(4, "big") + part.encode())
     return state.hexdigest()
 
 
 def code_files() -> list[Path]:
     """The sources that decide how a relay behaves, sorted."""
-    found = sorted(PACKAGE.rglob("*.py"))
-    return [path for path in found if path.relative_to(PACKAGE).parts[0] not in _NOT_THE_RELAYS]
+    return sorted(
+        path
+        for name in THE_RELAYS
+        for path in ([PACKAGE / name] if name.endswith(".py") else (PACKAGE / name).rglob("*.py"))
+    )
 
 
 @functools.cache
 def code_digest() -> str:
-    """16 hex digits over the code that daemons and relays run: this package's, and which zenoh library it loads."""
+    """16 hex digits over the code that relays run: what they may load of this package, and which zenoh library."""
     state = blake2s(digest_size=8)
     for path in code_files():
         state.update(f"{path.relative_to(PACKAGE)} {path.stat().st_size}\n".encode() + path.read_bytes())
