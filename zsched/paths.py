@@ -98,8 +98,25 @@ def local_marks(runtime: Path) -> tuple[Path, ...]:
 
 
 def local_sockets(runtime: Path) -> tuple[Path, ...]:
-    """Every operator socket in the runtime folder, sorted: usually one, several in a lab."""
-    return tuple(sorted(runtime.glob("*.sock")))
+    """Every operator socket in the folder, sorted: usually one, several in a lab; none where we may not look into it.
+
+    The service's folder is closed to all but root as long as its user has no name (`DynamicUser`).
+    """
+    try:
+        return tuple(sorted(runtime.glob("*.sock")))
+    except PermissionError:
+        return ()
+
+
+def is_closed(folder: Path) -> bool:
+    """Whether it is there, as far as one can tell, and we may not look into it."""
+    try:
+        with os.scandir(folder):
+            return False
+    except PermissionError:
+        return True
+    except OSError:
+        return False
 
 
 def node_name(given: str | None, env: Mapping[str, str]) -> NodeId:

@@ -70,11 +70,7 @@ def find_door(
     await_beginners(runtime)
     sockets = {path.stem: path for path in places.local_sockets(runtime)}
     if not sockets:
-        why = "the folder cannot be read" if runtime.exists() and not os.access(runtime, os.R_OK) else "no socket there"
-        raise CliError(
-            EXIT_UNREACHABLE,
-            f"no daemon in {runtime} ({why}); start one with `zsched up`, or say where it is with --runtime-dir",
-        )
+        raise CliError(EXIT_UNREACHABLE, _no_socket(runtime))
     own = places.node_name(None, env)
     if node is not None:
         if node in sockets:
@@ -105,6 +101,18 @@ def _is_fresh(mark: Path) -> bool:
     with contextlib.suppress(OSError):
         return abs(wall_s() - mark.stat().st_mtime) < AGAIN_S
     return False
+
+
+def _no_socket(runtime: Path) -> str:
+    closed = next((path for path in (runtime, places.SYSTEM_RUNTIME) if places.is_closed(path)), None)
+    if closed is not None:
+        return (
+            f"may not look into {closed} (the folder cannot be read); run this as root, or, where the service's user "
+            "has a name, as a member of its group (docs/guide/install.md)"
+        )
+    return (
+        f"no daemon in {runtime} (no socket there); start one with `zsched up`, or say where it is with --runtime-dir"
+    )
 
 
 def name_here(given: str | None, runtime_dir: Path | None, env: Mapping[str, str] = os.environ) -> str:
@@ -272,6 +280,16 @@ def _unanswered(door: Door, error: AdapterError) -> CliError:
     if isinstance(error.__cause__, TimeoutError):
         return CliError(EXIT_TIMED_OUT, str(error))
     if isinstance(error.__cause__, PermissionError):
-        advice = "run this as root or as a member of the socket's group"
+        advice = f"run this as root or as a member of {_group_of(door.socket)}"
         return CliError(EXIT_UNREACHABLE, f"may not open {door.socket} (permission denied); {advice}")
     return CliError(EXIT_UNREACHABLE, str(error))
+
+
+def _group_of(path: Path) -> str:
+    """Whose members may open a socket, in words."""
+    import grp  # noqa: PLC0415 - only who may not ask pays for it
+
+    with contextlib.suppress(OSError, KeyError):
+        name = grp.getgrgid(path.stat().st_gid).gr_name
+        return f"the group {name} (sudo usermod -aG {name} $USER, then log in again)"
+    return "the socket's group"
