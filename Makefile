@@ -9,7 +9,7 @@ REAL_JOBS ?= 4
 # How the tests with real processes are run; `.ci/run` gives failed ones a second chance, alone.
 PYTEST_REAL ?= -m pytest
 
-.PHONY: help demo test test-cpu test-real test-quick lint types format man bench clean
+.PHONY: help demo test test-cpu test-real test-quick lint types format man bench deb wheel image lock clean
 .NOTPARALLEL:
 # Where it is set, each daemon, relay and worker of a test compiles all its modules anew: half of its start.
 unexport PYTHONDONTWRITEBYTECODE
@@ -65,6 +65,21 @@ man: $(VENV)/.dev  ## Write the manual pages anew (man/), from the texts of --he
 
 bench: $(VENV)/.dev  ## Print the figures of the README (takes some minutes; keep the machine quiet)
 	$(BIN)/python -m benchmarks.run
+
+# The wheels' platforms and hashes are in package/requirements.lock; nothing else is fetched. No root is needed.
+deb: $(VENV)/.dev  ## Build dist/zsched_*.deb (ARCH=aarch64; PYTHON_DIST=FILE: with a Python of its own)
+	$(BIN)/python package/deb/build.py $(if $(ARCH),--arch $(ARCH)) $(if $(PYTHON_DIST),--python-dist $(PYTHON_DIST))
+
+wheel: $(VENV)/.dev  ## Build dist/zsched-*.whl, with its SBOM
+	$(BIN)/python package/wheel.py dist
+
+image: wheel  ## Build the container image (podman; BASE=IMAGE, IMAGE_ARGS="..." to choose)
+	podman build $(if $(BASE),--build-arg BASE=$(BASE)) $(IMAGE_ARGS) -f package/Containerfile -t zsched .
+
+lock: $(VENV)/.dev  ## Write package/requirements.lock anew: the newest releases that pyproject.toml allows
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
+	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --upgrade \
+	  --custom-compile-command "make lock" pyproject.toml -o package/requirements.lock
 
 clean:  ## Remove the virtual environment and caches
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist *.egg-info

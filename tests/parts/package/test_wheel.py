@@ -95,5 +95,5 @@ def test_it_brings_what_zsched_install_and_the_package_lay_out(wheel: zipfile.Zi
     units = {f"zsched/{name}" for name in ("zsched.service", "zsched-web.service", "zsched-renew.timer")}
     assert units | {"zsched/zsched.sysusers", "man/man1/zsched-install.1", "doc/zsched/install.md"} <= share
     names = set(wheel.namelist())
-    assert {"zsched/commands/completions/zsched", "zsched/schemas/zsched.status-1.json"} <= names
+    assert {"zsched/commands/completions/zsched", "zsched/schemas/zsched.status.1.json"} <= names
     assert not [name for name in names if name.startswith(("package/", "tests/", "lab/"))]

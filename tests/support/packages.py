@@ -1,0 +1,74 @@
+"""Debian packages of this tree, built as small as a test may have them: for one Python, packed fast.
+
+Knows: `package/deb/build.py`, how a package becomes one of another version. Does not know: what is installed where.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from support.debian import PYTHON_IN_SUITE, cache_folder
+
+REPO = Path(__file__).parents[2]
+FAST = "-Zgzip -z1"
+TIMEOUT_S = 240.0
+NOT_FETCHED = 3
+"""How `build.py` ends when the index does not give the wheels."""
+
+
+def builder() -> ModuleType:
+    """The program that builds packages, as a module."""
+    spec = importlib.util.spec_from_file_location("deb_build", REPO / "package/deb/build.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def wheels_folder() -> Path:
+    """Where fetched wheels are kept from run to run."""
+    return cache_folder() / "deb"
+
+
+def built(out: Path) -> Path:
+    """This tree's package, for the Python of the booted Debian. Skips where the wheels cannot be had."""
+    if shutil.which("dpkg-deb") is None:
+        pytest.skip("not installed: dpkg-deb")
+    python = ".".join(str(one) for one in PYTHON_IN_SUITE)
+    command = [sys.executable, str(REPO / "package/deb/build.py"), "--python", python, "--compression", FAST]
+    command += ["--work", str(wheels_folder())]
+    fetched = subprocess.run([*command, "--fetch"], capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
+    if fetched.returncode == NOT_FETCHED:
+        pytest.skip(f"the locked wheels cannot be fetched (no network?): {fetched.stderr.strip()[-300:]}")
+    done = subprocess.run([*command, "--out", str(out)], capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
+    assert done.returncode == 0, done.stderr
+    (package,) = out.glob("*.deb")
+    return package
+
+
+def another(package: Path, version: str, folder: Path, change: Callable[[Path], None] = lambda _home: None) -> Path:
+    """The same package under another version; ``change`` may alter its /opt/zsched."""
+    tree = folder / f"tree-{version}"
+    subprocess.run(["dpkg-deb", "-R", str(package), str(tree)], timeout=120, check=True)
+    told = tree / "DEBIAN/control"
+    lines = [f"Version: {version}" if line.startswith("Version:") else line for line in told.read_text().splitlines()]
+    told.write_text("\n".join(lines) + "\n")
+    home = tree / "opt/zsched"
+    (home / "lib/site-packages/zsched/_version.py").write_text(f'"""Of a test."""\n\n__version__ = "{version}"\n')
+    change(home)
+    target = folder / f"zsched_{version}.deb"
+    command = ["dpkg-deb", "--root-owner-group", *FAST.split(), "--build", str(tree), str(target)]
+    subprocess.run(command, capture_output=True, env={**os.environ, "LC_ALL": "C"}, timeout=120, check=True)
+    shutil.rmtree(tree)
+    return target
