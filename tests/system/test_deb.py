@@ -1,0 +1,141 @@
+"""The Debian package in a booted Debian: installed, asked by a group's member, upgraded, rolled back, removed, purged.
+
+Needs what `test_systemd_boot.py` needs, and once the index for the locked wheels (`support.packages`). Skipped with the
+reason otherwise.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from support.debian import NoDebianError, debian_root
+from support.machine import nspawn, overlaid
+from support.packages import another, built
+from zsched_lab.fleet.loopback import free_endpoints
+
+HERE = Path(__file__).parent
+BOOT_TIMEOUT_S = 400.0
+pytestmark = [pytest.mark.root, pytest.mark.timeout(900)]
+
+FLEET = """
+fleet: deb
+timing: wired
+nodes:
+  robot1: {kind: robot, wired: true, host: 127.0.0.1, listen: {control: E0, data: E1}}
+  edge1: {kind: edge, host: 127.0.0.1, listen: {control: E2, data: E3}}
+tasks:
+  echo:
+    candidates: [robot1, edge1]
+    weights: {cpu: 1}
+    scheduling: {bonus: 0.5}
+    worker: {command: [python, -m, zsched.tasks.echo]}
+    inputs: [{from: "{robot}/in", to: "{target}/echo/{robot}/in", class: reliable}]
+    outputs: [{from: "{target}/echo/{epoch}/{robot}/out", to: "{robot}/out", class: reliable, handover: all}]
+"""
+DRIVE_UNIT = """
+[Unit]
+After=multi-user.target
+[Service]
+Type=exec
+ExecStart=/usr/bin/python3 /opt/drive.py
+"""
+OLD = "0.0.1"
+
+
+def furnish(root: Path) -> None:
+    """Put the fleet file, the application and the driver of the test into the machine."""
+    fleet, endpoints = FLEET, free_endpoints(4)
+    for number, endpoint in enumerate(endpoints):
+        fleet = fleet.replace(f"E{number}", endpoint)
+    files = {
+        "etc/systemd/system/drive.service": DRIVE_UNIT,
+        "etc/systemd/system/zsched.service.d/test.conf": "[Service]\nEnvironment=ZSCHED_NODE=robot1\n",
+        "opt/fleet.yaml": fleet,
+        "opt/endpoint": endpoints[1],
+        "opt/drive.py": (HERE / "deb_drive.py").read_text(),
+        "opt/app.py": (HERE / "deb_app.py").read_text(),
+    }
+    for name, text in files.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(text)
+    wants = root / "etc/systemd/system/multi-user.target.wants"
+    wants.mkdir(parents=True, exist_ok=True)
+    (wants / "drive.service").symlink_to("/etc/systemd/system/drive.service")
+    for name in ("result", "debs"):
+        (root / name).mkdir()
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """What was seen inside."""
+    try:
+        debian = debian_root()
+    except NoDebianError as error:
+        pytest.skip(str(error))
+    folder = tmp_path_factory.mktemp("deb")
+    (folder / "debs").mkdir()
+    (folder / "result").mkdir()
+    new = built(folder / "built")
+    another(new, OLD, folder).rename(folder / "debs/old.deb")
+    new.rename(folder / "debs/new.deb")
+    with overlaid(debian, folder) as root:
+        furnish(root)
+        binds = [f"--bind={folder / 'result'}:/result", f"--bind-ro={folder / 'debs'}:/debs"]
+        machine = f"--machine=zsched-deb-{os.getpid()}"
+        options = ["-q", "-D", str(root), machine, "--register=no", "--keep-unit", *binds, "-b"]
+        done = nspawn(folder, options, timeout_s=BOOT_TIMEOUT_S)
+        console = (folder / "console.log").read_text(errors="replace")
+    path = folder / "result" / "report.json"
+    assert path.exists(), f"no report; nspawn said {done}:\n{console[-3000:]}"
+    found: dict[str, Any] = json.loads(path.read_text())
+    assert "error" not in found, json.dumps(found, indent=1)
+    return found
+
+
+def test_it_is_installed_and_starts_nothing_without_a_fleet_file(report: dict[str, Any]) -> None:
+    assert report["install"]["code"] == 0, report["install"]
+    assert "sudo zsched fleet create NAME" in report["install"]["said"]
+    assert set(report["idle"]) == {"ActiveState=inactive", "UnitFileState=disabled"}
+    assert report["cached"], "compiled once, for the service may not write there"
+    assert "_zsched" in report["completion"]
+
+
+def test_it_does_not_mix_with_an_installation_by_pip(report: dict[str, Any]) -> None:
+    assert report["refused"]["code"] != 0
+    assert "holds an installation by pip" in report["refused"]["said"]
+
+
+def test_members_of_the_group_may_ask_and_others_may_not(report: dict[str, Any]) -> None:
+    assert report["socket"] == ["zsched", "0o660"]
+    assert report["member"]["code"] == 0, report["member"]
+    assert json.loads(report["member"]["said"])["node"] == "robot1"
+    assert report["stranger"]["code"] == 3, report["stranger"]
+    assert "member of the group zsched" in report["stranger"]["said"]
+
+
+@pytest.mark.parametrize("step", ["upgrade", "downgrade"])
+def test_another_version_comes_under_a_reliable_stream_that_loses_nothing(report: dict[str, Any], step: str) -> None:
+    found = report[step]
+    assert found["dpkg"]["code"] == 0, found
+    stream = found["stream"]
+    assert stream["sent"] > 100, found
+    assert (stream["missing"], stream["doubled"], stream["in_order"]) == ([], 0, True), json.dumps(report, indent=1)
+    assert found["same_relay"], "its code is the same, so it carries the stream on"
+    assert found["running"] == found["version"].removeprefix("zsched "), found
+    assert (found["running"] == OLD) == (step == "downgrade"), found
+
+
+def test_removed_it_hands_over_and_purged_nothing_is_left(report: dict[str, Any]) -> None:
+    removed = report["remove"]
+    assert removed["dpkg"]["code"] == 0, removed
+    assert removed["owner"] == ["edge1"], removed
+    assert removed["active"] != "active"
+    assert removed["kept"] == ["/etc/zsched/fleet.yaml", "/var/lib/zsched/"]
+    assert removed["gone"] == ["/opt/zsched", "/usr/bin/zsched"], removed
+    assert report["purge"]["code"] == 0, report["purge"]
+    assert (report["left"], report["lost"]) == ([], [])
