@@ -38,7 +38,8 @@ def _where() -> dict[str, Any]:
     if file is None:
         return {}  # ZENOH_CONFIG_OVERRIDE names the endpoint
     endpoint: str = json.loads(Path(file).read_text())["connect"]["endpoints"][0]
-    host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
+    address = endpoint.removeprefix("tcp/").partition("?")[0].partition("#")[0]  # without zenoh's options of a link
+    host, _, port = address.rpartition(":")
     return {"router_ip": host, "router_port": int(port)}
 
 
