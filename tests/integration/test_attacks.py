@@ -287,6 +287,10 @@ def test_who_is_certified_by_another_trusted_authority_under_a_public_name_says_
     assert (victim.heard, victim.asked, victim.tokens, heard) == ([], [], [], [])
 
 
+LESSER, GREATER = {"robot2": "1", "mallory": "2"}, "f" * 32
+"""Ids of sessions: of two peers that could dial each other only the one with the greater id does."""
+
+
 def test_who_is_dialled_because_a_member_named_its_address_says_and_hears_nothing(fresh: Yard) -> None:
     """Gossip passes no rule: a member tells of a peer that is none, and the victim dials it."""
     meeting = free_endpoint().replace("tcp/", "tls/")
@@ -295,6 +299,7 @@ def test_who_is_dialled_because_a_member_named_its_address_says_and_hears_nothin
 
         def peer(holder: str, listen: str, *connect: str) -> zenoh.Session:
             config = json.loads(zenoh_config.control_config(listen=(listen,), connect=connect))
+            config["id"] = LESSER[holder]
             files = {"listen_certificate": "certificate.pem", "listen_private_key": "key.pem"}
             own = {name: str(fresh.folder / holder / file) for name, file in files.items()}
             config["transport"]["link"]["tls"] = fresh.tls(holder, **own)
@@ -304,7 +309,7 @@ def test_who_is_dialled_because_a_member_named_its_address_says_and_hears_nothin
         foreign = peer("mallory", free_endpoint().replace("tcp/", "tls/"), meeting)
         note_keys(foreign, heard)
         until(liar.info.links, "the peer that is none is at the member")
-        text = fresh.text("robot1", connect=(meeting,))
+        text = json.dumps({**json.loads(fresh.text("robot1", connect=(meeting,))), "id": GREATER})
         victim = Victim(stack.enter_context(zenoh.open(zenoh.Config.from_json5(text))), meeting)
         victim.listen()
         strangers = {"mallory.yard.zsched.internal"}
