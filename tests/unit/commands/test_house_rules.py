@@ -57,6 +57,7 @@ OTHERS = {
         "logs",
     ),
     *("doctor", "ping", "bugreport", "wait", "check", "version", "completion", "man", "fleet show", "fleet export"),
+    *("install", "uninstall"),
     *("stream list", "stream hz", "stream bw", "stream tail", "metrics print", "metrics write", "demo", "bench paper"),
 }
 """What changes no fleet; `pki` makes files for an authority."""
