@@ -142,15 +142,22 @@ class Recoveries(Members):
         pairs = [pair for pair in pairs if all(self.sim.machines[name].node is not None for name in pair)]
 
         def show() -> bool:
+            told = {name: self._strangers_of(name) for name in (*one_side, *other_side) if name in self.sim.running()}
             return all(
-                f"{SAYS_STRANGER}{there}" in self.sim.node(here).agreement.problems
+                there in told[here]
                 for a, b in pairs
                 for here, there in ((a, b), (b, a))
-                if here in self.sim.running() and there in self.sim.running()
+                if here in told and there in told
             )
 
         if not self.sim.run_until(show, SHOWN_S):
             raise DisagreementError(f"not all of {one_side} and {other_side} show that they are strangers")
+
+    def _strangers_of(self, name: NodeId) -> set[NodeId]:
+        """Whom a node shows as of another generation, whether or not its own document names them."""
+        node, now = self.sim.node(name), self.sim.machines[name].clock.local(self.sim.now)
+        told = (*node.agreement.problems, *node.knocking.problems(now))
+        return {text.partition(":")[0].removeprefix(SAYS_STRANGER) for text in told if text.startswith(SAYS_STRANGER)}
 
     def halves(self) -> None:
         """The fleet is cut in two, each half is recovered that cannot agree, and the cut heals.

@@ -56,10 +56,9 @@ class Strangers:
                 files are told apart by the generation that operators count.
             now: monotonic seconds.
         """
-        named = generation_in(beat.lease_terms)
-        if not ours or not (named or is_named):
+        told = self.told(beat, ours, is_named=is_named)
+        if told is None:
             return False
-        told = named or _told_of_file(self.fleet, beat.generation)
         if told == ours[:TOLD_DIGITS]:
             self._ours_at[beat.node] = now
             if self._heard:
@@ -67,6 +66,13 @@ class Strangers:
             return False
         self._heard[beat.node] = told, now
         return True
+
+    def told(self, beat: Beat, ours: str, *, is_named: bool) -> str | None:
+        """The generation that a beat tells (`hear`); ``None``: it cannot be compared with ``ours``."""
+        named = generation_in(beat.lease_terms)
+        if not ours or not (named or is_named):
+            return None
+        return named or _told_of_file(self.fleet, beat.generation)
 
     def is_one(self, node: NodeId, now: float) -> bool:
         """Whether a node's other frames are a stranger's."""

@@ -100,7 +100,7 @@ def _on_beat(node: Stages, event: ev.BeatReceived, todo: ToDo, now: float) -> No
         return
     if not node.membership.is_known(beat.node):
         node.counters["beat_foreign"] += 1
-        node.knocking.on_beat(beat, now)
+        node.knocking.on_beat(beat, now, generation=node.agreement.foreign_generation(beat))
         return
     if node.agreement.is_stranger(beat, todo, now):
         node.counters["beat_stranger"] += 1

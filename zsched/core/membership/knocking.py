@@ -3,6 +3,9 @@
 A fleet file with a new node does not reach all machines at once. The new node sees another hash and reports it; the
 others do not know the node and would report nothing. Such beats only lead to a line in the status.
 
+A node that counts by another generation may also be one that our document has ceased to name, or does not name yet: a
+half that was recovered goes by the document that it knew.
+
 Knows: names and beats of unknown nodes. Does not know: the other content of their beats.
 """
 
@@ -11,6 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from zsched.core.membership.identity import ONE_FILE, QUIET_S, here
+from zsched.core.values.electorate import SAID_DIGITS
 from zsched.core.values.model import Beat, NodeId
 
 SHOWN_AFTER_S = 5.0
@@ -24,20 +28,20 @@ class Knocking:
     """The unknown nodes that one node hears, with its own fleet file's hash."""
 
     fleet_file: str
-    _heard: dict[NodeId, tuple[Beat, float, float]] = field(default_factory=dict)
-    """{name: (newest beat, when, since when without a long break)}."""
+    _heard: dict[NodeId, _Knock] = field(default_factory=dict)
 
     def adopt(self, fleet_file: str, nodes: frozenset[NodeId]) -> None:
         """The fleet file has this hash and names these nodes, from now on."""
         self.fleet_file = fleet_file
         self._heard = {name: known for name, known in self._heard.items() if name not in nodes}
 
-    def on_beat(self, beat: Beat, now: float) -> None:
-        """A beat of a node that the fleet file does not name."""
-        self._heard = {name: known for name, known in self._heard.items() if now < known[1] + QUIET_S}
+    def on_beat(self, beat: Beat, now: float, *, generation: str = "") -> None:
+        """A beat of a node that the fleet file does not name; ``generation`` if it tells of another one than ours."""
+        self._heard = {name: known for name, known in self._heard.items() if now < known.at + QUIET_S}
         if beat.node in self._heard or len(self._heard) < KNOCKERS_KEPT:
             known = self._heard.get(beat.node)
-            self._heard[beat.node] = (beat, now, now if known is None else known[2])
+            since = now if known is None else known.since
+            self._heard[beat.node] = _Knock(beat=beat, at=now, since=since, generation=generation)
 
     def problems(self, now: float, path: str = "", *, is_agreed: bool = False) -> tuple[str, ...]:
         """The status lines about unknown nodes that were heard lately.
@@ -48,19 +52,48 @@ class Knocking:
             is_agreed: the fleet goes by an agreed document, not by a file on each machine.
         """
         heard = [
-            (name, beat)
-            for name, (beat, at, since) in sorted(self._heard.items())
-            if now < at + QUIET_S and at >= since + SHOWN_AFTER_S
+            (name, known)
+            for name, known in sorted(self._heard.items())
+            if now < known.at + QUIET_S and known.at >= known.since + SHOWN_AFTER_S
         ]
+        return tuple(
+            self._apart(name, known.generation, path, is_agreed=is_agreed)
+            if known.generation
+            else self._unnamed(name, known.beat, path, is_agreed=is_agreed)
+            for name, known in heard
+        )
+
+    def _unnamed(self, name: NodeId, beat: Beat, path: str, *, is_agreed: bool) -> str:
+        """A node of our own generation, or of none."""
         if is_agreed:
-            return tuple(
+            return (
                 f"fleet/{name}: {name} beats in this fleet, and the agreed document does not name it: `zsched leave` "
                 f"on that machine if it was taken out, `zsched invite {name}` here if it shall come"
-                for name, _ in heard
             )
-        ours = here(self.fleet_file, path)
-        return tuple(
+        return (
             f"fleet/{name}: {name} beats in this fleet, goes by another fleet file ({beat.fleet_file or 'not told'}, "
-            f"{ours}), and is in no line of this one: {ONE_FILE}"
-            for name, beat in heard
+            f"{here(self.fleet_file, path)}), and is in no line of this one: {ONE_FILE}"
         )
+
+    def _apart(self, name: NodeId, generation: str, path: str, *, is_agreed: bool) -> str:
+        """A stranger that our document does not name: an order there would change its half, not ours."""
+        ours = "the document agreed here" if is_agreed else f"this node's fleet file ({here(self.fleet_file, path)})"
+        return (
+            f"generation/{name}: {name} counts by another generation of this fleet, {generation[:SAID_DIGITS]}, and "
+            f"{ours} does not name it; nothing passes between them. To bring {name} over: `zsched node add` here, then "
+            f"`zsched rejoin` there; to bring this node over: `zsched rejoin {generation[:SAID_DIGITS]}` here"
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Knock:
+    """What was heard of one unknown node."""
+
+    beat: Beat
+    """The newest."""
+    at: float
+    """When it came."""
+    since: float
+    """Since when without a long break."""
+    generation: str
+    """What the beat tells of another generation than ours; empty: nothing."""

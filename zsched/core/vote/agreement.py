@@ -24,7 +24,7 @@ from zsched.core.todo import ToDo
 from zsched.core.values.change import Change, Ended, MoveOwner, Retune, RoundOutcome, SetLeased
 from zsched.core.values.document import Flag
 from zsched.core.values.durable import DurableState
-from zsched.core.values.electorate import CREATION_STEP, SAID_DIGITS, Elector, FleetValue, terms_of
+from zsched.core.values.electorate import CREATION_STEP, SAID_DIGITS, TOLD_DIGITS, Elector, FleetValue, terms_of
 from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.messages import (
     Accepted,
@@ -685,6 +685,16 @@ class Agreement:
         if self.strangers.must_ask(beat.node, now):
             todo.add(do.AskLearnt(peer=beat.node, deadline_s=self._fleet.timing.ballot_s))
         return True
+
+    def foreign_generation(self, beat: Beat) -> str:
+        """What a beat tells of another generation than this node's; empty: it tells of none.
+
+        Nothing is remembered, so it serves for nodes that the document does not name, too.
+        """
+        ours = self._numbers.value
+        named = "" if ours is None else ours.generation_id
+        told = self.strangers.told(beat, named, is_named=self._numbers.is_named)
+        return "" if told is None or told == named[:TOLD_DIGITS] else told
 
     def _hear_electorate(self, beat: Beat) -> None:
         """Note whether an elector and this node refuse each other's ballots (other electors, or another generation)."""

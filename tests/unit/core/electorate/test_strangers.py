@@ -15,6 +15,7 @@ from zsched.core.electorate.changes import AdoptDocument
 from zsched.core.electorate.founding import founded, recovered
 from zsched.core.electorate.recovery import MOVED, Found, Recovery, consider, rejoined, sides_of
 from zsched.core.electorate.strangers import SHOWN_S, Strangers
+from zsched.core.membership.knocking import SHOWN_AFTER_S
 from zsched.core.node import Node
 from zsched.core.status import build_snapshot
 from zsched.core.todo import ToDo
@@ -135,6 +136,18 @@ def test_a_stranger_that_is_not_heard_any_more_is_not_shown() -> None:
     one.is_stranger(beat(RIGHT), ToDo(), 100.0)
     one.tick(ToDo(), 100.0 + SHOWN_S)
     assert "generation/robot3" not in one.problems
+
+
+@pytest.mark.parametrize(("theirs", "subject"), [(RIGHT, "generation/robot9"), (LEFT, "fleet/robot9")])
+def test_a_stranger_that_the_document_does_not_name_is_shown_as_one_too(theirs: FleetValue, subject: str) -> None:
+    """A half goes by the document that it knew. `zsched leave` on such a node would change that half, not ours."""
+    one = node()
+    for number in (1, 2):
+        one.handle(ev.BeatReceived(beat=beat(theirs, "robot9", number)), 100.0 + SHOWN_AFTER_S * number)
+    told = [text for text in build_snapshot(one, 110.0).problems if "robot9" in text]
+    assert [text.partition(":")[0] for text in told] == [subject]
+    assert ("To bring robot9 over: `zsched node add` here" in told[0]) is (theirs is RIGHT)
+    assert ("`zsched leave`" in told[0]) is (theirs is LEFT)
 
 
 def test_what_a_stranger_has_learnt_is_not_learnt_and_its_memory_counts_for_nothing() -> None:
