@@ -6,10 +6,10 @@ let in.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,8 +19,9 @@ import typer
 
 from zsched import paths as places
 from zsched.clock import wall_ns
-from zsched.commands.ask import Door, ask_door
+from zsched.commands.ask import Door, ask_door, find_door
 from zsched.commands.common import CliError, Json, nearest, print_json
+from zsched.commands.document import fleet_here
 from zsched.commands.page import harmless
 from zsched.config.load import load_fleet
 from zsched.core.values.certificates import Role, parse_label
@@ -293,11 +294,20 @@ def rotate(where: Where, *, is_end: bool) -> int:
 
 
 def _office(where: Where) -> _Office:
-    fleet = load_fleet(places.config_path(where.config, os.environ))
+    """The authority of the fleet in the fleet file; its names are those of the document, if a daemon here tells one.
+
+    Raises:
+        ConfigError: the fleet file cannot be used.
+    """
+    path = places.config_path(where.config, os.environ)
+    fleet = load_fleet(path)
+    with contextlib.suppress(CliError):  # none runs here, or nothing says which one is meant
+        held = fleet_here(find_door(None, None), path)
+        fleet = held if held.name == fleet.name else fleet
     return _Office(fleet=fleet, folder=places.authority_folder(where.authority, os.environ, fleet.name))
 
 
-@contextmanager
+@contextlib.contextmanager
 def _opened(where: Where) -> Iterator[tuple[_Office, Authority]]:
     from zsched.pki.authority import opened  # noqa: PLC0415 - imports cryptography
 

@@ -32,6 +32,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("ZSCHED_CONFIG", str(tmp_path / "fleet.yaml"))
     monkeypatch.setenv("ZSCHED_AUTHORITY", str(tmp_path / "authority"))
+    monkeypatch.setenv("ZSCHED_RUNTIME_DIR", str(tmp_path / "run"))  # no daemon of this machine is asked
     monkeypatch.delenv("ZSCHED_AUTHORITY_PASSPHRASE", raising=False)
     return tmp_path
 
@@ -146,6 +147,23 @@ def test_what_is_due_is_sent_to_the_nodes_and_so_is_what_a_node_has_missed(
         assert [one["node"] for one in asked] == ["robot2"], "nobody renews a revoked key"
         assert "no node's key 'ana.operator'" in pki(*words, "ana.operator", code=2).stderr
         assert "go without --deliver" in pki(*words, "robot2", "--out", "x", code=2).stderr
+
+
+def test_names_are_those_of_the_document_where_a_daemon_tells_one(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The fleet file may be a copy from before the newest node came."""
+    told = {
+        "node": "robot1", "fleet": "yard", "revision": 2, "number": 1, "settled": True, "electors": [],
+        "document": "a" * 64, "text": FLEET.replace("robot2:", "robot9:"), "flags": [],
+    }  # fmt: skip
+    pki("init")
+    monkeypatch.setenv("ZSCHED_RUNTIME_DIR", str(here))
+    with closing(OperatorSocket(here / "robot1.sock", lambda _request: told)) as door:
+        door.open()
+        pki("issue", "robot9")
+        assert "no node 'robot2'" in pki("issue", "robot2", code=2).stderr
+        told["text"] = told["text"].replace("yard", "hall")  # another fleet's daemon
+        pki("issue", "robot2")
+    assert "no node 'robot8'" in pki("issue", "robot8", code=2).stderr, "no daemon: the file holds"
 
 
 def test_a_rotation_ends_once_everything_is_renewed(here: Path) -> None:
