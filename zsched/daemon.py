@@ -59,7 +59,7 @@ from zsched.runtime.access_rules import Side, common_names_of, names_of
 from zsched.runtime.adoption import Adoption
 from zsched.runtime.descriptors import take_descriptors
 from zsched.runtime.endpoints import DATA_PORT, Endpoints, claim_port, endpoints_for, free_port, is_here
-from zsched.runtime.leaving import Leaving
+from zsched.runtime.leaving import ANEW_S, HAND_OVER_S, Leaving
 from zsched.runtime.library import Library
 from zsched.runtime.membership import copied_file
 from zsched.runtime.memory import shared_memory_objection
@@ -85,6 +85,8 @@ CERTIFICATE = "certificate"
 """Of the problem that this node's certificate ends soon."""
 SESSIONS = "sessions"
 """Of the problem that sessions cannot be opened again."""
+TURN = "turn"
+"""Of the problem that this node waits to begin anew, for a task of its would have no owner."""
 STDERR = 2
 RESTART_SIGNAL = signal.SIGUSR2
 """As SIGTERM, but the relay stays and carries the streams on for the daemon that follows (`systemctl restart`)."""
@@ -463,8 +465,10 @@ class Daemon:
                 raise NameTakenError(f"{node.me}: {shell.stand_down}")
             if isinstance(event, ev.TokenLost):
                 alert_until = now + ALERT_S
-            if isinstance(event, ev.StopRequested) and leaving.ask(node.owned(), now) and not self.begins_anew:
-                self._notify.stopping()
+            if isinstance(event, ev.StopRequested):
+                is_first = leaving.ask(node.owned(), now, hand_over_s=ANEW_S if self.begins_anew else HAND_OVER_S)
+                if is_first and not self.begins_anew:
+                    self._notify.stopping()
             if self._may_begin_again and leaving.asked_at is None:
                 self._tend_sessions(node, now)
             if leaving.asked_at is not None and leaving.is_over(node.owned(), node.movable(now), now):
@@ -510,9 +514,12 @@ class Daemon:
                 self._reopening.want(order, lives, now)
             else:
                 self._reopening.forget()
-        is_free = set(node.owned()) <= set(node.movable(now))
+        lacks = () if self._reopening.due_at is None else node.lacking(now)
         awaited = [name for name in electors if name not in left]  # who has left is heard again only afterwards
-        if not self._reopening.is_due(awaited, lives, now, is_free=is_free):
+        is_due = self._reopening.is_due(awaited, lives, now, lack=[lack.sparing for lack in lacks])
+        texts = [] if is_due else [f"{lack.task}: {lack.why}" for lack in lacks]
+        node.set_problem(TURN, f"it waits to open its sessions anew ({'; '.join(texts)})" if texts else None)
+        if not is_due:
             return
         why_not = self._why_not_anew(node)
         self._inbox.post(ev.ProblemReported(source=SESSIONS, problem=why_not))

@@ -20,6 +20,7 @@ from zsched.core.executor.progress import HangWatch
 from zsched.core.executor.renewing import Renewing
 from zsched.core.executor.rollouts import Rollouts
 from zsched.core.executor.sealing import Sealing
+from zsched.core.executor.sparing import Lack, lacking
 from zsched.core.executor.tenure import Tenure
 from zsched.core.executor.workers import Workers
 from zsched.core.gateway.gateway import Gateway
@@ -219,6 +220,16 @@ class Stages:
             for name in self.owned()
             if any(self._can_take(candidate, now) for candidate in self.fleet.task(name).candidates)
         )
+
+    def lacking(self, now: float) -> tuple[Lack, ...]:
+        """The tasks that would have no owner if this node went now, though not if it waited."""
+        others = {name: self._told_in_this_life(name, now) for name in self.membership.alive()}
+        return lacking(self.fleet.tasks, self.values(), self.me, others, self.flags.closed)
+
+    def _told_in_this_life(self, node: NodeId, now: float) -> Profile | None:
+        profile = self.gateway.fresh(node, now)
+        is_old = profile is not None and profile.incarnation != self.membership.incarnation(node)
+        return None if is_old else profile
 
     def _can_take(self, node: NodeId, now: float) -> bool:
         is_there = node != self.me and self.membership.state(node) is PeerState.ALIVE

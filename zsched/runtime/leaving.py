@@ -14,6 +14,8 @@ from zsched.core.values.model import TaskId
 HAND_OVER_S = 3.0
 """How long a stopping owner waits for tasks that another node could take. With what follows (`LEAVE_S`, workers, relay,
 session: 2.6 s at most) it fits into the unit's TimeoutStopSec=8."""
+ANEW_S = 10.0
+"""...where it begins anew in its process: nobody counts its seconds, and a busy fleet needs some for a move."""
 NOBODY_S = 0.8
 """...and for those that nobody else can: their answers are still to come."""
 LEAVE_S = 0.4
@@ -30,11 +32,15 @@ class Leaving:
     asked_at: float | None = None
     _moved_at: float | None = None
     _is_hurried: bool = False
+    _hand_over_s: float = HAND_OVER_S
 
-    def ask(self, owned: Collection[TaskId], now: float) -> bool:
-        """Somebody asks to stop; whether that is the first time. The second time means: at once."""
+    def ask(self, owned: Collection[TaskId], now: float, *, hand_over_s: float = HAND_OVER_S) -> bool:
+        """Somebody asks to stop; whether that is the first time. The second time means: at once.
+
+        ``hand_over_s``: how long tasks that another node could take are waited for.
+        """
         if self.asked_at is None:
-            self.asked_at = now
+            self.asked_at, self._hand_over_s = now, hand_over_s
             if not owned:
                 self._is_hurried = True  # nothing is to be handed over
             return True
@@ -57,7 +63,7 @@ class Leaving:
             self._moved_at = now if self._moved_at is None else self._moved_at
             return now >= self._moved_at + LEAVE_S
         self._moved_at = None
-        return now >= self.asked_at + (HAND_OVER_S if movable else NOBODY_S)
+        return now >= self.asked_at + (self._hand_over_s if movable else NOBODY_S)
 
     def last_words(self, owned: Collection[TaskId], now: float) -> str:
         """What is left behind, for the log; empty: nothing."""

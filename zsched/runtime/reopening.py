@@ -1,7 +1,7 @@
 """Decides when a daemon begins again, so that its sessions go by other access rules or another certificate.
 
 An open session of zenoh keeps the access rules, the certificate with which it listens, and the addresses that it dials,
-that it was opened with. So nodes begin again in turns: electors first, each while the others live, then the others.
+that it was opened with. So nodes begin again in turns (`turns`).
 
 Knows: the order of nodes, how long each of them has at most, whose lives are new. Does not know: which nodes live,
 what has changed, how a daemon begins again (`zsched.daemon`).
@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
+from zsched.core.executor.sparing import Sparing
 from zsched.core.values.model import NodeId
 
 FIRST_S = 2.0
@@ -20,6 +21,8 @@ TURN_S = 10.0
 """Each has at most this long: a daemon that owns tasks gives them away (3 s), ends (2 s) and is heard again (3 s)."""
 SETTLE_S = 1.0
 """Once all before it are heard in a new life, the next one waits this long: their workers start meanwhile."""
+OWNER_S = 30.0
+"""An owner waits this much longer for another candidate that starts: without one its task would have no owner."""
 LONGEST_WAIT_S = 120.0
 """An elector waits this long for the others; one that is away for good must not keep a new node out."""
 
@@ -107,7 +110,7 @@ class Reopening:
         lives: Mapping[NodeId, int | None],
         now: float,
         *,
-        is_free: bool = True,
+        lack: Collection[Sparing] = (),
     ) -> bool:
         """Whether to begin again now.
 
@@ -115,11 +118,14 @@ class Reopening:
             electors: of the fleet.
             lives: {other node that lives: its incarnation}.
             now: monotonic seconds.
-            is_free: every task of this node's could go to another one; else it waits for the latest of its turn.
+            lack: of each task that would have no owner: it waits for the latest of its turn, and for `OWNER_S` more
+                where somebody starts who could have the task.
         """
         if self.due_at is None or now < self._first_at:
             return False
-        if now < self.due_at and not (is_free and self._is_next(lives, now)):
+        if now < self.due_at and (lack or not self._is_next(lives, now)):
+            return False
+        if now < self.due_at + OWNER_S and Sparing.STARTING in lack:
             return False
         missing = {name for name in electors if name not in lives} - {self.me}
         return self.me not in electors or not missing or now >= self.due_at + LONGEST_WAIT_S

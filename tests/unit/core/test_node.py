@@ -18,6 +18,7 @@ from support.proposals import proposal_of, vector_of
 from support.states import state_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
+from zsched.core.executor.sparing import Sparing
 from zsched.core.membership.identity import QUIET_S
 from zsched.core.membership.knocking import KNOCKERS_KEPT, SHOWN_AFTER_S
 from zsched.core.node import Node
@@ -340,6 +341,22 @@ def test_movable_is_what_a_living_candidate_that_does_not_drain_could_take() -> 
     alone = make("edge1", learnt=allocation_of(1, "edge1"))
     alone.start(100.0)
     assert (alone.owned(), alone.movable(100.0)) == (("merge",), ())
+
+
+def test_a_candidate_that_begins_anew_is_not_ready_by_the_word_of_its_former_life() -> None:
+    node = make("edge1", learnt=allocation_of(1, "edge1"))
+    node.start(100.0)
+    node.handle(ev.BeatReceived(beat=beat("edge2")), 100.0)
+    ready = profile_of("edge2", incarnation=3, workers=(load_of("merge", WorkerState.READY),))
+    node.handle(ev.ProfileReceived(profile=ready), 100.0)
+    assert node.lacking(100.0) == ()
+    node.handle(ev.BeatReceived(beat=beat("edge2", incarnation=4)), 100.5)
+    assert [one.sparing for one in node.lacking(100.5)] == [Sparing.STARTING], "it has not told yet"
+    starting = replace(ready, incarnation=4, workers=(load_of("merge", WorkerState.STARTING),))
+    node.handle(ev.ProfileReceived(profile=starting), 100.6)
+    assert [one.sparing for one in node.lacking(100.6)] == [Sparing.STARTING]
+    node.handle(ev.ProfileReceived(profile=replace(ready, incarnation=4, sequence=9)), 100.7)
+    assert node.lacking(100.7) == ()
 
 
 def test_a_newer_profile_in_our_name_is_not_ours_either() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from zsched.runtime.leaving import HAND_OVER_S, LEAVE_S, NOBODY_S, TWICE_S, Leaving
+from zsched.runtime.leaving import ANEW_S, HAND_OVER_S, LEAVE_S, NOBODY_S, TWICE_S, Leaving
 
 OWNED = ("map", "plan")
 
@@ -40,6 +40,14 @@ def test_tasks_that_another_could_take_are_waited_for_longer_than_those_that_nob
         leaving = asked()
         assert not leaving.is_over(OWNED, movable, 100.0 + wait_s - 0.01)
         assert leaving.is_over(OWNED, movable, 100.0 + wait_s)
+
+
+def test_a_daemon_that_begins_anew_waits_longer_for_the_move() -> None:
+    leaving = Leaving()
+    leaving.ask(OWNED, 100.0, hand_over_s=ANEW_S)
+    assert not leaving.is_over(OWNED, OWNED, 100.0 + ANEW_S - 0.01)
+    assert leaving.is_over(OWNED, OWNED, 100.0 + ANEW_S)
+    assert leaving.is_over(OWNED, (), 100.0 + NOBODY_S), "nobody can take them"
 
 
 def test_what_is_left_behind_is_named() -> None:

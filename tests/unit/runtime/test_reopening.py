@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from zsched.runtime.reopening import FIRST_S, LONGEST_WAIT_S, SETTLE_S, TURN_S, Moved, Reopening, turns
+from zsched.core.executor.sparing import Sparing
+from zsched.runtime.reopening import FIRST_S, LONGEST_WAIT_S, OWNER_S, SETTLE_S, TURN_S, Moved, Reopening, turns
 
 ELECTORS = ("edge1", "robot1", "robot2")
 NODES = ("edge1", "edge2", "robot1", "robot2")
@@ -72,9 +73,20 @@ def test_the_next_one_follows_when_those_before_it_live_anew() -> None:
     assert not one.is_due(ELECTORS, both, FIRST_S + 2.0)
     assert not one.is_due(ELECTORS, both, FIRST_S + 1.9 + SETTLE_S), "their workers start"
     assert one.is_due(ELECTORS, both, FIRST_S + 2.0 + SETTLE_S)
-    assert not one.is_due(ELECTORS, both, FIRST_S + 2.0 + SETTLE_S, is_free=False), "nobody could take its task"
+    lack = (Sparing.AWAY,)
+    assert not one.is_due(ELECTORS, both, FIRST_S + 2.0 + SETTLE_S, lack=lack), "nobody could take its task"
     assert one.due_at is not None
-    assert one.is_due(ELECTORS, both, one.due_at, is_free=False), "that is not waited for without end"
+    assert one.is_due(ELECTORS, both, one.due_at, lack=lack), "that is not waited for without end"
+
+
+def test_an_owner_waits_longer_for_a_candidate_that_starts_but_not_for_ever() -> None:
+    one, lack = wanting("robot1"), (Sparing.AWAY, Sparing.STARTING)
+    both = others("robot1", "edge1", "edge2")
+    assert one.due_at is not None
+    assert not one.is_due(ELECTORS, both, one.due_at, lack=lack), "its task would have no owner until one is ready"
+    assert one.is_due(ELECTORS, both, one.due_at, lack=()), "one is ready"
+    assert not one.is_due(ELECTORS, both, one.due_at + OWNER_S - 0.1, lack=lack)
+    assert one.is_due(ELECTORS, both, one.due_at + OWNER_S, lack=lack)
 
 
 def test_one_that_dies_again_is_waited_for_until_the_latest() -> None:
