@@ -1,8 +1,9 @@
 """What silent connections of strangers cost a session that asks for certificates; when a member is let in meanwhile.
 
-``python -m benchmarks.silent [--connections 1000] [--limit 20]``. One session that listens as a daemon's does, and
-connections that say nothing. Memory is what its process has more, in proportional shares (PSS). zenoh gives up on a
-handshake after 10 s, and then waits 0.1 s before it looks at the next one.
+``python -m benchmarks.silent [--connections 1000] [--limit 20] [--bare]``. One session that listens as a daemon's does,
+and connections that say nothing. ``--bare``: without what keeps them from zenoh (`link_sockets.hold_back_silent`).
+Memory is what its process has more, in proportional shares (PSS). zenoh gives up on a handshake after 10 s, and then
+waits 0.1 s before it looks at the next one.
 """
 
 from __future__ import annotations
@@ -28,9 +29,15 @@ from zsched.sessions.config import client_config, control_config
 from zsched_lab.fleet.floods import connections
 from zsched_lab.fleet.loopback import free_endpoint
 
-LISTENER = (
-    "import sys, zenoh\ns = zenoh.open(zenoh.Config.from_json5(sys.argv[1]))\nprint(flush=True)\nsys.stdin.read()"
-)
+LISTENER = """
+import sys, zenoh
+from zsched.sessions.link_sockets import hold_back_silent
+session = zenoh.open(zenoh.Config.from_json5(sys.argv[1]))
+if sys.argv[2] == "held":
+    hold_back_silent()
+print(flush=True)
+sys.stdin.read()
+"""
 LOOKS_S = (0.0, 5.0, 12.0)
 
 
@@ -76,12 +83,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--connections", type=int, default=1000)
     parser.add_argument("--limit", type=float, default=20.0, help="seconds that a member tries")
+    parser.add_argument("--bare", action="store_true", help="a session of zenoh as it is")
     given = parser.parse_args()
     print(machine())
     endpoint = free_endpoint().partition("#")[0].replace("tcp/", "tls/")
     with tempfile.TemporaryDirectory() as name:
         tls = certificates(Path(name))
-        command = [sys.executable, "-c", LISTENER, with_tls(control_config(listen=(endpoint,), connect=()), tls)]
+        config = with_tls(control_config(listen=(endpoint,), connect=()), tls)
+        command = [sys.executable, "-c", LISTENER, config, "bare" if given.bare else "held"]
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as listener:
             assert listener.stdout is not None
             listener.stdout.readline()

@@ -24,6 +24,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 
 from support.authorities import install, make_authority
 from support.waiting import free_endpoint, until
+from zsched.adapters.network import expulsion
 from zsched.adapters.network.control_bus import ControlBus
 from zsched.adapters.network.expulsion import MAX_SHOWN
 from zsched.adapters.network.limits import limit_for
@@ -323,6 +324,29 @@ def test_who_is_dialled_because_a_member_named_its_address_says_and_hears_nothin
     assert KEYS.beat("robot1") not in heard
 
 
+@contextlib.contextmanager
+def _bus(yard: Yard) -> Iterator[tuple[ControlBus, Victim, list[ev.Event]]]:
+    """A daemon's control session, as robot1; where it listens; what it tells."""
+    endpoint = free_endpoint().replace("tcp/", "tls/")
+    fleet, events = yard.fleet("robot1"), list[ev.Event]()
+    assert fleet.security is not None
+    bus = ControlBus(
+        fleet="yard",
+        node="robot1",
+        incarnation=1,
+        zenoh_config=yard.text("robot1", listen=(endpoint,)),
+        post=events.append,
+        members=common_names_of(fleet, fleet.security),
+        limit=limit_for(fleet.timing, 1),
+        names=names_of(fleet),
+    )
+    bus.open()
+    try:
+        yield bus, Victim(yard.control.session, endpoint.partition("#")[0]), events
+    finally:
+        bus.close()
+
+
 def _dropped(bus: ControlBus, events: list[ev.Event]) -> set[str]:
     """What has been dropped, ``kind/reason``."""
     events.extend(bus.waiting())
@@ -334,33 +358,32 @@ def test_who_shows_thousands_of_tokens_loses_its_link(
     fresh: Yard, holder: str, counted: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A member, and somebody with a certificate who is none; tokens that were seen are taken back with the link."""
-    endpoint = free_endpoint().replace("tcp/", "tls/")
-    fleet, events = fresh.fleet("robot1"), list[ev.Event]()
-    assert fleet.security is not None
-    bus = ControlBus(
-        fleet="yard",
-        node="robot1",
-        incarnation=1,
-        zenoh_config=fresh.text("robot1", listen=(endpoint,)),
-        post=events.append,
-        members=common_names_of(fleet, fleet.security),
-        limit=limit_for(fleet.timing, 1),
-        names=names_of(fleet),
-    )
-    bus.open()
-    try:
-        victim = Victim(fresh.control.session, endpoint.partition("#")[0])
+    with _bus(fresh) as (bus, victim, events):
         with fresh.member(holder, victim) as session:
             held = [session.liveliness().declare_token(KEYS.alive(holder, number)) for number in range(TOKENS)]
             until(lambda: counted in _dropped(bus, events), f"{counted} to be counted")
             assert len(held) == TOKENS
             until(lambda: "is ended" in caplog.text, "the link is ended")
         until(lambda: not bus.peers(), "the link to end")
-    finally:
-        bus.close()
     here = Counter(event.node for event in events if isinstance(event, ev.TokenSeen))
     here.subtract(event.node for event in events if isinstance(event, ev.TokenLost))
     assert max(here.values(), default=0) <= MAX_SHOWN
+
+
+def test_a_member_has_so_many_sessions_and_no_more(
+    fresh: Yard, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """zenoh takes 1000 sessions in all: one member must not have them. Another member is let in beside it."""
+    monkeypatch.setattr(expulsion, "MAX_SESSIONS", 3)
+    with _bus(fresh) as (bus, victim, events), contextlib.ExitStack() as stack:
+        for _ in range(3):
+            stack.enter_context(fresh.member("robot2", victim))
+        until(lambda: bus.peers() == 3, "three sessions of robot2")
+        stack.enter_context(fresh.member("robot2", victim))
+        until(lambda: "link/too_many" in _dropped(bus, events), "the fourth one to be counted")
+        until(lambda: "is ended" in caplog.text, "its link is ended")
+        stack.enter_context(fresh.member("edge1", victim))
+        until(lambda: bus.peers() >= 4, "another member is let in")
 
 
 # --- members that speak for others -----------------------------------------------------------------------------------

@@ -43,6 +43,7 @@ from zsched.relay.task import TaskRelay
 from zsched.relay.tokens import Tokens
 from zsched.relay.troubles import Troubles
 from zsched.sessions.config import lease_s
+from zsched.sessions.link_sockets import hold_back_silent
 from zsched.sessions.problems import why_not_open
 from zsched.sessions.relink import Introducer
 from zsched.wire import codec as wire
@@ -393,11 +394,14 @@ def _opened(config: str) -> zenoh.Session:
     until = awake_s() + END_S
     while True:
         try:
-            return zenoh.open(zenoh.Config.from_json5(config))
+            session = zenoh.open(zenoh.Config.from_json5(config))
         except zenoh.ZError:
             if awake_s() >= until:
                 raise
             time.sleep(RETRY_S)
+        else:
+            hold_back_silent()
+            return session
 
 
 def run(
@@ -422,6 +426,7 @@ def run(
     config = text.decode()
     try:
         session = zenoh.open(zenoh.Config.from_json5(config))
+        hold_back_silent()
     except (zenoh.ZError, ValueError) as error:
         problem = f"its data session {why_not_open(config, error)}"
         reporter.report(ProblemReported(source=SOURCE, problem=problem))

@@ -58,7 +58,7 @@ from zsched.core.values.rehearsal import ReadRehearsals, RehearsalsTold
 from zsched.core.values.snapshot import Snapshot
 from zsched.errors import AdapterError, WireError
 from zsched.guard import guarded, tolerant
-from zsched.sessions.link_sockets import LinkSockets
+from zsched.sessions.link_sockets import LinkSockets, hold_back_silent
 from zsched.sessions.problems import why_not_open
 from zsched.sessions.relink import Introducer
 from zsched.wire import codec as wire
@@ -184,6 +184,7 @@ class ControlBus:
             session = zenoh.open(zenoh.Config.from_json5(self._config))
         except zenoh.ZError as error:
             raise AdapterError(f"the control session {why_not_open(self._config, error)}") from error
+        hold_back_silent()
         self._session, self._sockets = session, LinkSockets(session)
         self._expulsion = None if self._members is None else Expulsion(session, self._fleet)
         keys, node = self._keys, self._node
@@ -346,8 +347,12 @@ class ControlBus:
 
     def _on_link(self, event: zenoh.LinkEvent) -> None:
         """Only linked nodes' names count here; zenoh's access rules check a frame's sender against its link."""
-        name = event.link.auth_identifier
-        if event.kind != zenoh.SampleKind.PUT or self._members is None or name in self._members:
+        name, is_present = event.link.auth_identifier, event.kind == zenoh.SampleKind.PUT
+        if self._members is not None and self._expulsion is not None and name in self._members:
+            if not self._expulsion.links(name, str(event.link.zid), is_present=is_present):
+                self._drops.add("link", "too_many")
+            return
+        if not is_present or self._members is None:
             return
         log.warning("stranger certificate=%r address=%s: it may nothing here", name, event.link.dst)
         self._post(ev.FrameDropped(kind="link", reason="stranger"))

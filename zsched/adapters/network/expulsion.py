@@ -1,4 +1,4 @@
-"""Ends links whose other end may say nothing here, or shows more tokens than a node has.
+"""Ends links whose other end may say nothing here, or shows more tokens or has more sessions than a node needs.
 
 zenoh keeps each key and token that comes by a link until the link ends, and the time for one grows with their number;
 no access rule forbids the keys. So what is cut is the link.
@@ -23,6 +23,8 @@ from zsched.sessions.link_sockets import LinkSockets
 
 MAX_SHOWN: Final = 64
 """Tokens of one node: it has one for each of its lives, and of those that have ended some may not be gone yet."""
+MAX_SESSIONS: Final = 32
+"""Of one certificate: a daemon has one, and each verb that asks one more. zenoh takes 1000 in all, then nobody."""
 LOOK_AGAIN_S: Final = 0.05
 LOOKS: Final = 10
 """A link is told of before it is in zenoh's list."""
@@ -32,7 +34,7 @@ _log = logging.getLogger("zsched.control")
 
 
 class Expulsion:
-    """Of one session. `expel` and `shows` may be called from any thread, and never block."""
+    """Of one session. `expel`, `shows` and `links` may be called from any thread, and never block."""
 
     def __init__(self, session: zenoh.Session, fleet: str) -> None:
         """Nothing runs before the first link is to be ended."""
@@ -43,6 +45,8 @@ class Expulsion:
         self._thread: threading.Thread | None = None
         self._shown: dict[str, int] = {}
         """{node: tokens}; whoever shows one in a node's name has its certificate."""
+        self._linked: dict[str, set[str]] = {}
+        """{common name: its sessions}."""
 
     def expel(self, zid: str) -> None:
         """End the links to a session."""
@@ -58,6 +62,20 @@ class Expulsion:
         if count % MAX_SHOWN == 1:
             self._end(lambda link: self._holder(link) == node)
         return False
+
+    def links(self, name: str, zid: str, *, is_present: bool) -> bool:
+        """A session of a certificate came or went; ``False``: it has too many, and this one is ended."""
+        held = self._linked.setdefault(name, set())
+        if not is_present:
+            held.discard(zid)
+            if not held:
+                del self._linked[name]
+            return True
+        if len(held) >= MAX_SESSIONS and zid not in held:
+            self.expel(zid)
+            return False
+        held.add(zid)
+        return True
 
     def _holder(self, link: zenoh.Link) -> str:
         held = parse_common_name(link.auth_identifier or "", self._fleet)
