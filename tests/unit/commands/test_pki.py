@@ -151,7 +151,7 @@ def test_what_is_due_is_sent_to_the_nodes_and_so_is_what_a_node_has_missed(
 
 def test_names_are_those_of_the_document_where_a_daemon_tells_one(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The fleet file may be a copy from before the newest node came."""
-    told = {
+    told: Json = {
         "node": "robot1", "fleet": "yard", "revision": 2, "number": 1, "settled": True, "electors": [],
         "document": "a" * 64, "text": FLEET.replace("robot2:", "robot9:"), "flags": [],
     }  # fmt: skip
