@@ -442,13 +442,17 @@ def record(
             "--map", metavar="KEY", help="A key whose samples are maps (OccupancyGrid, CDR) is recorded, too."
         ),
     ] = None,
+    tf: Annotated[
+        list[str] | None,
+        typer.Option("--tf", metavar="KEY", help="The same of a key whose samples are frames (TFMessage, CDR)."),
+    ] = None,
     node: AskedOption = None,
     runtime_dir: RuntimeOption = None,
     connect: ConnectOption = None,
 ) -> None:
-    """Record what the fleet does as MCAP, for Foxglove: owners, utilities, moves, streams, events, maps.
+    """Record what the fleet does as MCAP, for Foxglove: owners, utilities, moves, streams, events, maps, tf.
 
-    Needs the extra mcap. Maps on ROS topics are found by their type.
+    Needs the extra mcap. Maps and frames on ROS topics are found by their type.
     """
     from zsched.commands.history import duration_s  # noqa: PLC0415 - each verb imports what it needs
     from zsched.commands.watch.record import RecordView  # noqa: PLC0415 - as above
@@ -462,6 +466,7 @@ def record(
         interval_s=interval,
         for_s=None if for_ is None else duration_s(for_),
         maps=tuple(map_ or ()),
+        frames=tuple(tf or ()),
     )
     raise typer.Exit(write(view))
 

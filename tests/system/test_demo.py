@@ -17,6 +17,8 @@ import cv2
 import numpy as np
 import pytest
 
+from support.mcap_files import read_mcap
+from zsched.tasks.map_merge.cdr import decode_grid, decode_transforms
 from zsched_lab.fleet.janitor import TOKEN_VARIABLE, groups_of, tagged_processes
 
 DEMO = (sys.executable, "-m", "zsched.cli", "demo", "--headless")
@@ -101,6 +103,17 @@ def test_the_demo_moves_the_task_and_merges_the_map(run: Callable[[float], Run])
     assert epochs == sorted(set(epochs))
     for name in ("map.png", "timeline.png"):
         assert np.asarray(cv2.imread(str(demo.out / name))).std() > 10
+    recorded = read_mcap(demo.out / "run.mcap")
+    kinds = {topic: kind for topic, kind, _, _ in recorded}
+    assert kinds["/robot1/global_map"] == kinds["/robot1/map"] == "nav_msgs/msg/OccupancyGrid"
+    assert kinds["/robot1/map_merge/tf"] == "tf2_msgs/msg/TFMessage"
+    merged = [decode_grid(data).known_area_m2 for topic, _, _, data in recorded if topic == "/robot1/global_map"]
+    assert merged[-1] > merged[0], "it grows"
+    frames = [decode_transforms(data) for topic, _, _, data in recorded if topic == "/robot1/map_merge/tf"]
+    assert {one.child for one in frames[-1]} == {f"robot{number}/map" for number in (1, 2, 3)}
+    moves = [json.loads(data) for topic, _, _, data in recorded if topic == "/zsched/moves"]
+    assert {move["owner"] for move in moves} <= {move["node"] for move in summary["allocations"]}
+    assert moves
     assert (demo.out / "fleet.yaml").exists()
     assert (demo.out / "logs" / "daemon-robot1.log").read_text() != ""
     assert re.search(r"map_merge moves edge\d -> edge\d \(epoch 2\)", demo.text())

@@ -231,7 +231,10 @@ def print_summary(summary: Mapping[str, Any], out: Path) -> None:
     console.print(figures)
     console.print(allocation_table(summary))
     console.print(robot_table(summary))
-    console.print(f"in {out}: map.png, timeline.png, summary.json, fleet.yaml, logs/, records/", soft_wrap=True)
+    console.print(
+        f"in {out}: map.png, timeline.png, run.mcap (for Foxglove), summary.json, fleet.yaml, logs/, records/",
+        soft_wrap=True,
+    )
 
 
 def headline(summary: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import sys
+import textwrap
 from types import TracebackType
 from typing import Protocol, Self, TextIO
 
@@ -17,11 +18,16 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from zsched_lab.demo.map_panel import map_panel
 from zsched_lab.fleet.view import FleetView, MapView, NodeView, TaskView
+from zsched_lab.maps.picture import MapPicture
 
 PROGRESS_PERIOD_S = 10.0
 WIDE = 96
-"""From this many columns on the kinds are spelled out and the bars are long."""
+"""From this many columns on the bars are long."""
+WIDEST = 160
+"""From this many columns on the maps' table has all its words, in half of them."""
+SHORT_NAMES = ("robot", "maps", "rate", "age", "gap", "drive")
 
 
 class View(Protocol):
@@ -115,19 +121,34 @@ def make_view(*, headless: bool) -> View:
 
 
 def render(view: FleetView, width: int, height: int) -> RenderableType:
-    """One frame of ``height`` lines at most."""
+    """One frame of ``height`` lines at most: nodes and the task, below them the map, and beside it what robots see."""
     wide = width >= WIDE
-    middle = Table.grid(expand=True, padding=0)
-    middle.add_column(ratio=1)
-    middle.add_column(ratio=1)
+    middle = halves()
     middle.add_row(nodes_panel(view.nodes, wide=wide), task_panel(view.task))
     rows = max(len(view.nodes) + 1, task_rows(view.task)) + 2
-    maps = maps_panel(view.maps, wide=wide)
-    left = height - 2 - rows - (len(view.maps) + 3)
-    parts: list[RenderableType] = [header(view), middle, maps]
-    if left >= 3:
-        parts.append(events_panel(view, left - 2))
-    return Group(*parts)
+    left = height - 2 - rows
+    columns = width // 2
+    table_rows = len(view.maps) + 3
+    beside: list[RenderableType] = [maps_panel(view.maps, wide=width >= WIDEST)]
+    if left - table_rows >= 3:
+        beside.append(events_panel(view, width - columns - 2, left - table_rows - 2))
+    bottom = halves()
+    bottom.add_row(map_panel(newest_picture(view.maps), columns, max(3, left)), Group(*beside))
+    return Group(header(view), middle, bottom)
+
+
+def halves() -> Table:
+    """Two columns of the same width."""
+    grid = Table.grid(expand=True, padding=0)
+    grid.add_column(ratio=1)
+    grid.add_column(ratio=1)
+    return grid
+
+
+def newest_picture(maps: tuple[MapView, ...]) -> MapPicture | None:
+    """The map of the robot that has heard the newest one."""
+    seen = [row for row in maps if row.picture is not None]
+    return min(seen, key=lambda row: math.inf if row.age_s is None else row.age_s).picture if seen else None
 
 
 def header(view: FleetView) -> RenderableType:
@@ -231,12 +252,13 @@ def decimal(value: float | None) -> str:
 def maps_panel(maps: tuple[MapView, ...], *, wide: bool) -> RenderableType:
     """What the robots see of the merged map, and how far they have driven."""
     table = Table(box=None, expand=True, padding=(0, 1, 0, 0), header_style="dim")
-    for column in ("robot", "merged maps", "rate", "age", "longest gap", "drive"):
+    names = ("robot", "merged maps", "rate", "age", "longest gap", "drive") if wide else SHORT_NAMES
+    for column in names:
         table.add_column(column, no_wrap=True)
     for row in maps:
         rate = "-" if row.rate_hz is None else f"{row.rate_hz:.1f} Hz"
         table.add_row(row.robot, str(row.maps), rate, seconds(row.age_s), seconds(row.gap_max_s), drive(row, wide=wide))
-    return Panel(table, title="the merged map, as the robots see it", title_align="left", padding=(0, 0))
+    return Panel(table, title="as the robots see it", title_align="left", padding=(0, 0))
 
 
 def drive(row: MapView, *, wide: bool) -> str:
@@ -257,11 +279,17 @@ def rates(maps: tuple[MapView, ...]) -> str:
     return "/".join("-" if row.rate_hz is None else f"{row.rate_hz:.1f}" for row in maps) + " Hz"
 
 
-def events_panel(view: FleetView, lines: int) -> RenderableType:
-    """The newest events; problems that exist now come first."""
-    shown = [Text(problem, style="red") for problem in view.problems[: max(1, lines // 3)]]
-    shown += [Text(event) for event in view.events[-(lines - len(shown)) :]]
-    for line in shown:
-        line.no_wrap, line.overflow = True, "ellipsis"
+def events_panel(view: FleetView, columns: int, lines: int) -> RenderableType:
+    """The newest events, each with all its words; problems that exist now come first."""
+    shown = [Text(problem, style="red", no_wrap=True, overflow="ellipsis") for problem in view.problems]
+    shown = shown[: max(1, lines // 3)]
+    room = lines - len(shown)
+    told: list[Text] = []
+    for event in reversed(view.events):
+        folded = textwrap.wrap(event.strip(), columns, subsequent_indent="  ")[: room - len(told)]
+        told[:0] = [Text(line) for line in folded]
+        if len(told) >= room:
+            break
+    shown += told
     shown += [Text("")] * (lines - len(shown))
     return Panel(Group(*shown), title="events", title_align="left", padding=(0, 0))

@@ -65,6 +65,11 @@ class RunPlan:
         """Folder of everything that is written down while it happens."""
         return self.out / "records"
 
+    @property
+    def recording(self) -> Path:
+        """What `zsched record` writes of the run."""
+        return self.out / "run.mcap"
+
 
 def fleet_template() -> Path:
     """The demo's fleet file, shipped with the package."""
@@ -121,6 +126,7 @@ class DemoRun:
             self._tell(0.0, f"{len(self._fleet.kinds)} daemons started")
             with self._observer:
                 self._runner.wait_up(self._observer.statuses, self._tick)
+                self._start_recording()
                 self._tell(self._now_s(), "all daemons answer; the robots start to drive")
                 self._start_robots()
                 self._phase = "running"
@@ -139,6 +145,14 @@ class DemoRun:
         self._events.append((t_s, text))
         self._recorder.write("events", {"kind": "event", "t_s": self._start_s + t_s, "text": text})
         self._view.event(t_s, text)
+
+    def _start_recording(self) -> None:
+        """What an operator would type: the fleet as its first robot sees it, that robot's maps, and its frames."""
+        robot = self._fleet.robots[0]
+        command = [*self._plan.cli, "record", "--output", str(self._plan.recording), "--node", robot]
+        command += ["--runtime-dir", str(self._runner.socket(robot).parent)]
+        command += ["--map", f"{robot}/map", "--map", f"{robot}/global_map", "--tf", f"{robot}/map_merge/tf"]
+        self._children.start("record", command)
 
     def _start_robots(self) -> None:
         replay_s = max(MIN_DRIVE_S, DRIVE_END_RATIO * self._plan.duration_s - self._now_s())
@@ -225,6 +239,7 @@ class DemoRun:
         duration_s = self._now_s()
         self._injector.stop(duration_s)
         self._children.stop(*self._children.running("app-"))
+        self._children.stop(*self._children.running("record"))
         self._children.stop(*self._children.running("daemon-"))
         for watch in self._robots:
             watch.update()

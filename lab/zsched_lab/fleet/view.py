@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from zsched.core.values.model import NodeId, TaskId
+from zsched_lab.maps.picture import MapPicture
 
 Status = Mapping[str, Any]
 """One decoded status snapshot."""
@@ -65,6 +66,8 @@ class MapView:
     gap_max_s: float | None = None
     scans: int = 0
     scans_total: int = 0
+    picture: MapPicture | None = None
+    """The newest map, small; ``None`` before the first."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -30,7 +30,7 @@ from mcap.writer import Writer
 
 from zsched.adapters.machine.cgroup import CgroupTree, CpuQuota, MemoryQuota
 from zsched.clock import monotonic_s
-from zsched.commands.watch.tracks import GRID_DEFINITION
+from zsched.commands.watch.tracks import GRID, ROS_DEFINITIONS
 from zsched.core.values.model import NodeId
 from zsched.tasks.map_merge.cdr import CdrError, decode_grid
 from zsched_lab.fleet.application import connect
@@ -180,7 +180,7 @@ class StreamFile:
     def __init__(self, stream: IO[bytes]) -> None:
         self._writer = Writer(stream)
         self._writer.start(profile="ros2", library="zsched")
-        self._grid = self._writer.register_schema("nav_msgs/msg/OccupancyGrid", "ros2msg", GRID_DEFINITION.encode())
+        self._grid = self._writer.register_schema(GRID, "ros2msg", ROS_DEFINITIONS[GRID].encode())
         self._json = self._writer.register_schema("zsched/Status", "jsonschema", b'{"type": "object"}')
         self._channels: dict[str, tuple[int, int]] = {}
 

@@ -4,8 +4,9 @@ Knows: its log, its own keys (``<robot>/map``, ``<robot>/global_map``, ``<robot>
 its robot. Does not know: zsched. It is a plain zenoh client, like any robot program, and never notices a move.
 
 Started as ``python -m zsched_lab.robots.app`` (see `parse`). Records go to ``<records>/<robot>.ndjson``: ``progress``
-once a second, ``map`` per merged map, ``status`` per change of the merger's word on the robots. When it is stopped it
-writes the last merged map and its own, as received and as sent: ``<records>/<robot>-global_map.cdr``, ``-map.cdr``.
+and ``picture`` once a second, ``map`` per merged map, ``status`` per change of the merger's word on the robots. When it
+is stopped it writes the last merged map and its own, as received and as sent: ``<records>/<robot>-global_map.cdr``,
+``-map.cdr``.
 """
 
 from __future__ import annotations
@@ -25,10 +26,12 @@ from zsched_lab.fleet import application
 from zsched_lab.fleet.recorder import Record, Recorder
 from zsched_lab.fleet.signals import StopFlag
 from zsched_lab.maps.mapping import GridMapper, displacements
+from zsched_lab.maps.picture import MapPicture
 from zsched_lab.robots.laser_log import LaserLog, Scan, load_log, malaga_path, split_log
 
 MAP_PERIOD_S = 1.0
 PROGRESS_PERIOD_S = 1.0
+PICTURE_PERIOD_S = 1.0
 POLL_S = 0.02
 """How often the subscribers are looked at: the error of an arrival time."""
 
@@ -102,6 +105,7 @@ class Applications:
         self._last_map = self._last_sent = b""
         self._last_map_s: float | None = None
         self._last_state = b""
+        self._next_picture_s = 0.0
 
     def run(self, stop: StopFlag) -> None:
         """Drive, map, publish and listen until stopped."""
@@ -155,6 +159,9 @@ class Applications:
         self._last_map, self._last_map_s = payload, now
         area = round(grid.known_area_m2, 1)
         self._write({"kind": "map", "t_s": now, "gap_s": gap, "bytes": len(payload), "known_m2": area})
+        if now >= self._next_picture_s:
+            self._next_picture_s = now + PICTURE_PERIOD_S
+            self._write({"kind": "picture", "t_s": now, **MapPicture.of(grid).record()})
 
     def _take_state(self, payload: bytes, now: float) -> None:
         if payload == self._last_state:

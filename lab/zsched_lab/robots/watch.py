@@ -14,6 +14,7 @@ from typing import Any
 from zsched.core.values.model import NodeId
 from zsched_lab.fleet.recorder import Follower, Record
 from zsched_lab.fleet.view import MapView
+from zsched_lab.maps.picture import MapPicture
 
 RATE_WINDOW_S = 5.0
 
@@ -28,6 +29,8 @@ class RobotWatch:
     progress: Record = field(default_factory=dict)
     status: Any = None
     """The merger's newest word, as decoded JSON."""
+    picture: MapPicture | None = None
+    """The newest that was recorded."""
 
     @classmethod
     def of(cls, robot: NodeId, records: Path) -> RobotWatch:
@@ -44,6 +47,8 @@ class RobotWatch:
                 self.progress = record
             elif kind == "status":
                 self.status = record.get("status")
+            elif kind == "picture":
+                self.picture = MapPicture.read(record)
 
     def view(self, now: float) -> MapView:
         """The robot's row at ``now``."""
@@ -56,6 +61,7 @@ class RobotWatch:
             gap_max_s=self.longest_gap_s(),
             scans=int(self.progress.get("scans", 0)),
             scans_total=int(self.progress.get("scans_total", 0)),
+            picture=self.picture,
         )
 
     def rate_hz(self, now: float) -> float | None:

@@ -1,6 +1,6 @@
 """`zsched record`: writes what a fleet does into an MCAP file, for Foxglove and every other reader of MCAP.
 
-Knows: the file, intervals, the tap on maps, signals. Does not know: topics, schemas
+Knows: the file, intervals, the tap on maps and frames, signals. Does not know: topics, schemas
 (`zsched.commands.watch.tracks`).
 """
 
@@ -48,6 +48,8 @@ class RecordView:
     """For how long; ``None``: until Ctrl-C."""
     maps: tuple[str, ...] = ()
     """Key expressions whose samples are maps, besides those that say so by their ROS type."""
+    frames: tuple[str, ...] = ()
+    """The same of transforms (tf)."""
 
 
 def record(view: RecordView) -> int:
@@ -57,11 +59,12 @@ def record(view: RecordView) -> int:
         CliError: nobody answers (3), the file is there already or cannot be written (1), a key is none (2), or the
             library that writes is not installed (1).
     """
-    for key in view.maps:
-        if (fault := keyexpr.fault(key)) is not None:
-            raise CliError(EXIT_USAGE, f"--map: {key!r} is no key expression: {fault}")
-    if view.maps and view.connect is not None:
-        raise CliError(EXIT_USAGE, "--map joins the data network of a daemon here; --connect only asks")
+    for option, keys in (("--map", view.maps), ("--tf", view.frames)):
+        for key in keys:
+            if (fault := keyexpr.fault(key)) is not None:
+                raise CliError(EXIT_USAGE, f"{option}: {key!r} is no key expression: {fault}")
+        if keys and view.connect is not None:
+            raise CliError(EXIT_USAGE, f"{option} joins the data network of a daemon here; --connect only asks")
     feed = Feed(lambda: find_door(view.runtime_dir, view.node, connect=view.connect))
     door = feed.door()
     first = feed.ask()
@@ -69,8 +72,9 @@ def record(view: RecordView) -> int:
         raise CliError(first.code, first.why)
     ended = threading.Event()
     with contextlib.ExitStack() as stack:
-        tap = stack.enter_context(_tapped(door, first.status, view))
-        tape = stack.enter_context(_taped(view.file))
+        kinds = {} if door.endpoint else _ros_keys(first.status, view)
+        tap = stack.enter_context(_tapped(door, tuple(kinds)))
+        tape = stack.enter_context(_taped(view.file, kinds))
         for number in (signal.SIGINT, signal.SIGTERM):
             before = signal.signal(number, lambda _number, _frame: ended.set())
             stack.callback(signal.signal, number, before)
@@ -90,37 +94,42 @@ def record(view: RecordView) -> int:
             if news.status is None:
                 sys.stderr.write(f"zsched record: {harmless(news.why)}; asking again\n")
     told = f"{view.file}: {tape.messages} messages of {len(tape.topics)} topics, {size(view.file.stat().st_size)}"
-    missed = f"; {tap.missed} maps came faster than they could be written" if tap is not None and tap.missed else ""
+    missed = f"; {tap.missed} samples came faster than they could be written" if tap is not None and tap.missed else ""
     sys.stderr.write(f"{told}{missed}\n")
     return EXIT_OK
 
 
 def _wait(until: float, tap: StreamTap | None, tape: Tape, ended: threading.Event) -> None:
-    """Write maps as they come, until then."""
+    """Write what the tap hears as it comes, until then."""
     if tap is None:
         ended.wait(max(until - monotonic_s(), 0.0))
         return
     while not ended.is_set() and (now := monotonic_s()) < until:
         for sample in tap.until(min(now + 0.2, until)):
             if sample.kind == "put" and sample.side == "fleet":
-                tape.put_map(sample.key, sample.payload.to_bytes(), wall_s() - (monotonic_s() - sample.at))
+                tape.put_ros(sample.key, sample.payload.to_bytes(), wall_s() - (monotonic_s() - sample.at))
+
+
+def _ros_keys(status: Json, view: RecordView) -> dict[str, str]:
+    """{key expression: ROS 2 type} of what is recorded as it was published."""
+    named = {**dict.fromkeys(view.maps, tracks.GRID), **dict.fromkeys(view.frames, tracks.FRAMES)}
+    return {**tracks.ros_keys(status), **named}
 
 
 @contextlib.contextmanager
-def _tapped(door: Door, status: Json, view: RecordView) -> Iterator[StreamTap | None]:
-    """A tap on the keys that carry maps; ``None`` where there are none, or no daemon here leads to them."""
-    keys = () if door.endpoint else (*tracks.map_keys(status), *view.maps)
+def _tapped(door: Door, keys: tuple[str, ...]) -> Iterator[StreamTap | None]:
+    """A tap on the keys that carry maps and frames; ``None`` where there are none."""
     if not keys:
         yield None
         return
     asked = {} if door.node is None else {"node": door.node}
     access = ask_door(Door(socket=door.socket), {"verb": "access", **asked})
-    from zsched.adapters.network.stream_tap import StreamTap  # noqa: PLC0415 - loads zenoh, which only maps need
+    from zsched.adapters.network.stream_tap import StreamTap  # noqa: PLC0415 - loads zenoh, which only these need
 
     try:
         tap = StreamTap({"fleet": access["sides"]["fleet"]}, keys)
     except AdapterError as error:
-        raise CliError(EXIT_UNREACHABLE, f"the maps cannot be listened to: {error}") from error
+        raise CliError(EXIT_UNREACHABLE, f"maps and frames cannot be listened to: {error}") from error
     with tap:
         yield tap
 
@@ -131,8 +140,10 @@ def _tapped(door: Door, status: Json, view: RecordView) -> Iterator[StreamTap | 
 class Tape:
     """An MCAP file while it is written."""
 
-    def __init__(self, writer: Writer) -> None:
+    def __init__(self, writer: Writer, kinds: dict[str, str]) -> None:
+        """``kinds``: {key expression: ROS 2 type} of samples that are written as they come."""
         self._writer = writer
+        self._kinds = kinds
         self._schemas: dict[str, int] = {}
         self.topics: dict[str, int] = {}
         self._numbers: Counter[str] = Counter()
@@ -149,10 +160,11 @@ class Tape:
             message.topic, message.schema, "jsonschema", text, "json", json.dumps(message.body).encode(), message.at_ns
         )
 
-    def put_map(self, key: str, data: bytes, at: float) -> None:
-        """Write a map as its publisher has sent it; ``at``: seconds since 1970."""
+    def put_ros(self, key: str, data: bytes, at: float) -> None:
+        """Write a map or frames as their publisher has sent them; ``at``: seconds since 1970."""
+        kind = next(kind for expr, kind in self._kinds.items() if keyexpr.matches(expr, key))
         topic, stamp = tracks.topic_of(key), tracks.nanoseconds(at)
-        self._put(topic, tracks.GRID, "ros2msg", tracks.GRID_DEFINITION, "cdr", data, stamp)
+        self._put(topic, kind, "ros2msg", tracks.ROS_DEFINITIONS[kind], "cdr", data, stamp)
 
     def _put(self, topic: str, schema: str, kind: str, definition: str, encoding: str, data: bytes, at_ns: int) -> None:
         if topic not in self.topics:
@@ -164,7 +176,7 @@ class Tape:
 
 
 @contextlib.contextmanager
-def _taped(path: Path) -> Iterator[Tape]:
+def _taped(path: Path, kinds: dict[str, str]) -> Iterator[Tape]:
     """A new file; what has been written is whole when the block ends, however it ends."""
     try:
         from mcap.writer import Writer  # noqa: PLC0415 - an extra
@@ -180,7 +192,7 @@ def _taped(path: Path) -> Iterator[Tape]:
         writer = Writer(file)
         writer.start(profile="", library=LIBRARY)
         try:
-            yield Tape(writer)
+            yield Tape(writer, kinds)
         except OSError as error:
             raise CliError(EXIT_FAILED, f"{path} cannot be written any more: {error.strerror}") from error
         finally:

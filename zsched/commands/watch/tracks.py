@@ -1,6 +1,6 @@
 """The topics of a recording: what a status and a log become as messages, with the schema of each (pure).
 
-Knows: names, JSON schemas, Foxglove's log message, the ROS 2 definition of a map. Does not know: files, MCAP, sockets.
+Knows: names, JSON schemas, Foxglove's log message, ROS 2 definitions of maps and frames. Does not know: files, MCAP.
 """
 
 from __future__ import annotations
@@ -77,42 +77,29 @@ JSON_SCHEMAS: Final = {
 """{name: JSON schema}; a value that was not measured is left out of a message."""
 STATUS: Final = "zsched.status.1"
 GRID: Final = "nav_msgs/msg/OccupancyGrid"
-_GRID_IN_KEYS: Final = "nav_msgs::msg::dds_::OccupancyGrid_"
-GRID_DEFINITION: Final = """std_msgs/Header header
-nav_msgs/MapMetaData info
-int8[] data
-================================================================================
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-================================================================================
-MSG: nav_msgs/MapMetaData
-builtin_interfaces/Time map_load_time
-float32 resolution
-uint32 width
-uint32 height
-geometry_msgs/Pose origin
-================================================================================
-MSG: geometry_msgs/Pose
-geometry_msgs/Point position
-geometry_msgs/Quaternion orientation
-================================================================================
-MSG: geometry_msgs/Point
-float64 x
-float64 y
-float64 z
-================================================================================
-MSG: geometry_msgs/Quaternion
-float64 x
-float64 y
-float64 z
-float64 w
-================================================================================
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-"""
-"""nav_msgs/msg/OccupancyGrid as ros2msg."""
+FRAMES: Final = "tf2_msgs/msg/TFMessage"
+_RULE: Final = "=" * 80 + "\nMSG: "
+_HEADER: Final = f"{_RULE}std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
+_TIME_OF_ROS: Final = f"{_RULE}builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
+_TURN: Final = f"{_RULE}geometry_msgs/Quaternion\nfloat64 x\nfloat64 y\nfloat64 z\nfloat64 w\n"
+ROS_DEFINITIONS: Final = {
+    GRID: "std_msgs/Header header\nnav_msgs/MapMetaData info\nint8[] data\n"
+    f"{_HEADER}"
+    f"{_RULE}nav_msgs/MapMetaData\nbuiltin_interfaces/Time map_load_time\nfloat32 resolution\n"
+    "uint32 width\nuint32 height\ngeometry_msgs/Pose origin\n"
+    f"{_RULE}geometry_msgs/Pose\ngeometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n"
+    f"{_RULE}geometry_msgs/Point\nfloat64 x\nfloat64 y\nfloat64 z\n"
+    f"{_TURN}{_TIME_OF_ROS}",
+    FRAMES: "geometry_msgs/TransformStamped[] transforms\n"
+    f"{_RULE}geometry_msgs/TransformStamped\nstd_msgs/Header header\nstring child_frame_id\n"
+    "geometry_msgs/Transform transform\n"
+    f"{_HEADER}"
+    f"{_RULE}geometry_msgs/Transform\ngeometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n"
+    f"{_RULE}geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n"
+    f"{_TURN}{_TIME_OF_ROS}",
+}
+"""{ROS 2 type: its definition as ros2msg}: what is recorded as it was published."""
+_IN_KEYS: Final = {"nav_msgs::msg::dds_::OccupancyGrid_": GRID, "tf2_msgs::msg::dds_::TFMessage_": FRAMES}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -188,18 +175,22 @@ def of_entry(entry: Json) -> Iterator[Message]:
         yield Message(topic="/zsched/moves", schema="zsched.Move", at_ns=at_ns, body=_measured(told))
 
 
-# --- maps ------------------------------------------------------------------------------------------------------------
+# --- maps and frames -------------------------------------------------------------------------------------------------
 
 
-def map_keys(status: Json) -> tuple[str, ...]:
-    """The key expressions of streams whose ROS type says that they carry maps."""
+def ros_keys(status: Json) -> dict[str, str]:
+    """{key expression: ROS 2 type} of streams whose keys say that they carry maps or frames."""
     ends = (
         stream.get(end, "")
         for task in status["tasks"]
         for stream in task["streams"]
         for end in ("from_expr", "to_expr")
     )
-    return tuple(dict.fromkeys(end for end in ends if _GRID_IN_KEYS in end))
+    return {end: kind for end in ends if (kind := _type_in(end)) is not None}
+
+
+def _type_in(key: str) -> str | None:
+    return next((_IN_KEYS[chunk] for chunk in key.split("/") if chunk in _IN_KEYS), None)
 
 
 def topic_of(key: str) -> str:
@@ -209,5 +200,5 @@ def topic_of(key: str) -> str:
     ('/robot1/map', '/robot1/map')
     """
     chunks = key.split("/")
-    at = next((number for number, chunk in enumerate(chunks) if chunk == _GRID_IN_KEYS), None)
+    at = next((number for number, chunk in enumerate(chunks) if chunk in _IN_KEYS), None)
     return f"/{key}" if at is None else "/" + "/".join(chunks[1:at])

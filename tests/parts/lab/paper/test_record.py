@@ -19,7 +19,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from support.waiting import free_endpoint, until
 from zsched.adapters.machine.cgroup import LimitedGroup
-from zsched.commands.watch.tracks import GRID_DEFINITION
+from zsched.commands.watch.tracks import ROS_DEFINITIONS
 from zsched.tasks.map_merge.cdr import encode_grid
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid
@@ -75,15 +75,16 @@ def test_a_stream_file_is_read_by_any_mcap_reader() -> None:
     assert stamp_ns(b"nonsense") == 0
 
 
-def test_the_schema_is_that_of_ros() -> None:
+@pytest.mark.parametrize("kind", ROS_DEFINITIONS)
+def test_the_schema_is_that_of_ros(kind: str) -> None:
     store = get_typestore(Stores.ROS2_HUMBLE)
-    text, _ = store.generate_msgdef("nav_msgs/msg/OccupancyGrid", ros_version=2)
+    text, _ = store.generate_msgdef(kind, ros_version=2)
 
     def fields(definition: str) -> set[str]:
         lines = (line.partition("#")[0].split() for line in definition.splitlines())
         return {" ".join(words) for words in lines if words and not words[0].startswith(("=", "MSG"))}
 
-    assert fields(GRID_DEFINITION) == fields(text)
+    assert fields(ROS_DEFINITIONS[kind]) == fields(text)
 
 
 def test_the_recorder_hears_what_a_robot_sends_and_ends_whole(tmp_path: Path) -> None:

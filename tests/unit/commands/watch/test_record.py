@@ -16,7 +16,7 @@ from support.mcap_files import read_mcap
 from support.schemas import faults
 from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.cli import app
-from zsched.commands.watch.tracks import JSON_SCHEMAS, map_keys, of_entry, of_status
+from zsched.commands.watch.tracks import FRAMES, GRID, JSON_SCHEMAS, of_entry, of_status, ros_keys, topic_of
 
 RECORDED = Path(__file__).parent / "recorded"
 
@@ -106,12 +106,14 @@ def test_every_message_is_as_its_schema_says() -> None:
     assert checked > 10
 
 
-def test_maps_are_found_by_their_ros_type() -> None:
+def test_maps_and_frames_are_found_by_their_ros_type() -> None:
     status = recorded()
-    key = "0/robot1/map/nav_msgs::msg::dds_::OccupancyGrid_/*"
-    status["tasks"][0]["streams"][0]["from_expr"] = key
-    assert map_keys(status) == (key,)
-    assert map_keys(recorded()) == ()
+    maps, frames = "0/robot1/map/nav_msgs::msg::dds_::OccupancyGrid_/*", "0/tf/tf2_msgs::msg::dds_::TFMessage_/*"
+    stream = status["tasks"][0]["streams"][0]
+    stream["from_expr"], stream["to_expr"] = maps, frames
+    assert ros_keys(status) == {maps: GRID, frames: FRAMES}
+    assert ros_keys(recorded()) == {}
+    assert topic_of(frames) == "/tf"
 
 
 def test_a_file_that_is_there_is_kept(folder: Path) -> None:
@@ -126,7 +128,9 @@ def test_what_cannot_be_done_is_said_before_anything_is_written(folder: Path, mo
     file = folder / "run.mcap"
     for words, code, text in (
         (("--map", "a//b"), 2, "is no key expression"),
-        (("--map", "a", "--connect", "tcp/127.0.0.1:1"), 2, "--connect only asks"),
+        (("--map", "a", "--connect", "tcp/127.0.0.1:1"), 2, "--map joins the data network"),
+        (("--tf", "a//b"), 2, "--tf: 'a//b' is no key expression"),
+        (("--tf", "a", "--connect", "tcp/127.0.0.1:1"), 2, "--connect only asks"),
         (("--for", "soon"), 2, "is no duration"),
         (("--runtime-dir", folder / "none"), 3, "no daemon in"),
     ):

@@ -2,11 +2,13 @@ from __future__ import annotations
 
 import io
 
+import numpy as np
 import pytest
 from rich.console import Console
 
 from zsched_lab.demo.live_view import PlainLines, cpu_bar, make_view, render
 from zsched_lab.fleet.view import FleetView, MapView, NodeView, TaskView
+from zsched_lab.maps.picture import FREE, WALL, MapPicture
 
 EDGES = ("edge1", "edge2", "edge3")
 ROBOTS = ("robot1", "robot2", "robot3")
@@ -68,6 +70,30 @@ def test_a_frame_fits_and_shows_the_story(width: int, height: int) -> None:
     assert "1.0 Hz" in text
     assert "event 49" in text
     assert "joint" in text
+
+
+def test_the_map_grows_in_it() -> None:
+    def shown(side: int) -> tuple[str, int]:
+        cells = np.zeros((80, 160), np.uint8)
+        cells[:side, :side] = FREE
+        cells[0, :side] = WALL
+        maps = (MapView(robot="robot1", maps=3, age_s=0.1, picture=MapPicture(cells=cells, known_m2=side)),)
+        text = "\n".join(drawn(a_view(maps=maps), 100, 30))
+        return text, sum("\u2800" <= letter <= "\u28ff" for letter in text)
+
+    (small, few), (large, many) = shown(20), shown(80)
+    assert "the merged map, 20 m²" in small
+    assert "the merged map, 80 m²" in large
+    assert 0 < few < many
+    assert "no map yet" in "\n".join(drawn(a_view(), 100, 30))
+
+
+def test_a_long_event_is_told_to_its_end() -> None:
+    event = "  23.4 s  map_merge moves edge1 -> edge2 (epoch 2): edge2 leads by 0.2 for longer than the patience"
+    lines = drawn(a_view(events=(*(f"event {index}" for index in range(9)), event)), 100, 30)
+
+    beside = " ".join(line[50:].strip("│ ") for line in lines)
+    assert event.strip() in beside
 
 
 def test_a_utility_that_is_absent_is_a_dash_not_a_number() -> None:

@@ -2,9 +2,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from zsched_lab.fleet.recorder import Recorder
+from zsched_lab.maps.picture import MapPicture
 from zsched_lab.robots.watch import RobotWatch
 
 
@@ -19,11 +21,15 @@ def test_a_robots_records_become_rates_and_gaps(tmp_path: Path) -> None:
             recorder.write("robot1", {"kind": "map", "t_s": t_s})
         recorder.write("robot1", {"kind": "progress", "t_s": 15.0, "scans": 7, "scans_total": 33})
         recorder.write("robot1", {"kind": "status", "t_s": 15.0, "status": {"merges": 5}})
+        picture = MapPicture(cells=np.array([[1, 2]], np.uint8), known_m2=3.0)
+        recorder.write("robot1", {"kind": "picture", "t_s": 15.0, **picture.record()})
     watch.update()
 
     view = watch.view(16.0)
 
     assert (view.maps, view.scans, view.scans_total, view.age_s, view.gap_max_s) == (5, 7, 33, 1.0, 2.5)
+    assert view.picture is not None
+    assert view.picture.cells.tolist() == [[1, 2]]
     assert view.rate_hz == pytest.approx(3 / 5.0)
     assert watch.status == {"merges": 5}
     assert watch.mean_hz(20.0) == pytest.approx(0.4)
