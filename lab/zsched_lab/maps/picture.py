@@ -56,5 +56,5 @@ def blocks(mask: Mask, side: int) -> Mask:
     height, width = (-(-length // side) for length in mask.shape)
     padded = np.zeros((height * side, width * side), bool)
     padded[: mask.shape[0], : mask.shape[1]] = mask
-    found: Mask = padded.reshape(height, side, width, side).any(axis=(1, 3))
+    found: Mask = np.asarray(padded.reshape(height, side, width, side).any(axis=(1, 3)))
     return found
