@@ -471,7 +471,9 @@ class Daemon:
                     self._notify.stopping()
             if self._may_begin_again and leaving.asked_at is None:
                 self._tend_sessions(node, now)
-            if leaving.asked_at is not None and leaving.is_over(node.owned(), node.movable(now), now):
+            if leaving.asked_at is not None and leaving.is_over(
+                node.owned(), node.movable(now), now, finishing=node.finishing()
+            ):
                 self._say_goodbye(node, leaving.last_words(node.owned(), now))
                 return
             if watchdog_s is not None and now >= next_ping:

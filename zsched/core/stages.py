@@ -221,6 +221,10 @@ class Stages:
             if any(self._can_take(candidate, now) for candidate in self.fleet.task(name).candidates)
         )
 
+    def finishing(self) -> tuple[TaskId, ...]:
+        """The tasks that have moved away while the worker here has not said that it has finished."""
+        return tuple(name for name, executor in self.executors.items() if executor.is_finishing)
+
     def lacking(self, now: float) -> tuple[Lack, ...]:
         """The tasks that would have no owner if this node went now, though not if it waited."""
         others = {name: self._told_in_this_life(name, now) for name in self.membership.alive()}

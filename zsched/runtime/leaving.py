@@ -21,6 +21,8 @@ NOBODY_S = 0.8
 LEAVE_S = 0.4
 """...and how long it stays when they are moved: the next owner's worker asks ours for its state, and what ours has in
 hand is still to come."""
+FINISH_S = 10.0
+"""...and where it begins anew: for at most so long until its workers say that they have finished."""
 TWICE_S = 0.3
 """Two signals so close together are one: a terminal and a wrapper may both pass on the same Ctrl-C."""
 
@@ -47,13 +49,16 @@ class Leaving:
         self._is_hurried |= now - self.asked_at >= TWICE_S
         return False
 
-    def is_over(self, owned: Collection[TaskId], movable: Collection[TaskId], now: float) -> bool:
+    def is_over(
+        self, owned: Collection[TaskId], movable: Collection[TaskId], now: float, *, finishing: Collection[TaskId] = ()
+    ) -> bool:
         """Whether to go now.
 
         Args:
             owned: what this node owns.
             movable: what of it another node could take.
             now: monotonic seconds.
+            finishing: what has moved while the worker here still has some of it in work.
         """
         if self.asked_at is None:
             return False
@@ -61,7 +66,7 @@ class Leaving:
             return True
         if not owned:
             self._moved_at = now if self._moved_at is None else self._moved_at
-            return now >= self._moved_at + LEAVE_S
+            return now >= self._moved_at + (FINISH_S if finishing and self._hand_over_s == ANEW_S else LEAVE_S)
         self._moved_at = None
         return now >= self.asked_at + (self._hand_over_s if movable else NOBODY_S)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from zsched.runtime.leaving import ANEW_S, HAND_OVER_S, LEAVE_S, NOBODY_S, TWICE_S, Leaving
+from zsched.runtime.leaving import ANEW_S, FINISH_S, HAND_OVER_S, LEAVE_S, NOBODY_S, TWICE_S, Leaving
 
 OWNED = ("map", "plan")
 
@@ -48,6 +48,19 @@ def test_a_daemon_that_begins_anew_waits_longer_for_the_move() -> None:
     assert not leaving.is_over(OWNED, OWNED, 100.0 + ANEW_S - 0.01)
     assert leaving.is_over(OWNED, OWNED, 100.0 + ANEW_S)
     assert leaving.is_over(OWNED, (), 100.0 + NOBODY_S), "nobody can take them"
+
+
+def test_a_daemon_that_begins_anew_lets_its_worker_finish() -> None:
+    for hand_over_s, wait_s in ((ANEW_S, FINISH_S), (HAND_OVER_S, LEAVE_S)):
+        leaving = Leaving()
+        leaving.ask(OWNED, 100.0, hand_over_s=hand_over_s)
+        assert not leaving.is_over((), (), 101.0, finishing=OWNED)
+        assert not leaving.is_over((), (), 100.99 + wait_s, finishing=OWNED)
+        assert leaving.is_over((), (), 101.0 + wait_s, finishing=OWNED)
+    leaving = Leaving()
+    leaving.ask(OWNED, 100.0, hand_over_s=ANEW_S)
+    assert not leaving.is_over((), (), 101.0, finishing=OWNED)
+    assert leaving.is_over((), (), 101.0 + LEAVE_S), "it has finished"
 
 
 def test_what_is_left_behind_is_named() -> None:

@@ -293,6 +293,11 @@ class Executor:
         is_let = self.role.role is not WorkerRole.IDLE and self.role.lease_until_s is None
         return is_let or self._unleased_epoch is not None or now < self._leaves_until
 
+    @property
+    def is_finishing(self) -> bool:
+        """Whether the worker here may still do what it had in work for its last epoch."""
+        return self.role.role is WorkerRole.DRAINING and self._unleased_epoch is not None
+
     def isolate(self, todo: ToDo) -> None:
         """Owner and quorum are out of reach: this robot's own worker serves its streams."""
         may_work = self.spec.on_isolation is OnIsolation.LOCAL and not self.is_leased

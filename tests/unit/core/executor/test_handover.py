@@ -457,6 +457,21 @@ def test_a_worker_that_has_drained_hears_of_its_end_a_little_later() -> None:
     assert not one.may_work_unleased(ends_at + LEAVES_S)
 
 
+def test_an_old_owner_s_worker_finishes_until_it_says_so_or_its_time_is_over() -> None:
+    one, other, seen = edge(), edge(), list[bool]()
+    done(one.execute, allocation_of(1, "edge1"), 0.0)
+    seen.append(one.is_finishing)
+    done(one.execute, allocation_of(2, "edge2"), 1.0)
+    seen.append(one.is_finishing)
+    one.on_role_ended(1)
+    seen.append(one.is_finishing)
+    assert seen == [False, True, False]
+    done(other.execute, allocation_of(1, "edge1"), 0.0)
+    done(other.execute, allocation_of(2, "edge2"), 1.0)
+    done(other.tick, other.next_deadline())
+    assert not other.is_finishing, "it is idle"
+
+
 def test_a_worker_that_was_told_to_stop_at_once_has_nothing_to_hear() -> None:
     one = edge(spec=replace(SPEC, exclusive=True))
     done(one.execute, replace(allocation_of(1, "edge1"), leased=True), 0.0)
