@@ -14,6 +14,7 @@ import contextlib
 import errno
 import io
 import os
+import shlex
 import signal
 import sys
 from enum import StrEnum
@@ -315,8 +316,8 @@ def _place(config: Path | None, node: str | None, state_dir: Path | None) -> Pla
 def _write_example(example: Example, folder: Path) -> None:
     for path in write_example(example, folder):
         typer.echo(str(path))
-    where = "" if folder == Path() else f"cd {folder} && "
-    _say(f"next: {where}zsched dev; in another terminal the application, as README.md there says")
+    words = shlex.join(("zsched", "dev", *(() if folder == Path() else (str(folder),))))
+    _say(f"next: `{words}`; it prints the line that starts the application in another terminal")
 
 
 def _heard(heard: Heard, name: str, generation: int, *, is_elector: bool) -> str:
@@ -333,7 +334,9 @@ def _heard(heard: Heard, name: str, generation: int, *, is_elector: bool) -> str
 
 @app.command(cls=Verb)
 def dev(
-    file: Annotated[Path | None, typer.Argument(metavar="FILE", help="Fleet file; else ./fleet.yaml.")] = None,
+    file: Annotated[
+        Path | None, typer.Argument(metavar="FILE", help="Fleet file, or its folder; else ./fleet.yaml.")
+    ] = None,
     task: Annotated[
         list[str] | None,
         typer.Option("--task", metavar="[TASK=]FILE", help="This worker in place of the fleet file's."),

@@ -82,20 +82,18 @@ def play_task(example: str, play: dict[str, Any], terminal: Terminal) -> dict[st
     """From the example to answers that go on after a kill; what it took."""
     began, first = time.monotonic(), len(terminal.typed)
     folder = HOME / f"my-{example}"
-    for line in play["begin"]:
-        terminal.run(line.replace("--example python", f"--example {example}").replace("my-task", folder.name))
+    terminal.run(play["begin"].replace("--example python", f"--example {example}").replace("my-task", folder.name))
     own: dict[str, str] = play["tasks"][example]["files"]
     for name, text in own.items():
         (folder / name).write_text(text)
     answer = re.compile(play["tasks"][example]["answer"].encode())
-    terminal.type(play["run"])
+    terminal.type(play["run"].replace("my-task", folder.name))
     started = len(terminal.said)
     terminal.wait(re.compile(rb": on \w+ \(epoch 1"), FLEET_S, started)
     placed_s = time.monotonic() - began
     other = Terminal(HOME)
-    opening = terminal.wait(re.compile(rb"dev: another terminal begins with: ([^\r\n]+)"), COMMAND_S, started)
-    other.run(opening[1].decode())
-    other.type(play["tasks"][example].get("ask", play["ask"]))
+    printed = re.compile(rb"dev: the application, in another terminal: ([^\r\n]+)")
+    other.type(terminal.wait(printed, COMMAND_S, started)[1].decode())
     other.wait(answer, ANSWER_S)
     answered_s = time.monotonic() - began
     told = terminal.press("k")
@@ -149,7 +147,6 @@ def main() -> None:
             terminal.run(line, INSTALL_S)
         report["install"] = {"seconds": time.monotonic() - began, "commands": list(terminal.typed)}
         for example in play["tasks"]:
-            terminal.run(f"cd {CLONE}")
             report["tasks"][example] = play_task(example, play, terminal)
             Path(sys.argv[2]).write_text(json.dumps(report, indent=1))
     except StumbledError as error:

@@ -7,6 +7,7 @@ import os
 import pty
 import re
 import select
+import shlex
 import signal
 import subprocess
 import sys
@@ -82,8 +83,9 @@ class Dev:
         return match
 
     @property
-    def endpoint(self) -> str:
-        return self.wait(r"robot1 .* data endpoint (tcp/\S+)")[1]
+    def application(self) -> list[str]:
+        """The words of the line that starts the example's application."""
+        return shlex.split(self.wait(r"the application, in another terminal: (.+)\n")[1])
 
     def left(self) -> list[str]:
         """What there still is of the run: its folder, and processes that work in the example's folder."""
@@ -110,12 +112,10 @@ def dev(folder: Path, *, has_terminal: bool = False, options: tuple[str, ...] = 
 
 
 class Application:
-    """The example's own application; its answers are lines."""
+    """The example's own application, started from another folder; its answers are lines."""
 
-    def __init__(self, folder: Path, endpoint: str) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, "ask.py", endpoint], cwd=folder, stdout=subprocess.PIPE, stdin=subprocess.DEVNULL
-        )
+    def __init__(self, words: list[str]) -> None:
+        self._process = subprocess.Popen(words, cwd="/", stdout=subprocess.PIPE, stdin=subprocess.DEVNULL)
         assert self._process.stdout is not None
         self._pipe = self._process.stdout
         self._rest = b""
@@ -150,7 +150,7 @@ def test_an_example_answers_survives_a_kill_and_leaves_nothing(folder: Path, exa
     write_example(example, folder)
     with dev(folder, has_terminal=True) as run:
         run.wait(r"shout: on (\w+) \(epoch 1")
-        with Application(folder, run.endpoint) as application:
+        with Application(run.application) as application:
             application.wait_answer(r"\(by \w+\)")
             told = len(run.said)
             run.press("k")
@@ -196,7 +196,7 @@ def test_a_saved_worker_is_started_again_and_a_broken_one_leaves_the_owner_its_o
     with dev(folder, options=("fleet.yaml", "--task", "worker.py")) as run:
         run.wait(r"shout: on (\w+) \(epoch 1")
         run.wait("no terminal, no keys")
-        with Application(folder, run.endpoint) as application:
+        with Application(run.application) as application:
             application.wait_answer(r"\(by ")
             worker.write_text(good.replace("(by ", "(from "))
             run.wait("every worker runs what was saved")

@@ -18,6 +18,7 @@ from typing import Final
 
 from zsched import paths as places
 from zsched.commands.common import CliError, Json, nearest, wants_color
+from zsched.commands.example import APPLICATION
 from zsched.commands.page import harmless
 from zsched.commands.report import render_status
 from zsched.config.load import load_fleet
@@ -37,6 +38,8 @@ HERE: Final = Path("fleet.yaml")
 PORT_STEP: Final = 10
 """From one robot's data port to the next one's."""
 NARROW: Final = 80
+DEFAULT_JOINS: Final = f"tcp/127.0.0.1:{DATA_PORT}"
+"""Where an application joins that is told nothing."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,7 +67,7 @@ def dev(options: DevOptions) -> int:
         here = on_loopback(file, addresses, commands)
         candidates = sorted({node for task in fleet.tasks for node in task.candidates})
         cpus = shares(candidates, os.sched_getaffinity(0))
-        folder = file.absolute().parent
+        folder = file.resolve().parent
         words = {**{task.name: task.worker.command for task in fleet.tasks}, **commands}
         nodes = Nodes(fleet, here.text, folder, cpus)
         stop = stack.enter_context(stopped_by_signal())
@@ -81,8 +84,16 @@ def dev(options: DevOptions) -> int:
 
 
 def _file(given: Path | None) -> Path:
-    if given is not None:
+    if given is not None and not given.is_dir():
         return given
+    if given is not None:
+        if not (given / HERE).exists():
+            raise CliError(
+                EXIT_CONFIG,
+                f"no {HERE} in the folder {given}; name the fleet file, or begin with "
+                f"`zsched init --example python {shlex.quote(str(given))}`",
+            )
+        return given / HERE
     file = HERE if HERE.exists() else places.config_path(None, os.environ)
     if not file.exists():
         raise CliError(
@@ -164,6 +175,8 @@ def _introduce(
     print(f"\nAn application of {robot} joins by this configuration of zenoh (JSON5):\n")
     print(textwrap.indent(json5(addresses[robot].joins), "    "))
     print('\nIn Python: zenoh.open(zenoh.Config.from_json5("""..."""))\n')
+    if (words := application(nodes.work_folder, fleet.tasks[0].worker.command, addresses[robot].joins)) is not None:
+        _say(f"the application, in another terminal: {words}")
     _say(f"another terminal begins with: {_entrance(nodes.work_folder)}")
     _say(f"this fleet there: zsched status --runtime-dir {nodes.folder} --node {robot}")
 
@@ -173,6 +186,20 @@ def _entrance(folder: Path) -> str:
     activate = Path(sys.prefix) / "bin" / "activate"
     enter = f"cd {shlex.quote(str(folder))}"
     return f"{enter} && source {shlex.quote(str(activate))}" if activate.is_file() else enter
+
+
+def application(folder: Path, worker: Sequence[str], joins: str) -> str | None:
+    """The command line that starts an example's application from any folder; None where there is none.
+
+    It runs by the Python of the task's worker, so a ROS node by the system's.
+    """
+    file = folder / APPLICATION
+    if not file.is_file():
+        return None
+    named = Path(worker[0]) if worker else Path()
+    python = named if named.is_absolute() and named.name.startswith("python") else Path(sys.executable)
+    elsewhere = () if joins == DEFAULT_JOINS else (joins,)
+    return shlex.join((str(python), str(file), *elsewhere))
 
 
 def json5(endpoint: str) -> str:

@@ -16,6 +16,10 @@ from zsched.files import write_regular
 EXAMPLES: Final = Path(__file__).parents[1] / "examples"
 
 
+APPLICATION: Final = "ask.py"
+"""The file of each example that runs on the robot and knows nothing of zsched."""
+
+
 class Example(StrEnum):
     """Which way the example's worker goes."""
 

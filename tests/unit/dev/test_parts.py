@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import shlex
+import sys
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
@@ -13,7 +15,7 @@ from typer.testing import CliRunner
 
 from zsched.cli import app
 from zsched.commands.common import CliError
-from zsched.commands.dev import DevOptions, _commands, dev, json5
+from zsched.commands.dev import DEFAULT_JOINS, DevOptions, _commands, application, dev, json5
 from zsched.config.load import load_fleet
 from zsched.core.values.model import NodeId
 from zsched.dev.nodes import shares
@@ -65,6 +67,29 @@ def test_a_saved_file_is_noticed_once_and_one_that_is_away_is_not(tmp_path: Path
 )
 def test_a_daemons_line_has_level_logger_and_text(line: str, expected: tuple[str, str, str]) -> None:
     assert _parts(line) == expected
+
+
+def test_the_application_is_started_by_one_line_from_any_folder(tmp_path: Path) -> None:
+    folder = tmp_path / "my task"
+    folder.mkdir()
+    assert application(folder, ("python", "worker.py"), DEFAULT_JOINS) is None
+    (folder / "ask.py").write_text("")
+    file = str(folder / "ask.py")
+    for worker, joins, expected in (
+        (("python", "worker.py"), DEFAULT_JOINS, [sys.executable, file]),
+        (("python", "worker.py"), "tcp/127.0.0.1:61234", [sys.executable, file, "tcp/127.0.0.1:61234"]),
+        (("/usr/bin/python3", "worker.py"), DEFAULT_JOINS, ["/usr/bin/python3", file]),
+        (("/opt/detector",), DEFAULT_JOINS, [sys.executable, file]),
+        ((), DEFAULT_JOINS, [sys.executable, file]),
+    ):
+        words = application(folder, worker, joins)
+        assert words is not None
+        assert shlex.split(words) == expected
+
+
+def test_a_folder_without_a_fleet_file_is_said(tmp_path: Path) -> None:
+    with pytest.raises(CliError, match=r"no fleet\.yaml in the folder .*zsched init --example python"):
+        dev(DevOptions(file=tmp_path, workers=()))
 
 
 def test_a_worker_is_named_alone_or_with_its_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
