@@ -6,13 +6,15 @@ any verb. What is installed is looked at only when a verb is not the program's o
 
 from __future__ import annotations
 
-from importlib.metadata import EntryPoint, entry_points
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import typer
 
 from zsched.commands.common import CliError, Verb, Verbs
 from zsched.exits import EXIT_FAILED
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 GROUP: Final = "zsched.commands"
 LAB_VERBS: Final = frozenset({"bench", "demo"})
@@ -21,6 +23,8 @@ LAB_VERBS: Final = frozenset({"bench", "demo"})
 
 def installed_verbs() -> dict[str, EntryPoint]:
     """{verb: what brings it}, by name; of two of one name the first that is found."""
+    from importlib.metadata import entry_points  # noqa: PLC0415 - it loads the whole of `email`
+
     found: dict[str, EntryPoint] = {}
     for point in entry_points(group=GROUP):
         found.setdefault(point.name, point)
