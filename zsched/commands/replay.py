@@ -9,6 +9,7 @@ import json
 import sys
 from pathlib import Path
 
+from zsched.adapters.host.decision_log import is_torn
 from zsched.commands.common import CliError, print_json
 from zsched.commands.page import harmless
 from zsched.core.scheduler.decision import decide_again, verdict_of
@@ -25,6 +26,8 @@ MOST_BYTES = 64 * 1024 * 1024
 def replay(file: Path, *, is_json: bool) -> int:
     """Judge again what the log tells; returns 1 at the first judgement that comes out differently.
 
+    A line that a power cut has torn is left out, and told.
+
     Raises:
         CliError: the file cannot be read, or a line is none of a decision log.
     """
@@ -33,7 +36,11 @@ def replay(file: Path, *, is_json: bool) -> int:
     except OSError as error:
         raise CliError(EXIT_USAGE, f"{file}: cannot be read: {error.strerror}") from error
     done = 0
+    torn: list[int] = []
     for number, line in enumerate(lines, 1):
+        if is_torn(line):
+            torn.append(number)
+            continue
         decision, written = _decision(file, number, line)
         if decision is None:
             continue
@@ -41,17 +48,21 @@ def replay(file: Path, *, is_json: bool) -> int:
         if again != written:
             where = f"{file}:{number}"
             if is_json:
-                print_json(
-                    {"schema": SCHEMA, "judged": done, "equal": False, "line": number, "was": written, "is": again}
-                )
+                found = {"judged": done, "equal": False, "line": number, "was": written, "is": again, "torn": torn}
+                print_json({"schema": SCHEMA, **found})
             else:
                 sys.stdout.write(f"{where}: decided {_told(written)}\n{where}: and again {_told(again)}\n")
             return EXIT_FAILED
         done += 1
     if is_json:
-        print_json({"schema": SCHEMA, "judged": done, "equal": True, "line": None, "was": None, "is": None})
+        print_json(
+            {"schema": SCHEMA, "judged": done, "equal": True, "line": None, "was": None, "is": None, "torn": torn}
+        )
     else:
         sys.stdout.write(f"{done} judgements made again, all equal\n")
+        if torn:
+            where = ", ".join(map(str, torn))
+            sys.stdout.write(f"left out, for a power cut or a full disk has torn it: line {where}\n")
     return EXIT_OK
 
 

@@ -309,6 +309,22 @@ def test_what_is_no_log_is_refused_with_its_line(tmp_path: Path, line: str) -> N
     assert run("replay", tmp_path / "nothing").exit_code == EXIT_USAGE
 
 
+@pytest.mark.parametrize("cut", [1, 12, 60, 400])
+@pytest.mark.parametrize("filled", [b"", bytes(64)])
+def test_a_line_that_a_power_cut_has_torn_is_left_out_and_told(tmp_path: Path, cut: int, filled: bytes) -> None:
+    """The daemon goes on below it, and what came before and after is judged."""
+    file = log_of(tmp_path, decision(0.1), decision(0.5))
+    whole = file.read_bytes()
+    file.write_bytes(whole[: whole[:-1].rindex(b"\n") + 1 + cut] + filled)
+    done = run("replay", file)
+    assert (done.exit_code, done.stdout.splitlines()[0]) == (0, "1 judgements made again, all equal")
+    assert done.stdout.splitlines()[1].endswith("has torn it: line 3")
+    log_of(tmp_path, decision(0.9))
+    body = json.loads(run("replay", file, "--json").stdout)
+    assert faults(body) == []
+    assert (body["judged"], body["equal"], body["torn"]) == (2, True, [3])
+
+
 # --- what is chosen --------------------------------------------------------------------------------------------------
 
 

@@ -37,6 +37,9 @@ CLOSE_S = 0.5
 _BODY = b',"decision":'
 """Where a judgement's figures begin; in a string its quotes would be escaped."""
 
+_HEAD = b'{"schema":"zsched.event/'
+"""How every line begins."""
+
 Json = dict[str, Any]
 
 
@@ -80,6 +83,8 @@ class DecisionLog:
         self._queue: queue.SimpleQueue[tuple[float, RecordStory] | None] = queue.SimpleQueue()
         self._lost = self._crowded_out = 0
         self._is_failing = False
+        self._is_whole = False
+        """Whether the file is known to end with a whole line; a life begins without knowing."""
         self._thread = guarded(self._run, name="zsched-decision-log")
 
     def start(self) -> None:
@@ -146,13 +151,20 @@ class DecisionLog:
         return json.dumps(as_plain(entry), separators=(",", ":")).encode() + b"\n"
 
     def _append(self, line: bytes) -> None:
-        """Append a line whole or not at all; in a full file's place begins a new one."""
+        """Append a line whole or not at all; in a full file's place begins a new one.
+
+        What a power cut has torn stays a line of its own.
+        """
         path = self._folder / NAME
         if path.exists() and path.stat().st_size + len(line) > self._file_bytes:
             path.replace(self._folder / OLD_NAME)
         flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC | os.O_NOFOLLOW
         with os.fdopen(os.open(path, flags, 0o640), "wb", buffering=0) as file:
             before = os.fstat(file.fileno()).st_size
+            if before and not self._is_whole:
+                with path.open("rb") as there:
+                    there.seek(-1, os.SEEK_END)
+                    line = line if there.read(1) == b"\n" else b"\n" + line
             try:
                 written = 0
                 while written < len(line):
@@ -160,6 +172,7 @@ class DecisionLog:
             except OSError:
                 os.ftruncate(file.fileno(), before)
                 raise
+            self._is_whole = True
 
     # --- reading (an operator's thread) ------------------------------------------------------------------------------
 
@@ -177,6 +190,24 @@ class DecisionLog:
         wanted = [line for line in map(without_figures, lines) if not is_moves or _is_of_move(line)]
         entries = [entry for line in wanted if (entry := _parsed(line)) is not None]
         return {"node": self._node, "now": wall_s(), "entries": entries, "cursor": cursor, "more": has_more}
+
+
+def is_torn(line: bytes) -> bool:
+    """Whether this is only the beginning of a line, as a power cut leaves it.
+
+    >>> is_torn(b'{"schema":"zsched.event/1","at":17'), is_torn(b'{"sche'), is_torn(b'{"schema":"zsched.event/1"}')
+    (True, True, False)
+    >>> is_torn(b"something else")
+    False
+    """
+    text = line.rstrip(b"\0")  # some file systems fill up what they have not written
+    if not (text.startswith(_HEAD) or _HEAD.startswith(text)):
+        return False
+    try:
+        json.loads(text)
+    except ValueError:
+        return True
+    return False
 
 
 def _parsed(line: bytes) -> Json | None:
