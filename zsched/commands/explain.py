@@ -165,7 +165,7 @@ def _past(door: Door, task: str, point: Point) -> tuple[Json, Decision]:
     told: Json = plain(explained(decision))
     head = {"schema": SCHEMA, "node": node, "age_s": max(now - float(entry["at"]), 0.0)}
     made = None if move is None else _move(move, now)
-    more = {"newest_revision": decision.figures.allocation.revision, "vote": None, "plan": None}
+    more = {"newest_revision": decision.figures.allocation.revision, "vote": None, "plan": None, "knows_jobs": None}
     return {**head, **told, **more, "at": wall_text(entry["at"]), "made": made, "robot": None}, decision
 
 
@@ -246,7 +246,7 @@ def _body(answer: Explanation, decision: Decision) -> Json:
     vote = None if answer.vote is None else {**plain(answer.vote), "votes": dict(answer.vote.votes)}
     told: Json = plain(explained(decision))
     head = {"schema": SCHEMA, "node": answer.node, "age_s": answer.age_s}
-    more = {"newest_revision": answer.allocation.revision, "vote": vote, "plan": None}
+    more = {"newest_revision": answer.allocation.revision, "vote": vote, "plan": None, "knows_jobs": answer.knows_jobs}
     return {**head, **told, **more, "at": None, "made": None, "robot": None}
 
 
@@ -365,7 +365,11 @@ def _heard(sight: Json) -> list[Cell]:
 def _tuning(page: Page, body: Json) -> None:
     tuning = body["tuning"]
     weights = " ".join(f"{name} {value:g}" for name, value in shares(tuning["weights"]).items())
-    deadline = [] if tuning["deadline_ms"] is None else [(f"deadline {tuning['deadline_ms']:g} ms", "")]
+    deadline: list[Cell] = []
+    if tuning["deadline_ms"] is not None:
+        deadline = [(f"deadline {tuning['deadline_ms']:g} ms", "")]
+        if body["knows_jobs"] is False:
+            deadline.append(("which does not count yet: its worker has not told of a job", "yellow"))
     page.block(
         "TUNING",
         (weights, ""),

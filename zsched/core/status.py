@@ -103,6 +103,7 @@ def build_explanation(node: Stages, task: TaskId, now: float) -> Explanation:
         decision=node.rounds.decision(task, now),
         age_s=max(now - node.rounds.tasks[task].judged_at, 0.0) if node.rounds.tasks[task].judgement else 0.0,
         vote=_vote(node.votes.tasks[task], now),
+        knows_jobs=node.gateway.demands.job(task) is not None,
     )
 
 

@@ -150,6 +150,25 @@ def test_the_line_of_the_utility_is_what_the_core_reckons(score: str, said: str)
     assert formula_of({"tuning": tuning, "candidates": []}) == ""
 
 
+@pytest.mark.parametrize(("knows", "is_said"), [(False, True), (True, False), (None, False)])
+def test_a_deadline_that_does_not_count_yet_is_said(
+    fleet: Fleet, capsys: pytest.CaptureFixture[str], knows: bool | None, is_said: bool
+) -> None:
+    """Until a worker has told what a job takes, the task is judged without its deadline."""
+    answer = fleet.answers[None]
+    one = answer.decision
+    tuning = replace(VALUE.tuning, score=ScoreForm.SERVICE, deadline_ms=100.0)
+    figures = replace(one.figures, allocation=replace(VALUE, tuning=tuning))
+    fleet.answers[None] = replace(answer, decision=replace(one, figures=figures), knows_jobs=knows)
+    assert asked() == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert "deadline 100 ms" in told
+    assert ("does not count yet: its worker has not told of a job" in told) is is_said
+    assert asked(is_json=True) == 0
+    body = json.loads(capsys.readouterr().out)
+    assert (faults(body), body["knows_jobs"]) == ([], knows)
+
+
 @pytest.mark.usefixtures("fleet")
 def test_what_is_printed_adds_up(capsys: pytest.CaptureFixture[str]) -> None:
     assert asked() == 0

@@ -22,7 +22,7 @@ from zsched.core.instructions import RecordStory
 from zsched.core.node import Node
 from zsched.core.report import snapshot_json
 from zsched.core.scheduler.patience import FIRST_PATIENCE
-from zsched.core.status import build_snapshot, status_line
+from zsched.core.status import build_explanation, build_snapshot, status_line
 from zsched.core.values.fleet import TaskSpec, WorkerSpec, electorate_hash, lease_terms
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import (
@@ -30,6 +30,7 @@ from zsched.core.values.model import (
     WAS_READY,
     DeviceSample,
     Echo,
+    Jobs,
     LinkSample,
     LinkSource,
     ScoreForm,
@@ -340,6 +341,16 @@ def test_the_way_there_and_back_is_told_of_a_task_with_a_deadline(deadline_ms: f
         node.round_trips.note_heard(replace(ours, node=name, echoes=(echo,)), 7, 101.0)
     told = {task.name: task.round_trips for task in build_snapshot(node, 101.0).tasks}
     assert told == {"merge": () if deadline_ms is None else (("edge1", 0.5),), "merge2": ()}
+
+
+def test_an_explanation_says_whether_jobs_are_known_that_a_deadline_needs() -> None:
+    node = make()
+    assert build_explanation(node, "merge", 100.0).knows_jobs is False
+    load = load_of("merge", cpu_cores=0.5, jobs=Jobs(time_s=0.1, cpu_s=0.05, done_hz=5.0, wanted_hz=5.0))
+    owner = profile_of("edge1", memory_mb=100.0, memory_used_mb=1.0, cpu_used_cores=0.5, workers=(load,))
+    for second in range(60):
+        node.gateway.demands.learn("merge", owner, 100.0 + second)
+    assert build_explanation(node, "merge", 160.0).knows_jobs is True
 
 
 def test_problems_say_what_is_missing_in_words() -> None:

@@ -157,3 +157,5 @@ class Explanation:
     """``None``: an edge, or no round yet."""
     age_s: float = 0.0
     vote: VoteStatus | None = None
+    knows_jobs: bool | None = None
+    """Whether this node knows what a job of the task takes, which a deadline needs; ``None``: it does not say."""
