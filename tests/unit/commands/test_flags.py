@@ -10,14 +10,14 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
+from support.doors import STATUS, answering, living
 from support.schemas import faults
-from zsched.adapters.host.operator_socket import Json, OperatorSocket
+from zsched.adapters.host.operator_socket import Json
 from zsched.cli import app
 from zsched.commands import flags as verbs
 from zsched.commands.brief import render_brief
 from zsched.commands.report import render_status
 
-STATUS = json.loads((Path(__file__).parent / "recorded_status" / "healthy.json").read_text())
 TEXT = "fleet: lab\n"
 NODES = ("edge1", "edge2", "robot1")
 ROLLOUT: Json = {"task": "echo", "first": ["edge1"], "command": ["/opt/echo"]}
@@ -31,25 +31,15 @@ def task(name: str, owner: str) -> Json:
     return {**found, **more, "streams": [], "pause": None, "pin": None, "switched_s": 0.086, "decision": decision}
 
 
-def node(name: str, kind: str) -> Json:
-    recorded = STATUS["nodes"][0]
-    workers = [{**recorded["workers"][0], "task": one, "state": "ready"} for one in ("echo", "merge")]
-    return {
-        **recorded,
-        "name": name,
-        "kind": kind,
-        "state": "alive",
-        "draining": False,
-        "workers": workers,
-        "flags": [],
-    }
+def node(name: str) -> Json:
+    return {**living(name, "robot" if name == "robot1" else "edge", "echo", "merge"), "flags": []}
 
 
 class Daemon:
     """Answers as three daemons of a fleet with a document; after each look at a status `step` happens."""
 
-    def __init__(self, folder: Path) -> None:
-        nodes = [node(name, "robot" if name == "robot1" else "edge") for name in NODES]
+    def __init__(self) -> None:
+        nodes = [node(name) for name in NODES]
         self.status: Json = {**STATUS, "fleet": "lab", "node": "robot1", "nodes": nodes, "fleet_revision": 4}
         self.status["tasks"] = [task("echo", "edge1"), task("merge", "edge1")]
         self.flags: list[Json] = []
@@ -57,7 +47,6 @@ class Daemon:
         self.changes: list[Json] = []
         self.outcome = "ok"
         self.step: Callable[[], None] = lambda: None
-        self.socket = OperatorSocket(folder / "robot1.sock", self.answer)
 
     def answer(self, request: Json) -> Json:
         if request["verb"] == "status":
@@ -90,13 +79,10 @@ class Daemon:
 
 @pytest.fixture
 def daemon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Daemon]:
-    monkeypatch.setenv("ZSCHED_RUNTIME_DIR", str(tmp_path))
-    monkeypatch.delenv("ZSCHED_NODE", raising=False)
     monkeypatch.setattr(verbs, "PAUSE_S", 0.001)
-    running = Daemon(tmp_path)
-    running.socket.open()
-    yield running
-    running.socket.close()
+    running = Daemon()
+    with answering(running.answer, tmp_path, monkeypatch):
+        yield running
 
 
 def run(*words: str) -> Result:

@@ -16,10 +16,10 @@ import typer
 import typer.core
 from typer.testing import CliRunner, Result
 
-from zsched.adapters.host.operator_socket import Json, OperatorSocket
+from support.doors import STATUS, answering, living
+from zsched.adapters.host.operator_socket import Json
 from zsched.cli import app
 
-STATUS = json.loads((Path(__file__).parent / "recorded_status" / "healthy.json").read_text())
 DOCUMENT = (Path(__file__).parents[3] / "configs" / "fleet.yaml").read_text()
 CLI_PAGE = (Path(__file__).parents[3] / "docs" / "guide" / "cli.md").read_text()
 RULES = ("--plan", "--yes", "--revision", "--reason", "--json")
@@ -108,10 +108,7 @@ def test_a_changing_verb_has_every_flag_of_the_rules_or_the_page_says_why_not(ve
 
 
 def node(name: str) -> Json:
-    recorded = copy.deepcopy(STATUS["nodes"][0])
-    worker = {**recorded["workers"][0], "task": "map_merge", "state": "ready"}
-    kind = name.rstrip("0123456789")
-    return {**recorded, "name": name, "kind": kind, "state": "alive", "draining": False, "workers": [worker]}
+    return living(name, name.rstrip("0123456789"), "map_merge")
 
 
 @dataclass
@@ -141,7 +138,6 @@ class Daemon:
             "weights": {"cpu": 0.5, "memory": 0.5, "network": 0.0},
         }
         self.task |= {"pause": None, "pin": None}
-        self.socket = OperatorSocket(self.folder / "robot1.sock", self.answer)
 
     def answer(self, request: Json) -> Json:
         if request["verb"] == "status":
@@ -169,12 +165,9 @@ class Daemon:
 
 @pytest.fixture
 def daemon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Daemon]:
-    monkeypatch.setenv("ZSCHED_RUNTIME_DIR", str(tmp_path))
-    monkeypatch.delenv("ZSCHED_NODE", raising=False)
     running = Daemon(tmp_path)
-    running.socket.open()
-    yield running
-    running.socket.close()
+    with answering(running.answer, tmp_path, monkeypatch):
+        yield running
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *words: str) -> Result:

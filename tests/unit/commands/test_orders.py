@@ -11,15 +11,15 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
+from support.doors import STATUS, answering, living
 from support.schemas import faults
-from zsched.adapters.host.operator_socket import Json, OperatorSocket
+from zsched.adapters.host.operator_socket import Json
 from zsched.cli import app
 from zsched.commands.brief import render_brief
 from zsched.commands.common import CliError
 from zsched.commands.orders import KEYS, tuned, user_name
 from zsched.commands.report import render_status
 
-STATUS = json.loads((Path(__file__).parent / "recorded_status" / "healthy.json").read_text())
 TUNING: Json = {
     "weights": {"cpu": 0.5, "memory": 0.5, "network": 0.0},
     "bonus": 0.1,
@@ -36,23 +36,16 @@ def task(name: str, owner: str) -> Json:
     return {**found, **more, "tuning": TUNING, "file_tuning": TUNING, "pause": None, "pin": None, "switched_s": 0.086}
 
 
-def node(name: str, kind: str) -> Json:
-    recorded = STATUS["nodes"][0]
-    worker = {**recorded["workers"][0], "task": "echo", "state": "ready"}
-    return {**recorded, "name": name, "kind": kind, "state": "alive", "draining": False, "workers": [worker]}
-
-
 class Daemon:
     """Answers as a daemon whose register takes every order."""
 
-    def __init__(self, folder: Path) -> None:
-        nodes = [node("edge1", "edge"), node("edge2", "edge"), node("robot1", "robot")]
+    def __init__(self) -> None:
+        nodes = [living("edge1", "edge", "echo"), living("edge2", "edge", "echo"), living("robot1", "robot", "echo")]
         self.status: Json = {**STATUS, "fleet": "lab", "node": "robot1", "nodes": nodes}
         self.status["tasks"] = [task("echo", "edge1"), task("merge", "edge2")]
         self.orders: list[Json] = []
         self.outcome = "ok"
         self.answers: Callable[[Json], Json] = self.answer
-        self.socket = OperatorSocket(folder / "robot1.sock", self.answer_now)
 
     def answer_now(self, request: Json) -> Json:
         return self.answers(request)
@@ -84,12 +77,9 @@ class Daemon:
 
 @pytest.fixture
 def daemon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Daemon]:
-    monkeypatch.setenv("ZSCHED_RUNTIME_DIR", str(tmp_path))
-    monkeypatch.delenv("ZSCHED_NODE", raising=False)
-    running = Daemon(tmp_path)
-    running.socket.open()
-    yield running
-    running.socket.close()
+    running = Daemon()
+    with answering(running.answer_now, tmp_path, monkeypatch):
+        yield running
 
 
 def run(*words: str) -> Result:

@@ -13,8 +13,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
+from support.doors import STATUS, answering, living
 from support.schemas import faults
-from zsched.adapters.host.operator_socket import Json, OperatorSocket
+from zsched.adapters.host.operator_socket import Json
 from zsched.cli import app
 from zsched.commands import rehearse
 from zsched.commands.ask import Door
@@ -25,7 +26,6 @@ from zsched.core.rehearsal.programme import Do, Over, Programme
 from zsched.core.values.rehearsal import Step
 from zsched.exits import EXIT_TIMED_OUT
 
-STATUS = json.loads((Path(__file__).parent / "recorded_status" / "healthy.json").read_text())
 PROMISED = {
     "move": {"step": "move", "gap_s": 0.3, "decide_s": 1.0, "whole": ["echo/in/0"]},
     "drain": {"step": "drain", "gap_s": 0.3, "decide_s": None, "whole": []},
@@ -35,17 +35,11 @@ PROMISED = {
 }
 
 
-def node(name: str, kind: str) -> Json:
-    recorded = STATUS["nodes"][0]
-    worker = {**recorded["workers"][0], "task": "echo", "state": "ready"}
-    return {**recorded, "name": name, "kind": kind, "state": "alive", "draining": False, "workers": [worker]}
-
-
 class Daemon:
     """Answers as a robot's daemon in a fleet of two edges; notes what it is told to do."""
 
-    def __init__(self, folder: Path) -> None:
-        nodes = [node("edge1", "edge"), node("edge2", "edge"), node("robot1", "robot")]
+    def __init__(self) -> None:
+        nodes = [living("edge1", "edge", "echo"), living("edge2", "edge", "echo"), living("robot1", "robot", "echo")]
         task = copy.deepcopy(STATUS["tasks"][0])
         more = {"name": "echo", "owner": "edge1", "owner_state": "alive", "revision": 7, "phase": "settled"}
         task |= {**more, "streams": [], "candidates": ["edge1", "edge2"], "pause": None, "pin": None, "switched_s": 0.1}
@@ -57,7 +51,6 @@ class Daemon:
         self.document, self.revision = "", 4
         self.flags: list[Json] = []
         self.on_change: Callable[[], None] = lambda: None
-        self.socket = OperatorSocket(folder / "robot1.sock", self.answer)
 
     def answer(self, request: Json) -> Json:
         if request["verb"] == "status":
@@ -84,12 +77,9 @@ class Daemon:
 
 @pytest.fixture
 def daemon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Daemon]:
-    monkeypatch.setenv("ZSCHED_RUNTIME_DIR", str(tmp_path))
-    monkeypatch.delenv("ZSCHED_NODE", raising=False)
-    running = Daemon(tmp_path)
-    running.socket.open()
-    yield running
-    running.socket.close()
+    running = Daemon()
+    with answering(running.answer, tmp_path, monkeypatch):
+        yield running
 
 
 def run(*words: str) -> Result:
