@@ -19,6 +19,7 @@ import subprocess
 import sys
 import tempfile
 import textwrap
+import tomllib
 from pathlib import Path
 from typing import Any, Final
 
@@ -141,7 +142,8 @@ def checked(command: list[str], timeout_s: float = 300.0) -> None:
 def fill(wheels: Path) -> None:
     """Fetch what the clean machine installs, unless it has been fetched."""
     wheels.mkdir(exist_ok=True)
-    for wanted in ([str(REPO), "setuptools>=77"], ["zenoh-ros2-sdk"]):
+    builds_with = tomllib.loads((REPO / "pyproject.toml").read_text())["build-system"]["requires"]
+    for wanted in ([str(REPO), *builds_with], ["zenoh-ros2-sdk"]):
         checked([sys.executable, "-m", "pip", "download", "-q", "-d", str(wheels), "-f", str(wheels), *wanted])
 
 
