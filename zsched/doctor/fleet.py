@@ -5,6 +5,8 @@ Knows: the status of every node that answers. Does not know: how they were asked
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Iterator, Mapping
 from typing import Final
 
@@ -13,6 +15,7 @@ from zsched.doctor.daemon import judged_lag
 from zsched.doctor.model import Json, Result, Scene, counted, failed, joined, passed, skipped, warned
 from zsched.doctor.network import addresses, connected
 
+HASH_DIGITS: Final = 8
 HEARD: Final = ("alive", "suspect")
 
 
@@ -87,26 +90,34 @@ def hear_each_other(scene: Scene) -> Result:
 
 
 def agree_on_registers(scene: Scene) -> Result:
-    """Whether every node knows the same revision, epoch and owner of each task."""
+    """Whether every node knows the same revision, epoch, owner, tuning and orders of each task."""
     found = [result for task in scene.fleet.tasks for result in _register(task.name, scene.statuses)]
     told = f"{counted(len(scene.fleet.tasks), 'registers')}, equal on {counted(len(scene.statuses), 'nodes')}"
     return joined(found, passed(told))
 
 
 def differs(statuses: Mapping[str, Json]) -> bool:
-    """Whether any two nodes know another revision, epoch or owner of a task: a move may be under way."""
+    """Whether any two nodes know another value of a task's register: a move may be under way."""
     tasks = {str(task["name"]) for status in statuses.values() for task in status["tasks"]}
     return any(len(_values(task, statuses)) > 1 for task in tasks)
 
 
-def _values(task: str, statuses: Mapping[str, Json]) -> dict[tuple[int, int, str], list[str]]:
-    found: dict[tuple[int, int, str], list[str]] = {}
+def _values(task: str, statuses: Mapping[str, Json]) -> dict[tuple[int, int, str, str], list[str]]:
+    found: dict[tuple[int, int, str, str], list[str]] = {}
     for name, status in sorted(statuses.items()):
         for one in status["tasks"]:
             if one["name"] == task:
-                value = (int(one["revision"]), int(one["epoch"]), str(one["owner"] or "nobody"))
+                value = (int(one["revision"]), int(one["epoch"]), str(one["owner"] or "nobody"), _rest_hash(one))
                 found.setdefault(value, []).append(name)
     return found
+
+
+def _rest_hash(task: Json) -> str:
+    """A hash of what else the register holds: tuning and orders, but not for how long each node has known them."""
+    orders = {key: task.get(key) for key in ("pause", "pin")}
+    kept = {key: {name: hold[name] for name in hold if name != "known_s"} for key, hold in orders.items() if hold}
+    text = json.dumps({"tuning": task.get("tuning"), **kept}, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:HASH_DIGITS]
 
 
 def _register(task: str, statuses: Mapping[str, Json]) -> Iterator[Result]:
@@ -115,8 +126,8 @@ def _register(task: str, statuses: Mapping[str, Json]) -> Iterator[Result]:
         return
     newest = max(values)
     told = [
-        f"{task}: revision {revision}, epoch {epoch}, owner {owner} on {', '.join(names)}"
-        for (revision, epoch, owner), names in sorted(values.items(), reverse=True)
+        f"{task}: revision {revision}, epoch {epoch}, owner {owner}, hash {rest} on {', '.join(names)}"
+        for (revision, epoch, owner, rest), names in sorted(values.items(), reverse=True)
     ]
     if any(value[0] == newest[0] and value != newest for value in values):
         fix = "two values of one revision: a state came from a backup or was made anew; see docs/design/failures.md"

@@ -127,7 +127,7 @@ CHECKS: Final[tuple[Check, ...]] = (
     Check(name="fleet.pairs", asks="Does everybody hear everybody?", run=fleet.hear_each_other, needs=Needs.FLEET),
     Check(
         name="fleet.registers",
-        asks="Do all know the same revisions, epochs and owners?",
+        asks="Do all know the same value of each task?",
         run=fleet.agree_on_registers,
         needs=Needs.FLEET,
     ),

@@ -81,15 +81,28 @@ def register(**changes: Any) -> Callable[[Scene, str], Scene]:
     return plant
 
 
-@pytest.mark.parametrize("changes", [{"revision": 4}, {"owner": "robot1"}, {"epoch": 2, "revision": 4}])
+PIN = {"by": "eve@robot2", "reason": "", "known_s": 3.0, "for_s": None, "node": "edge1", "is_hard": False}
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"revision": 4}, {"owner": "robot1"}, {"epoch": 2, "revision": 4}, {"pin": PIN}, {"tuning": {"bonus": 9}}],
+)
 def test_registers_that_differ_are_found(tmp_path: Path, changes: dict[str, Any]) -> None:
     scene = fleet_scene(tmp_path)
     assert not differs(scene.statuses)
     apart = register(**changes)(scene, "robot2")
     assert differs(apart.statuses)
-    assert_finds(run("fleet.registers", apart), FAIL, "revision 5, epoch 3, owner edge1 on edge1, robot1, robot3")
-    if changes == {"owner": "robot1"}:
-        assert "two values of one revision" in run("fleet.registers", apart).fix
+    assert_finds(run("fleet.registers", apart), FAIL, "revision 5, epoch 3, owner edge1, hash ")
+    assert_finds(run("fleet.registers", apart), FAIL, " on edge1, robot1, robot3")
+    assert ("two values of one revision" in run("fleet.registers", apart).fix) is ("revision" not in changes)
+
+
+def test_an_order_that_nodes_have_known_for_different_times_is_one(tmp_path: Path) -> None:
+    scene = fleet_scene(tmp_path)
+    for name, known_s in zip(scene.statuses, (1.0, 2.0, 3.0, 4.0), strict=True):
+        scene = register(pin={**PIN, "known_s": known_s})(scene, name)
+    assert not differs(scene.statuses)
 
 
 def test_electors_without_their_state_or_apart_are_found(tmp_path: Path) -> None:

@@ -23,11 +23,15 @@ from zsched.core.values.electorate import Elector, FleetValue
 from zsched.core.values.model import RegisterState
 from zsched.doctor import machine, state
 from zsched.doctor.look import Machine, look
-from zsched.doctor.model import Scene, Verdict
-from zsched.doctor.table import run_all
+from zsched.doctor.model import Check, Scene, Verdict
+from zsched.doctor.table import CHECKS, run_all
 from zsched.wire.codec import as_plain, document_hash
 
 FAIL, WARN, PASS, SKIP = Verdict.FAIL, Verdict.WARN, Verdict.PASS, Verdict.SKIP
+HERE = Path(__file__).parent
+PLANTED = "".join(
+    path.read_text() for folder in (HERE, HERE.parents[1] / "parts" / "doctor") for path in folder.glob("test_*.py")
+)
 ROBOTS_OWN = FLEET.replace("  robot1: {kind: robot}", "  robot1: {kind: robot, wifi: wlan7}")
 
 
@@ -47,6 +51,14 @@ def test_a_machine_in_order_has_no_fault(tmp_path: Path) -> None:
     bad = [(check.name, result) for check, result in run_all(scene) if result.fix]
     assert [one for one in bad if not one[0].startswith(elsewhere)] == []
     assert len(run_all(scene)) >= 20
+
+
+@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.name)
+def test_a_fault_is_planted_for_every_check(check: Check) -> None:
+    """By the check's name or by its function: a new check comes with the fault that it finds."""
+    run = check.run
+    function = f"{run.__module__.rpartition('.')[2]}.{run.__name__}"
+    assert f'"{check.name}"' in PLANTED or function in PLANTED
 
 
 # --- the fleet file --------------------------------------------------------------------------------------------------
@@ -485,3 +497,12 @@ def test_a_worker_s_module_is_followed_through_its_own_package(tmp_path: Path) -
 
 def test_a_worker_s_module_that_is_not_there_is_found(tmp_path: Path) -> None:
     assert_finds(run("worker.imports", with_command(tmp_path, "[python, -m, nosuch.worker]")), FAIL, "nosuch")
+
+
+def test_a_unit_that_this_machine_has_not_is_found(tmp_path: Path) -> None:
+    """Also where there is no systemd at all."""
+    kept = FLEET.replace("{command: [python, -m, zsched.tasks.echo]}", "{driver: systemd, unit: nosuch@.service}")
+    found = run("worker.engine", scene_of(tmp_path, kept))
+    assert found.verdict in (FAIL, WARN)
+    assert found.fix
+    assert run("worker.engine", scene_of(tmp_path)).verdict is SKIP
