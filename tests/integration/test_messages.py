@@ -21,7 +21,7 @@ REPO = Path(__file__).parents[2]
 PAGE = REPO / "docs" / "develop" / "messages.md"
 CLI = (sys.executable, "-m", "zsched.cli")
 WITHOUT_RIGHTS = ("setpriv", "--bounding-set", "-all", "--inh-caps", "-all")
-"""Root that may read no more than others: what `closed.yaml` forbids its owner is forbidden."""
+"""Root that may read no more than others: what `closed.yaml` and `closed` forbid their owner is forbidden."""
 QUOTED = re.compile(r"(`+)\s?(.+?)\s?\1(?!`)")
 DEAF = "import time\ntime.sleep(3600)\n"
 RAISES = """\
@@ -127,6 +127,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (place / name).write_text(text)
         assert text != good or name == "closed.yaml", name
     (place / "closed.yaml").chmod(0)
+    (place / "closed").mkdir(mode=0)
     said("zsched init -c fleet.yaml --node robot1 --state-dir s", place)
     return place
 
