@@ -23,7 +23,6 @@ import struct
 import sys
 import tempfile
 import termios
-import threading
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -34,12 +33,13 @@ from typing import Any, Final
 import typer
 import zenoh
 
-from benchmarks.common import machine
+from benchmarks.common import at_pace, machine
 from zsched.cli import app
 from zsched.sessions.config import client_config
 from zsched_lab.fleet.hall import Hall, block_of_ports
 
 NODES: Final = ("robot1", "robot2", "robot3", "edge1", "edge2", "edge3")
+ASKS_HZ: Final = 10.0
 LONGEST_S: Final = 60.0
 QUIT_S: Final = 15.0
 SHOWN_PAUSE_S: Final = 1.0
@@ -243,21 +243,10 @@ def found_fleet(hall: Hall, port: int) -> None:
 def application(hall: Hall) -> Iterator[None]:
     """Something that asks robot1's task ten times a second."""
     joins_at = tuple(json.loads(patiently(hall, "status", "--json"))["joins_at"])
-    stop = threading.Event()
     with zenoh.open(zenoh.Config.from_json5(client_config(connect=joins_at, connect_s=20.0))) as session:
         publisher = session.declare_publisher("robot1/in")
-
-        def ask() -> None:
-            while not stop.wait(0.1):
-                publisher.put(b"message")
-
-        thread = threading.Thread(target=ask, daemon=True)
-        thread.start()
-        try:
+        with at_pace(ASKS_HZ, lambda: publisher.put(b"message")):
             yield
-        finally:
-            stop.set()
-            thread.join()
 
 
 def write_cast(file: Path, seen: Sequence[Seen], size: tuple[int, int]) -> None:
