@@ -1,10 +1,12 @@
 """Plays every verb of `zsched --help` on a live fleet of six machines, and records the screens.
 
-``python -m benchmarks.tour [--columns 80] [--rows 24] [--cast FILE] [--screens FOLDER]``; about four minutes.
+``python -m benchmarks.tour [--columns 80] [--rows 24] [--cast FILE] [--screens FOLDER] [--page FILE]``; about four
+minutes.
 
 The fleet is founded, joined and left by its verbs (`zsched_lab.fleet.hall`): three robots and three edges on loopback,
 with certificates, one task, and an application that asks ten times a second. Each verb runs on a terminal of its own of
-that size. ``--cast`` writes an asciicast (version 2), for `asciinema play`; ``--screens`` a text file for each verb.
+that size. ``--cast`` writes an asciicast (version 2), for `asciinema play`; ``--screens`` a text file for each verb;
+``--page`` the transcript of docs/guide/tour.md: the verbs of `ON_PAGE`, whole, with the usual paths of a machine.
 At the end: every line that is wider than the terminal, and every verb that was not played.
 """
 
@@ -56,6 +58,18 @@ tasks:
     inputs: [{from: "{robot}/in", to: "{target}/echo/{robot}/in"}]
     outputs: [{from: "{target}/echo/{epoch}/{robot}/out", to: "{robot}/out"}]
 """
+ON_PAGE: Final = (
+    "status",
+    "explain echo",
+    "history echo",
+    "ping edge1 -c 3",
+    "drain edge2 --yes -m tour",
+    "maint",
+    "rehearse echo --steps move,drain --yes",
+    "wait --for healthy --timeout 30",
+)
+"""What the page shows; the recording has every verb."""
+PLACES: Final = (("/state", "/var/lib/zsched"), ("/etc", "/etc/zsched"), ("/run", "/run/zsched"))
 _OTHER_WORDS: Final = (("echo:", "second:"), ("/echo/", "/second/"), ("/in", "/scan"), ("/out", "/seen"))
 OTHER_TASK: Final = reduce(lambda text, words: text.replace(*words), _OTHER_WORDS, TASK)
 
@@ -249,7 +263,7 @@ def application(hall: Hall) -> Iterator[None]:
             yield
 
 
-def write_cast(file: Path, seen: Sequence[Seen], size: tuple[int, int]) -> None:
+def write_cast(file: Path, seen: Sequence[Seen], size: tuple[int, int], folder: Path) -> None:
     """An asciicast of all steps, one after another; what took long is shortened."""
     rows, columns = size
     lines: list[Any] = [{"version": 2, "width": columns, "height": rows, "title": "every verb of zsched, six machines"}]
@@ -260,10 +274,34 @@ def write_cast(file: Path, seen: Sequence[Seen], size: tuple[int, int]) -> None:
         for at, text in one.events:
             now += min(at - before, SHOWN_PAUSE_S)
             before = at
-            lines.append([round(now, 2), "o", text])
+            lines.append([round(now, 2), "o", usual(text, folder)])
         now += SHOWN_PAUSE_S
         lines.append([round(now, 2), "o", "\r\n"])
     file.write_text("".join(f"{json.dumps(line, ensure_ascii=False)}\n" for line in lines))
+
+
+def usual(text: str, folder: Path) -> str:
+    """The text with the paths of an installed machine in place of those of this run."""
+    for name in NODES:
+        for here, there in PLACES:
+            text = text.replace(f"{folder / name}{here}", there)
+    return text.replace(sys.prefix, "/opt/zsched").replace(f"{folder}/", "")
+
+
+def write_page(file: Path, seen: Sequence[Seen], folder: Path) -> None:
+    """The chosen screens in place of those that the page has; text around its blocks stays."""
+    text = file.read_text()
+    for one in seen:
+        if one.step.words not in ON_PAGE:
+            continue
+        shown = "\n".join(line.rstrip() for line in usual(one.text, folder).rstrip().splitlines())
+        words = re.escape(f"$ zsched {one.step.words}\n")
+        found = list(re.finditer(rf"```\n{words}.*?```", text, re.DOTALL))
+        if len(found) != 1:
+            raise SystemExit(f"{file} has {len(found)} blocks of `zsched {one.step.words}`")
+        block = f"```\n$ zsched {one.step.words}\n{shown}\n```"
+        text = text[: found[0].start()] + block + text[found[0].end() :]
+    file.write_text(text)
 
 
 def too_wide(one: Seen, columns: int) -> list[str]:
@@ -279,6 +317,7 @@ def main() -> None:
     parser.add_argument("--columns", type=int, default=80)
     parser.add_argument("--rows", type=int, default=24)
     parser.add_argument("--cast", type=Path, help="the recording")
+    parser.add_argument("--page", type=Path, help="the guide's page, whose blocks are written anew")
     parser.add_argument("--screens", type=Path, help="a folder for a text file of each verb")
     options = parser.parse_args()
     size = (options.rows, options.columns)
@@ -294,7 +333,9 @@ def main() -> None:
                 seen.append(played(hall, step, size))
                 print(f"{seen[-1].seconds:5.1f} s  {seen[-1].code}  {step.node}$ zsched {step.words}", flush=True)
     if options.cast:
-        write_cast(options.cast, seen, size)
+        write_cast(options.cast, seen, size, Path(name))
+    if options.page:
+        write_page(options.page, seen, Path(name))
     if options.screens:
         options.screens.mkdir(parents=True, exist_ok=True)
         for at, one in enumerate(seen):
