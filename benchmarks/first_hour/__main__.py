@@ -155,6 +155,7 @@ def furnish(root: Path, only: str | None) -> None:
     (root / SITE).mkdir(parents=True, exist_ok=True)
     (root / SITE / "rclpy.py").write_text((HERE / "rclpy_standin.py").read_text())
     (root / SITE / "ros.pth").write_text("/opt/ros\n")
+    (root / "etc" / "hosts").write_text("127.0.0.1 localhost\n")  # as Debian's installer does; ROS nodes listen there
 
 
 def play(folder: Path, wheels: Path, only: str | None) -> dict[str, Any]:
