@@ -5,15 +5,20 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import replace
 from random import Random
+from typing import Any
 
 import pytest
 
 from support.plays import FLEET, TASK, Play
 from zsched.core.electorate.founding import founded_id
+from zsched.core.values.messages import Ballots
 from zsched_lab.sim import fleets
 from zsched_lab.sim.change_cost import measure
+from zsched_lab.sim.parts import Machine
 from zsched_lab.sim.recoveries import Recoveries
+from zsched_lab.sim.simulator import Simulator
 
+ELECT = Simulator._elect
 HALVES_SEED = 3
 """With it two of the four electors are on each side."""
 
@@ -100,10 +105,26 @@ def test_two_halves_that_were_recovered_apart_show_each_other_until_one_changes_
 
 
 def test_the_electors_of_a_change_take_turns_and_the_first_asks_for_each_task_once() -> None:
-    """Ten tasks, two other electors and a new one: three prepares, accepts and answers to both for each task."""
-    cost = measure(10, exclusive=False)
+    """Two other electors and a new one: ten tasks cost a prepare, an accept and the answers, as one task does."""
+    cost, of_one = measure(10, exclusive=False), measure(1, exclusive=False)
     kinds = ("prepares of tasks", "accepts of tasks", "answers of tasks")
-    assert [cost.frames[kind] for kind in kinds] == [30, 30, 60]
+    assert [of_one.frames[kind] for kind in kinds] == [3, 3, 6]
+    assert [cost.frames[kind] for kind in kinds] == [0, 0, 0]
+    assert [cost.frames[f"{kind} of several tasks"] for kind in ("questions", "answers")] == [6, 6]
+    assert cost.writes == of_one.writes
+
+
+def test_electors_of_an_older_version_settle_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They read no frame of several questions: those are dropped, and come again one by one."""
+    monkeypatch.setattr(Simulator, "_elect", _reads_single_questions)
+    cost = measure(3, exclusive=False)
+    assert cost.frames["questions of several tasks"] > 0
+    assert cost.frames["prepares of tasks"] >= 9
+
+
+def _reads_single_questions(sim: Simulator, me: Machine, question: object, *more: Any) -> None:
+    if not isinstance(question, Ballots):
+        ELECT(sim, me, question, *more)
 
 
 def test_schedules_play_machines_that_come_and_go() -> None:

@@ -14,6 +14,7 @@ from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import (
     Accept,
     Accepted,
+    Ballots,
     ChangeFleet,
     Command,
     ExplainTask,
@@ -33,6 +34,7 @@ from zsched.core.values.messages import (
     TakeCertificate,
     TuneTask,
     Utilities,
+    Votes,
 )
 from zsched.core.values.model import (
     MAX_COUNTER,
@@ -139,6 +141,22 @@ class ElectorAnswered:
     """An elector answered our prepare or accept."""
 
     answer: Promise | Accepted | Refused
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BallotsAsked:
+    """A proposer asks this elector several questions in one frame."""
+
+    request: int
+    asker: NodeId
+    ballots: Ballots
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VotesReceived:
+    """An elector answered questions of ours that went in one frame."""
+
+    votes: Votes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -572,6 +590,8 @@ Event = (
     | PrepareAsked
     | AcceptAsked
     | ElectorAnswered
+    | BallotsAsked
+    | VotesReceived
     | LearntReceived
     | LearntAsked
     | PersistFailed

@@ -19,6 +19,7 @@ from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import (
     Accept,
     Accepted,
+    Ballots,
     CommandResult,
     FleetAnswer,
     FleetTold,
@@ -27,6 +28,7 @@ from zsched.core.values.messages import (
     Promise,
     Refused,
     Utilities,
+    Votes,
 )
 from zsched.core.values.model import Beat, NodeId, Profile, Proposal, TaskId
 from zsched.core.values.plan import Role, RoutePlan
@@ -89,6 +91,8 @@ class SendPrepare:
 
     prepare: Prepare
     deadline_s: float
+    may_join: bool = False
+    """It may go in one frame with others of the same batch (`SendBallots`)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,6 +101,23 @@ class SendAccept:
 
     accept: Accept
     deadline_s: float
+    may_join: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SendBallots:
+    """Ask every elector (ourselves included) several questions in one frame."""
+
+    ballots: Ballots
+    deadline_s: float
+
+    @property
+    def parts(self) -> tuple[SendPrepare | SendAccept, ...]:
+        """The questions, each as it would go alone."""
+        return (
+            *(SendPrepare(prepare=one, deadline_s=self.deadline_s) for one in self.ballots.prepares),
+            *(SendAccept(accept=one, deadline_s=self.deadline_s) for one in self.ballots.accepts),
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,6 +126,19 @@ class AnswerElection:
 
     request: int
     answer: Promise | Accepted | Refused
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AnswerBallots:
+    """Answer a proposer's questions that came in one frame."""
+
+    request: int
+    votes: Votes
+
+    @property
+    def parts(self) -> tuple[AnswerElection, ...]:
+        """The answers, each as it would go alone."""
+        return tuple(AnswerElection(request=self.request, answer=one) for one in self.votes.answers)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -421,7 +455,9 @@ Instruction = (
     | PublishProposal
     | SendPrepare
     | SendAccept
+    | SendBallots
     | AnswerElection
+    | AnswerBallots
     | AskElectors
     | AnswerFleet
     | StoreDocument

@@ -21,6 +21,7 @@ from zsched.core.stages import Handler, Stages
 from zsched.core.todo import ToDo
 from zsched.core.values.change import MoveOwner
 from zsched.core.values.plan import WorkerRole
+from zsched.core.vote.joining import joined
 
 _HANDLERS: Final[Mapping[type[Any], Handler]] = {
     ev.DeadlineReached: lambda _node, _event, _todo, _now: None,
@@ -127,7 +128,7 @@ class Node(Stages):
         self._promised = max(self._next_deadline(now), now)
         state = self.agreement.to_persist(now) if todo.must_persist else None
         first: tuple[do.Instruction, ...] = () if state is None else (do.PersistState(state=state),)
-        return (*first, *todo.send, *todo.apply)
+        return (*first, *(joined(todo.send) if len(todo.send) > 1 else todo.send), *todo.apply)
 
     def _next_deadline(self, now: float) -> float:
         due = min(

@@ -507,6 +507,8 @@ class Shell:
                 bus.ask_electors(prepare, deadline_s)
             case do.SendAccept(accept=accept, deadline_s=deadline_s):
                 bus.ask_electors(accept, deadline_s)
+            case do.SendBallots(ballots=ballots, deadline_s=deadline_s):
+                bus.ask_electors(ballots, deadline_s)
             case do.AskElectors(question=question, deadline_s=deadline_s):
                 bus.ask_fleet(fleet_question(question), deadline_s)
             case do.AnswerFleet(request=request, answer=fleet_answer):
@@ -529,6 +531,8 @@ class Shell:
                 bus.answer(request, value)
             case do.AnswerElection(request=request, answer=vote):
                 bus.answer(request, vote)
+            case do.AnswerBallots(request=request, votes=votes):
+                bus.answer(request, votes)
             case do.AnswerLearnt(request=request, learnt=learnt):
                 bus.answer(request, learnt)
             case do.AnswerStatus(request=request, snapshot=snapshot):

@@ -44,6 +44,8 @@ KINDS: dict[str, tuple[type, int]] = {
     "accept": (messages.Accept, SMALL),
     "accepted": (messages.Accepted, SMALL),
     "refused": (messages.Refused, 8 * SMALL),
+    "ballots": (messages.Ballots, LARGE),
+    "votes": (messages.Votes, LARGE),
     "fleet_question": (messages.FleetQuestion, LARGE),
     "fleet_answer": (messages.FleetAnswer, LARGE),
     "ask_document": (messages.AskDocument, SMALL),

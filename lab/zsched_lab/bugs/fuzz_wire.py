@@ -38,6 +38,7 @@ from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSp
 from zsched.core.values.messages import (
     Accept,
     Accepted,
+    Ballots,
     ChangeFleet,
     FleetAnswer,
     FleetQuestion,
@@ -47,6 +48,8 @@ from zsched.core.values.messages import (
     Refused,
     SetWeights,
     Utilities,
+    Votes,
+    votes_of,
 )
 from zsched.core.values.model import (
     Beat,
@@ -128,6 +131,11 @@ def _dataclass(cls: Any, rng: Random) -> Any:
         return Weights(cpu=cpu, memory=1.0 - cpu, network=0.0)
     if cls is FleetValue:
         return rng.choice(FOUNDED)
+    if cls is Ballots:
+        return Ballots(prepares=(_dataclass(Prepare, rng),), accepts=(_dataclass(Accept, rng),))
+    if cls is Votes:
+        elector = rng.choice(NAMES)
+        return votes_of(replace(_dataclass(kind, rng), elector=elector) for kind in (Promise, Accepted, Refused))
     hints = wire.hints_of(cls)
     values = {one.name: sample(hints[one.name], rng, one.name) for one in fields(made)}
     if made is Accept:
@@ -238,6 +246,8 @@ _EVENTS: dict[type[Any], Callable[[Any], ev.Event]] = {
     Promise: lambda v: ev.ElectorAnswered(answer=v),
     Accepted: lambda v: ev.ElectorAnswered(answer=v),
     Refused: lambda v: ev.ElectorAnswered(answer=v),
+    Ballots: lambda v: ev.BallotsAsked(request=1, asker="robot2", ballots=v),
+    Votes: lambda v: ev.VotesReceived(votes=v),
     FleetQuestion: lambda v: ev.FleetAsked(request=1, asker=v.ballot.node, question=v),
     FleetAnswer: lambda v: ev.FleetAnswered(answer=v),
     ChangeFleet: lambda v: ev.FleetCommanded(request=1, command=v),

@@ -32,6 +32,8 @@ WAIT_S = 30.0
 ASKED = {
     do.SendPrepare: "prepares of tasks",
     do.SendAccept: "accepts of tasks",
+    do.SendBallots: "questions of several tasks",
+    do.AnswerBallots: "answers of several tasks",
     do.AskElectors: "questions about the fleet",
     do.AnswerElection: "answers of tasks",
     do.AnswerFleet: "answers about the fleet",
@@ -72,11 +74,11 @@ class _Counted(Simulator):
         assert me.node is not None
         if isinstance(instruction, do.AskElectors):
             return sum(name != me.name for name in instruction.to)
-        if isinstance(instruction, do.SendPrepare | do.SendAccept):
+        if isinstance(instruction, do.SendPrepare | do.SendAccept | do.SendBallots):
             return sum(name != me.name for name in me.node.agreement.electors)
         if isinstance(instruction, do.PublishLearnt):
             return len(self.machines) - 1
-        if isinstance(instruction, do.AnswerElection | do.AnswerFleet | do.AnswerLearnt):
+        if isinstance(instruction, do.AnswerElection | do.AnswerBallots | do.AnswerFleet | do.AnswerLearnt):
             question = self._asked.get(instruction.request)
             return int(question is not None and question[1] is not me)
         return 1

@@ -174,6 +174,9 @@ class Invariants:
                 if request == FORGED:
                     raise InvariantError(f"{machine.key} said yes to a ballot that is not its asker's: {answer}")
                 self._check_answer(machine, answer, now)
+            case do.AnswerBallots() | do.SendBallots():
+                for part in instruction.parts:
+                    self.on_leaving(machine, part, now)
             case do.PublishBeat(beat=beat):
                 for task, revision, _ in beat.learnt:
                     self._check_told(machine, task, revision)

@@ -83,6 +83,9 @@ class Documents:
             return
         if isinstance(instruction, do.SendAccept):
             self.judge.note(instruction.accept)
+        elif isinstance(instruction, do.SendBallots):
+            for accept in instruction.ballots.accepts:
+                self.judge.note(accept)
         elif isinstance(instruction, do.AskElectors):
             self.judge.note(instruction.question)
 

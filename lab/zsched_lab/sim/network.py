@@ -16,6 +16,7 @@ from random import Random
 from typing import Any
 
 from zsched.core import events as ev
+from zsched.core.values.messages import Ballots, Votes
 from zsched.core.values.model import Ballot, NodeId
 from zsched.errors import InvariantError, WireError
 from zsched.wire import codec as wire
@@ -147,6 +148,10 @@ def forge(message: Message, rng: Random) -> ev.Event:
     value, event = wire.decode(message.frame, message.kind), message.event
     if isinstance(event, ev.PrepareAsked | ev.AcceptAsked):
         return _forged_question(event, rng)
+    if isinstance(event, ev.BallotsAsked):
+        return _forged_ballots(event, rng)
+    if isinstance(event, ev.VotesReceived):
+        return _forged_votes(event, rng)
     if rng.random() < 0.5 and (forged := _in_its_name(event, rng)) is not None:
         return forged
     if rng.random() < 0.3:
@@ -201,6 +206,39 @@ def _forged_question(event: ev.PrepareAsked | ev.AcceptAsked, rng: Random) -> ev
     value = replace(acceptance.value, revision=acceptance.value.revision + 1)
     accept = replace(event.accept, acceptance=replace(acceptance, ballot=_high(acceptance.ballot, node), value=value))
     return ev.AcceptAsked(request=FORGED, asker=asker, accept=accept)
+
+
+def _forged_ballots(event: ev.BallotsAsked, rng: Random) -> ev.Event:
+    """Such questions, all in one frame."""
+    forged = [
+        *(
+            _forged_question(ev.PrepareAsked(request=FORGED, asker=event.asker, prepare=one), rng)
+            for one in event.ballots.prepares
+        ),
+        *(
+            _forged_question(ev.AcceptAsked(request=FORGED, asker=event.asker, accept=one), rng)
+            for one in event.ballots.accepts
+        ),
+    ]
+    ballots = Ballots(
+        prepares=tuple(one.prepare for one in forged if isinstance(one, ev.PrepareAsked)),
+        accepts=tuple(one.accept for one in forged if isinstance(one, ev.AcceptAsked)),
+    )
+    return ev.BallotsAsked(request=FORGED, asker=GHOST if rng.random() < 0.5 else event.asker, ballots=ballots)
+
+
+def _forged_votes(event: ev.VotesReceived, rng: Random) -> ev.Event:
+    """A stranger's answers, or what the bus makes of them under another's key."""
+    if rng.random() < 0.3:
+        return ev.FrameDropped(kind="votes", reason="foreign")
+    votes = event.votes
+    return ev.VotesReceived(
+        votes=Votes(
+            promises=tuple(replace(one, elector=GHOST) for one in votes.promises),
+            accepted=tuple(replace(one, elector=GHOST) for one in votes.accepted),
+            refused=tuple(replace(one, elector=GHOST) for one in votes.refused),
+        )
+    )
 
 
 def _other(node: NodeId) -> NodeId:

@@ -393,6 +393,13 @@ class Simulator(Links):
                 self._elect(me, prepare, lambda n, value: ev.PrepareAsked(request=n, asker=me.name, prepare=value))
             case do.SendAccept(accept=accept):
                 self._elect(me, accept, lambda n, value: ev.AcceptAsked(request=n, asker=me.name, accept=value))
+            case do.SendBallots(ballots=ballots):
+                self._elect(
+                    me,
+                    ballots,
+                    lambda n, value: ev.BallotsAsked(request=n, asker=me.name, ballots=value),
+                    lambda answer: ev.VotesReceived(votes=answer),
+                )
             case do.AskElectors(to=to, question=fleet_asked):
                 self._ask_fleet(me, to, fleet_question(fleet_asked))
             case do.AnswerFleet(request=request, answer=fleet_vote):
@@ -415,6 +422,10 @@ class Simulator(Links):
                 if not isinstance(vote, Refused):
                     self.memory.on_vote(me)
                 self._answer(request, vote)
+            case do.AnswerBallots(request=request, votes=votes):
+                for _ in (*votes.promises, *votes.accepted):
+                    self.memory.on_vote(me)
+                self._answer(request, votes)
             case do.AnswerLearnt(request=request, learnt=learnt):
                 self._answer(request, learnt)
             case do.AnswerCommand(result=result):
@@ -488,12 +499,18 @@ class Simulator(Links):
                 number = self.ask(other, me, make)
                 self.send(me, other, Message(ev.UtilityAsked(request=number, asker=me.name)))
 
-    def _elect(self, me: Machine, question: object, make: Callable[[int, Any], ev.Event]) -> None:
+    def _elect(
+        self,
+        me: Machine,
+        question: object,
+        make: Callable[[int, Any], ev.Event],
+        answered: Make = lambda answer: ev.ElectorAnswered(answer=answer),
+    ) -> None:
         (frame, value), kind = self._framed(me, question), type(question)
         assert me.node is not None
         for elector in me.node.agreement.electors:
             for other in self.named(elector):
-                number = self.ask(other, me, lambda answer: ev.ElectorAnswered(answer=answer))
+                number = self.ask(other, me, answered)
                 self.send(me, other, Message(make(number, value), frame, kind))
 
 

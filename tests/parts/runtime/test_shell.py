@@ -33,6 +33,7 @@ from zsched.core.values.fleet import WorkerSpec
 from zsched.core.values.messages import (
     Accept,
     Accepted,
+    Ballots,
     CommandOutcome,
     CommandResult,
     FleetTold,
@@ -45,6 +46,7 @@ from zsched.core.values.messages import (
     SetWeights,
     TuneTask,
     Utilities,
+    Votes,
 )
 from zsched.core.values.model import Acceptance, Asked, Tuning, Weights, WorkerState
 from zsched.core.values.plan import Role, RoutePhase, RoutePlan, WorkerRole
@@ -73,6 +75,7 @@ ACCEPT = Accept(task="merge", acceptance=Acceptance(ballot=BALLOT, value=VALUE),
 LEARNT = Learnt(node="robot1", values=(VALUE,))
 UTILITIES = Utilities(voter="robot1", vectors=())
 ANSWER = Accepted(elector="robot1", task="merge", ballot=BALLOT)
+BALLOTS, VOTES = Ballots(prepares=(PREPARE,), accepts=(ACCEPT,)), Votes(accepted=(ANSWER,))
 RESULT = CommandResult(outcome=CommandOutcome.OK, detail="done", revision=4)
 EXPLANATION = Explanation(node="edge1", kind="edge", task="merge", allocation=VALUE, robots=("robot1",))
 PLAN = RoutePlan(task="merge", phase=RoutePhase.CLOSE, current=None)
@@ -137,9 +140,11 @@ EVERY: dict[do.Instruction, tuple[Any, ...]] = {
     do.AskUtilities(gather=3, deadline_s=0.1): ("ask_utilities", 3, 0.1),
     do.SendPrepare(prepare=PREPARE, deadline_s=0.2): ("ask_electors", PREPARE, 0.2),
     do.SendAccept(accept=ACCEPT, deadline_s=0.2): ("ask_electors", ACCEPT, 0.2),
+    do.SendBallots(ballots=BALLOTS, deadline_s=0.2): ("ask_electors", BALLOTS, 0.2),
     do.AskLearnt(peer="edge1", deadline_s=0.2): ("ask_learnt", "edge1", 0.2),
     do.AnswerUtilities(request=1, utilities=UTILITIES): ("answer", 1, UTILITIES),
     do.AnswerElection(request=2, answer=ANSWER): ("answer", 2, ANSWER),
+    do.AnswerBallots(request=2, votes=VOTES): ("answer", 2, VOTES),
     do.AnswerLearnt(request=3, learnt=LEARNT): ("answer", 3, LEARNT),
     do.AnswerCommand(request=4, result=RESULT): ("answer", 4, RESULT),
     do.AnswerExplanation(request=5, explanation=EXPLANATION): ("answer", 5, EXPLANATION),

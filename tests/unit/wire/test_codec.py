@@ -82,6 +82,10 @@ ONE_OF = {
     messages.FleetAnswer: ("promise", "accepted", "refused"),
     messages.ChangeFleet: ("document", "add_elector", "remove_elector"),
 }
+BATCHES = {
+    messages.Ballots: (messages.Prepare, messages.Accept),
+    messages.Votes: (messages.Promise, messages.Accepted, messages.Refused),
+}
 IDS = {"disk", "document", "joins"}
 FREE_TEXT = {"reason", "detail", "electorate", "hardware", "problem", "source", "zid", "incarnation", "from_expr"}
 RANGES: dict[str, tuple[float, float]] = {
@@ -129,6 +133,13 @@ def strategy(hint: Any, name: str = "") -> st.SearchStrategy[Any]:
     return dataclass_strategy(hint)
 
 
+def batch_of(cls: type[Any], elector: str, parts: tuple[list[Any], ...]) -> Any:
+    """Some questions of one proposer, or the answers of one elector."""
+    if cls is messages.Votes:
+        parts = tuple([replace(one, elector=elector) for one in part] for part in parts)
+    return cls(**{field.name: tuple(part) for field, part in zip(fields(cls), parts, strict=True)})
+
+
 def tuple_strategy(args: tuple[Any, ...], name: str) -> st.SearchStrategy[Any]:
     if len(args) == 2 and args[1] is Ellipsis:
         return st.lists(strategy(args[0], name), max_size=2).map(tuple)
@@ -150,6 +161,9 @@ def dataclass_strategy(cls: type[Any]) -> st.SearchStrategy[Any]:
             strategy(wire.hints_of(cls)["acceptance"]),
             TEXTS,
         )
+    if cls in BATCHES:
+        parts = st.tuples(*(st.lists(strategy(kind), max_size=2) for kind in BATCHES[cls])).filter(any)
+        return st.builds(batch_of, st.just(cls), NAMES, parts)
     hints = wire.hints_of(cls)
     made = get_origin(cls) or cls
     parts = {field.name: strategy(hints[field.name], field.name) for field in fields(made)}

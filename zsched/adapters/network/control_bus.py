@@ -34,6 +34,7 @@ from zsched.core.values.messages import (
     Accept,
     Accepted,
     AskDocument,
+    Ballots,
     Command,
     CommandOutcome,
     CommandResult,
@@ -51,6 +52,7 @@ from zsched.core.values.messages import (
     Refused,
     TuneTask,
     Utilities,
+    Votes,
     WorkerLines,
 )
 from zsched.core.values.model import NAME, Beat, NodeId, Profile, Proposal
@@ -414,12 +416,14 @@ class ControlBus:
             number = self._questions.keep(query, keys.utility(node, asker))
             return ev.UtilityAsked(request=number, asker=asker)
         if kind == "register":
-            value: Any = wire.decode(payload, Prepare, Accept, FleetQuestion)
+            value: Any = wire.decode(payload, Prepare, Accept, FleetQuestion, Ballots)
             number = self._questions.keep(query, keys.register(node, asker))
             if isinstance(value, FleetQuestion):
                 return ev.FleetAsked(request=number, asker=asker, question=value)
             if isinstance(value, Prepare):
                 return ev.PrepareAsked(request=number, asker=asker, prepare=value)
+            if isinstance(value, Ballots):
+                return ev.BallotsAsked(request=number, asker=asker, ballots=value)
             return ev.AcceptAsked(request=number, asker=asker, accept=value)
         if kind == "allocation":
             return ev.LearntAsked(request=self._questions.keep(query, keys.learnt(node, asker)))
@@ -480,16 +484,18 @@ class ControlBus:
 
         self._ask(self._keys.utility("*", self._node), None, deadline_s, (Utilities,), on_answer, is_remote=True)
 
-    def ask_electors(self, question: Prepare | Accept, deadline_s: float) -> None:
+    def ask_electors(self, question: Prepare | Accept | Ballots, deadline_s: float) -> None:
         """One query to every elector, ourselves included; answers are posted as they come."""
 
-        def on_answer(owner: NodeId, value: Promise | Accepted | Refused, _zid: str) -> None:
-            if owner == value.elector:
-                self._post(ev.ElectorAnswered(answer=value))
-            else:
+        def on_answer(owner: NodeId, value: Promise | Accepted | Refused | Votes, _zid: str) -> None:
+            if owner != value.elector:
                 self._post(ev.FrameDropped(kind="register", reason="foreign"))
+            elif isinstance(value, Votes):
+                self._post(ev.VotesReceived(votes=value))
+            else:
+                self._post(ev.ElectorAnswered(answer=value))
 
-        kinds = (Promise, Accepted, Refused)
+        kinds = (Promise, Accepted, Refused) if isinstance(question, Prepare | Accept) else (Votes,)
         self._ask(self._keys.register("*", self._node), wire.encode(question), deadline_s, kinds, on_answer)
 
     def ask_fleet(self, question: FleetQuestion, deadline_s: float) -> None:

@@ -131,6 +131,15 @@ def _on_answer(node: Stages, event: ev.ElectorAnswered, todo: ToDo, now: float) 
     node.agreement.on_answer(event, todo, now)
 
 
+def _on_ballots(node: Stages, event: ev.BallotsAsked, todo: ToDo, now: float) -> None:
+    node.agreement.on_ballots(event, todo, now)
+
+
+def _on_votes(node: Stages, event: ev.VotesReceived, todo: ToDo, now: float) -> None:
+    for answer in event.votes.answers:
+        node.agreement.on_answer(ev.ElectorAnswered(answer=answer), todo, now)
+
+
 def _on_learnt(node: Stages, event: ev.LearntReceived, todo: ToDo, now: float) -> None:
     node.agreement.on_learnt(event, todo, now)
     if node.agreement.strangers.is_one(event.learnt.node, now):
@@ -159,6 +168,8 @@ HANDLERS: Final[Mapping[type[Any], Handler]] = {
     ev.PrepareAsked: _on_prepare,
     ev.AcceptAsked: _on_accept,
     ev.ElectorAnswered: _on_answer,
+    ev.BallotsAsked: _on_ballots,
+    ev.VotesReceived: _on_votes,
     ev.LearntReceived: _on_learnt,
     ev.LearntAsked: _on_learnt_asked,
 }

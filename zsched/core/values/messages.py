@@ -5,7 +5,8 @@ Knows: the fields of each message and their ranges. Does not know: keys, bytes, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final, Generic, get_args
 
@@ -132,6 +133,70 @@ class Refused:
     def __post_init__(self) -> None:
         check_name("refused.elector", self.elector)
         check_name("refused.task", self.task)
+
+
+MOST_BALLOTS = 24
+"""Tasks of one `Ballots`, so that no batch of the largest questions and answers is too large for a frame."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ballots:
+    """Questions of several tasks' registers to an elector, in one frame: each counts as if it had come alone.
+
+    Only identity rounds travel so, and only at their first try: an elector of an older version does not read it.
+    """
+
+    prepares: tuple[Prepare, ...] = ()
+    accepts: tuple[Accept, ...] = ()
+
+    def __post_init__(self) -> None:
+        _check_batch("ballots", len(self.prepares) + len(self.accepts))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Votes:
+    """One elector's answers to `Ballots`; a question that it would not answer alone has none here."""
+
+    promises: tuple[Promise, ...] = ()
+    accepted: tuple[Accepted, ...] = ()
+    refused: tuple[Refused, ...] = ()
+
+    def __post_init__(self) -> None:
+        _check_batch("votes", len(self.answers))
+        if any(one.elector != self.elector for one in self.answers):
+            raise ValueError("votes: expected the answers of one elector")
+
+    @property
+    def answers(self) -> tuple[Promise | Accepted | Refused, ...]:
+        """All of them."""
+        return (*self.promises, *self.accepted, *self.refused)
+
+    @property
+    def elector(self) -> NodeId:
+        """Whose answers they are."""
+        return self.answers[0].elector
+
+
+def _check_batch(what: str, count: int) -> None:
+    if not 1 <= count <= MOST_BALLOTS:
+        raise ValueError(f"{what}: expected 1 to {MOST_BALLOTS}, not {count}")
+
+
+def votes_of(answers: Iterable[Promise | Accepted | Refused]) -> Votes:
+    """One elector's answers as they travel: the newest fleet value goes along once, not with each no."""
+    promises: list[Promise] = []
+    accepted: list[Accepted] = []
+    refused: list[Refused] = []
+    told: FleetValue | None = None
+    for answer in answers:
+        if isinstance(answer, Promise):
+            promises.append(answer)
+        elif isinstance(answer, Accepted):
+            accepted.append(answer)
+        else:
+            refused.append(replace(answer, fleet=None) if answer.fleet == told else answer)
+            told = answer.fleet or told
+    return Votes(promises=tuple(promises), accepted=tuple(accepted), refused=tuple(refused))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

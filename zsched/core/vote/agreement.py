@@ -36,6 +36,7 @@ from zsched.core.values.messages import (
     Refusal,
     Refused,
     fleet_answer,
+    votes_of,
 )
 from zsched.core.values.model import (
     NO_BALLOT,
@@ -360,8 +361,29 @@ class Agreement:
 
     # --- electors ----------------------------------------------------------------------------------------------------
 
-    def on_prepare(self, event: ev.PrepareAsked, todo: ToDo, now: float) -> None:
-        """A proposer asks for a promise: only for its own ballots, at a bounded rate (each promise costs an fsync)."""
+    def on_ballots(self, event: ev.BallotsAsked, todo: ToDo, now: float) -> None:
+        """A proposer asks several questions at once: each by its own rules, all answers together, after one write.
+
+        They count as one question at the rate, for they cost one fsync. No accept waits here for an owner to leave: it
+        is refused, and comes again alone.
+        """
+        may_ask = not event.ballots.prepares or self._may_ask(event.asker, now)
+        sent, todo.send = todo.send, []
+        for prepare in event.ballots.prepares:
+            asked = ev.PrepareAsked(request=event.request, asker=event.asker, prepare=prepare)
+            self.on_prepare(asked, todo, now, may_ask=may_ask)
+        for accept in event.ballots.accepts:
+            self.on_accept(ev.AcceptAsked(request=event.request, asker=event.asker, accept=accept), todo, now, park_s=0)
+        answers = [one for one in todo.send if isinstance(one, do.AnswerElection) and one.request == event.request]
+        todo.send = [*sent, *(one for one in todo.send if one not in answers)]
+        if answers:
+            todo.add(do.AnswerBallots(request=event.request, votes=votes_of(one.answer for one in answers)))
+
+    def on_prepare(self, event: ev.PrepareAsked, todo: ToDo, now: float, *, may_ask: bool | None = None) -> None:
+        """A proposer asks for a promise: only for its own ballots, at a bounded rate (each promise costs an fsync).
+
+        ``may_ask``: whether the rate allows it, where that is known already.
+        """
         register = self.registers.get(event.prepare.task)
         if register is None or not self._is_its_own(event.prepare.ballot, event.asker):
             self.counters["prepare_foreign"] += 1
@@ -372,7 +394,7 @@ class Agreement:
         ballot = event.prepare.ballot
         answer: Promise | Refused
         turned_away = self._numbers.turned_away(event.prepare, event.asker, todo)
-        if not self._may_ask(event.asker, now):
+        if not (self._may_ask(event.asker, now) if may_ask is None else may_ask):
             self.counters["prepare_rate"] += 1
             answer = register.refuse(ballot, Refusal.RATE)
         elif turned_away is not None:
@@ -437,8 +459,11 @@ class Agreement:
         self._buckets[asker] = (tokens - may_ask, now)
         return may_ask
 
-    def on_accept(self, event: ev.AcceptAsked, todo: ToDo, now: float) -> None:
-        """A proposer asks this elector to accept a value: only under its own ballots."""
+    def on_accept(self, event: ev.AcceptAsked, todo: ToDo, now: float, *, park_s: float | None = None) -> None:
+        """A proposer asks this elector to accept a value: only under its own ballots.
+
+        ``park_s``: so long at most it may wait for an owner to leave (seconds); ``None``: by the file.
+        """
         acceptance = event.accept.acceptance
         register = self.registers.get(event.accept.task)
         if register is None or not self._is_its_own(acceptance.ballot, event.asker):
@@ -455,7 +480,8 @@ class Agreement:
         elif self.is_elector and not self.witness.may_vote(now):
             refused = register.refuse(acceptance.ballot, Refusal.YOUNG)
         else:
-            self._accept_or_park(event, now + PARK_SHARE * self._fleet.timing.ballot_s, todo, now)
+            at_most = PARK_SHARE * self._fleet.timing.ballot_s if park_s is None else park_s
+            self._accept_or_park(event, now + at_most, todo, now)
             return
         todo.add(do.AnswerElection(request=event.request, answer=refused))
 

@@ -66,6 +66,8 @@ class _Round(Generic[V]):
     unfit: V | None = None
     """Another node's value that no majority will accept, since too many electors take it for false."""
     attempt: int = 0
+    is_alone: bool = False
+    """Its questions go in frames of their own: the first try, maybe in a frame with others, had no success."""
 
 
 class Register(ABC, Generic[V]):
@@ -395,6 +397,12 @@ class Register(ABC, Generic[V]):
         )
         self._ask(prepare, todo)
 
+    @property
+    def _may_join(self) -> bool:
+        """Whether a question of the round under way may travel with others: it reads, and nobody waits for it yet."""
+        running = self._running()
+        return running.change is None and not running.is_alone
+
     def _running(self) -> _Round[V]:
         assert self._round is not None
         return self._round
@@ -508,6 +516,7 @@ class Register(ABC, Generic[V]):
             return
         assert running.ballot is not None
         assert running.value is not None
+        running.is_alone = True
         self._accept(running, running.ballot, running.value, todo, now)
 
     def _accept(self, running: _Round[V], ballot: Ballot, value: V, todo: ToDo, now: float) -> None:
@@ -533,6 +542,7 @@ class Register(ABC, Generic[V]):
             self._give_up(running, todo, now)
             return
         running.attempt += 1
+        running.is_alone = True
         running.phase, running.deadline, running.ballot = _Phase.WAIT, now + wait, None
 
     def _give_up(self, running: _Round[V], todo: ToDo, now: float) -> None:

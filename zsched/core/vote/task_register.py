@@ -35,9 +35,9 @@ class TaskRegister(Register[Allocation]):
 
     def _ask(self, question: Prepare | Accept, todo: ToDo) -> None:
         if isinstance(question, Prepare):
-            todo.add(SendPrepare(prepare=question, deadline_s=self._ballot_s))
+            todo.add(SendPrepare(prepare=question, deadline_s=self._ballot_s, may_join=self._may_join))
         else:
-            todo.add(SendAccept(accept=question, deadline_s=self._ballot_s))
+            todo.add(SendAccept(accept=question, deadline_s=self._ballot_s, may_join=self._may_join))
 
     def _hand_on(self, value: Allocation, why: str, todo: ToDo) -> None:
         todo.learnt.append((value, why))

@@ -26,6 +26,7 @@ from zsched.core.values.fleet import Timing
 from zsched.core.values.messages import (
     Accept,
     Accepted,
+    Ballots,
     CommandOutcome,
     CommandResult,
     Learnt,
@@ -36,6 +37,7 @@ from zsched.core.values.messages import (
     Refused,
     SetWeights,
     Utilities,
+    Votes,
 )
 from zsched.core.values.model import Acceptance, Asked
 from zsched.core.values.snapshot import QuorumStatus, Snapshot
@@ -318,6 +320,19 @@ def test_electors_are_asked_ourselves_included(mesh: tuple[Peer, Peer, Peer], qu
         peer.bus.answer(asked.request, answers[peer.name])
     heard = [a.next(ev.ElectorAnswered).answer for _ in mesh]
     assert sorted(heard, key=lambda answer: answer.elector) == list(answers.values())
+
+
+def test_questions_of_several_tasks_go_in_one_frame_and_so_do_the_answers(mesh: tuple[Peer, Peer, Peer]) -> None:
+    a, b, c = mesh
+    ballots = Ballots(prepares=(PREPARE,), accepts=(ACCEPT,))
+    a.bus.ask_electors(ballots, 2.0)
+    for peer in mesh:
+        asked = peer.next(ev.BallotsAsked)
+        assert (asked.asker, asked.ballots) == ("a", ballots)
+        name = "a" if peer is c else peer.name
+        peer.bus.answer(asked.request, Votes(promises=(Promise(elector=name, task="merge", ballot=BALLOT),)))
+    assert {a.next(ev.VotesReceived).votes.elector for _ in (a, b)} == {"a", "b"}
+    assert a.next(ev.FrameDropped).reason == "foreign", "c answers for a"
 
 
 def test_one_peer_is_asked_for_what_it_has_learnt(mesh: tuple[Peer, Peer, Peer]) -> None:

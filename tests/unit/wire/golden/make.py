@@ -226,6 +226,25 @@ SAMPLES: dict[str, object] = {
             base_revision=6, votes=(("robot1", "edge1"),), outcome="won", winner="edge1", age_s=1.5
         ),
     ),
+    "ballots": messages.Ballots(
+        prepares=(messages.Prepare(task="other", ballot=_BALLOT, electorate="0a", generation_id="0a1b", number=2),),
+        accepts=(
+            messages.Accept(
+                task="map_merge", acceptance=_ACCEPTANCE, electorate="0a", creation=1, generation_id="0a1b", number=2
+            ),
+        ),
+    ),
+    "votes": messages.Votes(
+        promises=(
+            messages.Promise(elector="robot2", task="map_merge", ballot=_BALLOT, accepted=_ACCEPTANCE, disk="d2"),
+        ),
+        accepted=(messages.Accepted(elector="robot2", task="map_merge", ballot=_BALLOT, disk="d2", joining=1),),
+        refused=(
+            messages.Refused(
+                elector="robot2", task="other", ballot=_BALLOT, refusal=messages.Refusal.NUMBER, promised=_BALLOT
+            ),
+        ),
+    ),
     "fleet_question": messages.FleetQuestion(
         accept=messages.Accept(
             task="lab",
