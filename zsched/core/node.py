@@ -128,7 +128,9 @@ class Node(Stages):
         self._promised = max(self._next_deadline(now), now)
         state = self.agreement.to_persist(now) if todo.must_persist else None
         first: tuple[do.Instruction, ...] = () if state is None else (do.PersistState(state=state),)
-        return (*first, *(joined(todo.send) if len(todo.send) > 1 else todo.send), *todo.apply)
+        if len(todo.send) > 1:
+            todo.send = joined(todo.send)
+        return (*first, *todo.send, *todo.apply)
 
     def _next_deadline(self, now: float) -> float:
         due = min(

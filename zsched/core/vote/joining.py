@@ -15,7 +15,7 @@ from zsched.core.instructions import Instruction, SendAccept, SendBallots, SendP
 from zsched.core.values.messages import MOST_BALLOTS, Ballots
 
 
-def joined(send: Sequence[Instruction]) -> Sequence[Instruction]:
+def joined(send: list[Instruction]) -> list[Instruction]:
     """What is sent, the questions that may join in one frame; they stand where the first of them stood."""
     may = [one for one in send if isinstance(one, SendPrepare | SendAccept) and one.may_join]
     if len(may) < 2:
