@@ -162,8 +162,8 @@ def dataclass_strategy(cls: type[Any]) -> st.SearchStrategy[Any]:
             TEXTS,
         )
     if cls in BATCHES:
-        parts = st.tuples(*(st.lists(strategy(kind), max_size=2) for kind in BATCHES[cls])).filter(any)
-        return st.builds(batch_of, st.just(cls), NAMES, parts)
+        some = st.tuples(*(st.lists(strategy(kind), max_size=2) for kind in BATCHES[cls])).filter(any)
+        return st.builds(batch_of, st.just(cls), NAMES, some)
     hints = wire.hints_of(cls)
     made = get_origin(cls) or cls
     parts = {field.name: strategy(hints[field.name], field.name) for field in fields(made)}

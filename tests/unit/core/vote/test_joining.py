@@ -191,7 +191,12 @@ def sent(task: str, *, may_join: bool = True) -> do.SendPrepare:
 
 def test_what_may_join_goes_in_one_frame_where_the_first_stood() -> None:
     other, own = do.AskLearnt(peer="robot2", deadline_s=0.3), sent("plan", may_join=False)
-    batch = [other, sent("guard"), own, do.SendAccept(accept=accept("merge"), deadline_s=0.3, may_join=True)]
+    batch: list[do.Instruction] = [
+        other,
+        sent("guard"),
+        own,
+        do.SendAccept(accept=accept("merge"), deadline_s=0.3, may_join=True),
+    ]
     together = do.SendBallots(ballots=Ballots(prepares=(prepare("guard"),), accepts=(accept("merge"),)), deadline_s=0.3)
     assert joined(batch) == [other, together, own]
     assert joined([other, sent("guard"), own]) == [other, sent("guard"), own], "one alone stays as it is"
