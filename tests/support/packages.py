@@ -25,15 +25,20 @@ NOT_FETCHED = 3
 """How `build.py` ends when the index does not give the wheels."""
 
 
-def builder() -> ModuleType:
-    """The program that builds packages, as a module."""
-    spec = importlib.util.spec_from_file_location("deb_build", REPO / "package/deb/build.py")
+def loaded(file: Path) -> ModuleType:
+    """A program as a module."""
+    spec = importlib.util.spec_from_file_location(f"loaded_{file.stem}", file)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
     return module
+
+
+def builder() -> ModuleType:
+    """The program that builds packages."""
+    return loaded(REPO / "package/deb/build.py")
 
 
 def wheels_folder() -> Path:

@@ -1,4 +1,4 @@
-"""Runs inside the booted machine: installs, upgrades, downgrades, removes and purges the package; writes what it saw.
+"""Runs inside the booted machine: installs, upgrades, downgrades, removes and purges zsched; writes what it saw.
 
 Only the standard library: this file is copied into a fresh Debian. The verdict is the test's; here is only evidence.
 """
@@ -18,6 +18,7 @@ from typing import Any
 
 RESULT = Path("/result/report.json")
 DEBS = Path("/debs")
+HOME = Path("/opt/zsched")
 ZSCHED = "/usr/bin/zsched"
 FLEET = "/etc/zsched/fleet.yaml"
 EDGE = Path("/srv/edge1")
@@ -195,30 +196,36 @@ def removed() -> Report:
         "dpkg": done,
         "owner": [task.get("owner") for task in told.get("tasks", [])],
         "kept": [name for name in (FLEET, "/var/lib/zsched/") if Path(name).exists()],
-        "gone": [name for name in ("/opt/zsched", "/usr/bin/zsched") if not Path(name).exists()],
+        "gone": [name for name in ("/opt/zsched", ZSCHED) if not Path(name).exists()],
         "active": run("systemctl", "is-active", "zsched.service").stdout.strip(),
         "processes": processes,
         "journal": journal[-4000:],
     }
 
 
+def refused() -> dict[str, Any]:
+    """Where pip has installed already."""
+    HOME.mkdir()
+    (HOME / "pyvenv.cfg").write_text("home = /usr/bin\n")
+    done = dpkg("-i", str(DEBS / "old.deb"))
+    (HOME / "pyvenv.cfg").unlink()
+    HOME.rmdir()
+    run("dpkg", "--purge", "zsched")
+    return done
+
+
 def observe(report: Report) -> None:
     run("useradd", "--create-home", "first")  # leaves /etc/subuid- and the like, as `members` will
     run("userdel", "--remove", "first")
     before = listing()
-    Path("/opt/zsched").mkdir()
-    Path("/opt/zsched/pyvenv.cfg").write_text("home = /usr/bin\n")
-    report["refused"] = dpkg("-i", str(DEBS / "old.deb"))
-    Path("/opt/zsched/pyvenv.cfg").unlink()
-    Path("/opt/zsched").rmdir()
-    run("dpkg", "--purge", "zsched")
-
+    report["refused"] = refused()
     report["install"] = dpkg("-i", str(DEBS / "old.deb"))
     report["idle"] = run("systemctl", "show", "zsched.service", "-p", "ActiveState,UnitFileState").stdout.split()
-    report["cached"] = bool(list(Path("/opt/zsched/lib/site-packages/zsched/__pycache__").glob("daemon*.pyc")))
+    report["cached"] = bool(list(HOME.glob("lib/*/zsched/__pycache__/daemon*.pyc")))
     bash = ["bash", "-c", ". /usr/share/bash-completion/completions/zsched; complete -p zsched"]
     report["completion"] = run(*bash).stdout.strip()
     begin_fleet(report)
+    report["first"] = status_of(ROBOT_SOCKET).get("version")
     members(report)
     report["upgrade"] = changed("new")
     report["downgrade"] = changed("old")

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import os
 import sysconfig
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -18,8 +17,8 @@ from typing import Any
 
 import pytest
 
+from support import machine
 from support.debian import NoDebianError, debian_root
-from support.machine import nspawn, overlaid
 from zsched_lab.fleet.loopback import free_endpoints
 
 HERE, REPO = Path(__file__).parent, Path(__file__).parents[2]
@@ -37,15 +36,6 @@ tasks:
     worker: {command: [python, -m, zsched.tasks.echo], standby: warm}
     inputs: [{from: "{robot}/ping", to: "{target}/echo/{robot}/ping"}]
     outputs: [{from: "{target}/echo/{epoch}/pong", to: "{robot}/pong"}]
-"""
-DRIVE_UNIT = """
-[Unit]
-After=multi-user.target
-[Service]
-Type=exec
-ExecStart=/usr/bin/python3 /opt/drive.py
-[Install]
-WantedBy=multi-user.target
 """
 PROGRAM = """#!/bin/sh
 export PYTHONPATH=/opt/zsched/src:/opt/zsched/site PYTHONDONTWRITEBYTECODE=1 ZSCHED_NODE=edge1
@@ -87,49 +77,26 @@ def furnish(root: Path, start: str, expected: str) -> None:
         "etc/systemd/system/zsched-web.service": (REPO / "systemd" / "zsched-web.service").read_text(),
         "etc/systemd/system/zsched-web.service.d/test.conf": WEB_DROP_IN.format(port=port),
         "opt/web_port": port,
-        "etc/systemd/system/drive.service": DRIVE_UNIT,
         "etc/zsched/fleet.yaml": fleet_file(),
         "opt/expected": expected,
-        "opt/drive.py": (HERE / "boot_drive.py").read_text(),
         "opt/standin.py": (HERE / "service_standin.py").read_text(),
-        "opt/zsched/bin/zsched": PROGRAM.format(start=start),
-        "opt/zsched/bin/python": PYTHON,
     }
-    for name, text in files.items():
-        path = root / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
-    for name in ("zsched", "python"):
-        (root / "opt/zsched/bin" / name).chmod(0o755)
-    for name in ("opt/zsched/src/zsched", "opt/zsched/site", "result"):
-        (root / name).mkdir(parents=True)
-    wants = root / "etc/systemd/system/multi-user.target.wants"
-    wants.mkdir(parents=True, exist_ok=True)
-    (wants / "drive.service").symlink_to("/etc/systemd/system/drive.service")
+    programs = {"opt/zsched/bin/zsched": PROGRAM.format(start=start), "opt/zsched/bin/python": PYTHON}
+    machine.furnish(root, HERE / "boot_drive.py", files, programs)
 
 
 def boot(debian: Path, folder: Path, start: str, expected: str, *, init: bool) -> dict[str, Any]:
     """Boot a machine with the service, let the driver run, and return its report."""
-    (folder / "result").mkdir(parents=True)
-    with overlaid(debian, folder) as root:
+    folder.mkdir(parents=True)
+    with machine.overlaid(debian, folder) as root:
         furnish(root, start, expected)
-        binds = [
-            f"--bind-ro={REPO / 'zsched'}:/opt/zsched/src/zsched",
-            f"--bind-ro={sysconfig.get_paths()['purelib']}:/opt/zsched/site",
-            f"--bind={folder / 'result'}:/result",
-        ]
-        machine = f"--machine=zsched-test-{os.getpid()}-{folder.name}"
-        options = ["-q", "-D", str(root), machine, "--register=no", "--keep-unit", *binds]
+        ours = {"/opt/zsched/src/zsched": REPO / "zsched", "/opt/zsched/site": Path(sysconfig.get_paths()["purelib"])}
+        options = machine.options(root, folder, f"boot-{folder.name}", ours)
         if init:
             command = ["/opt/zsched/bin/zsched", "init", "--config", "/etc/zsched/fleet.yaml"]
-            done = nspawn(folder, [*options, *command], timeout_s=60.0)
+            done = machine.nspawn(folder, [*options, *command], timeout_s=60.0)
             assert done == 0, (folder / "console.log").read_text(errors="replace")
-        done = nspawn(folder, [*options, "-b"], timeout_s=BOOT_TIMEOUT_S)
-        report = folder / "result" / "report.json"
-        console = (folder / "console.log").read_text(errors="replace")
-        assert report.exists(), f"no report; nspawn said {done}:\n{console[-3000:]}"
-        found: dict[str, Any] = json.loads(report.read_text())
-    return found
+        return machine.booted(folder, options, BOOT_TIMEOUT_S)
 
 
 def check_life(report: dict[str, Any], expected: str) -> None:

@@ -6,15 +6,14 @@ Needs what `test_systemd_boot.py` needs; about 15 s, most of it waiting.
 from __future__ import annotations
 
 import json
-import os
 import sysconfig
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from support import machine
 from support.debian import NoDebianError, debian_root
-from support.machine import nspawn, overlaid
 from zsched_lab.fleet.loopback import free_endpoints
 
 HERE, REPO = Path(__file__).parent, Path(__file__).parents[2]
@@ -43,13 +42,6 @@ EnvironmentFile=/run/fleet/%i.env
 ExecStartPre=/bin/sh -c 'echo "greeted with $GREETING"'
 ExecStart=/opt/zsched/bin/python -m zsched.tasks.echo
 """
-DRIVE_UNIT = """
-[Unit]
-After=multi-user.target
-[Service]
-Type=exec
-ExecStart=/usr/bin/python3 /opt/drive.py
-"""
 RUN = """#!/bin/sh
 export PYTHONPATH=/opt/zsched/src:/opt/zsched/site PYTHONDONTWRITEBYTECODE=1
 exec /usr/bin/python3 {start} "$@"
@@ -61,25 +53,10 @@ def furnish(root: Path) -> None:
     fleet = FLEET
     for number, endpoint in enumerate(free_endpoints(6)):
         fleet = fleet.replace(f"E{number}", endpoint)
-    files = {
-        "etc/systemd/system/echoer@.service": WORKER_UNIT,
-        "etc/systemd/system/drive.service": DRIVE_UNIT,
-        "etc/zsched/fleet.yaml": fleet,
-        "opt/drive.py": (HERE / "drivers_drive.py").read_text(),
-        "opt/zsched/bin/zsched": RUN.format(start="-m zsched.cli"),
-        "opt/zsched/bin/python": RUN.format(start=""),
-    }
-    for name, text in files.items():
-        path = root / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
-    for name in ("zsched", "python"):
-        (root / "opt/zsched/bin" / name).chmod(0o755)
-    for name in ("opt/zsched/src/zsched", "opt/zsched/site", "result"):
-        (root / name).mkdir(parents=True)
-    wants = root / "etc/systemd/system/multi-user.target.wants"
-    wants.mkdir(parents=True, exist_ok=True)
-    (wants / "drive.service").symlink_to("/etc/systemd/system/drive.service")
+    files = {"etc/systemd/system/echoer@.service": WORKER_UNIT, "etc/zsched/fleet.yaml": fleet}
+    starts = {"zsched": "-m zsched.cli", "python": ""}
+    programs = {f"opt/zsched/bin/{name}": RUN.format(start=start) for name, start in starts.items()}
+    machine.furnish(root, HERE / "drivers_drive.py", files, programs)
 
 
 @pytest.fixture(scope="module")
@@ -90,21 +67,10 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     except NoDebianError as error:
         pytest.skip(str(error))
     folder = tmp_path_factory.mktemp("units")
-    (folder / "result").mkdir()
-    with overlaid(debian, folder) as root:
+    with machine.overlaid(debian, folder) as root:
         furnish(root)
-        binds = [
-            f"--bind-ro={REPO / 'zsched'}:/opt/zsched/src/zsched",
-            f"--bind-ro={sysconfig.get_paths()['purelib']}:/opt/zsched/site",
-            f"--bind={folder / 'result'}:/result",
-        ]
-        machine = f"--machine=zsched-units-{os.getpid()}"
-        options = ["-q", "-D", str(root), machine, "--register=no", "--keep-unit", *binds, "-b"]
-        done = nspawn(folder, options, timeout_s=BOOT_TIMEOUT_S)
-        console = (folder / "console.log").read_text(errors="replace")
-    path = folder / "result" / "report.json"
-    assert path.exists(), f"no report; nspawn said {done}:\n{console[-3000:]}"
-    found: dict[str, Any] = json.loads(path.read_text())
+        ours = {"/opt/zsched/src/zsched": REPO / "zsched", "/opt/zsched/site": Path(sysconfig.get_paths()["purelib"])}
+        found = machine.booted(folder, machine.options(root, folder, "units", ours), BOOT_TIMEOUT_S)
     assert "error" not in found, found["error"] + found["journal"]
     return found
 
