@@ -50,6 +50,7 @@ from zsched.core.values.snapshot import Exposure
 from zsched.errors import AdapterError, ConfigError, NameTakenError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_LEFT, EXIT_NAME_TAKEN, EXIT_OK
 from zsched.guard import on_failure
+from zsched.heap import give_back, share_heaps
 from zsched.ipc.takeover import Door
 from zsched.log_limit import log_to_stderr
 from zsched.runtime import renewal
@@ -197,6 +198,7 @@ class Daemon:
                 node.problems["tls"] = plain_text
             node.security = self._exposure(points)
             gc.freeze()  # what lives until the end need not be looked at again
+            give_back()
             self._loop(node, shell)
         return EXIT_LEFT if self._has_left else EXIT_OK
 
@@ -604,6 +606,7 @@ def main(arguments: list[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     _set_up_logging(given.log_level)
     take_descriptors()
+    share_heaps()
     faulthandler.enable(
         file=STDERR
     )  # a crash, or systemd's watchdog (SIGABRT), leaves every thread's place in the journal

@@ -18,12 +18,12 @@ import os
 import signal
 import sys
 
+from zsched.heap import share_heaps
 from zsched.ipc.protocol import RelayHello
 from zsched.log_limit import log_to_stderr
 from zsched.sessions.config import relay_pools
 
 PR_SET_PDEATHSIG = 1
-M_ARENA_MAX = -8
 DEFAULT_THREADS = 6
 STOP_S = 2.0
 """A daemon that stops hands its tasks over first, and its robot's streams must run until then."""
@@ -33,7 +33,7 @@ def main() -> None:
     """Run the relay; never returns (threads of zenoh must not be waited for at exit)."""
     arguments = _arguments()
     log_to_stderr(arguments.log_level, "%(name)s %(levelname)s %(message)s")
-    _few_arenas()
+    share_heaps()
     if arguments.door is None:
         _die_with(arguments.parent)
     # Both may reach the whole group: the daemon needs us for its own orderly stop, and ends us with it.
@@ -80,13 +80,6 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--session", default="", help="a digest over what the data session is opened with")
     parser.add_argument("--log-level", default="WARNING")
     return parser.parse_args()
-
-
-def _few_arenas() -> None:
-    """Let all threads share two heaps: with one per thread and their leftovers the relay took 5 MB more (measured)."""
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)  # glibc's
-    if mallopt is not None:
-        mallopt(M_ARENA_MAX, 2)
 
 
 def _die_with(parent: int) -> None:

@@ -31,6 +31,7 @@ from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.plan import Role, Route, RoutePlan
 from zsched.errors import WireError
 from zsched.guard import guarded, on_failure
+from zsched.heap import give_back
 from zsched.ipc.pipe import COMMANDS, read_frame, wait_readable, write_frame
 from zsched.ipc.protocol import RelayHello, RelayPulse
 from zsched.relay.graph import GraphMirror
@@ -433,6 +434,7 @@ def run(
         reporter.flush(CLOSE_S)
         return 1
     relay = RelayProcess(session, me.fleet, me.node, reporter, local.decode(), Introducer(config), lease_s(config))
+    give_back()
     successors = None if door is None else Successors(socket.socket(fileno=door), me, reopens=has_local_side)
     wakeups, parent = _signals_wake(), os.getppid()
     try:
