@@ -6,10 +6,12 @@ DEMO_ARGS ?=
 # Test modules at a time; integration tests mostly wait.
 TEST_JOBS ?= 2
 REAL_JOBS ?= 4
+# Which tests: what is marked `long` tells a whole story, or again what a shorter test tells too.
+MARK ?= not long
 # How the tests with real processes are run; `.ci/run` gives failed ones a second chance, alone.
 PYTEST_REAL ?= -m pytest
 
-.PHONY: help demo test test-cpu test-real test-quick lint types format man bench deb wheel image lock clean
+.PHONY: help demo test test-all test-cpu test-real test-quick lint types format man bench deb wheel image lock clean
 .NOTPARALLEL:
 # Where it is set, each daemon, relay and worker of a test compiles all its modules anew: half of its start.
 unexport PYTHONDONTWRITEBYTECODE
@@ -34,16 +36,19 @@ $(VENV)/.dev: pyproject.toml lab/pyproject.toml $(VENV)/.python
 demo: $(VENV)/.lab  ## Watch six machines merge laser maps (DEMO_ARGS="--headless --out DIR" to choose)
 	$(BIN)/zsched demo $(DEMO_ARGS)
 
-test: test-cpu test-real  ## All tests
+test: test-cpu test-real  ## All tests but the long ones
+
+test-all: MARK =
+test-all: test  ## All tests
 
 test-cpu: $(VENV)/.dev  ## Tests that only need a processor: unit, paper, simulator
-	$(BIN)/python -m pytest -q -n $(TEST_JOBS) --dist loadfile tests/unit tests/paper tests/sim tests/planted
+	$(BIN)/python -m pytest -q -m "$(MARK)" -n $(TEST_JOBS) --dist loadfile tests/unit tests/paper tests/sim tests/planted
 
 # Real fleets of the system tests keep real time and fill a machine: they have it to themselves.
 test-real: $(VENV)/.dev  ## Tests with real processes: system, integration, parts, bench (real daemons on localhost)
-	$(BIN)/python $(PYTEST_REAL) -q --durations=10 tests/system
-	$(BIN)/python $(PYTEST_REAL) -q -n $(REAL_JOBS) --dist loadfile --no-loadscope-reorder --durations=10 tests/integration tests/parts
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile tests/bench
+	$(BIN)/python $(PYTEST_REAL) -q -m "$(MARK)" --durations=10 tests/system
+	$(BIN)/python $(PYTEST_REAL) -q -m "$(MARK)" -n $(REAL_JOBS) --dist loadfile --no-loadscope-reorder --durations=10 tests/integration tests/parts
+	$(if $(MARK),,$(BIN)/python -m pytest -q -n 2 --dist loadfile tests/bench)
 
 test-quick: $(VENV)/.dev  ## Unit and paper tests only
 	$(BIN)/python -m pytest -q -n $(TEST_JOBS) --dist loadfile tests/unit tests/paper

@@ -22,6 +22,8 @@ from zsched_lab.paper.scenario import LoadPlan, load_scenario
 from zsched_lab.paper.schemes import SCHEMES
 from zsched_lab.robots.laser_log import malaga_path
 
+pytestmark = pytest.mark.long
+
 WHY_NOT = LimitedGroup.why_not()
 NO_SPACES = WHY_NOT or why_not()
 DRIVE_S = 5.0

@@ -19,6 +19,8 @@ from zsched.adapters.machine.cgroup import LimitedGroup
 from zsched_lab.fleet.janitor import TOKEN_VARIABLE
 from zsched_lab.paper.places import scenario_path
 
+pytestmark = pytest.mark.long
+
 WHY_NOT = LimitedGroup.why_not()
 CELL_S = 300.0
 """A run takes under half a minute where the machine is free; this is for one that is busy with other tests."""

@@ -20,7 +20,7 @@ from zsched_lab.fleet.containers import Host, NoEngineError, container_host
 from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 
 FLEET = "testbed"
-pytestmark = [pytest.mark.root, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.long, pytest.mark.root, pytest.mark.timeout(300)]
 
 
 @pytest.fixture(scope="module")

@@ -22,6 +22,8 @@ import pytest
 from support.waiting import until
 from zsched.commands.example import Example, write_example
 
+pytestmark = pytest.mark.long
+
 CLI = (sys.executable, "-m", "zsched.cli")
 END_S = 30.0
 

@@ -16,6 +16,8 @@ import pytest
 from zsched.errors import AdapterError
 from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
+pytestmark = pytest.mark.long
+
 WAIT_S = 40.0
 VERB_S = 60.0
 BUSY = ("daemon.lag", "fleet.lag", "state.fsync")

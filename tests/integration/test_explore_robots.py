@@ -23,6 +23,8 @@ from zsched_lab.fleet.loopback import free_endpoints
 from zsched_lab.fleet.recorder import Record, read_records
 from zsched_lab.maps.metrics import score_map
 
+pytestmark = pytest.mark.long
+
 ROBOTS = ("robot1", "robot2")
 WORLD = "turtlebot3"
 TARGET = 0.8

@@ -28,6 +28,8 @@ from zsched.core.values.plan import RosGraph
 from zsched.sessions.config import client_config
 from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).parents[2]
 MERGER = Path(__file__).with_name("ros_merger.py")
 TYPE = "nav_msgs::msg::dds_::OccupancyGrid_/RIHS01_8d348150c12913a31ee0ec170fbf25089e4745d17035792a1ba94d6f0bc0cfc7"

@@ -16,6 +16,8 @@ import pytest
 from zsched_lab.fleet.netbed import descendants_running
 from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 
+pytestmark = pytest.mark.long
+
 WORKER = Path(__file__).with_name("hangable_echo.py")
 DEADLINE_S = 1.0
 

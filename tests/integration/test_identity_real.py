@@ -18,6 +18,8 @@ from zsched.runtime.init import init_state
 from zsched_lab.fleet.loopback import free_endpoint
 from zsched_lab.fleet.testbed import DAEMON, Testbed, TestbedError, echo_fleet
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture
 def bed(tmp_path: Path) -> Iterator[Testbed]:

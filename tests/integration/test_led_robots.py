@@ -29,6 +29,8 @@ from zsched_lab.fleet.loopback import free_endpoints
 from zsched_lab.fleet.recorder import Record, read_records
 from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
+pytestmark = pytest.mark.long
+
 WORLD = "office:3"
 DEADLINE_S = 45.0
 SLIP_M = 0.02

@@ -17,7 +17,7 @@ from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 NODE = Path(__file__).with_name("ros2_lifecycle_node.py")
 ACTIVATE = "3"
 INACTIVE, ACTIVE = 2, 3
-pytestmark = pytest.mark.timeout(240)
+pytestmark = [pytest.mark.long, pytest.mark.timeout(240)]
 
 
 @pytest.fixture

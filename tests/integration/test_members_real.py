@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from pathlib import Path
 
+import pytest
 import zenoh
 
 from support.operators import Stream
@@ -13,6 +14,8 @@ from support.waiting import until
 from zsched.exits import EXIT_LEFT
 from zsched.sessions.config import client_config
 from zsched_lab.fleet.hall import Hall, block_of_ports
+
+pytestmark = pytest.mark.long
 
 TASK = """\
 tasks:

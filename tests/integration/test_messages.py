@@ -17,6 +17,8 @@ import pytest
 from support.waiting import until
 from zsched.commands.example import Example, write_example
 
+pytestmark = pytest.mark.long
+
 REPO = Path(__file__).parents[2]
 PAGE = REPO / "docs" / "develop" / "messages.md"
 CLI = (sys.executable, "-m", "zsched.cli")

@@ -6,9 +6,13 @@ import json
 from copy import deepcopy
 from pathlib import Path
 
+import pytest
+
 from support.operators import Operator
 from zsched_lab.fleet.loopback import free_endpoint
 from zsched_lab.fleet.testbed import Testbed, echo_fleet
+
+pytestmark = pytest.mark.long
 
 MOVER = "edge1"
 """Everybody else dials the first seed."""

@@ -7,10 +7,13 @@ import json
 import time
 from pathlib import Path
 
+import pytest
 import zenoh
 
 from zsched.runtime.crew import REJOIN_S
 from zsched_lab.fleet.testbed import TASK, Json, Testbed, echo_fleet
+
+pytestmark = pytest.mark.long
 
 WAIT_S = 60.0
 SAID = "the worker on edge1: seems to run since before its session changed: start it again on edge1"

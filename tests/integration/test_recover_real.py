@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from zsched.adapters.network.fleet_client import FleetClient
 from zsched.core.values.fleet import dial_endpoint
 from zsched.core.values.messages import CommandOutcome, CommandResult, MoveTask
@@ -13,6 +15,8 @@ from zsched.core.values.model import Asked, NodeId
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
 from zsched.sessions import config as zenoh_config
 from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
+
+pytestmark = pytest.mark.long
 
 DEAD: tuple[NodeId, ...] = ("robot1", "robot2", "robot3")
 DANGERS = ("--accept", "old-electors-are-off", "--accept", "newest-may-be-lost")

@@ -8,10 +8,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from support.authorities import install, make_authority
 from zsched.core.values.model import NodeId
 from zsched.exits import EXIT_OK, EXIT_WOULD_CHANGE
 from zsched_lab.fleet.testbed import TASK, Json, Testbed, echo_fleet
+
+pytestmark = pytest.mark.long
 
 DEAD: tuple[NodeId, ...] = ("robot1", "robot2", "robot3")
 DANGERS = ("--accept", "old-electors-are-off", "--accept", "newest-may-be-lost")

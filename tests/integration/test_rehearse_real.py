@@ -13,6 +13,8 @@ from support.operators import Operator, Stream
 from support.sessions import matches
 from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 
+pytestmark = pytest.mark.long
+
 WITHIN_S = 180.0
 
 

@@ -14,6 +14,8 @@ from zsched.clock import monotonic_s
 from zsched.core.events import SlotDrained, SlotFlipped, SlotReady
 from zsched.core.values.plan import OnCrash, RoutePhase, Slot, StreamClass, WorkerRole
 
+pytestmark = pytest.mark.long
+
 BEFORE, BACKLOG, BEHIND = 5, 200, 10
 DRAIN_S = 2.0
 

@@ -19,6 +19,8 @@ from zsched.core.values.fleet import Timing
 from zsched.core.values.plan import StreamClass
 from zsched.sessions.config import client_config
 
+pytestmark = pytest.mark.long
+
 READER = """
 import sys, time
 import zenoh

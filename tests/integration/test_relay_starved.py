@@ -17,6 +17,8 @@ from zsched.core.relay_protocol import HandleReport
 from zsched.errors import AdapterError
 from zsched.sessions.config import data_config
 
+pytestmark = pytest.mark.long
+
 CONFIG = data_config(listen=("tcp/127.0.0.1:0",), connect=())
 
 

@@ -5,7 +5,11 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import pytest
+
 from zsched_lab.fleet.testbed import Testbed, echo_fleet
+
+pytestmark = pytest.mark.long
 
 
 def test_an_elector_whose_folder_was_restored_votes_no_more_and_says_so_on_every_node(tmp_path: Path) -> None:

@@ -5,11 +5,14 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
+import pytest
 import zenoh
 
 from support.sessions import matches
 from zsched.core.hop.shared import NEWCOMERS_S, TICK_S
 from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
+
+pytestmark = pytest.mark.long
 
 COUNT = 60
 

@@ -8,11 +8,15 @@ from copy import deepcopy
 from functools import partial
 from pathlib import Path
 
+import pytest
+
 from support.operators import Operator, Stream
 from support.sessions import matches
 from zsched.core.executor.renewing import SAME_FILE_S
 from zsched.core.hop.books import unaccounted
 from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
+
+pytestmark = pytest.mark.long
 
 EDGES = ("edge1", "edge2", "edge3")
 MARK = "CHANGED"

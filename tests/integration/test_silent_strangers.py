@@ -9,12 +9,15 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
 import zenoh
 
 from zsched.errors import AdapterError
 from zsched.runtime.descriptors import WANTED
 from zsched.sessions import config as zenoh_config
 from zsched_lab.fleet.testbed import Testbed, echo_fleet
+
+pytestmark = pytest.mark.long
 
 SPARE = 12
 """Descriptors that the process has left when the strangers come."""

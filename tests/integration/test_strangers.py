@@ -25,6 +25,8 @@ from zsched.wire import codec as wire
 from zsched.wire.keyspace import END_CHUNK, Keyspace
 from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 
+pytestmark = pytest.mark.long
+
 KEYS = Keyspace("testbed")
 FAR = 10**6
 

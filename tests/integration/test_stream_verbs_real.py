@@ -24,6 +24,8 @@ from zsched.tasks.map_merge.cdr import encode_grid
 from zsched.tasks.map_merge.grid import Grid
 from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
+pytestmark = pytest.mark.long
+
 HZ, SIZE = 50.0, 1000
 GRID = Grid(data=np.arange(12, dtype=np.int8).reshape(3, 4), resolution=0.05)
 VERB_S = 30.0

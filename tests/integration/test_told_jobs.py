@@ -20,6 +20,8 @@ from zsched.core.values.fleet import Demand, TaskSpec
 from zsched.core.values.model import Jobs, Profile, WorkerLoad, WorkerState
 from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 
+pytestmark = pytest.mark.long
+
 WORKER = Path(__file__).with_name("busy_echo.py")
 BUSY_MS, RATE_HZ = 40.0, 10.0
 LOOPS = 4

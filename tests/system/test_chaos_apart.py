@@ -29,7 +29,7 @@ from zsched_lab.fleet.chaos import TWO_CLASSES
 from zsched_lab.fleet.netbed import Netbed, Probe, Received
 from zsched_lab.fleet.testbed import TASK, Json, echo_fleet
 
-pytestmark = pytest.mark.root
+pytestmark = [pytest.mark.long, pytest.mark.root]
 
 HIDDEN = ("edge1", "edge2", "robot3")
 ROBOTS_TASK: Json = {"on_isolation": "local", **TWO_CLASSES}

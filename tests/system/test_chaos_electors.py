@@ -30,7 +30,7 @@ from zsched_lab.fleet import netns
 from zsched_lab.fleet.netbed import CONTROL_PORT, Netbed, Probe
 from zsched_lab.fleet.testbed import DAEMON, TASK, Json, echo_fleet
 
-pytestmark = pytest.mark.root
+pytestmark = [pytest.mark.long, pytest.mark.root]
 
 GUEST = "guest"
 """A machine on the network that the fleet file does not name."""

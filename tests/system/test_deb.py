@@ -24,7 +24,7 @@ HERE = Path(__file__).parent
 BOOT_TIMEOUT_S = 400.0
 PROVE = "ZSCHED_PROVE"
 """What `package/prove.py` gives, as JSON: ``suite``, ``new`` and ``old`` (packages), ``same_relay``, ``report``."""
-pytestmark = [pytest.mark.root, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.long, pytest.mark.root, pytest.mark.timeout(900)]
 
 FLEET = """
 fleet: deb

@@ -19,7 +19,7 @@ from zsched_lab.fleet import netns
 from zsched_lab.fleet.hall import Hall
 from zsched_lab.fleet.netbed import CONTROL_PORT, DATA_PORT, PROBE, Probe
 
-pytestmark = pytest.mark.root
+pytestmark = [pytest.mark.long, pytest.mark.root]
 
 FIRST, LAST = "robot1", "edge4"
 OTHERS = ("edge1", "robot2", "edge2", "robot3", "edge3", "robot4", "robot5", LAST)

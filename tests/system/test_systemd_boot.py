@@ -23,7 +23,7 @@ from zsched_lab.fleet.loopback import free_endpoints
 
 HERE, REPO = Path(__file__).parent, Path(__file__).parents[2]
 BOOT_TIMEOUT_S = 150.0
-pytestmark = [pytest.mark.root, pytest.mark.timeout(420)]
+pytestmark = [pytest.mark.long, pytest.mark.root, pytest.mark.timeout(420)]
 
 FLEET = """
 fleet: boot
