@@ -32,15 +32,23 @@ class String:
     data: str = ""
 
 
-def _where() -> dict[str, Any]:
-    """Where a node joins: the session file's endpoint, as rmw_zenoh takes it."""
+def _join() -> None:
+    """Dial every endpoint of the session file, as rmw_zenoh does.
+
+    A worker dials the relays of all machines; the library would put one address in their place.
+    """
     file = os.environ.get("ZENOH_SESSION_CONFIG_URI")
     if file is None:
-        return {}  # ZENOH_CONFIG_OVERRIDE names the endpoint
-    endpoint: str = json.loads(Path(file).read_text())["connect"]["endpoints"][0]
-    address = endpoint.removeprefix("tcp/").partition("?")[0].partition("#")[0]  # without zenoh's options of a link
-    host, _, port = address.rpartition(":")
-    return {"router_ip": host, "router_port": int(port)}
+        return  # ZENOH_CONFIG_OVERRIDE names the endpoint
+    endpoints = json.dumps(json.loads(Path(file).read_text())["connect"]["endpoints"])
+    session: Any = importlib.import_module("zenoh_ros2_sdk.session")
+    zenoh: Any = importlib.import_module("zenoh")
+
+    def open_(config: Any) -> Any:
+        config.insert_json5("connect/endpoints", endpoints)
+        return zenoh.open(config)
+
+    session.zenoh = types.SimpleNamespace(open=open_, Config=zenoh.Config)
 
 
 class _Publisher:
@@ -55,21 +63,21 @@ class _Node:
     def __init__(self, name: str, namespace: str) -> None:
         os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")  # the library looks for git, which a clean machine lacks
         self._sdk: Any = importlib.import_module("zenoh_ros2_sdk")
+        _join()
         self._name, self._namespace = name, namespace
         self._kept: list[Any] = []
         self.timers: list[tuple[float, Callable[[], object]]] = []
 
     def create_publisher(self, _kind: type, topic: str, _depth: int) -> _Publisher:
-        where = {**STRING, **_where()}
-        return _Publisher(self._sdk.ROS2Publisher(f"{self._namespace}/{topic}", node_name=self._name, **where))
+        name = f"{self._namespace}/{topic}"
+        return _Publisher(self._sdk.ROS2Publisher(name, node_name=self._name, **STRING))
 
     def create_subscription(self, _kind: type, topic: str, act: Callable[[String], object], _depth: int) -> None:
         def on_message(message: Any) -> None:
             act(String(message.data))
 
-        where = {**STRING, **_where()}
         name = f"{self._namespace}/{topic}"
-        self._kept.append(self._sdk.ROS2Subscriber(name, callback=on_message, node_name=self._name, **where))
+        self._kept.append(self._sdk.ROS2Subscriber(name, callback=on_message, node_name=self._name, **STRING))
 
     def create_timer(self, period_s: float, act: Callable[[], object]) -> None:
         self.timers.append((period_s, act))
