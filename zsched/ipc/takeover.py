@@ -48,6 +48,7 @@ THE_RELAYS: Final = (
     "core/values",
     "__init__.py",
     "clock.py",
+    "heap.py",
     "errors.py",
     "guard.py",
     "log_limit.py",
