@@ -62,6 +62,7 @@ _REGISTER = (
 )
 _SCHEDULES = ("tests/unit/core/vote/test_register_schedules.py",)
 _AGREEMENT = ("tests/unit/core/vote/test_agreement.py",)
+_JOINING = ("tests/unit/core/vote/test_joining.py",)
 _LEASE = ("tests/sim/test_lease_rules.py", "tests/sim/test_exclusive.py")
 _GENERATIONS = ("tests/sim/test_generations.py",)
 _BEAT_ROOM = ("tests/unit/core/membership/test_beat_room.py",)
@@ -712,6 +713,27 @@ MEMBERSHIP_BUGS = (
 )
 
 VOTE_BUGS = (
+    _bug(
+        "an accept waits for a lease although it came with others",
+        AGREEMENT,
+        "accept=accept), todo, now, park_s=0)",
+        "accept=accept), todo, now)",
+        _JOINING,
+    ),
+    _bug(
+        "a question that had no success together is asked together again",
+        REGISTER,
+        "return running.change is None and not running.is_alone",
+        "return running.change is None",
+        _JOINING,
+    ),
+    _bug(
+        "each question of a frame counts at the rate",
+        AGREEMENT,
+        "self.on_prepare(asked, todo, now, may_ask=may_ask)",
+        "self.on_prepare(asked, todo, now)",
+        _JOINING,
+    ),
     Bug(
         name="stale proposal counted",
         module=VOTING,
