@@ -178,6 +178,8 @@ def moves_of(entries: Iterable[Json], now: float, task: str | None) -> Iterator[
         move = entry.get("move")
         if move is None or task not in (None, entry["task"]):
             continue
+        if move["left"] is None and move["owner"] is None:
+            continue  # known from a founding: nobody has had the task yet
         yield {
             "at": wall_text(entry["at"]),
             "age_s": max(now - entry["at"], 0.0),
@@ -222,6 +224,8 @@ def _move_line(move: Json) -> str:
     switched = "" if move["switched_s"] is None else f", streams switched in {millis(move['switched_s'])}"
     switched += "" if move["gap_s"] is None else f", no answer for {millis(move['gap_s'])}"
     where = f"{move['from'] or 'nobody'} -> {move['to'] or 'nobody'}"
+    if move["from"] is None and move["reason"].startswith("known from"):
+        where = f"{move['to']}"  # this daemon has begun anew; the task went on where it was
     head = f"{span(move['age_s']):>6} ago  {move['at']}  {move['task']} epoch {move['epoch']}  {where}"
     return f"{head}: {move['reason']}{f' ({votes})' if votes else ''}{switched}\n"
 

@@ -102,6 +102,14 @@ def test_moves_are_told_with_age_wall_time_votes_and_how_long_the_streams_took(
     ]
 
 
+def test_what_is_known_from_before_a_restart_is_no_move(pages: Pages, capsys: pytest.CaptureFixture[str]) -> None:
+    known = {**MOVE, "left": None, "votes": [], "reason": "known from before the restart"}
+    pages.entries = [entry("learnt", 60.0, move={**known, "owner": None}), entry("learnt", 50.0, move=known)]
+    assert history(HERE, None, is_json=False) == 0
+    line = "   50s ago  2026-09-21T14:12:30.000Z  merge epoch 2  edge2: known from before the restart"
+    assert capsys.readouterr().out.splitlines() == [line]
+
+
 def test_a_changed_worker_that_waits_for_a_look_is_part_of_the_history(
     pages: Pages, capsys: pytest.CaptureFixture[str]
 ) -> None:
