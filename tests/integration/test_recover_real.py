@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -46,6 +48,11 @@ def problem_of(bed: Testbed, node: NodeId, other: NodeId) -> str:
     """What a node says of one that counts by another generation; empty: nothing."""
     told = [one for one in bed.status(node)["problems"] if one.startswith(f"generation/{other}: ")]
     return told[0] if told else ""
+
+
+def says(bed: Testbed, node: NodeId, other: NodeId, words: tuple[str, ...]) -> bool:
+    """Whether a node says all of that about one that counts by another generation."""
+    return all(word in problem_of(bed, node, other) for word in words)
 
 
 def test_a_survivor_recovers_the_fleet_and_an_old_elector_that_comes_back_changes_sides_by_word(tmp_path: Path) -> None:
@@ -101,3 +108,35 @@ def test_a_survivor_recovers_the_fleet_and_an_old_elector_that_comes_back_change
         bed.wait(lambda: bed.status("robot1")["quorum"]["this_node"] == "elector", 60, "robot1 as an elector")
         assert not problem_of(bed, "robot4", "robot1")
         bed.wait(lambda: bed.owner("robot1", "robot4", "edge1"), 60, "one owner")
+
+
+def test_two_halves_that_were_both_recovered_show_each_other_and_stay_apart(tmp_path: Path) -> None:
+    tree = {**echo_fleet(robots=4, edges=0, task={"candidates": ["robot1", "robot3"]}), "replace_s": 1, "away_s": 2}
+    halves: tuple[tuple[NodeId, NodeId], ...] = (("robot1", "robot2"), ("robot3", "robot4"))
+    with Testbed(tmp_path, tree) as bed:
+        bed.init()
+        bed.start()
+        bed.wait_settled()
+        bed.stop()
+        for survivor, other in halves:
+            done = run(bed, "recover", survivor, *DANGERS, "--yes")
+            assert done.returncode == EXIT_OK, done.stderr
+            bed.start(survivor, other)
+            bed.wait(partial(problem_of, bed, other, survivor), 60, f"{other} to see what {survivor} has recovered")
+            bed.stop(other)
+            joined = run(bed, "rejoin", other, "--yes")
+            assert joined.returncode == EXIT_OK, joined.stderr
+            bed.start(other)
+            bed.wait(lambda: bed.owner(survivor, other) == survivor, 60, f"the task on {survivor}")  # noqa: B023 - called here
+            bed.stop(survivor, other)
+
+        bed.start()
+        for (here, beside), (there, behind) in (halves, halves[::-1]):
+            for name, far in itertools.product((here, beside), (there, behind)):
+                both = (f"(recovered by {there})", f"(recovered by {here})")
+                bed.wait(partial(says, bed, name, far, both), 60, f"{name} to say who has recovered what of {far}")
+        generations = [{bed.status(name)["quorum"]["generation_id"] for name in half} for half in halves]
+        assert [len(one) for one in generations] == [1, 1]
+        assert generations[0] != generations[1]
+        for survivor, other in halves:
+            bed.wait(lambda: bed.owner(survivor, other) == survivor, 60, f"{survivor} to do its half's task")  # noqa: B023 - called here
