@@ -22,7 +22,6 @@ from zsched.core.values.fleet import Fleet, OnIsolation, Standby, StreamRule, Ta
 from zsched.core.values.messages import (
     Accept,
     Accepted,
-    Ballots,
     ChangeFleet,
     ExplainTask,
     Learnt,
@@ -144,7 +143,6 @@ class Storm:
         self.epochs = dict.fromkeys(TASKS, 1)
         self.makers: tuple[Callable[[], ev.Event], ...] = (
             ev.DeadlineReached, self.sampled, self.profile, self.utility, self.proposal, self.prepare, self.accept,
-            self.ballots,
             self.answer, self.answer, self.answer, self.learnt, self.beat, self.beat, self.token, self.worker,
             self.slot, self.slot, self.counted, self.relay, self.status, self.command, self.problem, self.fleet,
         )  # fmt: skip
@@ -249,11 +247,6 @@ class Storm:
         acceptance = Acceptance(ballot=self.ballot(asker), value=self.value(name))
         asked = Accept(task=name, acceptance=acceptance, electorate=ELECTORATE)
         return ev.AcceptAsked(request=self.number(), asker=asker, accept=asked)
-
-    def ballots(self) -> ev.Event:
-        asker, names = self.name(), self.rng.sample(TASKS, self.rng.randrange(1, len(TASKS) + 1))
-        asked = [Prepare(task=name, ballot=self.ballot(asker), electorate=ELECTORATE) for name in names]
-        return ev.BallotsAsked(request=self.number(), asker=asker, ballots=Ballots(prepares=tuple(asked)))
 
     def answer(self) -> ev.Event:
         """Mostly to what the node asked last."""

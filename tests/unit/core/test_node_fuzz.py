@@ -67,8 +67,9 @@ def test_any_events_in_any_order_are_taken(me: str, seed: int) -> None:
 def test_the_storm_reaches_every_part_of_the_door() -> None:
     """The test above is worth something: within a few storms every instruction occurs."""
     # a twin that beats twice; a worker that a majority finds hung; addresses, which only a daemon gives a node; an
-    # owner that could be spared (core/handlers/test_rehearsal.py)
-    by_hand = {do.StandDown, do.RestartWorker, do.TryAddresses, do.StrikeDaemon}
+    # owner that could be spared (core/handlers/test_rehearsal.py); answers to several
+    # questions in one frame (vote/test_joining.py)
+    by_hand = {do.AnswerBallots, do.StandDown, do.RestartWorker, do.TryAddresses, do.StrikeDaemon}
     missing = set(do.Instruction.__args__) - by_hand
     storms = itertools.product(range(16), ("robot1", "edge1"))
     while missing and (one := next(storms, None)):
