@@ -10,7 +10,8 @@ from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
-from zsched.core.values.fleet import Standby, TaskSpec
+from zsched.core.scheduler.scoring import may_get
+from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.model import Allocation, NodeId, Profile, TaskId, WorkerState
 
 
@@ -66,7 +67,7 @@ def _of_own(spec: TaskSpec, me: NodeId, others: Mapping[NodeId, Profile | None])
     names = [name for name in spec.candidates if name != me]
     living = {name: others[name] for name in names if name in others}
     states = {name: _state(spec, one) for name, one in living.items() if one is None or not one.draining}
-    if not names or any(_is_ready(spec, state) for state in states.values()):
+    if not names or any(may_get(spec, state) for state in states.values()):
         return Sparing.FREE, ""
     awaited = sorted(name for name, state in states.items() if _will_be_ready(spec, state))
     if awaited:
@@ -87,14 +88,6 @@ def _of_other(owner: NodeId, others: Mapping[NodeId, Profile | None]) -> tuple[S
 def _state(spec: TaskSpec, profile: Profile | None) -> WorkerState | None:
     load = None if profile is None else profile.worker(spec.name)
     return None if load is None else load.state
-
-
-def _is_ready(spec: TaskSpec, state: WorkerState | None) -> bool:
-    """Whether SCHEDULER could give the task to such a worker (`zsched.core.scheduler.scoring`)."""
-    if state is None:
-        return not spec.worker.command
-    is_cold = bool(spec.worker.command) and spec.worker.standby is Standby.COLD
-    return state is WorkerState.READY or (is_cold and state is not WorkerState.FAILED)
 
 
 def _will_be_ready(spec: TaskSpec, state: WorkerState | None) -> bool:

@@ -223,6 +223,17 @@ def is_out(spec: TaskSpec, profile: Profile) -> bool:
     return profile.draining or (load is not None and load.state is WorkerState.FAILED)
 
 
+def may_get(spec: TaskSpec, state: WorkerState | None) -> bool:
+    """Whether a node that is not the owner may get the task by its worker there; ``None``: no worker is known.
+
+    What somebody else starts is there or is not, cold or warm.
+    """
+    if state is None:
+        return not spec.worker.command
+    starts_then = bool(spec.worker.command) and spec.worker.standby is Standby.COLD
+    return state is WorkerState.READY or (starts_then and state is not WorkerState.FAILED)
+
+
 def _refusal(spec: TaskSpec, allocation: Allocation, profile: Profile, demand: Demand, unseen: Demand) -> str:
     """Why the node may not have the task; empty when it may."""
     if profile.draining:
@@ -235,9 +246,7 @@ def _refusal(spec: TaskSpec, allocation: Allocation, profile: Profile, demand: D
     if state is WorkerState.FAILED:
         return f"worker failed{why}"
     is_owner = profile.node == allocation.owner
-    # what somebody else starts is there or is not, cold or warm
-    is_awaited = spec.worker.standby is Standby.WARM or not spec.worker.command
-    if is_awaited and not is_owner and state not in (None, WorkerState.READY):
+    if not is_owner and not may_get(spec, state):
         return f"worker {state}{why}"
     used = _memory_use(profile, spec, demand, unseen)
     if used is not None and used > profile.memory_mb:
