@@ -60,7 +60,7 @@ from zsched.runtime.access_rules import Side, common_names_of, names_of
 from zsched.runtime.adoption import Adoption
 from zsched.runtime.descriptors import take_descriptors
 from zsched.runtime.endpoints import DATA_PORT, Endpoints, claim_port, endpoints_for, free_port, is_here
-from zsched.runtime.leaving import ANEW_S, HAND_OVER_S, Leaving
+from zsched.runtime.leaving import Leaving
 from zsched.runtime.library import Library
 from zsched.runtime.membership import copied_file
 from zsched.runtime.memory import shared_memory_objection
@@ -468,7 +468,7 @@ class Daemon:
             if isinstance(event, ev.TokenLost):
                 alert_until = now + ALERT_S
             if isinstance(event, ev.StopRequested):
-                is_first = leaving.ask(node.owned(), now, hand_over_s=ANEW_S if self.begins_anew else HAND_OVER_S)
+                is_first = leaving.ask(node.owned(), now, begins_anew=self.begins_anew)
                 if is_first and not self.begins_anew:
                     self._notify.stopping()
             if self._may_begin_again and leaving.asked_at is None:

@@ -34,15 +34,15 @@ class Leaving:
     asked_at: float | None = None
     _moved_at: float | None = None
     _is_hurried: bool = False
-    _hand_over_s: float = HAND_OVER_S
+    _begins_anew: bool = False
 
-    def ask(self, owned: Collection[TaskId], now: float, *, hand_over_s: float = HAND_OVER_S) -> bool:
+    def ask(self, owned: Collection[TaskId], now: float, *, begins_anew: bool = False) -> bool:
         """Somebody asks to stop; whether that is the first time. The second time means: at once.
 
-        ``hand_over_s``: how long tasks that another node could take are waited for.
+        ``begins_anew``: the process goes on, so a move and its worker have more time.
         """
         if self.asked_at is None:
-            self.asked_at, self._hand_over_s = now, hand_over_s
+            self.asked_at, self._begins_anew = now, begins_anew
             if not owned:
                 self._is_hurried = True  # nothing is to be handed over
             return True
@@ -66,9 +66,10 @@ class Leaving:
             return True
         if not owned:
             self._moved_at = now if self._moved_at is None else self._moved_at
-            return now >= self._moved_at + (FINISH_S if finishing and self._hand_over_s == ANEW_S else LEAVE_S)
+            return now >= self._moved_at + (FINISH_S if finishing and self._begins_anew else LEAVE_S)
         self._moved_at = None
-        return now >= self.asked_at + (self._hand_over_s if movable else NOBODY_S)
+        hand_over_s = ANEW_S if self._begins_anew else HAND_OVER_S
+        return now >= self.asked_at + (hand_over_s if movable else NOBODY_S)
 
     def last_words(self, owned: Collection[TaskId], now: float) -> str:
         """What is left behind, for the log; empty: nothing."""

@@ -44,21 +44,21 @@ def test_tasks_that_another_could_take_are_waited_for_longer_than_those_that_nob
 
 def test_a_daemon_that_begins_anew_waits_longer_for_the_move() -> None:
     leaving = Leaving()
-    leaving.ask(OWNED, 100.0, hand_over_s=ANEW_S)
+    leaving.ask(OWNED, 100.0, begins_anew=True)
     assert not leaving.is_over(OWNED, OWNED, 100.0 + ANEW_S - 0.01)
     assert leaving.is_over(OWNED, OWNED, 100.0 + ANEW_S)
     assert leaving.is_over(OWNED, (), 100.0 + NOBODY_S), "nobody can take them"
 
 
 def test_a_daemon_that_begins_anew_lets_its_worker_finish() -> None:
-    for hand_over_s, wait_s in ((ANEW_S, FINISH_S), (HAND_OVER_S, LEAVE_S)):
+    for begins_anew, wait_s in ((True, FINISH_S), (False, LEAVE_S)):
         leaving = Leaving()
-        leaving.ask(OWNED, 100.0, hand_over_s=hand_over_s)
+        leaving.ask(OWNED, 100.0, begins_anew=begins_anew)
         assert not leaving.is_over((), (), 101.0, finishing=OWNED)
         assert not leaving.is_over((), (), 100.99 + wait_s, finishing=OWNED)
         assert leaving.is_over((), (), 101.0 + wait_s, finishing=OWNED)
     leaving = Leaving()
-    leaving.ask(OWNED, 100.0, hand_over_s=ANEW_S)
+    leaving.ask(OWNED, 100.0, begins_anew=True)
     assert not leaving.is_over((), (), 101.0, finishing=OWNED)
     assert leaving.is_over((), (), 101.0 + LEAVE_S), "it has finished"
 
