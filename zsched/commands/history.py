@@ -225,7 +225,7 @@ def _move_line(move: Json) -> str:
     switched += "" if move["gap_s"] is None else f", no answer for {millis(move['gap_s'])}"
     where = f"{move['from'] or 'nobody'} -> {move['to'] or 'nobody'}"
     if move["from"] is None and move["reason"].startswith("known from"):
-        where = f"{move['to']}"  # this daemon has begun anew; the task went on where it was
+        where = move["to"]  # this daemon has begun anew; the task went on where it was
     head = f"{span(move['age_s']):>6} ago  {move['at']}  {move['task']} epoch {move['epoch']}  {where}"
     return f"{head}: {move['reason']}{f' ({votes})' if votes else ''}{switched}\n"
 

@@ -38,10 +38,13 @@ def replay(file: Path, *, is_json: bool) -> int:
     done = 0
     torn: list[int] = []
     for number, line in enumerate(lines, 1):
-        if is_torn(line):
+        try:
+            decision, written = _decision(line)
+        except (ValueError, AttributeError, TypeError, KeyError, WireError) as error:
+            if not is_torn(line):
+                raise CliError(EXIT_USAGE, f"{file}:{number}: no line of a decision log ({error})") from error
             torn.append(number)
             continue
-        decision, written = _decision(file, number, line)
         if decision is None:
             continue
         again = json.loads(json.dumps(as_plain(verdict_of(decide_again(decision.figures).judgement))))
@@ -66,14 +69,10 @@ def replay(file: Path, *, is_json: bool) -> int:
     return EXIT_OK
 
 
-def _decision(file: Path, number: int, line: bytes) -> tuple[Decision | None, object]:
+def _decision(line: bytes) -> tuple[Decision | None, object]:
     """(a line's judgement, its verdict as it is written); ``None`` for a line without one."""
-    try:
-        entry = json.loads(line)
-        body = entry.get("decision")
-        return (None, None) if body is None else (from_plain(body, Decision), body["verdict"])
-    except (ValueError, AttributeError, TypeError, KeyError, WireError) as error:
-        raise CliError(EXIT_USAGE, f"{file}:{number}: no line of a decision log ({error})") from error
+    body = json.loads(line).get("decision")
+    return (None, None) if body is None else (from_plain(body, Decision), body["verdict"])
 
 
 def _told(verdict: object) -> str:
