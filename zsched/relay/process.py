@@ -44,7 +44,7 @@ from zsched.relay.task import TaskRelay
 from zsched.relay.tokens import Tokens
 from zsched.relay.troubles import Troubles
 from zsched.sessions.config import lease_s
-from zsched.sessions.link_sockets import hold_back_silent
+from zsched.sessions.link_sockets import opened
 from zsched.sessions.problems import why_not_open
 from zsched.sessions.relink import Introducer
 from zsched.wire import codec as wire
@@ -210,7 +210,7 @@ class RelayProcess:
             self._tokens.leave()
             self._close_data()
             left_at = awake_s()
-            self._session = session = _opened(config)
+            self._session = session = _opened_in_time(config)
             lease = lease_s(config)
             self._introducer = None if self._introducer is None else Introducer(config)
             self._own_ids = frozenset({str(one.zid()) for one in (session, self._local) if one is not None})
@@ -386,7 +386,7 @@ def _standbys_of(task: TaskId) -> str:
     return f"{task}@standbys"
 
 
-def _opened(config: str) -> zenoh.Session:
+def _opened_in_time(config: str) -> zenoh.Session:
     """A session; its port may be free a moment later only.
 
     Raises:
@@ -395,14 +395,11 @@ def _opened(config: str) -> zenoh.Session:
     until = awake_s() + END_S
     while True:
         try:
-            session = zenoh.open(zenoh.Config.from_json5(config))
+            return opened(config)
         except zenoh.ZError:
             if awake_s() >= until:
                 raise
             time.sleep(RETRY_S)
-        else:
-            hold_back_silent()
-            return session
 
 
 def run(
@@ -426,8 +423,7 @@ def run(
         return 0
     config = text.decode()
     try:
-        session = zenoh.open(zenoh.Config.from_json5(config))
-        hold_back_silent()
+        session = opened(config)
     except (zenoh.ZError, ValueError) as error:
         problem = f"its data session {why_not_open(config, error)}"
         reporter.report(ProblemReported(source=SOURCE, problem=problem))

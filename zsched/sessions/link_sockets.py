@@ -105,6 +105,17 @@ class LinkSockets:
                     self._known[ends] = int(path.name)
 
 
+def opened(config: str) -> Session:
+    """A session of this configuration (JSON5); whoever dials it and says nothing waits in the kernel.
+
+    Raises:
+        zenoh.ZError, ValueError: it cannot be opened.
+    """
+    session = zenoh.open(zenoh.Config.from_json5(config))
+    hold_back_silent()
+    return session
+
+
 def hold_back_silent() -> int:
     """Let the kernel keep connections that say nothing from this process's sessions; how many listeners do so.
 

@@ -60,7 +60,7 @@ from zsched.core.values.rehearsal import ReadRehearsals, RehearsalsTold
 from zsched.core.values.snapshot import Snapshot
 from zsched.errors import AdapterError, WireError
 from zsched.guard import guarded, tolerant
-from zsched.sessions.link_sockets import LinkSockets, hold_back_silent
+from zsched.sessions.link_sockets import LinkSockets, opened
 from zsched.sessions.problems import why_not_open
 from zsched.sessions.relink import Introducer
 from zsched.wire import codec as wire
@@ -183,10 +183,9 @@ class ControlBus:
         """
         zenoh.init_log_from_env_or("error")
         try:
-            session = zenoh.open(zenoh.Config.from_json5(self._config))
+            session = opened(self._config)
         except zenoh.ZError as error:
             raise AdapterError(f"the control session {why_not_open(self._config, error)}") from error
-        hold_back_silent()
         self._session, self._sockets = session, LinkSockets(session)
         self._expulsion = None if self._members is None else Expulsion(session, self._fleet)
         keys, node = self._keys, self._node
