@@ -21,50 +21,55 @@ from pathlib import Path
 
 from benchmarks.common import machine
 from benchmarks.idle import memory, read
+from zsched_lab.fleet.loopback import free_endpoint
 from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
-HOST, NODE = "127.0.0.1", "robot1"
+NODE = "robot1"
 START_S = 20.0
+SETTLE_S = 2.0
+"""A page's first answer holds the whole past."""
+Place = tuple[str, int]
 
 
-def cpu_share(pid: int, seconds: float) -> float:
-    """Percent of a core that a process takes over the next ``seconds``."""
-    before, began = sum(read(pid).cpu_ns.values()), time.monotonic()
+def cpu_shares(seconds: float, *pids: int) -> list[float]:
+    """Percent of a core that each process takes over the next ``seconds``."""
+    before, began = [sum(read(pid).cpu_ns.values()) for pid in pids], time.monotonic()
     time.sleep(seconds)
-    return (sum(read(pid).cpu_ns.values()) - before) / 1e7 / (time.monotonic() - began)
+    took_s = time.monotonic() - began
+    return [(sum(read(pid).cpu_ns.values()) - first) / 1e7 / took_s for pid, first in zip(pids, before, strict=True)]
 
 
 @contextmanager
-def web_server(folder: str) -> Iterator[tuple[int, int]]:
-    """(process id, port) of `zsched web`, which listens."""
-    with socket.create_server((HOST, 0)) as free:
-        port = free.getsockname()[1]
-    command = [sys.executable, "-m", "zsched.cli", "web", "--listen", f"{HOST}:{port}"]
+def web_server(folder: str) -> Iterator[tuple[int, Place]]:
+    """(process id, (address, port)) of `zsched web`, which listens."""
+    host, _, port = free_endpoint().removeprefix("tcp/").rpartition(":")
+    place = host, int(port)
+    command = [sys.executable, "-m", "zsched.cli", "web", "--listen", f"{host}:{port}"]
     process = subprocess.Popen([*command, "--runtime-dir", folder, "--node", NODE], stderr=subprocess.DEVNULL)
     try:
         end = time.monotonic() + START_S
-        while not _listens(port):
+        while not _listens(place):
             if time.monotonic() > end:
-                raise TimeoutError(f"zsched web does not listen on {port} after {START_S:g} s")
+                raise TimeoutError(f"zsched web does not listen at {host}:{port} after {START_S:g} s")
             time.sleep(0.1)
-        yield process.pid, port
+        yield process.pid, place
     finally:
         process.terminate()
         process.wait(20)
 
 
-def _listens(port: int) -> bool:
+def _listens(place: Place) -> bool:
     with socket.socket() as probe:
-        return probe.connect_ex((HOST, port)) == 0
+        return probe.connect_ex(place) == 0
 
 
 @contextmanager
-def pages(port: int, count: int) -> Iterator[None]:
+def pages(place: Place, count: int) -> Iterator[None]:
     """So many pages follow the fleet live."""
     with ExitStack() as stack:
-        followed = [stack.enter_context(socket.create_connection((HOST, port), START_S)) for _ in range(count)]
+        followed = [stack.enter_context(socket.create_connection(place, START_S)) for _ in range(count)]
         for one in followed:
-            one.sendall(f"GET /api/live HTTP/1.1\r\nHost: {HOST}:{port}\r\n\r\n".encode())
+            one.sendall(f"GET /api/live HTTP/1.1\r\nHost: {place[0]}:{place[1]}\r\n\r\n".encode())
         readers = [threading.Thread(target=_read, args=(one,)) for one in followed]
         for reader in readers:
             reader.start()
@@ -101,18 +106,14 @@ def main() -> None:
         bed.wait_settled()
         for _ in range(given.rounds):
             for name, count in states.items():
-                with ExitStack() as stack:
-                    pid = bed.pid(NODE)
-                    if count is None:
-                        daemon[name].append(cpu_share(pid, given.seconds))
-                        continue
-                    web, port = stack.enter_context(web_server(folder))
-                    stack.enter_context(pages(port, count))
-                    time.sleep(2.0)  # the first answer holds the whole past
-                    began = sum(read(web).cpu_ns.values()), time.monotonic()
-                    daemon[name].append(cpu_share(pid, given.seconds))
-                    took = (sum(read(web).cpu_ns.values()) - began[0]) / 1e7
-                    server[name].append(took / (time.monotonic() - began[1]))
+                if count is None:
+                    daemon[name] += cpu_shares(given.seconds, bed.pid(NODE))
+                    continue
+                with web_server(folder) as (web, place), pages(place, count):
+                    time.sleep(SETTLE_S)
+                    shares = cpu_shares(given.seconds, bed.pid(NODE), web)
+                    daemon[name].append(shares[0])
+                    server[name].append(shares[1])
                     pss[name].append(memory(web)[0])
     print(f"| state (n = {given.rounds}) | daemon, % of a core | `zsched web`, % of a core | its PSS, MiB |")
     print("| --- | ---: | ---: | ---: |")
