@@ -52,6 +52,7 @@ from zsched.core.vote.retuning import Retuning
 from zsched.core.vote.votes import Votes
 
 HISTORY = 32
+"""Past values of a task that status can show."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

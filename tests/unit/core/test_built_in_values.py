@@ -1,4 +1,7 @@
-"""docs/design/built-in-values.md tells every number that the core goes by, and tells it as it is."""
+"""docs/design/built-in-values.md tells every number that the core goes by, and tells it as it is.
+
+Run as a program, this file writes that page's table anew.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +11,22 @@ import re
 from pathlib import Path
 
 ROOT = Path(__file__).parents[3]
-ROW = re.compile(r"^\| `(\w+)` \| ([^|]+) \| `([\w/]+)\.py` \| (.+) \|$", re.MULTILINE)
+PAGE = ROOT / "docs" / "design" / "built-in-values.md"
+ROW = re.compile(r"^\| `([\w/]+)\.py` \| (.+) \|$", re.MULTILINE)
+VALUE = re.compile(r"`(\w+)` (\S+?)(?:, |$)")
 
 
 def told() -> dict[tuple[str, str], str]:
     """{(module, name): value} of the table."""
-    text = (ROOT / "docs" / "design" / "built-in-values.md").read_text(encoding="utf-8")
-    return {(module, name): value for name, value, module, _ in ROW.findall(text)}
+    rows = ROW.findall(PAGE.read_text(encoding="utf-8"))
+    return {(module, name): value for module, values in rows for name, value in VALUE.findall(values)}
+
+
+def table() -> str:
+    rows: dict[str, list[str]] = {}
+    for (module, name), value in built_in().items():
+        rows.setdefault(module, []).append(f"`{name}` {value}")
+    return "\n".join(f"| `{module}.py` | {', '.join(values)} |" for module, values in sorted(rows.items()))
 
 
 def built_in() -> dict[tuple[str, str], str]:
@@ -49,3 +61,8 @@ def assigned(source: str) -> list[str]:
 def test_the_table_tells_every_value_as_the_code_has_it() -> None:
     assert told() == built_in()
     assert len(told()) > 50
+
+
+if __name__ == "__main__":
+    head = PAGE.read_text(encoding="utf-8").partition("| --- | --- |\n")
+    PAGE.write_text(f"{head[0]}{head[1]}{table()}\n", encoding="utf-8")

@@ -23,7 +23,7 @@ from zsched.core.values.model import NodeId
 FETCH_EVERY_S = 3.0
 """A document that no peer has sent is asked for again after this time."""
 RECENT = 3
-"""So many documents that were stored last are known beside those that the node's state names."""
+"""Documents stored last that a node knows beside those that its state names."""
 MAX_WANTED = 4
 """A peer's word must not fill the memory: of more wanted documents the oldest are forgotten."""
 

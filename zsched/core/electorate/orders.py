@@ -22,7 +22,7 @@ from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import ChangeFleet, CommandOutcome, CommandResult
 
 MAX_OPEN = 16
-"""So many commands may wait for their documents; of more the oldest ends, and its operator hears so."""
+"""Operators' commands that may wait for their documents; of more the oldest ends, and its operator is answered so."""
 
 _ENDED = {
     RoundOutcome.CONFLICT: (CommandOutcome.CONFLICT, "another change came first; look and try again"),

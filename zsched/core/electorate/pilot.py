@@ -37,7 +37,7 @@ from zsched.core.values.quorum import majority
 TARGET = 5
 """How many electors a fleet has at most by itself."""
 STEADY = 4.0
-"""A candidate has been heard without a break for so many times the silence after which an elector is gone."""
+"""A node that becomes an elector has been heard without a break for this many times `replace_s`."""
 PAUSE_SHARE = 0.5
 """A node that has not looked for this share of the silence has paused itself: it listens anew."""
 

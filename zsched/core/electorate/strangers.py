@@ -17,11 +17,11 @@ from zsched.core.values.messages import Learnt
 from zsched.core.values.model import Beat, NodeId
 
 SHOWN_S = 10.0
-"""A stranger that was not heard for so long is not shown any more."""
+"""A node of another generation that was not heard for this long is not shown any more."""
 ASK_S = 5.0
 """A stranger is asked at most this often who has recovered its generation."""
 KEPT = 16
-"""Of so many generations it is remembered who has recovered them; a stranger may invent any number."""
+"""Generations whose recovering node is remembered: a stranger may invent any number."""
 
 _told_of_file = lru_cache(maxsize=8)(lambda fleet, generation: founded_id(fleet, generation)[:TOLD_DIGITS])
 

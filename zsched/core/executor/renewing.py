@@ -30,9 +30,9 @@ from zsched.core.values.fleet import Standby, TaskSpec
 from zsched.core.values.model import Allocation, NodeId, Profile, Renewal, TaskId, WorkerState
 
 SAME_FILE_S = 1.0
-"""Another candidate has beaten by the same file for so long: by then its profile tells of its own worker..."""
+"""A candidate has beaten by the same fleet file for this long: its profile tells of its own worker."""
 OTHER_FILE_S = 30.0
-"""...and nobody waits longer than this for one that goes by another file."""
+"""A worker that is to start again waits at most this long for candidates with another fleet file."""
 GIVE_AWAY_S = 30.0
 """An owner that nobody replaces within this time starts its worker again in place."""
 

@@ -27,6 +27,7 @@ from zsched.core.values.messages import Learnt
 from zsched.core.values.model import Allocation, Beat, NodeId, TaskId
 
 ASK_EVERY_S = 0.2
+"""An owner that waits for unleased workers asks their nodes at most this often."""
 
 
 @dataclass(slots=True)

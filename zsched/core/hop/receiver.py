@@ -26,9 +26,10 @@ SourceName = tuple[str, str, int]
 """(key, session id, entity id) of a publisher as zenoh names it."""
 
 GIVE_UP_S: Final = 1.0
+"""Missing numbers are lost after this wait, and the stream goes on."""
 MAX_MISSING: Final = 256
 MAX_AHEAD: Final = 1 << 30
-"""No source is so far ahead: at 1 kHz that is a cut of twelve days. Of what is further nobody knows which way it is."""
+"""A number further ahead could also lie behind. At 1 kHz this is a cut of twelve days."""
 RETURN: Final = 3
 """So many numbers in a row take a jump back that nothing has followed; so many start markers what one has said."""
 MAX_SOURCES: Final = 8192
@@ -38,7 +39,7 @@ MAX_REPLAYED: Final = 1 << 13
 
 
 STEP_S: Final = 0.25
-"""Who did not look for longer did not run."""
+"""A longer pause between two looks means that the process stood still; it does not count as waiting."""
 
 
 class RunningTime:

@@ -27,7 +27,7 @@ GREET_S: Final = 0.2
 MAX_GREET_S: Final = 1.0
 """An unanswered start marker is put again after this time, and then after twice as long each time; bounds of that."""
 MAX_RESEND_S: Final = 10.0
-"""What is not acknowledged is put again after so long without progress at the latest."""
+"""The longest wait before unacknowledged samples are put again."""
 
 
 class Sums(NamedTuple):

@@ -12,7 +12,9 @@ from __future__ import annotations
 from typing import Final
 
 BITS: Final = 32
+"""Width of zenoh's source numbers."""
 SPAN: Final = 1 << BITS
+"""Source numbers start again after this many."""
 _MASK: Final = SPAN - 1
 _HALF: Final = SPAN >> 1
 

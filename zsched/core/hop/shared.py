@@ -22,7 +22,7 @@ from zsched.core.hop.sender import near
 from zsched.core.relay_protocol import EndMarker, StreamAck
 
 SHARED_BYTES: Final = 32 << 20
-"""So much one publisher keeps, besides the newest sample."""
+"""One publisher keeps at most this much beside the newest sample."""
 MAX_PAUSE_S: Final = 2.0
 """A receiver without progress is sent what it lacks after `RESEND_S`, then after twice as long, at most after this."""
 ASKED_S: Final = 0.1
@@ -37,11 +37,11 @@ STALLED_S: Final = 1.0
 """A receiver that lacks something and has not come further for this time is stalled: nothing waits for it."""
 BATCH: Final = 512
 BATCH_BYTES: Final = 4 << 20
-"""So much is put again at one time; progress brings the next."""
+"""At most this much is put again at one time; progress brings the next."""
 LOOK_S: Final = 0.1
 """A receiver that is expected and has said nothing for this time: it is looked whether it subscribes at all."""
 TICK_S: Final = 0.1
-"""While there is something to do it is looked at so often: a way to a receiver does not say when it comes to match."""
+"""A worker looks after kept answers this often: a way to a receiver does not say when it comes to match."""
 
 
 class Wanted(NamedTuple):

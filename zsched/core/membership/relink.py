@@ -15,9 +15,9 @@ LINK_WAIT_S = 1.0
 """A link has this long to come back by itself: zenoh redials known addresses within a second."""
 FIRST_PAUSE_S, MAX_PAUSE_S = 2.0, 60.0
 MUTE_S = 5.0
-"""A link to a node that has been gone for so long, and that is still up, is mute."""
+"""The link to a node that has been gone for this long is ended, if it is still up: it is mute."""
 MUTE_PAUSE_S = 15.0
-"""Longest pause between two ends of the links to one node: so long it may stay deaf once it is well again."""
+"""Longest pause between two ends of the links to one node: it may stay deaf for this long once it is well again."""
 
 
 class Introductions:

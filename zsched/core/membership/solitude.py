@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from zsched.core.values.fleet import Timing
 
 ALONE_S = 3.0
-"""A node that hears nobody for so long after its start says so; zenoh dials an address at least once a second."""
+"""A node that hears nobody for this long after its start says so; zenoh dials an address at least once a second."""
 TRY_PAUSE_S = 30.0
 """Its addresses are tried no more often."""
 ADDRESSES_SHOWN = 8

@@ -50,8 +50,11 @@ JOB_CHANGE = 0.2
 GAUGE_SMOOTHING_S = 2.0
 """Least time constant of a gauge: a GPU's use jumps between 0 and 1 with every job."""
 RSSI_CHANGE_DB = 1.0
+"""This change of a signal sends a profile at once."""
 RSSI_IMPOSSIBLE_ABOVE_DBM = -10.0
+"""A higher reading is dropped."""
 RSSI_IMPOSSIBLE_BELOW_DBM = -100.0
+"""A lower reading is dropped."""
 RSSI_OUTLIER_DB = 25.0
 SIGNAL_SMOOTHING_S = 0.5
 """Least time constant of a signal: readings scatter by 2.5 to 2.9 dB, and trends are taken from them."""

@@ -31,7 +31,7 @@ from zsched.core.values.model import NodeId
 from zsched.core.values.rehearsal import Promised, Step
 
 COUNTED_S: Final = 2.2
-"""So long after the end of a step its counters have come: relays count once a second."""
+"""A rehearsal waits this long for counters after a step; relays count once a second."""
 MIN_CALM_S: Final = 11.0
 """A shorter calm would take the gap of one step for the usual one of the next (`zsched.core.route.gaps`)."""
 PLANNED: Final = (Step.MOVE, Step.DRAIN)

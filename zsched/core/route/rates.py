@@ -13,9 +13,9 @@ from typing import Final
 from zsched.core.values.plan import StreamCount
 
 WINDOW_S: Final = 5.0
-"""A rate is the mean over about so many seconds. The relay tells its totals once a second."""
+"""A rate is the mean over about this time; the relay tells totals once a second."""
 STALE_S: Final = 5.0
-"""Without new totals for so long nobody knows a rate."""
+"""Without new totals for this time a rate is not known."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

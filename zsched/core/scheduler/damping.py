@@ -21,11 +21,14 @@ from zsched.core.values.decision import DampingMemory
 from zsched.core.values.model import NodeId
 
 STEP = 0.03
+"""Penalty for the first point."""
 MAX_PENALTY = 0.35
+"""No node loses more."""
 HALF_LIFE_S = 60.0
 EARLY_FAILURE_S = 30.0
-"""A node that fails so soon after it got the task pays more for it."""
+"""An owner that fails this soon pays more for it."""
 FORGET_BELOW = 0.05
+"""Fewer points are none."""
 WINDOW_S = 60.0
 ESCAPES_PER_MINUTE = 60
 """Even fleeing is bounded: one escape a second, on average."""

@@ -18,9 +18,9 @@ from zsched.core.values.document import Flag, FlagKind
 from zsched.core.values.model import NodeId
 
 SPREAD_S = 0.5
-"""So much later than the node before it in the fleet file a node proposes the end: usually one proposal is enough."""
+"""A node proposes the end this much later than the node before it in the fleet file: usually one proposal is enough."""
 AGAIN_S = 5.0
-"""An end that was not agreed is proposed again after so long."""
+"""The end of a flag that was not agreed is proposed again after this time."""
 
 HANDS_OVER = (FlagKind.DRAIN, FlagKind.LEAVE)
 """A node with one of these hands over what it owns."""

@@ -34,9 +34,9 @@ from zsched.core.values.model import (
 )
 
 INITIAL_SETTLE_S = 3.0
-"""A task that nobody owns yet waits so long for candidates that are still starting."""
+"""A task without an owner waits this long for candidates that still start."""
 UNSCORED_S = 2.0
-"""An owner that cannot be scored is left after so long: nobody knows what staying costs there."""
+"""An owner that cannot be scored is left after this time: nobody knows the cost of staying there."""
 
 
 class Outcome(StrEnum):

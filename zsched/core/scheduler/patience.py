@@ -32,7 +32,7 @@ MOVE_PRICE_S = 0.3
 SEEN_LATE_S = 1.0
 """A lead is seen so late, and so long after its end: a move earns less than the figures say, by the lead times it."""
 MEMORY_S = 600.0
-"""What was paid counts 1/e after so long."""
+"""A payment counts 1/e after this time."""
 FORGIVEN_IN_S = 2.0
 LONGEST_GAP_S = 2.0
 """Nothing is charged for longer than this between two judgements: nobody looked."""

@@ -28,6 +28,7 @@ from zsched.core.values.plan import ReadyWhen
 LEASE_MARGIN_S = 0.5
 """zenoh looks at its leases now and then, and a token's end has a way to go."""
 LIMIT_S = 10.0
+"""This long after its return a node is judged like any other."""
 _NONE: Mapping[NodeId, str] = {}
 
 

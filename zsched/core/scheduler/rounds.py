@@ -34,7 +34,7 @@ from zsched.core.values.messages import Utilities
 from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, TaskId, Tuning, UtilityVector
 
 FRESH_MARGIN_S = 0.001
-"""Sums of floats: a profile is certainly fresh until so long before its end."""
+"""For the rounding of sums: a profile is surely fresh until this much before its end."""
 
 
 @dataclass(slots=True)

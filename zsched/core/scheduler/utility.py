@@ -122,7 +122,7 @@ def on_time(job_s: float, deadline_s: float) -> float:
 
 
 NEARLY_FULL = 0.15
-"""So much of the memory's term goes where nothing is left beside the task: enough to leave for, in some seconds."""
+"""This part of the memory's term goes where nothing is left beside the task: enough to leave for, in some seconds."""
 
 
 def memory_service(free: float, demand: float, capacity: float, floor_ratio: float) -> float:

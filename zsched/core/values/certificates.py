@@ -22,6 +22,7 @@ DOMAIN: Final = "zsched.internal"
 MAX_COMMON_NAME: Final = 64
 """Characters (RFC 5280, ub-common-name)."""
 MAX_KEY: Final = 9999
+"""Highest number of a holder's key."""
 _KEY: Final = re.compile(r"k([2-9]|[1-9][0-9]{1,3})")
 
 

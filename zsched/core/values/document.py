@@ -17,7 +17,9 @@ Text = NewType("Text", str)
 MAX_DOCUMENT_BYTES = 192 * 1024
 """Of a document's text in UTF-8: with its flags it fits into one frame."""
 MAX_FLAGS = 64
+"""Flags of a document."""
 MAX_FLAG_S = 366 * 86_400
+"""The longest time of a flag: 366 days."""
 MAX_ROLLOUTS = 64
 MAX_HELD_BYTES = 16 * 1024
 """Of the command and the environment that one rollout keeps, in UTF-8."""

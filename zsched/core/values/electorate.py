@@ -17,9 +17,9 @@ CREATION_STEP = 2**32
 """Revision and epoch of a task that was created as number C start at C times this."""
 MAX_LEASE_S = 3600.0
 TOLD_DIGITS = 16
-"""So many digits of a generation id are told in beats, and are enough to name one."""
+"""Beats have this many digits of a generation id, which are enough to name one."""
 SAID_DIGITS = 8
-"""So many digits of a generation id stand in a sentence."""
+"""A sentence has this many digits of a generation id."""
 _ID = re.compile(r"[0-9a-f]{0,32}")
 
 

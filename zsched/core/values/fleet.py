@@ -44,11 +44,11 @@ DEFAULT_SCORE = ScoreForm.SERVICE
 PAPER_PATIENCE = 0.55
 """Utility seconds, of a task with `ScoreForm.PAPER` whose fleet file gives no patience."""
 RADIO_PATIENCE = 0.3
-"""Likewise, of a task scored by service that weighs the network. All others learn theirs (docs/decisions/0033)."""
+"""Patience of a task scored by service that weighs the network. All others learn theirs (docs/decisions/0033)."""
 DEFAULT_BONUS = 0.05
 """The bonus of a task whose fleet file gives none (docs/decisions/0021)."""
 DEFAULT_COOL_DOWN_S = 2.0
-"""The cool-down, likewise (docs/decisions/0033)."""
+"""The cool-down of a task whose fleet file gives none (docs/decisions/0033)."""
 DEFAULT_FORESEE_S = 3.0
 """How far ahead the signals of a task count when its fleet file does not say."""
 SECONDS = Range(0.01, 3600, "s")

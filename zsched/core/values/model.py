@@ -42,7 +42,7 @@ MAX_REASON = 400
 MAX_ASKER, MAX_ASKED = 96, 200
 """Characters of an operator's name and reason: they travel with every ballot of a task."""
 MAX_FOR_S = 366 * 86400.0
-"""An operator's order lasts at most so long, or until it is taken back."""
+"""An operator's order lasts at most this long, or until it is taken back."""
 
 
 def as_reason(text: str, longest: int = MAX_REASON) -> str:

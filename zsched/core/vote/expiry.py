@@ -17,9 +17,9 @@ from zsched.core.values.change import SetHold
 from zsched.core.values.model import Allocation, TaskId
 
 SPREAD_S = 0.5
-"""So much later than the node before it in the fleet file a node proposes the end: usually one proposal is enough."""
+"""A node proposes the end this much later than the node before it in the fleet file: usually one proposal is enough."""
 AGAIN_S = 5.0
-"""An end that was not agreed is proposed again after so long."""
+"""The end of an order that was not agreed is proposed again after this time."""
 
 
 @dataclass(slots=True)

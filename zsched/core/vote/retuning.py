@@ -20,9 +20,9 @@ from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.model import Allocation, NodeId, TaskId, Tuning
 
 RANK_S = 0.5
-"""The next node in rank tries so much later."""
+"""The next node in rank proposes a changed tuning of the fleet file this much later."""
 AGAIN_S = 5.0
-"""A node whose change found no quorum tries again so much later."""
+"""A changed tuning of the fleet file that found no quorum is proposed again this much later."""
 
 
 @dataclass(slots=True)

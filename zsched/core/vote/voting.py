@@ -21,6 +21,7 @@ from zsched.core.values.quorum import present_voters
 from zsched.core.vote.tally import Tally, VoteOutcome, tally
 
 VOTE_MARGIN_S = 0.1
+"""A vote ends this long after the time for two gathers."""
 
 
 def vote_time(timing: Timing) -> float:
