@@ -6,7 +6,7 @@ Steps (all of them unless some are named), each of which says `ok`, `FAILED` wit
 
     bookworm trixie  the package as it is shipped, in a booted Debian 12 and 13: from the older version REF and back
     jammy            the same in Ubuntu 22.04, whose python3 is too old: with a Python of its own (PYTHON_DIST)
-    relay            an upgrade whose relay has other code, so that the relay is replaced under the stream
+    relay            an upgrade to a relay of other code, which goes on; one to other words, which replaces the relay
     arm              the package for aarch64: what is in it, and its Python under qemu where that is installed
 
 The verdicts about packages are those of tests/system/test_deb.py. Sizes and times are printed; docs/measurements.md
@@ -43,6 +43,8 @@ PROVE_S = 900.0
 E_MACHINE = {"x86_64": 62, "aarch64": 183}
 """Of ELF files, by machine."""
 RELAYS_CODE = "lib/site-packages/zsched/relay/process.py"
+RELAYS_WORDS = "lib/site-packages/zsched/core/values/plan.py"
+OTHER_WORDS = ("    exclusive: bool = False\n", "    exclusive: bool = False\n    urgency: int = 0\n")
 
 
 class SkippedError(Exception):
@@ -114,7 +116,7 @@ def told(package: Path) -> str:
 
 def tried(work: Work, suite: str, old: Path, new: Path) -> None:
     """The life of a package in a booted system: the test's verdict, and what it took."""
-    same = relay_digest(old, work.folder) == relay_digest(new, work.folder)
+    same = relay_words(old, work.folder) == relay_words(new, work.folder)
     report = work.folder / f"report-{suite}-{old.stem[-12:]}.json"
     given = {"suite": suite, "old": str(old), "new": str(new), "same_relay": same, "report": str(report)}
     began = time.monotonic()
@@ -137,7 +139,7 @@ def tried(work: Work, suite: str, old: Path, new: Path) -> None:
 
 def say_report(report: dict[str, Any], *, same: bool, took_s: float) -> None:
     """Figures of a life."""
-    print(f"  the relay's code is {'the same' if same else 'another'}; {took_s:.0f} s in all")
+    print(f"  the relay {'goes on: it is told the same words' if same else 'is replaced'}; {took_s:.0f} s in all")
     print(f"  install {report['install']['seconds']} s")
     for step in ("upgrade", "downgrade"):
         found = report.get(step, {})
@@ -149,17 +151,14 @@ def say_report(report: dict[str, Any], *, same: bool, took_s: float) -> None:
     print(f"  left after the purge: {report.get('left')}")
 
 
-def relay_digest(package: Path, folder: Path) -> str:
-    """Of the code that its relays run, as a daemon works it out."""
-    tree = folder / f"digest-{package.stem}"
-    if not tree.exists():
-        run("dpkg-deb", "-x", str(package), str(tree))
-    return relay_code(tree / "opt/zsched/lib/site-packages")
-
-
-def relay_code(site: Path) -> str:
-    """The digest that a daemon below ``site`` works out."""
-    ask = "from zsched.ipc.takeover import code_digest; print(code_digest())"
+def relay_words(package: Path, folder: Path) -> str:
+    """The digest by which its daemon goes on with a relay. Before 2026-11-25 versions went by the code."""
+    tree = folder / f"digest-{package.parent.name}-{package.stem}"
+    shutil.rmtree(tree, ignore_errors=True)
+    run("dpkg-deb", "-x", str(package), str(tree))
+    site = tree / "opt/zsched/lib/site-packages"
+    word = "ipc.words import words" if (site / "zsched/ipc/words.py").exists() else "ipc.takeover import code"
+    ask = f"from zsched.{word}_digest as digest; print(digest())"
     return run(sys.executable, "-I", "-c", f"import sys; sys.path.insert(0, {str(site)!r}); {ask}").strip()
 
 
@@ -177,14 +176,19 @@ def in_jammy(work: Work) -> None:
 
 
 def other_relay(work: Work) -> None:
-    """The relay is replaced when its own code differs."""
+    """The relay goes on when its code is another one, and is replaced when it is told other words."""
 
-    def change(home: Path) -> None:
+    def code(home: Path) -> None:
         path = home / RELAYS_CODE
         path.write_text(path.read_text() + "\n# Other code.\n")
 
+    def words(home: Path) -> None:
+        path = home / RELAYS_WORDS
+        path.write_text(path.read_text().replace(*OTHER_WORDS, 1))
+
     new = work.new()
-    tried(work, SUITE, another(new, "0.0.2", work.folder, change), new)
+    tried(work, SUITE, another(new, "0.0.2", work.folder, code), new)
+    tried(work, SUITE, another(new, "0.0.3", work.folder, words), new)
 
 
 def own_python(folder: Path) -> Path:

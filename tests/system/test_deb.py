@@ -58,6 +58,12 @@ def furnish(root: Path) -> None:
     machine.furnish(root, HERE / "deb_drive.py", files)
 
 
+def other_relay(home: Path) -> None:
+    """The older version's relay has other code, and is told the same words."""
+    with (home / "lib/site-packages/zsched/relay/process.py").open("a") as file:
+        file.write("# Of the older version.\n")
+
+
 @pytest.fixture(scope="module")
 def given() -> dict[str, Any]:
     """What is to be tried instead of a small package of this tree, if anything."""
@@ -80,7 +86,7 @@ def report(given: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> d
             shutil.copy(given[name], packages / f"{name}.deb")
     else:
         new = built(folder / "built")
-        another(new, OLD, folder).rename(packages / "old.deb")
+        another(new, OLD, folder, other_relay).rename(packages / "old.deb")
         new.rename(packages / "new.deb")
     with machine.overlaid(debian, folder) as root:
         furnish(root)
@@ -122,7 +128,7 @@ def test_another_version_comes_under_a_reliable_stream_that_loses_nothing(
     assert stream["sent"] > 100, found
     assert (stream["doubled"], stream["in_order"]) == (0, True), json.dumps(report, indent=1)
     stays = given.get("same_relay", True)
-    assert found["same_relay"] == stays, "whose code is the same carries the stream on"
+    assert found["same_relay"] == stays, "who is told the same words carries the stream on"
     if stays:
         assert stream["missing"] == [], json.dumps(report, indent=1)
     else:

@@ -5,10 +5,15 @@ Knows: the status of one node. Does not know: what other nodes say.
 
 from __future__ import annotations
 
+from typing import Final
+
 from zsched import __version__
 from zsched.core.scheduler.flags import HANDS_OVER, told_flag
 from zsched.core.values.document import Flag, FlagKind
 from zsched.doctor.model import Json, Result, Scene, failed, joined, passed, skipped, warned
+from zsched.ipc.takeover import code_digest
+
+RENEW_RELAY: Final = "when this robot stands still: sudo systemctl stop zsched && sudo systemctl start zsched"
 
 
 def answers(scene: Scene) -> Result:
@@ -39,12 +44,15 @@ def judged_lag(node: str, status: Json, beat_s: float, suspect_s: float) -> Resu
 
 
 def is_of_this_version(scene: Scene) -> Result:
-    """Whether the daemon is of the version that is installed here."""
+    """Whether the daemon is of the version that is installed here, and its relay of that version's code."""
     running = scene.status["version"]
-    if running == __version__:
-        return passed(f"zsched {running}")
-    told = f"the daemon is zsched {running}, installed is {__version__}"
-    return warned(told, fix="sudo systemctl restart zsched")
+    if running != __version__:
+        told = f"the daemon is zsched {running}, installed is {__version__}"
+        return warned(told, fix="sudo systemctl restart zsched")
+    if scene.relay_code not in ("", code_digest()):
+        told = f"the daemon is zsched {running}; its relay carries the streams on by the code of another version"
+        return warned(told, fix=RENEW_RELAY)
+    return passed(f"zsched {running}")
 
 
 def sees_no_problem(scene: Scene) -> Result:

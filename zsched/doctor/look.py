@@ -28,6 +28,7 @@ from zsched.core.values.model import NodeId
 from zsched.doctor.fleet import differs
 from zsched.doctor.model import Json, Scene
 from zsched.errors import AdapterError, ConfigError, WireError
+from zsched.ipc.takeover import Door
 from zsched.runtime.access_rules import Side
 from zsched.runtime.tls import asker_in, session_text
 from zsched.sessions import config as zenoh_config
@@ -81,6 +82,7 @@ def look(machine: Machine, *, is_fleet: bool) -> Scene:
         text=text,
         revision=revision,
         node=node,
+        relay_code=_relay_code(machine.runtime_folder, node),
         state_folder=machine.state_folder,
         own=own,
         refusal=refusal,
@@ -135,6 +137,12 @@ def _sides(door: Path, node: NodeId) -> Mapping[str, str]:
         return {}
     found: dict[str, str] = answer.get("sides", {})
     return found
+
+
+def _relay_code(folder: Path, node: NodeId) -> str:
+    """Of the relay's note."""
+    note = Door(folder, node).note()
+    return "" if note is None else note.code
 
 
 def _own(door: Path) -> tuple[Json | None, str]:

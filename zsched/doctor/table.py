@@ -42,7 +42,7 @@ CHECKS: Final[tuple[Check, ...]] = (
     Check(name="daemon.answers", asks="Does the daemon run and answer?", run=daemon.answers, needs=Needs.FILE),
     Check(
         name="daemon.version",
-        asks="Is it of the installed version?",
+        asks="Are it and its relay of the installed version?",
         run=daemon.is_of_this_version,
         needs=Needs.STATUS,
     ),

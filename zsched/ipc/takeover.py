@@ -19,7 +19,7 @@ import select
 import socket
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from hashlib import blake2s
 from importlib.util import find_spec
 from pathlib import Path
@@ -55,7 +55,8 @@ THE_RELAYS: Final = (
 )
 """What a relay may load, of this package: a test holds it to the imports."""
 PROTOCOL: Final = 1
-"""Raised whenever an older relay would misunderstand a newer daemon."""
+"""Raised whenever a relay and a daemon of other code would misunderstand each other: by the same words
+(`zsched.ipc.words`), or by the configurations that go before them."""
 GREETING_S: Final = 1.0
 """A relay that does not answer for this long is no relay to go on with."""
 _ANSWERS: Final[tuple[type[Any], ...]] = (RelayHere, RelayRefused)
@@ -70,6 +71,8 @@ class Note:
 
     pid: int
     listen: str
+    code: str = ""
+    """The digest of the code that it runs (`code_digest`); empty: not known."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -134,7 +137,7 @@ class Door:
     def sign(self, claim: Claim, note: Note) -> None:
         """Write down which relay has taken the claim."""
         os.ftruncate(claim.lock, 0)
-        os.pwrite(claim.lock, json.dumps({"pid": note.pid, "listen": note.listen}).encode(), 0)
+        os.pwrite(claim.lock, json.dumps(asdict(note)).encode(), 0)
 
     def connect(
         self, hello: RelayHello, goes_on: Callable[[float, float], bool] = lambda _asked_s, _took_s: False
@@ -195,7 +198,10 @@ def code_files() -> list[Path]:
 
 @functools.cache
 def code_digest() -> str:
-    """16 hex digits over the code that relays run: what they may load of this package, and which zenoh library."""
+    """16 hex digits over the code that relays run: what they may load of this package, and which zenoh library.
+
+    It replaces no relay: it says whether the one that runs is of the code that is installed.
+    """
     state = blake2s(digest_size=8)
     for path in code_files():
         state.update(f"{path.relative_to(PACKAGE)} {path.stat().st_size}\n".encode() + path.read_bytes())
@@ -234,6 +240,6 @@ def user_of(link: socket.socket) -> int:
 def _read_note(text: bytes) -> Note | None:
     try:
         found = json.loads(text)
-        return Note(pid=int(found["pid"]), listen=str(found["listen"]))
+        return Note(pid=int(found["pid"]), listen=str(found["listen"]), code=str(found.get("code", "")))
     except (ValueError, KeyError, TypeError):
         return Note(pid=0, listen="")  # it has only just been started

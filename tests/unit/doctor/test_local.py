@@ -25,6 +25,7 @@ from zsched.doctor import machine, state
 from zsched.doctor.look import Machine, look
 from zsched.doctor.model import Check, Scene, Verdict
 from zsched.doctor.table import CHECKS, run_all
+from zsched.ipc.takeover import code_digest
 from zsched.wire.codec import as_plain, document_hash
 
 FAIL, WARN, PASS, SKIP = Verdict.FAIL, Verdict.WARN, Verdict.PASS, Verdict.SKIP
@@ -238,6 +239,14 @@ def test_a_daemon_of_another_version_is_found(tmp_path: Path) -> None:
     scene = scene_of(tmp_path)
     assert run("daemon.version", scene).verdict is PASS
     assert_finds(run("daemon.version", answer(scene, version="0.0.9")), WARN, "0.0.9")
+
+
+def test_a_relay_of_another_versions_code_is_found(tmp_path: Path) -> None:
+    scene = scene_of(tmp_path)
+    assert run("daemon.version", replace(scene, relay_code=code_digest())).verdict is PASS
+    assert_finds(
+        run("daemon.version", replace(scene, relay_code="0123456789abcdef")), WARN, "by the code of another version"
+    )
 
 
 def test_a_decision_loop_that_lags_is_found(tmp_path: Path) -> None:

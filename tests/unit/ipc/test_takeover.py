@@ -40,15 +40,15 @@ def loaded_by(*modules: str) -> set[Path]:
 
 
 def test_the_digest_covers_all_that_a_relay_may_load() -> None:
-    """A relay of other code is replaced."""
+    """By it an operator learns that the relay runs other code than what is installed."""
     needed = loaded_by("zsched.relay.__main__", "zsched.relay.process")
     assert len(needed) > 60
     assert needed - set(code_files()) - {PACKAGE / "_version.py"} == set()
     assert len(code_digest()) == 16
 
 
-def test_a_relay_goes_on_where_only_other_code_is_newer() -> None:
-    """An upgrade of the daemon, the command line or the version alone leaves the streams as they are."""
+def test_a_relay_has_the_installed_code_where_only_other_code_is_newer() -> None:
+    """An upgrade of the daemon, the command line or the version alone is nothing to it."""
     names = {str(path.relative_to(PACKAGE)) for path in code_files()}
     others = ("tasks/", "examples/", "dev/", "commands/", "daemon.py", "cli.py", "runtime/", "config/", "_version.py")
     assert not {name for name in names if name.startswith(others)}

@@ -101,8 +101,8 @@ class RelayChild:
                 os.kill(self.pid, number)
 
 
-def start_relay(command: list[str], door: Door | None = None, listen: str = "") -> RelayChild:
-    """Start a relay; with ``door`` it can be found again there, and its session listens on ``listen``.
+def start_relay(command: list[str], door: Door | None = None, listen: str = "", code: str = "") -> RelayChild:
+    """Start a relay; with ``door`` it can be found again there: its session listens on ``listen``, its code is ``code``.
 
     Raises:
         AdapterError: the door is another relay's, or its folder cannot be used.
@@ -117,7 +117,7 @@ def start_relay(command: list[str], door: Door | None = None, listen: str = "") 
             stack.callback(claim.close)
         pid = _spawn(command, theirs, claim)
         if claim is not None and door is not None:
-            door.sign(claim, Note(pid=pid, listen=listen))
+            door.sign(claim, Note(pid=pid, listen=listen, code=code))
         ours = ours.dup()  # the stack closes the other one
     return RelayChild(pid=pid, link=ours, door=door, is_child=True)
 

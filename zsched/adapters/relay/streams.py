@@ -31,6 +31,7 @@ from zsched.guard import guarded
 from zsched.ipc.pipe import REPORTS, read_frame, write_frame
 from zsched.ipc.protocol import RelayHello, RelayPulse
 from zsched.ipc.takeover import GREETING_S, Door, code_digest, digest_of
+from zsched.ipc.words import words_digest
 from zsched.wire import codec as wire
 
 BACKOFF_MIN_S: Final = 0.1
@@ -97,7 +98,7 @@ class Bequest:
     incarnation: int
     """This daemon's; only a later one may take the relay over."""
     digest: str
-    """Over everything beside sessions and code that a running relay must agree with (`digest_of`)."""
+    """Over everything beside sessions and words that a running relay must agree with (`digest_of`)."""
     listen: str = ""
     """Where the data session listens, for the next daemon."""
     certificate: str = ""
@@ -139,7 +140,7 @@ class RelayHandle:
         self._command += ["--threads", str(threads + spare), "--parent", str(os.getpid())]
         self._command += ["--local"] if local_config else []
         if bequest is not None:
-            digest = digest_of(bequest.digest, code_digest(), python, local_config)
+            digest = digest_of(bequest.digest, words_digest(), python, local_config)
             session = digest_of(zenoh_config, bequest.certificate)
             self._hello = RelayHello(
                 fleet=fleet,
@@ -256,6 +257,11 @@ class RelayHandle:
         link, here = found
         self._reopens = here.reopens
         how = ", and opens its data session anew" if here.reopens else ""
+        how += (
+            ""
+            if note.code == code_digest()
+            else "; its code stays that of another version until the service is stopped"
+        )
         _log.info("the relay that runs here (pid %d) is taken over%s", here.pid, how)
         return RelayChild(pid=here.pid, link=link, door=bequest.door)
 
@@ -297,7 +303,7 @@ class RelayHandle:
     def _start(self) -> RelayChild:
         if self._bequest is None:
             return start_relay(self._command)
-        return start_relay(self._command, self._bequest.door, self._bequest.listen)
+        return start_relay(self._command, self._bequest.door, self._bequest.listen, code_digest())
 
     def _write(self, relay: RelayChild, outbox: _Outbox) -> None:
         try:

@@ -20,11 +20,13 @@ import zsched
 from support.waiting import until
 from zsched.adapters.relay import silence as relay_silence
 from zsched.adapters.relay.streams import Bequest, RelayHandle
-from zsched.core.events import RelayChanged
+from zsched.core.events import ProblemReported, RelayChanged, StreamsCounted
 from zsched.core.relay_protocol import HandleReport
+from zsched.core.values.plan import RoutePhase, RoutePlan
 from zsched.ipc.pipe import read_frame, write_frame
 from zsched.ipc.protocol import RelayHello
 from zsched.ipc.takeover import GREETING_S, Door, code_digest, digest_of
+from zsched.ipc.words import words_digest
 from zsched.sessions.config import data_config
 from zsched.wire import codec as wire
 
@@ -153,21 +155,43 @@ def test_a_relay_that_is_not_ours_is_replaced_never_doubled(
         second.handle.stop(2.0)
 
 
-@pytest.mark.parametrize("is_changed", [False, True], ids=["the same code elsewhere", "changed code"])
-def test_code_that_changed_under_one_version_replaces_the_relay(tmp_path: Path, *, is_changed: bool) -> None:
+OTHER_CODE = ("relay/task.py", "", "# a line more\n")
+OTHER_WORDS = (
+    "core/values/plan.py",
+    "    exclusive: bool = False\n",
+    "    exclusive: bool = False\n    urgency: int = 0\n",
+)
+
+
+@pytest.mark.parametrize(
+    ("change", "stays"), [(OTHER_CODE, True), (OTHER_WORDS, False)], ids=["other code", "other words"]
+)
+def test_a_relay_of_another_version_goes_on_while_the_words_are_the_same(
+    tmp_path: Path, change: tuple[str, str, str], *, stays: bool
+) -> None:
+    """And needs nothing of its version, which an upgrade has taken away by then."""
     package = Path(zsched.__file__).parent
     copy = shutil.copytree(package, tmp_path / "code" / "zsched", ignore=shutil.ignore_patterns("__pycache__"))
-    if is_changed:
-        with (copy / "relay" / "inputs.py").open("a") as file:
-            file.write("# a line more\n")
+    name, before, after = change
+    text = (copy / name).read_text()
+    (copy / name).write_text(text.replace(before, after, 1) if before else text + after)
+    assert (copy / name).read_text() != text
     run = tmp_path / "run"
     run.mkdir()
     first = First(run, package=tmp_path / "code")
     try:
+        note = Door(run, "robot1").note()
+        assert note is not None
+        assert note.code != code_digest(), "who asks learns that it runs other code"
         first.crash()
+        shutil.rmtree(tmp_path / "code")
         second = Second(run)
         try:
-            assert (second.handle.pid != first.relay) is is_changed
+            assert (second.handle.pid == first.relay) is stays
+            plan = RoutePlan(task="merge", phase=RoutePhase.CLOSE, current=None)
+            second.handle.apply(plan)
+            until(lambda: any(isinstance(report, StreamsCounted) for report in second.reports), "it counts streams")
+            assert not [one for one in second.reports if isinstance(one, ProblemReported)], second.reports
         finally:
             second.handle.stop(2.0)
     finally:
@@ -230,7 +254,7 @@ def test_a_daemon_that_stops_takes_its_relay_with_it(tmp_path: Path) -> None:
 
 
 def test_a_relay_with_a_daemon_lets_no_other_in(first: First, tmp_path: Path) -> None:
-    digest = digest_of("fleet", code_digest(), sys.executable, "")
+    digest = digest_of("fleet", words_digest(), sys.executable, "")
     hello = RelayHello(fleet="test", node="robot1", incarnation=9, digest=digest, session=digest_of(CONFIG, ""))
     found = Door(tmp_path, "robot1").connect(hello)
     assert isinstance(found, str)
