@@ -3,10 +3,10 @@
 Knows: the listening socket in the runtime folder, who may take this relay over. Does not know: why the daemon went,
 what is carried meanwhile.
 
-A successor is the same user's, of the same fleet and node, was started later (its incarnation is higher), says the same
-words to a relay (`zsched.ipc.words`; its code may be another version's), and has the same Python and the same session on
-the host's own side: anything else makes a new relay necessary. Its data session may be another one where the host has a
-side of its own (docs/decisions/0071).
+A successor is the same user's, of the same fleet and node, was started later (its incarnation is higher), says the
+same words to a relay (`zsched.ipc.words`; its code may be another version's), and has the same Python and the same
+session on the host's own side: anything else makes a new relay necessary. Its data session may be another one where the
+host has a side of its own (docs/decisions/0071).
 """
 
 from __future__ import annotations

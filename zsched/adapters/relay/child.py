@@ -102,7 +102,7 @@ class RelayChild:
 
 
 def start_relay(command: list[str], door: Door | None = None, listen: str = "", code: str = "") -> RelayChild:
-    """Start a relay; with ``door`` it can be found again there: its session listens on ``listen``, its code is ``code``.
+    """Start a relay; with ``door`` it can be found again there, with where its session listens and its code.
 
     Raises:
         AdapterError: the door is another relay's, or its folder cannot be used.
