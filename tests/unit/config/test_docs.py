@@ -6,7 +6,7 @@ from pathlib import Path
 
 from zsched.config.load import check_bytes
 from zsched.config.schema import LINK_LIMITS, SCHEDULING, reference
-from zsched.config.timing import _RELATIONS, PROFILES
+from zsched.config.timing import _RELATIONS
 from zsched.core.values.fleet import (
     DEFAULT_BONUS,
     DEFAULT_COOL_DOWN_S,
@@ -14,7 +14,6 @@ from zsched.core.values.fleet import (
     DEFAULT_SCORE,
     PAPER_PATIENCE,
     RADIO_PATIENCE,
-    Timing,
 )
 from zsched.core.values.model import Tuning
 
@@ -38,11 +37,7 @@ def test_defaults_that_hang_on_each_other_are_the_codes() -> None:
     assert LINK_LIMITS.items["foresee_s"].default == f"`{DEFAULT_FORESEE_S:g}`"
 
 
-def test_timing_table_and_relations_are_the_codes() -> None:
-    for field in fields(Timing):
-        if field.name != "name":
-            values = " | ".join(f"{getattr(PROFILES[name], field.name):g}" for name in ("wired", "wifi", "wan"))
-            assert f"| `{field.name}` | {values} |" in DOC
+def test_relations_between_times_are_the_codes() -> None:
     for relation in _RELATIONS:
         assert f"* `{relation.field}` {relation.sign} {relation.formula}: {relation.why}." in DOC
 
