@@ -164,7 +164,11 @@ NODE: Final = Record(
                 "a listen section",
                 {
                     "control": Field(_ENDPOINT, "Endpoint of the control session.", default="any free port"),
-                    "data": Field(_ENDPOINT, "Endpoint of the data session, another port.", default="any free port"),
+                    "data": Field(
+                        _ENDPOINT,
+                        "Endpoint of the data session, another port.",
+                        default="port 7458 if it is free, else any free port",
+                    ),
                 },
             ),
             "Where this node listens; the others find it by gossip from the seeds.",
@@ -406,6 +410,10 @@ FLEET: Final = Record(
 )
 
 
+_KEYS_BELOW: Final = re.compile(r"a mapping \{[^{}]*\}")
+"""The keys of a mapping have a table of their own."""
+
+
 def reference() -> str:
     """The reference of every key as Markdown: one table per section, sections in the order of the file.
 
@@ -439,10 +447,10 @@ def _records(block: Block[Any]) -> Iterator[tuple[str, Record]]:
 
 def _section(record: Record, paths: list[str]) -> str:
     heading = ", ".join(f"`{path}`" for path in paths) if paths != [""] else "The file"
-    rows = (
-        f"| `{name}` | {item.block.says()} | {'required' if item.required else item.default} | {item.doc} |"
-        for name, item in record.items.items()
-    )
+    rows = []
+    for name, item in record.items.items():
+        takes = _KEYS_BELOW.sub("a mapping", item.block.says())
+        rows.append(f"| `{name}` | {takes} | {'required' if item.required else item.default} | {item.doc} |")
     return "\n".join(
         (f"### {heading}\n", "| key | takes | default | meaning |", "| --- | --- | --- | --- |", *rows, "")
     )
