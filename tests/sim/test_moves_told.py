@@ -44,4 +44,4 @@ def test_votes_of_another_revision_are_no_votes_for_a_move() -> None:
     assert proposal.base_revision == value.revision
     for ahead, votes in ((1, ((voter, proposal.candidate),)), (2, ())):
         learnt = replace(value, revision=value.revision + ahead, epoch=1, owner=proposal.candidate)
-        assert _move_of(node, learnt, FROM_A_PEER).votes[:1] == votes
+        assert _move_of(node, learnt, FROM_A_PEER, is_known=False).votes[:1] == votes

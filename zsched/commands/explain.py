@@ -16,7 +16,7 @@ from datetime import UTC, datetime
 
 from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, nearest, print_json
-from zsched.commands.history import age_s_of, wall_text
+from zsched.commands.history import age_s_of, is_known, is_move, wall_text, where_of
 from zsched.commands.page import Cell, Page, memory, span
 from zsched.commands.report import printable
 from zsched.commands.weight_words import shares
@@ -173,7 +173,8 @@ def _move(entry: Json, now: float) -> Json:
     move = entry["move"]
     where = {"epoch": move["epoch"], "revision": move["revision"], "from": move["left"], "to": move["owner"]}
     when = {"at": wall_text(entry["at"]), "age_s": max(now - entry["at"], 0.0)}
-    return {**when, **where, "reason": move["reason"], "votes": dict(move.get("votes", ()))}
+    why = {"is_known": is_known(move), "reason": move["reason"]}
+    return {**when, **where, **why, "votes": dict(move.get("votes", ()))}
 
 
 def _search(door: Door, task: str, point: Point) -> tuple[str, float, Json | None, Json | None]:
@@ -189,7 +190,9 @@ def _search(door: Door, task: str, point: Point) -> tuple[str, float, Json | Non
         answer = ask_door(door, {"verb": "log", "judgement": wish, "cursor": cursor})
         if "judgement" not in answer:
             raise CliError(EXIT_FAILED, f"the daemon of {answer['node']} is older than --at; restart it")
-        judgement, move = answer["judgement"] or judgement, answer["move"] or move
+        judgement = answer["judgement"] or judgement
+        told = answer["move"]
+        move = told if told is not None and (move is None or is_move(told)) else move
         epochs += answer["epochs"]
         cursor = str(answer["cursor"])
         if not answer["more"]:
@@ -315,7 +318,7 @@ def _made(page: Page, body: Json) -> None:
     votes = ", ".join(f"{voter} for {choice}" for voter, choice in move["votes"].items())
     page.block(
         "THEN",
-        (f"{move['from'] or 'nobody'} -> {move['to'] or 'nobody'}, epoch {move['epoch']}", "bold"),
+        (f"{where_of(move)}, epoch {move['epoch']}", "bold"),
         (move["reason"], ""),
         (votes or "no votes heard", "" if votes else "dim"),
         (f"{span(move['age_s'])} ago ({move['at']})", "dim"),

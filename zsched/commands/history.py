@@ -178,8 +178,8 @@ def moves_of(entries: Iterable[Json], now: float, task: str | None) -> Iterator[
         move = entry.get("move")
         if move is None or task not in (None, entry["task"]):
             continue
-        if move["left"] is None and move["owner"] is None:
-            continue  # known from a founding: nobody has had the task yet
+        if move["owner"] is None:
+            continue  # an older daemon's line: nobody has had the task yet
         yield {
             "at": wall_text(entry["at"]),
             "age_s": max(now - entry["at"], 0.0),
@@ -188,11 +188,26 @@ def moves_of(entries: Iterable[Json], now: float, task: str | None) -> Iterator[
             "revision": move["revision"],
             "from": move["left"],
             "to": move["owner"],
+            "is_known": is_known(move),
             "reason": move["reason"],
             "votes": dict(move.get("votes", ())),
             "switched_s": took.get((entry["task"], move["epoch"], entry["life"])),
             "gap_s": gaps.get((entry["task"], move["epoch"])),
         }
+
+
+def is_known(move: Json) -> bool:
+    """Whether no owner changed: the daemon had begun anew, and found the task where it was.
+
+    A line that an older daemon has written says so by its reason alone.
+    """
+    return bool(move.get("is_known")) or (move["left"] is None and str(move["reason"]).startswith("known from"))
+
+
+def where_of(move: Json) -> str:
+    """From whom to whom, of a move as ``zsched.history/1`` has it; one that is only known came from nobody."""
+    to = str(move["to"] or "nobody")
+    return to if move["is_known"] else f"{move['from'] or 'nobody'} -> {to}"
 
 
 def rehearsals_of(entries: Iterable[Json], now: float, task: str | None) -> Iterator[Json]:
@@ -223,10 +238,7 @@ def _move_line(move: Json) -> str:
     votes = "; ".join(f"{', '.join(voters)} for {choice}" for choice, voters in camps.items())
     switched = "" if move["switched_s"] is None else f", streams switched in {millis(move['switched_s'])}"
     switched += "" if move["gap_s"] is None else f", no answer for {millis(move['gap_s'])}"
-    where = f"{move['from'] or 'nobody'} -> {move['to'] or 'nobody'}"
-    if move["from"] is None and move["reason"].startswith("known from"):
-        where = move["to"]  # this daemon has begun anew; the task went on where it was
-    head = f"{span(move['age_s']):>6} ago  {move['at']}  {move['task']} epoch {move['epoch']}  {where}"
+    head = f"{span(move['age_s']):>6} ago  {move['at']}  {move['task']} epoch {move['epoch']}  {where_of(move)}"
     return f"{head}: {move['reason']}{f' ({votes})' if votes else ''}{switched}\n"
 
 
@@ -249,7 +261,13 @@ def _print(entries: list[Json], view: EventsView) -> None:
 
 
 def _is_of(entry: Json, types: Container[str]) -> bool:
-    return entry["stage"] in types or (MOVE in types and entry.get("move") is not None)
+    return entry["stage"] in types or (MOVE in types and is_move(entry))
+
+
+def is_move(entry: Json) -> bool:
+    """Whether a line of the log tells of a change of owner."""
+    move = entry.get("move")
+    return move is not None and not is_known(move)
 
 
 def names(entry: Json, node: str) -> bool:

@@ -67,7 +67,7 @@ class Node(Stages):
             executor.start(todo)
             value = self.registers[name].value
             if value.revision > 0:
-                work.carry_out(self, value, "known from before the restart", todo, now)
+                work.carry_out(self, value, "known from before the restart", todo, now, is_known=True)
         return self._finish(now)
 
     def handle(self, event: ev.Event, now: float) -> tuple[do.Instruction, ...]:

@@ -310,7 +310,7 @@ def test_a_robot_that_is_none_is_refused_with_the_nearest() -> None:
 @pytest.fixture
 def past(fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Fleet:
     """A log of two moves: at 1000 s and at 2000 s of the wall clock, each 1 s after its judgement."""
-    moments = iter([999.0, 999.5, 1000.0, 1500.0, 1999.0, 2000.0, 2050.0])
+    moments = iter([999.0, 999.5, 1000.0, 1500.0, 1999.0, 2000.0, 2050.0, 2060.0])
     monkeypatch.setattr("zsched.adapters.host.decision_log.wall_s", lambda: next(moments, 2100.0))
     fleet.log = DecisionLog(tmp_path, "robot1", 7, lambda _problem: None)
     fleet.log.start()
@@ -347,6 +347,8 @@ def past(fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Fleet
     judged(4, "edge2", 0.33)
     moved(5, "edge2", "edge1")
     judged(5, "edge1", 0.44)
+    again = Move(epoch=5, revision=6, left=None, owner="edge1", reason="known from before the restart", is_known=True)
+    fleet.log.put(RecordStory(stage="vote", text="learnt", task="merge", epoch=5, move=again))
     fleet.log.close()
     return fleet
 

@@ -103,11 +103,23 @@ def test_moves_are_told_with_age_wall_time_votes_and_how_long_the_streams_took(
 
 
 def test_what_is_known_from_before_a_restart_is_no_move(pages: Pages, capsys: pytest.CaptureFixture[str]) -> None:
-    known = {**MOVE, "left": None, "votes": [], "reason": "known from before the restart"}
-    pages.entries = [entry("learnt", 60.0, move={**known, "owner": None}), entry("learnt", 50.0, move=known)]
+    older = {**MOVE, "left": None, "votes": [], "reason": "known from before the restart"}
+    known = {**older, "reason": "as it was", "is_known": True}
+    pages.entries = [
+        entry("learnt", 60.0, move={**older, "owner": None}),
+        entry("learnt", 50.0, move=older),
+        entry("learnt", 40.0, move=known),
+    ]
     assert history(HERE, None, is_json=False) == 0
-    line = "   50s ago  2026-09-21T14:12:30.000Z  merge epoch 2  edge2: known from before the restart"
-    assert capsys.readouterr().out.splitlines() == [line]
+    assert capsys.readouterr().out.splitlines() == [
+        "   50s ago  2026-09-21T14:12:30.000Z  merge epoch 2  edge2: known from before the restart",
+        "   40s ago  2026-09-21T14:12:40.000Z  merge epoch 2  edge2: as it was",
+    ]
+    assert events(HERE, view(types=("move",))) == 0
+    assert capsys.readouterr().out == ""
+    assert history(HERE, None, is_json=True) == 0
+    body = json.loads(capsys.readouterr().out)
+    assert (faults(body), [one["is_known"] for one in body["moves"]]) == ([], [True, True])
 
 
 def test_a_changed_worker_that_waits_for_a_look_is_part_of_the_history(
@@ -141,6 +153,7 @@ def test_moves_of_one_task_as_json(capsys: pytest.CaptureFixture[str]) -> None:
                 "revision": 3,
                 "from": "edge1",
                 "to": "edge2",
+                "is_known": False,
                 "reason": "edge1 is gone",
                 "votes": {"robot1": "edge2", "robot2": "edge2", "robot3": "edge1"},
                 "switched_s": 0.086,

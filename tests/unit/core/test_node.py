@@ -25,6 +25,7 @@ from zsched.core.node import Node
 from zsched.core.status import build_snapshot
 from zsched.core.values.document import Text
 from zsched.core.values.durable import DurableState
+from zsched.core.values.electorate import CREATION_STEP
 from zsched.core.values.fleet import StreamRule, TaskSpec, WorkerSpec, electorate_hash
 from zsched.core.values.messages import (
     Accept,
@@ -71,8 +72,16 @@ def durable(me: str, *registers: RegisterState) -> DurableState:
     return state_of(me, *registers, electorate=ELECTORATE)
 
 
-def make(me: str = "robot1", *, has_state: bool = True, learnt: Allocation | None = None, now: float = 100.0) -> Node:
-    state = durable(me, RegisterState(task="merge", learnt=learnt)) if learnt is not None else durable(me)
+def make(
+    me: str = "robot1",
+    *,
+    has_state: bool = True,
+    learnt: Allocation | None = None,
+    now: float = 100.0,
+    creation: int = 0,
+) -> Node:
+    is_blank = learnt is None and not creation
+    state = durable(me) if is_blank else durable(me, RegisterState(task="merge", learnt=learnt, creation=creation))
     return Node(
         fleet=FLEET,
         me=me,
@@ -293,6 +302,33 @@ def test_restart_carries_out_again_what_was_learnt() -> None:
     assert [one.role.epoch for one in of(batch, do.SetRole)] == [2]
     (plan,) = of(make("robot1", learnt=allocation_of(4, "edge1", 2)).start(100.0), do.ApplyRoutes)
     assert plan.plan.phase is RoutePhase.PREPARE
+
+
+def learnt_from(peer: str, value: Allocation) -> ev.LearntReceived:
+    return ev.LearntReceived(learnt=Learnt(node=peer, values=(value,)), is_answer=True)
+
+
+def moves_in(batch: tuple[do.Instruction, ...]) -> list[tuple[str | None, str | None, int, bool]]:
+    stories = of(batch, do.RecordStory)
+    return [(one.move.left, one.move.owner, one.move.epoch, one.move.is_known) for one in stories if one.move]
+
+
+def test_an_owner_that_was_there_before_the_start_is_told_as_known_and_the_next_one_as_a_move() -> None:
+    node = make("robot1", learnt=allocation_of(4, "edge1", 2))
+    assert moves_in(node.start(100.0)) == [(None, "edge1", 2, True)]
+    assert moves_in(node.handle(learnt_from("robot2", allocation_of(5, "edge2", 3)), 100.0)) == [
+        ("edge1", "edge2", 3, False)
+    ]
+    assert moves_in(make("robot1", learnt=allocation_of(1, None, 0)).start(100.0)) == [], "nobody has it"
+
+
+@pytest.mark.parametrize(("epoch", "is_known"), [(1, False), (2, True), (CREATION_STEP + 1, False)])
+def test_of_a_peers_first_news_only_the_first_placement_is_a_move(epoch: int, is_known: bool) -> None:
+    node = make("edge1", creation=epoch // CREATION_STEP)
+    node.start(100.0)
+    batch = node.handle(learnt_from("robot2", allocation_of(epoch, "edge1")), 100.0)
+    assert moves_in(batch) == [(None, "edge1", epoch, is_known)]
+    assert any("first news here" in one.text for one in of(batch, do.RecordStory)) is is_known
 
 
 # --- own events like peers' ------------------------------------------------------------------------------------------

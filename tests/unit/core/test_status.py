@@ -623,7 +623,7 @@ def test_task_shows_its_owner_how_it_is_seen_since_when_and_the_handover() -> No
     task = build_snapshot(node, 101.5).tasks[0]
     assert (task.owner, task.owner_state, task.since_s, task.phase) == ("edge2", "unknown", 1.5, "preparing")
     assert [(past.revision, past.owner, past.age_s, past.reason) for past in task.history] == [
-        (3, "edge2", 1.5, "learnt from a peer")
+        (3, "edge2", 1.5, "known from a peer, the first news here")
     ]
 
 

@@ -241,7 +241,7 @@ def judged_before(lines: list[bytes], wish: Json) -> Json:
         is_early = entry["at"] <= until if isinstance(until, int | float) else True
         if isinstance(epoch, int):
             is_early = is_early and entry.get("epoch", 0) < epoch
-            move = entry if begun == epoch else move
+            move = entry if begun == epoch and (move is None or not entry["move"].get("is_known")) else move
         if is_early and _BODY in line:
             judgement = line
     known = [min(epochs), max(epochs)] if epochs else []

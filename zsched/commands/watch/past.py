@@ -13,6 +13,7 @@ from typing import Final
 from zsched.commands.common import Json
 from zsched.commands.history import moves_of, wall_text
 from zsched.commands.watch.feed import News
+from zsched.core.values.electorate import CREATION_STEP
 
 POINTS: Final = 900
 """Of a task's utilities: a quarter of an hour at one a second."""
@@ -69,7 +70,9 @@ class Past:
                 kept.append(Point(at=judged_at, owner=task["owner"], totals=dict(decision["aggregates"])))
 
     def moves(self) -> list[Json]:
-        """The newest changes of owner as ``zsched.history/1`` has them, the newest last.
+        """The newest changes of owner, and owners that were there already, as ``zsched.history/1`` has them.
+
+        The newest is the last.
 
         Where the log cannot be read, they are what the status remembers: without votes and durations.
         """
@@ -80,10 +83,13 @@ class Past:
 
 
 def _remembered(task: Json, at: float) -> Iterator[Json]:
-    """The moves of a task that its status tells of."""
+    """The moves of a task that its status tells of.
+
+    The first that it tells is one only where it is the first placement: what was before is not told.
+    """
     left: str | None = None
     for number, past in enumerate(task["history"]):
-        if number and past["owner"] == left:
+        if past["owner"] == left:
             continue  # another weight, the same owner
         yield {
             "at": wall_text(at - past["age_s"]),
@@ -93,6 +99,7 @@ def _remembered(task: Json, at: float) -> Iterator[Json]:
             "revision": past["revision"],
             "from": left,
             "to": past["owner"],
+            "is_known": number == 0 and (past["epoch"] % CREATION_STEP > 1 or past["reason"].startswith("known from")),
             "reason": past["reason"],
             "votes": {},
             "switched_s": None,

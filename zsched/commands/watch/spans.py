@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from zsched.commands.common import Json
+from zsched.commands.history import is_move
 
 OVERDUE_S: Final = 60.0
 """A move that is not settled by then is reported as far as it came."""
@@ -65,7 +66,9 @@ class Moves:
             task = str(entry.get("task", ""))
             if not task:
                 continue
-            if "move" in entry:
+            if "move" in entry and not is_move(entry):
+                yield from self._close(task)  # the daemon has begun anew: no lines of its earlier life follow
+            elif "move" in entry:
                 yield from self._close(task)
                 self._open[task] = _Open(entry, [*self._before.pop(task, []), entry])
             elif task in self._open and entry.get("epoch") == self._open[task].entry["epoch"]:

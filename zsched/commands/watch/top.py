@@ -232,7 +232,7 @@ def _streams(task: Json, frame: Frame) -> list[str]:
 def _moves(past: Past, frame: Frame) -> list[str]:
     """A title and a line per move, the newest first."""
     page = _page(frame)
-    moves = printable(past.moves())
+    moves = printable([move for move in past.moves() if not move["is_known"]])
     if not moves:
         return []
     page.row(("MOVES", frame.width, "stage"))

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from zsched.commands.common import SCHEMAS, Json
+from zsched.commands.history import is_move
 from zsched.commands.report import degradations
 
 NANO: Final = 1_000_000_000
@@ -164,7 +165,7 @@ def of_entry(entry: Json) -> Iterator[Message]:
     """What a line of the decision log tells: a line of Foxglove's log, and of a move its figures."""
     at_ns = nanoseconds(entry["at"])
     task = str(entry.get("task", ""))
-    move: Any = entry.get("move")
+    move: Any = entry["move"] if is_move(entry) else None
     stamp = {"sec": at_ns // NANO, "nsec": at_ns % NANO}
     where = f"{entry['node']}/{entry['stage']}"
     text = f"{task}: {entry['text']}" if task else str(entry["text"])

@@ -131,7 +131,8 @@ def _adopt_work(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
         executor.start(todo)
         value = values[executor.spec.name]
         if value.revision > 0:
-            carry_out(node, value, "known from before the task left the fleet file", todo, now)
+            reason = "known from before the task left the fleet file"
+            carry_out(node, value, reason, todo, now, is_known=True)
 
 
 def _is_of_before(executor: Executor, value: Allocation) -> bool:

@@ -15,18 +15,27 @@ from zsched.core.executor.workers import failed_workers
 from zsched.core.stages import Handler, PastValue, Stages, Unready
 from zsched.core.todo import ToDo
 from zsched.core.values.decision import Move
+from zsched.core.values.electorate import CREATION_STEP
 from zsched.core.values.model import Allocation, NodeId, PeerState, TaskId, Weights, WorkerState, told_by
 from zsched.core.values.plan import StreamCount
 from zsched.core.vote.register import FROM_A_PEER
 
+FIRST_NEWS: Final = "known from a peer, the first news here"
+"""Why a task has its owner, at a node that knew nothing of the task."""
+
 # --- learnt values ---------------------------------------------------------------------------------------------------
 
 
-def carry_out(node: Stages, value: Allocation, reason: str, todo: ToDo, now: float) -> None:
-    """Carry out a newly learnt value; this batch writes it to disk before anything else."""
+def carry_out(node: Stages, value: Allocation, reason: str, todo: ToDo, now: float, *, is_known: bool = False) -> None:
+    """Carry out a newly learnt value; this batch writes it to disk before anything else.
+
+    ``is_known``: the value was there before this node's executor was, so it is no change of owner.
+    """
     task, executor = value.task, node.executors[value.task]
     is_new_epoch = value.epoch > executor.epoch
-    move = _move_of(node, value, reason) if is_new_epoch else None
+    if _is_first_news(executor.epoch, value, reason):
+        is_known, reason = True, FIRST_NEWS
+    move = _move_of(node, value, reason, is_known=is_known) if is_new_epoch and value.owner is not None else None
     reason = _reason_of(value, reason, is_new_epoch=is_new_epoch) if move is None else move.reason
     node.history[task].append(PastValue(value=value, at=now, reason=reason))
     if is_new_epoch:
@@ -38,7 +47,7 @@ def carry_out(node: Stages, value: Allocation, reason: str, todo: ToDo, now: flo
     node.votes.on_learnt(task)
     node.rounds.on_learnt(task, is_new_epoch=is_new_epoch, now=now)
     text = f"learnt revision {value.revision}: owner {value.owner}, weights {_told(value.tuning.weights)}"
-    text += "" if value.asked is None else f", {reason}"
+    text += "" if value.asked is None and not is_known else f", {reason}"
     todo.add(do.RecordStory(stage="vote", text=text, task=task, epoch=value.epoch, move=move))
     executor.execute(value, todo, now)
     node.tenure.hold(value, node.beat_sequence + 1)
@@ -48,7 +57,15 @@ def carry_out(node: Stages, value: Allocation, reason: str, todo: ToDo, now: flo
     todo.must_beat = True
 
 
-def _move_of(node: Stages, value: Allocation, reason: str) -> Move:
+def _is_first_news(epoch: int, value: Allocation, reason: str) -> bool:
+    """Whether a peer tells of an owner to a node that knew nothing of the task, and that owner is not the first one.
+
+    The first placement is a move for everybody: nobody had the task before.
+    """
+    return epoch == 0 and reason == FROM_A_PEER and value.owner is not None and value.epoch % CREATION_STEP > 1
+
+
+def _move_of(node: Stages, value: Allocation, reason: str, *, is_known: bool) -> Move:
     """A change of owner, with the votes for it as far as this node has heard them.
 
     A robot that did not commit it itself tells the reason of one that wanted it.
@@ -63,6 +80,7 @@ def _move_of(node: Stages, value: Allocation, reason: str) -> Move:
         owner=value.owner,
         reason=wanted[0] if wanted and reason == FROM_A_PEER else _reason_of(value, reason, is_new_epoch=True),
         votes=tuple((proposal.voter, proposal.candidate) for proposal in votes),
+        is_known=is_known,
     )
 
 

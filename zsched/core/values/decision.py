@@ -132,7 +132,7 @@ class Decision:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Move:
-    """A change of owner that a node has learnt."""
+    """A change of owner that a node has learnt, or an owner that was there before the node knew of it."""
 
     epoch: int
     revision: int
@@ -141,6 +141,8 @@ class Move:
     reason: str
     votes: tuple[tuple[NodeId, NodeId], ...] = ()
     """(voter, candidate) of the vote that led to it, as far as this node heard it; edges hear none."""
+    is_known: bool = False
+    """No owner has changed: it is the first that the node learns of the task since its start. ``left`` is ``None``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -33,7 +33,7 @@ def entry(text: str, **more: Any) -> dict[str, Any]:
 MOVE = {
     "epoch": 3,
     "revision": 3,
-    "left": None,
+    "left": "edge2",
     "owner": "edge3",
     "reason": "edge2 is gone",
     "votes": [["robot1", "edge3"]],
@@ -87,6 +87,7 @@ def test_the_file_holds_every_topic_and_the_moves_since_its_beginning(folder: Pa
         "task": "echo",
         "epoch": 3,
         "revision": 3,
+        "left": "edge2",
         "owner": "edge3",
         "reason": "edge2 is gone",
         "votes": {"robot1": "edge3"},

@@ -88,6 +88,14 @@ def test_a_move_without_an_end_is_told_when_the_next_comes_or_its_time_is_over()
     assert [span.epoch for span in moves.rest()] == [5]
 
 
+def test_an_owner_that_was_there_before_the_start_is_no_move() -> None:
+    moves = Moves()
+    known = learnt(40.0, 4, None, "edge2", "known from before the restart")
+    known["move"]["is_known"] = True
+    assert [span.epoch for span in moves.take([*PLANNED[:6], known, *PLANNED[7:]])] == [4]
+    assert not list(moves.rest())
+
+
 def test_an_edge_only_learns() -> None:
     moves = Moves()
     assert not list(moves.take([learnt(5.0, 1, None, "edge1", "learnt from a peer")]))

@@ -77,6 +77,28 @@ def test_a_recorded_fleet_looks_as_agreed(size: tuple[int, int], name: str) -> N
     assert len(lines) == size[1]
 
 
+def test_an_owner_that_was_there_before_the_start_is_no_move_on_the_screen() -> None:
+    past = past_of()
+    known = move(5.0, "echo", 2, None, "edge2", "known from before the restart")
+    known["move"]["is_known"] = True
+    past.take(News(at=NOON, status=recorded(), entries=(known,)))
+    text = "\n".join(render_top(past, replace(SMALL, width=120, height=40)))
+    assert "known from" not in text
+    assert "nobody -> edge2" not in text
+    assert "edge1 -> edge2" in text
+
+
+@pytest.mark.parametrize(("epoch", "shown"), [(1, ["nobody -> edge1"]), (7, [])])
+def test_without_a_log_the_first_owner_told_is_a_move_only_as_the_first_placement(epoch: int, shown: list[str]) -> None:
+    status = recorded()
+    told = {"revision": epoch, "epoch": epoch, "owner": "edge1", "age_s": 9.0, "reason": "learnt from a peer"}
+    status["tasks"] = [{**status["tasks"][0], "history": [told]}]
+    past = Past()
+    past.take(News(at=NOON, status=status, entries=()))
+    text = "\n".join(render_top(past, replace(SMALL, width=120, height=40)))
+    assert re.findall(r"nobody -> \w+", text) == shown
+
+
 def visible(line: str) -> str:
     return re.sub(r"\x1b\[[0-9;]*m", "", line)
 

@@ -125,7 +125,7 @@ function chart(task, view) {
   const y = (value) => height - 6 - Math.min(Math.max(value, 0), 1.1) / 1.1 * (height - 12);
   const parts = [0, 0.5, 1].map((value) => [s("line", { class: "grid", x1: 0, x2: width, y1: y(value), y2: y(value) }),
     s("text", { class: "dim small", x: 2, y: y(value) - 3 }, String(value))]).flat();
-  for (const move of state.moves.filter((one) => one.task === task.name && seconds(one.at) > view.from)) {
+  for (const move of state.moves.filter((one) => !one.is_known && one.task === task.name && seconds(one.at) > view.from)) {
     const x = across(seconds(move.at), view, width);
     parts.push(s("line", { class: "move", x1: x, x2: x, y1: 0, y2: height }));
   }
@@ -266,7 +266,7 @@ function draw() {
   fill("topology", topology(status));
   fill("tasks", status.tasks.map((task) => taskCard(task, view)));
   fill("epochs", epochs(status, longer(view)));
-  fill("moves", state.moves.slice(-12).reverse().map(moveLine));
+  fill("moves", state.moves.filter((one) => !one.is_known).slice(-12).reverse().map(moveLine));
   fill("streams", streams(status));
   fill("nodes", nodes(status));
   fill("events", state.events.slice().reverse().map(eventLine));
