@@ -25,25 +25,49 @@ ExecStart=/usr/bin/python3 /opt/drive.py
 [Install]
 WantedBy=multi-user.target
 """
+ENOUGH_MB = 3000
+"""Of memory that is available: a machine writes some hundred."""
 LEGACY = "systemd.unified_cgroup_hierarchy=0 SYSTEMD_CGROUP_ENABLE_LEGACY_FORCE=1"
 """What a systemd from 256 on wants to be told where this machine's control groups are of the first version."""
 
 
 @contextmanager
 def overlaid(debian: Path, folder: Path) -> Iterator[Path]:
-    """A writable view of ``debian`` that forgets everything afterwards."""
-    upper, work, root = (folder / name for name in ("upper", "work", "root"))
-    for path in (upper, work, root):
-        path.mkdir()
-    options = f"lowerdir={debian},upperdir={upper},workdir={work}"
-    command = ["mount", "-t", "overlay", "overlay", "-o", options, str(root)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
-    if done.returncode != 0:
-        pytest.skip(f"cannot mount an overlay: {done.stderr.strip()}")
+    """A writable view of ``debian`` that forgets everything afterwards.
+
+    What it writes is kept in memory, where there is enough: packages are unpacked in a third of the time, and no disk
+    is busy with them when the next fleet keeps real time.
+    """
+    disk, root = folder / "disk", folder / "root"
+    upper, work = disk / "upper", disk / "work"
+    disk.mkdir()
+    root.mkdir()
+    is_in_memory = available_mb() > ENOUGH_MB and _mounts("tmpfs", disk, "size=2g") == ""
+    upper.mkdir()
+    work.mkdir()
     try:
-        yield root
+        if refusal := _mounts("overlay", root, f"lowerdir={debian},upperdir={upper},workdir={work}"):
+            pytest.skip(f"cannot mount an overlay: {refusal}")
+        try:
+            yield root
+        finally:
+            subprocess.run(["umount", "--lazy", str(root)], timeout=20, check=True)
     finally:
-        subprocess.run(["umount", "--lazy", str(root)], timeout=20, check=True)
+        if is_in_memory:
+            subprocess.run(["umount", "--lazy", str(disk)], timeout=20, check=True)
+
+
+def available_mb() -> int:
+    """Memory that this machine could give."""
+    lines = Path("/proc/meminfo").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")) // 1024
+
+
+def _mounts(kind: str, place: Path, options: str) -> str:
+    """Mount a file system of a kind; what was said when it could not be."""
+    command = ["mount", "-t", kind, kind, "-o", options, str(place)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
+    return "" if done.returncode == 0 else done.stderr.strip() or "mount failed"
 
 
 def furnish(root: Path, driver: Path, files: Mapping[str, str], programs: Mapping[str, str] | None = None) -> None:

@@ -5,6 +5,8 @@ Knows: `package/deb/build.py`, how a package becomes one of another version. Doe
 
 from __future__ import annotations
 
+import fcntl
+import hashlib
 import importlib.util
 import os
 import shutil
@@ -46,6 +48,37 @@ def wheels_folder() -> Path:
     return cache_folder() / "deb"
 
 
+def own_wheel() -> Path:
+    """The wheel of this tree, by the program that `make wheel` runs; built once for each state that git knows."""
+    listed = git("ls-files", "-z", "--cached", "--others", "--exclude-standard").split("\0")
+    state = hashlib.blake2s(git("describe", "--always", "--dirty", "--tags").encode(), digest_size=8)
+    for name in listed:
+        if name and (REPO / name).is_file():
+            state.update(name.encode() + b"\0" + (REPO / name).read_bytes())
+    folder = cache_folder() / "own" / state.hexdigest()
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with (folder.parent / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not folder.exists() or listed == [""]:
+            for old in folder.parent.iterdir():
+                if old.is_dir():
+                    shutil.rmtree(old)
+            before, part = set(REPO.iterdir()), folder.with_suffix(".part")
+            command = [sys.executable, str(REPO / "package/wheel.py"), str(part)]
+            done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
+            assert done.returncode == 0, done.stderr
+            assert set(REPO.iterdir()) == before, "it leaves nothing in the tree"
+            part.rename(folder)
+        (wheel,) = folder.glob("*.whl")
+    return wheel
+
+
+def git(*arguments: str) -> str:
+    """What git says of this tree; empty where there is none."""
+    command = ["git", "-C", str(REPO), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False).stdout
+
+
 def built(out: Path) -> Path:
     """This tree's package, for the Python of the booted Debian. Skips where the wheels cannot be had."""
     if shutil.which("dpkg-deb") is None:
@@ -56,7 +89,8 @@ def built(out: Path) -> Path:
     fetched = subprocess.run([*command, "--fetch"], capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
     if fetched.returncode == NOT_FETCHED:
         pytest.skip(f"the locked wheels cannot be fetched (no network?): {fetched.stderr.strip()[-300:]}")
-    done = subprocess.run([*command, "--out", str(out)], capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
+    command += ["--wheel", str(own_wheel()), "--out", str(out)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
     assert done.returncode == 0, done.stderr
     (package,) = out.glob("*.deb")
     return package

@@ -9,7 +9,6 @@ import io
 import json
 import shutil
 import subprocess
-import sys
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -18,22 +17,15 @@ import pytest
 from cyclonedx.schema import SchemaVersion
 from cyclonedx.validation.json import JsonStrictValidator
 
+from support.packages import own_wheel
+
 REPO = Path(__file__).parents[3]
-BUILD = REPO / "package/wheel.py"
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
+def wheel() -> zipfile.ZipFile:
     """Built by the program that `make wheel` runs."""
-    before = set(REPO.iterdir())
-    out = tmp_path_factory.mktemp("wheel")
-    done = subprocess.run(
-        [sys.executable, str(BUILD), str(out)], capture_output=True, text=True, timeout=240, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    assert set(REPO.iterdir()) == before, "it leaves nothing in the tree"
-    (found,) = out.glob("*.whl")
-    return zipfile.ZipFile(found)
+    return zipfile.ZipFile(own_wheel())
 
 
 def text_of(wheel: zipfile.ZipFile, ending: str) -> str:
