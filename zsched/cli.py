@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from zsched.commands.common import CliError, Json, Verb, Verbs, print_json
+from zsched.commands.common import CliError, Json, Verb, Verbs, print_json, say
 from zsched.commands.example import Example, write_example
 from zsched.commands.flag_verbs import add_flag_verbs
 from zsched.commands.fleet_verbs import (
@@ -797,10 +797,12 @@ def check(
     if counts is None:
         raise typer.Exit(EXIT_CONFIG)
     if not json_:
-        typer.echo("ok: " + ", ".join(_count(number, noun) for noun, number in counts.items()))
-        typer.echo(f"hash: {digest} (nodes whose files have another one say so in `zsched status`)")
+        say("ok: " + ", ".join(_count(number, noun) for noun, number in counts.items()))
+        say(f"hash: {digest} (nodes whose files have another one say so in `zsched status`)")
     for first, *more in told_once(fleet.tasks, fleet.timing) if fleet is not None and not json_ else ():
-        typer.echo("\n".join((first, *(f"  {line}" for line in more))))
+        say(first)
+        for line in more:
+            say(f"  {line}", indent=4)
 
 
 @app.command(cls=Verb)

@@ -7,15 +7,16 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TextIO
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from zsched.commands.page import harmless
+from zsched.commands.page import harmless, wrapped
 from zsched.core.values.model import MAX_ASKED
 from zsched.errors import AdapterError, ConfigError, ZschedError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE
@@ -31,6 +32,8 @@ NAMED_OTHERWISE: Final = {
 }
 LONGEST_SENTENCE: Final = 1000
 """Characters."""
+MIN_WIDTH: Final = 60
+"""Of what is written for people; a terminal that is narrower breaks the lines itself."""
 SCHEMAS: Final = Path(__file__).parents[1] / "schemas"
 """A JSON Schema per kind of output and major version."""
 
@@ -163,6 +166,30 @@ def print_json(body: Mapping[str, Any], *, is_line: bool = False) -> None:
     text = json.dumps(body, ensure_ascii=False, indent=None if is_line else 2)
     sys.stdout.write(f"{text}\n")
     sys.stdout.flush()
+
+
+def say(text: str, indent: int = 2) -> None:
+    """Lines for people on stdout, without what a terminal would obey.
+
+    On a terminal they wrap at its width, and go on at ``indent``; for a file or another program a line stays a line.
+    """
+    sys.stdout.write(f"{_fitted(text, sys.stdout, indent)}\n")
+    sys.stdout.flush()
+
+
+def warn(text: str) -> None:
+    """The same on stderr."""
+    sys.stderr.write(f"{_fitted(text, sys.stderr)}\n")
+
+
+def _fitted(text: str, stream: TextIO, indent: int = 2) -> str:
+    shown = harmless(text)
+    return wrapped(shown, max(shutil.get_terminal_size().columns, MIN_WIDTH), indent) if is_screen(stream) else shown
+
+
+def is_screen(stream: TextIO) -> bool:
+    """Whether people look at what is written there."""
+    return stream.isatty()
 
 
 def check_reason(reason: str) -> None:

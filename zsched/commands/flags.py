@@ -15,10 +15,10 @@ from typing import Any, Final
 
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door
-from zsched.commands.common import CliError, Json, nearest, print_json
+from zsched.commands.common import CliError, Json, nearest, print_json, say
 from zsched.commands.document import InForce, change, document_text, in_force
 from zsched.commands.orders import OrderView, Row, begin, check_said
-from zsched.commands.page import harmless, span
+from zsched.commands.page import span
 from zsched.commands.report import millis, told_flag
 from zsched.commands.wait import Condition, missing
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE
@@ -167,8 +167,7 @@ def tell(view: OrderView, event: str, text: str, **more: Any) -> int:
     if view.is_json:
         print_json(_body(event, **more), is_line=True)
     else:
-        sys.stdout.write(harmless(text) + "\n")
-        sys.stdout.flush()
+        say(text)
     return EXIT_OK
 
 
@@ -186,7 +185,7 @@ def _list(view: OrderView, status: Json, kind: str) -> int:
     ]
     if not found and not view.is_json:
         word = "drained" if kind == DRAIN else "kept from getting tasks"
-        sys.stdout.write(f"no node is {word}, as {status['node']} knows\n")
+        say(f"no node is {word}, as {status['node']} knows")
     for name, flag in found:
         text = f"{name}: {told_flag(flag)}, known for {span(flag['known_s'])}"
         told = {key: flag[key] for key in ("by", "reason", "known_s", "for_s")}
@@ -297,7 +296,7 @@ def _check_dangers(
         return None
     means = f"{NO_OTHER}: {', '.join(told)}: no candidate may get it any more; when its owner ends, nobody does it"
     if view.is_plan and not view.is_json:
-        sys.stdout.write(harmless(means) + "\n")
+        say(means)
     if not view.is_plan and not accepted:
         again = shlex.join(["zsched", *sys.argv[1:], "--accept", NO_OTHER])
         raise CliError(EXIT_FAILED, f"nothing was changed; if this may be:\n  {means}\n{again}")

@@ -16,13 +16,15 @@ from datetime import UTC, datetime
 from typing import Final
 
 from zsched.commands.ask import Door, ask_door
-from zsched.commands.common import CliError, Json, nearest, print_json
+from zsched.commands.common import CliError, Json, nearest, print_json, say
 from zsched.commands.page import harmless, span
 from zsched.commands.report import millis, printable
 from zsched.exits import EXIT_OK, EXIT_UNREACHABLE, EXIT_USAGE
 
 SCHEMA = "zsched.history/1"
 FOLLOW_S = 0.5
+AGE_COLUMNS: Final = 12
+"""Of a move's line: what does not fit goes on behind them."""
 MOVE: Final = "move"
 STAGES: Final = ("scheduler", "vote", "executor", "route", "membership", "log")
 """As a line names what has told it (`zsched.core.instructions.RecordStory`)."""
@@ -112,10 +114,11 @@ def history(
     if not moves and not rehearsals and not rollouts:
         whose = (f" of {task}" if task else "") + (f" to {about} or away from it" if about else "")
         whose += "" if since_s is None else f" of the last {span(since_s)}"
-        sys.stdout.write(f"no move{whose} in the log of {node}\n")
+        say(f"no move{whose} in the log of {node}")
     lines = [(move["age_s"], _move_line(printable(move))) for move in moves]
     lines += [(one["age_s"], _told_line(printable(one))) for one in (*rehearsals, *rollouts)]
-    sys.stdout.writelines(line for _, line in sorted(lines, key=lambda line: -line[0]))
+    for _, text in sorted(lines, key=lambda line: -line[0]):
+        say(text, indent=AGE_COLUMNS)
     return EXIT_OK
 
 
@@ -228,7 +231,7 @@ def rollouts_of(entries: Iterable[Json], now: float, task: str | None) -> Iterat
 
 
 def _told_line(one: Json) -> str:
-    return f"{span(one['age_s']):>6} ago  {one['at']}  {one['task']} {one['text']}\n"
+    return f"{span(one['age_s']):>6} ago  {one['at']}  {one['task']} {one['text']}"
 
 
 def _move_line(move: Json) -> str:
@@ -239,7 +242,7 @@ def _move_line(move: Json) -> str:
     switched = "" if move["switched_s"] is None else f", streams switched in {millis(move['switched_s'])}"
     switched += "" if move["gap_s"] is None else f", no answer for {millis(move['gap_s'])}"
     head = f"{span(move['age_s']):>6} ago  {move['at']}  {move['task']} epoch {move['epoch']}  {where_of(move)}"
-    return f"{head}: {move['reason']}{f' ({votes})' if votes else ''}{switched}\n"
+    return f"{head}: {move['reason']}{f' ({votes})' if votes else ''}{switched}"
 
 
 # --- events ----------------------------------------------------------------------------------------------------------
@@ -256,8 +259,7 @@ def _print(entries: list[Json], view: EventsView) -> None:
             continue
         shown = printable(entry)
         where = f"task={shown['task']} epoch={shown.get('epoch', 0)} " if shown.get("task") else ""
-        sys.stdout.write(f"{wall_text(entry['at'])} {shown['stage']:<10} {where}{shown['text']}\n")
-    sys.stdout.flush()
+        say(f"{wall_text(entry['at'])} {shown['stage']:<10} {where}{shown['text']}", indent=4)
 
 
 def _is_of(entry: Json, types: Container[str]) -> bool:

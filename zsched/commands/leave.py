@@ -10,7 +10,6 @@ Each step is agreed before the next one begins, so the command can be broken off
 from __future__ import annotations
 
 import itertools
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,13 +18,13 @@ from typing import Final
 from zsched import paths
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door, find_door
-from zsched.commands.common import CliError, Json, check_reason, nearest
+from zsched.commands.common import CliError, Json, check_reason, nearest, say, warn
 from zsched.commands.document import QUESTION, InForce, ask_all, change, document_text, in_force
 from zsched.commands.entries import DOCUMENT, HERE
 from zsched.commands.flags import LEAVE, NO_OTHER, DrainOrder, drain
 from zsched.commands.membership import Told
 from zsched.commands.orders import OrderView, Row
-from zsched.commands.page import harmless, span
+from zsched.commands.page import span
 from zsched.config.difference import names_electors
 from zsched.config.editing import remove_node
 from zsched.config.load import check_bytes
@@ -81,8 +80,7 @@ class _Way:
     def tell(self, text: str) -> None:
         """A step that is done, for people; programs read the events and the end."""
         if not self.order.is_json:
-            sys.stdout.write(harmless(text) + "\n")
-            sys.stdout.flush()
+            say(text)
 
     def check_time(self, lacks: str) -> None:
         """End at the deadline.
@@ -146,7 +144,7 @@ def _accept(order: LeaveOrder, name: str, means: str) -> None:
     if name not in order.accepted and not order.is_plan:
         raise CliError(EXIT_FAILED, f"nothing was changed; if this may be, --accept {name}: {means}")
     if not order.is_json:
-        sys.stderr.write(harmless(f"{name}: {means}") + "\n")
+        warn(f"{name}: {means}")
 
 
 # --- while the daemon runs -------------------------------------------------------------------------------------------
@@ -323,9 +321,7 @@ def _wait_until_known(way: _Way, revision: int) -> None:
         if waiting:
             time.sleep(PAUSE_S)
     if waiting:
-        sys.stderr.write(
-            harmless(f"{', '.join(waiting)}: not heard yet that {way.me} has left; the others tell") + "\n"
-        )
+        warn(f"{', '.join(waiting)}: not heard yet that {way.me} has left; the others tell")
 
 
 def _knows(answer: Json | CliError, revision: int) -> bool:

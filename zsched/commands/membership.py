@@ -20,10 +20,9 @@ from typing import Final
 from zsched import paths as places
 from zsched.commands.apply import ApplyView, apply
 from zsched.commands.ask import CONTROL_PORT, Door, ask_door
-from zsched.commands.common import CliError, Json, nearest, print_json
+from zsched.commands.common import CliError, Json, nearest, print_json, say
 from zsched.commands.document import InForce, document_text, in_force, status_of
 from zsched.commands.entries import DOCUMENT, HERE
-from zsched.commands.page import harmless
 from zsched.commands.papers import FirstPapers, ask_for_certificate, check_request, papers_for, refuse_open_network
 from zsched.config.editing import add_entries, add_names, is_list
 from zsched.config.load import check_bytes
@@ -69,7 +68,8 @@ class Told:
             return
         lines = [self.said, *(f"  {one.path}: {one.what}" for one in self.files)]
         lines += [f"next: {one}" for one in self.next]
-        sys.stdout.write(harmless("\n".join(lines)) + "\n")
+        for line in lines:
+            say(line, indent=4)
 
 
 # --- addresses -------------------------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ from typing import Any, Final
 
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door
-from zsched.commands.common import CliError, Json, check_reason, nearest, print_json
+from zsched.commands.common import CliError, Json, check_reason, nearest, print_json, say
 from zsched.commands.page import harmless, span
 from zsched.commands.report import FLAGS, millis, told_flag, told_hold, told_rollout
 from zsched.commands.wait import Condition, missing
@@ -167,7 +167,8 @@ def hold(view: OrderView, order: HoldOrder, names: Sequence[str], *, is_all: boo
         print_json({"schema": TASK_SCHEMA, "tasks": tasks, "missing": lacks})
         return max([late, *[CODES.get(str(result["outcome"]), EXIT_FAILED) for result in results.values()]])
     code = _tell_results(results)
-    sys.stdout.writelines(f"  {harmless(lack)}\n" for lack in lacks)
+    for lack in lacks:
+        say(f"  {lack}", indent=4)
     return max(code, late)
 
 
@@ -253,7 +254,7 @@ def _list_holds(view: OrderView, verb: str, tasks: Sequence[Json]) -> int:
         sys.stdout.write(f"no task is {verb}{'ned' if verb == 'pin' else 'd'}\n")
     for task in held:
         age = span(task[verb]["known_s"])
-        sys.stdout.write(f"{harmless(str(task['name']))}: {harmless(told_hold(verb, task[verb]))}, known for {age}\n")
+        say(f"{task['name']}: {told_hold(verb, task[verb])}, known for {age}")
     return EXIT_OK
 
 
@@ -383,17 +384,15 @@ def _tell_move(
         body |= {"gap_s": gap_s}
         print_json({**body, **more, "missing": list(lacks)})
     elif not found:
-        sys.stdout.write(
-            f"{order.task}: revision {result['revision']} is agreed; `zsched wait --for settled={order.task}`\n"
-        )
+        say(f"{order.task}: revision {result['revision']} is agreed; `zsched wait --for settled={order.task}`")
     elif lacks:
-        sys.stdout.write(f"{order.task}: not settled after {span(order.timeout_s)}\n")
-        sys.stdout.writelines(f"  {harmless(lack)}\n" for lack in lacks)
+        say(f"{order.task}: not settled after {span(order.timeout_s)}")
+        for lack in lacks:
+            say(f"  {lack}", indent=4)
     else:
         took = "" if switched_s is None else f", streams switched in {millis(switched_s)}"
         took += "" if gap_s is None else f", no answer for at most {millis(gap_s)}"
-        told = f"{order.task}: settled on {order.node}{took}, lost {more['lost']}, doubled {more['doubled']}\n"
-        sys.stdout.write(told)
+        say(f"{order.task}: settled on {order.node}{took}, lost {more['lost']}, doubled {more['doubled']}")
     return EXIT_TIMED_OUT if lacks else EXIT_OK
 
 
@@ -562,7 +561,7 @@ def _list_tunings(view: OrderView, tasks: Sequence[Json]) -> int:
             for key in KEYS
             if key in now or key in file
         ]
-        sys.stdout.write(f"{harmless(str(task['name']))} (revision {task['revision']}): {' '.join(words)}\n")
+        say(f"{task['name']} (revision {task['revision']}): {' '.join(words)}")
     return EXIT_OK
 
 
@@ -681,7 +680,7 @@ def _table(titles: Row, rows: Sequence[Row]) -> None:
     widths = [max(len(row[column]) for row in shown) for column in range(len(titles))]
     for row in shown:
         cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
-        sys.stdout.write("  ".join(cells).rstrip() + "\n")
+        say("  ".join(cells).rstrip())
 
 
 def _refused(task: str, result: Json) -> CliError:
@@ -703,5 +702,5 @@ def _tell_results(results: Mapping[str, Json]) -> int:
         if code != EXIT_OK and len(results) == 1:
             raise _refused(name, result)
         word = "agreed" if result["outcome"] == "ok" else str(_refused(name, result)).removeprefix(f"{name}: ")
-        sys.stdout.write(f"{name}: {harmless(word)} (revision {result['revision']})\n")
+        say(f"{name}: {word} (revision {result['revision']})")
     return max(codes)

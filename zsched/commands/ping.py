@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import statistics
-import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -19,9 +18,8 @@ from zsched import paths as places
 from zsched.adapters.network.node_ping import Pinged, ping
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door, name_here
-from zsched.commands.common import CliError, Json, nearest, print_json
+from zsched.commands.common import CliError, Json, nearest, print_json, say
 from zsched.commands.document import fleet_here
-from zsched.commands.page import harmless
 from zsched.core.values.fleet import Fleet, NodeSpec, dial_endpoint
 from zsched.core.values.model import NodeId
 from zsched.core.values.snapshot import Snapshot
@@ -86,7 +84,8 @@ def ping_node(
     if is_json:
         print_json(body)
     else:
-        sys.stdout.write("".join(f"{harmless(line)}\n" for line in _lines(question.node, ways, body["heard"])))
+        for line in _lines(question.node, ways, body["heard"]):
+            say(line)
     answered = [bool(way.found.round_trips_s) for way in ways]
     return EXIT_OK if all(answered) else EXIT_FAILED if any(answered) else EXIT_UNREACHABLE
 

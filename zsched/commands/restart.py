@@ -5,13 +5,10 @@ Knows: which node is meant, outcomes as exit codes. Does not know: how a worker 
 
 from __future__ import annotations
 
-import sys
-
 from zsched.commands.ask import ask_door
-from zsched.commands.common import CliError, print_json
+from zsched.commands.common import CliError, print_json, say
 from zsched.commands.logs import worker_node
 from zsched.commands.orders import OrderView, begin, check_said
-from zsched.commands.page import harmless
 from zsched.commands.retry import worker_states
 from zsched.exits import EXIT_FAILED, EXIT_OK
 
@@ -40,7 +37,7 @@ def restart(view: OrderView, task: str, whose: str | None) -> int:
     if view.is_json:
         print_json({"schema": SCHEMA, "task": task, "node": node, "outcome": outcome, "detail": detail})
     elif outcome == "ok":
-        sys.stdout.write(harmless(f"{task} on {node}: {detail}") + "\n")
+        say(f"{task} on {node}: {detail}")
     else:
         raise CliError(EXIT_FAILED, f"{task} on {node}: {detail}")
     return EXIT_OK if outcome == "ok" else EXIT_FAILED

@@ -5,15 +5,13 @@ Knows: which daemon to ask, outcomes as exit codes. Does not know: what a node r
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 from zsched.commands.ask import ask_door
-from zsched.commands.common import CliError, Json, nearest, print_json
+from zsched.commands.common import CliError, Json, nearest, print_json, say
 from zsched.commands.orders import OrderView, Row, begin, check_said
-from zsched.commands.page import harmless
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE
 
 SCHEMA = "zsched.retry/1"
@@ -94,6 +92,6 @@ def _forget(view: OrderView, node: str, *, task: str, whose: str | None) -> str 
 
 def _print(task: str, done: Json, missed: Json) -> None:
     for node, detail in done.items():
-        sys.stdout.write(f"{task} on {node}: {harmless(detail)}\n")
+        say(f"{task} on {node}: {detail}")
     for node, why in missed.items():
-        sys.stdout.write(f"{task} on {node}: not asked, {harmless(why)}\n")
+        say(f"{task} on {node}: not asked, {why}")

@@ -5,7 +5,6 @@ Knows: the conditions, what a status must say for each. Does not know: how a sta
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,8 +13,8 @@ from typing import Final
 
 from zsched.clock import monotonic_s
 from zsched.commands.ask import ask_door, find_door
-from zsched.commands.common import CliError, Json, nearest, print_json
-from zsched.commands.page import harmless, span
+from zsched.commands.common import CliError, Json, nearest, print_json, say
+from zsched.commands.page import span
 from zsched.commands.report import all_problems
 from zsched.exits import EXIT_OK, EXIT_TIMED_OUT, EXIT_UNREACHABLE, EXIT_USAGE
 
@@ -179,5 +178,6 @@ def _tell(view: WaitView, text: str, lacks: list[str], waited_s: float) -> None:
         print_json(body)
         return
     word = "not met" if lacks else "met"
-    sys.stdout.write(f"{text}: {word} after {span(waited_s)}\n")
-    sys.stdout.writelines(f"  {harmless(lack)}\n" for lack in lacks)
+    say(f"{text}: {word} after {span(waited_s)}")
+    for lack in lacks:
+        say(f"  {lack}", indent=4)

@@ -102,6 +102,25 @@ def test_moves_are_told_with_age_wall_time_votes_and_how_long_the_streams_took(
     ]
 
 
+@pytest.mark.usefixtures("pages", "screen")
+def test_on_a_terminal_of_80_columns_no_line_is_longer(capsys: pytest.CaptureFixture[str]) -> None:
+    assert history(HERE, "merge", is_json=False) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        " 1m30s ago  2026-09-21T14:11:50.000Z  merge epoch 2  edge1 -> edge2: edge1 is",
+        "            gone (robot1, robot2 for edge2; robot3 for edge1), streams switched",
+        "            in 86 ms, no answer for 300 ms",
+    ]
+
+
+@pytest.mark.usefixtures("screen")
+def test_a_long_event_goes_on_in_its_next_line_on_a_terminal(pages: Pages, capsys: pytest.CaptureFixture[str]) -> None:
+    pages.entries = [entry("move to edge2 on revision 3: " + "committed again " * 6, 60.0)]
+    assert events(HERE, view()) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("2026-09-21T14:12:20.000Z vote       task=merge epoch=2 move to edge2 on")
+    assert (len(lines), max(map(len, lines)) <= 80, lines[1].startswith("    ")) == (3, True, True)
+
+
 def test_what_is_known_from_before_a_restart_is_no_move(pages: Pages, capsys: pytest.CaptureFixture[str]) -> None:
     older = {**MOVE, "left": None, "votes": [], "reason": "known from before the restart"}
     known = {**older, "reason": "as it was", "is_known": True}

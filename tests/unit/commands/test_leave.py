@@ -195,6 +195,14 @@ def test_it_hands_over_gives_its_seat_up_goes_out_of_the_document_and_ends(hall:
     assert places == sorted(places)
 
 
+@pytest.mark.usefixtures("hall")
+def test_on_a_terminal_no_line_of_the_plan_is_longer_than_it_is_wide(screen: int) -> None:
+    plan = run("--plan")
+    assert plan.exit_code == 10
+    words = [word for line in plan.stdout.splitlines() if len(line) > screen for word in line.split()]
+    assert [word for word in words if len(word) < screen - 4] == []
+
+
 def test_it_stays_until_the_others_have_the_new_document(hall: Hall) -> None:
     hall.fetches_after = 3
     done = run("--yes")

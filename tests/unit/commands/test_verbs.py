@@ -12,12 +12,16 @@ from typer.testing import CliRunner, Result
 
 from zsched import __version__
 from zsched.adapters.machine import core_speed
+from zsched.adapters.network.node_ping import Pinged
 from zsched.cli import app
 from zsched.commands.brief import render_brief
+from zsched.commands.common import say
+from zsched.commands.ping import Way, _lines
 from zsched.commands.report import render_status
 from zsched.config.load import load_fleet
 from zsched.core.values.fleet import fleet_hash
 
+REPOSITORY = Path(__file__).parents[3]
 RECORDED = Path(__file__).parent / "recorded_status"
 
 FLEET = """
@@ -368,3 +372,22 @@ def test_the_manual_names_every_field_of_the_status() -> None:
     (row,) = [line for line in manual.splitlines() if "`zsched.status/1`" in line]
     fields = json.loads((RECORDED / "healthy.json").read_text()).keys() - {"schema"} | {"degraded"}
     assert fields == set(row.split("|")[3].strip(" `").split())
+
+
+def test_on_a_terminal_the_rules_of_a_file_wrap_at_its_width(screen: int) -> None:
+    file = REPOSITORY / "configs" / "fleet.yaml"
+    lines = run("check", file).stdout.splitlines()
+    assert max(map(len, lines)) <= screen
+    assert any(line.startswith("    ") for line in lines), "none was long enough to wrap"
+
+
+def test_what_a_ping_found_wraps_between_words_and_leaves_an_address_whole(
+    screen: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    endpoint = "tls/robot1.hall.example.org:7457"
+    found = Pinged(opened_s=0.05, round_trips_s=[0.0011, 0.0012])
+    for line in _lines("robot1", [Way(name="control", endpoint=endpoint, found=found)], {}):
+        say(line)
+    lines = capsys.readouterr().out.splitlines()
+    assert (len(lines), max(map(len, lines)) <= screen) == (2, True)
+    assert endpoint in lines[0]
