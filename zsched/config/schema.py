@@ -414,14 +414,19 @@ _KEYS_BELOW: Final = re.compile(r"a mapping \{[^{}]*\}")
 """The keys of a mapping have a table of their own."""
 
 
+MANY: Final = 4
+"""Settings that two sections share are told once from this many on."""
+
+
 def reference() -> str:
     """The reference of every key as Markdown: one table per section, sections in the order of the file.
 
-    `docs/guide/fleet-file.md` holds it, and a test compares the two.
+    `docs/guide/fleet-file.md` holds it, and a test compares the two. Settings that sections share are in the first one.
     """
     sections: dict[int, tuple[Record, list[str]]] = {}
     _collect(FLEET, "", sections)
-    return "\n".join(_section(record, paths) for record, paths in sections.values())
+    before: dict[str, list[str]] = {}
+    return "\n".join(_section(record, paths, before) for record, paths in sections.values())
 
 
 def _collect(record: Record, path: str, sections: dict[int, tuple[Record, list[str]]]) -> None:
@@ -445,12 +450,20 @@ def _records(block: Block[Any]) -> Iterator[tuple[str, Record]]:
         yield from ((f"[]{suffix}", record) for suffix, record in _records(block.item))
 
 
-def _section(record: Record, paths: list[str]) -> str:
+def _section(record: Record, paths: list[str], before: dict[str, list[str]]) -> str:
+    """One table; ``before`` are the rows of the sections above it, to which this one is added."""
     heading = ", ".join(f"`{path}`" for path in paths) if paths != [""] else "The file"
     rows = []
     for name, item in record.items.items():
         takes = _KEYS_BELOW.sub("a mapping", item.block.says())
         rows.append(f"| `{name}` | {takes} | {'required' if item.required else item.default} | {item.doc} |")
-    return "\n".join(
-        (f"### {heading}\n", "| key | takes | default | meaning |", "| --- | --- | --- | --- |", *rows, "")
-    )
+    model = max(before, key=lambda name: len(set(before[name]) & set(rows)), default="")
+    shared = [row for row in rows if row in before.get(model, ())]
+    before[heading] = rows
+    if len(shared) < MANY:
+        shared = []
+    own = [row for row in rows if row not in shared]
+    table = ("| key | takes | default | meaning |", "| --- | --- | --- | --- |", *own) if own else ()
+    names = ", ".join(row.split(" | ")[0].removeprefix("| ") for row in shared)
+    more = ((f"\nAnd as in {model}: {names}." if own else f"As in {model}: {names}."),) if shared else ()
+    return "\n".join((f"### {heading}\n", *table, *more, ""))

@@ -156,7 +156,9 @@ class WorkerSpec:
     link: WorkerLink = key(WorkerLink.PEER, "How workers join the data network.")
     env: tuple[tuple[str, str], ...] = key((), "Environment.")
     start_deadline_s: float = key(
-        20.0, "Ready within this time, or the start has failed. So long may the owner's be away.", SECONDS
+        20.0,
+        "Ready within this time, or the start has failed. The worker of an owner may be away for this time.",
+        SECONDS,
     )
     stop_grace_s: float = key(2.0, "Between SIGINT, SIGTERM and SIGKILL.", SECONDS)
     output_deadline_s: float | None = key(
@@ -192,7 +194,7 @@ class LinkLimits:
     )
     foresee_s: float = key(
         0.0,
-        "Signals count as they will be so far ahead along their trend (at most 6 dB); `0`: as they are.",
+        "Signals count as they will be after this time along their trend (at most 6 dB); `0`: as they are.",
         Range(0, MAX_FORESEE_S, "s"),
         shown=f"`{DEFAULT_FORESEE_S:g}`",
     )
@@ -292,10 +294,10 @@ class Timing:
     zenoh_lease_s: float = key(1.5, "zenoh's own lease.", SECONDS)
     sample_s: float = key(0.2, "Period of the profilers.", SECONDS)
     smoothing_s: float = key(0.3, "Time constant of CPU and memory, and of dBm where it is over 0.5 s.", SECONDS)
-    publish_s: float = key(1.0, "A profile at least so often.", SECONDS)
+    publish_s: float = key(1.0, "Longest time between two profiles.", SECONDS)
     """Sooner on change."""
     profile_ttl_s: float = key(3.0, "An older profile does not count.", SECONDS)
-    decide_s: float = key(0.5, "A robot's own round at least so often.", SECONDS)
+    decide_s: float = key(0.5, "Longest time between two rounds of a robot.", SECONDS)
     gather_s: float = key(0.15, "Deadline for the peers' utilities.", SECONDS)
     ballot_s: float = key(0.3, "Deadline of one prepare or accept phase.", SECONDS)
     stagger_s: float = key(0.03, "Wait per rank before a proposer starts.", Range(0, 10, "s"))
