@@ -234,7 +234,8 @@ def kinds_table() -> str:
 
 
 def parts_table() -> str:
-    inner = {part for cls, _ in wire.KINDS.values() for hint in wire.hints_of(cls).values() for part in parts_of(hint)}
+    kinds = {cls for cls, _ in wire.KINDS.values()}
+    inner = {part for cls in kinds for hint in wire.hints_of(cls).values() for part in parts_of(hint)} - kinds
     lines = ["| value | fields |", "| --- | --- |"]
     lines += [f"| `{cls.__name__}` | {fields_of(cls)} |" for cls in sorted(inner, key=lambda cls: cls.__name__)]
     return "\n".join(lines)
