@@ -77,6 +77,9 @@ from zsched.sessions import config as zenoh_config
 
 NAME_TAKEN_WAIT_S = 5.0
 CLOSE_WORKERS_S = 0.7
+"""How long workers have to end..."""
+FINISH_WORKERS_S = 4.0
+"""...and where the daemon begins anew: they do what has come, and nobody counts the seconds."""
 LOOP_MAX_WAIT_S = 1.0
 LOOK_S = 30.0
 """How often the certificate's files are looked at."""
@@ -360,7 +363,7 @@ class Daemon:
         shell.follow = adoption.adopt
         relay.start()
         stack.callback(lambda: relay.leave() if self._is_restart else relay.stop(1.0))
-        stack.callback(supervisor.close, CLOSE_WORKERS_S)
+        stack.callback(lambda: supervisor.close(FINISH_WORKERS_S if self.begins_anew else CLOSE_WORKERS_S))
         sampler.start()
         stack.callback(sampler.stop)
         return shell

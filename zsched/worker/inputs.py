@@ -86,6 +86,9 @@ class Dispatcher:
         self._has_withheld = False
         self._backlog = StandbyInputs[Input]()
         self._is_standby: Callable[[], bool] = _never
+        self._came_at = monotonic_s()
+        """When a sample came last."""
+        self._is_busy = False
         self._is_closed = False
         self._is_held = False
         self._first: Callable[[], bool] | None = None
@@ -121,6 +124,7 @@ class Dispatcher:
             waiting.number = number
             waiting.replayed = number < self._acks.replay_end(waiting.name)
         with self._wake:
+            self._came_at = monotonic_s()
             self._timer.waiting += 1
             line = source.waiting.setdefault(key, deque())
             line.append(waiting)
@@ -290,6 +294,12 @@ class Dispatcher:
             is_queued = any(waiting.sample is not None and waiting.name in heard for waiting in self._queue)
             return is_queued or (self._in_hand is not None and self._in_hand <= epoch) or self._backlog.owes(epoch)
 
+    def is_still(self, quiet_s: float) -> bool:
+        """Whether all that has come is processed, and nothing has come for so long."""
+        with self._wake:
+            is_free = not self._is_busy and not self._has_work()
+            return is_free and monotonic_s() - self._came_at >= quiet_s
+
     def has_begun(self, epoch: int) -> bool:
         """Whether `begin` has come for the epoch, or a newer one."""
         return self._epoch >= epoch
@@ -316,12 +326,14 @@ class Dispatcher:
                     return
                 first, self._first = self._first, None
                 claimed = None if self._is_held or first is not None else self._claim()
+                self._is_busy = first is not None or claimed is not None
             if first is not None:
                 is_restored = first()
                 with self._wake:
                     self._settle_state(is_restored=is_restored)
             if claimed is not None:
                 self._process(claimed)
+            self._is_busy = False
             if (self._markers or self._asked) and not self._owes_withheld():
                 self._settle()
 

@@ -25,6 +25,7 @@ import logging
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Mapping
 from functools import partial
 from types import FrameType, TracebackType
@@ -64,6 +65,11 @@ CLOSE_S: Final = 0.6
 """Closing a session towards a stopped peer can take seconds; we wait for at most this long."""
 ALARM_S: Final = 0.9
 """...and should zenoh hold Python's global lock meanwhile, the kernel ends a process that was told to stop."""
+FINISH_S: Final = 2.0
+"""A worker that was told to stop does what has come, for at most so long, and until a second signal comes."""
+STILL_S: Final = 0.08
+"""It has all of it when nothing has come for so long: relays send nothing more once they miss its token."""
+LOOK_S: Final = 0.01
 
 _log = logging.getLogger("zsched.worker")
 
@@ -102,7 +108,8 @@ class Worker:
         self._early_end = 0
         """The newest epoch whose inputs have ended although our role in it has not, or has not come yet."""
         self._stop = threading.Event()
-        self._is_signalled = False
+        self._signals = 0
+        """How often it was told to stop."""
         self._outputs: list[Output] = []
         self._output_keys = output_keys
         self._untaken = ""
@@ -325,15 +332,21 @@ class Worker:
         self._stop.set()
 
     def close(self) -> None:
-        """Close the session, within a second; after a signal the process ends here when zenoh would hold it longer."""
+        """Do what has come, then close the session within a second.
+
+        After a signal: the process ends here when zenoh would hold it longer. Without one nothing is finished.
+        """
         self._stop.set()
-        has_alarm = self._is_signalled and threading.current_thread() is threading.main_thread()
+        if self._signals:
+            self._finish()
+        has_alarm = self._signals > 0 and threading.current_thread() is threading.main_thread()
         if has_alarm:
             signal.signal(signal.SIGALRM, signal.SIG_DFL)
             signal.setitimer(signal.ITIMER_REAL, ALARM_S)
         self._dispatcher.close()
         self._troubles.close()
         self._debts.settle(monotonic_s())
+        self._acks.flush()  # before the session closes: what is done must not be called lost
         self._acks.close()
         self._keeper.close()
         for output in tuple(self._outputs):
@@ -342,7 +355,7 @@ class Worker:
         closing = guarded(self._close_session, name="zsched close", is_lasting=False)
         closing.start()
         closing.join(CLOSE_S)
-        if closing.is_alive() and self._is_signalled:
+        if closing.is_alive() and self._signals:
             logging.shutdown()
             os._exit(0)  # a stopped peer holds zenoh's close for seconds, and its threads hold the interpreter
         if has_alarm:
@@ -365,8 +378,25 @@ class Worker:
                 close()
 
     def _on_signal(self, _signal: int, _frame: FrameType | None) -> None:
-        self._is_signalled = True
+        self._signals += 1
         self._stop.set()
+
+    def _finish(self) -> None:
+        """Take the token back, so that relays keep what is to come for the next worker, and do what has come."""
+        token, self._token = self._token, None
+        if token is None or self._role.role is WorkerRole.IDLE:
+            return
+        guarded(self._undeclare, token, name="zsched token", is_lasting=False).start()
+        ends_at = monotonic_s() + FINISH_S
+        while self._signals == 1 and monotonic_s() < ends_at:
+            if self._dispatcher.is_still(STILL_S) and not self._debts.is_waiting:
+                return
+            time.sleep(LOOK_S)  # no event: a signal's handler may not set one that its thread waits for
+
+    @staticmethod
+    def _undeclare(token: zenoh.LivelinessToken) -> None:
+        with contextlib.suppress(zenoh.ZError):
+            token.undeclare()
 
     # --- role --------------------------------------------------------------------------------------------------------
 

@@ -293,6 +293,61 @@ def test_a_signalled_worker_is_gone_within_a_second(tmp_path: Path, is_relay_sto
             peer.stdout.close()
 
 
+def test_who_is_told_to_stop_takes_its_token_back_and_does_what_has_come(relay: Relay, tmp_path: Path) -> None:
+    """Relays keep what is to come once the token went; what is here already is nobody else's."""
+    count, is_gone = 20, threading.Event()
+    token = KEYS.worker("edge1", "t", 3)
+    with Worker.from_env(environment(relay, tmp_path), handles_signals=False) as worker:
+        output = worker.publisher("{prefix}/{epoch}/robot1/out")
+
+        def take(received: Received) -> None:
+            is_gone.wait(5.0)
+            output.put(received.payload)
+
+        worker.subscribe("{prefix}/*/in", take, keep_last=None)
+        worker.ready()
+        until(lambda: token in relay.tokens, "the ready token")
+        relay.tell(WorkerRole.ACTIVE, 4)
+        until(lambda: worker.role.epoch == 4, "the role")
+        for number in range(count):
+            relay.put(str(number).encode())
+        until(lambda: relay.acks and relay.acks[-1].arrived == count, "all are with the worker")
+
+        def let_go() -> None:
+            until(lambda: token not in relay.tokens, "the token goes")
+            is_gone.set()
+
+        seen = threading.Thread(target=let_go)
+        seen.start()
+        worker._on_signal(signal.SIGINT, None)
+    seen.join()
+    until(lambda: len(relay.outputs) == count, "every answer")
+    until(lambda: relay.acks[-1].processed == count, "all are said to be done")
+
+
+def test_a_second_signal_waits_for_nothing(relay: Relay, tmp_path: Path) -> None:
+    is_let = threading.Event()
+    worker = Worker.from_env(environment(relay, tmp_path), handles_signals=False)
+
+    def take(_: Received) -> None:
+        is_let.wait(10.0)
+
+    worker.subscribe("{prefix}/*/in", take)
+    worker.ready()
+    relay.tell(WorkerRole.ACTIVE, 4)
+    until(lambda: worker.role.epoch == 4, "the role")
+    relay.put(b"0")
+    until(lambda: worker._dispatcher._is_busy, "it is in work")
+    worker._on_signal(signal.SIGINT, None)
+    finishing = threading.Thread(target=worker._finish)
+    finishing.start()
+    worker._on_signal(signal.SIGTERM, None)
+    finishing.join(1.0)
+    assert not finishing.is_alive(), "without the signal it takes 2 s"
+    is_let.set()
+    worker.close()
+
+
 def test_what_an_owner_that_died_may_have_done_is_marked(relay: Relay, echo: Echo) -> None:
     """The start marker says how many samples went to it; what a standby took of them keeps the mark."""
     payload = encode_end(EndMarker(epoch=0, count=0, replayed=2))
