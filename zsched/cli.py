@@ -404,7 +404,7 @@ def web(
     ] = "127.0.0.1:7459",
     token_file: Annotated[
         Path | None,
-        typer.Option("--token-file", metavar="FILE", help="Who looks must know its only word. [ZSCHED_WEB_TOKEN]"),
+        typer.Option("--token-file", metavar="FILE", help="Readers must know its only word. [ZSCHED_WEB_TOKEN]"),
     ] = None,
     host: Annotated[
         list[str] | None,
@@ -436,7 +436,7 @@ def web(
 def record(
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="A new file, as run.mcap.")],
     for_: Annotated[
-        str | None, typer.Option("--for", metavar="DURATION", help="So long: 90s, 10m, 2h. [until Ctrl-C]")
+        str | None, typer.Option("--for", metavar="DURATION", help="How long: 90s, 10m, 2h. [until Ctrl-C]")
     ] = None,
     interval: Annotated[float, typer.Option(min=0.1, max=3600.0, metavar="S", help="Seconds between two.")] = 1.0,
     map_: Annotated[

@@ -84,7 +84,7 @@ LOOP_MAX_WAIT_S = 1.0
 LOOK_S = 30.0
 """How often the certificate's files are looked at."""
 SPARE_NODES = 2
-"""A relay is carried on while its fleet grows by so many nodes."""
+"""A relay is carried on while its fleet grows by at most this many nodes."""
 CERTIFICATE = "certificate"
 """Of the problem that this node's certificate ends soon."""
 SESSIONS = "sessions"

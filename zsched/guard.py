@@ -26,7 +26,7 @@ CALM_S: Final = 60.0
 """A thread that has run for this long fails for the first time again."""
 
 NAME_BYTES: Final = 15
-"""So much of a thread's name the kernel keeps."""
+"""The kernel keeps this much of a thread's name."""
 
 T = TypeVar("T")
 

@@ -34,7 +34,7 @@ def drain(
     self_: Annotated[bool, typer.Option("--self", help="The node that is asked.")] = False,
     for_: ForOption = None,
     deadline: Annotated[
-        str, typer.Option("--deadline", metavar="DURATION", help="So long it is watched: 90s, 10m, 2h.")
+        str, typer.Option("--deadline", metavar="DURATION", help="How long to watch: 90s, 10m, 2h.")
     ] = "10m",
     force: Annotated[
         bool, typer.Option("--force", help="Ignore the deadline: watch until the nodes are empty.")

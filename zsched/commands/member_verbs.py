@@ -234,7 +234,7 @@ def leave(
         typer.Option("--purge", help="Delete this machine's files of the fleet, its key too; else they are renamed."),
     ] = False,
     deadline: Annotated[
-        str, typer.Option("--deadline", metavar="DURATION", help="So long it waits in all: 90s, 10m, 2h.")
+        str, typer.Option("--deadline", metavar="DURATION", help="How long to wait in all: 90s, 10m, 2h.")
     ] = "10m",
     accept: AcceptOption = None,
     reason: ReasonOption = "",

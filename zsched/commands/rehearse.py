@@ -38,13 +38,13 @@ LOOK_S: Final = 0.2
 ANSWER_S: Final = 0.3
 """A daemon begins this long after it has answered (`zsched.runtime.strikes`)."""
 CUT_MORE_S: Final = 2.0
-"""A cut lasts so much longer than deciding may take, so that the task moves within it."""
+"""A cut lasts this much longer than deciding may take, so that the task moves within it."""
 BACK_S: Final = 30.0
 """How long the way back may take."""
 DRAIN_MORE_S: Final = 60.0
-"""A drain that nobody ends is over so long after the step's limit: the fleet itself sees to that."""
+"""A drain that nobody ends is over this long after the step's limit: the fleet itself sees to that."""
 UNSURE_S: Final = IN_FORCE_S
-"""So long it is looked for a drain of which nobody has said whether it is agreed."""
+"""How long to look for a drain of which nobody has said whether it is agreed."""
 REFUSED: Final = (EXIT_FAILED, EXIT_USAGE, EXIT_DEGRADED)
 """Exit codes that say: nothing was changed."""
 DEFAULT_PAUSE_S: Final = 12.0

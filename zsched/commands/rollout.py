@@ -53,7 +53,7 @@ def begun(wave: Wave, count: int, kept: Sequence[Json], *, by: str, reason: str)
 
     Args:
         wave: what changes.
-        count: so many candidates of each task; at least 1.
+        count: how many candidates of each task; at least 1.
         kept: rollouts that wait already; a worker that changes once more goes on to wait with its own first ones.
         by: the operator, user@node.
         reason: why.

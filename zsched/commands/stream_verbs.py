@@ -31,7 +31,7 @@ NodeOption = Annotated[
 JsonOption = Annotated[bool, typer.Option("--json", help="JSON, with its schema; --json=1: of that version.")]
 WindowOption = Annotated[float, typer.Option("--window", min=0.1, max=3600.0, metavar="S", help="Seconds to look at.")]
 CountOption = Annotated[
-    int | None, typer.Option("--count", min=1, metavar="N", help="End after so many. [go on until Ctrl-C]")
+    int | None, typer.Option("--count", min=1, metavar="N", help="End after N of them. [go on until Ctrl-C]")
 ]
 ConnectOption = Annotated[
     str | None,
@@ -95,7 +95,7 @@ def tail(
     json_: JsonOption = False,
     count: CountOption = None,
     timeout: Annotated[
-        float | None, typer.Option("--timeout", min=0.1, metavar="S", help="End after so long. [go on until Ctrl-C]")
+        float | None, typer.Option("--timeout", min=0.1, metavar="S", help="End after S seconds. [go on until Ctrl-C]")
     ] = None,
     runtime_dir: RuntimeOption = None,
 ) -> None:

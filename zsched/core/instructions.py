@@ -343,9 +343,9 @@ class RecordStory:
     move: Move | None = None
     """With it, this is a change of owner."""
     took_s: float | None = None
-    """With it, this node's streams have switched to the owner of ``epoch``, so long after it learnt the value."""
+    """With it, this node's streams have switched to the owner of ``epoch``, this long after it learnt the value."""
     gap_s: float | None = None
-    """With it, one of this node's output streams was without an answer for so long, until the owner of ``epoch``
+    """With it, one of this node's output streams was without an answer for this long, until the owner of ``epoch``
     answered."""
     rehearsal: str = ""
     """With it, an operator has rehearsed; this is the rehearsal's name."""

@@ -111,7 +111,7 @@ def has_space(scene: Scene) -> Result:
 
 
 def judged_space(folder: Path, *, free: int, files: int | None, is_read_only: bool) -> Result:
-    """What so much room means: ``free`` bytes, and ``files`` more of them (``None``: without limit)."""
+    """What this room means: ``free`` bytes, and ``files`` more of them (``None``: without limit)."""
     fix = f"free space on it: df -h {folder}; df -i {folder}"
     if is_read_only:
         return failed(f"the disk of {folder} is read-only: no state can be saved", fix=f"mount -o remount,rw; {fix}")

@@ -23,7 +23,7 @@ ACK_S: Final = 0.05
 """Acknowledgements leave this often while anything changes (20 Hz)..."""
 ACK_SAMPLES: Final = 256
 ACK_BYTES: Final = 1 << 20
-"""...or when so much was processed."""
+"""...or when this much was processed."""
 MAX_PER_FRAME: Final = 500
 
 _log = logging.getLogger("zsched.streams")

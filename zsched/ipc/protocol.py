@@ -33,7 +33,7 @@ class RelayHello:
     session: str = ""
     """A digest over what its data session is opened with: access rules, certificate, addresses."""
     threads: int = 0
-    """So many threads it needs, each to receive, to transmit, and to close links."""
+    """How many threads it needs, each to receive, to transmit, and to close links."""
     tasks: tuple[TaskId, ...] | None = None
     """Of its fleet: what an earlier daemon's relay carries beside these has ended. ``None``: it ends nothing."""
 

@@ -32,7 +32,7 @@ TRUSTED, RECORD, LOCK = "ca.pem", "authority.json", ".lock"
 FORMAT: Final = 1
 MAX_BYTES: Final = 4 << 20
 RENEW_SHARE: Final = 2 / 3
-"""A certificate is due once so much of its life is over."""
+"""A certificate is due once this share of its life is over."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -55,13 +55,13 @@ COUNT_S: Final = 1.0
 PULSE_S: Final = 0.5
 """After this long without a report we tell the daemon that we live, whatever the streams' threads wait for."""
 LEAVE_S: Final = 1.5
-"""Before the data session is opened anew, what is under way arrives; when nothing has for so long, it is given up..."""
+"""Before the data session is opened anew, samples under way arrive; after this time without any they are given up..."""
 LEAVE_MAX_S: Final = 8.0
-"""...and in any case after so long."""
+"""...and in any case after this time."""
 ANEW_S: Final = 60.0
-"""A daemon whose process goes on begins anew in it: it is waited for so long, however slow the machine is."""
+"""How long to wait for a daemon that begins anew in its process, however slow the machine is."""
 END_S: Final = 3.0
-"""So long the session has to close, and its port to be free."""
+"""The session has this time to close, and its port to be free."""
 RETRY_S: Final = 0.05
 CLOSE_S: Final = 0.6
 """Closing a session towards a stopped peer can take seconds: we wait at most this long, then the process ends."""

@@ -49,9 +49,9 @@ SETTLE_S: Final = 1.5
 """An old owner that has ended has acknowledged all by then, also when one acknowledgement was dropped on the way, or a
 robot has just stalled that gets the same answers (`zsched.core.hop.shared.STALLED_S`)."""
 REJOIN_S: Final = 5.0
-"""Behind another data session a worker's link has so long to come back, before what has waited goes on its way."""
+"""After a new data session a worker's link has this long to come back, before what has waited goes on its way."""
 SAY_AGAIN_S: Final = 1.0
-"""...and a worker may learn of us so much later than we of it."""
+"""...and a worker may learn of us this much later than we of it."""
 GATHER_S: Final = 0.5
 """What a worker left that restarted in place is reported once, when each of its streams has met the new life."""
 MAX_UNTAKEN: Final = 4
@@ -93,14 +93,14 @@ class _Leave:
     has_left: threading.Event
     began_at: float
     patience_s: float
-    """When nothing of what is under way has arrived for so long, it is given up..."""
+    """When nothing of what is under way has arrived for this long, it is given up..."""
     at_most_s: float
-    """...and in any case after so long."""
+    """...and in any case after this time."""
     under_way: int | None = None
     moved_at: float = 0.0
 
     def is_over(self, under_way: int, now: float) -> bool:
-        """Whether to wait no longer for so much that is under way."""
+        """Whether to wait no longer for what is under way (a number of samples)."""
         if self.under_way is None or under_way < self.under_way:
             self.under_way, self.moved_at = under_way, now
         return now - self.moved_at >= self.patience_s or now - self.began_at >= self.at_most_s

@@ -22,7 +22,7 @@ LEAVE_S = 0.4
 """...and how long it stays when they are moved: the next owner's worker asks ours for its state, and what ours has in
 hand is still to come."""
 FINISH_S = 10.0
-"""...and where it begins anew: for at most so long until its workers say that they have finished."""
+"""...and where it begins anew: at most this long, until its workers say that they have finished."""
 TWICE_S = 0.3
 """Two signals so close together are one: a terminal and a wrapper may both pass on the same Ctrl-C."""
 

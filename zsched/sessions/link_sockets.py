@@ -26,9 +26,9 @@ import zenoh
 from zenoh import Session
 
 SILENT_S: Final = 3600
-"""A connection that has said nothing for about so long is given to zenoh after all."""
+"""A connection that has said nothing for about this long is given to zenoh after all."""
 WAITING: Final = 4096
-"""So many connections may wait; further ones go to zenoh at once, by SYN cookies. The kernel has this limit, too."""
+"""At most this many connections wait; others go to zenoh at once, by SYN cookies. The kernel has this limit, too."""
 _INTERNET: Final = (socket.AF_INET, socket.AF_INET6)
 _BYTES_ACKED: Final = struct.Struct("<Q")
 _BYTES_ACKED_AT: Final = 120

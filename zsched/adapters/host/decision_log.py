@@ -31,7 +31,7 @@ SCHEMA = "zsched.event/1"
 NAME, OLD_NAME = "decisions.ndjson", "decisions.1.ndjson"
 FILE_BYTES = 2 * 1024 * 1024
 PAGE_BYTES = 512 * 1024
-"""One answer tells of so much of a file, so that a question keeps a daemon busy for milliseconds only."""
+"""One answer tells of at most this much of a file, so that a question keeps a daemon busy for milliseconds only."""
 QUEUE_LIMIT = 1000
 CLOSE_S = 0.5
 _BODY = b',"decision":'

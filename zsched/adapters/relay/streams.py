@@ -106,7 +106,7 @@ class Bequest:
     tasks: tuple[TaskId, ...] | None = None
     """Of the fleet; a relay that is taken over ends what it carries for others (``None``: it ends nothing)."""
     spare_threads: int = 0
-    """A relay that is started gets so many more, for a fleet that grows."""
+    """A relay that is started gets this many more, for a fleet that grows."""
 
 
 class RelayHandle:

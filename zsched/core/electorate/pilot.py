@@ -51,9 +51,9 @@ class Course:
     is_auto: bool
     """Whether electors are replaced by themselves; otherwise the operator has named them, and they stay."""
     silence_s: float
-    """T: an elector that is not heard for so long is gone (seconds, > 0)."""
+    """T: an elector that is not heard for this long is gone (seconds, > 0)."""
     away_s: float
-    """A robot that is not heard for so long does not vote (seconds, >= ``silence_s``)."""
+    """A robot that is not heard for this long does not vote (seconds, >= ``silence_s``)."""
     leaving: tuple[NodeId, ...] = ()
     """Nodes that an operator takes out of the fleet."""
 

@@ -32,7 +32,7 @@ class Strangers:
 
     Args:
         fleet: the fleet's name.
-        silence_s: after so long without a beat of this node's generation a stranger's other frames do not count
+        silence_s: after this time without a beat of this node's generation a stranger's other frames do not count
             (seconds). A single forged beat thus ends nothing.
     """
 

@@ -48,7 +48,7 @@ class Held(Generic[L]):
     size: int = 0
     owed: dict[L, int] = field(default_factory=dict)
     unanswered: int = 0
-    """So many of them are to be processed again: what they were answered was withheld."""
+    """How many of them are to be processed again: what they were answered was withheld."""
 
     def owe(self, owed: Mapping[L, int]) -> None:
         """It is not done without these, too."""

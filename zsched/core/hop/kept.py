@@ -64,7 +64,7 @@ class Kept:
         return iter(self._samples)
 
     def keep(self, sent: Sent, *, samples: int, least: int, size: int) -> None:
-        """Keep what was just put: at most so many ``samples`` and ``size`` bytes, but ``least`` of them; oldest go."""
+        """Keep what was just put: at most ``samples`` samples and ``size`` bytes, but ``least`` of them; oldest go."""
         kept = self._samples
         kept.append(sent)
         self.size += sent.size
@@ -102,7 +102,7 @@ class Kept:
     def owed(self, start: int, until: int, waits_for: int, *, samples: int | None = None, size: int = 0) -> Owed:
         """What goes again of the numbers from ``start`` to before ``until``, to a receiver that waits for a number.
 
-        With ``samples`` at most so many of them, and nothing more behind ``size`` bytes.
+        With ``samples`` at most this many of them, and nothing more behind ``size`` bytes.
         """
         chosen: list[Sent] = []
         total = 0

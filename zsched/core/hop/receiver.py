@@ -31,7 +31,7 @@ MAX_MISSING: Final = 256
 MAX_AHEAD: Final = 1 << 30
 """A number further ahead could also lie behind. At 1 kHz this is a cut of twelve days."""
 RETURN: Final = 3
-"""So many numbers in a row take a jump back that nothing has followed; so many start markers what one has said."""
+"""This many numbers in a row take a jump back that nothing has followed; this many start markers take one back."""
 MAX_SOURCES: Final = 8192
 """Publishers that a process remembers on the receiving side."""
 MAX_REPLAYED: Final = 1 << 13

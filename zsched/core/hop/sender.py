@@ -22,7 +22,7 @@ KEPT_SAMPLES: Final = 2048
 KEPT_BYTES: Final = 16 << 20
 """Bounds of what one publisher of class ``reliable`` keeps until it is acknowledged."""
 KEPT_BYTES_LATEST: Final = 256 << 10
-"""Class ``latest``: so much besides the newest ``keep_last`` samples; large ones are not worth a radio's time again."""
+"""Class ``latest``: this much beside the newest ``keep_last`` samples; large ones cost a radio too much time."""
 GREET_S: Final = 0.2
 MAX_GREET_S: Final = 1.0
 """An unanswered start marker is put again after this time, and then after twice as long each time; bounds of that."""
@@ -38,7 +38,7 @@ class Sums(NamedTuple):
     doubled: int
     reordered: int
     at_most_lost: int = 0
-    """It left so many open when another life followed."""
+    """It left this many open when another life followed."""
 
 
 @dataclass(slots=True, eq=False, kw_only=True)
@@ -76,7 +76,7 @@ class Sender:
     """What the newest acknowledgement has let go of: until one that goes further, it may be taken back."""
     resend_from: int | None = None
     question: int | None = None
-    """It has been asked how far it is, when so many samples had been put: its next acknowledgement is the answer."""
+    """It has been asked how far it is, when this many samples had been put: its next acknowledgement is the answer."""
     is_start_due: bool = False
     """Our start marker goes out again: the receiver believes one that was not ours, or is asked how far it is."""
     moved_at: float = 0.0
@@ -90,7 +90,7 @@ class Sender:
     # --- what goes out -----------------------------------------------------------------------------------------------
 
     def note_put(self, sample: Any, stamp: Any, size: int, *, at: float, took_s: float = 0.0) -> Sums | None:
-        """A sample was put under the next number: its put returned at a time, having waited for so long.
+        """A sample was put under the next number: its put returned at a time, after this wait.
 
         Answers the sums of whoever acknowledged before, when nobody acknowledges this one.
         """
@@ -138,7 +138,7 @@ class Sender:
         return True
 
     def announce(self, count: int) -> int:
-        """So many numbers from the next one on will be replays; answers the lowest that may come before them."""
+        """This many numbers from the next one on will be replays; answers the lowest that may come before them."""
         self.replay_end = self.count + count
         return self.lowest
 

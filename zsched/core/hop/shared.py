@@ -70,7 +70,7 @@ class Receiver:
     wanted: Wanted | None = None
     """What is to be put again, until it is taken."""
     question: int | None = None
-    """It has been asked how far it is, when so many samples had been put: its next acknowledgement is the answer."""
+    """It has been asked how far it is, when this many samples had been put: its next acknowledgement is the answer."""
     batch_end: int | None = None
     unreached_since: float | None = None
     heard_at: float = 0.0

@@ -30,7 +30,7 @@ FIRST_PATIENCE = 0.15
 MOVE_PRICE_S = 0.3
 """What a move costs, in seconds of the task's work; real fleets: 0.3 to 0.5 s."""
 SEEN_LATE_S = 1.0
-"""A lead is seen so late, and so long after its end: a move earns less than the figures say, by the lead times it."""
+"""A lead is seen this late, and its end as well: a move earns less than the figures say, by the lead times it."""
 MEMORY_S = 600.0
 """A payment counts 1/e after this time."""
 FORGIVEN_IN_S = 2.0

@@ -304,7 +304,7 @@ def _cpu(
 ) -> float | None:
     """Eq. 1, or the share of its jobs that the task would get done, in time where it has a deadline.
 
-    ``least_cores``: so much it gets, however full the machine is.
+    ``least_cores``: it gets at least this, however full the machine is.
     """
     if profile.cpu_used_cores is None:
         return None

@@ -164,7 +164,7 @@ class WorkerSpec:
     output_deadline_s: float | None = key(
         None, "No output for this long while inputs flow counts as hung.", SECONDS, shown="not watched"
     )
-    max_failures: int = key(3, "So many failures in the window make the node ineligible.", Range(1, 100))
+    max_failures: int = key(3, "This many failures in the window make the node ineligible.", Range(1, 100))
     failure_window_s: float = key(
         60.0, "The window; failures since it was last ready count however old.", Range(1, 86400, "s")
     )

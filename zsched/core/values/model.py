@@ -631,7 +631,7 @@ class Allocation:
     owner: NodeId | None
     tuning: Tuning
     pinned: bool = False
-    """Whether `pin` is in force: so much of it an older program knows, and moves nothing then."""
+    """Whether `pin` is in force. An older program knows only this much of it, and moves nothing then."""
     paused: bool = False
     """Whether `pause` is, likewise; without that its author is not known."""
     leased: bool = False

@@ -462,7 +462,7 @@ class Agreement:
     def on_accept(self, event: ev.AcceptAsked, todo: ToDo, now: float, *, park_s: float | None = None) -> None:
         """A proposer asks this elector to accept a value: only under its own ballots.
 
-        ``park_s``: so long at most it may wait for an owner to leave (seconds); ``None``: by the file.
+        ``park_s``: the longest wait for an owner to leave (seconds); ``None``: by the file.
         """
         acceptance = event.accept.acceptance
         register = self.registers.get(event.accept.task)

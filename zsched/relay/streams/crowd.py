@@ -42,7 +42,7 @@ FORGIVEN_RATIO: Final = 0.5
 REST_S, MAX_REST_S = 1.0, 8.0
 """A receiver is left behind for at least this long; for twice as long when it is left again soon."""
 FITS_BYTES: Final = 96 << 10
-"""So much still fits into zenoh's queue of a link whose socket is full (two batches of 48 KiB)."""
+"""This much still fits into zenoh's queue of a link whose socket is full (two batches of 48 KiB)."""
 OVERHEAD_BYTES: Final = 48
 SLOW_PUT_S: Final = 0.005
 MAX_CHARGE_S: Final = 0.5

@@ -54,7 +54,7 @@ def parser() -> argparse.ArgumentParser:
     add("--threads", type=int, choices=range(1, 65), default=1, metavar="N", help="threads of OpenCV and BLAS (1)")
     add("--world-frame", default="world", help="frame_id of the merged map (world)")
     add("--min-score", type=_ratio, default=0.75, help="accept an alignment from this score on (0.75)")
-    add("--min-agreeing", type=int, default=600, help="... and so many agreeing wall cells of 0.05 m (600)")
+    add("--min-agreeing", type=int, default=600, help="... and this number of agreeing wall cells of 0.05 m (600)")
     add("--min-margin", type=_positive, default=1.3, help="... and this margin over the next place that fits (1.3)")
     add("--ros2", action="store_true", help="hang rmw_zenoh's attachment on the map and the transforms, for ROS nodes")
     add("--standalone", action="store_true", help="run without a daemon, as the owner on node 'local'")

@@ -31,9 +31,9 @@ MAX_STEP_M = 1.0
 MAX_STEP_RAD = math.radians(10.0)
 """ICP that runs farther than this from its start has left the place it was asked about."""
 SEARCH_GROWTH = 1.1
-"""A refused pair is searched again when either map's known area has grown so much since the last search."""
+"""A refused pair is searched again when either map's known area has grown by this factor since the last search."""
 CHECK_GROWTH = 1.3
-"""An accepted pair is searched again (mode estimate) when either map has grown so much."""
+"""An accepted pair is searched again (mode estimate) when either map has grown by this factor."""
 CONTRADICTION = 0.5
 CONTRADICTIONS_TO_DROP = 5
 """A kept alignment under this score, this many times in a row, is dropped: the maps say that it is wrong."""
