@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from typing import Any
 import pytest
 
 from support.clinic import FLEET, assert_finds, make_state, run, scene_of
+from support.planted_faults import found_in
 from zsched.adapters.host.document_store import DocumentStore
 from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.adapters.radio.nl80211 import GenericNetlink, Interface
@@ -30,9 +32,7 @@ from zsched.wire.codec import as_plain, document_hash
 
 FAIL, WARN, PASS, SKIP = Verdict.FAIL, Verdict.WARN, Verdict.PASS, Verdict.SKIP
 HERE = Path(__file__).parent
-PLANTED = "".join(
-    path.read_text() for folder in (HERE, HERE.parents[1] / "parts" / "doctor") for path in folder.glob("test_*.py")
-)
+FOUND = found_in(path for folder in (HERE, HERE.parents[1] / "parts" / "doctor") for path in folder.glob("test_*.py"))
 ROBOTS_OWN = FLEET.replace("  robot1: {kind: robot}", "  robot1: {kind: robot, wifi: wlan7}")
 
 
@@ -55,11 +55,32 @@ def test_a_machine_in_order_has_no_fault(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.name)
-def test_a_fault_is_planted_for_every_check(check: Check) -> None:
-    """By the check's name or by its function: a new check comes with the fault that it finds."""
-    run = check.run
-    function = f"{run.__module__.rpartition('.')[2]}.{run.__name__}"
-    assert f'"{check.name}"' in PLANTED or function in PLANTED
+def test_a_planted_fault_is_found_by_every_check(check: Check) -> None:
+    """By its name or its function: a new check comes with a test that fails unless it finds what was planted."""
+    function = f"{check.run.__module__.rpartition('.')[2]}.{check.run.__name__}"
+    assert {check.name, function} & FOUND
+
+
+def test_a_check_that_is_only_mentioned_or_passes_counts_for_nothing(tmp_path: Path) -> None:
+    file = tmp_path / "test_some.py"
+    file.write_text(
+        """
+def test_one():
+    assert run("a.passes", scene).verdict is PASS
+    "a.mentioned"
+    assert_finds(inner.judged(run("a.within", scene)), FAIL)
+    assert_finds(run("a.direct", scene), FAIL, "a.word")
+    found = run("a.assigned", scene)
+    assert_finds(found, WARN)
+    check = room.function
+    assert_finds(check(scene), FAIL)
+    assert_finds(results["a.table"], FAIL)
+
+def helper():
+    assert_finds(run("a.helper", scene), FAIL)
+"""
+    )
+    assert found_in([file]) == {"inner.judged", "a.direct", "a.assigned", "room.function", "a.table"}
 
 
 # --- the fleet file --------------------------------------------------------------------------------------------------
@@ -193,13 +214,16 @@ def test_a_state_by_which_nobody_may_vote_is_found(tmp_path: Path, field: str) -
     assert_finds(run("state.elector", scene), FAIL)
 
 
-def test_a_slow_disk_is_found(tmp_path: Path) -> None:
+def test_a_slow_disk_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     took_s = state._sync_s(tmp_path)
     assert 0.0 < took_s < 5.0
     assert list(tmp_path.iterdir()) == []
     assert state.judged_sync(0.004, 0.3, tmp_path).verdict is PASS
     assert_finds(state.judged_sync(0.06, 0.3, tmp_path), WARN, "60.0 ms")
     assert_finds(state.judged_sync(0.2, 0.3, tmp_path), FAIL, "ballot_s = 0.3 s")
+    scene = scene_of(tmp_path)
+    monkeypatch.setattr(state, "_sync_s", lambda _folder: scene.fleet.timing.ballot_s)
+    assert_finds(run("state.fsync", scene), FAIL, str(scene.state_folder), "ballot_s")
 
 
 def test_the_state_folder_s_own_disk_is_looked_at(tmp_path: Path) -> None:
@@ -211,7 +235,7 @@ def test_the_state_folder_s_own_disk_is_looked_at(tmp_path: Path) -> None:
     assert run("state.fsync", replace(scene, state_folder=tmp_path / "none")).verdict is SKIP
 
 
-def test_a_full_and_a_read_only_disk_are_found(tmp_path: Path) -> None:
+def test_a_full_and_a_read_only_disk_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def judged(**facts: Any) -> Any:
         return state.judged_space(tmp_path, **{"free": 1 << 30, "files": 1000, "is_read_only": False, **facts})
 
@@ -220,6 +244,11 @@ def test_a_full_and_a_read_only_disk_are_found(tmp_path: Path) -> None:
     assert_finds(judged(free=9 << 20), WARN, "9 MiB left")
     assert_finds(judged(files=3), FAIL, "3 files")
     assert_finds(judged(is_read_only=True), FAIL, "read-only")
+    scene = scene_of(tmp_path)
+    facts = os.statvfs(scene.state_folder)
+    full = os.statvfs_result((*facts[:4], 0, *facts[5:]))  # no block is left for this user
+    monkeypatch.setattr(os, "statvfs", lambda _folder: full)
+    assert_finds(run("state.space", scene), FAIL, "0 MiB left")
 
 
 # --- the daemon ------------------------------------------------------------------------------------------------------
@@ -512,6 +541,5 @@ def test_a_unit_that_this_machine_has_not_is_found(tmp_path: Path) -> None:
     """Also where there is no systemd at all."""
     kept = FLEET.replace("{command: [python, -m, zsched.tasks.echo]}", "{driver: systemd, unit: nosuch@.service}")
     found = run("worker.engine", scene_of(tmp_path, kept))
-    assert found.verdict in (FAIL, WARN)
-    assert found.fix
+    assert_finds(found, FAIL if found.verdict is FAIL else WARN)
     assert run("worker.engine", scene_of(tmp_path)).verdict is SKIP
