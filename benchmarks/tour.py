@@ -21,6 +21,7 @@ import pty
 import re
 import select
 import shlex
+import socket
 import struct
 import sys
 import tempfile
@@ -47,6 +48,8 @@ QUIT_S: Final = 15.0
 SHOWN_PAUSE_S: Final = 1.0
 """Between two verbs of the recording; pauses within one are shortened to that, too."""
 ESCAPES: Final = re.compile(r"\x1b(?:\[[0-9;?>]*[ -/]*[@-~]|\][^\x07]*\x07|[()][AB0]|[=>])")
+HOST: Final = "robot1"
+"""What the machine of a recording is called."""
 PER_NODE: Final = 5
 """Ports of one node: its sessions, its local side, and what it dials from."""
 TASK: Final = """\
@@ -281,7 +284,8 @@ def write_cast(file: Path, seen: Sequence[Seen], size: tuple[int, int], folder: 
 
 
 def usual(text: str, folder: Path) -> str:
-    """The text with the paths of an installed machine in place of those of this run."""
+    """The text with the paths of an installed machine in place of those of this run, and a host's name of a robot's."""
+    text = re.sub(rf"(?<![\w-]){re.escape(socket.gethostname())}(?![\w-])", HOST, text)
     for name in NODES:
         for here, there in PLACES:
             text = text.replace(f"{folder / name}{here}", there)

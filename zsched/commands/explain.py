@@ -3,7 +3,8 @@
 With ``--at`` a judgement of the past, out of the decision log of the node that is asked.
 
 Knows: which daemon to ask, the text, the schema ``zsched.explain/1``. Does not know: how a sum comes about
-(`zsched.core.scheduler.explain`), where a log lies (`zsched.adapters.host.decision_log`).
+(`zsched.core.scheduler.explain`: the daemon tells the sums of its last judgement, others are made here, by
+`zsched.commands.judgement`), where a log lies (`zsched.adapters.host.decision_log`).
 """
 
 from __future__ import annotations
@@ -15,21 +16,17 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 
 from zsched.commands.ask import Door, ask_door
-from zsched.commands.common import CliError, Json, nearest, print_json
+from zsched.commands.common import CliError, Json, print_json
 from zsched.commands.history import age_s_of, is_known, is_move, wall_text, where_of
 from zsched.commands.page import Cell, Page, memory, span
 from zsched.commands.report import printable
 from zsched.commands.weight_words import shares
-from zsched.core.report import plain
-from zsched.core.scheduler.explain import explained, judged_again, seen_by, without
-from zsched.core.values.decision import Decision, Explanation
 from zsched.core.values.model import PAPER_METRICS
-from zsched.errors import WireError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
-from zsched.wire.codec import from_plain
-from zsched.wire.keyspace import MAX_DIGITS
 
 SCHEMA = "zsched.explain/1"
+MAX_DIGITS = 16
+"""Of an epoch (`zsched.core.values.model.MAX_COUNTER`)."""
 MIN_WIDTH, MAX_WIDTH = 60, 160
 COLUMNS = {"memory": "mem", "network": "net"}
 """The short titles of columns."""
@@ -58,14 +55,18 @@ def explain(door: Door, task: str, view: ExplainView) -> int:
     """
     gone = None if view.plan is None else _planned(view.plan)
     if view.at is not None:
-        body, decision = _past(door, task, _point_of(view.at))
+        body, written = _past(door, task, _point_of(view.at))
     else:
-        body, decision = explanation(door, task) if view.robot is None else _of_robot(door, task, view.robot)
+        body, written = explanation(door, task) if view.robot is None else _of_robot(door, task, view.robot)
     if view.robot is not None:
-        body["robot"] = _sight(decision, view.robot, str(body["node"]))
+        from zsched.commands.judgement import sight  # noqa: PLC0415 - loads the scheduler, which takes as long as this
+
+        body["robot"] = sight(written, view.robot, str(body["node"]))
     code = EXIT_OK
     if gone is not None:
-        body["plan"] = _plan(decision, gone)
+        from zsched.commands.judgement import planned  # noqa: PLC0415 - as above
+
+        body["plan"] = planned(written, gone)
         code = EXIT_WOULD_CHANGE if body["plan"]["would_move"] else EXIT_OK
     if view.is_json:
         print_json(body)
@@ -75,41 +76,45 @@ def explain(door: Door, task: str, view: ExplainView) -> int:
     return code
 
 
-def explanation(door: Door, task: str) -> tuple[Json, Decision]:
-    """Why a task is where it is, as ``zsched.explain/1`` has it, and the judgement that this is made of.
+def explanation(door: Door, task: str) -> tuple[Json, Json]:
+    """Why a task is where it is, as ``zsched.explain/1`` has it, and the written judgement that this is made of.
 
     Raises:
         CliError: nobody answers, there is no such task, or no judgement yet.
     """
     answer = _asked(door, task)
-    if answer.decision is None:
-        raise CliError(EXIT_FAILED, f"{answer.node} has judged nothing of {task} yet; ask again in a second")
-    return _body(answer, answer.decision), answer.decision
+    told = answer["explanation"]
+    written: Json | None = told.get("decision")
+    if written is None:
+        raise CliError(EXIT_FAILED, f"{told['node']} has judged nothing of {task} yet; ask again in a second")
+    sums = answer.get("sums") or _sums(written)  # an older daemon tells none
+    vote = told.get("vote")
+    more = {
+        "newest_revision": told["allocation"]["revision"],
+        "vote": None if vote is None else {**vote, "votes": dict(vote["votes"])},
+        "plan": None,
+        "knows_jobs": told.get("knows_jobs"),
+    }
+    head = {"schema": SCHEMA, "node": told["node"], "age_s": told.get("age_s", 0.0)}
+    return {**head, **sums, **more, "at": None, "made": None, "robot": None}, written
 
 
-def _of_robot(door: Door, task: str, robot: str) -> tuple[Json, Decision]:
+def _sums(written: Json) -> Json:
+    from zsched.commands.judgement import sums  # noqa: PLC0415 - as above
+
+    return sums(written)
+
+
+def _of_robot(door: Door, task: str, robot: str) -> tuple[Json, Json]:
     """A robot's own judgement; where it does not answer, another one's, which knows what it has told."""
-    body, decision = explanation(door, task)
-    if body["node"] == robot or robot not in decision.figures.voters:
-        return body, decision
+    body, written = explanation(door, task)
+    if body["node"] == robot or robot not in written["figures"]["voters"]:
+        return body, written
     try:
         return explanation(door.to(robot), task)
     except CliError as error:
         sys.stderr.write(f"zsched explain: {error}; this is what {body['node']} has heard of {robot}\n")
-        return body, decision
-
-
-def _sight(decision: Decision, robot: str, judge: str) -> Json:
-    """What the robot sees, as ``zsched.explain/1`` has it.
-
-    Raises:
-        CliError: it is no robot of the fleet.
-    """
-    robots = decision.figures.voters
-    if robot not in robots:
-        raise CliError(EXIT_USAGE, f"--robot: the fleet has no robot {robot!r}{nearest(robot, robots)}")
-    told: Json = plain(seen_by(decision, robot, judge))
-    return told
+        return body, written
 
 
 # --- a judgement of the past -----------------------------------------------------------------------------------------
@@ -144,7 +149,7 @@ def _point_of(word: str) -> Point:
     return Point(word=word, wall_s=(moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp())
 
 
-def _past(door: Door, task: str, point: Point) -> tuple[Json, Decision]:
+def _past(door: Door, task: str, point: Point) -> tuple[Json, Json]:
     """The newest judgement before the point in the log of this machine's node, and the move that began the epoch.
 
     Raises:
@@ -155,18 +160,17 @@ def _past(door: Door, task: str, point: Point) -> tuple[Json, Decision]:
     answer = _ask(door, task)  # names an unknown task
     node, now, entry, move = _search(door, task, point)
     if entry is None:
-        edge = f"; {node} is an edge and decides nothing: ask on a robot" if answer.kind == "edge" else ""
+        is_edge = answer["explanation"]["kind"] == "edge"
+        edge = f"; {node} is an edge and decides nothing: ask on a robot" if is_edge else ""
         when = f"before epoch {point.epoch}" if point.epoch is not None else f"until {point.word}"
         raise CliError(EXIT_FAILED, f"the log of {node} has no judgement of {task} {when}{edge}")
-    try:
-        decision = from_plain(entry["decision"], Decision)
-    except WireError as error:
-        raise CliError(EXIT_FAILED, f"the log's judgement cannot be read ({error})") from error
-    told: Json = plain(explained(decision))
+    written: Json = entry["decision"]
+    told = _sums(written)
     head = {"schema": SCHEMA, "node": node, "age_s": max(now - float(entry["at"]), 0.0)}
     made = None if move is None else _move(move, now)
-    more = {"newest_revision": decision.figures.allocation.revision, "vote": None, "plan": None, "knows_jobs": None}
-    return {**head, **told, **more, "at": wall_text(entry["at"]), "made": made, "robot": None}, decision
+    revision = written["figures"]["allocation"]["revision"]
+    more = {"newest_revision": revision, "vote": None, "plan": None, "knows_jobs": None}
+    return {**head, **told, **more, "at": wall_text(entry["at"]), "made": made, "robot": None}, written
 
 
 def _move(entry: Json, now: float) -> Json:
@@ -218,16 +222,18 @@ def _planned(word: str) -> str:
     return node
 
 
-def _asked(door: Door, task: str) -> Explanation:
+def _asked(door: Door, task: str) -> Json:
     """A robot's answer; an edge decides nothing, so it names the robots, and one of them is asked in its place."""
     answer = _ask(door, task)
-    if answer.kind != "edge" or door.node is not None or not answer.robots:
-        if answer.kind == "edge":
-            whom = f"ask a robot: --node {answer.robots[0]}" if answer.robots else "and no robot is alive"
-            raise CliError(EXIT_FAILED, f"{answer.node} is an edge and decides nothing; {whom}")
+    told = answer["explanation"]
+    robots = told["robots"]
+    if told["kind"] != "edge" or door.node is not None or not robots:
+        if told["kind"] == "edge":
+            whom = f"ask a robot: --node {robots[0]}" if robots else "and no robot is alive"
+            raise CliError(EXIT_FAILED, f"{told['node']} is an edge and decides nothing; {whom}")
         return answer
     failures = []
-    for robot in answer.robots:
+    for robot in robots:
         try:
             return _ask(door.to(robot), task)
         except CliError as error:
@@ -235,33 +241,12 @@ def _asked(door: Door, task: str) -> Explanation:
     raise failures[0]
 
 
-def _ask(door: Door, task: str) -> Explanation:
+def _ask(door: Door, task: str) -> Json:
+    """The daemon's answer: ``explanation`` (`zsched.core.values.decision.Explanation`), and the ``sums``."""
     answer = ask_door(door, {"verb": "explain", "task": task})
     if "explanation" not in answer:
         raise CliError(EXIT_USAGE, str(answer.get("detail") or "the daemon is of another version"))
-    try:
-        return from_plain(answer["explanation"], Explanation)
-    except WireError as error:
-        raise CliError(EXIT_FAILED, f"the answer cannot be read ({error}); update the older of the two") from error
-
-
-def _body(answer: Explanation, decision: Decision) -> Json:
-    vote = None if answer.vote is None else {**plain(answer.vote), "votes": dict(answer.vote.votes)}
-    told: Json = plain(explained(decision))
-    head = {"schema": SCHEMA, "node": answer.node, "age_s": answer.age_s}
-    more = {"newest_revision": answer.allocation.revision, "vote": vote, "plan": None, "knows_jobs": answer.knows_jobs}
-    return {**head, **told, **more, "at": None, "made": None, "robot": None}
-
-
-def _plan(decision: Decision, gone: str) -> Json:
-    figures = decision.figures
-    known = sorted({*figures.rules.candidates, *figures.voters, *figures.electors})
-    if gone not in known:
-        raise CliError(EXIT_USAGE, f"--plan: {gone!r} is no candidate, robot or elector{nearest(gone, known)}")
-    again = judged_again(decision, without(figures, gone))
-    told: Json = plain(explained(again))
-    moves = again.verdict.outcome == "propose" and again.verdict.candidate != figures.allocation.owner
-    return {"without": gone, "would_move": moves, **told}
+    return answer
 
 
 # --- text ------------------------------------------------------------------------------------------------------------

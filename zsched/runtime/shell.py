@@ -36,8 +36,8 @@ from zsched.core.relay_protocol import (
     WorkerSeen,
     WorkerTrouble,
 )
-from zsched.core.report import snapshot_json
-from zsched.core.values.decision import Explanation
+from zsched.core.report import plain, snapshot_json
+from zsched.core.values.decision import Decision, Explanation
 from zsched.core.values.document import Document, Flag, Rollout, Text
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.gauges import GAUGES
@@ -380,7 +380,7 @@ def answer_json(value: object) -> dict[str, Any]:
     if isinstance(value, Snapshot):
         return snapshot_json(value)
     if isinstance(value, Explanation):
-        return {"explanation": wire.as_plain(value)}
+        return {"explanation": wire.as_plain(value), "sums": _sums(value.decision)}
     if isinstance(value, WorkerLines):
         lines = [{"number": line.number, "age_s": line.age_s, "text": line.text} for line in value.lines]
         body = {"node": value.node, "task": value.task, "lines": lines}
@@ -393,6 +393,13 @@ def answer_json(value: object) -> dict[str, Any]:
         return {"node": value.node, "timing": value.timing, "promised": promised, **kept}
     assert isinstance(value, CommandResult)
     return {"outcome": value.outcome.value, "detail": value.detail, "revision": value.revision}
+
+
+def _sums(decision: Decision | None) -> dict[str, Any] | None:
+    """The sums of a judgement: so the tool that asks need not load the scheduler."""
+    from zsched.core.scheduler.explain import explained  # noqa: PLC0415 - only a daemon that is asked pays for it
+
+    return None if decision is None else plain(explained(decision))
 
 
 def _fleet_json(told: FleetTold) -> dict[str, Any]:

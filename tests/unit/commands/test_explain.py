@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import math
 import re
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +26,7 @@ from zsched.core.values.decision import Decision, Explanation, Figures, Move, Ne
 from zsched.core.values.model import Allocation, PeerState, Reach, ScoreForm, Tuning, Utility, UtilityVector, Weights
 from zsched.core.values.snapshot import VoteStatus
 from zsched.exits import EXIT_FAILED, EXIT_UNREACHABLE, EXIT_USAGE, EXIT_WOULD_CHANGE
-from zsched.wire.codec import as_plain
+from zsched.runtime.shell import answer_json
 
 ROBOTS = ("robot1", "robot2", "robot3")
 WEIGHTS = Weights(cpu=0.5, memory=0.3, network=0.2)
@@ -93,6 +95,7 @@ class Fleet:
         self.answers: dict[str | None, Any] = {"robot1": robot, None: robot, "edge1": edge}
         self.asked: list[str | None] = []
         self.silent: set[str] = set()
+        self.tells_sums = True
         self.log: DecisionLog | None = None
 
     def ask(self, door: Door, request: dict[str, Any], timeout_s: float = 5.0) -> dict[str, Any]:
@@ -105,7 +108,8 @@ class Fleet:
             raise CliError(EXIT_UNREACHABLE, f"no daemon of {door.node}")
         if request["task"] != "merge":
             return {"outcome": "invalid", "detail": "no task 'merg'; there are merge"}
-        return {"explanation": json.loads(json.dumps(as_plain(self.answers[door.node])))}
+        answer = json.loads(json.dumps(answer_json(self.answers[door.node])))
+        return dict(answer) if self.tells_sums else {"explanation": answer["explanation"]}
 
 
 @pytest.fixture
@@ -118,6 +122,22 @@ def fleet(monkeypatch: pytest.MonkeyPatch) -> Fleet:
 def asked(node: str | None = None, task: str = "merge", *, is_json: bool = False, **more: str | None) -> int:
     view = ExplainView(plan=more.pop("plan", None), is_json=is_json, is_colored=False, **more)
     return explain(Door(socket=Path("s"), node=node), task, view)
+
+
+def test_a_daemon_that_tells_no_sums_gets_the_same_page(fleet: Fleet, capsys: pytest.CaptureFixture[str]) -> None:
+    assert asked(is_json=True) == 0
+    told = json.loads(capsys.readouterr().out)
+    fleet.tells_sums = False
+    assert asked(is_json=True) == 0
+    assert json.loads(capsys.readouterr().out) == told
+
+
+def test_the_verb_alone_loads_no_scheduler() -> None:
+    """It takes as long as the whole verb."""
+    code = "import sys, zsched.cli, zsched.commands.explain; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert "zsched.commands.explain" in loaded
+    assert [one for one in loaded if one.startswith(("zsched.core.scheduler", "zsched.wire", "msgpack", "zenoh"))] == []
 
 
 def by_formula(text: str, **terms: float) -> float:
