@@ -126,3 +126,23 @@ def test_gauges_are_told_by_name() -> None:
     node = status["nodes"][0]
     node["gauges"] = {"battery": 0.8}
     assert values(metrics_text(status), "zsched_node_gauge") == {(node["name"], "battery"): 0.8}
+
+
+def told_names() -> set[str]:
+    """The names of docs/guide/cli.md; `_alive` behind `zsched_quorum_electors` is `zsched_quorum_alive`."""
+    page = (Path(__file__).parents[3] / "docs" / "guide" / "cli.md").read_text(encoding="utf-8")
+    table = page.partition("| names | labels |")[2].partition("\n\n")[0]
+    found = set()
+    for line in table.splitlines():
+        family = ""
+        for name in re.findall(r"`(\w+)`", line.split(" | ")[0]):
+            family = "_".join(name.split("_")[:2]) if name.startswith("zsched_") else family
+            found.add(name if name.startswith("zsched_") else family + name)
+    return found
+
+
+def test_the_page_of_the_command_line_names_every_metric() -> None:
+    status = recorded()
+    status["nodes"][0]["gauges"] = {"gpu": 0.5}
+    names = {sample.name for family in parsed(metrics_text(status)).values() for sample in family.samples}
+    assert names - told_names() == set()
