@@ -93,6 +93,7 @@ class Door:
 
     def __init__(self, folder: Path, node: NodeId) -> None:
         self._socket = folder / f"{node}.relay"
+        self._next = folder / f"{node}.relay.next"
         self._lock = folder / f"{node}{_LOCK}"
 
     def note(self) -> Note | None:
@@ -109,11 +110,11 @@ class Door:
             os.close(descriptor)
         return None
 
-    def claim(self) -> Claim:
-        """Lock the place for a relay that is about to be started, and listen.
+    def prepare(self) -> Claim:
+        """What a relay that is about to be started inherits; it has the place once it is taken (`take`).
 
         Raises:
-            AdapterError: a relay holds the lock, or the folder cannot be used.
+            AdapterError: the folder cannot be used.
         """
         try:
             lock = os.open(self._lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
@@ -121,18 +122,29 @@ class Door:
             raise AdapterError(f"cannot open {self._lock}: {error.strerror}; check --runtime-dir") from error
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            self._socket.unlink(missing_ok=True)
-            listener.bind(str(self._socket))
-            self._socket.chmod(0o600)
+            self._next.unlink(missing_ok=True)
+            listener.bind(str(self._next))
+            self._next.chmod(0o600)
             listener.listen(4)
         except OSError as error:
             os.close(lock)
             listener.close()
-            if isinstance(error, BlockingIOError):
-                raise AdapterError(f"another relay holds {self._lock}; it ends by itself soon") from error
-            raise AdapterError(f"cannot listen on {self._socket}: {error}; check --runtime-dir") from error
+            raise AdapterError(f"cannot listen on {self._next}: {error}; check --runtime-dir") from error
         return Claim(lock=lock, listener=listener)
+
+    def take(self, claim: Claim) -> None:
+        """Lock the place for the claim's relay, and be found there.
+
+        Raises:
+            AdapterError: another relay holds the lock, or the folder cannot be used.
+        """
+        try:
+            fcntl.flock(claim.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._next.rename(self._socket)
+        except BlockingIOError as error:
+            raise AdapterError(f"another relay holds {self._lock}; it ends by itself soon") from error
+        except OSError as error:
+            raise AdapterError(f"cannot listen on {self._socket}: {error}; check --runtime-dir") from error
 
     def sign(self, claim: Claim, note: Note) -> None:
         """Write down which relay has taken the claim."""
@@ -168,7 +180,7 @@ class Door:
 
     def remove(self) -> None:
         """Remove both files, once the relay is gone."""
-        for path in (self._socket, self._lock):
+        for path in (self._socket, self._next, self._lock):
             with contextlib.suppress(OSError):
                 path.unlink(missing_ok=True)
 

@@ -39,7 +39,9 @@ def test_the_own_control_group_of_either_version() -> None:
 
 
 def test_the_relays_of_a_folder_are_those_that_hold_their_lock(tmp_path: Path) -> None:
-    claims = {name: Door(tmp_path, name).claim() for name in ("robot1", "robot2")}
+    claims = {name: Door(tmp_path, name).prepare() for name in ("robot1", "robot2")}
+    for name, claim in claims.items():
+        Door(tmp_path, name).take(claim)
     for number, (name, claim) in enumerate(claims.items()):
         Door(tmp_path, name).sign(claim, Note(pid=100 + number, listen=""))
     assert relays_in(tmp_path) == (100, 101)

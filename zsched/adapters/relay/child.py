@@ -8,12 +8,15 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
+import select
 import signal
 import socket
 import threading
 import time
+from collections.abc import Callable
 
 from zsched.clock import awake_s
+from zsched.errors import AdapterError
 from zsched.ipc.takeover import Claim, Door, Note
 
 POLL_S = 0.01
@@ -62,6 +65,12 @@ class RelayChild:
             self._has_ended = True
             return True
 
+    def speaks(self, timeout_s: float) -> bool:
+        """Whether there is a word of it to read within ``timeout_s``."""
+        poller = select.poll()
+        poller.register(self.descriptor, select.POLLIN)
+        return bool(poller.poll(timeout_s * 1000))
+
     def wait(self, timeout_s: float) -> bool:
         """Whether the process is gone within ``timeout_s``."""
         until = awake_s() + timeout_s
@@ -101,8 +110,16 @@ class RelayChild:
                 os.kill(self.pid, number)
 
 
-def start_relay(command: list[str], door: Door | None = None, listen: str = "", code: str = "") -> RelayChild:
+def start_relay(
+    command: list[str],
+    door: Door | None = None,
+    listen: str = "",
+    code: str = "",
+    ends_other: Callable[[RelayChild], None] = lambda _next: None,
+) -> RelayChild:
     """Start a relay; with ``door`` it can be found again there, with where its session listens and its code.
+
+    ``ends_other`` is called when it runs, before it has the place: the relay that has it yet ends then.
 
     Raises:
         AdapterError: the door is another relay's, or its folder cannot be used.
@@ -112,14 +129,21 @@ def start_relay(command: list[str], door: Door | None = None, listen: str = "", 
     with contextlib.ExitStack() as stack:
         stack.callback(theirs.close)
         stack.callback(ours.close)
-        claim = None if door is None else door.claim()
+        claim = None if door is None else door.prepare()
         if claim is not None:
             stack.callback(claim.close)
-        pid = _spawn(command, theirs, claim)
-        if claim is not None and door is not None:
-            door.sign(claim, Note(pid=pid, listen=listen, code=code))
-        ours = ours.dup()  # the stack closes the other one
-    return RelayChild(pid=pid, link=ours, door=door, is_child=True)
+        child = RelayChild(pid=_spawn(command, theirs, claim), link=ours.dup(), door=door, is_child=True)
+        if claim is None or door is None:
+            return child
+        try:
+            ends_other(child)
+            door.take(claim)
+        except AdapterError:
+            child.kill()
+            child.close()
+            raise
+        door.sign(claim, Note(pid=child.pid, listen=listen, code=code))
+    return child
 
 
 def _spawn(command: list[str], link: socket.socket, claim: Claim | None) -> int:

@@ -50,6 +50,8 @@ STARVED_S: Final = 15.0
 STILL_S: Final = 8.0
 """Its streams are counted every second; after this long without a count they hang on something, though it lives."""
 EVICT_S: Final = 2.0
+WARM_S: Final = 4.0
+"""So long a relay that is to be replaced carries on, until the next one has loaded its code."""
 
 _log = logging.getLogger("zsched.streams")
 
@@ -252,8 +254,7 @@ class RelayHandle:
         found = bequest.door.connect(self._hello, lambda asked_s, took_s: not silence.go_on(asked_s, took_s))
         if isinstance(found, str):
             _log.warning("the relay that runs here (pid %d) is replaced: %s", note.pid, found)
-            RelayChild(pid=note.pid, link=None, door=bequest.door).end(EVICT_S)
-            return None
+            return self._replaced(RelayChild(pid=note.pid, link=None, door=bequest.door))
         link, here = found
         self._reopens = here.reopens
         how = ", and opens its data session anew" if here.reopens else ""
@@ -264,6 +265,24 @@ class RelayHandle:
         )
         _log.info("the relay that runs here (pid %d) is taken over%s", here.pid, how)
         return RelayChild(pid=here.pid, link=link, door=bequest.door)
+
+    def _replaced(self, other: RelayChild) -> RelayChild | None:
+        """The relay that follows ``other``; ``None``: it could not be started yet.
+
+        The other one carries on until the next one waits for its configuration: it opens its sessions at once then, and
+        the host's applications find a relay when they dial for the second time.
+        """
+
+        def end(following: RelayChild) -> None:
+            following.speaks(WARM_S)
+            other.end(EVICT_S)
+
+        try:
+            return self._start(end)
+        except (OSError, AdapterError) as error:
+            _log.warning("the relay that is to follow does not start: %s", error)
+            other.end(EVICT_S)
+            return None
 
     def _run_once(self, found: RelayChild | None) -> str:
         """Serve one relay to its end; answers why it ended."""
@@ -300,10 +319,10 @@ class RelayHandle:
             relay.close()
         return reason or relay.ending
 
-    def _start(self) -> RelayChild:
+    def _start(self, ends_other: Callable[[RelayChild], None] = lambda _next: None) -> RelayChild:
         if self._bequest is None:
             return start_relay(self._command)
-        return start_relay(self._command, self._bequest.door, self._bequest.listen, code_digest())
+        return start_relay(self._command, self._bequest.door, self._bequest.listen, code_digest(), ends_other)
 
     def _write(self, relay: RelayChild, outbox: _Outbox) -> None:
         try:

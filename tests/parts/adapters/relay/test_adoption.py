@@ -19,6 +19,7 @@ import pytest
 import zsched
 from support.waiting import until
 from zsched.adapters.relay import silence as relay_silence
+from zsched.adapters.relay.child import RelayChild
 from zsched.adapters.relay.streams import Bequest, RelayHandle
 from zsched.core.events import ProblemReported, RelayChanged, StreamsCounted
 from zsched.core.relay_protocol import HandleReport
@@ -153,6 +154,35 @@ def test_a_relay_that_is_not_ours_is_replaced_never_doubled(
         assert note.pid == second.handle.pid
     finally:
         second.handle.stop(2.0)
+
+
+def test_a_relay_that_is_replaced_carries_on_until_the_next_one_is_ready(
+    first: First, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So the host's applications are without one for a moment only."""
+    seen: list[tuple[bool, bool]] = []
+    followers: list[RelayChild] = []
+    end, speaks = RelayChild.end, RelayChild.speaks
+
+    def speaking(child: RelayChild, timeout_s: float) -> bool:
+        followers.append(child)
+        return speaks(child, timeout_s)
+
+    def ending(child: RelayChild, timeout_s: float) -> None:
+        seen.append((is_there(first.relay), bool(followers) and speaks(followers[0], 0.0)))
+        end(child, timeout_s)
+
+    monkeypatch.setattr(RelayChild, "speaks", speaking)
+    monkeypatch.setattr(RelayChild, "end", ending)
+    first.crash()
+    second = Second(tmp_path, digest="another fleet file")
+    try:
+        assert seen == [(True, True)], "it is there, and the next one has said its first word"
+        assert second.handle.pid == followers[0].pid
+        assert not is_there(first.relay)
+    finally:
+        second.handle.stop(2.0)
+    assert list(tmp_path.iterdir()) == []
 
 
 OTHER_CODE = ("relay/task.py", "", "# a line more\n")
