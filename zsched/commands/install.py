@@ -31,6 +31,16 @@ COMPLETIONS: Final = {
     "zsh": "usr/local/share/zsh/site-functions",
     "fish": "usr/local/share/fish/vendor_completions.d",
 }
+SYSTEM_FOLDERS: Final = (
+    ".",
+    "etc",
+    "etc/systemd",
+    "etc/systemd/system",
+    "usr/local/bin",
+    "usr/local/share",
+    "usr/local/share/man",
+)
+"""Folders that are not ours, empty or not."""
 TOOL_S: Final = 60.0
 
 
@@ -132,6 +142,8 @@ def uninstall(root: Path, *, is_plan: bool) -> int:
     for piece in ours:
         _carefully(piece.path, piece.path.unlink)
         _print([f"removed {piece.path}"])
+    for folder in {piece.path.parent for piece in ours}:
+        _remove_empty(folder, root)
     _print(f"left {piece.path}: not zsched's" for piece in pieces if piece.is_in_the_way())
     _reload(root)
     _print(["nothing of it was there"] if not ours else [])
@@ -231,6 +243,16 @@ def _tool(*command: str) -> None:
         raise CliError(EXIT_FAILED, f"{command[0]}: {error}; do it by hand, and run this again") from error
     if done.returncode != 0:
         raise CliError(EXIT_FAILED, f"{' '.join(command)}: {done.stderr.strip()}; mend that, and run this again")
+
+
+def _remove_empty(folder: Path, root: Path) -> None:
+    """Remove a folder that nothing is left in, and so its parents, up to those that every system has."""
+    while folder.relative_to(root).as_posix() not in SYSTEM_FOLDERS:
+        try:
+            folder.rmdir()
+        except OSError:
+            return  # somebody else's files are in it
+        folder = folder.parent
 
 
 def _carefully(path: Path, act: Callable[[], None]) -> None:

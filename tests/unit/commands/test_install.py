@@ -10,6 +10,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from zsched.cli import app
+from zsched.commands.install import SYSTEM_FOLDERS
 
 REPO = Path(__file__).parents[3]
 
@@ -62,7 +63,19 @@ def test_uninstall_takes_away_all_of_it(prefix: Path, root: Path) -> None:
     run("install", root)
     assert run("uninstall", root).exit_code == 0
     assert files_in(root) == set()
+    folders = {path.relative_to(root).as_posix() for path in root.rglob("*")}
+    assert folders - {*SYSTEM_FOLDERS, "usr", "usr/local"} == set(), "no empty folder is left either"
+    assert "usr/local/share/man" in folders, "every system has it"
     assert "nothing of it was there" in run("uninstall", root).output
+
+
+def test_uninstall_leaves_a_folder_with_somebody_elses_file(prefix: Path, root: Path) -> None:
+    assert prefix.exists()
+    run("install", root)
+    other = root / "usr/local/share/zsh/site-functions/_other"
+    other.write_text("#compdef other\n")
+    assert run("uninstall", root).exit_code == 0
+    assert files_in(root) == {other.relative_to(root).as_posix()}
 
 
 def test_a_plan_writes_nothing_and_tells_by_its_exit_code(prefix: Path, root: Path) -> None:
