@@ -1,6 +1,7 @@
 """Runs inside the booted machine: installs, upgrades, downgrades, removes and purges zsched; writes what it saw.
 
-Only the standard library: this file is copied into a fresh Debian. The verdict is the test's; here is only evidence.
+By the package, or, where /opt/way says so, by pip and `zsched install` (for package/prove.py). Only the standard
+library: this file is copied into a fresh Debian. The verdict is the test's; here is only evidence.
 """
 
 from __future__ import annotations
@@ -18,8 +19,10 @@ from typing import Any
 
 RESULT = Path("/result/report.json")
 DEBS = Path("/debs")
+BY_PIP = Path("/opt/way").exists()
 HOME = Path("/opt/zsched")
-ZSCHED = "/usr/bin/zsched"
+ZSCHED = "/usr/local/bin/zsched" if BY_PIP else "/usr/bin/zsched"
+SHARE = "/usr/local/share" if BY_PIP else "/usr/share"
 FLEET = "/etc/zsched/fleet.yaml"
 EDGE = Path("/srv/edge1")
 NOT_OURS = frozenset(
@@ -49,6 +52,26 @@ def said(*command: str, **options: Any) -> dict[str, Any]:
 def dpkg(*arguments: str) -> dict[str, Any]:
     """By dpkg without its waits for the disk: this machine has no power loss to survive."""
     return said("dpkg", "--force-unsafe-io", *arguments, timeout_s=240.0)
+
+
+def put(package: str) -> dict[str, Any]:
+    """Install ``package`` ("old" or "new"), over another one or afresh."""
+    if not BY_PIP:
+        return dpkg("-i", str(DEBS / f"{package}.deb"))
+    (wheel,) = (DEBS / package).glob("*.whl")
+    steps = [f"{HOME}/bin/pip install --quiet --no-index --find-links {DEBS} {wheel}", f"{HOME}/bin/zsched install"]
+    steps = [*steps, "systemctl restart zsched"] if HOME.exists() else [f"python3 -m venv {HOME}", *steps]
+    return said("sh", "-ec", "; ".join(steps), timeout_s=240.0)
+
+
+def take_away() -> dict[str, Any]:
+    return said(f"{HOME}/bin/zsched", "uninstall") if BY_PIP else dpkg("-r", "zsched")
+
+
+def purge() -> dict[str, Any]:
+    """With pip as docs/guide/install.md says."""
+    by_hand = f"rm -r /etc/zsched /var/lib/zsched {HOME}; userdel zsched"
+    return said("sh", "-ec", by_hand) if BY_PIP else dpkg("-P", "zsched")
 
 
 def wait_for(condition: Callable[[], bool], timeout_s: float, what: str) -> None:
@@ -105,6 +128,7 @@ EDGE_SOCKET = EDGE / "run/edge1.sock"
 
 def begin_fleet(report: Report) -> None:
     """The service as robot1, and beside it a daemon as edge1."""
+    Path(FLEET).parent.mkdir(exist_ok=True)
     Path(FLEET).write_text(Path("/opt/fleet.yaml").read_text())
     report["init"] = said(ZSCHED, "init", "--config", FLEET, "--node", "robot1")
     edge = ["--config", FLEET, "--node", "edge1", "--state-dir", str(EDGE / "state")]
@@ -171,7 +195,7 @@ def changed(package: str) -> Report:
     wait_for(lambda: is_settled(ROBOT_SOCKET, "robot1"), 60.0, "robot1 owns the task")
     before = {"relay": relay(), "daemon": daemon()}
     stream = Stream(package)
-    done = dpkg("-i", str(DEBS / f"{package}.deb"))
+    done = put(package)
     wait_for(lambda: daemon() not in {"0", before["daemon"]}, 60.0, "another daemon")
     wait_for(lambda: is_settled(ROBOT_SOCKET), 60.0, "settled after the change")
     return {
@@ -189,7 +213,7 @@ def removed() -> Report:
     """Taken away while it owns the task: the other node has it then."""
     run(ZSCHED, "move", "echo", "robot1", "--yes")
     wait_for(lambda: is_settled(ROBOT_SOCKET, "robot1"), 60.0, "robot1 owns the task")
-    done = dpkg("-r", "zsched")
+    done = take_away()
     told = status_of(EDGE_SOCKET)
     processes = run("ps", "-eo", "args").stdout if Path("/usr/bin/ps").exists() else ""
     journal = run("journalctl", "--no-pager", "-u", "zsched", "-o", "cat").stdout
@@ -197,7 +221,7 @@ def removed() -> Report:
         "dpkg": done,
         "owner": [task.get("owner") for task in told.get("tasks", [])],
         "kept": [name for name in (FLEET, "/var/lib/zsched/") if Path(name).exists()],
-        "gone": [name for name in ("/opt/zsched", ZSCHED) if not Path(name).exists()],
+        "gone": [name for name in (str(HOME), ZSCHED) if not Path(name).exists()],
         "active": run("systemctl", "is-active", "zsched.service").stdout.strip(),
         "processes": processes,
         "journal": journal[-4000:],
@@ -219,11 +243,12 @@ def observe(report: Report) -> None:
     run("useradd", "--create-home", "first")  # leaves /etc/subuid- and the like, as `members` will
     run("userdel", "--remove", "first")
     before = listing()
-    report["refused"] = refused()
-    report["install"] = dpkg("-i", str(DEBS / "old.deb"))
+    if not BY_PIP:
+        report["refused"] = refused()
+    report["install"] = put("old")
     report["idle"] = run("systemctl", "show", "zsched.service", "-p", "ActiveState,UnitFileState").stdout.split()
-    report["cached"] = bool(list(HOME.glob("lib/*/zsched/__pycache__/daemon*.pyc")))
-    bash = ["bash", "-c", ". /usr/share/bash-completion/completions/zsched; complete -p zsched"]
+    report["cached"] = bool(list(HOME.glob("lib/**/zsched/__pycache__/daemon*.pyc")))
+    bash = ["bash", "-c", f". {SHARE}/bash-completion/completions/zsched; complete -p zsched"]
     report["completion"] = run(*bash).stdout.strip()
     begin_fleet(report)
     report["first"] = status_of(ROBOT_SOCKET).get("version")
@@ -232,7 +257,7 @@ def observe(report: Report) -> None:
     report["downgrade"] = changed("old")
     report["remove"] = removed()
     run("systemctl", "stop", "edge1")
-    report["purge"] = dpkg("-P", "zsched")
+    report["purge"] = purge()
     after = listing()
     report["left"] = sorted(set(after) - set(before))
     report["lost"] = sorted(set(before) - set(after))
