@@ -110,6 +110,8 @@ class Testbed:
         self.file = folder / "fleet.yaml"
         self.file.write_text(json.dumps(tree, indent=1))  # JSON is YAML
         self.fleet: Fleet = load_fleet(self.file)
+        self.code: dict[NodeId, Path] = {}
+        """Where the package is that a node runs from its next start on; by default this one."""
         self._processes: dict[NodeId, subprocess.Popen[bytes]] = {}
         self._may_end: set[NodeId] = set()
         self._sessions: list[zenoh.Session] = []
@@ -135,13 +137,17 @@ class Testbed:
                     [*DAEMON, "--config", self.file, "--node", node, *self._folders(node)],
                     stdin=subprocess.DEVNULL,
                     stderr=log,
-                    env={**os.environ, "OMP_NUM_THREADS": "1", **self._credentials(node)},
+                    env={**os.environ, "OMP_NUM_THREADS": "1", **self._credentials(node), **self._code(node)},
+                    cwd=self.code.get(node),  # `python -m` looks there first
                 )
 
     def _credentials(self, node: NodeId) -> dict[str, str]:
         """Of a secured fleet: where the node's key and certificates are, as systemd would hand them over."""
         folder = self.folder / "pki" / node
         return {"CREDENTIALS_DIRECTORY": str(folder)} if folder.is_dir() else {}
+
+    def _code(self, node: NodeId) -> dict[str, str]:
+        return {"PYTHONPATH": str(self.code[node])} if node in self.code else {}
 
     def running(self) -> tuple[NodeId, ...]:
         """Whose daemons have been started and not stopped."""
