@@ -121,12 +121,13 @@ function longer(view) {
 const across = (at, view, width) => ((at - view.from) / (view.to - view.from)) * width;
 
 function chart(task, view) {
-  const width = roomOf("tasks", 280, 2000), height = 120, points = (state.points[task.name] || []).filter((point) => point.at >= view.from);
+  const width = roomOf("tasks", 280, 2000), left = 22, height = 120, points = (state.points[task.name] || []).filter((point) => point.at >= view.from);
   const y = (value) => height - 6 - Math.min(Math.max(value, 0), 1.1) / 1.1 * (height - 12);
-  const parts = [0, 0.5, 1].map((value) => [s("line", { class: "grid", x1: 0, x2: width, y1: y(value), y2: y(value) }),
-    s("text", { class: "dim small", x: 2, y: y(value) - 3 }, String(value))]).flat();
+  const at = (when) => left + across(when, view, width - left);
+  const parts = [0, 0.5, 1].map((value) => [s("line", { class: "grid", x1: left, x2: width, y1: y(value), y2: y(value) }),
+    s("text", { class: "dim small", x: left - 5, y: y(value) + 3, "text-anchor": "end" }, String(value))]).flat();
   for (const move of state.moves.filter((one) => !one.is_known && one.task === task.name && seconds(one.at) > view.from)) {
-    const x = across(seconds(move.at), view, width);
+    const x = at(seconds(move.at));
     parts.push(s("line", { class: "move", x1: x, x2: x, y1: 0, y2: height }));
   }
   for (const name of task.candidates) {
@@ -134,7 +135,7 @@ function chart(task, view) {
     for (const point of points) {
       const value = point.totals[name];
       if (value === undefined) { isDown = false; continue; }
-      path += `${isDown ? "L" : "M"}${across(point.at, view, width).toFixed(1)} ${y(value).toFixed(1)}`;
+      path += `${isDown ? "L" : "M"}${at(point.at).toFixed(1)} ${y(value).toFixed(1)}`;
       isDown = true;
     }
     if (path) parts.push(s("path", { class: `curve s${colour(name)}${name === task.owner ? " thick" : ""}`, d: path }));
