@@ -115,7 +115,7 @@ function window_() {
   return { from: Math.max(first, to - KEPT_S), to };
 }
 function longer(view) {
-  const first = Math.min(...state.moves.map((move) => seconds(move.at)), view.to - KEPT_S);
+  const first = Math.min(...state.moves.map((move) => seconds(move.at)), view.from);
   return { from: Math.max(first - 30, view.to - LONGEST_S), to: view.to };
 }
 const across = (at, view, width) => ((at - view.from) / (view.to - view.from)) * width;
