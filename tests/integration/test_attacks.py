@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -24,9 +25,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 
 from support.authorities import install, make_authority
 from support.waiting import free_endpoint, until
-from zsched.adapters.network import expulsion
 from zsched.adapters.network.control_bus import ControlBus
-from zsched.adapters.network.expulsion import MAX_SHOWN
 from zsched.adapters.network.limits import limit_for
 from zsched.config.load import check_file
 from zsched.core import events as ev
@@ -36,6 +35,8 @@ from zsched.pki.authority import Authority
 from zsched.runtime.access_rules import Side, common_names_of, names_of
 from zsched.runtime.tls import session_text
 from zsched.sessions import config as zenoh_config
+from zsched.sessions import expulsion
+from zsched.sessions.expulsion import HOLD_S, MAX_SHOWN, Expulsion, members_of
 from zsched.wire.keyspace import Keyspace
 
 FLEET = """\
@@ -384,6 +385,32 @@ def test_a_member_has_so_many_sessions_and_no_more(
         until(lambda: "is ended" in caplog.text, "its link is ended")
         stack.enter_context(fresh.member("edge1", victim))
         until(lambda: bus.peers() >= 4, "another member is let in")
+
+
+LOOK_S = 4 * HOLD_S
+
+
+@pytest.mark.parametrize("side", [Side.CONTROL, Side.DATA])
+def test_who_is_not_let_in_and_dials_again_is_held(fresh: Yard, side: Side) -> None:
+    """zenoh dials at once what it had a link to: 40 times a second, each with a handshake, to daemon and relay."""
+    endpoint, told = free_endpoint().replace("tcp/", "tls/"), list[str]()
+    make = zenoh_config.control_config if side is Side.CONTROL else zenoh_config.data_config
+    text = make(listen=(endpoint,), connect=(), operator_json5=session_text(fresh.fleet("robot1"), side))
+    members = members_of(text)
+    assert members is not None
+    with zenoh.open(zenoh.Config.from_json5(text)) as session:
+        expulsion = Expulsion(session, "yard", members, told.append)
+        victim = Victim(session, endpoint.partition("#")[0])
+        with fresh.member("mallory", victim) as stranger:
+            held = [stranger.liveliness().declare_token(KEYS.alive("mallory", number)) for number in range(100)]
+            time.sleep(LOOK_S)  # a rate is looked at, not an event
+            with fresh.member("robot2", victim):
+                until(lambda: "robot2.yard.zsched.internal" in victim.links(), "a member is let in beside it")
+        assert len(held) == 100
+        assert 2 <= len(told) <= 2 + 2 * LOOK_S / HOLD_S
+        assert set(told) == {"stranger"}
+        until_alone(victim)
+        expulsion.close()
 
 
 # --- members that speak for others -----------------------------------------------------------------------------------

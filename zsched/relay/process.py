@@ -18,13 +18,14 @@ import signal
 import socket
 import threading
 import time
+from collections import Counter
 from collections.abc import Collection
 from typing import Final
 
 import zenoh
 
 from zsched.clock import awake_s
-from zsched.core.events import ProblemReported, RoleEnded, StreamsCounted
+from zsched.core.events import FrameDropped, ProblemReported, RoleEnded, StreamsCounted
 from zsched.core.membership.relink import Introductions
 from zsched.core.relay_protocol import RelayReport, RelayStarted, RelayStop, TaskEnded, WorkerSeen, WorkerWatch
 from zsched.core.values.model import NodeId, TaskId
@@ -44,6 +45,7 @@ from zsched.relay.task import TaskRelay
 from zsched.relay.tokens import Tokens
 from zsched.relay.troubles import Troubles
 from zsched.sessions.config import lease_s
+from zsched.sessions.expulsion import MAX_DATA_SESSIONS, Expulsion, Refusal, members_of
 from zsched.sessions.link_sockets import opened
 from zsched.sessions.problems import why_not_open
 from zsched.sessions.relink import Introducer
@@ -158,9 +160,12 @@ class RelayProcess:
         local_config: str = "",
         introducer: Introducer | None = None,
         link_lease_s: float = DEFAULT_LEASE_S,
+        members: frozenset[str] | None = None,
     ) -> None:
-        """``link_lease_s``: zenoh's, on the session's links."""
-        self._session = session
+        """``link_lease_s``: zenoh's, on the session's links. ``members``: the common names that it lets in, if any."""
+        self._session, self._fleet = session, fleet
+        self._counting, self._refused = threading.Lock(), Counter[Refusal]()
+        self._expulsion = self._expel_from(session, members)
         self._lock = threading.Lock()  # plans come from the pipe, the local side from a thread of its own
         self._graph: GraphMirror | None = None
         self._local: zenoh.Session | None = None
@@ -212,6 +217,7 @@ class RelayProcess:
             left_at = awake_s()
             self._session = session = _opened_in_time(config)
             lease = lease_s(config)
+            self._expulsion = self._expel_from(session, members_of(config))
             self._introducer = None if self._introducer is None else Introducer(config)
             self._own_ids = frozenset({str(one.zid()) for one in (session, self._local) if one is not None})
             self._acks.rejoin(session, lease)
@@ -226,7 +232,24 @@ class RelayProcess:
             awake_s() - left_at,
         )
 
+    def _expel_from(self, session: zenoh.Session, members: frozenset[str] | None) -> Expulsion | None:
+        if members is None:
+            return None
+        return Expulsion(session, self._fleet, members, self._refuse, MAX_DATA_SESSIONS)
+
+    def _refuse(self, why: Refusal) -> None:
+        with self._counting:
+            self._refused[why] += 1
+
+    def _tell_refused(self) -> None:
+        with self._counting:
+            refused, self._refused = self._refused, Counter()
+        for why, count in refused.items():
+            self._reporter.report(FrameDropped(kind="data_link", reason=why, count=count))
+
     def _close_data(self) -> None:
+        if self._expulsion is not None:
+            self._expulsion.close()
         if self._introducer is not None:
             self._introducer.close()
         closing = guarded(self._session.close, name="close", is_lasting=False)
@@ -376,6 +399,7 @@ class RelayProcess:
             pause.wait(due - awake_s())
             counts = tuple(count for task in tuple(self._tasks.values()) for count in task.counts())
             self._reporter.report(StreamsCounted(counts=counts))
+            self._tell_refused()
             is_missing = any(task.misses_its_worker for task in tuple(self._tasks.values()))
             if introductions.is_due(awake_s(), is_missing=is_missing) and self._introducer is not None:
                 self._introducer.introduce()
@@ -429,7 +453,16 @@ def run(
         reporter.report(ProblemReported(source=SOURCE, problem=problem))
         reporter.flush(CLOSE_S)
         return 1
-    relay = RelayProcess(session, me.fleet, me.node, reporter, local.decode(), Introducer(config), lease_s(config))
+    relay = RelayProcess(
+        session,
+        me.fleet,
+        me.node,
+        reporter,
+        local.decode(),
+        Introducer(config),
+        lease_s(config),
+        members_of(config),
+    )
     give_back()
     successors = None if door is None else Successors(socket.socket(fileno=door), me, reopens=has_local_side)
     wakeups, parent = _signals_wake(), os.getppid()

@@ -5,14 +5,15 @@ about a slow receiver.
 
 zenoh tells nobody that a receiver takes nothing: a put waits, or drops, in silence. The kernel knows it for every link:
 whether there is room in its send buffer, and how many bytes the other end has taken. The descriptors are zenoh's; they
-are only looked at, but for `cut`, which looks twice, and `hold_back_silent`. zenoh's admin space names subscribers; but
-a question to it from within its own process stops for ever when somebody declares something at the same moment
-(1.10.2).
+are only looked at, but for `cut`, `hold` and `abort`, which look twice, and `hold_back_silent`. zenoh's admin space
+names subscribers; but a question to it from within its own process stops for ever when somebody declares something at
+the same moment (1.10.2).
 """
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import re
 import select
 import socket
@@ -37,6 +38,9 @@ _LAST_DATA_RECV: Final = struct.Struct("<I")
 _LAST_DATA_RECV_AT: Final = 52
 """Where ``tcpi_last_data_recv`` stands there, in ms."""
 _ADDRESS: Final = re.compile(r"(?:tcp|tls)/\[?([^\]#?]+)\]?:(\d+)")
+_NEVER: Final = 1 << 30
+_NOBODY: Final = struct.pack("=H14x", socket.AF_UNSPEC)
+_LIBC: Final = ctypes.CDLL(None, use_errno=True)
 _Ends = tuple[tuple[str, int], tuple[str, int]]
 
 
@@ -75,6 +79,24 @@ class LinkSocket:
             if _ends_of(held) == self.ends:
                 held.shutdown(socket.SHUT_RDWR)
                 return True
+        return False
+
+    def hold(self) -> bool:
+        """Let zenoh read nothing more of it, but for what fills its buffer; ``False``: it cannot be.
+
+        A descriptor counts as readable once so many bytes are there (``SO_RCVLOWAT``, tcp(7)).
+        """
+        with contextlib.suppress(OSError), _borrowed(self.fd) as held:
+            if _ends_of(held) == self.ends:
+                held.setsockopt(socket.SOL_SOCKET, socket.SO_RCVLOWAT, _NEVER)
+                return True
+        return False
+
+    def abort(self) -> bool:
+        """End the connection as `cut` does, and forget what has come by it: zenoh would read that first."""
+        with contextlib.suppress(OSError), _borrowed(self.fd) as held:
+            if _ends_of(held) == self.ends:
+                return bool(_LIBC.connect(self.fd, _NOBODY, len(_NOBODY)) == 0)  # connect(2), AF_UNSPEC
         return False
 
 

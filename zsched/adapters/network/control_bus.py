@@ -20,7 +20,6 @@ from typing import Any
 import zenoh
 
 from zsched.adapters.network import seals as sealing
-from zsched.adapters.network.expulsion import Expulsion
 from zsched.adapters.network.limits import Buckets, Drops, Limit
 from zsched.adapters.network.open_questions import Questions
 from zsched.adapters.network.seals import Seals
@@ -60,6 +59,7 @@ from zsched.core.values.rehearsal import ReadRehearsals, RehearsalsTold
 from zsched.core.values.snapshot import Snapshot
 from zsched.errors import AdapterError, WireError
 from zsched.guard import guarded, tolerant
+from zsched.sessions.expulsion import Expulsion, Refusal
 from zsched.sessions.link_sockets import LinkSockets, opened
 from zsched.sessions.problems import why_not_open
 from zsched.sessions.relink import Introducer
@@ -187,7 +187,8 @@ class ControlBus:
         except zenoh.ZError as error:
             raise AdapterError(f"the control session {why_not_open(self._config, error)}") from error
         self._session, self._sockets = session, LinkSockets(session)
-        self._expulsion = None if self._members is None else Expulsion(session, self._fleet)
+        if self._members is not None:
+            self._expulsion = Expulsion(session, self._fleet, self._members, self._refused)
         keys, node = self._keys, self._node
         self._publishers = {
             "beat": self._publisher(session, keys.beat(node), zenoh.Priority.REAL_TIME),
@@ -202,7 +203,6 @@ class ControlBus:
         token = keys.alive(node, self._incarnation)
         # The token goes last: a node that sees it may ask, and must find the queryable.
         self._kept = [
-            *self._watch_links(session),
             session.declare_subscriber(keys.all_puts(), tolerant(self._on_sample, "put")),
             *self._hear_in_turn(session),
             *(session.declare_queryable(key, tolerant(self._on_query, "question")) for key in self._questions_to_us()),
@@ -211,12 +211,6 @@ class ControlBus:
             ),
             session.liveliness().declare_token(token),
         ]
-
-    def _watch_links(self, session: zenoh.Session) -> list[Any]:
-        """Look at the certificate of every link, where certificates are asked for: one more thread."""
-        if self._members is None:
-            return []
-        return [session.info.declare_link_events_listener(tolerant(self._on_link, "link"), history=True)]
 
     def _hear_in_turn(self, session: zenoh.Session) -> list[Any]:
         """Subscribe to periodic frames: thirty a second in a small fleet, too many to wake up for each."""
@@ -278,6 +272,8 @@ class ControlBus:
         if session is None:
             return
         self._introducer.close()
+        if self._expulsion is not None:
+            self._expulsion.close()
         kept, self._kept, self._publishers, self._ring = self._kept, [], {}, None
         closing = guarded(self._close, session, kept, name="zsched-bus-close", is_lasting=False)
         closing.start()
@@ -346,19 +342,8 @@ class ControlBus:
         owner, event = _event_of(value)
         return event if owner == key.owner else ev.FrameDropped(kind=key.kind, reason="foreign")
 
-    def _on_link(self, event: zenoh.LinkEvent) -> None:
-        """Only linked nodes' names count here; zenoh's access rules check a frame's sender against its link."""
-        name, is_present = event.link.auth_identifier, event.kind == zenoh.SampleKind.PUT
-        if self._members is not None and self._expulsion is not None and name in self._members:
-            if not self._expulsion.links(name, str(event.link.zid), is_present=is_present):
-                self._drops.add("link", "too_many")
-            return
-        if not is_present or self._members is None:
-            return
-        log.warning("stranger certificate=%r address=%s: it may nothing here", name, event.link.dst)
-        self._post(ev.FrameDropped(kind="link", reason="stranger"))
-        if self._expulsion is not None:
-            self._expulsion.expel(str(event.link.zid))
+    def _refused(self, why: Refusal) -> None:
+        self._drops.add("link", why)
 
     def _on_token(self, sample: zenoh.Sample) -> None:
         key = parse(str(sample.key_expr))

@@ -1,0 +1,198 @@
+"""Ends links whose other end may say nothing here, or shows more tokens or has more sessions than a node needs.
+
+zenoh keeps each key and token that comes by a link until the link ends, and the time for one grows with their number;
+no access rule forbids the keys. So what ends is the link. Whoever dialled it dials again at once, 40 times a second,
+each time with a handshake. So a link is *held* first: zenoh reads nothing more of it, and it ends after `HOLD_S`.
+
+Knows: which certificate is at the other end of a link, who is let in, how many tokens each node shows. Does not know:
+access rules, what tokens mean.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import queue
+import threading
+from collections.abc import Callable, Iterable
+from enum import StrEnum
+from typing import Final
+
+import zenoh
+
+from zsched.clock import monotonic_s
+from zsched.core.values.certificates import parse_common_name
+from zsched.guard import guarded, tolerant
+from zsched.sessions.link_sockets import LinkSocket, LinkSockets
+
+MAX_SHOWN: Final = 64
+"""Tokens of one node: it has one for each of its lives, and of those that have ended some may not be gone yet."""
+MAX_SESSIONS: Final = 32
+"""Of one certificate: a daemon has one, and each verb that asks one more. zenoh takes 1000 in all, then nobody."""
+MAX_DATA_SESSIONS: Final = 128
+"""...at a relay: also each worker of that node, and each verb that looks at streams."""
+HOLD_S: Final = 0.8
+"""A link that is held reads nothing, so zenoh ends it itself after its lease (1 s or more)."""
+MAX_HELD: Final = 16
+"""More are ended at once: what has come by a link that is held waits in the kernel, up to some MiB."""
+LOOK_AGAIN_S: Final = 0.05
+LOOKS: Final = 10
+"""A link is told of before it is in zenoh's list."""
+MAX_WAITING: Final = 256
+
+_log = logging.getLogger("zsched.control")
+
+
+class Refusal(StrEnum):
+    """Why a link ends."""
+
+    STRANGER = "stranger"  # its certificate is not let in
+    TOO_MANY = "too_many"  # its certificate has too many sessions here
+
+
+def members_of(config: str) -> frozenset[str] | None:
+    """The common names that a session of this configuration (JSON) lets in; ``None``: it goes by no such rules."""
+    rules = json.loads(config).get("access_control") or {}
+    if not rules.get("enabled"):
+        return None
+    subjects = rules.get("subjects") or ()
+    return frozenset(name for subject in subjects for name in subject.get("cert_common_names") or ())
+
+
+class Expulsion:
+    """Of one session. `shows` may be called from any thread, and never blocks."""
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        fleet: str,
+        members: Iterable[str],
+        tell: Callable[[Refusal], None],
+        max_sessions: int | None = None,
+    ) -> None:
+        """Look at every link from now on.
+
+        ``members``: common names that are let in; each has at most ``max_sessions`` (`MAX_SESSIONS`).
+        ``tell`` hears of each link that is refused, in zenoh's threads. Nothing runs before the first one.
+        """
+        self._session, self._fleet, self._members, self._tell = session, fleet, frozenset(members), tell
+        self._max_sessions = MAX_SESSIONS if max_sessions is None else max_sessions
+        self._sockets = LinkSockets(session)
+        self._queue: queue.Queue[Callable[[zenoh.Link], bool] | None] = queue.Queue(MAX_WAITING)
+        self._lock = threading.Lock()
+        self._thread: threading.Thread | None = None
+        self._held: dict[LinkSocket, float] = {}
+        """{link: when it ends}; the thread's own."""
+        self._shown: dict[str, int] = {}
+        """{node: tokens}; whoever shows one in a node's name has its certificate."""
+        self._linked: dict[str, set[str]] = {}
+        """{common name: its sessions}."""
+        self._watch = session.info.declare_link_events_listener(tolerant(self._on_link, "link"), history=True)
+
+    def close(self) -> None:
+        """Look at nothing more; the session may be closed already."""
+        with self._lock:
+            if self._thread is not None:
+                self._put(None)
+
+    def shows(self, node: str, *, is_present: bool) -> bool:
+        """A token of a node came or went; ``False``: it shows too many, and its links are ended."""
+        count = self._shown[node] = max(0, self._shown.get(node, 0) + (1 if is_present else -1))
+        if not count:
+            del self._shown[node]
+        if not is_present or count <= MAX_SHOWN:
+            return True
+        if count % MAX_SHOWN == 1:
+            self._end(lambda link: self._holder(link) == node)
+        return False
+
+    def _on_link(self, event: zenoh.LinkEvent) -> None:
+        """Only linked nodes' names count here; zenoh's access rules check a frame's sender against its link."""
+        name, zid, is_present = (
+            event.link.auth_identifier or "",
+            str(event.link.zid),
+            event.kind == zenoh.SampleKind.PUT,
+        )
+        if name in self._members:
+            if not self._has_room(name, zid, is_present=is_present):
+                self._refuse(zid, Refusal.TOO_MANY)
+        elif is_present:
+            _log.warning("stranger certificate=%r address=%s: it may nothing here", name, event.link.dst)
+            self._refuse(zid, Refusal.STRANGER)
+
+    def _refuse(self, zid: str, why: Refusal) -> None:
+        self._tell(why)
+        self._end(lambda link: str(link.zid) == zid)
+
+    def _has_room(self, name: str, zid: str, *, is_present: bool) -> bool:
+        """A session of a certificate came or went; ``False``: it has too many."""
+        held = self._linked.setdefault(name, set())
+        if not is_present:
+            held.discard(zid)
+            if not held:
+                del self._linked[name]
+            return True
+        if len(held) >= self._max_sessions and zid not in held:
+            return False
+        held.add(zid)
+        return True
+
+    def _holder(self, link: zenoh.Link) -> str:
+        held = parse_common_name(link.auth_identifier or "", self._fleet)
+        return "" if held is None else held.name
+
+    def _end(self, is_meant: Callable[[zenoh.Link], bool]) -> None:
+        with self._lock:
+            if self._thread is None:
+                self._thread = guarded(self._run, name="expulsion", is_lasting=False)
+                self._thread.start()
+        self._put(is_meant)
+
+    def _put(self, is_meant: Callable[[zenoh.Link], bool] | None) -> None:
+        try:
+            self._queue.put_nowait(is_meant)
+        except queue.Full:  # so many are ended already, and those that are left come again
+            return
+
+    # --- the thread --------------------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        pause = threading.Event()
+        while True:
+            try:
+                wait_s = max(0.0, min(self._held.values()) - monotonic_s()) if self._held else None
+                is_meant = self._queue.get(timeout=wait_s)
+            except queue.Empty:
+                self._end_held()
+                continue
+            if is_meant is None:
+                return
+            for _ in range(LOOKS):
+                if self._halt(is_meant):
+                    break
+                self._end_held()
+                pause.wait(LOOK_AGAIN_S)
+
+    def _end_held(self) -> None:
+        now = monotonic_s()
+        for link in [link for link, until in self._held.items() if now >= until]:
+            del self._held[link]
+            link.abort()
+
+    def _halt(self, is_meant: Callable[[zenoh.Link], bool]) -> bool:
+        """Hold the links that are meant, or end them; whether there were any."""
+        try:
+            zids = {str(link.zid): link.auth_identifier for link in self._session.info.links() if is_meant(link)}
+            meant = [link for link in self._sockets.links() if link.zid in zids]
+        except zenoh.ZError:
+            return True  # the session closes
+        self._held = {link: until for link, until in self._held.items() if link in meant or until > monotonic_s()}
+        for link in meant:
+            if link in self._held:
+                continue
+            if len(self._held) < MAX_HELD and link.hold():
+                self._held[link] = monotonic_s() + HOLD_S
+            else:
+                link.abort()
+            _log.warning("the link to %s is ended: certificate=%r", link.name, zids[link.zid])
+        return bool(meant)
