@@ -15,6 +15,7 @@ import importlib.abc
 import importlib.machinery
 import importlib.util
 import os
+import re
 import resource
 import signal
 import subprocess
@@ -236,10 +237,11 @@ def places(bug: Bug) -> str:
 
 
 def _short(found_by: str) -> str:
-    """What found a bug, in a table's cell: the violation's beginning, or the test's name."""
+    """What found a bug, in a table's cell: the schedule's seed, or the test's name."""
     if found_by.startswith("FAILED "):
         return f"`{found_by.partition('::')[2].partition(' - ')[0].partition('[')[0]}`"
-    text = found_by.replace("|", "/") or "**survived**"
+    seed = re.match(r"seed \d+", found_by)
+    text = seed.group(0) if seed else found_by.replace("|", "/") or "**survived**"
     return text if len(text) <= CELL else f"{text[:CELL]} …"
 
 
