@@ -977,7 +977,7 @@ def _count(number: int, plural: str) -> str:
 def _node_name(given: str | None) -> str:
     """This node's name. Raises `CliError` (2) when it is no name."""
     from zsched import paths as places  # noqa: PLC0415 - each verb imports what it needs
-    from zsched.core.values.model import NAME  # noqa: PLC0415 - as above
+    from zsched.core.values.words import NAME  # noqa: PLC0415 - as above
 
     name = places.node_name(given, os.environ)
     if NAME.fullmatch(name) is None:

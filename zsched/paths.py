@@ -10,8 +10,10 @@ import re
 import socket
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from zsched.core.values.model import NodeId
+if TYPE_CHECKING:
+    from zsched.core.values.model import NodeId  # loads every value, which no verb needs that asks
 
 SYSTEM_CONFIG = Path("/etc/zsched/fleet.yaml")
 SYSTEM_RUNTIME = Path("/run/zsched")

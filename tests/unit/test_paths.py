@@ -9,7 +9,7 @@ from unittest.mock import patch
 import pytest
 
 from zsched import paths as places
-from zsched.core.values.model import NAME
+from zsched.core.values.words import NAME
 
 Find = Callable[[Path | None, Mapping[str, str]], Path]
 GIVEN = Path("/given")

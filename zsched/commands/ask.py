@@ -19,7 +19,7 @@ from zsched import paths as places
 from zsched.adapters.host.operator_socket import ask
 from zsched.clock import wall_s
 from zsched.commands.common import CliError, Json, nearest
-from zsched.core.values.model import NAME
+from zsched.core.values.words import NAME
 from zsched.errors import AdapterError
 from zsched.exits import EXIT_FAILED, EXIT_TIMED_OUT, EXIT_UNREACHABLE, EXIT_USAGE
 

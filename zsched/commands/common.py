@@ -17,7 +17,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from zsched.commands.page import harmless, wrapped
-from zsched.core.values.model import MAX_ASKED
+from zsched.core.values.words import MAX_ASKED
 from zsched.errors import AdapterError, ConfigError, ZschedError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE
 

@@ -21,7 +21,7 @@ from zsched.commands.history import age_s_of, is_known, is_move, wall_text, wher
 from zsched.commands.page import Cell, Page, memory, span
 from zsched.commands.report import printable
 from zsched.commands.weight_words import shares
-from zsched.core.values.model import PAPER_METRICS
+from zsched.core.values.words import PAPER_METRICS
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
 
 SCHEMA = "zsched.explain/1"

@@ -29,7 +29,8 @@ from zsched.config.load import check_bytes
 from zsched.core.values.document import Document
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet, NodeSpec, dial_endpoint
-from zsched.core.values.model import NAME, NodeId, NodeKind
+from zsched.core.values.model import NodeId, NodeKind
+from zsched.core.values.words import NAME
 from zsched.errors import WireError, ZschedError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
 from zsched.files import read_regular

@@ -25,16 +25,8 @@ from zsched.commands.report import FLAGS, millis, told_flag, told_hold, told_rol
 from zsched.commands.wait import Condition, missing
 from zsched.commands.weight_words import NAMES, shares
 from zsched.core.values.fleet import TUNED_LINKS, TUNED_RULES
-from zsched.core.values.model import (
-    MAX_ASKER,
-    MAX_FOR_S,
-    Aggregate,
-    PairReading,
-    Reach,
-    ScoreForm,
-    Tuning,
-    Weights,
-)
+from zsched.core.values.model import MAX_FOR_S, Aggregate, PairReading, Reach, ScoreForm, Tuning, Weights
+from zsched.core.values.words import MAX_ASKER
 from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE, EXIT_WOULD_CHANGE
 
 MOVE_SCHEMA: Final = "zsched.move/1"

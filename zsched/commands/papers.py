@@ -20,7 +20,8 @@ from zsched.commands.apply import DANGERS, OPEN_NETWORK
 from zsched.commands.common import CliError, nearest
 from zsched.commands.pki import begin_for, holds_authority, issue_for
 from zsched.core.values.fleet import Fleet
-from zsched.core.values.model import NAME, NodeId
+from zsched.core.values.model import NodeId
+from zsched.core.values.words import NAME
 from zsched.errors import AdapterError
 from zsched.exits import EXIT_FAILED, EXIT_USAGE
 from zsched.files import read_regular

@@ -26,7 +26,7 @@ from zsched.commands.page import harmless
 from zsched.config.load import load_fleet
 from zsched.core.values.certificates import Role, parse_label
 from zsched.core.values.fleet import Fleet
-from zsched.core.values.model import NAME
+from zsched.core.values.words import NAME
 from zsched.errors import AdapterError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE
 from zsched.files import read_regular

@@ -29,8 +29,8 @@ from zsched.commands.page import harmless
 from zsched.commands.rehearse_report import SCHEMA, as_json, table
 from zsched.commands.wait import Condition, missing
 from zsched.core.rehearsal.programme import MIN_CALM_S, Do, Lift, Look, Over, Programme, Result, Sight
-from zsched.core.values.model import MAX_ASKED
 from zsched.core.values.rehearsal import FAULTS, MAX_CUT_S, Promised, Step
+from zsched.core.values.words import MAX_ASKED
 from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE
 
 LOOK_S: Final = 0.2

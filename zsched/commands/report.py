@@ -12,7 +12,7 @@ from typing import Any, Final
 from zsched.commands.page import Cell, Page, cut, memory, none_for, since_drop, size, span
 from zsched.commands.weight_words import shares
 from zsched.core.values.gauges import BY_NAME
-from zsched.core.values.model import NEVER_INITIALISED, RESTARTING, WAS_READY, WorkerState, told_of_worker
+from zsched.core.values.words import NEVER_INITIALISED, RESTARTING, WAS_READY, told_of_worker
 
 Json = dict[str, Any]
 
@@ -64,7 +64,7 @@ def _lack_of_worker(status: Json, task: Json) -> str | None:
         return None
     because = f": {why}" if why else ""
     if state != "failed":
-        return f"the worker on {owner} {told_of_worker(WorkerState(state), why or '')}"
+        return f"the worker on {owner} {told_of_worker(state, why or '')}"
     return f"the worker on {owner} failed{because}; mend it, then `zsched retry {task['name']} {owner}`"
 
 

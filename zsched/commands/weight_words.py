@@ -10,7 +10,7 @@ from collections.abc import Iterable
 
 from zsched.commands.common import CliError, Json, nearest
 from zsched.core.values.gauges import BY_NAME
-from zsched.core.values.model import PAPER_METRICS
+from zsched.core.values.words import PAPER_METRICS
 from zsched.exits import EXIT_USAGE
 
 NAMES = (*PAPER_METRICS, *BY_NAME)

@@ -14,7 +14,7 @@ from enum import StrEnum
 from typing import Any, Final, Generic, Protocol, TypeVar
 
 from zsched.config.reader import Collector, Mapping, Node, Place, Scalar, Sequence, kind_of, nearest
-from zsched.core.values.model import NAME
+from zsched.core.values.words import NAME
 
 T = TypeVar("T")
 T_co = TypeVar("T_co", covariant=True)

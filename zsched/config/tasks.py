@@ -42,7 +42,7 @@ from zsched.core.values.fleet import (
     WorkerSpec,
 )
 from zsched.core.values.gauges import BY_NAME
-from zsched.core.values.model import PAPER_METRICS, NodeKind, Objective, ScoreForm, Tuning, Weights
+from zsched.core.values.model import NodeKind, Objective, ScoreForm, Tuning, Weights
 from zsched.core.values.plan import (
     Direction,
     HandoverRule,
@@ -53,6 +53,7 @@ from zsched.core.values.plan import (
     StreamClass,
     StreamSettings,
 )
+from zsched.core.values.words import PAPER_METRICS
 
 _ANY_TUNING: Final = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
 """Stands in for a faulty one, so that the task's rules are checked in the same pass; such a file gives no fleet."""

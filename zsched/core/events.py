@@ -48,10 +48,10 @@ from zsched.core.values.model import (
     WorkerState,
     check_counter,
     check_name,
-    check_range,
 )
 from zsched.core.values.plan import StreamCount
 from zsched.core.values.rehearsal import KeepRehearsal, ReadRehearsals, Strike
+from zsched.core.values.words import check_range
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -19,19 +19,7 @@ from zsched.core.values.decision import Explanation
 from zsched.core.values.document import Flag
 from zsched.core.values.fleet import NodeSpec, TaskSpec
 from zsched.core.values.gauges import possible
-from zsched.core.values.model import (
-    NEVER_INITIALISED,
-    RESTARTING,
-    Allocation,
-    NodeId,
-    Pause,
-    PeerState,
-    Pin,
-    TaskId,
-    WorkerLoad,
-    WorkerState,
-    told_of_worker,
-)
+from zsched.core.values.model import Allocation, NodeId, Pause, PeerState, Pin, TaskId, WorkerLoad, WorkerState
 from zsched.core.values.plan import Direction, ReadyWhen, Route, StreamCount
 from zsched.core.values.quorum import majority
 from zsched.core.values.snapshot import (
@@ -47,6 +35,7 @@ from zsched.core.values.snapshot import (
     TaskStatus,
     VoteStatus,
 )
+from zsched.core.values.words import NEVER_INITIALISED, RESTARTING, told_of_worker
 from zsched.core.vote.generations import way_out
 from zsched.core.vote.voting import Voting
 

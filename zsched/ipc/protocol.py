@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from zsched.core.values.model import NodeId, TaskId, check_counter, check_name, check_range
+from zsched.core.values.model import NodeId, TaskId, check_counter, check_name
+from zsched.core.values.words import check_range
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -61,9 +61,10 @@ from zsched.core.values.messages import (
     WorkerLines,
     fleet_question,
 )
-from zsched.core.values.model import MAX_ASKER, MAX_REASON, NAME, Asked, NodeId, TaskId, Tuning
+from zsched.core.values.model import MAX_REASON, Asked, NodeId, TaskId, Tuning
 from zsched.core.values.rehearsal import KeepRehearsal, ReadRehearsals, RehearsalsTold, Step, Strike
 from zsched.core.values.snapshot import Snapshot
+from zsched.core.values.words import MAX_ASKER, NAME
 from zsched.errors import AdapterError, WireError
 from zsched.runtime.crew import Crew
 from zsched.runtime.library import Library

@@ -16,7 +16,8 @@ from typing import Any, Final
 
 from zsched.core.values.document import Document
 from zsched.core.values.electorate import FleetValue
-from zsched.core.values.model import NAME, NodeId
+from zsched.core.values.model import NodeId
+from zsched.core.values.words import NAME
 from zsched.core.vote.belief import MAX_GENERATION
 from zsched.errors import WireError
 from zsched.wire.codec import as_plain, document_hash, from_plain

@@ -13,7 +13,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 
-from zsched.core.values.model import MAX_COUNTER, NAME, NodeId, TaskId
+from zsched.core.values.model import MAX_COUNTER, NodeId, TaskId
+from zsched.core.values.words import NAME
 
 ROOT = "@zsched"
 KEPT_KEYS = 512

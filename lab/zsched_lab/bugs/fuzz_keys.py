@@ -30,7 +30,8 @@ from zsched.core.hop.shared import MAX_RECEIVERS, SharedSender
 from zsched.core.relay_protocol import EndMarker, SnapshotChunk, StreamAck, StreamAcks
 from zsched.core.route.ros2 import parse_token
 from zsched.core.sequence import RUN, Order, Track
-from zsched.core.values.model import MAX_COUNTER, NAME
+from zsched.core.values.model import MAX_COUNTER
+from zsched.core.values.words import NAME
 from zsched.hop.acknowledger import Acknowledger
 from zsched.ipc.pipe import decode_chunk, decode_end, encode_chunk, encode_end
 from zsched.relay.streams.slots import KeyState

@@ -9,7 +9,8 @@ import random
 from dataclasses import dataclass
 from enum import StrEnum
 
-from zsched.core.values.model import NodeId, check_range
+from zsched.core.values.model import NodeId
+from zsched.core.values.words import check_range
 
 
 class SchedulePolicy(StrEnum):

@@ -19,7 +19,7 @@ from support.fleets import tuning_of
 from zsched.commands.page import Page, cut, memory, size, span
 from zsched.commands.report import degradations, printable, render_status
 from zsched.core.report import snapshot_json
-from zsched.core.values.model import WAS_READY, Link, LinkSource, Utility, WorkerLoad, WorkerState
+from zsched.core.values.model import Link, LinkSource, Utility, WorkerLoad, WorkerState
 from zsched.core.values.plan import StreamCount
 from zsched.core.values.snapshot import (
     DecisionStatus,
@@ -30,6 +30,7 @@ from zsched.core.values.snapshot import (
     TaskStatus,
     VoteStatus,
 )
+from zsched.core.values.words import WAS_READY
 
 RECORDED = Path(__file__).parent / "recorded_status"
 NAMES = ("healthy", "edge", "degraded")

@@ -54,9 +54,10 @@ from zsched.core.values.messages import (
     Votes,
     WorkerLines,
 )
-from zsched.core.values.model import NAME, Beat, NodeId, Profile, Proposal
+from zsched.core.values.model import Beat, NodeId, Profile, Proposal
 from zsched.core.values.rehearsal import ReadRehearsals, RehearsalsTold
 from zsched.core.values.snapshot import Snapshot
+from zsched.core.values.words import NAME
 from zsched.errors import AdapterError, WireError
 from zsched.guard import guarded, tolerant
 from zsched.sessions.expulsion import Expulsion, Refusal

@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from zsched.core.values.model import NAME
+from zsched.core.values.words import NAME
 
 METHODS: Final = ("GET", "HEAD")
 LEAST_TOKEN: Final = 16

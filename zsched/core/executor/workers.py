@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 from zsched.core import events as ev
 from zsched.core.instructions import RecordStory
 from zsched.core.values.fleet import Fleet, runs_worker
-from zsched.core.values.model import NodeId, Profile, Renewal, TaskId, WorkerState, as_reason, told_of_worker
+from zsched.core.values.model import NodeId, Profile, Renewal, TaskId, WorkerState, as_reason
+from zsched.core.values.words import told_of_worker
 
 TROUBLE_S = 60.0
 """Status shows a callback's error for this long after the last one."""

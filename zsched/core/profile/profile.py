@@ -33,13 +33,13 @@ from zsched.core.values.model import (
     LinkSource,
     NodeId,
     Profile,
-    Readings,
     Renewal,
     TaskId,
     TaskProgress,
     WorkerLoad,
     WorkerState,
 )
+from zsched.core.values.words import Readings
 
 RATIO_CHANGE = 0.02
 """This change of a CPU or memory ratio sends a profile at once."""

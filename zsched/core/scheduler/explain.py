@@ -18,8 +18,9 @@ from zsched.core.scheduler.judge import Outcome
 from zsched.core.scheduler.scoring import Standing, joined, pick, rounded
 from zsched.core.scheduler.utility import total_utility
 from zsched.core.values.decision import Decision, Figures, Verdict
-from zsched.core.values.model import Aggregate, NodeId, PeerState, Readings, Tuning, Utility, UtilityVector
+from zsched.core.values.model import Aggregate, NodeId, PeerState, Tuning, Utility, UtilityVector
 from zsched.core.values.quorum import majority
+from zsched.core.values.words import Readings
 
 _TIE = 1 / 512
 """Totals are compared to 1/256: so far above the owner's rounded one another total counts as higher."""

@@ -30,8 +30,8 @@ from zsched.core.values.model import (
     ScoreForm,
     WorkerState,
     told_by,
-    told_of_worker,
 )
+from zsched.core.values.words import told_of_worker
 
 INITIAL_SETTLE_S = 3.0
 """A task without an owner waits this long for candidates that still start."""

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-from zsched.core.values.model import NAME
+from zsched.core.values.words import NAME
 
 DOMAIN: Final = "zsched.internal"
 MAX_COMMON_NAME: Final = 64

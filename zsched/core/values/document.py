@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import NewType
 
-from zsched.core.values.model import MAX_REASON, NodeId, TaskId, check_counter, check_name, check_range
+from zsched.core.values.model import MAX_REASON, NodeId, TaskId, check_counter, check_name
+from zsched.core.values.words import check_range
 
 Text = NewType("Text", str)
 """A string that may be longer than any other on the wire: at most `MAX_DOCUMENT_BYTES` in UTF-8."""

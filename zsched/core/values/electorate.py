@@ -11,7 +11,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
 
-from zsched.core.values.model import NodeId, TaskId, check_counter, check_name, check_range
+from zsched.core.values.model import NodeId, TaskId, check_counter, check_name
+from zsched.core.values.words import check_range
 
 CREATION_STEP = 2**32
 """Revision and epoch of a task that was created as number C start at C times this."""

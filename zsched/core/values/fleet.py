@@ -32,12 +32,12 @@ from zsched.core.values.model import (
     NodeKind,
     PairReading,
     Reach,
-    Readings,
     ScoreForm,
     TaskId,
     Tuning,
 )
 from zsched.core.values.plan import Direction, ReadyWhen, ServiceSettings, StreamSettings
+from zsched.core.values.words import Readings
 
 DEFAULT_SCORE = ScoreForm.SERVICE
 """How to score a machine when the fleet file does not say (docs/decisions/0031)."""

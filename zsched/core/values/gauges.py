@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from zsched.core.values.model import GaugeName, Readings, check_range
+from zsched.core.values.words import GaugeName, Readings, check_range
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

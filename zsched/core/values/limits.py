@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from typing import Any, TypeVar
 
-from zsched.core.values.model import check_range
+from zsched.core.values.words import check_range
 
 T = TypeVar("T")
 

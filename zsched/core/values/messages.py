@@ -19,17 +19,16 @@ from zsched.core.values.model import (
     Asked,
     Ballot,
     NodeId,
-    Readings,
     TaskId,
     Tuning,
     UtilityVector,
     V,
     check_counter,
     check_name,
-    check_range,
     check_readings,
 )
 from zsched.core.values.rehearsal import KeepRehearsal, ReadRehearsals, Strike
+from zsched.core.values.words import Readings, check_range
 
 MAX_CERTIFICATE: Final = 4096
 """Characters of a certificate that is sent to a node; those of `zsched pki` have 900."""

@@ -11,22 +11,18 @@ dropped frame; from our own code it is a bug.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
+from zsched.core.values.words import MAX_ASKED, MAX_ASKER, NAME, PAPER_METRICS, Readings, check_range
+
 NodeId = str
 """A node's name: ``[a-z0-9][a-z0-9_-]{0,62}``, unique in the fleet."""
 TaskId = str
 """A task's name, same alphabet."""
-GaugeName = str
-"""A gauge's name (`zsched.core.values.gauges`), same alphabet."""
-Readings = tuple[tuple[GaugeName, float], ...]
-"""One number for each of some gauges; a gauge that is not there was not measured."""
 
-NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}")
 MAX_COUNTER = 2**53
 """Largest revision, epoch, incarnation or sequence number (exact in every language's float)."""
 MAX_CPU_CORES, MAX_MEMORY_MB, MAX_BITRATE_MBPS = 4096.0, 1e8, 1e6
@@ -39,8 +35,6 @@ MAX_GAUGES, MAX_READING = 16, 1e9
 """Bounds that no machine or link exceeds: a larger figure is a fault of its sender."""
 MAX_REASON = 400
 """Characters of a worker's reason: it travels with every profile."""
-MAX_ASKER, MAX_ASKED = 96, 200
-"""Characters of an operator's name and reason: they travel with every ballot of a task."""
 MAX_FOR_S = 366 * 86400.0
 """An operator's order lasts at most this long, or until it is taken back."""
 
@@ -54,12 +48,6 @@ def check_name(field: str, value: str) -> None:
     """Raise `ValueError` unless ``value`` is a valid node, task or fleet name."""
     if NAME.fullmatch(value) is None:
         raise ValueError(f"{field}: {value!r} is not a name ([a-z0-9][a-z0-9_-]{{0,62}})")
-
-
-def check_range(field: str, value: float | None, low: float, high: float) -> None:
-    """Raise `ValueError` unless ``low <= value <= high`` (``None``, "not measured", passes; NaN does not)."""
-    if value is not None and not low <= value <= high:
-        raise ValueError(f"{field}: {value!r} is not in [{low:g}, {high:g}]")
 
 
 def check_readings(field: str, readings: Readings, low: float = -MAX_READING, high: float = MAX_READING) -> None:
@@ -106,10 +94,6 @@ class Objective(StrEnum):
 
     SERVICE = "service"  # as many of its jobs done as possible
     LATENCY = "latency"  # as many of them as possible done within a deadline
-
-
-PAPER_METRICS = ("cpu", "memory", "network")
-"""The metrics of Eq. 1 to 3; the others are gauges."""
 
 
 class Reach(StrEnum):
@@ -319,24 +303,6 @@ class WorkerState(StrEnum):
     STARTING = "starting"
     READY = "ready"
     FAILED = "failed"  # too many failures in the window, or it said that it cannot: the node is not eligible
-
-
-NEVER_INITIALISED = "never initialised"
-"""First words of the problem that no elector has a state, and no node remembers one."""
-WAS_READY = "was ready until "
-"""First words of the reason of a worker that was ready and no longer is; its supervisor calls that starting."""
-
-RESTARTING = "restarting"
-"""First words of the reason of a worker that has failed and is, or will be, started again."""
-
-
-def told_of_worker(state: WorkerState, reason: str) -> str:
-    """A worker's state in words, to follow its name."""
-    if state is not WorkerState.READY and reason.startswith(WAS_READY):
-        return reason
-    if state is not WorkerState.READY and reason.startswith(RESTARTING):
-        return f"is {reason}"
-    return f"is {state}{': ' if reason else ''}{reason}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,7 +10,8 @@ from enum import StrEnum
 from typing import Final
 
 from zsched.core.values.document import Text
-from zsched.core.values.model import MAX_REASON, Asked, NodeId, TaskId, check_name, check_range
+from zsched.core.values.model import MAX_REASON, Asked, NodeId, TaskId, check_name
+from zsched.core.values.words import check_range
 
 MAX_CUT_S: Final = 60.0
 """The longest cut of a node's links."""

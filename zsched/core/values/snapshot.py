@@ -11,8 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
-from zsched.core.values.model import Link, NodeId, Readings, TaskId, Tuning, Utility, WorkerLoad
+from zsched.core.values.model import Link, NodeId, TaskId, Tuning, Utility, WorkerLoad
 from zsched.core.values.plan import StreamCount
+from zsched.core.values.words import Readings
 
 SCHEMA = "zsched.status/1"
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from zsched.core.values.model import NAME
+from zsched.core.values.words import NAME
 from zsched.errors import ConfigError
 from zsched.tasks.map_merge.geometry import Pose2, wrap_angle
 

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Protocol
 
-from zsched.core.values.model import NAME
+from zsched.core.values.words import NAME
 from zsched.guard import guarded
 from zsched.tasks.map_merge.cdr import CdrError, StampedTransform, decode_grid, encode_grid, encode_transforms
 from zsched.tasks.map_merge.geometry import Pose2

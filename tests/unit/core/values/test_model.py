@@ -27,8 +27,8 @@ from zsched.core.values.model import (
     WorkerState,
     as_reason,
     check_name,
-    check_range,
 )
+from zsched.core.values.words import check_range
 
 EVEN = Weights(cpu=0.5, memory=0.25, network=0.25)
 

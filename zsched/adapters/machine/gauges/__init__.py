@@ -15,7 +15,7 @@ from typing import Final, Protocol
 from zsched.clock import monotonic_s
 from zsched.core.profile.means import STALE_S
 from zsched.core.values.gauges import GAUGES
-from zsched.core.values.model import Readings
+from zsched.core.values.words import Readings
 from zsched.guard import guarded
 
 LOOK_S: Final = 2.0

@@ -1,0 +1,44 @@
+"""Names, ranges and words that values share with who only shows them, or looks whether a name is one.
+
+Knows: the alphabet of names, first words of reasons. Does not know: any value. It loads in no time, so a verb of the
+command line that needs no value (`status`, `history`) does without `zsched.core.values.model`.
+"""
+
+from __future__ import annotations
+
+import re
+
+GaugeName = str
+"""A gauge's name (`zsched.core.values.gauges`), of the alphabet of `NAME`."""
+Readings = tuple[tuple[GaugeName, float], ...]
+"""One number for each of some gauges; a gauge that is not there was not measured."""
+
+NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}")
+"""Of a node, a task or a fleet."""
+MAX_ASKER, MAX_ASKED = 96, 200
+"""Characters of an operator's name and reason: they travel with every ballot of a task."""
+PAPER_METRICS = ("cpu", "memory", "network")
+"""The metrics of Eq. 1 to 3; the others are gauges."""
+
+NEVER_INITIALISED = "never initialised"
+"""First words of the problem that no elector has a state, and no node remembers one."""
+WAS_READY = "was ready until "
+"""First words of the reason of a worker that was ready and no longer is; its supervisor calls that starting."""
+RESTARTING = "restarting"
+"""First words of the reason of a worker that has failed and is, or will be, started again."""
+_READY = "ready"
+
+
+def told_of_worker(state: str, reason: str) -> str:
+    """The state of a worker (`zsched.core.values.model.WorkerState`) in words, to follow its name."""
+    if state != _READY and reason.startswith(WAS_READY):
+        return reason
+    if state != _READY and reason.startswith(RESTARTING):
+        return f"is {reason}"
+    return f"is {state}{': ' if reason else ''}{reason}"
+
+
+def check_range(field: str, value: float | None, low: float, high: float) -> None:
+    """Raise `ValueError` unless ``low <= value <= high`` (``None``, "not measured", passes; NaN does not)."""
+    if value is not None and not low <= value <= high:
+        raise ValueError(f"{field}: {value!r} is not in [{low:g}, {high:g}]")
