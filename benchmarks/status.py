@@ -1,4 +1,4 @@
-"""Wall time of the verbs that are asked most, process start included, on a fleet of six.
+"""Wall and CPU time of the verbs that are asked most, process start included, on a fleet of six.
 
 ``python -m benchmarks.status [--n 40]``: `status`, `explain` and `history`. Beside them in the same run: a bare
 interpreter, the floor under any Python command. The history has the moves that the run makes before it measures.
@@ -7,6 +7,8 @@ interpreter, the floor under any Python command. The history has the moves that 
 from __future__ import annotations
 
 import argparse
+import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -20,19 +22,20 @@ from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 LATE_S = 30.0
 
 
-def wall_ms(command: list[str]) -> float:
-    """Milliseconds of one run of ``command``.
+def spent_ms(command: list[str]) -> tuple[float, float]:
+    """(wall time, CPU time of the process) of one run of ``command``, in milliseconds.
 
     The kernel tells its end: `subprocess` with a timeout looks every 50 ms, which would round each time up.
     """
     start = time.monotonic()
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-        late = threading.Timer(LATE_S, process.kill)
+        late = threading.Timer(LATE_S, os.kill, (process.pid, signal.SIGKILL))
         late.start()
-        process.wait()
-        took_ms = (time.monotonic() - start) * 1000
+        _, status, used = os.wait4(process.pid, 0)
+        took_s = time.monotonic() - start
         late.cancel()
-    return took_ms
+        process.returncode = os.waitstatus_to_exitcode(status)
+    return took_s * 1000, (used.ru_utime + used.ru_stime) * 1000
 
 
 def main() -> None:
@@ -60,12 +63,14 @@ def main() -> None:
             "zsched explain": [*zsched, "explain", TASK, *here],
             "zsched history": [*zsched, "history", *here],
         }
-        times: dict[str, list[float]] = {name: [] for name in commands}
+        times: dict[str, list[tuple[float, float]]] = {name: [] for name in commands}
         for _ in range(arguments.n):
             for name, command in commands.items():
-                times[name].append(wall_ms(command))
+                times[name].append(spent_ms(command))
     for name, values in times.items():
-        print(line(name, values, "ms", "200 ms" if "zsched" in name else "-"))
+        print(line(name, [wall for wall, _ in values], "ms", "200 ms" if "zsched" in name else "-"))
+    for name, values in times.items():
+        print(line(f"{name}, CPU", [cpu for _, cpu in values], "ms", "-"))
 
 
 if __name__ == "__main__":

@@ -35,6 +35,7 @@ from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE
 from zsched.runtime.endpoints import DATA_PORT, PortClaim, claim_port, free_port
 
 HERE: Final = Path("fleet.yaml")
+ENTER: Final = "enter.sh"
 PORT_STEP: Final = 10
 """From one robot's data port to the next one's."""
 NARROW: Final = 80
@@ -177,15 +178,25 @@ def _introduce(
     print('\nIn Python: zenoh.open(zenoh.Config.from_json5("""..."""))\n')
     if (words := application(nodes.work_folder, fleet.tasks[0].worker.command, addresses[robot].joins)) is not None:
         _say(f"the application, in another terminal: {words}")
-    _say(f"another terminal begins with: {_entrance(nodes.work_folder)}")
-    _say(f"this fleet there: zsched status --runtime-dir {nodes.folder} --node {robot}")
+    enter = nodes.folder / ENTER
+    enter.write_text(entrance(nodes, robot), encoding="utf-8")
+    _say(f"another terminal begins with: source {shlex.quote(str(enter))}")
+    _say(f"this fleet there: zsched status; elsewhere: zsched status --runtime-dir {nodes.folder} --node {robot}")
 
 
-def _entrance(folder: Path) -> str:
-    """The command line after which ``zsched`` and ``python`` are this run's, in the folder of its fleet file."""
+def entrance(nodes: Nodes, robot: NodeId) -> str:
+    """A script for a shell: ``zsched`` and ``python`` are this run's, in the file's folder, and verbs ask ``robot``."""
     activate = Path(sys.prefix) / "bin" / "activate"
-    enter = f"cd {shlex.quote(str(folder))}"
-    return f"{enter} && source {shlex.quote(str(activate))}" if activate.is_file() else enter
+    words = {
+        "ZSCHED_NODE": robot,
+        "ZSCHED_CONFIG": nodes.file,
+        "ZSCHED_RUNTIME_DIR": nodes.folder,
+        "ZSCHED_STATE_DIR": nodes.folder / robot,
+    }
+    lines = [f"cd {shlex.quote(str(nodes.work_folder))}"]
+    lines += [f"source {shlex.quote(str(activate))}"] if activate.is_file() else []
+    lines += [f"export {name}={shlex.quote(str(value))}" for name, value in words.items()]
+    return "\n".join(lines) + "\n"
 
 
 def application(folder: Path, worker: Sequence[str], joins: str) -> str | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shlex
+import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from typer.testing import CliRunner
 
 from zsched.cli import app
 from zsched.commands.common import CliError
-from zsched.commands.dev import DEFAULT_JOINS, DevOptions, _commands, application, dev, json5
+from zsched.commands.dev import DEFAULT_JOINS, ENTER, DevOptions, _commands, application, dev, entrance, json5
 from zsched.config.load import load_fleet
 from zsched.core.values.model import NodeId
 from zsched.dev.nodes import shares
@@ -156,7 +157,7 @@ class _Nodes:
 
     def __init__(self) -> None:
         self.fleet = load_fleet(EXAMPLE)
-        self.folder = Path()
+        self.folder = self.file = self.work_folder = Path()
         self.stopped: list[NodeId] = []
 
     def is_up(self, _node: NodeId) -> bool:
@@ -193,6 +194,24 @@ def test_a_worker_s_file_that_is_written_later_is_noticed(tmp_path: Path) -> Non
     (tmp_path / "worker.py").write_text("1")
     assert watched.changed() == {"shout": "worker.py"}
     assert watched.files["echo"] == ()
+
+
+def test_another_terminal_asks_this_fleet_by_every_verb(tmp_path: Path) -> None:
+    work = tmp_path / "my task"
+    work.mkdir()
+    nodes = _Nodes()
+    nodes.folder, nodes.file, nodes.work_folder = tmp_path, tmp_path / "fleet.yaml", work
+    script = tmp_path / ENTER
+    script.write_text(entrance(nodes, NodeId("robot1")))  # type: ignore[arg-type]
+    code = f"source {script} && pwd && env | grep ^ZSCHED_ | sort"
+    told = subprocess.run(["bash", "-c", code], capture_output=True, text=True, check=True).stdout.splitlines()
+    assert told == [
+        str(work),
+        f"ZSCHED_CONFIG={tmp_path}/fleet.yaml",
+        "ZSCHED_NODE=robot1",
+        f"ZSCHED_RUNTIME_DIR={tmp_path}",
+        f"ZSCHED_STATE_DIR={tmp_path}/robot1",
+    ]
 
 
 def test_a_failed_worker_whose_file_is_not_watched_is_tried_again_by_a_verb(tmp_path: Path) -> None:
