@@ -20,7 +20,6 @@ import secrets
 import signal
 import sys
 import time
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 from zsched import __version__
@@ -47,6 +46,7 @@ from zsched.core.values.fleet import Fleet, WorkerLink, dial_endpoint, electorat
 from zsched.core.values.messages import CommandResult
 from zsched.core.values.model import NodeId, NodeKind
 from zsched.core.values.snapshot import Exposure
+from zsched.core.values.struct import Struct, replace
 from zsched.errors import AdapterError, ConfigError, NameTakenError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_LEFT, EXIT_NAME_TAKEN, EXIT_OK
 from zsched.guard import on_failure
@@ -102,8 +102,7 @@ ALERT_S, ALERT_WAIT_S = 1.0, 0.01
 log = logging.getLogger("zsched.daemon")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Options:
+class Options(Struct, frozen=True, kw_only=True):
     """What a daemon is started with; every path is resolved already."""
 
     config: Path

@@ -6,15 +6,15 @@ Knows: the formats of /proc/PID/stat and schedstat. Does not know: which process
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+
+from zsched.core.values.struct import Struct
 
 TICKS_PER_S = float(os.sysconf("SC_CLK_TCK"))
 PAGE_MB = os.sysconf("SC_PAGE_SIZE") / 1048576.0
 READ_BYTES = 65536
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ProcessTimes:
+class ProcessTimes(Struct, frozen=True, kw_only=True):
     """One line of /proc/PID/stat, as far as anybody here needs it (times in seconds, memory in MiB)."""
 
     state: str

@@ -12,7 +12,6 @@ import shlex
 import socket
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TextIO
 
@@ -35,6 +34,7 @@ from zsched.config.difference import Change, Danger, difference, wanted_electors
 from zsched.config.load import check_bytes
 from zsched.config.reader import MAX_FILE_BYTES, render_all
 from zsched.core.values.fleet import Fleet, fleet_hash
+from zsched.core.values.struct import Struct, replace
 from zsched.errors import ConfigError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE, EXIT_WOULD_CHANGE
 from zsched.files import read_regular
@@ -50,8 +50,7 @@ PATH_ROOM, VALUE_ROOM = 44, 28
 STDIN = "-"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ApplyView:
+class ApplyView(Struct, frozen=True, kw_only=True):
     """How a change is shown and confirmed."""
 
     words: tuple[str, ...]
@@ -85,8 +84,7 @@ class ApplyView:
         return shlex.join(("zsched", *self.words, *kept, *self.where, *more))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Plan:
+class Plan(Struct, frozen=True, kw_only=True):
     """What is to be agreed, and what follows."""
 
     held: InForce

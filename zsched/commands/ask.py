@@ -10,7 +10,6 @@ import contextlib
 import os
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,6 +18,7 @@ from zsched import paths as places
 from zsched.adapters.host.operator_socket import ask
 from zsched.clock import wall_s
 from zsched.commands.common import CliError, Json, nearest
+from zsched.core.values.struct import Struct, replace
 from zsched.core.values.words import NAME
 from zsched.errors import AdapterError
 from zsched.exits import EXIT_FAILED, EXIT_TIMED_OUT, EXIT_UNREACHABLE, EXIT_USAGE
@@ -36,8 +36,7 @@ ASK_TIMEOUT_S = 5.0
 """Above the daemon's own limits (3 s for its loop, 3 s for another node), so that their reasons arrive."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Door:
+class Door(Struct, frozen=True, kw_only=True):
     """The daemon to ask: its socket, and the node to ask through it (``None``: the daemon itself)."""
 
     socket: Path
@@ -244,8 +243,7 @@ def _client(endpoint: str) -> FleetClient:
     return client
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Visit:
+class _Visit(Struct, frozen=True, kw_only=True):
     """How a tool comes to a fleet: its session's settings, in whose name it asks, and which fleet (``*``: any)."""
 
     text: str

@@ -13,7 +13,6 @@ import subprocess
 import sys
 import tarfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
@@ -25,6 +24,7 @@ from zsched.commands.page import harmless, size
 from zsched.commands.redaction import clean, clean_json, clean_yaml, secrets_of
 from zsched.commands.versions import versions
 from zsched.config.reader import MAX_FILE_BYTES
+from zsched.core.values.struct import Struct, replace
 from zsched.doctor.look import Machine, look
 from zsched.doctor.model import Result, Scene
 from zsched.doctor.table import run_all
@@ -41,8 +41,7 @@ TEXT_WIDTH: Final = 120
 Journal = Callable[[], str]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Member:
+class Member(Struct, frozen=True, kw_only=True):
     """One file of the report; ``missing``: why it is not there."""
 
     name: str

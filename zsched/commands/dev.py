@@ -12,7 +12,6 @@ import sys
 import textwrap
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -26,6 +25,7 @@ from zsched.core.route.templates import routes_for
 from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.model import NodeId, NodeKind, TaskId
 from zsched.core.values.plan import Direction
+from zsched.core.values.struct import Struct
 from zsched.dev.fleet import Addresses, LoopbackFile, on_loopback
 from zsched.dev.nodes import Nodes, shares
 from zsched.dev.run import KEYS, Run, stopped_by_signal
@@ -43,8 +43,7 @@ DEFAULT_JOINS: Final = f"tcp/127.0.0.1:{DATA_PORT}"
 """Where an application joins that is told nothing."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DevOptions:
+class DevOptions(Struct, frozen=True, kw_only=True):
     """What the verb was given."""
 
     file: Path | None

@@ -12,7 +12,6 @@ from __future__ import annotations
 import shutil
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 
 from zsched.commands.ask import Door, ask_door
@@ -21,6 +20,7 @@ from zsched.commands.history import age_s_of, is_known, is_move, wall_text, wher
 from zsched.commands.page import Cell, Page, memory, span
 from zsched.commands.report import printable
 from zsched.commands.weight_words import shares
+from zsched.core.values.struct import Struct
 from zsched.core.values.words import PAPER_METRICS
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
 
@@ -33,8 +33,7 @@ COLUMNS = {"memory": "mem", "network": "net"}
 OUTCOMES = {"stay": "green", "none": "red"}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ExplainView:
+class ExplainView(Struct, frozen=True, kw_only=True):
     """How an explanation is shown."""
 
     plan: str | None
@@ -120,8 +119,7 @@ def _of_robot(door: Door, task: str, robot: str) -> tuple[Json, Json]:
 # --- a judgement of the past -----------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Point:
+class Point(Struct, frozen=True, kw_only=True):
     """Which judgement of a log is meant: the one before an epoch, an age or a time."""
 
     word: str

@@ -10,7 +10,6 @@ import shlex
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any, Final
 
 from zsched.clock import monotonic_s
@@ -21,6 +20,7 @@ from zsched.commands.orders import OrderView, Row, begin, check_said
 from zsched.commands.page import span
 from zsched.commands.report import millis, told_flag
 from zsched.commands.wait import Condition, missing
+from zsched.core.values.struct import Struct, field
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE
 
 SCHEMA: Final = "zsched.drain/1"
@@ -40,8 +40,7 @@ BLANK: Final[Json] = dict.fromkeys(
 )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DrainOrder:
+class DrainOrder(Struct, frozen=True, kw_only=True):
     """Which nodes, and how their drain is watched."""
 
     nodes: tuple[str, ...]
@@ -57,8 +56,7 @@ class DrainOrder:
     """What else follows, in the table of what changes."""
 
 
-@dataclass(slots=True)
-class _Watch:
+class _Watch(Struct):
     """What has been told of a drain so far."""
 
     view: OrderView

@@ -11,7 +11,6 @@ import re
 import sys
 import time
 from collections.abc import Container, Iterable, Iterator
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Final
 
@@ -19,6 +18,7 @@ from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, nearest, print_json, say
 from zsched.commands.page import harmless, span
 from zsched.commands.report import millis, printable
+from zsched.core.values.struct import Struct
 from zsched.exits import EXIT_OK, EXIT_UNREACHABLE, EXIT_USAGE
 
 SCHEMA = "zsched.history/1"
@@ -33,8 +33,7 @@ _DURATION = re.compile(r"([0-9]{1,12}(?:\.[0-9]{1,9})?)(s|m|h|d)")
 _UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EventsView:
+class EventsView(Struct, frozen=True, kw_only=True):
     """Which events are shown, and how."""
 
     task: str | None

@@ -11,13 +11,13 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Final
 
 from zsched.commands.common import CliError
 from zsched.commands.completion import SCRIPTS, script_file
+from zsched.core.values.struct import Struct
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_WOULD_CHANGE
 
 UNITS: Final = ("zsched.service", "zsched-web.service", "zsched-renew.service", "zsched-renew.timer")
@@ -44,8 +44,7 @@ SYSTEM_FOLDERS: Final = (
 TOOL_S: Final = 60.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Piece:
+class Piece(Struct, frozen=True, kw_only=True):
     """One file that the system finds: a text, or a link into the installation."""
 
     path: Path

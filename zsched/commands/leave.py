@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import itertools
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -30,6 +29,7 @@ from zsched.config.editing import remove_node
 from zsched.config.load import check_bytes
 from zsched.core.electorate.pilot import may_go
 from zsched.core.values.electorate import FleetValue
+from zsched.core.values.struct import Struct
 from zsched.errors import AdapterError, ConfigError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_UNREACHABLE, EXIT_USAGE, EXIT_WOULD_CHANGE
 from zsched.runtime.membership import Places, Written, belongings, check_ended, put_away, whose
@@ -47,8 +47,7 @@ LEARN_S: Final = 10.0
 """How long the other nodes may take to learn that this one is gone."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LeaveOrder:
+class LeaveOrder(Struct, frozen=True, kw_only=True):
     """What the operator has said."""
 
     places: Places
@@ -63,8 +62,7 @@ class LeaveOrder:
     is_json: bool = False
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Way:
+class _Way(Struct, frozen=True, kw_only=True):
     """One node on its way out."""
 
     order: LeaveOrder

@@ -9,7 +9,6 @@ import re
 import sys
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -17,6 +16,7 @@ from zsched.clock import wall_ns
 from zsched.commands.ask import Door, ask_door, find_door
 from zsched.commands.common import CliError, Json, nearest, print_json
 from zsched.commands.page import clock_time, harmless
+from zsched.core.values.struct import Struct
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE
 
 SCHEMA: Final = "zsched.logs/1"
@@ -64,8 +64,7 @@ class Sieve:
         return self._is_shown
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LogsView:
+class LogsView(Struct, frozen=True, kw_only=True):
     """Which daemon to ask, and how to show the answer."""
 
     runtime_dir: Path | None

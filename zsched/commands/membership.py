@@ -13,7 +13,6 @@ import socket
 import stat
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -30,6 +29,7 @@ from zsched.core.values.document import Document
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet, NodeSpec, dial_endpoint
 from zsched.core.values.model import NodeId, NodeKind
+from zsched.core.values.struct import Struct
 from zsched.core.values.words import NAME
 from zsched.errors import WireError, ZschedError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
@@ -47,8 +47,7 @@ LOCAL_PORT_AFTER: Final = 3
 MAX_PORT: Final = 65_535
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Told:
+class Told(Struct, frozen=True, kw_only=True):
     """What a verb of these has done to this machine, or would do."""
 
     fleet: str
@@ -76,8 +75,7 @@ class Told:
 # --- addresses -------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Address:
+class Address(Struct, frozen=True, kw_only=True):
     """Where a node is dialled: its control session at ``port``, its data session at the next one."""
 
     host: str
@@ -166,8 +164,7 @@ security: {}
 """
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CreateView:
+class CreateView(Struct, frozen=True, kw_only=True):
     """The first machine of a new fleet."""
 
     fleet: str
@@ -260,8 +257,7 @@ def _start(node: NodeId, where: Places) -> tuple[str, ...]:
 # --- invite ----------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Guest:
+class Guest(Struct, frozen=True, kw_only=True):
     """The machine that is to come."""
 
     name: str

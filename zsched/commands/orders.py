@@ -13,7 +13,6 @@ import socket
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any, Final
 
@@ -26,6 +25,7 @@ from zsched.commands.wait import Condition, missing
 from zsched.commands.weight_words import NAMES, shares
 from zsched.core.values.fleet import TUNED_LINKS, TUNED_RULES
 from zsched.core.values.model import MAX_FOR_S, Aggregate, PairReading, Reach, ScoreForm, Tuning, Weights
+from zsched.core.values.struct import Struct, replace
 from zsched.core.values.words import MAX_ASKER
 from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE, EXIT_WOULD_CHANGE
 
@@ -58,8 +58,7 @@ Row = tuple[str, str, str, str]
 """(task, what, before, after)."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OrderView:
+class OrderView(Struct, frozen=True, kw_only=True):
     """Which daemon to ask, and what the operator has said beside the order itself."""
 
     door: Door
@@ -111,8 +110,7 @@ def check_said(view: OrderView) -> None:
 # --- pause, resume, pin, unpin ---------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class HoldOrder:
+class HoldOrder(Struct, frozen=True, kw_only=True):
     """A pause or a pin, or the end of one: ``hold`` is the verb."""
 
     hold: str
@@ -253,8 +251,7 @@ def _list_holds(view: OrderView, verb: str, tasks: Sequence[Json]) -> int:
 # --- move ------------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MoveOrder:
+class MoveOrder(Struct, frozen=True, kw_only=True):
     """A handover to a named node."""
 
     task: str

@@ -10,7 +10,6 @@ import statistics
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -23,6 +22,7 @@ from zsched.commands.document import fleet_here
 from zsched.core.values.fleet import Fleet, NodeSpec, dial_endpoint
 from zsched.core.values.model import NodeId
 from zsched.core.values.snapshot import Snapshot
+from zsched.core.values.struct import Struct
 from zsched.errors import WireError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_UNREACHABLE, EXIT_USAGE
 from zsched.runtime.access_rules import Side
@@ -35,8 +35,7 @@ SCHEMA: Final = "zsched.ping/1"
 CONTROL, DATA, DAEMON = "control", "data", "daemon"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Question:
+class Question(Struct, frozen=True, kw_only=True):
     """What to measure."""
 
     node: NodeId
@@ -45,8 +44,7 @@ class Question:
     interval_s: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Way:
+class Way(Struct, frozen=True, kw_only=True):
     """One way to the node, and what came of it."""
 
     name: str

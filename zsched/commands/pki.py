@@ -10,7 +10,6 @@ import contextlib
 import os
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -26,6 +25,7 @@ from zsched.commands.page import harmless
 from zsched.config.load import load_fleet
 from zsched.core.values.certificates import Role, parse_label
 from zsched.core.values.fleet import Fleet
+from zsched.core.values.struct import Struct
 from zsched.core.values.words import NAME
 from zsched.errors import AdapterError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE
@@ -43,16 +43,14 @@ MAX_BYTES: Final = 1 << 20
 DUE, REVOKED, ENDED, VALID = "due", "revoked", "ended", "valid"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Where:
+class Where(Struct, frozen=True, kw_only=True):
     """The fleet file and the authority's folder, as they were given."""
 
     config: Path | None
     authority: Path | None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Office:
+class _Office(Struct, frozen=True, kw_only=True):
     """Which fleet's authority, and where it is."""
 
     fleet: Fleet
@@ -102,8 +100,7 @@ def issue(where: Where, name: str, role: Role, request: Path | None, out: Path |
     return EXIT_OK
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Begun:
+class Begun(Struct, frozen=True, kw_only=True):
     """A new authority, and the certificate of its first node."""
 
     authority: Authority

@@ -6,7 +6,6 @@ Knows: which rollouts wait. Does not know: how a change is shown and agreed (`zs
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 from zsched.commands.apply import ApplyView, Plan, agree
 from zsched.commands.ask import Door
@@ -14,6 +13,7 @@ from zsched.commands.common import CliError, nearest
 from zsched.commands.document import document_text, in_force
 from zsched.commands.rollout import promoted
 from zsched.config.load import check_bytes
+from zsched.core.values.struct import replace
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from zsched.commands.common import CliError, nearest
@@ -19,14 +18,14 @@ from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import SAID_DIGITS, FleetValue
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId, RegisterState
+from zsched.core.values.struct import Struct
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
 from zsched.runtime import recovery as runtime
 
 DANGERS = tuple(danger.value for danger in Danger)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Place:
+class Place(Struct, frozen=True, kw_only=True):
     """Which node it is, and where its files are."""
 
     fleet: Fleet
@@ -35,8 +34,7 @@ class Place:
     folder: Path
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Manner:
+class Manner(Struct, frozen=True, kw_only=True):
     """How it is shown and confirmed."""
 
     words: tuple[str, ...]

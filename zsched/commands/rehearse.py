@@ -14,7 +14,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -30,6 +29,7 @@ from zsched.commands.rehearse_report import SCHEMA, as_json, table
 from zsched.commands.wait import Condition, missing
 from zsched.core.rehearsal.programme import MIN_CALM_S, Do, Lift, Look, Over, Programme, Result, Sight
 from zsched.core.values.rehearsal import FAULTS, MAX_CUT_S, Promised, Step
+from zsched.core.values.struct import Struct, field, replace
 from zsched.core.values.words import MAX_ASKED
 from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE
 
@@ -59,8 +59,7 @@ DOES: Final = {
 T = TypeVar("T")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RehearseOrder:
+class RehearseOrder(Struct, frozen=True, kw_only=True):
     """What is rehearsed."""
 
     task: str
@@ -262,8 +261,7 @@ def _line(result: Result) -> str:
     return f"  {gap}{whole}, lost {result.lost}: {word}"
 
 
-@dataclass(slots=True)
-class _Base:
+class _Base(Struct):
     """What was there when the rehearsal began."""
 
     alive: frozenset[str]

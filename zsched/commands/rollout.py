@@ -7,20 +7,19 @@ Knows: which worker goes first, what can wait and what cannot. Does not know: ho
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
 
 from zsched.commands.common import CliError, Json
 from zsched.config.difference import Change, Effect, difference
 from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec
 from zsched.core.values.model import MAX_REASON, NodeId
+from zsched.core.values.struct import Struct, replace
 from zsched.exits import EXIT_FAILED, EXIT_USAGE
 
 HELD = ("worker.command", "worker.env")
 """What of a task may wait: the keys of its worker's process that no other process goes by."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Wave:
+class Wave(Struct, frozen=True, kw_only=True):
     """A change of the document whose workers are to wait."""
 
     old: Fleet

@@ -8,7 +8,6 @@ from __future__ import annotations
 import shutil
 import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
 from zsched.clock import wall_ns
@@ -16,6 +15,7 @@ from zsched.commands.ask import Door, ask_door, find_door
 from zsched.commands.common import CliError, Json, print_json, wants_color
 from zsched.commands.page import harmless
 from zsched.commands.report import TROUBLES, degradations, render_status
+from zsched.core.values.struct import Struct
 from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK
 
 MIN_WIDTH, DEFAULT_WIDTH, MAX_WIDTH = 60, 100, 160
@@ -24,8 +24,7 @@ MAJOR = "1"
 HOME, CLEAR, REST_OF_LINE, REST_OF_SCREEN = "\x1b[H", "\x1b[2J", "\x1b[K", "\x1b[J"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StatusView:
+class StatusView(Struct, frozen=True, kw_only=True):
     """Which daemon to ask, and how to show the answer."""
 
     runtime_dir: Path | None

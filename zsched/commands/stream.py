@@ -8,7 +8,6 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -17,6 +16,7 @@ from zsched.commands.ask import Door, ask_door, find_door
 from zsched.commands.common import CliError, Json, nearest, print_json
 from zsched.commands.page import Page, harmless, since_drop, size, span
 from zsched.core.route import keyexpr
+from zsched.core.values.struct import Struct, field
 from zsched.errors import AdapterError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_UNREACHABLE, EXIT_USAGE
 
@@ -31,8 +31,7 @@ OWN_WORDS: Final = ("from_expr", "to_expr", "hz", "bytes_per_s")
 KINDS: Final = {"in": "input", "out": "output", "srv": "service"}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StreamView:
+class StreamView(Struct, frozen=True, kw_only=True):
     """Which daemon to ask, and how to show the answer."""
 
     runtime_dir: Path | None
@@ -193,8 +192,7 @@ def _check_key(word: str) -> None:
 # --- hz, bw, tail ----------------------------------------------------------------------------------------------------
 
 
-@dataclass(slots=True)
-class KeyStats:
+class KeyStats(Struct):
     """What came on one key in one window."""
 
     count: int = 0

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -16,6 +15,7 @@ from zsched.commands.ask import ask_door, find_door
 from zsched.commands.common import CliError, Json, nearest, print_json, say
 from zsched.commands.page import span
 from zsched.commands.report import all_problems
+from zsched.core.values.struct import Struct
 from zsched.exits import EXIT_OK, EXIT_TIMED_OUT, EXIT_UNREACHABLE, EXIT_USAGE
 
 SCHEMA: Final = "zsched.wait/1"
@@ -26,8 +26,7 @@ RESTING: Final = ("settled", "idle")
 """Phases of a handover in which nothing is under way."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Condition:
+class Condition(Struct, frozen=True, kw_only=True):
     """What is waited for: ``kind`` and, where it has them, the ``task`` and the ``node``."""
 
     kind: str
@@ -109,8 +108,7 @@ def _under_way(statuses: Mapping[str, Json], name: str, why: str) -> list[str]:
 # --- the verb --------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WaitView:
+class WaitView(Struct, frozen=True, kw_only=True):
     """Which daemon to ask, for how long, and how to show the answer."""
 
     runtime_dir: Path | None

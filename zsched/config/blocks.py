@@ -9,11 +9,12 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from collections.abc import Mapping as Lookup
-from dataclasses import dataclass, field, fields
+from dataclasses import fields
 from enum import StrEnum
 from typing import Any, Final, Generic, Protocol, TypeVar
 
 from zsched.config.reader import Collector, Mapping, Node, Place, Scalar, Sequence, kind_of, nearest
+from zsched.core.values.struct import Struct, field
 from zsched.core.values.words import NAME
 
 T = TypeVar("T")
@@ -36,8 +37,7 @@ class Block(Protocol[T_co]):
         ...
 
 
-@dataclass(frozen=True, slots=True)
-class Located(Generic[T]):
+class Located(Struct, Generic[T], frozen=True):
     """A value and where it stands."""
 
     value: T
@@ -51,8 +51,7 @@ def _refuse(node: Node, out: Collector, wanted: str, hint: str = "") -> None:
     out.error(node.place, f"expected {wanted}, not {kind_of(node)}", hint)
 
 
-@dataclass(frozen=True, slots=True)
-class Number:
+class Number(Struct, frozen=True):
     """A finite number in [low, high]; ``unit`` is for the reader only."""
 
     low: float
@@ -79,8 +78,7 @@ class Number:
         return f"{plain_number(self.low)}..{plain_number(self.high)}{f' {self.unit}' if self.unit else ''}"
 
 
-@dataclass(frozen=True, slots=True)
-class Whole:
+class Whole(Struct, frozen=True):
     """A whole number in [low, high]."""
 
     low: int
@@ -102,8 +100,7 @@ class Whole:
         return f"a whole number {self.low}..{self.high}"
 
 
-@dataclass(frozen=True, slots=True)
-class Flag:
+class Flag(Struct, frozen=True):
     """``true`` or ``false``; ``only`` when just one of them makes sense."""
 
     only: bool | None = None
@@ -122,16 +119,14 @@ class Flag:
         return "`true` or `false`" if self.only is None else f"`{str(self.only).lower()}`"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Removed:
+class Removed(Struct, frozen=True, kw_only=True):
     """A key or a word that fleet files had once: why it is gone, and what to write instead."""
 
     why: str
     instead: str
 
 
-@dataclass(frozen=True, slots=True)
-class Choice(Generic[T]):
+class Choice(Struct, Generic[T], frozen=True):
     """One of some words, each standing for a value."""
 
     values: Lookup[str, T]
@@ -163,8 +158,7 @@ class Choice(Generic[T]):
         return " or ".join(f"`{word}`" for word in self.values)
 
 
-@dataclass(frozen=True, slots=True)
-class Text:
+class Text(Struct, frozen=True):
     """Text as written (a plain ``1.10`` stays ``1.10``), checked by ``fault``: why not, or `None`."""
 
     what: str
@@ -198,8 +192,7 @@ def _name_fault(text: str) -> str | None:
 NAME_BLOCK: Final = Text("a name", _name_fault)
 
 
-@dataclass(frozen=True, slots=True)
-class Here(Generic[T]):
+class Here(Struct, Generic[T], frozen=True):
     """What ``inner`` reads, with its place, for checks that come later."""
 
     inner: Block[T]
@@ -217,8 +210,7 @@ class Here(Generic[T]):
 # --- collections -----------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class ListOf(Generic[T]):
+class ListOf(Struct, Generic[T], frozen=True):
     """A list of at least ``least`` items."""
 
     item: Block[T]
@@ -243,8 +235,7 @@ class ListOf(Generic[T]):
         return f"a list, each {self.item.says()}"
 
 
-@dataclass(frozen=True, slots=True)
-class MapOf(Generic[T]):
+class MapOf(Struct, Generic[T], frozen=True):
     """A mapping from free keys (checked by ``key``) to values of one kind."""
 
     key: Text
@@ -268,8 +259,7 @@ class MapOf(Generic[T]):
         return f"a mapping, each key {self.key.says()}, each value {self.item.says()}"
 
 
-@dataclass(frozen=True, slots=True)
-class Field:
+class Field(Struct, frozen=True):
     """One key of a record. ``default`` is only for the reference."""
 
     block: Block[Any]
@@ -278,8 +268,7 @@ class Field:
     default: str = ""
 
 
-@dataclass(slots=True)
-class Section:
+class Section(Struct):
     """A record that was read: values by key, with places. Keys that were absent or faulty are not there."""
 
     place: Place
@@ -309,8 +298,7 @@ class Section:
             return None
 
 
-@dataclass(frozen=True, slots=True)
-class Record:
+class Record(Struct, frozen=True):
     """A mapping with known keys."""
 
     what: str
@@ -352,8 +340,7 @@ class Record:
         return f"a mapping {{{', '.join(self.items)}}}"
 
 
-@dataclass(frozen=True, slots=True)
-class Forms:
+class Forms(Struct, frozen=True):
     """A place that takes more than one shape: each node goes to the block of its shape."""
 
     word: Block[Any] | None = None

@@ -11,7 +11,7 @@ another place, as candidates from a label, is a change of its own.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields
 from enum import StrEnum
 from typing import Any, Final
 
@@ -32,6 +32,7 @@ from zsched.core.values.fleet import (
     runs_worker,
 )
 from zsched.core.values.model import NodeId, NodeKind, TaskId, Weights
+from zsched.core.values.struct import Struct, replace
 
 EVERY_DAEMON: Final = "every daemon must be restarted"
 OPENED_ANEW: Final = "daemons begin again in turns: a robot's streams stop for that moment"
@@ -71,8 +72,7 @@ _MEANS: Final[Mapping[Danger, str]] = {
 }
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Change:
+class Change(Struct, frozen=True, kw_only=True):
     """One place of the file, and what follows."""
 
     path: str
@@ -92,8 +92,7 @@ class Change:
         return "" if self.danger is None else _MEANS[self.danger].format(about=self.about)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Verdict:
+class _Verdict(Struct, frozen=True, kw_only=True):
     """What follows where the two fleets differ in one part."""
 
     effect: Effect

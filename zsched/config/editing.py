@@ -13,12 +13,12 @@ lines above an entry stay when the entry goes: they may be about more than this 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from zsched.config.reader import Mapping, Node, Scalar, read_yaml
 from zsched.config.reader import Sequence as Listing
 from zsched.config.rows import flow
+from zsched.core.values.struct import Struct, replace
 from zsched.errors import ConfigError
 
 _STEP: Final = 2
@@ -26,8 +26,7 @@ _STEP: Final = 2
 _ADVICE: Final = "change the file by hand: zsched edit"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Entry:
+class _Entry(Struct, frozen=True, kw_only=True):
     """One entry of a section in the text: offsets of its key's first character and behind its value's last one."""
 
     name: str
@@ -36,8 +35,7 @@ class _Entry:
     col: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Section:
+class _Section(Struct, frozen=True, kw_only=True):
     """The value of a key at the top of the file, or of a key below."""
 
     key_end: int

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import errno
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 from zsched.config.blocks import Located, Section
@@ -22,6 +21,7 @@ from zsched.core.membership.beat_room import MAX_BEAT_BYTES, most_bytes
 from zsched.core.values.document import MAX_DOCUMENT_BYTES
 from zsched.core.values.fleet import Fleet, NodeSpec, Timing, dial_endpoint
 from zsched.core.values.model import NodeId, NodeKind
+from zsched.core.values.struct import Struct
 from zsched.errors import ConfigError
 from zsched.files import owner_of, read_regular
 
@@ -34,8 +34,7 @@ _PLAIN = ("relay_orphan_s", "shared_memory", "replace_s", "away_s")
 """How many nodes are seeds when the file names none: one may be down."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CheckResult:
+class CheckResult(Struct, frozen=True, kw_only=True):
     """What became of one fleet file: the fleet, or the faults that stand in its way; warnings with either."""
 
     file: str

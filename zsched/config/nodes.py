@@ -6,19 +6,18 @@ Knows: how the values of one node, and the nodes among each other, relate. Does 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 from zsched.config.blocks import Located, Section
 from zsched.config.reader import Collector, Place, nearest
 from zsched.core.values.fleet import LinkSpec, LocalMode, LocalSide, NodeSpec, dial_endpoint
 from zsched.core.values.model import LinkSource, NodeId, NodeKind
+from zsched.core.values.struct import Struct
 
 _SOURCES = ("wifi", "wired", "fixed", "trace")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Cast:
+class Cast(Struct, frozen=True, kw_only=True):
     """The nodes of the file: all names, and those nodes that could be read."""
 
     place: Place

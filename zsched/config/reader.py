@@ -13,8 +13,9 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass, field
 from typing import Final, TypeAlias
+
+from zsched.core.values.struct import Struct, field
 
 MAX_FILE_BYTES: Final = 256 << 10
 """Three thousand rules and more; each is checked, and an operator waits seconds."""
@@ -26,8 +27,7 @@ _LINE_BREAK: Final = re.compile("\r\n|[\n\r\x85\u2028\u2029]")
 """YAML's own line breaks, so that our lines are its lines."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Place:
+class Place(Struct, frozen=True, kw_only=True):
     """A place in the file: line and column from 1, and how many characters the caret underlines."""
 
     line: int
@@ -39,8 +39,7 @@ NOWHERE: Final = Place(line=0, col=0)
 """The file as a whole."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Fault:
+class Fault(Struct, frozen=True, kw_only=True):
     """One thing wrong in a file: where (line and column from 1; 0: the whole file), what, and what to do."""
 
     line: int
@@ -136,8 +135,7 @@ def nearest(name: str, names: Iterable[str]) -> str:
 # --- nodes -----------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Scalar:
+class Scalar(Struct, frozen=True, kw_only=True):
     """One scalar as written; ``is_plain`` when without quotes (only then it may be a number, a boolean or null)."""
 
     text: str
@@ -150,16 +148,14 @@ class Scalar:
         return self.is_plain and self.text in ("", "~", "null", "Null", "NULL")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Sequence:
+class Sequence(Struct, frozen=True, kw_only=True):
     """A list."""
 
     items: tuple[Node, ...]
     place: Place
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Mapping:
+class Mapping(Struct, frozen=True, kw_only=True):
     """Keys and values in the order of the file; keys are scalars, doubles are still there."""
 
     pairs: tuple[tuple[Scalar, Node], ...]
@@ -178,8 +174,7 @@ def kind_of(node: Node) -> str:
     return "nothing" if node.is_null else repr(node.text)
 
 
-@dataclass(slots=True)
-class _Conversion:
+class _Conversion(Struct):
     """From ruamel's nodes to ours: aliases shared, circles and other oddities refused."""
 
     out: Collector

@@ -11,13 +11,12 @@ from __future__ import annotations
 import difflib
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 from zsched.config.reader import Mapping, Node, Scalar, Sequence
+from zsched.core.values.struct import Struct
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Row:
+class Row(Struct, frozen=True, kw_only=True):
     """One place that differs; ``None``: nothing stands there."""
 
     path: str

@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from typing import Final
 
 from zsched.core.route import keyexpr
@@ -31,13 +30,13 @@ from zsched.core.route.templates import named_rules, widened
 from zsched.core.values.fleet import StreamRule, TaskSpec
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.plan import Direction
+from zsched.core.values.struct import Struct
 
 MAX_COMPARED: Final = 200_000
 """Pairs of rules and expanded rules that are looked at, together: some seconds' worth."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RuleConflict:
+class RuleConflict(Struct, frozen=True, kw_only=True):
     """Rules that cannot live together. ``streams`` are their names (``<task>/in/<i>``), the first is where to look."""
 
     streams: tuple[str, ...]
@@ -45,8 +44,7 @@ class RuleConflict:
     is_fatal: bool = True
 
 
-@dataclass(frozen=True, slots=True)
-class _Rule:
+class _Rule(Struct, frozen=True):
     stream: str
     task: TaskSpec
     rule: StreamRule
@@ -71,8 +69,7 @@ class _Budget:
             raise _TooMany
 
 
-@dataclass(frozen=True, slots=True)
-class _Relay:
+class _Relay(Struct, frozen=True):
     """One rule for one robot and candidate."""
 
     stream: str
@@ -88,8 +85,7 @@ _LOCAL: Final = "@local"
 """First chunk of the keys in a robot's own room."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Robots:
+class _Robots(Struct, frozen=True):
     budget: _Budget
     names: tuple[NodeId, ...]
     split: frozenset[NodeId]

@@ -8,10 +8,10 @@ Knows: the relations between the fields of `Timing`, each with its reason. Does 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
 from typing import Final
 
 from zsched.core.values.fleet import Timing
+from zsched.core.values.struct import Struct, replace
 
 WIFI: Final = Timing()
 WIRED: Final = replace(WIFI, name="wired", beat_s=0.1, suspect_s=0.45, confirm_s=0.15, zenoh_lease_s=1.0, lease_s=0.4)
@@ -32,8 +32,7 @@ WAN: Final = replace(
 PROFILES: Final[Mapping[str, Timing]] = {profile.name: profile for profile in (WIRED, WIFI, WAN)}
 
 
-@dataclass(frozen=True, slots=True)
-class _Relation:
+class _Relation(Struct, frozen=True):
     """``field`` must stand to ``bound`` as ``sign`` says; ``formula`` is the bound in words."""
 
     field: str

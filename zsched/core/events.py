@@ -7,8 +7,6 @@ Knows: the facts that adapters report. Does not know: what follows from them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from zsched.core.values.document import Flag
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import (
@@ -51,16 +49,15 @@ from zsched.core.values.model import (
 )
 from zsched.core.values.plan import StreamCount
 from zsched.core.values.rehearsal import KeepRehearsal, ReadRehearsals, Strike
+from zsched.core.values.struct import Struct
 from zsched.core.values.words import check_range
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DeadlineReached:
+class DeadlineReached(Struct, frozen=True, kw_only=True):
     """The time that `Node.next_deadline` named has come (or the loop simply woke up)."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ClockCompared:
+class ClockCompared(Struct, frozen=True, kw_only=True):
     """This machine's clock that a time service slews was compared with the raw one (`zsched.clock.ClockWatch`)."""
 
     error_ratio: float
@@ -74,16 +71,14 @@ class ClockCompared:
 # --- PROFILE, GATEWAY ------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ProfileSampled:
+class ProfileSampled(Struct, frozen=True, kw_only=True):
     """This machine and its links were measured."""
 
     device: DeviceSample
     links: tuple[LinkSample, ...] = ()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ProfileReceived:
+class ProfileReceived(Struct, frozen=True, kw_only=True):
     """A peer published its profile."""
 
     profile: Profile
@@ -92,16 +87,14 @@ class ProfileReceived:
 # --- SCHEDULER: the gather -------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class UtilityAsked:
+class UtilityAsked(Struct, frozen=True, kw_only=True):
     """A peer gathers and asks for our vectors."""
 
     request: int
     asker: NodeId
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class UtilityReceived:
+class UtilityReceived(Struct, frozen=True, kw_only=True):
     """A peer answered our gather."""
 
     gather: int
@@ -111,15 +104,13 @@ class UtilityReceived:
 # --- VOTE ------------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ProposalReceived:
+class ProposalReceived(Struct, frozen=True, kw_only=True):
     """A robot proposed a candidate (or to stay)."""
 
     proposal: Proposal
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PrepareAsked:
+class PrepareAsked(Struct, frozen=True, kw_only=True):
     """A proposer asks this elector for a promise."""
 
     request: int
@@ -127,8 +118,7 @@ class PrepareAsked:
     prepare: Prepare
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AcceptAsked:
+class AcceptAsked(Struct, frozen=True, kw_only=True):
     """A proposer asks this elector to accept a value."""
 
     request: int
@@ -136,15 +126,13 @@ class AcceptAsked:
     accept: Accept
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ElectorAnswered:
+class ElectorAnswered(Struct, frozen=True, kw_only=True):
     """An elector answered our prepare or accept."""
 
     answer: Promise | Accepted | Refused
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BallotsAsked:
+class BallotsAsked(Struct, frozen=True, kw_only=True):
     """A proposer asks this elector several questions in one frame."""
 
     request: int
@@ -152,15 +140,13 @@ class BallotsAsked:
     ballots: Ballots
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class VotesReceived:
+class VotesReceived(Struct, frozen=True, kw_only=True):
     """An elector answered questions of ours that went in one frame."""
 
     votes: Votes
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LearntReceived:
+class LearntReceived(Struct, frozen=True, kw_only=True):
     """A peer sent its learnt values: unasked, after a commit, or in answer to our question (`AskLearnt`)."""
 
     learnt: Learnt
@@ -169,15 +155,13 @@ class LearntReceived:
     """An answer: the other end of its sender's link, as text for people; empty: not known."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LearntAsked:
+class LearntAsked(Struct, frozen=True, kw_only=True):
     """A peer asks for our learnt values."""
 
     request: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PersistFailed:
+class PersistFailed(Struct, frozen=True, kw_only=True):
     """The durable state could not be written; nothing that depended on it was sent."""
 
     reason: str
@@ -186,8 +170,7 @@ class PersistFailed:
 # --- VOTE: the fleet register and its documents ----------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FleetAsked:
+class FleetAsked(Struct, frozen=True, kw_only=True):
     """A proposer asks this elector's fleet register."""
 
     request: int
@@ -195,23 +178,20 @@ class FleetAsked:
     question: FleetQuestion
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FleetAnswered:
+class FleetAnswered(Struct, frozen=True, kw_only=True):
     """An elector answered our question to its fleet register."""
 
     answer: FleetAnswer
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DocumentAsked:
+class DocumentAsked(Struct, frozen=True, kw_only=True):
     """A peer asks for the document with this hash."""
 
     request: int
     document: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DocumentStored:
+class DocumentStored(Struct, frozen=True, kw_only=True):
     """A document is on this node's disk, and it is valid here."""
 
     document: str
@@ -223,8 +203,7 @@ class DocumentStored:
     """Of `StoreDocument`; ``None``: it was fetched from a peer."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DocumentRefused:
+class DocumentRefused(Struct, frozen=True, kw_only=True):
     """A document is not valid here, or the disk refused it; nothing is stored."""
 
     document: str
@@ -236,23 +215,20 @@ class DocumentRefused:
 # --- membership ------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BeatReceived:
+class BeatReceived(Struct, frozen=True, kw_only=True):
     """A peer's decision loop is alive."""
 
     beat: Beat
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TokenSeen:
+class TokenSeen(Struct, frozen=True, kw_only=True):
     """A daemon's liveliness token appeared."""
 
     node: NodeId
     incarnation: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TokenLost:
+class TokenLost(Struct, frozen=True, kw_only=True):
     """A daemon's liveliness token went: its process closed, was killed, or its link's lease ended."""
 
     node: NodeId
@@ -262,8 +238,7 @@ class TokenLost:
 # --- EXECUTOR, ROUTE -------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WorkerChanged:
+class WorkerChanged(Struct, frozen=True, kw_only=True):
     """Our supervisor reports a worker of this node."""
 
     task: TaskId
@@ -271,8 +246,7 @@ class WorkerChanged:
     reason: str = ""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WorkerTroubled:
+class WorkerTroubled(Struct, frozen=True, kw_only=True):
     """A worker of this node says that ``count`` of its callbacks have raised; ``text`` is the newest error.
 
     With ``count`` 0 the text tells of a mistake that lasts as long as the worker lives.
@@ -283,16 +257,14 @@ class WorkerTroubled:
     text: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WorkerOutdated:
+class WorkerOutdated(Struct, frozen=True, kw_only=True):
     """A worker that somebody else started on this node should be started again; ``reason`` empty: no longer."""
 
     task: TaskId
     reason: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WorkerJobs:
+class WorkerJobs(Struct, frozen=True, kw_only=True):
     """A worker of this node reports its jobs of this life to the relay, which forwards them.
 
     Counts and sums only rise, so a lost report costs nothing: means and rates are made of the differences
@@ -330,8 +302,7 @@ class WorkerJobs:
             check_range(f"jobs.{name}", getattr(self, name), 0.0, MAX_COUNTER)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WorkerShown:
+class WorkerShown(Struct, frozen=True, kw_only=True):
     """The relay saw the token of another node's worker come over a living link, or go."""
 
     node: NodeId
@@ -340,8 +311,7 @@ class WorkerShown:
     is_present: bool = True
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SlotReady:
+class SlotReady(Struct, frozen=True, kw_only=True):
     """The relay sees the new owner's worker ready (or no longer) for the slot of ``epoch``."""
 
     task: TaskId
@@ -353,8 +323,7 @@ class SlotReady:
     """Not ready: the inputs' keys at the owner that nobody subscribes to."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SlotFlipped:
+class SlotFlipped(Struct, frozen=True, kw_only=True):
     """The relay switched every stream of the task to the slot of ``epoch``; ``replayed`` kept values went first."""
 
     task: TaskId
@@ -362,8 +331,7 @@ class SlotFlipped:
     replayed: int = 0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SlotDrained:
+class SlotDrained(Struct, frozen=True, kw_only=True):
     """The end markers of the old slot have come back."""
 
     task: TaskId
@@ -371,8 +339,7 @@ class SlotDrained:
     """Epoch of the slot that is drained, a predecessor."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RoleEnded:
+class RoleEnded(Struct, frozen=True, kw_only=True):
     """This node's worker reports that it no longer works in ``epoch``, or it is dead.
 
     The report does not say to which stop order it belongs. Where it might belong to an earlier one,
@@ -383,15 +350,13 @@ class RoleEnded:
     epoch: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StreamsCounted:
+class StreamsCounted(Struct, frozen=True, kw_only=True):
     """The relay's counters."""
 
     counts: tuple[StreamCount, ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RelayChanged:
+class RelayChanged(Struct, frozen=True, kw_only=True):
     """The relay process started or ended; a new one gets the newest plans again."""
 
     is_running: bool
@@ -401,79 +366,69 @@ class RelayChanged:
 # --- operators -------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StatusAsked:
+class StatusAsked(Struct, frozen=True, kw_only=True):
     """An operator (here or at another node) asks for the status."""
 
     request: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WeightsCommanded:
+class WeightsCommanded(Struct, frozen=True, kw_only=True):
     """An operator changes a task's weights."""
 
     request: int
     command: SetWeights
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MoveCommanded:
+class MoveCommanded(Struct, frozen=True, kw_only=True):
     """An operator hands a task over to another node."""
 
     request: int
     command: MoveTask
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class HoldCommanded:
+class HoldCommanded(Struct, frozen=True, kw_only=True):
     """An operator pauses or pins a task, or ends that."""
 
     request: int
     command: HoldTask
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TuneCommanded:
+class TuneCommanded(Struct, frozen=True, kw_only=True):
     """An operator changes a task's tuning."""
 
     request: int
     command: TuneTask
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RetryCommanded:
+class RetryCommanded(Struct, frozen=True, kw_only=True):
     """An operator orders that failures are forgotten."""
 
     request: int
     command: RetryTask
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ExplanationAsked:
+class ExplanationAsked(Struct, frozen=True, kw_only=True):
     """An operator asks for this node's last judgement of a task."""
 
     request: int
     command: ExplainTask
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RestartCommanded:
+class RestartCommanded(Struct, frozen=True, kw_only=True):
     """An operator orders that this node's worker is started again."""
 
     request: int
     command: RestartTask
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CertificateSent:
+class CertificateSent(Struct, frozen=True, kw_only=True):
     """Somebody has sent a newer certificate for this node's key."""
 
     request: int
     command: TakeCertificate
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StrikeCommanded:
+class StrikeCommanded(Struct, frozen=True, kw_only=True):
     """An operator rehearses: this node is to do something to itself."""
 
     request: int
@@ -482,48 +437,42 @@ class StrikeCommanded:
     """It came over this daemon's own operator socket."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RehearsalKept:
+class RehearsalKept(Struct, frozen=True, kw_only=True):
     """An operator has rehearsed, and this node is to keep what was found."""
 
     request: int
     command: KeepRehearsal
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RehearsalsAsked:
+class RehearsalsAsked(Struct, frozen=True, kw_only=True):
     """An operator asks for promises, or for rehearsals that were kept."""
 
     request: int
     command: ReadRehearsals
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LinesAsked:
+class LinesAsked(Struct, frozen=True, kw_only=True):
     """An operator asks what this node's worker has printed."""
 
     request: int
     command: ReadLines
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FleetCommanded:
+class FleetCommanded(Struct, frozen=True, kw_only=True):
     """An operator changes the fleet."""
 
     request: int
     command: ChangeFleet
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FleetReadAsked:
+class FleetReadAsked(Struct, frozen=True, kw_only=True):
     """An operator asks by which fleet value and document this node goes."""
 
     request: int
     command: ReadFleet
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FrameDropped:
+class FrameDropped(Struct, frozen=True, kw_only=True):
     """Frames came that are invalid or not for us: only a counter rises."""
 
     kind: str
@@ -531,8 +480,7 @@ class FrameDropped:
     count: int = 1
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Commanded:
+class Commanded(Struct, frozen=True, kw_only=True):
     """A command that changes something came, and its seal is right: it is told with the name of whoever gave it."""
 
     by: str
@@ -543,23 +491,20 @@ class Commanded:
     """Empty: the fleet."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AddressesTried:
+class AddressesTried(Struct, frozen=True, kw_only=True):
     """What became of one attempt at each address that this node dials: (address, a few words or nothing)."""
 
     found: tuple[tuple[str, str], ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ProblemReported:
+class ProblemReported(Struct, frozen=True, kw_only=True):
     """An adapter has trouble (``problem``), or no longer has (``None``); ``source`` names it for the status."""
 
     source: str
     problem: str | None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RecipeCompared:
+class RecipeCompared(Struct, frozen=True, kw_only=True):
     """What the process of this node's worker was started with was compared with what it would be started with now."""
 
     task: TaskId
@@ -567,15 +512,13 @@ class RecipeCompared:
     """It runs by an old command, environment or session; false as well once it has ended."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FleetChanged:
+class FleetChanged(Struct, frozen=True, kw_only=True):
     """Another fleet file, read and validated, holds on this node from now on."""
 
     fleet: Fleet
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StopRequested:
+class StopRequested(Struct, frozen=True, kw_only=True):
     """The daemon must stop: this node takes no new task and hands its tasks over."""
 
 

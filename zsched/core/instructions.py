@@ -9,8 +9,6 @@ safe when it is cut after any prefix.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from zsched.core.values.decision import Decision, Explanation, Move
 from zsched.core.values.document import Document, Flag
 from zsched.core.values.durable import DurableState
@@ -34,17 +32,16 @@ from zsched.core.values.model import Beat, NodeId, Profile, Proposal, TaskId
 from zsched.core.values.plan import Role, RoutePlan
 from zsched.core.values.rehearsal import KeepRehearsal, RehearsalsTold, Strike
 from zsched.core.values.snapshot import Snapshot
+from zsched.core.values.struct import Struct
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PersistState:
+class PersistState(Struct, frozen=True, kw_only=True):
     """Write the durable state; the rest of the batch must not happen unless it is on disk."""
 
     state: DurableState
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PublishBeat:
+class PublishBeat(Struct, frozen=True, kw_only=True):
     """Send the heartbeat to everybody, best effort.
 
     An urgent beat (``is_news``) wakes its receivers up; a periodic one waits until they are awake anyway.
@@ -54,39 +51,34 @@ class PublishBeat:
     is_news: bool = True
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PublishProfile:
+class PublishProfile(Struct, frozen=True, kw_only=True):
     """Send our profile to every gateway; an urgent one (news other than figures) wakes its receivers up."""
 
     profile: Profile
     is_news: bool = True
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AskUtilities:
+class AskUtilities(Struct, frozen=True, kw_only=True):
     """Query every robot's utilities once; answers come back as `UtilityReceived` with this number."""
 
     gather: int
     deadline_s: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AnswerUtilities:
+class AnswerUtilities(Struct, frozen=True, kw_only=True):
     """Answer a peer's gather."""
 
     request: int
     utilities: Utilities
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PublishProposal:
+class PublishProposal(Struct, frozen=True, kw_only=True):
     """Send our ballot paper to every robot."""
 
     proposal: Proposal
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SendPrepare:
+class SendPrepare(Struct, frozen=True, kw_only=True):
     """Ask every elector (ourselves included) for a promise."""
 
     prepare: Prepare
@@ -95,8 +87,7 @@ class SendPrepare:
     """It may go in one frame with others of the same batch (`SendBallots`)."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SendAccept:
+class SendAccept(Struct, frozen=True, kw_only=True):
     """Ask every elector (ourselves included) to accept."""
 
     accept: Accept
@@ -104,8 +95,7 @@ class SendAccept:
     may_join: bool = False
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SendBallots:
+class SendBallots(Struct, frozen=True, kw_only=True):
     """Ask every elector (ourselves included) several questions in one frame."""
 
     ballots: Ballots
@@ -120,16 +110,14 @@ class SendBallots:
         )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AnswerElection:
+class AnswerElection(Struct, frozen=True, kw_only=True):
     """Answer a proposer's prepare or accept."""
 
     request: int
     answer: Promise | Accepted | Refused
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AnswerBallots:
+class AnswerBallots(Struct, frozen=True, kw_only=True):
     """Answer a proposer's questions that came in one frame."""
 
     request: int
@@ -141,79 +129,68 @@ class AnswerBallots:
         return tuple(AnswerElection(request=self.request, answer=one) for one in self.votes.answers)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PublishLearnt:
+class PublishLearnt(Struct, frozen=True, kw_only=True):
     """Send our learnt values to everybody."""
 
     learnt: Learnt
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AskLearnt:
+class AskLearnt(Struct, frozen=True, kw_only=True):
     """Ask one peer for its learnt values; the answer comes back as `LearntReceived`."""
 
     peer: NodeId
     deadline_s: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class IntroducePeers:
+class IntroducePeers(Struct, frozen=True, kw_only=True):
     """A node is missing on the control network: tell every node all addresses again."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EndLinks:
+class EndLinks(Struct, frozen=True, kw_only=True):
     """These nodes are gone: end the control session's links to them that are still up. zenoh makes new ones."""
 
     nodes: tuple[NodeId, ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TryAddresses:
+class TryAddresses(Struct, frozen=True, kw_only=True):
     """Nobody was ever heard: find out what becomes of an attempt at each address (`AddressesTried`)."""
 
     addresses: tuple[str, ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AnswerLearnt:
+class AnswerLearnt(Struct, frozen=True, kw_only=True):
     """Answer a peer's `AskLearnt`."""
 
     request: int
     learnt: Learnt
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StartWorker:
+class StartWorker(Struct, frozen=True, kw_only=True):
     """Start this node's worker for the task; nothing happens if it runs."""
 
     task: TaskId
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StopWorker:
+class StopWorker(Struct, frozen=True, kw_only=True):
     """Stop this node's worker for the task (a cold standby, after its drain)."""
 
     task: TaskId
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ResetWorker:
+class ResetWorker(Struct, frozen=True, kw_only=True):
     """Forget the failures of this node's worker for the task; it is started again if it is wanted."""
 
     task: TaskId
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RestartWorker:
+class RestartWorker(Struct, frozen=True, kw_only=True):
     """This node's worker for the task hangs: kill it, count a failure, start it again."""
 
     task: TaskId
     reason: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StrikeDaemon:
+class StrikeDaemon(Struct, frozen=True, kw_only=True):
     """An operator rehearses: answer whether this machine can do it to this daemon, and do it."""
 
     request: int
@@ -222,16 +199,14 @@ class StrikeDaemon:
     """Whose links they are."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StoreRehearsal:
+class StoreRehearsal(Struct, frozen=True, kw_only=True):
     """Keep what a rehearsal has found on this machine, and answer."""
 
     request: int
     rehearsal: KeepRehearsal
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AnswerRehearsals:
+class AnswerRehearsals(Struct, frozen=True, kw_only=True):
     """Answer an operator's question for promises and kept rehearsals; what is kept is filled in from the disk."""
 
     request: int
@@ -240,15 +215,13 @@ class AnswerRehearsals:
     """The rehearsal that is wanted whole."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RenewWorker:
+class RenewWorker(Struct, frozen=True, kw_only=True):
     """An operator wants this node's worker for the task stopped and started again; that is no failure."""
 
     task: TaskId
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AdoptFleet:
+class AdoptFleet(Struct, frozen=True, kw_only=True):
     """Go by another fleet file: commands, environments, sessions to come, and what the relay watches.
 
     It is the first instruction of its batch that is not sent.
@@ -260,53 +233,46 @@ class AdoptFleet:
     """It is an agreed document: electors and leases are those in force."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EndTask:
+class EndTask(Struct, frozen=True, kw_only=True):
     """The task left the fleet file: the relay ends its streams and forgets it."""
 
     task: TaskId
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SetRole:
+class SetRole(Struct, frozen=True, kw_only=True):
     """Tell this node's worker its role."""
 
     role: Role
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ApplyRoutes:
+class ApplyRoutes(Struct, frozen=True, kw_only=True):
     """Give the relay the newest plan of one task."""
 
     plan: RoutePlan
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AnswerStatus:
+class AnswerStatus(Struct, frozen=True, kw_only=True):
     """Answer an operator."""
 
     request: int
     snapshot: Snapshot
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AnswerCommand:
+class AnswerCommand(Struct, frozen=True, kw_only=True):
     """Answer an operator's command."""
 
     request: int
     result: CommandResult
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AnswerExplanation:
+class AnswerExplanation(Struct, frozen=True, kw_only=True):
     """Answer an operator's question about a task's last judgement."""
 
     request: int
     explanation: Explanation
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AnswerLines:
+class AnswerLines(Struct, frozen=True, kw_only=True):
     """Answer an operator with what this node's worker for the task has printed behind line ``after``."""
 
     request: int
@@ -314,23 +280,20 @@ class AnswerLines:
     after: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TakeCertificate:
+class TakeCertificate(Struct, frozen=True, kw_only=True):
     """Keep a newer certificate for this node's key (PEM) if it is one, and answer who has sent it."""
 
     request: int
     certificate: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StandDown:
+class StandDown(Struct, frozen=True, kw_only=True):
     """End this daemon with the exit code of a wrong configuration: its name is alive elsewhere."""
 
     reason: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RecordStory:
+class RecordStory(Struct, frozen=True, kw_only=True):
     """One line for the journal and the decision log: a decision, a commit, a handover step, a peer's change."""
 
     stage: str
@@ -356,8 +319,7 @@ class RecordStory:
 # --- of the fleet register -------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AskElectors:
+class AskElectors(Struct, frozen=True, kw_only=True):
     """Ask these electors (this node may be one) a question of the fleet register."""
 
     to: tuple[NodeId, ...]
@@ -365,39 +327,34 @@ class AskElectors:
     deadline_s: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TellFleet:
+class TellFleet(Struct, frozen=True, kw_only=True):
     """Tell nodes the fleet value that this node has learnt."""
 
     to: tuple[NodeId, ...]
     value: FleetValue
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AskFleet:
+class AskFleet(Struct, frozen=True, kw_only=True):
     """Ask a node for the fleet value that it has learnt: it counts by a higher number."""
 
     peer: NodeId
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AnswerFleet:
+class AnswerFleet(Struct, frozen=True, kw_only=True):
     """Answer a question to the fleet register."""
 
     request: int
     answer: FleetAnswer
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StoreDocument:
+class StoreDocument(Struct, frozen=True, kw_only=True):
     """An operator gave this document: check it and write it; `DocumentStored` or `DocumentRefused` comes back."""
 
     request: int
     content: Document
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AmendDocument:
+class AmendDocument(Struct, frozen=True, kw_only=True):
     """Write the stored document with this hash once more, with other flags.
 
     `DocumentStored` comes back, without a request. If the document is not stored here any more, nothing comes back.
@@ -407,8 +364,7 @@ class AmendDocument:
     flags: tuple[Flag, ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FetchDocument:
+class FetchDocument(Struct, frozen=True, kw_only=True):
     """Fetch the document with this hash from one of the peers, in this order; check it and write it.
 
     `DocumentStored` or `DocumentRefused` comes back. If no peer has it, nothing comes back: the node asks again later.
@@ -418,16 +374,14 @@ class FetchDocument:
     peers: tuple[NodeId, ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AnswerDocument:
+class AnswerDocument(Struct, frozen=True, kw_only=True):
     """Answer a peer with the document that has this hash, or with nothing if it is not stored here."""
 
     request: int
     document: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AnswerFleetRead:
+class AnswerFleetRead(Struct, frozen=True, kw_only=True):
     """Answer an operator by which fleet value this node goes; with the value's document if that is asked for."""
 
     request: int
@@ -435,8 +389,7 @@ class AnswerFleetRead:
     with_document: bool
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class KeepDocuments:
+class KeepDocuments(Struct, frozen=True, kw_only=True):
     """Delete every stored document but these."""
 
     documents: tuple[str, ...]

@@ -11,7 +11,6 @@ Commands (daemon to relay): `RoutePlan`, `Role`, `WorkerWatch`, `TaskEnded`, `Re
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
@@ -28,15 +27,14 @@ from zsched.core.events import (
 )
 from zsched.core.values.model import MAX_REASON, NodeId, TaskId, check_counter, check_name
 from zsched.core.values.plan import Role, Route, RoutePlan
+from zsched.core.values.struct import Struct
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RelayStop:
+class RelayStop(Struct, frozen=True, kw_only=True):
     """Close everything and exit; the end of the pipe means the same."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TaskEnded:
+class TaskEnded(Struct, frozen=True, kw_only=True):
     """The task left the fleet file: close its streams, watch nothing of it, tell its worker nothing any more."""
 
     task: TaskId
@@ -45,16 +43,14 @@ class TaskEnded:
         check_name("ended.task", self.task)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RelayStarted:
+class RelayStarted(Struct, frozen=True, kw_only=True):
     """The relay's data session is open."""
 
     pid: int
     zid: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WorkerSeen:
+class WorkerSeen(Struct, frozen=True, kw_only=True):
     """A worker's token on the data network came (it is ready for its inputs) or went (``is_present`` false)."""
 
     node: NodeId
@@ -67,8 +63,7 @@ class WorkerSeen:
         check_name("worker.task", self.task)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WorkerWatch:
+class WorkerWatch(Struct, frozen=True, kw_only=True):
     """A task's keys that do not depend on its owner; told when the daemon starts, and when they change.
 
     The first three are for a worker of this node that shows no token (`zsched.relay.matching`).
@@ -87,8 +82,7 @@ class WorkerWatch:
     """Robots: the inputs towards nobody, taken from the start: what comes while there is no owner is counted."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WorkerMatched:
+class WorkerMatched(Struct, frozen=True, kw_only=True):
     """Whether zenoh reports subscribers for all inputs of this node's worker of the task."""
 
     task: TaskId
@@ -99,8 +93,7 @@ class WorkerMatched:
     """The inputs without a subscriber, in words."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WorkerTrouble:
+class WorkerTrouble(Struct, frozen=True, kw_only=True):
     """Something is wrong in a worker that is ready: its report to its relay, and the relay's to the daemon."""
 
     task: TaskId
@@ -117,8 +110,7 @@ class WorkerTrouble:
             raise ValueError(f"trouble.text: {len(self.text)} characters, at most {MAX_REASON}")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EndMarker:
+class EndMarker(Struct, frozen=True, kw_only=True):
     """Behind a stream's last sample of ``epoch``: ``count`` samples went before it on this key (source number - 1).
 
     With epoch 0 it ends nothing and is a *start marker*: no number below ``count`` will come any more.
@@ -150,8 +142,7 @@ class EndMarker:
         check_counter("end.had", self.had or 0)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SnapshotChunk:
+class SnapshotChunk(Struct, frozen=True, kw_only=True):
     """Beside each piece of a worker's snapshot: its place, and the checksum of the whole (blake2s, 16 bytes, hex)."""
 
     index: int
@@ -184,8 +175,7 @@ class ServiceProblem(StrEnum):
     TIMEOUT = "timeout"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StreamAck:
+class StreamAck(Struct, frozen=True, kw_only=True):
     """A worker's progress on one publisher of a relay, or a relay's on one of a worker; a hop's numbers start at 0."""
 
     eid: int
@@ -217,15 +207,13 @@ class StreamAck:
             check_counter(f"ack.{name}", getattr(self, name))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StreamAcks:
+class StreamAcks(Struct, frozen=True, kw_only=True):
     """A receiver's acknowledgements for one session, those that changed."""
 
     acks: tuple[StreamAck, ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SlotLost:
+class SlotLost(Struct, frozen=True, kw_only=True):
     """A slot closed, or its worker restarted, with unacknowledged samples: at most that many had no result."""
 
     task: TaskId

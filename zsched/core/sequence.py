@@ -11,8 +11,9 @@ came of the known course. In the same way a sender is heard again whose number a
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from enum import StrEnum
+
+from zsched.core.values.struct import Struct
 
 WINDOW = 16
 """No honest message is further ahead of the one before..."""
@@ -32,8 +33,7 @@ class Order(StrEnum):
     DOUBTFUL = "doubtful"
 
 
-@dataclass(slots=True)
-class _Course:
+class _Course(Struct):
     """A run of numbers that is not believed yet."""
 
     incarnation: int
@@ -42,8 +42,7 @@ class _Course:
     count: int = 1
 
 
-@dataclass(slots=True)
-class Track:
+class Track(Struct):
     """The newest believed (incarnation, sequence) of one sender, and another course that may replace it."""
 
     incarnation: int = -1

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from random import Random
 from types import MappingProxyType
 from typing import Any
@@ -46,6 +45,7 @@ from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet, TaskSpec, file_hash, fleet_hash
 from zsched.core.values.model import Allocation, NodeId, NodeKind, PeerState, Profile, TaskId
 from zsched.core.values.plan import StreamCount
+from zsched.core.values.struct import Struct
 from zsched.core.vote.agreement import Agreement
 from zsched.core.vote.expiry import Expiry
 from zsched.core.vote.retuning import Retuning
@@ -55,8 +55,7 @@ HISTORY = 32
 """Past values of a task that status can show."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PastValue:
+class PastValue(Struct, frozen=True, kw_only=True):
     """A learnt value, when this node learnt it and why it came about."""
 
     value: Allocation
@@ -64,8 +63,7 @@ class PastValue:
     reason: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Unready:
+class Unready(Struct, frozen=True, kw_only=True):
     """A slot whose worker our relay does not see: what it misses there, and since when."""
 
     slot: SlotReady

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 
 from zsched.core.executor.handover import Executor, Phase
 from zsched.core.executor.rollouts import waiting
@@ -35,6 +34,7 @@ from zsched.core.values.snapshot import (
     TaskStatus,
     VoteStatus,
 )
+from zsched.core.values.struct import replace
 from zsched.core.values.words import NEVER_INITIALISED, RESTARTING, told_of_worker
 from zsched.core.vote.generations import way_out
 from zsched.core.vote.voting import Voting

@@ -9,14 +9,13 @@ stage and makes a batch of instructions of it at the end.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 from zsched.core import instructions as do
 from zsched.core.instructions import FleetInstruction
 from zsched.core.values.change import Change, Ended, Rewrite, RoundOutcome
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import Allocation, TaskId
+from zsched.core.values.struct import Struct, field
 
 _LOCAL = frozenset(
     {
@@ -37,8 +36,7 @@ _LOCAL = frozenset(
 )
 
 
-@dataclass(slots=True)
-class ToDo:
+class ToDo(Struct):
     """What there is to do, by receiver."""
 
     must_persist: bool = False

@@ -12,13 +12,13 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from zsched.config import reader
 from zsched.config.load import check_bytes
 from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.struct import Struct
 from zsched.errors import ConfigError
 from zsched.files import read_regular
 
@@ -29,8 +29,7 @@ KEPT: Final = ("kind", "labels", "fixed")
 NOWHERE: Final = reader.NOWHERE
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Addresses:
+class Addresses(Struct, frozen=True, kw_only=True):
     """Where one node listens while its fleet runs here: zenoh endpoints on loopback."""
 
     control: str
@@ -44,8 +43,7 @@ class Addresses:
         return self.local or self.data
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LoopbackFile:
+class LoopbackFile(Struct, frozen=True, kw_only=True):
     """A fleet file for this machine."""
 
     text: str

@@ -30,6 +30,7 @@ from zsched.adapters.workers import launch
 from zsched.clock import monotonic_s
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.struct import Struct
 from zsched.errors import AdapterError
 from zsched.ipc.takeover import Door
 from zsched.runtime.init import init_state
@@ -49,8 +50,7 @@ SPIN: Final = "while True: pass"
 Json = dict[str, Any]
 
 
-@dataclass(slots=True, kw_only=True)
-class Running:
+class Running(Struct, kw_only=True):
     """One daemon."""
 
     process: subprocess.Popen[bytes]

@@ -13,13 +13,13 @@ import selectors
 import signal
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from threading import Event
 from typing import IO, Final
 
 from zsched.clock import monotonic_s
 from zsched.core.values.fleet import Standby
 from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.struct import Struct, field
 from zsched.dev.nodes import Json, Nodes
 from zsched.dev.terminal import Keys
 from zsched.dev.watch import Watched
@@ -43,8 +43,7 @@ ENDED: Final = re.compile(
 KEYS: Final = "m moves the task, k kills its owner, l loads its owner, s shows the status, q ends"
 
 
-@dataclass(slots=True, kw_only=True)
-class Rollout:
+class Rollout(Struct, kw_only=True):
     """The restart of one task's workers: standbys first, and the owner's only if they become ready."""
 
     waiting: deque[NodeId]
@@ -54,8 +53,7 @@ class Rollout:
     since: float = 0.0
 
 
-@dataclass(slots=True, kw_only=True)
-class Log:
+class Log(Struct, kw_only=True):
     """A daemon's log as it comes."""
 
     node: NodeId

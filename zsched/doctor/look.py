@@ -8,7 +8,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -25,6 +24,7 @@ from zsched.core.report import snapshot_json
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet, dial_endpoint
 from zsched.core.values.model import NodeId
+from zsched.core.values.struct import Struct, replace
 from zsched.doctor.fleet import differs
 from zsched.doctor.model import Json, Scene
 from zsched.errors import AdapterError, ConfigError, WireError
@@ -43,8 +43,7 @@ AGAIN_S: Final = 1.0
 """A move that was under way is over by then."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Machine:
+class Machine(Struct, frozen=True, kw_only=True):
     """Where this machine's things are, and what it is called."""
 
     file: Path
@@ -53,8 +52,7 @@ class Machine:
     node: NodeId
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Asked:
+class _Asked(Struct, frozen=True, kw_only=True):
     """What the nodes answered, and how long those took that were asked through the daemon here."""
 
     statuses: Mapping[NodeId, Json]

@@ -6,7 +6,6 @@ Knows: verdicts, what a check needs before it can be made. Does not know: any ch
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
 from enum import IntEnum, StrEnum
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -14,6 +13,7 @@ from typing import Any, TypeAlias
 from zsched.config.load import CheckResult
 from zsched.core.values.fleet import Fleet, NodeSpec
 from zsched.core.values.model import NodeId
+from zsched.core.values.struct import Struct, field
 from zsched.errors import InvariantError
 
 Json: TypeAlias = dict[str, Any]
@@ -31,8 +31,7 @@ class Verdict(StrEnum):
 _ORDER = (Verdict.SKIP, Verdict.PASS, Verdict.WARN, Verdict.FAIL)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Result:
+class Result(Struct, frozen=True, kw_only=True):
     """One check's verdict, what was seen, and what to do about it."""
 
     verdict: Verdict
@@ -94,8 +93,7 @@ class Needs(IntEnum):
     """The whole fleet is asked (``--fleet``), by a valid fleet file."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Scene:
+class Scene(Struct, frozen=True, kw_only=True):
     """All that checks look at; ``root`` is "/" but in tests."""
 
     file: Path
@@ -173,8 +171,7 @@ class Scene:
         return self.root / str(path).lstrip("/")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Check:
+class Check(Struct, frozen=True, kw_only=True):
     """One question about this machine or its fleet. ``name`` is ``family.word`` and never changes its meaning."""
 
     name: str

@@ -14,11 +14,11 @@ import sys
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures import TimeoutError as LateError
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from zsched.core.values.fleet import NodeSpec, dial_endpoint
+from zsched.core.values.struct import Struct
 from zsched.doctor.model import Result, Scene, counted, failed, joined, passed, skipped, warned
 from zsched.procfs import names, read_file
 
@@ -30,8 +30,7 @@ WILDCARDS: Final = frozenset({"0.0.0.0", "::"})  # noqa: S104 - what others list
 OURS: Final = ("zsched.daemon", "zsched.relay")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Address:
+class Address(Struct, frozen=True, kw_only=True):
     """One endpoint of a node, as others dial it."""
 
     node: str

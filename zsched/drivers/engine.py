@@ -16,10 +16,10 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Final, Protocol
 
 from zsched.adapters.workers.process import LAUNCHER
+from zsched.core.values.struct import Struct
 from zsched.drivers.place import Place
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_OK
 from zsched.guard import guarded
@@ -36,8 +36,7 @@ KEEPER: Final = "trap '' INT TERM HUP; read -r said; [ \"$said\" = done ] || {{ 
 """Reads from the driver's pipe. When it closes without a word, the driver was killed: the engine is asked to stop."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Ended:
+class Ended(Struct, frozen=True, kw_only=True):
     """The end of a worker that nobody has asked for."""
 
     reason: str
@@ -46,8 +45,7 @@ class Ended:
     """It cannot run on this machine: it is not started again (exit status 78)."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Look:
+class Look(Struct, frozen=True, kw_only=True):
     """What `zsched doctor` finds of a worker's engine on this machine."""
 
     told: str

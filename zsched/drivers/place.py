@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from zsched.core.values.struct import Struct
 from zsched.errors import ConfigError
 from zsched.paths import ENVIRONMENT_SUFFIX, PID_SUFFIX, beside_session
 
@@ -29,8 +29,7 @@ ALSO: Final = (
 MODE: Final = 0o600
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Place:
+class Place(Struct, frozen=True, kw_only=True):
     """Whose worker this is."""
 
     fleet: str

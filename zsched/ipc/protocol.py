@@ -5,14 +5,12 @@ Knows: the greeting between a relay and the successor of its daemon, the pulse. 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from zsched.core.values.model import NodeId, TaskId, check_counter, check_name
+from zsched.core.values.struct import Struct
 from zsched.core.values.words import check_range
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RelayPulse:
+class RelayPulse(Struct, frozen=True, kw_only=True):
     """The relay lives, though it has nothing to say; ``counted_s``: its streams were last counted this long ago."""
 
     counted_s: float
@@ -21,8 +19,7 @@ class RelayPulse:
         check_range("pulse.counted_s", self.counted_s, 0.0, 1e9)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RelayHello:
+class RelayHello(Struct, frozen=True, kw_only=True):
     """A daemon asks for the relay that another daemon left: who it is, and what it would start a relay with."""
 
     fleet: str
@@ -45,8 +42,7 @@ class RelayHello:
         check_counter("hello.threads", self.threads)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RelayHere:
+class RelayHere(Struct, frozen=True, kw_only=True):
     """The relay obeys this daemon from now on."""
 
     pid: int
@@ -54,8 +50,7 @@ class RelayHere:
     """Its data session is not the daemon's: it waits for the configuration of one, and opens that."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RelayRefused:
+class RelayRefused(Struct, frozen=True, kw_only=True):
     """The relay is not this daemon's."""
 
     reason: str

@@ -19,7 +19,7 @@ import select
 import socket
 import struct
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from hashlib import blake2s
 from importlib.util import find_spec
 from pathlib import Path
@@ -27,6 +27,7 @@ from typing import Any, Final
 
 from zsched.clock import awake_s
 from zsched.core.values.model import NodeId
+from zsched.core.values.struct import Struct
 from zsched.errors import AdapterError, WireError
 from zsched.ipc.pipe import read_frame, write_frame
 from zsched.ipc.protocol import RelayHello, RelayHere, RelayRefused
@@ -65,8 +66,7 @@ _TIMEVAL: Final = struct.Struct("ll")
 _CREDENTIALS: Final = struct.Struct("3i")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Note:
+class Note(Struct, frozen=True, kw_only=True):
     """About the relay that holds the lock: its process, and the endpoint its data session listens on."""
 
     pid: int
@@ -75,8 +75,7 @@ class Note:
     """The digest of the code that it runs (`code_digest`); empty: not known."""
 
 
-@dataclass(slots=True, kw_only=True)
-class Claim:
+class Claim(Struct, kw_only=True):
     """What the next relay inherits: the lock, and the listening socket for its daemon's successors."""
 
     lock: int

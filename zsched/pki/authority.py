@@ -17,12 +17,13 @@ import fcntl
 import json
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
 from zsched.core.values.certificates import MAX_KEY, Holder, Role, parse_label
+from zsched.core.values.struct import Struct, replace
 from zsched.errors import AdapterError
 from zsched.files import read_regular
 from zsched.pki import certificates as x509
@@ -35,8 +36,7 @@ RENEW_SHARE: Final = 2 / 3
 """A certificate is due once this share of its life is over."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Entry:
+class Entry(Struct, frozen=True, kw_only=True):
     """One key that was certified; times are seconds since 1970 (UTC)."""
 
     label: str
@@ -67,8 +67,7 @@ class Entry:
         return self.authority != authority or now >= self.issued + (self.until - self.issued) * RENEW_SHARE
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Record:
+class Record(Struct, frozen=True, kw_only=True):
     """What an authority remembers."""
 
     fleet: str
@@ -88,8 +87,7 @@ class Record:
         return max(own, key=lambda one: one.holder.key, default=None)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Issued:
+class Issued(Struct, frozen=True, kw_only=True):
     """What a holder gets. ``key`` is empty where the key was made elsewhere."""
 
     entry: Entry

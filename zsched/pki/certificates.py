@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import ipaddress
 from collections.abc import Sequence
-from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Final
 
@@ -18,6 +17,7 @@ from cryptography.hazmat.primitives.asymmetric import ec, ed25519
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from zsched.core.values.certificates import MAX_COMMON_NAME, Holder
+from zsched.core.values.struct import Struct
 from zsched.errors import AdapterError
 
 AUTHORITY_LIFE: Final = timedelta(days=3650)
@@ -32,8 +32,7 @@ PrivateKey = ed25519.Ed25519PrivateKey
 PublicKey = ed25519.Ed25519PublicKey | ec.EllipticCurvePublicKey
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Signer:
+class Signer(Struct, frozen=True, kw_only=True):
     """The authority's key and its own certificate."""
 
     key: PrivateKey

@@ -11,7 +11,6 @@ from __future__ import annotations
 import logging
 import queue
 import threading
-from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Final
 
@@ -22,6 +21,7 @@ from zsched.core.route.ros2 import Endpoint, endpoint_token, node_token, parse_t
 from zsched.core.route.ros_mirror import Sides, mirrored
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.plan import RosGraph, Route
+from zsched.core.values.struct import Struct, field
 from zsched.guard import guarded, tolerant
 from zsched.relay.streams.receive import undeclare
 
@@ -34,8 +34,7 @@ _Item = tuple[TaskId, tuple[Route, ...]] | tuple["_Side", Sample] | tuple[None, 
 _Wanted = dict[tuple[RosGraph, Endpoint | str], None]
 
 
-@dataclass(slots=True, eq=False)
-class _Side:
+class _Side(Struct, eq=False):
     """One session's part of the graph: what others announce there, and what we do."""
 
     session: Session

@@ -15,7 +15,6 @@ import logging
 import queue
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import Any, Final
 
 import zenoh
@@ -24,6 +23,7 @@ from zenoh import Locality, Session
 from zsched.clock import monotonic_s
 from zsched.core.relay_protocol import WorkerMatched, WorkerWatch
 from zsched.core.values.model import TaskId
+from zsched.core.values.struct import Struct, field
 from zsched.guard import guarded, tolerant
 from zsched.relay.streams.receive import Declared, undeclare
 
@@ -33,8 +33,7 @@ SETTLE_S: Final = 1.5
 _log = logging.getLogger("zsched.relay")
 
 
-@dataclass(slots=True, eq=False)
-class _Watched:
+class _Watched(Struct, eq=False):
     """One task's probes. ``inputs`` are publishers, ``strangers`` too, ``services`` queriers of one rule each."""
 
     watch: WorkerWatch

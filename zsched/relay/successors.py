@@ -15,11 +15,11 @@ import logging
 import os
 import select
 import socket
-from dataclasses import dataclass, replace
 from typing import Final
 
 from zsched.clock import monotonic_s
 from zsched.core.values.model import TaskId
+from zsched.core.values.struct import Struct, replace
 from zsched.errors import WireError
 from zsched.ipc.pipe import read_frame, write_frame
 from zsched.ipc.protocol import RelayHello, RelayHere, RelayRefused
@@ -31,8 +31,7 @@ HELLO_S: Final = 0.5
 _log = logging.getLogger("zsched.relay")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Successor:
+class Successor(Struct, frozen=True, kw_only=True):
     """The next daemon: the link to it, the tasks of its fleet (if it says), whether it wants another data session."""
 
     link: socket.socket

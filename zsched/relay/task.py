@@ -10,7 +10,6 @@ import logging
 import queue
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Final
 
 import zenoh
@@ -31,6 +30,7 @@ from zsched.core.values.plan import (
     StreamClass,
     StreamCount,
 )
+from zsched.core.values.struct import Struct
 from zsched.guard import guarded
 from zsched.relay.graph import GraphMirror
 from zsched.relay.services.service import Services
@@ -63,8 +63,7 @@ BUSY_S, CARE_S, IDLE_S = 0.01, 0.2, 0.5
 _log = logging.getLogger("zsched.relay")
 
 
-@dataclass(slots=True, eq=False)
-class _OpenSlot:
+class _OpenSlot(Struct, eq=False):
     slot: Slot
     tokens: frozenset[str] = frozenset()
     seen: frozenset[str] = frozenset()
@@ -86,8 +85,7 @@ class _Orphaned:
     """In the queue of plans: those behind it are another daemon's."""
 
 
-@dataclass(slots=True, eq=False, kw_only=True)
-class _Leave:
+class _Leave(Struct, kw_only=True, eq=False):
     """In the queue of plans: the data session is about to close."""
 
     has_left: threading.Event
@@ -106,8 +104,7 @@ class _Leave:
         return now - self.moved_at >= self.patience_s or now - self.began_at >= self.at_most_s
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Rejoin:
+class _Rejoin(Struct, frozen=True, eq=False):
     """In the queue of plans: another data session is there."""
 
     session: Session
@@ -118,8 +115,7 @@ class _Ended:
     """In the queue of plans: the task left the fleet file, nothing follows."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Unowned:
+class _Unowned(Struct, frozen=True):
     """In the queue of plans: inputs that are taken whether or not there is an owner."""
 
     routes: tuple[Route, ...]

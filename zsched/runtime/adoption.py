@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, field
 
 from zsched.adapters.network.control_bus import ControlBus
 from zsched.adapters.relay.streams import RelayHandle
@@ -18,6 +17,7 @@ from zsched.core.relay_protocol import WorkerWatch
 from zsched.core.route.route import watch_for
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.struct import Struct, field
 from zsched.runtime.access import StreamAccess
 from zsched.runtime.access_rules import names_of
 from zsched.runtime.crew import Crew
@@ -32,8 +32,7 @@ SOURCE = "restart"
 _log = logging.getLogger("zsched.daemon")
 
 
-@dataclass(slots=True, kw_only=True)
-class Adoption:
+class Adoption(Struct, kw_only=True):
     """The adapters of one daemon that follow the fleet file."""
 
     me: NodeId

@@ -10,12 +10,12 @@ import errno
 import secrets
 import socket
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from zsched.core.values.fleet import Fleet, NodeSpec, dial_endpoint
 from zsched.core.values.model import NodeId, NodeKind
+from zsched.core.values.struct import Struct
 
 PORT_RANGE: Final = Path("/proc/sys/net/ipv4/ip_local_port_range")
 MIN_PORT: Final = 20_000
@@ -26,8 +26,7 @@ DATA_PORT: Final = 7458
 """Where the relay of a node without `listen: {data: ...}` listens: its host's applications need no fleet file."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Endpoints:
+class Endpoints(Struct, frozen=True, kw_only=True):
     """Where this node's sessions listen and which nodes they dial."""
 
     control_listen: tuple[str, ...]
@@ -132,8 +131,7 @@ def free_port(outgoing: range | None = None) -> int:
     return _bound_port(0)
 
 
-@dataclass(slots=True)
-class PortClaim:
+class PortClaim(Struct):
     """A port that this process, and no other zsched of this machine, may listen on until it closes the claim."""
 
     port: int

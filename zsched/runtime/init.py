@@ -6,7 +6,6 @@ Knows: what a blank state holds, and which nodes to ask whether that is true. Do
 from __future__ import annotations
 
 import secrets
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 from zsched.adapters.host.state_file import StateFile, hardware_id
@@ -17,6 +16,7 @@ from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet, dial_endpoint, electorate_hash
 from zsched.core.values.model import NodeId
 from zsched.core.values.snapshot import Snapshot
+from zsched.core.values.struct import Struct, replace
 from zsched.core.vote.belief import MAX_GENERATION
 from zsched.core.vote.generations import blank_state, objection
 from zsched.errors import AdapterError
@@ -25,8 +25,7 @@ from zsched.runtime.tls import asker_in, operator_json5, protocol_of, session_te
 from zsched.sessions import config as zenoh_config
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Heard:
+class Heard(Struct, frozen=True, kw_only=True):
     """What the other nodes said: how many have an address in the fleet file, and who of them answered."""
 
     asked: int

@@ -7,9 +7,9 @@ a task.
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
 
 from zsched.core.values.model import TaskId
+from zsched.core.values.struct import Struct
 
 HAND_OVER_S = 3.0
 """How long a stopping owner waits for tasks that another node could take. With what follows (`LEAVE_S`, workers, relay,
@@ -27,8 +27,7 @@ TWICE_S = 0.3
 """Two signals so close together are one: a terminal and a wrapper may both pass on the same Ctrl-C."""
 
 
-@dataclass(slots=True)
-class Leaving:
+class Leaving(Struct):
     """One daemon's way out."""
 
     asked_at: float | None = None

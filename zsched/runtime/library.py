@@ -11,7 +11,6 @@ import logging
 import queue
 from collections import deque
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 from zsched.adapters.host.document_store import DocumentStore
@@ -22,6 +21,7 @@ from zsched.core import instructions as do
 from zsched.core.values.document import Document, Rollout
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId
+from zsched.core.values.struct import replace
 from zsched.errors import AdapterError, ConfigError, WireError
 from zsched.guard import guarded
 from zsched.wire.codec import decode_document, document_hash

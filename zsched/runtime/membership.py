@@ -14,7 +14,6 @@ import os
 import secrets
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -39,6 +38,7 @@ from zsched.core.values.document import Document, Text
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet, fleet_hash
 from zsched.core.values.model import NodeId, RegisterState
+from zsched.core.values.struct import Struct, replace
 from zsched.core.vote.generations import blank_state
 from zsched.errors import AdapterError, ConfigError, WireError
 from zsched.files import read_regular
@@ -62,16 +62,14 @@ _WHAT: Final = {
 }
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Places:
+class Places(Struct, frozen=True, kw_only=True):
     """Where a machine keeps what belongs to its node."""
 
     config: Path
     state: Path
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Written:
+class Written(Struct, frozen=True, kw_only=True):
     """One file of a machine that was written, or that would be."""
 
     path: Path

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from zsched.core.route.route import outputs_of
 from zsched.core.values.fleet import Fleet, TaskSpec, WorkerLink, WorkerSpec, runs_worker
 from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.struct import Struct
 from zsched.errors import AdapterError
 from zsched.files import write_regular
 from zsched.paths import ENVIRONMENT_SUFFIX, PID_SUFFIX, SESSION_SUFFIX, beside_session
@@ -24,8 +24,7 @@ from zsched.sessions import config as zenoh_config
 NOTHING: Final[Mapping[str, str]] = {}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Made:
+class _Made(Struct, frozen=True, kw_only=True):
     """All workers of one fleet file; replaced as a whole, for the supervisor's thread reads it."""
 
     specs: Mapping[TaskId, WorkerSpec]

@@ -10,10 +10,10 @@ what has changed, how a daemon begins again (`zsched.daemon`).
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
 
 from zsched.core.executor.sparing import Sparing
 from zsched.core.values.model import NodeId
+from zsched.core.values.struct import Struct, field
 
 FIRST_S = 2.0
 """The first one waits this long: the operator's tool may still ask it, and the others learn of the change meanwhile."""
@@ -69,8 +69,7 @@ def _fits(
     return all(task == {name} or task - {name, *wave} for task in living)
 
 
-@dataclass(slots=True)
-class Reopening:
+class Reopening(Struct):
     """One node's turn: when all before it have begun again, at the latest when the time of all of them is over."""
 
     me: NodeId
@@ -144,8 +143,7 @@ def _is_newer(life: int | None, before: int | None) -> bool:
     return life is not None and before is not None and life > before
 
 
-@dataclass(slots=True)
-class Moved:
+class Moved(Struct):
     """The nodes that open sessions dial where they are no more, by the fleet in force."""
 
     _lives: dict[NodeId, int | None] = field(default_factory=dict)

@@ -8,10 +8,10 @@ session dials, where it listens, its lease. Does not know: what the daemon does 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 from zsched.core.values.fleet import Fleet, NodeSpec, Security, dial_endpoint
 from zsched.core.values.model import NodeId
+from zsched.core.values.struct import replace
 from zsched.runtime.access_rules import Side, access_control
 from zsched.runtime.endpoints import Endpoints, endpoints_for
 from zsched.sessions.config import pool_threads

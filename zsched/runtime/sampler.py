@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import logging
 import threading
-from dataclasses import replace
 from pathlib import Path
 
 from zsched.adapters.machine import core_speed
@@ -17,6 +16,7 @@ from zsched.adapters.radio.network_profiler import readers_for
 from zsched.clock import ClockWatch, monotonic_s
 from zsched.core import events as ev
 from zsched.core.values.fleet import NodeSpec
+from zsched.core.values.struct import replace
 from zsched.core.vote.clocks import is_bad
 from zsched.guard import guarded
 from zsched.paths import PID_SUFFIX, beside_session

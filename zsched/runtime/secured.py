@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Final
@@ -17,6 +16,7 @@ from typing import Final
 from zsched import paths as places
 from zsched.core.values.certificates import Holder, Role, accepted, parse_common_name
 from zsched.core.values.fleet import Fleet, Security
+from zsched.core.values.struct import Struct
 from zsched.errors import ConfigError
 from zsched.files import owner_of, read_regular
 from zsched.runtime.access_rules import Side, access_control
@@ -31,8 +31,7 @@ CREDENTIALS: Final = "CREDENTIALS_DIRECTORY"
 """Where systemd puts what `LoadCredential=` names: the key, which nobody but root reads where it lies."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Identity:
+class Identity(Struct, frozen=True, kw_only=True):
     """What this machine's certificate says."""
 
     holder: Holder
@@ -40,8 +39,7 @@ class Identity:
     ends: datetime
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Files:
+class Files(Struct, frozen=True, kw_only=True):
     """Where this machine's three files are."""
 
     certificate: Path

@@ -12,11 +12,11 @@ from __future__ import annotations
 
 import json
 import logging
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from zsched.core.values.model import TaskId
+from zsched.core.values.struct import Struct
 from zsched.files import read_regular, write_regular
 from zsched.sessions.comparison import lacking
 
@@ -27,8 +27,7 @@ BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")
 _log = logging.getLogger("zsched.daemon")
 
 
-@dataclass(slots=True)
-class _Read:
+class _Read(Struct):
     """What one worker has read, and which life of it (0: its lives have no numbers)."""
 
     text: str

@@ -15,7 +15,6 @@ import queue
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from typing import Any, assert_never
 
 from zsched.adapters.host.decision_log import DecisionLog
@@ -64,6 +63,7 @@ from zsched.core.values.messages import (
 from zsched.core.values.model import MAX_REASON, Asked, NodeId, TaskId, Tuning
 from zsched.core.values.rehearsal import KeepRehearsal, ReadRehearsals, RehearsalsTold, Step, Strike
 from zsched.core.values.snapshot import Snapshot
+from zsched.core.values.struct import replace
 from zsched.core.values.words import MAX_ASKER, NAME
 from zsched.errors import AdapterError, WireError
 from zsched.runtime.crew import Crew

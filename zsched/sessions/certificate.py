@@ -9,9 +9,10 @@ from __future__ import annotations
 import binascii
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Final, TypeVar
+
+from zsched.core.values.struct import Struct
 
 T = TypeVar("T")
 
@@ -22,8 +23,7 @@ SEQUENCE, VERSION, UTC_TIME, GENERALIZED_TIME = 0x30, 0xA0, 0x17, 0x18
 BIT_STRING: Final = 0x03
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Parts:
+class Parts(Struct, frozen=True, kw_only=True):
     """A certificate taken apart. What ``signed`` holds may be believed once the authority's signature over it is right.
 
     ``key`` is the SubjectPublicKeyInfo (DER).

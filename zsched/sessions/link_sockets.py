@@ -19,12 +19,13 @@ import select
 import socket
 import struct
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import zenoh
 from zenoh import Session
+
+from zsched.core.values.struct import Struct
 
 SILENT_S: Final = 3600
 """A connection that has said nothing for about this long is given to zenoh after all."""
@@ -44,8 +45,7 @@ _LIBC: Final = ctypes.CDLL(None, use_errno=True)
 _Ends = tuple[tuple[str, int], tuple[str, int]]
 
 
-@dataclass(frozen=True, slots=True)
-class LinkSocket:
+class LinkSocket(Struct, frozen=True):
     """One TCP (or TLS) link of a session."""
 
     zid: str

@@ -16,10 +16,10 @@ import queue
 import threading
 from collections import deque
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass
 from typing import Any, Final
 
 from zsched.clock import monotonic_s
+from zsched.core.values.struct import Struct
 from zsched.guard import guarded
 
 MAX_BYTES: Final = 64 << 20
@@ -35,8 +35,7 @@ _log = logging.getLogger("zsched.streams")
 Action = Callable[[], None]
 
 
-@dataclass(slots=True, eq=False)
-class _Waiting:
+class _Waiting(Struct, eq=False):
     """One entry; ``action`` is ``None`` once a newer one has taken its place."""
 
     lane: Hashable

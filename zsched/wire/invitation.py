@@ -11,12 +11,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass
 from typing import Any, Final
 
 from zsched.core.values.document import Document
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.model import NodeId
+from zsched.core.values.struct import Struct
 from zsched.core.values.words import NAME
 from zsched.core.vote.belief import MAX_GENERATION
 from zsched.errors import WireError
@@ -29,8 +29,7 @@ PEMS: Final = ("certificate", "key", "trusted")
 """The key is missing where it was made on the machine that joins."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Papers:
+class Papers(Struct, frozen=True, kw_only=True):
     """What a node of a secured fleet shows to the others, as PEM."""
 
     certificate: str
@@ -39,8 +38,7 @@ class Papers:
     """Empty: the machine that joins has made it."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Invitation:
+class Invitation(Struct, frozen=True, kw_only=True):
     """One machine may join one fleet."""
 
     node: NodeId

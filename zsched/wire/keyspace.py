@@ -10,10 +10,10 @@ a table.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 
 from zsched.core.values.model import MAX_COUNTER, NodeId, TaskId
+from zsched.core.values.struct import Struct
 from zsched.core.values.words import NAME
 
 ROOT = "@zsched"
@@ -26,8 +26,7 @@ AGAIN_CHUNK = "@zsched/again"
 """Behind an output's key, with a relay's zenoh id behind it: what that relay has missed, sent once more."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ParsedKey:
+class ParsedKey(Struct, frozen=True, kw_only=True):
     """A control key taken apart: ``kind``, the ``owner`` node and what follows it."""
 
     fleet: str
@@ -62,8 +61,7 @@ def counter(chunk: str) -> int | None:
     return number if number <= MAX_COUNTER else None
 
 
-@dataclass(frozen=True, slots=True)
-class Keyspace:
+class Keyspace(Struct, frozen=True):
     """The keys of one fleet. Pass ``"*"`` for a name to get the selector over all of them."""
 
     fleet: str

@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import hashlib
 import struct
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
+from zsched.core.values.struct import Struct
 from zsched.errors import WireError
 
 VERSION: Final = 1
@@ -34,8 +34,7 @@ class Act(StrEnum):
     ANSWER = "answer"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Seal:
+class Seal(Struct, frozen=True, kw_only=True):
     """One frame's seal."""
 
     life: int

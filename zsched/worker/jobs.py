@@ -12,12 +12,12 @@ from __future__ import annotations
 import contextlib
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from time import monotonic, process_time, thread_time
 from types import TracebackType
 from typing import Final, Self
 
 from zsched.core.events import WorkerJobs
+from zsched.core.values.struct import Struct, replace
 from zsched.guard import guarded
 from zsched.procfs import parse_schedstat, read_file
 
@@ -250,8 +250,7 @@ class JobBook:
         )
 
 
-@dataclass(slots=True)
-class _Sums:
+class _Sums(Struct):
     """Over timers."""
 
     done: int = 0

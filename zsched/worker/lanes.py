@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from typing import Any
 
 import zenoh
@@ -19,6 +18,7 @@ from zsched.clock import monotonic_s
 from zsched.core.hop.kept import Owed
 from zsched.core.hop.shared import MAX_RECEIVERS, SharedSender
 from zsched.core.relay_protocol import EndMarker, StreamAck
+from zsched.core.values.struct import Struct, field
 from zsched.wire.keyspace import AGAIN_CHUNK
 
 _log = logging.getLogger("zsched.worker")
@@ -27,8 +27,7 @@ Answer = tuple[Any, Any, Any]
 """(payload, attachment, encoding)."""
 
 
-@dataclass(slots=True, eq=False, kw_only=True)
-class KeptLane:
+class KeptLane(Struct, kw_only=True, eq=False):
     """One publisher's answers; its lock guards `state`.
 
     `keep`, `note_end` and `settled` may be called from any thread, the rest is the keeper's.

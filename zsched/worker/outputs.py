@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, Final
 
 import zenoh
@@ -16,6 +15,7 @@ from zenoh import CongestionControl, ext
 
 from zsched.core.hop.serial import serial_of
 from zsched.core.relay_protocol import EndMarker
+from zsched.core.values.struct import Struct
 from zsched.sessions.send_queue import SendQueue
 from zsched.worker.keep import Keeper, put_end
 from zsched.worker.lanes import KeptLane
@@ -30,8 +30,7 @@ KEPT_EPOCHS: Final = 2
 """Publishers of older epochs are given back: nobody admits them any more."""
 
 
-@dataclass(slots=True, eq=False)
-class _Stamped:
+class _Stamped(Struct, eq=False):
     """The publisher of one epoch."""
 
     key: str

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import Final, Literal
 
 import zenoh
 
 from zsched.core.hop.receiver import SourceName
 from zsched.core.relay_protocol import EndMarker
+from zsched.core.values.struct import Struct, field
 from zsched.worker.backlog import Done
 
 BY_CLASS: Final = "by_class"
@@ -24,8 +24,7 @@ one the newest."""
 KeepLast = int | Literal["by_class"] | None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Received:
+class Received(Struct, frozen=True, kw_only=True):
     """One input sample. ``payload`` and ``attachment`` are zenoh's own bytes (``to_bytes()`` copies)."""
 
     key: str
@@ -36,8 +35,7 @@ class Received:
     """An owner that died may have had this sample, too, and have done it (`on_crash: replay`)."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Marker:
+class Marker(Struct, frozen=True, kw_only=True):
     """An end marker and the source it ends."""
 
     name: SourceName
@@ -45,8 +43,7 @@ class Marker:
     came_at: float
 
 
-@dataclass(slots=True, eq=False)
-class Input:
+class Input(Struct, eq=False):
     """One subscription: where its samples go, how many may wait."""
 
     on_sample: Callable[[Received], None]
@@ -74,8 +71,7 @@ class Input:
         return is_whole or self.keep_last is None
 
 
-@dataclass(slots=True, eq=False)
-class Waiting:
+class Waiting(Struct, eq=False):
     """A sample in the queue; ``None`` once a newer one has taken its place."""
 
     source: Input
@@ -96,8 +92,7 @@ class Waiting:
         return self.source.wants(is_whole=self.is_whole)
 
 
-@dataclass(slots=True)
-class OpenSource:
+class OpenSource(Struct):
     """A source that has sent something: its newest number, and its epoch.
 
     That is the one its start marker names, else the one it was first heard in (0: standby).

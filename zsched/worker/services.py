@@ -13,7 +13,6 @@ import logging
 import queue
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
 from time import monotonic
 from typing import Final
 
@@ -22,6 +21,7 @@ import zenoh
 from zsched.clock import monotonic_s
 from zsched.core.relay_protocol import ERROR_ENCODING, REFUSED_ENCODING
 from zsched.core.route.keyexpr import is_wild
+from zsched.core.values.struct import Struct
 from zsched.guard import guarded, tolerant
 from zsched.worker.jobs import JobBook
 from zsched.worker.troubles import Troubles
@@ -33,8 +33,7 @@ LOOK_AGAIN_S: Final = 0.01
 _log = logging.getLogger("zsched.worker")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Request:
+class Request(Struct, frozen=True, kw_only=True):
     """One request. ``payload`` and ``attachment`` are zenoh's own bytes, ``None`` when there are none."""
 
     key: str
@@ -45,8 +44,7 @@ class Request:
     encoding: str = ""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Answer:
+class Answer(Struct, frozen=True, kw_only=True):
     """An answer that is more than a payload."""
 
     payload: bytes | zenoh.ZBytes = b""

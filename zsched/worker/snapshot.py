@@ -17,7 +17,6 @@ import math
 import queue
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Final, Protocol
 
 import zenoh
@@ -26,6 +25,7 @@ from zsched.clock import monotonic_s
 from zsched.core.relay_protocol import ERROR_ENCODING, SnapshotChunk
 from zsched.core.values.model import NodeId
 from zsched.core.values.plan import Role, WorkerRole
+from zsched.core.values.struct import Struct
 from zsched.guard import guarded, tolerant
 from zsched.ipc.pipe import decode_chunk, encode_chunk
 
@@ -260,8 +260,7 @@ def _added(assembly: Assembly, reply: zenoh.Reply) -> bytes | str | None:
     return assembly.add(chunk, sample.payload.to_bytes())
 
 
-@dataclass(frozen=True, slots=True)
-class _Fetched:
+class _Fetched(Struct, frozen=True):
     epoch: int
     predecessor: NodeId
     content: bytes | str

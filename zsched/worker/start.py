@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import zenoh
 
+from zsched.core.values.struct import Struct
 from zsched.errors import ConfigError
 from zsched.worker.keys import OUTPUT_KEYS, output_keys
 
@@ -22,8 +22,7 @@ _ENVIRONMENT: Final = ("ZSCHED_FLEET", "ZSCHED_NODE", "ZSCHED_TASK", "ZSCHED_INC
 DEADLINE: Final = "ZSCHED_DEADLINE_MS"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Surroundings:
+class Surroundings(Struct, frozen=True, kw_only=True):
     """Who a worker is, and its session's configuration (JSON5 text)."""
 
     fleet: str

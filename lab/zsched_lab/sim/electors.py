@@ -7,7 +7,7 @@ Knows: what a machine keeps and forgets, which message each thing to do becomes.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from random import Random
 from typing import Final
 
@@ -20,6 +20,7 @@ from zsched.core.values.change import MoveOwner, Rewrite, RoundOutcome
 from zsched.core.values.electorate import CREATION_STEP, Creation, Elector, FleetValue
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refused
 from zsched.core.values.model import Allocation, NodeId, RegisterState, TaskId, Tuning, Weights
+from zsched.core.values.struct import replace
 from zsched.core.vote.task_register import TaskRegister
 from zsched_lab.sim.chosen import Chosen
 

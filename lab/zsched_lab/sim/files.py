@@ -6,13 +6,13 @@ Knows: fleet files. Does not know: which node has which (`zsched_lab.sim.rollout
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from random import Random
 
 from zsched.config.timing import PROFILES
 from zsched.core.values.fleet import Fleet, OnIsolation, Standby, StreamRule, TaskSpec
 from zsched.core.values.model import ScoreForm, Weights
 from zsched.core.values.plan import Direction
+from zsched.core.values.struct import replace
 
 Change = Callable[[Random, Fleet], Fleet]
 

@@ -19,7 +19,7 @@ import sys
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from random import Random
 
 from zsched.core import events as ev
@@ -30,6 +30,7 @@ from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.messages import ChangeFleet, CommandOutcome
 from zsched.core.values.model import NodeId, NodeKind, ScoreForm, Tuning, Weights
+from zsched.core.values.struct import replace
 from zsched_lab.sim.checks import unsettled
 from zsched_lab.sim.links import Pair
 from zsched_lab.sim.members import GUESTS

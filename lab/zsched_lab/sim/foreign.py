@@ -5,13 +5,13 @@ Knows: which schedules have such workers, when one ends and is back. Does not kn
 
 from __future__ import annotations
 
-from dataclasses import replace
 from random import Random
 from typing import Final
 
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId
 from zsched.core.values.plan import ReadyWhen
+from zsched.core.values.struct import replace
 
 SHARE: Final = 0.2
 """Of the schedules without an exclusive task."""

@@ -11,10 +11,11 @@ from __future__ import annotations
 import json
 from collections import deque
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.struct import replace
 from zsched.core.vote.belief import GENERATION_STEP
 
 WINDOW_S = 60.0

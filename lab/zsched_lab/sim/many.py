@@ -5,11 +5,11 @@ Knows: which schedules have them. Does not know: how a beat is made to fit (`zsc
 
 from __future__ import annotations
 
-from dataclasses import replace
 from random import Random
 from typing import Final
 
 from zsched.core.values.fleet import Fleet
+from zsched.core.values.struct import replace
 
 MOST_NODES: Final = 4
 """They are dear to play: 40 tasks on 4 nodes cost as much as a dozen other schedules."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from random import Random
 from typing import Final
 
@@ -30,6 +30,7 @@ from zsched.core.values.messages import ChangeFleet
 from zsched.core.values.model import NodeId, NodeKind, RegisterState
 from zsched.core.values.quorum import majority
 from zsched.core.values.snapshot import Snapshot
+from zsched.core.values.struct import replace
 from zsched.core.vote.generations import blank_state
 from zsched_lab.sim.parts import Machine
 from zsched_lab.sim.simulator import Simulator

@@ -11,13 +11,14 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from random import Random
 from typing import Any
 
 from zsched.core import events as ev
 from zsched.core.values.messages import Ballots, Votes
 from zsched.core.values.model import Ballot, NodeId
+from zsched.core.values.struct import replace
 from zsched.errors import InvariantError, WireError
 from zsched.wire import codec as wire
 from zsched_lab.sim.checks import FORGED

@@ -19,9 +19,10 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
+from zsched.core.values.struct import replace
 from zsched_lab.sim.faults import Result, play
 from zsched_lab.sim.rest import spread, too_slow
 from zsched_lab.sim.swarm import KINDS, MAX_NODES, MIN_NODES, PENDING, SECONDS, Plan, plan

@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from random import Random
 from typing import Any
 
@@ -22,6 +22,7 @@ from zsched.core.values.fleet import Fleet, electorate_hash, fleet_hash
 from zsched.core.values.messages import FleetQuestion, Refused, fleet_question
 from zsched.core.values.model import Allocation, DeviceSample, NodeId, PeerState, TaskId
 from zsched.core.values.plan import RoutePlan
+from zsched.core.values.struct import replace
 from zsched.core.values.words import Readings
 from zsched.core.vote.generations import blank_state
 from zsched.errors import InvariantError, WireError

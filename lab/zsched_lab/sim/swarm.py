@@ -10,12 +10,13 @@ Swarm testing: Groce et al., ISSTA 2012.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from random import Random
 
 from zsched.config.timing import WAN, WIFI, WIRED
 from zsched.core.values.fleet import Fleet, NodeSpec, OnIsolation, Standby, TaskSpec, WorkerSpec
 from zsched.core.values.model import Aggregate, NodeId, NodeKind, Tuning, Weights
+from zsched.core.values.struct import replace
 from zsched_lab.sim.clocks import clock_faults, suspensions
 from zsched_lab.sim.files import CHANGES, RELOADED
 from zsched_lab.sim.foreign import absences, with_foreign_workers

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 import math
 import types
-from dataclasses import MISSING, fields, is_dataclass, make_dataclass, replace
+from dataclasses import MISSING, fields, make_dataclass, replace
 from enum import Enum
 from pathlib import Path
 from random import Random
@@ -21,6 +21,7 @@ from zsched.core.membership.beat_room import MAX_BEAT_BYTES
 from zsched.core.values import document, messages, model
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.rehearsal import FAULTS, Strike
+from zsched.core.values.struct import Struct
 from zsched.errors import WireError
 from zsched.ipc import pipe as relay_pipe
 from zsched.wire import codec as wire
@@ -77,12 +78,12 @@ def test_golden_frames_of_kinds_that_are_gone_are_not_deleted() -> None:
 FOUNDED = founded("lab", 1, ("r1", "r2"))
 NAMES = st.from_regex(r"[a-z0-9][a-z0-9_-]{0,20}", fullmatch=True)
 TEXTS = st.text(st.characters(codec="utf-8"), max_size=60)
-ONE_OF = {
+ONE_OF: dict[type, tuple[str, ...]] = {
     messages.FleetQuestion: ("prepare", "accept"),
     messages.FleetAnswer: ("promise", "accepted", "refused"),
     messages.ChangeFleet: ("document", "add_elector", "remove_elector"),
 }
-BATCHES = {
+BATCHES: dict[type, tuple[type, ...]] = {
     messages.Ballots: (messages.Prepare, messages.Accept),
     messages.Votes: (messages.Promise, messages.Accepted, messages.Refused),
 }
@@ -457,7 +458,8 @@ def test_foreign_file_is_no_state(content: bytes) -> None:
 
 def test_every_kind_is_a_frozen_value_with_bounded_size() -> None:
     for cls, bound in wire.KINDS.values():
-        assert is_dataclass(cls)
-        assert cls.__dataclass_params__.frozen  # type: ignore[attr-defined] # typeshed does not name it
+        assert issubclass(cls, Struct)
+        assert cls.__struct_config__.frozen
         assert bound <= wire.LARGE
-        assert all(field.default_factory is MISSING for field in fields(cls))  # encode compares with `default` only
+        made: Any = cls  # typeshed does not know it as a dataclass
+        assert all(field.default_factory is MISSING for field in fields(made))  # encode compares with `default` only

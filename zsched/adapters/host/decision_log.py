@@ -16,7 +16,6 @@ import json
 import os
 import queue
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +23,7 @@ from zsched.clock import wall_s
 from zsched.core.instructions import RecordStory
 from zsched.core.values.decision import Decision, Move
 from zsched.core.values.model import NodeId
+from zsched.core.values.struct import Struct
 from zsched.guard import guarded
 from zsched.wire.codec import as_plain
 
@@ -43,8 +43,7 @@ _HEAD = b'{"schema":"zsched.event/'
 Json = dict[str, Any]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Entry:
+class Entry(Struct, frozen=True, kw_only=True):
     """One line."""
 
     schema: str

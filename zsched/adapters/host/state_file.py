@@ -17,13 +17,13 @@ import errno
 import fcntl
 import hashlib
 import os
-from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 from zsched.core.values.durable import DurableState
 from zsched.core.values.model import NodeId
+from zsched.core.values.struct import Struct, replace
 from zsched.core.vote.generations import way_out
 from zsched.errors import AdapterError, WireError
 from zsched.files import read_regular
@@ -39,8 +39,7 @@ HARDWARE_SOURCES = (
 """machine-id(5), the BIOS's UUID (readable by root only), a board's serial number."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LoadResult:
+class LoadResult(Struct, frozen=True, kw_only=True):
     """The state, or why there is none: one line for `status` and the log."""
 
     state: DurableState | None = None

@@ -13,9 +13,9 @@ import contextlib
 import os
 import re
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
+from zsched.core.values.struct import Struct
 from zsched.errors import AdapterError
 
 MIB = 1024.0 * 1024.0
@@ -28,8 +28,7 @@ REMOVE_WITHIN_S = 1.0
 _UNLIMITED_V1 = 2**62
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CgroupMount:
+class CgroupMount(Struct, frozen=True, kw_only=True):
     """One cgroup file system: its controllers (v1 only; v2 lists them per group) and the group at its mount point."""
 
     point: Path
@@ -38,8 +37,7 @@ class CgroupMount:
     is_v2: bool
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CpuQuota:
+class CpuQuota(Struct, frozen=True, kw_only=True):
     """The smallest CPU quota over a process, in cores, and its group; `used_s` reads what the group has used."""
 
     cores: float
@@ -62,8 +60,7 @@ class CpuQuota:
         return str(self.folder / "cpu.pressure") if self.is_v2 else None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MemoryQuota:
+class MemoryQuota(Struct, frozen=True, kw_only=True):
     """The smallest memory limit over a process, in MiB, and its group."""
 
     limit_mb: float

@@ -19,13 +19,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 from zsched.adapters.machine.cgroup import CgroupTree, CpuQuota, MemoryQuota
 from zsched.clock import monotonic_s
 from zsched.core.profile.appetite import Appetite, Thread
 from zsched.core.values.model import DeviceSample, TaskId, WorkerLoad, WorkerState
+from zsched.core.values.struct import Struct
 from zsched.procfs import PAGE_MB, TICKS_PER_S, ProcessTimes, names, parse_process_stat, parse_schedstat, read_file
 
 LIMITS_EVERY_S = 5.0
@@ -37,8 +37,7 @@ RESTING_LOOK_S = 1.0
 """Threads and children of a worker that uses less are read this often: there may be dozens, with two files each."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CpuTimes:
+class CpuTimes(Struct, frozen=True, kw_only=True):
     """Busy and total seconds summed over some CPUs since boot."""
 
     busy_s: float

@@ -14,7 +14,6 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
 from typing import Any
 
 import zenoh
@@ -57,6 +56,7 @@ from zsched.core.values.messages import (
 from zsched.core.values.model import Beat, NodeId, Profile, Proposal
 from zsched.core.values.rehearsal import ReadRehearsals, RehearsalsTold
 from zsched.core.values.snapshot import Snapshot
+from zsched.core.values.struct import replace
 from zsched.core.values.words import NAME
 from zsched.errors import AdapterError, WireError
 from zsched.guard import guarded, tolerant

@@ -11,10 +11,10 @@ from __future__ import annotations
 import threading
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Final
 
 from zsched.core.values.fleet import Fleet, Timing
+from zsched.core.values.struct import Struct
 from zsched.wire.keyspace import Keyspace
 
 ROOM: Final = 20.0
@@ -28,8 +28,7 @@ EVERYBODY_ELSE: Final = ""
 """The one bucket of all names that are no node's, operator's or guest's."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Limit:
+class Limit(Struct, frozen=True, kw_only=True):
     """Frames a second, and how many at once."""
 
     hz: float

@@ -6,20 +6,19 @@ Knows: zenoh sessions, round trips. Does not know: which question it is, what th
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass, field
 from typing import Final
 
 import zenoh
 
 from zsched.clock import monotonic_s
+from zsched.core.values.struct import Struct, field
 from zsched.guard import guarded
 
 CONNECT_S: Final = 2.0
 """How long an address is waited for that neither takes a connection nor refuses it."""
 
 
-@dataclass(slots=True, kw_only=True)
-class Pinged:
+class Pinged(Struct, kw_only=True):
     """What came back so far; another thread may still fill it in."""
 
     opened_s: float | None = None

@@ -15,7 +15,6 @@ import secrets
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import StrEnum
 from typing import Final
@@ -23,6 +22,7 @@ from typing import Final
 from zsched.clock import monotonic_s, wall_ns, wall_s
 from zsched.core.values.certificates import Holder, Role, parse_common_name
 from zsched.core.values.model import NodeId
+from zsched.core.values.struct import Struct
 from zsched.errors import WireError
 from zsched.sessions.certificate import Parts
 from zsched.wire.codec import LARGE
@@ -51,8 +51,7 @@ class SealFault(StrEnum):
     STALE = "stale"  # a command for another life of this node
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Keys:
+class Keys(Struct, frozen=True, kw_only=True):
     """What signs and checks, from the certificates of this machine (`zsched.runtime.sealing` makes it)."""
 
     sign: Callable[[bytes], bytes]
@@ -64,8 +63,7 @@ class Keys:
     """What checks a signature by a public key."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Known:
+class _Known(Struct, frozen=True):
     holder: Holder
     begins: datetime
     ends: datetime

@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import queue
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Final, Self
 
@@ -16,6 +15,7 @@ import zenoh
 
 from zsched.clock import monotonic_s
 from zsched.core.route.ros2 import decode_attachment
+from zsched.core.values.struct import Struct
 from zsched.errors import AdapterError
 from zsched.guard import guarded
 
@@ -25,8 +25,7 @@ CLOSE_S: Final = 0.5
 """Closing a session towards a stopped peer can take seconds; we wait for at most this long."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Tapped:
+class Tapped(Struct, frozen=True, kw_only=True):
     """One sample as it passed. ``at`` is when it came, seconds of `monotonic_s`."""
 
     side: str

@@ -14,7 +14,6 @@ import csv
 import io
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -22,6 +21,7 @@ from zsched.adapters.radio.nl80211 import GenericNetlink, Nl80211Error, Station
 from zsched.clock import monotonic_s
 from zsched.core.values.fleet import LinkSpec, NodeSpec
 from zsched.core.values.model import LinkSample, LinkSource
+from zsched.core.values.struct import Struct
 from zsched.files import read_packed
 
 NO_SAMPLE = frozenset({-2.0, -256.0})
@@ -213,8 +213,7 @@ def _increase(before: int | None, after: int | None) -> int | None:
 # --- recorded drives -------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Trace:
+class Trace(Struct, frozen=True, kw_only=True):
     """A recorded drive: seconds since its first row (rising) and dBm, one per valid row; ``duration_s`` of one loop."""
 
     times_s: tuple[float, ...]

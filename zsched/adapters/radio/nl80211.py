@@ -14,9 +14,9 @@ import os
 import socket
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
 from enum import IntEnum
 
+from zsched.core.values.struct import Struct
 from zsched.errors import AdapterError
 
 NETLINK_GENERIC = 16
@@ -88,8 +88,7 @@ class Nl80211Error(AdapterError):
     """The kernel refused, did not answer, or sent bytes that make no sense."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Message:
+class Message(Struct, frozen=True, kw_only=True):
     """One netlink message without its header."""
 
     kind: int
@@ -98,16 +97,14 @@ class Message:
     payload: bytes
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Interface:
+class Interface(Struct, frozen=True, kw_only=True):
     """One wireless interface."""
 
     index: int
     name: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Station:
+class Station(Struct, frozen=True, kw_only=True):
     """One radio peer of an interface: the access point of a client, a client of an access point, a mesh neighbour."""
 
     mac: str

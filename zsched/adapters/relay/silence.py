@@ -13,9 +13,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Final
 
+from zsched.core.values.struct import Struct
 from zsched.procfs import names, parse_process_stat, parse_schedstat, read_file
 
 WORK_S: Final = 10.0
@@ -76,8 +76,7 @@ class Silence:
         return verdict if has_slept and is_idle(self._pid) else ""
 
 
-@dataclass(frozen=True, slots=True)
-class _Use:
+class _Use(Struct, frozen=True):
     """What all threads of a process have had and lacked so far."""
 
     processor_s: float

@@ -16,7 +16,6 @@ import select
 import sys
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import Final
 
 from zsched.adapters.relay.child import ENDING_S, RelayChild, start_relay
@@ -26,6 +25,7 @@ from zsched.core.events import ProblemReported, RelayChanged
 from zsched.core.relay_protocol import HandleReport, RelayStarted, RelayStop, TaskEnded, WorkerWatch
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.plan import Role, RoutePlan
+from zsched.core.values.struct import Struct, field
 from zsched.errors import AdapterError, WireError
 from zsched.guard import guarded
 from zsched.ipc.pipe import REPORTS, read_frame, write_frame
@@ -61,8 +61,7 @@ _KINDS: Final = ("plan", "role", "watch")
 """What a task has in the table."""
 
 
-@dataclass(slots=True)
-class _Outbox:
+class _Outbox(Struct):
     """What the relay has not been told yet; at most one plan, one role and one watch per task."""
 
     items: dict[_Key, _Told] = field(default_factory=dict)
@@ -90,8 +89,7 @@ class _Outbox:
             return self.items.pop(next(iter(self.items)))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Bequest:
+class Bequest(Struct, frozen=True, kw_only=True):
     """How a relay passes from this daemon to the next one."""
 
     door: Door

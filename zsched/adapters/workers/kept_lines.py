@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from dataclasses import dataclass
 from typing import Final
 
 from zsched.clock import awake_s
 from zsched.core.values.messages import WorkerLine
+from zsched.core.values.struct import Struct
 
 MOST_LINES: Final = 400
 """Per task; the oldest go."""
@@ -21,8 +21,7 @@ PER_ANSWER: Final = 100
 """Lines in one answer, so that it fits into a frame in any script."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Line:
+class _Line(Struct, frozen=True):
     number: int
     at: float
     text: str

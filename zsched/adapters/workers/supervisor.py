@@ -26,7 +26,6 @@ import random
 import signal
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import partial
 from typing import Protocol
@@ -37,6 +36,7 @@ from zsched.adapters.workers.process import ProcessWatch, WorkerGuard, WorkerPro
 from zsched.clock import awake_s
 from zsched.core.values.fleet import WorkerSpec
 from zsched.core.values.model import MAX_REASON, NodeId, TaskId, WorkerState, as_reason
+from zsched.core.values.struct import Struct, field
 from zsched.core.values.words import RESTARTING
 from zsched.guard import guarded
 from zsched.sessions.comparison import lacking
@@ -71,8 +71,7 @@ class WorkerEvents(Protocol):
         """The worker's process runs by an old recipe, or does not any more."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WorkerContext:
+class WorkerContext(Struct, frozen=True, kw_only=True):
     """What every worker of this daemon gets through its environment."""
 
     fleet: str
@@ -81,8 +80,7 @@ class WorkerContext:
     """The daemon's: a worker's own is this times 100 000 plus a count, so no two ever share one."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RestartPolicy:
+class RestartPolicy(Struct, frozen=True, kw_only=True):
     """Delay before restart ``n`` (1, 2, ...): ``first_s * 2**(n-1)``, at most ``most_s``, +- ``jitter_ratio`` of it."""
 
     first_s: float = 0.1
@@ -113,8 +111,7 @@ A node or a task that comes is no reason to start every worker of the fleet agai
 """
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Recipe:
+class Recipe(Struct, frozen=True, kw_only=True):
     """What a worker's process is made with, and must be started again for when it changes."""
 
     command: tuple[str, ...] = ()
@@ -132,8 +129,7 @@ class Recipe:
         )
 
 
-@dataclass(slots=True, kw_only=True)
-class _Worker:
+class _Worker(Struct, kw_only=True):
     """The supervisor's record of one task; touched by its thread only."""
 
     task: TaskId
@@ -175,7 +171,7 @@ class WorkerSupervisor:
         events: WorkerEvents,
         environment: Callable[[TaskId], Mapping[str, str]] = lambda _task: {},
         rng: random.Random | None = None,
-        policy: RestartPolicy = RestartPolicy(),
+        policy: RestartPolicy | None = None,
         why_not_ready: Callable[[TaskId], str] = lambda _task: "",
         session: Callable[[TaskId], str] = lambda _task: "",
     ) -> None:
@@ -196,7 +192,7 @@ class WorkerSupervisor:
             task: _Worker(task=task, spec=spec, logger=log.getChild(task)) for task, spec in sorted(specs.items())
         }
         self._context, self._events, self._environment = context, events, environment
-        self._rng, self._policy = rng or random.Random(), policy
+        self._rng, self._policy = rng or random.Random(), policy or RestartPolicy()
         self._why_not_ready, self._session = why_not_ready, session
         self._started = 0
         self._guard = WorkerGuard()

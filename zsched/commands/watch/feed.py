@@ -7,18 +7,17 @@ Does not know: how the answers are shown.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from zsched.clock import wall_s
 from zsched.commands.ask import Door
 from zsched.commands.common import CliError, Json
 from zsched.commands.history import read_log
 from zsched.commands.status import ask_status
+from zsched.core.values.struct import Struct
 from zsched.exits import EXIT_OK
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class News:
+class News(Struct, frozen=True, kw_only=True):
     """What one question brought."""
 
     at: float

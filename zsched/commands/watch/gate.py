@@ -14,9 +14,9 @@ import hmac
 import ipaddress
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Final
 
+from zsched.core.values.struct import Struct
 from zsched.core.values.words import NAME
 
 METHODS: Final = ("GET", "HEAD")
@@ -46,8 +46,7 @@ HEADERS: Final = {
 _HOST: Final = re.compile(r"(?:\[(?P<v6>[^\]]+)\]|(?P<name>[^:\[\]]+))(?::[0-9]{1,5})?")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Asked:
+class Asked(Struct, frozen=True, kw_only=True):
     """One request."""
 
     method: str
@@ -57,8 +56,7 @@ class Asked:
     """All values of a header, by its name."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Refusal:
+class Refusal(Struct, frozen=True, kw_only=True):
     """Why a request is not answered."""
 
     status: int
@@ -66,8 +64,7 @@ class Refusal:
     headers: tuple[tuple[str, str], ...] = ()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Route:
+class Route(Struct, frozen=True, kw_only=True):
     """What is to be answered."""
 
     path: str
@@ -75,8 +72,7 @@ class Route:
     """`EXPLAIN` only."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Gate:
+class Gate(Struct, frozen=True, kw_only=True):
     """The rules of one server."""
 
     names: frozenset[str]

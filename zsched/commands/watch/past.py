@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Final
 
 from zsched.commands.common import Json
 from zsched.commands.history import moves_of, wall_text
 from zsched.commands.watch.feed import News
 from zsched.core.values.electorate import CREATION_STEP
+from zsched.core.values.struct import Struct
 
 POINTS: Final = 900
 """Of a task's utilities: a quarter of an hour at one a second."""
@@ -23,8 +23,7 @@ MOST_MOVES: Final = 200
 MOST_EVENTS: Final = 300
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Point:
+class Point(Struct, frozen=True, kw_only=True):
     """The joint utilities of a task's candidates in one round."""
 
     at: float

@@ -13,7 +13,6 @@ import sys
 import threading
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Final
 
@@ -24,6 +23,7 @@ from zsched.commands.page import harmless, size
 from zsched.commands.watch import tracks
 from zsched.commands.watch.feed import Feed
 from zsched.core.route import keyexpr
+from zsched.core.values.struct import Struct, replace
 from zsched.errors import AdapterError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_UNREACHABLE, EXIT_USAGE
 
@@ -35,8 +35,7 @@ if TYPE_CHECKING:
 LIBRARY: Final = "zsched"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RecordView:
+class RecordView(Struct, frozen=True, kw_only=True):
     """Which daemon to ask, and what to write."""
 
     runtime_dir: Path | None

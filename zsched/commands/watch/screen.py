@@ -16,7 +16,6 @@ import termios
 import threading
 import tty
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -27,6 +26,7 @@ from zsched.commands.status import code_of
 from zsched.commands.watch.feed import Feed, News
 from zsched.commands.watch.past import Past
 from zsched.commands.watch.top import MIN_HEIGHT, MIN_WIDTH, Frame, render_top
+from zsched.core.values.struct import Struct, replace
 from zsched.exits import EXIT_OK, EXIT_USAGE
 from zsched.guard import guarded
 
@@ -38,8 +38,7 @@ STEPS: Final = {"\x1b[A": -1, "\x1b[B": 1, "k": -1, "j": 1, "\x1b[5~": -10, "\x1
 """{key: by how many tasks it scrolls}."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TopView:
+class TopView(Struct, frozen=True, kw_only=True):
     """Which daemon to ask, and how to show the answer."""
 
     runtime_dir: Path | None

@@ -9,19 +9,18 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
 from typing import Final
 
 from zsched.commands.common import Json
 from zsched.commands.history import is_move
+from zsched.core.values.struct import Struct, field
 
 OVERDUE_S: Final = 60.0
 """A move that is not settled by then is reported as far as it came."""
 MOST_LINES: Final = 100
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Span:
+class Span(Struct, frozen=True, kw_only=True):
     """One move as one node saw it; times in seconds since 1970, by that node's clock."""
 
     node: str
@@ -43,8 +42,7 @@ def trace_id(fleet: str, task: str, epoch: int) -> int:
     return int.from_bytes(hashlib.sha256(f"{fleet}/{task}/{epoch}".encode()).digest()[:16], "big") or 1
 
 
-@dataclass(slots=True)
-class _Open:
+class _Open(Struct):
     """A move that is not over."""
 
     entry: Json

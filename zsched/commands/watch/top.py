@@ -6,7 +6,6 @@ Knows: what stands where, and what is left out first where the screen is low. Do
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import IntEnum
 from itertools import groupby
 from operator import itemgetter
@@ -17,6 +16,7 @@ from zsched.commands.common import Json
 from zsched.commands.page import Cell, Page, clock_time, cut, harmless, size, span
 from zsched.commands.report import header, millis, node_rows, per_second, printable, troubles
 from zsched.commands.watch.past import Past, Point
+from zsched.core.values.struct import Struct
 
 LEVELS: Final = "▁▂▃▄▅▆▇█"
 TOP: Final = 1.0
@@ -38,8 +38,7 @@ class Detail(IntEnum):
     STREAMS = 2
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Frame:
+class Frame(Struct, frozen=True, kw_only=True):
     """Where and when a screen is shown."""
 
     width: int

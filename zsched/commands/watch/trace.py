@@ -10,7 +10,6 @@ import signal
 import sys
 import threading
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -20,6 +19,7 @@ from zsched.commands.common import CliError
 from zsched.commands.page import harmless
 from zsched.commands.watch.feed import Feed
 from zsched.commands.watch.spans import Moves, Span, trace_id
+from zsched.core.values.struct import Struct
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE
 
 if TYPE_CHECKING:
@@ -29,8 +29,7 @@ PERIOD_S: Final = 1.0
 SEND_S: Final = 5.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TraceView:
+class TraceView(Struct, frozen=True, kw_only=True):
     """Whose log is read, and where spans go."""
 
     runtime_dir: Path | None

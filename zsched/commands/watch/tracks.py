@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any, Final
 
 from zsched.commands.common import SCHEMAS, Json
 from zsched.commands.history import is_move
 from zsched.commands.report import degradations
+from zsched.core.values.struct import Struct
 
 NANO: Final = 1_000_000_000
 INFO, WARNING, ERROR = 2, 3, 4
@@ -103,8 +103,7 @@ ROS_DEFINITIONS: Final = {
 _IN_KEYS: Final = {"nav_msgs::msg::dds_::OccupancyGrid_": GRID, "tf2_msgs::msg::dds_::TFMessage_": FRAMES}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Message:
+class Message(Struct, frozen=True, kw_only=True):
     """One message of a topic."""
 
     topic: str

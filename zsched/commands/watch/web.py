@@ -19,7 +19,6 @@ import signal
 import socket
 import sys
 import threading
-from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Final
@@ -31,6 +30,7 @@ from zsched.commands.page import harmless
 from zsched.commands.watch.feed import Feed
 from zsched.commands.watch.gate import EXPLAIN, FILES, HEADERS, LEAST_TOKEN, LIVE, METRICS, Asked, Gate, Refusal, Route
 from zsched.commands.watch.hub import Hub
+from zsched.core.values.struct import Struct
 from zsched.errors import ZschedError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_UNREACHABLE, EXIT_USAGE
 from zsched.files import read_regular
@@ -48,8 +48,7 @@ PING_S: Final = 15.0
 MOST_TOKEN_BYTES: Final = 4096
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WebView:
+class WebView(Struct, frozen=True, kw_only=True):
     """Which daemon to ask, where to listen, and who may look."""
 
     runtime_dir: Path | None

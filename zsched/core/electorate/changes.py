@@ -14,14 +14,12 @@ A change that its rule forbids is no error: `apply` returns what was read, and i
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
 from zsched.core.values.electorate import Creation, Elector, FleetValue
 from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.struct import Struct, replace
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AddElector:
+class AddElector(Struct, frozen=True, kw_only=True):
     """Change: one more elector."""
 
     base_revision: int
@@ -41,8 +39,7 @@ class AddElector:
         return _renumbered(read, tuple(sorted((*read.electors, added), key=lambda one: one.name)))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RemoveElector:
+class RemoveElector(Struct, frozen=True, kw_only=True):
     """Change: one elector less."""
 
     base_revision: int
@@ -62,8 +59,7 @@ class RemoveElector:
         return _renumbered(read, tuple(one for one in read.electors if one.name != self.name))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SetLease:
+class SetLease(Struct, frozen=True, kw_only=True):
     """Change: another length of leases."""
 
     base_revision: int
@@ -81,8 +77,7 @@ class SetLease:
         return _relet(replace(read, revision=read.revision + 1), read, self.lease_s)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AdoptDocument:
+class AdoptDocument(Struct, frozen=True, kw_only=True):
     """Change: the first document of a fleet that has gone by its files. Registers stay; the number rises.
 
     It rises because the lease is agreed by it: until then each node has gone by the length in its own file.
@@ -114,8 +109,7 @@ class AdoptDocument:
         )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SetDocument:
+class SetDocument(Struct, frozen=True, kw_only=True):
     """Change: another document. Tasks that stay keep their registers; those that come get new ones."""
 
     base_revision: int
@@ -156,8 +150,7 @@ class SetDocument:
         return _relet(changed, read, self.lease_s)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SetAway:
+class SetAway(Struct, frozen=True, kw_only=True):
     """Change: which robots are away, and do not count in votes."""
 
     base_revision: int
@@ -176,8 +169,7 @@ class SetAway:
         return replace(read, revision=read.revision + 1, away=self.away)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Settle:
+class Settle(Struct, frozen=True, kw_only=True):
     """Change: these electors hold all that was chosen before them (`zsched.core.electorate.settling`)."""
 
     base_revision: int

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
 
 from zsched.core.values.electorate import Creation, Elector, FleetValue
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NO_BALLOT, Acceptance, Allocation, Ballot, NodeId, RegisterState, TaskId
+from zsched.core.values.struct import Struct, replace
 
 
 def founded(fleet: str, generation: int, electors: Iterable[NodeId]) -> FleetValue:
@@ -68,8 +68,7 @@ def founded_id(fleet: str, generation: int) -> str:
     return drawn.hexdigest()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Agreed:
+class Agreed(Struct, frozen=True, kw_only=True):
     """The document by which a recovered generation goes."""
 
     document: str

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
 from random import Random
 from types import MappingProxyType
 
@@ -27,6 +26,7 @@ from zsched.core.values.electorate import Creation, FleetValue
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refusal, Refused
 from zsched.core.values.model import NO_BALLOT, NodeId, RegisterState, TaskId
+from zsched.core.values.struct import replace
 from zsched.core.vote.task_register import TaskRegister
 
 

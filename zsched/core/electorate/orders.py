@@ -8,8 +8,6 @@ A command ends when its change is chosen, or cannot be. The electors of the new 
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.electorate.changes import AddElector, AdoptDocument, FleetChange, RemoveElector, SetDocument
@@ -20,6 +18,7 @@ from zsched.core.values.document import Flag
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import ChangeFleet, CommandOutcome, CommandResult
+from zsched.core.values.struct import replace
 
 MAX_OPEN = 16
 """Operators' commands that may wait for their documents; of more the oldest ends, and its operator is answered so."""

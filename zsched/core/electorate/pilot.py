@@ -33,6 +33,7 @@ from zsched.core.electorate.changes import AddElector, FleetChange, RemoveElecto
 from zsched.core.values.electorate import Elector, FleetValue
 from zsched.core.values.model import NodeId, NodeKind
 from zsched.core.values.quorum import majority
+from zsched.core.values.struct import Struct
 
 TARGET = 5
 """How many electors a fleet has at most by itself."""
@@ -42,8 +43,7 @@ PAUSE_SHARE = 0.5
 """A node that has not looked for this share of the silence has paused itself: it listens anew."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Course:
+class Course(Struct, frozen=True, kw_only=True):
     """What the document says about electors and robots."""
 
     members: tuple[tuple[NodeId, NodeKind], ...]
@@ -63,8 +63,7 @@ class Course:
         return tuple(name for name, kind in self.members if kind is NodeKind.ROBOT)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Word:
+class Word(Struct, frozen=True, kw_only=True):
     """What one beat says to the pilot."""
 
     node: NodeId
@@ -80,16 +79,14 @@ class Word:
     """Its sender has lost what belongs to its seat, and can be added anew once that is given up."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Advice:
+class Advice(Struct, frozen=True, kw_only=True):
     """What is to be done now, or why nothing is."""
 
     change: FleetChange | None
     reason: str
 
 
-@dataclass(slots=True)
-class _Peer:
+class _Peer(Struct):
     """One name: its newest word, and since when it has been heard with that disk without a break."""
 
     word: Word

@@ -11,7 +11,6 @@ promised belongs to its generation, and knows only which generation it is to fol
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from zsched.core.electorate.founding import Agreed, founded, founded_id, newest_fleet, recovered
@@ -21,6 +20,7 @@ from zsched.core.values.fleet import Fleet, electorate_hash
 from zsched.core.values.model import NodeId, RegisterState
 from zsched.core.values.quorum import majority
 from zsched.core.values.snapshot import Snapshot
+from zsched.core.values.struct import Struct, replace
 
 MOVED = "it has changed sides to another generation, and has no seat there"
 """Why a node that rejoins is no elector until it is added as one."""
@@ -37,8 +37,7 @@ class Danger(StrEnum):
     HALF = "another-half"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Found:
+class Found(Struct, frozen=True, kw_only=True):
     """What was found before a recovery."""
 
     fleet: Fleet
@@ -61,8 +60,7 @@ class Found:
         return (() if self.own is None else (self.own,)) + self.others
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Recovery:
+class Recovery(Struct, frozen=True, kw_only=True):
     """A recovery that may go on once its dangers are accepted."""
 
     found: Found
@@ -260,8 +258,7 @@ def _has_seat(before: FleetValue, state: DurableState) -> bool:
 # --- changing sides --------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Sides:
+class Sides(Struct, frozen=True, kw_only=True):
     """The generation that a node is to follow, and who follows it already."""
 
     generation_id: str

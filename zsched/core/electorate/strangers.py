@@ -8,13 +8,13 @@ Knows: which generation a beat or an answer names. Does not know: what becomes o
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from functools import lru_cache
 
 from zsched.core.electorate.founding import founded_id
 from zsched.core.values.electorate import SAID_DIGITS, TOLD_DIGITS, FleetValue, generation_in
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import Beat, NodeId
+from zsched.core.values.struct import Struct, field
 
 SHOWN_S = 10.0
 """A node of another generation that was not heard for this long is not shown any more."""
@@ -26,8 +26,7 @@ KEPT = 16
 _told_of_file = lru_cache(maxsize=8)(lambda fleet, generation: founded_id(fleet, generation)[:TOLD_DIGITS])
 
 
-@dataclass(slots=True)
-class Strangers:
+class Strangers(Struct):
     """The strangers that one node hears.
 
     Args:

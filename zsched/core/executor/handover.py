@@ -33,7 +33,7 @@ the newest carries until the next flip, and the others go on to drain, each with
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 from zsched.core.instructions import ApplyRoutes, EndTask, RecordStory, SetRole, StartWorker, StopWorker
@@ -42,6 +42,7 @@ from zsched.core.todo import ToDo
 from zsched.core.values.fleet import OnIsolation, Standby, TaskSpec, runs_worker
 from zsched.core.values.model import Allocation, NodeId, NodeKind
 from zsched.core.values.plan import Role, Route, RoutePhase, RoutePlan, Slot, WorkerRole
+from zsched.core.values.struct import Struct, replace
 
 ROLE_DRAIN_MARGIN_S = 1.0
 """The old owner's worker goes idle this much after the robots' drain time (a cold standby's start comes on top)."""
@@ -61,8 +62,7 @@ class Phase(StrEnum):
     SETTLED = "settled"
 
 
-@dataclass(frozen=True, slots=True)
-class _Old:
+class _Old(Struct, frozen=True):
     """A slot that another one follows, or will: a predecessor."""
 
     slot: Slot

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass
 
 from zsched.core.executor.handover import Executor, Phase
 from zsched.core.gateway.gateway import Gateway
@@ -30,6 +29,7 @@ from zsched.core.todo import ToDo
 from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.model import NodeId, Profile, TaskId, TaskProgress, WorkerState
 from zsched.core.values.plan import Direction, StreamCount
+from zsched.core.values.struct import Struct
 
 COUNT_S = 1.0
 """Period of the relays' counters, so a report is at most this old."""
@@ -39,8 +39,7 @@ _INPUTS, _OUTPUTS = "in", "out"
 """The directions in stream names (`zsched.core.route.templates`)."""
 
 
-@dataclass(slots=True)
-class _Seen:
+class _Seen(Struct):
     """What one robot has seen of one task."""
 
     epoch: int

@@ -21,13 +21,13 @@ how a task moves.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
 from enum import StrEnum
 
 from zsched.core.instructions import RecordStory, RenewWorker
 from zsched.core.todo import ToDo
 from zsched.core.values.fleet import Standby, TaskSpec
 from zsched.core.values.model import Allocation, NodeId, Profile, Renewal, TaskId, WorkerState
+from zsched.core.values.struct import Struct, field
 
 SAME_FILE_S = 1.0
 """A candidate has beaten by the same fleet file for this long: its profile tells of its own worker."""
@@ -100,8 +100,7 @@ def _renewal(spec: TaskSpec, profile: Profile) -> Renewal:
     return Renewal.NONE if load is None else load.renewal
 
 
-@dataclass(slots=True)
-class Renewing:
+class Renewing(Struct):
     """One node's workers that run by an old recipe."""
 
     me: NodeId

@@ -10,11 +10,11 @@ has started again (profiles tell), who begins and ends a rollout (`zsched.comman
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 
 from zsched.core.values.document import Rollout
 from zsched.core.values.fleet import Fleet, TaskSpec, runs_worker
 from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.struct import Struct, field
 
 
 def waiting(fleet: Fleet, task: TaskSpec) -> tuple[NodeId, ...]:
@@ -23,8 +23,7 @@ def waiting(fleet: Fleet, task: TaskSpec) -> tuple[NodeId, ...]:
     return () if task.rollout is None else tuple(name for name in homes if name not in task.rollout.first)
 
 
-@dataclass(slots=True)
-class Rollouts:
+class Rollouts(Struct):
     """What one node knows of all rollouts; times are monotonic seconds."""
 
     _known: dict[TaskId, tuple[Rollout, float]] = field(default_factory=dict)

@@ -18,20 +18,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 
 from zsched.core.executor.handover import Executor
 from zsched.core.values.change import SetLeased
 from zsched.core.values.fleet import Fleet, TaskSpec, fleet_hash, lease_terms
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import Allocation, Beat, NodeId, TaskId
+from zsched.core.values.struct import Struct, field
 
 ASK_EVERY_S = 0.2
 """An owner that waits for unleased workers asks their nodes at most this often."""
 
 
-@dataclass(slots=True)
-class Sealing:
+class Sealing(Struct):
     """Decides for one node which changes of *leased* to propose and which peers to ask first."""
 
     fleet: Fleet

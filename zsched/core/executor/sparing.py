@@ -7,12 +7,12 @@ go, how long it waits (`zsched.runtime.reopening`), who gets the task (SCHEDULER
 from __future__ import annotations
 
 from collections.abc import Container, Iterable, Mapping
-from dataclasses import dataclass
 from enum import StrEnum
 
 from zsched.core.scheduler.scoring import may_get
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.model import Allocation, NodeId, Profile, TaskId, WorkerState
+from zsched.core.values.struct import Struct
 
 
 class Sparing(StrEnum):
@@ -23,8 +23,7 @@ class Sparing(StrEnum):
     STARTING = "starting"  # somebody who could have it lives, and will be ready
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Lack:
+class Lack(Struct, frozen=True, kw_only=True):
     """A task that would have no owner for a while."""
 
     task: TaskId

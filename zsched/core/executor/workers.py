@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass, field
 
 from zsched.core import events as ev
 from zsched.core.instructions import RecordStory
 from zsched.core.values.fleet import Fleet, runs_worker
 from zsched.core.values.model import NodeId, Profile, Renewal, TaskId, WorkerState, as_reason
+from zsched.core.values.struct import Struct, field
 from zsched.core.values.words import told_of_worker
 
 TROUBLE_S = 60.0
@@ -29,8 +29,7 @@ def given_away(profile: Profile) -> set[TaskId]:
     return {load.task for load in profile.workers if load.renewal is Renewal.LEAVES}
 
 
-@dataclass(slots=True)
-class Workers:
+class Workers(Struct):
     """{task: state} of every worker that this node keeps, and {task: why} of those that are not ready."""
 
     states: dict[TaskId, WorkerState]

@@ -10,10 +10,9 @@ but for a common factor, so an unchanging fleet has no limit cycle.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
 from zsched.core.values.fleet import Demand, TaskSpec
 from zsched.core.values.model import Jobs, NodeId, Profile, TaskId, WorkerLoad, WorkerState
+from zsched.core.values.struct import Struct, replace
 
 STARVED_CPU_RATIO = 0.9
 """On a busier owner a task may get less than it wants: its use is only a lower bound of its need."""
@@ -35,8 +34,7 @@ LEAST_FREE_CORES = 0.05
 """A job on a full machine gets at least this much, so that its time is finite."""
 
 
-@dataclass(frozen=True, slots=True)
-class JobNeed:
+class JobNeed(Struct, frozen=True):
     """One job's need, as the worker reported it where it ran."""
 
     work_s: float
@@ -59,8 +57,7 @@ class JobNeed:
         return self.queue_ratio * (self.other_s + stretch * self.work_s / speed)
 
 
-@dataclass(frozen=True, slots=True)
-class _Shortfall:
+class _Shortfall(Struct, frozen=True):
     """What a task got on a machine, compared with the forecast for that machine."""
 
     share: float
@@ -71,8 +68,7 @@ class _Shortfall:
     """Cores that others used there."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Known:
+class _Known(Struct, frozen=True):
     """What is known of a task's need; ``None``: nothing yet."""
 
     work: float | None = None

@@ -6,17 +6,16 @@ Knows: which profile is newer, how old is too old, the task's demand. Does not k
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 from zsched.core.gateway.demand import Demands
 from zsched.core.gateway.sharing import Shares
 from zsched.core.sequence import Order, Track
 from zsched.core.values.fleet import Demand, Fleet, TaskSpec
 from zsched.core.values.model import NodeId, Profile, TaskId
+from zsched.core.values.struct import Struct
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EdgeData:
+class EdgeData(Struct, frozen=True, kw_only=True):
     """A node's newest profile and its age in seconds since we received it."""
 
     profile: Profile

@@ -6,7 +6,6 @@ Knows: which stage takes each of them, and when a decision may be needed. Does n
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any, Final
 
 from zsched.core import events as ev
@@ -16,6 +15,7 @@ from zsched.core.handlers.beats import on_twins
 from zsched.core.stages import Handler, Stages
 from zsched.core.todo import ToDo
 from zsched.core.values.model import Proposal
+from zsched.core.values.struct import replace
 
 # --- PROFILE, GATEWAY ------------------------------------------------------------------------------------------------
 

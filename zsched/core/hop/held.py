@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import Final, Generic, NamedTuple, Protocol, TypeVar
 
 from zsched.core.hop.receiver import MAX_SOURCES, SourceName
+from zsched.core.values.struct import Struct, field
 
 MAX_HELD: Final = 4096
 """Inputs of a source that are held one by one (a relay sends at most 2048 ahead); further ones share the last place."""
@@ -39,8 +39,7 @@ class Done(NamedTuple):
     """Bytes of all that were held with it."""
 
 
-@dataclass(slots=True, eq=False)
-class Held(Generic[L]):
+class Held(Struct, Generic[L], eq=False):
     """Inputs of a source that are held; ``owed``: {lane: what lies below this number must be there}."""
 
     number: int = 0

@@ -16,11 +16,11 @@ acknowledgements, and the publisher says what is true (`Source.note_start`). Onl
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
 from typing import Final
 
 from zsched.core.hop.serial import number_near, serial_of
 from zsched.core.relay_protocol import StreamAck
+from zsched.core.values.struct import Struct, field
 
 SourceName = tuple[str, str, int]
 """(key, session id, entity id) of a publisher as zenoh names it."""
@@ -60,8 +60,7 @@ class RunningTime:
         return now - self._stood_s
 
 
-@dataclass(slots=True)
-class Jump:
+class Jump(Struct):
     """The newest jump over numbers that have not come: where it began and ended, what has come of them since.
 
     Anybody can put one number. So a jump stands once something newer follows; when `RETURN` numbers in a row go on
@@ -82,8 +81,7 @@ class Jump:
         return self.count >= RETURN
 
 
-@dataclass(slots=True)
-class Source:
+class Source(Struct):
     """One publisher, as it has been heard."""
 
     first: int

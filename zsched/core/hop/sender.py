@@ -11,12 +11,12 @@ stands still, has no link or has just begun another life.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
 from typing import Any, Final, NamedTuple
 
 from zsched.core.hop.kept import NOTHING, RESEND_S, Kept, Owed, Sent
 from zsched.core.hop.serial import number_near, serial_of
 from zsched.core.relay_protocol import StreamAck
+from zsched.core.values.struct import Struct, field, replace
 
 KEPT_SAMPLES: Final = 2048
 KEPT_BYTES: Final = 16 << 20
@@ -41,8 +41,7 @@ class Sums(NamedTuple):
     """It left this many open when another life followed."""
 
 
-@dataclass(slots=True, eq=False, kw_only=True)
-class Sender:
+class Sender(Struct, kw_only=True, eq=False):
     """One publisher towards one receiver."""
 
     is_whole: bool = False

@@ -14,12 +14,12 @@ Anybody can acknowledge under any receiver's name. So at most `MAX_RECEIVERS` ar
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
 from zsched.core.hop.kept import NOTHING, RESEND_S, Kept, Owed, Sent
 from zsched.core.hop.sender import near
 from zsched.core.relay_protocol import EndMarker, StreamAck
+from zsched.core.values.struct import Struct, field
 
 SHARED_BYTES: Final = 32 << 20
 """One publisher keeps at most this much beside the newest sample."""
@@ -54,8 +54,7 @@ class Wanted(NamedTuple):
     """It is only asked how far it is, by a skip of what it has; its answer says what is put again."""
 
 
-@dataclass(slots=True, eq=False)
-class Receiver:
+class Receiver(Struct, eq=False):
     """One that acknowledges: ``arrived`` is the number it comes to next."""
 
     node: str
@@ -95,8 +94,7 @@ class Receiver:
             self.owes_since = now
 
 
-@dataclass(slots=True, eq=False)
-class Expected:
+class Expected(Struct, eq=False):
     """One whose inputs answers were made of, and that has acknowledged none: it may not be told of them at all."""
 
     since: float
@@ -104,8 +102,7 @@ class Expected:
     """It is a receiver by now, or does not subscribe."""
 
 
-@dataclass(slots=True, eq=False, kw_only=True)
-class SharedSender:
+class SharedSender(Struct, kw_only=True, eq=False):
     """One publisher towards everybody that subscribes and acknowledges."""
 
     limit: int

@@ -8,10 +8,9 @@ Knows: how many bytes a beat's parts take at most. Does not know: the bytes them
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import Beat, Grant
+from zsched.core.values.struct import Struct, replace
 
 MAX_BEAT_BYTES = 16 * 1024
 FRAME_BYTES = 704
@@ -54,8 +53,7 @@ def most_bytes(fleet: Fleet) -> int:
     return FRAME_BYTES + learnt + grants + 3 * sum(_text(node.name) for node in fleet.nodes)
 
 
-@dataclass(slots=True)
-class BeatRoom:
+class BeatRoom(Struct):
     """Makes one node's beats fit, and remembers which parts come next."""
 
     _next: int = 0

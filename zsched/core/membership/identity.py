@@ -14,10 +14,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from enum import StrEnum
 
 from zsched.core.values.model import Beat, NodeId
+from zsched.core.values.struct import Struct, field
 
 YOUNG_S = 3.0
 """A daemon that finds its own name alive within this time after its start leaves again."""
@@ -53,8 +53,7 @@ class Verdict(StrEnum):
     DISPUTE = "dispute"  # neither leaves
 
 
-@dataclass(slots=True)
-class Identity:
+class Identity(Struct):
     """This node's knowledge about its own name and file."""
 
     me: NodeId

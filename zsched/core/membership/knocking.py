@@ -11,11 +11,10 @@ Knows: names and beats of unknown nodes. Does not know: the other content of the
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 from zsched.core.membership.identity import ONE_FILE, QUIET_S, here
 from zsched.core.values.electorate import SAID_DIGITS
 from zsched.core.values.model import Beat, NodeId
+from zsched.core.values.struct import Struct, field
 
 SHOWN_AFTER_S = 5.0
 """A node that leaves beats for a moment after it is out of the document; one that goes on for longer is told."""
@@ -23,8 +22,7 @@ KNOCKERS_KEPT = 4
 """Unknown names that status shows; a stranger may invent any number."""
 
 
-@dataclass(slots=True)
-class Knocking:
+class Knocking(Struct):
     """The unknown nodes that one node hears, with its own fleet file's hash."""
 
     fleet_file: str
@@ -85,8 +83,7 @@ class Knocking:
         )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Knock:
+class _Knock(Struct, frozen=True, kw_only=True):
     """What was heard of one unknown node."""
 
     beat: Beat

@@ -12,10 +12,10 @@ Knows: tokens and beats of every life of a name. Does not know: which of the two
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 
 from zsched.core.membership.identity import QUIET_S
 from zsched.core.values.model import Beat, NodeId
+from zsched.core.values.struct import Struct, field
 
 BESIDE_S = 1.0
 """Two lives are twins when both have beaten side by side for this long..."""
@@ -29,8 +29,7 @@ WHERE_EVERY_S = 2.0
 """A name that lives twice is asked for its addresses at most this often."""
 
 
-@dataclass(slots=True)
-class _Life:
+class _Life(Struct):
     sequence: int
     at: float
     since: float | None = None
@@ -41,8 +40,7 @@ class _Life:
         return 0.0 if self.since is None else self.at - self.since
 
 
-@dataclass(slots=True)
-class _Name:
+class _Name(Struct):
     tokens: set[int] = field(default_factory=set)
     lives: dict[int, _Life] = field(default_factory=dict)
     """{incarnation: life}, of those that have beaten since there were two tokens."""

@@ -20,11 +20,11 @@ owner that all others hear.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 
 from zsched.core.sequence import Order, Track
 from zsched.core.values.fleet import Timing
 from zsched.core.values.model import Beat, NodeId, PeerState
+from zsched.core.values.struct import Struct, field
 
 SMALL_FLEET = 3
 """Up to this size nobody waits for a second observer: there is at most one, and it may be the next to go."""
@@ -35,8 +35,7 @@ IN_FLIGHT_S = 0.03
 _NOBODY: frozenset[NodeId] = frozenset()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Transition:
+class Transition(Struct, frozen=True, kw_only=True):
     """A peer's state changed."""
 
     node: NodeId
@@ -45,8 +44,7 @@ class Transition:
     reason: str
 
 
-@dataclass(slots=True)
-class _Peer:
+class _Peer(Struct):
     state: PeerState = PeerState.UNKNOWN
     track: Track = field(default_factory=Track)
     order: Order = Order.NEW

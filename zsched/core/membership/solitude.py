@@ -9,9 +9,9 @@ Knows: the addresses, the time, what a trial of each address has shown. Does not
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 from zsched.core.values.fleet import Timing
+from zsched.core.values.struct import Struct
 
 ALONE_S = 3.0
 """A node that hears nobody for this long after its start says so; zenoh dials an address at least once a second."""
@@ -23,8 +23,7 @@ ADDRESSES_SHOWN = 8
 CHECK = "Check host, port, firewall, and that every node has the same `fleet:`"
 
 
-@dataclass(slots=True)
-class Solitude:
+class Solitude(Struct):
     """Of one node: when to try its addresses, and what its status says while nobody was ever heard."""
 
     timing: Timing

@@ -13,7 +13,6 @@ import math
 import statistics
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import replace
 
 from zsched.core.events import WorkerJobs
 from zsched.core.profile.jobs import JobMeter
@@ -39,6 +38,7 @@ from zsched.core.values.model import (
     WorkerLoad,
     WorkerState,
 )
+from zsched.core.values.struct import replace
 from zsched.core.values.words import Readings
 
 RATIO_CHANGE = 0.02

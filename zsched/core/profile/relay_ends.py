@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, field
 
 from zsched.core.events import RelayChanged
 from zsched.core.values.model import as_reason
+from zsched.core.values.struct import Struct, field
 
 WINDOW_S = 60.0
 OFTEN = 3
@@ -22,8 +22,7 @@ DOWN_TOLD_S = 2.0
 """A node without a relay for longer is a problem: a new one starts faster."""
 
 
-@dataclass(slots=True)
-class RelayEnds:
+class RelayEnds(Struct):
     """The ends of one node's relay."""
 
     _ended_at: deque[float] = field(default_factory=deque)

@@ -24,11 +24,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from typing import Final
 
 from zsched.core.values.model import NodeId
 from zsched.core.values.rehearsal import Promised, Step
+from zsched.core.values.struct import Struct, field, replace
 
 COUNTED_S: Final = 2.2
 """A rehearsal waits this long for counters after a step; relays count once a second."""
@@ -40,8 +40,7 @@ TELLS_S: Final = 0.05
 """What a look at a daemon may add to a measured time."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Sight:
+class Sight(Struct, frozen=True, kw_only=True):
     """One stream at one robot, as the robot's daemon tells it."""
 
     robot: NodeId
@@ -57,8 +56,7 @@ class Sight:
     move_epoch: int = 0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Look:
+class Look(Struct, frozen=True, kw_only=True):
     """What was seen of the fleet at once."""
 
     now: float
@@ -79,8 +77,7 @@ class Look:
     sights: tuple[Sight, ...] = ()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Gap:
+class Gap(Struct, frozen=True, kw_only=True):
     """The longest time without an answer at one robot, and what is usual there."""
 
     robot: NodeId
@@ -95,8 +92,7 @@ class Gap:
         return None if self.gap_s is None else max(0.0, self.gap_s - self.usual_s)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Result:
+class Result(Struct, frozen=True, kw_only=True):
     """What one step has shown; times are seconds from the step."""
 
     round: int
@@ -119,8 +115,7 @@ class Result:
     """Why it was not done; empty: it was."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Do:
+class Do(Struct, frozen=True, kw_only=True):
     """Do this step now, and tell `Programme.struck` or `Programme.leave_out`."""
 
     round: int
@@ -131,22 +126,19 @@ class Do:
     """Where a move goes."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Lift:
+class Lift(Struct, frozen=True, kw_only=True):
     """End the drains of this rehearsal now."""
 
     nodes: tuple[NodeId, ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Wait:
+class Wait(Struct, frozen=True, kw_only=True):
     """Look again soon."""
 
     why: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Over:
+class Over(Struct, frozen=True, kw_only=True):
     """Nothing more is done."""
 
     is_kept: bool
@@ -157,8 +149,7 @@ class Over:
 Action = Do | Lift | Wait | Over
 
 
-@dataclass(slots=True)
-class _Struck:
+class _Struck(Struct):
     """A step under way."""
 
     do: Do

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Final
 
 from zsched.core.values.plan import StreamCount
+from zsched.core.values.struct import Struct
 
 WINDOW_S: Final = 5.0
 """A rate is the mean over about this time; the relay tells totals once a second."""
@@ -18,8 +18,7 @@ STALE_S: Final = 5.0
 """Without new totals for this time a rate is not known."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Total:
+class _Total(Struct, frozen=True, kw_only=True):
     at: float
     messages: int
     size: int

@@ -14,12 +14,12 @@ zenoh-plugin-ros2dds 1.x; REP 2016 for type hashes. Read, not copied.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
 from zsched.core.route import keyexpr
 from zsched.core.values.plan import RosGraph
+from zsched.core.values.struct import Struct
 
 ANY: Final = "any"
 """In a fleet file: whatever type or hash the nodes use."""
@@ -53,8 +53,7 @@ class EndpointKind(StrEnum):
     CLIENT = "SC"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ActionPart:
+class ActionPart(Struct, frozen=True, kw_only=True):
     """One of the three services and two topics that a ROS action is made of."""
 
     word: str
@@ -83,8 +82,7 @@ ACTION_PARTS: Final = (
 """Topics first, which are the worker's outputs. Source: the design article "Actions" of ROS 2 (names, types)."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Endpoint:
+class Endpoint(Struct, frozen=True, kw_only=True):
     """One endpoint of the ROS graph, without the node it belongs to."""
 
     kind: EndpointKind
@@ -254,8 +252,7 @@ def ros_node_name(node: str) -> str:
 _BYTES: Final = 8 + 8 + 1 + GID_BYTES
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Attachment:
+class Attachment(Struct, frozen=True, kw_only=True):
     """The attachment of rmw_zenoh (0.2.4 and later) on every message, request and reply."""
 
     sequence: int

@@ -12,13 +12,13 @@ and publishes (or serves) as soon as the route exists.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from typing import Final
 
 from zsched.core.route import keyexpr
 from zsched.core.route.ros2 import Endpoint, EndpointKind, default_qos, is_rmw_key
 from zsched.core.route.wildcards import Rewriter, rewriter, wildcards
 from zsched.core.values.plan import Direction, RosGraph, Route, StreamClass
+from zsched.core.values.struct import Struct
 
 MAX_ENDPOINTS: Final = 2000
 """Endpoints announced per side; a graph with more is shown in part."""
@@ -28,8 +28,7 @@ _BACKWARDS: Final = {EndpointKind.SUBSCRIPTION, EndpointKind.SERVICE}
 _STREAM_KINDS: Final = {EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION}
 
 
-@dataclass(frozen=True, slots=True)
-class Sides:
+class Sides(Struct, frozen=True):
     """Endpoints by side; both fields hold the same when one session serves both."""
 
     local: frozenset[Endpoint]

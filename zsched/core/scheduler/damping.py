@@ -14,11 +14,11 @@ them remembers counts (`zsched.core.scheduler.scoring.joined`).
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
 from typing import Self
 
 from zsched.core.values.decision import DampingMemory
 from zsched.core.values.model import NodeId
+from zsched.core.values.struct import Struct, field
 
 STEP = 0.03
 """Penalty for the first point."""
@@ -34,8 +34,7 @@ ESCAPES_PER_MINUTE = 60
 """Even fleeing is bounded: one escape a second, on average."""
 
 
-@dataclass(slots=True)
-class Damping:
+class Damping(Struct):
     """One task's record of moves at one node."""
 
     _points: dict[NodeId, tuple[float, float]] = field(default_factory=dict)

@@ -9,8 +9,6 @@ figures give the same judgement, bit for bit.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
 from zsched.core.scheduler.damping import Damping
 from zsched.core.scheduler.judge import Judge, Judgement, Outcome, escape_ahead, escape_reason
 from zsched.core.scheduler.scoring import Standing, compare
@@ -18,10 +16,10 @@ from zsched.core.values.decision import Figures, Rules, Verdict
 from zsched.core.values.fleet import TaskSpec, WorkerSpec
 from zsched.core.values.model import Allocation, PeerState, WorkerState
 from zsched.core.values.quorum import majority
+from zsched.core.values.struct import Struct, replace
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Decided:
+class Decided(Struct, frozen=True, kw_only=True):
     """The result of one judgement."""
 
     standing: Standing

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
 
 from zsched.core.scheduler.damping import WINDOW_S, Damping
 from zsched.core.scheduler.decision import Decided, decide_again, verdict_of
@@ -20,6 +19,7 @@ from zsched.core.scheduler.utility import total_utility
 from zsched.core.values.decision import Decision, Figures, Verdict
 from zsched.core.values.model import Aggregate, NodeId, PeerState, Tuning, Utility, UtilityVector
 from zsched.core.values.quorum import majority
+from zsched.core.values.struct import Struct, replace
 from zsched.core.values.words import Readings
 
 _TIE = 1 / 512
@@ -27,8 +27,7 @@ _TIE = 1 / 512
 _HALVINGS = 40
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RobotView:
+class RobotView(Struct, frozen=True, kw_only=True):
     """One robot's score of one candidate: the terms and the utility that they make, each in [0, 1]."""
 
     robot: NodeId
@@ -43,8 +42,7 @@ class RobotView:
     """Why this robot did not score it; empty: it did."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CandidateSum:
+class CandidateSum(Struct, frozen=True, kw_only=True):
     """``max(joint + bonus - penalty, 0) = total``; ``None`` where the candidate cannot have the task."""
 
     node: NodeId
@@ -61,8 +59,7 @@ class CandidateSum:
     robots: tuple[RobotView, ...] = ()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Explained:
+class Explained(Struct, frozen=True, kw_only=True):
     """One judgement as an operator reads it."""
 
     task: str
@@ -93,8 +90,7 @@ class Explained:
     """What would have to change for a move."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Sight:
+class Sight(Struct, frozen=True, kw_only=True):
     """What one robot sees: its own terms, and whom it hears."""
 
     robot: NodeId

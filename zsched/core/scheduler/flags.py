@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
 
 from zsched.core.values.document import Flag, FlagKind
 from zsched.core.values.model import NodeId
+from zsched.core.values.struct import Struct, field
 
 SPREAD_S = 0.5
 """A node proposes the end this much later than the node before it in the fleet file: usually one proposal is enough."""
@@ -29,8 +29,7 @@ Known = tuple[FlagKind, NodeId, int]
 """(kind, node, revision): one order of one operator."""
 
 
-@dataclass(slots=True)
-class NodeFlags:
+class NodeFlags(Struct):
     """All nodes' flags at one node.
 
     ``rank`` is this node's place in the fleet file. Times are monotonic seconds.

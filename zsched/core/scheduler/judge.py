@@ -9,9 +9,9 @@ to propose, or the owner, always with the reason.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass, field
 from enum import StrEnum
 
 from zsched.core.scheduler.damping import ESCAPES_PER_MINUTE, WINDOW_S, Damping
@@ -31,6 +31,7 @@ from zsched.core.values.model import (
     WorkerState,
     told_by,
 )
+from zsched.core.values.struct import Struct, field
 from zsched.core.values.words import told_of_worker
 
 INITIAL_SETTLE_S = 3.0
@@ -48,8 +49,7 @@ class Outcome(StrEnum):
     NONE = "none"  # nobody to propose
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Judgement:
+class Judgement(Struct, frozen=True, kw_only=True):
     """A decision with its reason; ``candidate`` is whom this robot would vote for (the owner when it stays)."""
 
     outcome: Outcome
@@ -61,7 +61,7 @@ class Judgement:
     """With the owner's bonus."""
 
 
-@dataclass(slots=True)
+@dataclasses.dataclass(slots=True)
 class Judge:
     """The memory of one task's stickiness at one robot."""
 
@@ -72,7 +72,7 @@ class Judge:
     spent: float = 0.0
     """What staying has cost so far, in utility seconds."""
     spent_at: float | None = None
-    learnt: LearntPatience = field(default_factory=LearntPatience)
+    learnt: LearntPatience = dataclasses.field(default_factory=LearntPatience)
     """Of a task that learns its patience."""
     seen_first_at: float | None = None
     """When a first candidate could be scored (a task that nobody owns waits for the others)."""

@@ -9,12 +9,11 @@ nothing foreseen makes it so. What it is *worth* depends on the task's reading o
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.utility import network_utility
 from zsched.core.values.fleet import LinkLimits
 from zsched.core.values.model import Link, LinkSource, NodeId, PairReading, Profile
+from zsched.core.values.struct import Struct
 
 WIRED_DBM = 0.0
 """Stands for a cable in comparisons of signals: better than any radio."""
@@ -22,16 +21,14 @@ FORESEE_MOST_DB = 6.0
 """No signal is foreseen further from the measured one than this: a trend of noise must not outweigh a signal."""
 
 
-@dataclass(frozen=True, slots=True)
-class Way:
+class Way(Struct, frozen=True):
     """One way, in dBm: what is measured now, and what it will be."""
 
     now_dbm: float
     ahead_dbm: float
 
 
-@dataclass(frozen=True, slots=True)
-class PairLink:
+class PairLink(Struct, frozen=True):
     """The link of one (robot, candidate) pair: ``is_reached`` by nu, and Eq. 3's kappa in [0, 1]."""
 
     is_reached: bool

@@ -17,11 +17,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 from zsched.core.scheduler.scoring import pick
 from zsched.core.values.decision import PlayerMemory
 from zsched.core.values.model import NodeId
+from zsched.core.values.struct import Struct
 
 CHOICES = (0.05, 0.15, 0.5, 1.5)
 """The patiences that are played all the time, in seconds of the task's work."""
@@ -51,8 +51,7 @@ def spend(spent: float, lead: float, patience: float, elapsed_s: float) -> float
     return min(max(spent + elapsed_s * rate, 0.0), patience)
 
 
-@dataclass(slots=True)
-class _Player:
+class _Player(Struct):
     """One patience, with the owner that the task would have by it."""
 
     patience: float

@@ -19,11 +19,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 
 from zsched.core.values.fleet import Fleet, Standby, TaskSpec
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.plan import ReadyWhen
+from zsched.core.values.struct import Struct, field
 
 LEASE_MARGIN_S = 0.5
 """zenoh looks at its leases now and then, and a token's end has a way to go."""
@@ -32,14 +32,12 @@ LIMIT_S = 10.0
 _NONE: Mapping[NodeId, str] = {}
 
 
-@dataclass(slots=True)
-class _Return:
+class _Return(Struct):
     gone_at: float
     back_at: float = math.inf
 
 
-@dataclass(slots=True)
-class Probation:
+class Probation(Struct):
     """What one robot knows of the streams to nodes that were gone."""
 
     fleet: Fleet

@@ -9,16 +9,15 @@ not ask: whoever sees more will call it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 from zsched.core.values.model import NodeId, PeerState, UtilityVector
+from zsched.core.values.struct import Struct
 
 SAME_UTILITY = 0.02
 """Utilities that differ by less are the same: as much as a profile's figures change before it is sent at once."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Answers:
+class Answers(Struct, frozen=True, kw_only=True):
     """What all living robots have answered to one gather, our own vectors among it."""
 
     vectors: Mapping[NodeId, tuple[UtilityVector, ...]]

@@ -32,13 +32,13 @@ from zsched.core.values.decision import Decision, Figures, Need, Rules
 from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.messages import Utilities
 from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, TaskId, Tuning, UtilityVector
+from zsched.core.values.struct import Struct
 
 FRESH_MARGIN_S = 0.001
 """For the rounding of sums: a profile is surely fresh until this much before its end."""
 
 
-@dataclass(slots=True)
-class _Gather:
+class _Gather(Struct):
     number: int
     deadline: float
     expected: list[NodeId]

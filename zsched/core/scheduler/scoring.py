@@ -11,7 +11,6 @@ from __future__ import annotations
 import statistics
 from collections.abc import Iterable, Mapping
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass, field
 
 from zsched.core.gateway.demand import Demands, is_short, speed_of
 from zsched.core.gateway.gateway import Gateway
@@ -42,6 +41,7 @@ from zsched.core.values.model import (
     WorkerState,
 )
 from zsched.core.values.quorum import majority
+from zsched.core.values.struct import Struct, field
 
 Bookings = Mapping[NodeId, tuple[TaskSpec, ...]]
 """{owner: its tasks}: of a task that has just come, profiles show nothing yet."""
@@ -55,8 +55,7 @@ def rounded(aggregate: float) -> float:
 # --- score: one robot's view (Calculate_Utility) ---------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class _Terms:
+class _Terms(Struct, frozen=True):
     """Eq. 1-3 for one candidate; ``None`` where the metric is not measured. Of the gauges the weighed ones."""
 
     cpu: float | None
@@ -70,8 +69,7 @@ class _Terms:
         return frozenset((*(name for name, term in three.items() if term is not None), *self.gauges))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Doubts:
+class Doubts(Struct, frozen=True, kw_only=True):
     """Doubts about nodes that are too young, or not enough, to take a task from them."""
 
     in_grace: AbstractSet[NodeId] = frozenset()
@@ -336,8 +334,7 @@ def _memory(spec: TaskSpec, profile: Profile, demand: Demand, unseen: Demand, fo
 # --- compare: all robots' views (Compare_Utility) --------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Standing:
+class Standing(Struct, frozen=True, kw_only=True):
     """The joint view of one gather: ``aggregates`` without bonus, ``vetoed`` with reasons, and who was heard."""
 
     aggregates: Mapping[NodeId, float]

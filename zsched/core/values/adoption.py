@@ -6,10 +6,9 @@ Knows: which fields a daemon is built on for its whole life. Does not know: how 
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId
+from zsched.core.values.struct import replace
 
 
 def obstacle(old: Fleet, new: Fleet, me: NodeId) -> str:

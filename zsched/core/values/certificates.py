@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
+from zsched.core.values.struct import Struct
 from zsched.core.values.words import NAME
 
 DOMAIN: Final = "zsched.internal"
@@ -34,8 +34,7 @@ class Role(StrEnum):
     GUEST = "guest"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, order=True)
-class Holder:
+class Holder(Struct, frozen=True, kw_only=True, order=True):
     """The holder of one key: its name, its role, and the number of the key (1..9999)."""
 
     name: str

@@ -6,11 +6,11 @@ Knows: which fields of an allocation each change touches. Does not know: ballots
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Protocol, TypeVar
 
 from zsched.core.values.model import Allocation, Asked, NodeId, Pause, Pin, TaskId, Tuning, told_by
+from zsched.core.values.struct import Struct, replace
 
 _Value = TypeVar("_Value")
 
@@ -30,8 +30,7 @@ class Rewrite(Protocol[_Value]):
         """The new value, of the next revision; what was read when nothing is to change."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MoveOwner:
+class MoveOwner(Struct, frozen=True, kw_only=True):
     """Change: another owner; the epoch rises with the revision."""
 
     base_revision: int
@@ -50,8 +49,7 @@ class MoveOwner:
         return replace(read, revision=revision, epoch=epoch, owner=self.owner, asked=self.asked)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Retune:
+class Retune(Struct, frozen=True, kw_only=True):
     """Change: another tuning; owner and epoch stay, so routes do not move."""
 
     base_revision: int
@@ -74,8 +72,7 @@ class Retune:
         return replace(read, revision=read.revision + 1, tuning=self.tuning, asked=self.asked)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SetHold:
+class SetHold(Struct, frozen=True, kw_only=True):
     """Change: both of an operator's lasting orders about the task, its pause and its pin; ``None`` ends one."""
 
     base_revision: int
@@ -103,8 +100,7 @@ class SetHold:
         )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SetLeased:
+class SetLeased(Struct, frozen=True, kw_only=True):
     """Change: from now on no node works without a lease, or every node may (`zsched.core.executor.sealing`)."""
 
     base_revision: int
@@ -135,8 +131,7 @@ class RoundOutcome(StrEnum):
     UNKNOWN = "unknown"  # some elector may have it, and no majority could be asked
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Ended:
+class Ended(Struct, frozen=True, kw_only=True):
     """A change of this node has ended."""
 
     task: TaskId

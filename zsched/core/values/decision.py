@@ -8,14 +8,12 @@ seconds, because the judgement itself goes by them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from zsched.core.values.model import Allocation, NodeId, PeerState, Profile, Reach, TaskId, UtilityVector
 from zsched.core.values.snapshot import VoteStatus
+from zsched.core.values.struct import Struct
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Rules:
+class Rules(Struct, frozen=True, kw_only=True):
     """The settings of the fleet file by which a task is judged; what can be tuned stands in its allocation."""
 
     candidates: tuple[NodeId, ...]
@@ -29,8 +27,7 @@ class Rules:
     """Whether zsched starts the worker."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PlayerMemory:
+class PlayerMemory(Struct, frozen=True, kw_only=True):
     """One patience that is played, in the order of the choices (`zsched.core.scheduler.patience`)."""
 
     owner: NodeId | None = None
@@ -39,8 +36,7 @@ class PlayerMemory:
     moved_at: float | None = None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class JudgeMemory:
+class JudgeMemory(Struct, frozen=True, kw_only=True):
     """The memory that a judgement begins with (`zsched.core.scheduler.judge.Judge`)."""
 
     unscored_since: float | None = None
@@ -53,8 +49,7 @@ class JudgeMemory:
     watched_at: float | None = None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DampingMemory:
+class DampingMemory(Struct, frozen=True, kw_only=True):
     """The record of moves that a judgement begins with (`zsched.core.scheduler.damping.Damping`)."""
 
     points: tuple[tuple[NodeId, float, float], ...] = ()
@@ -63,8 +58,7 @@ class DampingMemory:
     """(when, whether it was an escape), oldest first."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Figures:
+class Figures(Struct, frozen=True, kw_only=True):
     """Everything that one judgement of one task at one robot goes by."""
 
     task: TaskId
@@ -99,8 +93,7 @@ class Figures:
     damping: DampingMemory = DampingMemory()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Verdict:
+class Verdict(Struct, frozen=True, kw_only=True):
     """A judgement as a plain value; ``aggregates`` with bonus and penalties, sorted."""
 
     outcome: str
@@ -111,8 +104,7 @@ class Verdict:
     aggregates: tuple[tuple[NodeId, float], ...] = ()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Need:
+class Need(Struct, frozen=True, kw_only=True):
     """What the task would use on one candidate, by the deciding robot's figures (cores, MiB)."""
 
     candidate: NodeId
@@ -120,8 +112,7 @@ class Need:
     memory_mb: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Decision:
+class Decision(Struct, frozen=True, kw_only=True):
     """A judgement with its figures."""
 
     figures: Figures
@@ -130,8 +121,7 @@ class Decision:
     """Of the candidates with a fresh profile."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Move:
+class Move(Struct, frozen=True, kw_only=True):
     """A change of owner that a node has learnt, or an owner that was there before the node knew of it."""
 
     epoch: int
@@ -145,8 +135,7 @@ class Move:
     """No owner has changed: it is the first that the node learns of the task since its start. ``left`` is ``None``."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Explanation:
+class Explanation(Struct, frozen=True, kw_only=True):
     """A node's answer about the last judgement of one task."""
 
     node: NodeId

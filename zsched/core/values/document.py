@@ -6,11 +6,11 @@ Knows: the fields of a document and their sizes. Does not know: what the text me
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import NewType
 
 from zsched.core.values.model import MAX_REASON, NodeId, TaskId, check_counter, check_name
+from zsched.core.values.struct import Struct
 from zsched.core.values.words import check_range
 
 Text = NewType("Text", str)
@@ -34,8 +34,7 @@ class FlagKind(StrEnum):
     LEAVE = "leave"  # as drained, and it gives its seat among the electors up
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Flag:
+class Flag(Struct, frozen=True, kw_only=True):
     """One thing that an operator has said of a node, until it is taken back or its time is over."""
 
     kind: FlagKind
@@ -58,8 +57,7 @@ class Flag:
                 raise ValueError(f"flag.{what}: longer than {MAX_REASON} characters")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Rollout:
+class Rollout(Struct, frozen=True, kw_only=True):
     """A changed worker that a few nodes run already; all others run the one of before, until an operator goes on."""
 
     task: TaskId
@@ -88,8 +86,7 @@ class Rollout:
             raise ValueError(f"rollout.command: with its environment larger than {MAX_HELD_BYTES} bytes")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Document:
+class Document(Struct, frozen=True, kw_only=True):
     """What all machines of a fleet go by, once it is agreed."""
 
     text: Text

@@ -6,14 +6,12 @@ their stages.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from zsched.core.values.electorate import FleetValue, check_id
 from zsched.core.values.model import NodeId, RegisterState
+from zsched.core.values.struct import Struct
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DurableState:
+class DurableState(Struct, frozen=True, kw_only=True):
     """Everything that a node keeps across restarts (one file, `zsched.adapters.host.state_file`)."""
 
     fleet: str

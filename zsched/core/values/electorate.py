@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
 from itertools import pairwise
 
 from zsched.core.values.model import NodeId, TaskId, check_counter, check_name
+from zsched.core.values.struct import Struct
 from zsched.core.values.words import check_range
 
 CREATION_STEP = 2**32
@@ -30,8 +30,7 @@ def check_id(field: str, value: str) -> None:
         raise ValueError(f"{field}: {value!r} is not an id (at most 32 hex digits)")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Elector:
+class Elector(Struct, frozen=True, kw_only=True):
     """One seat: a node may answer for it only with this disk. Its promises belong to this joining."""
 
     name: NodeId
@@ -50,8 +49,7 @@ class Elector:
         return self.name == name and self.disk in ("", disk)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Creation:
+class Creation(Struct, frozen=True, kw_only=True):
     """One task of the document: its register is named by task and number."""
 
     task: TaskId
@@ -68,8 +66,7 @@ class Creation:
         return self.number * CREATION_STEP
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Electorate:
+class Electorate(Struct, frozen=True, kw_only=True):
     """With whom a round counts: it belongs to one number of one generation."""
 
     generation_id: str = ""
@@ -123,8 +120,7 @@ def electorate_of(names: Iterable[NodeId]) -> Electorate:
     return Electorate(electors=tuple(Elector(name=name) for name in names))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FleetValue:
+class FleetValue(Struct, frozen=True, kw_only=True):
     """What the fleet register holds.
 
     ``revision`` rises by one with every change, ``number`` only when the electors or the lease length change.

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
 from functools import lru_cache
 from typing import Any
@@ -37,6 +37,7 @@ from zsched.core.values.model import (
     Tuning,
 )
 from zsched.core.values.plan import Direction, ReadyWhen, ServiceSettings, StreamSettings
+from zsched.core.values.struct import Struct, replace
 from zsched.core.values.words import Readings
 
 DEFAULT_SCORE = ScoreForm.SERVICE
@@ -108,8 +109,7 @@ class LocalSide:
     listen: tuple[str, ...] = key((), "Where the host's applications dial us (`peer` only).")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NodeSpec:
+class NodeSpec(Struct, frozen=True, kw_only=True):
     """One machine of the fleet file."""
 
     name: NodeId
@@ -170,8 +170,7 @@ class WorkerSpec:
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StreamRule:
+class StreamRule(Struct, frozen=True, kw_only=True):
     """One line of `inputs:`, `outputs:` or `services:`: templates with ``{robot} {node} {target} {task} {epoch}``."""
 
     direction: Direction
@@ -319,8 +318,7 @@ class Signatures(StrEnum):
     OFF = "off"  # nobody signs, and nobody looks
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Security:
+class Security(Struct, frozen=True, kw_only=True):
     """A fleet with certificates of its own authority: who is let in, besides its nodes.
 
     Names of operators and guests are of the same form as nodes' and are no node's.

@@ -10,14 +10,13 @@ profiles and in JSON.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Final
 
+from zsched.core.values.struct import Struct
 from zsched.core.values.words import GaugeName, Readings, check_range
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Gauge:
+class Gauge(Struct, frozen=True, kw_only=True):
     """One figure of a machine."""
 
     name: GaugeName

@@ -6,7 +6,6 @@ Knows: the fields of each message and their ranges. Does not know: keys, bytes, 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final, Generic, get_args
 
@@ -28,14 +27,14 @@ from zsched.core.values.model import (
     check_readings,
 )
 from zsched.core.values.rehearsal import KeepRehearsal, ReadRehearsals, Strike
+from zsched.core.values.struct import Struct, replace
 from zsched.core.values.words import Readings, check_range
 
 MAX_CERTIFICATE: Final = 4096
 """Characters of a certificate that is sent to a node; those of `zsched pki` have 900."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Prepare:
+class Prepare(Struct, frozen=True, kw_only=True):
     """Phase 1 of a round: asks an elector to promise ``ballot`` (Synod, phase 1a)."""
 
     task: TaskId
@@ -51,8 +50,7 @@ class Prepare:
         check_name("prepare.task", self.task)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Promise(Generic[V]):
+class Promise(Struct, Generic[V], frozen=True, kw_only=True):
     """An elector's yes to a `Prepare`: persisted, with its earlier acceptance (Synod, phase 1b)."""
 
     elector: NodeId
@@ -68,8 +66,7 @@ class Promise(Generic[V]):
         check_name("promise.task", self.task)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Accept(Generic[V]):
+class Accept(Struct, Generic[V], frozen=True, kw_only=True):
     """Phase 2 of a round: asks an elector to accept ``acceptance`` (Synod, phase 2a)."""
 
     task: TaskId
@@ -85,8 +82,7 @@ class Accept(Generic[V]):
             raise ValueError(f"accept: value of {self.acceptance.value.task!r} for task {self.task!r}")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Accepted:
+class Accepted(Struct, frozen=True, kw_only=True):
     """An elector's yes to an `Accept`: persisted (Synod, phase 2b)."""
 
     elector: NodeId
@@ -115,8 +111,7 @@ class Refusal(StrEnum):
     YOUNG = "young"  # it has just started, and asks the others first what they remember of it
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Refused:
+class Refused(Struct, frozen=True, kw_only=True):
     """An elector's no; ``promised`` tells the proposer which counter to beat."""
 
     elector: NodeId
@@ -138,8 +133,7 @@ MOST_BALLOTS = 24
 """Tasks of one `Ballots`, so that no batch of the largest questions and answers is too large for a frame."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Ballots:
+class Ballots(Struct, frozen=True, kw_only=True):
     """Questions of several tasks' registers to an elector, in one frame: each counts as if it had come alone.
 
     Only identity rounds travel so, and only at their first try: an elector of an older version does not read it.
@@ -152,8 +146,7 @@ class Ballots:
         _check_batch("ballots", len(self.prepares) + len(self.accepts))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Votes:
+class Votes(Struct, frozen=True, kw_only=True):
     """One elector's answers to `Ballots`; a question that it would not answer alone has none here."""
 
     promises: tuple[Promise, ...] = ()
@@ -198,8 +191,7 @@ def votes_of(answers: Iterable[Promise | Accepted | Refused]) -> Votes:
     return Votes(promises=tuple(promises), accepted=tuple(accepted), refused=tuple(refused))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FleetQuestion:
+class FleetQuestion(Struct, frozen=True, kw_only=True):
     """A question of the fleet register to an elector: one of the two."""
 
     prepare: Prepare | None = None
@@ -228,8 +220,7 @@ def fleet_question(content: Prepare | Accept[FleetValue]) -> FleetQuestion:
     return FleetQuestion(prepare=content) if isinstance(content, Prepare) else FleetQuestion(accept=content)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FleetAnswer:
+class FleetAnswer(Struct, frozen=True, kw_only=True):
     """An elector's answer to a `FleetQuestion`: one of the three."""
 
     promise: Promise[FleetValue] | None = None
@@ -255,8 +246,7 @@ def fleet_answer(content: Promise[FleetValue] | Accepted | Refused) -> FleetAnsw
     return FleetAnswer(refused=content) if isinstance(content, Refused) else FleetAnswer(promise=content)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AskDocument:
+class AskDocument(Struct, frozen=True, kw_only=True):
     """Asks a node for the document with this hash; the answer is the `Document`, or nothing."""
 
     document: str
@@ -265,8 +255,7 @@ class AskDocument:
         check_id("ask_document.document", self.document)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Learnt:
+class Learnt(Struct, frozen=True, kw_only=True):
     """Register values that ``node`` has learnt, one per task; sent on every change and to late joiners."""
 
     node: NodeId
@@ -296,8 +285,7 @@ class Learnt:
         check_counter("learnt.generation", self.generation)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Utilities:
+class Utilities(Struct, frozen=True, kw_only=True):
     """A robot's answer to a gather: its vectors for all tasks."""
 
     voter: NodeId
@@ -307,8 +295,7 @@ class Utilities:
         check_name("utilities.voter", self.voter)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SetWeights:
+class SetWeights(Struct, frozen=True, kw_only=True):
     """Operator command: change Eq. 4's weights of one task on the whole fleet, through the register.
 
     ``base_revision`` is the revision the operator saw; ``None`` means "whatever is current at this node".
@@ -329,8 +316,7 @@ class SetWeights:
         check_readings("weights", self.gauges, 0.0, 1.0)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RetryTask:
+class RetryTask(Struct, frozen=True, kw_only=True):
     """Operator command to one node: forget the consequences of failures of the task's workers.
 
     Sent to every node, since each remembers others. ``node`` is the node whose failures are meant; empty means all.
@@ -347,8 +333,7 @@ class RetryTask:
             check_name("retry.node", self.node)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ExplainTask:
+class ExplainTask(Struct, frozen=True, kw_only=True):
     """Operator question to one node: its last judgement of a task, with every figure."""
 
     task: TaskId
@@ -357,8 +342,7 @@ class ExplainTask:
         check_name("explain.task", self.task)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RestartTask:
+class RestartTask(Struct, frozen=True, kw_only=True):
     """Operator command to one node: stop its worker for the task, and start it again."""
 
     task: TaskId
@@ -369,8 +353,7 @@ class RestartTask:
         check_name("restart.task", self.task)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TakeCertificate:
+class TakeCertificate(Struct, frozen=True, kw_only=True):
     """Operator command to one node: go by a newer certificate for the key that it has.
 
     Nobody needs to be trusted for it: the node looks at the authority's signature.
@@ -384,8 +367,7 @@ class TakeCertificate:
             raise ValueError(f"certificate: {len(self.certificate)} characters, at most {MAX_CERTIFICATE}")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReadLines:
+class ReadLines(Struct, frozen=True, kw_only=True):
     """Operator's question to one node: what its worker for the task has printed behind line ``after``."""
 
     task: TaskId
@@ -396,8 +378,7 @@ class ReadLines:
         check_counter("lines.after", self.after)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ChangeFleet:
+class ChangeFleet(Struct, frozen=True, kw_only=True):
     """Operator command to one node: commit one change of the fleet. Exactly one of the three changes is given.
 
     The answer comes when a majority of the electors has the change; settling them may go on after that.
@@ -425,16 +406,14 @@ class ChangeFleet:
             raise ValueError(f"fleet.disk: {self.add_elector} needs the id of its disk")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReadFleet:
+class ReadFleet(Struct, frozen=True, kw_only=True):
     """Operator's question to one node: by which fleet value and document it goes."""
 
     with_document: bool = True
     """Tell the document itself, too: it may be large."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MoveTask:
+class MoveTask(Struct, frozen=True, kw_only=True):
     """Operator command: hand a task over to a candidate, through the register."""
 
     task: TaskId
@@ -460,8 +439,7 @@ class Hold(StrEnum):
     UNPIN = "unpin"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class HoldTask:
+class HoldTask(Struct, frozen=True, kw_only=True):
     """Operator command: give a lasting order about a task, or end it, through the register."""
 
     task: TaskId
@@ -480,8 +458,7 @@ class HoldTask:
         check_range("hold.for_s", self.for_s, 1.0, MAX_FOR_S)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TuneTask:
+class TuneTask(Struct, frozen=True, kw_only=True):
     """Operator command: another tuning of a task, made of that of ``base_revision``, through the register."""
 
     task: TaskId
@@ -513,8 +490,7 @@ Command = (
 COMMANDS: tuple[type, ...] = get_args(Command)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FleetTold:
+class FleetTold(Struct, frozen=True, kw_only=True):
     """The answer to `ReadFleet`."""
 
     node: NodeId
@@ -532,8 +508,7 @@ class FleetTold:
         check_id("fleet_told.disk", self.disk)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WorkerLine:
+class WorkerLine(Struct, frozen=True, kw_only=True):
     """One line that a worker has printed."""
 
     number: int
@@ -542,8 +517,7 @@ class WorkerLine:
     text: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WorkerLines:
+class WorkerLines(Struct, frozen=True, kw_only=True):
     """The answer to `ReadLines`: the oldest lines behind the one that was named, as many as fit."""
 
     node: NodeId
@@ -570,8 +544,7 @@ class CommandOutcome(StrEnum):
     UNKNOWN = "unknown"  # the round's outcome is not known; ask status
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CommandResult:
+class CommandResult(Struct, frozen=True, kw_only=True):
     """The answer to an operator's command."""
 
     outcome: CommandOutcome

@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
+from zsched.core.values.struct import Struct
 from zsched.core.values.words import MAX_ASKED, MAX_ASKER, NAME, PAPER_METRICS, Readings, check_range
 
 NodeId = str
@@ -115,8 +115,7 @@ class PairReading(StrEnum):
 # --- what an operator sets -------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Weights:
+class Weights(Struct, frozen=True, kw_only=True):
     """The weights of Eq. 4 and of the gauges: each in [0, 1], their sum 1 (to 1e-6).
 
     An older program reads no ``gauges``. It drops a frame with such weights, since the other weights' sum is not 1.
@@ -157,8 +156,7 @@ MIN_DEADLINE_MS, MAX_DEADLINE_MS = 1.0, 3.6e6
 MAX_PATIENCE, MAX_MOVES_PER_MINUTE, MAX_MEMORY_FLOOR, MAX_FORESEE_S = 1000.0, 100_000, 0.9, 30.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Tuning:
+class Tuning(Struct, frozen=True, kw_only=True):
     """The settings that may change on the running fleet, agreed through the register like an allocation.
 
     ``bonus`` is added to the owner's aggregate (APPLY_COST of Alg. 2), in utility units [0, 1]; ``cool_down_s`` is the
@@ -200,8 +198,7 @@ class Tuning:
         check_range("foresee_s", self.foresee_s, 0.0, MAX_FORESEE_S)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Asked:
+class Asked(Struct, frozen=True, kw_only=True):
     """Who ordered a change, and why; ``by`` is user@node as that node told it, for people."""
 
     by: str
@@ -226,8 +223,7 @@ def _check_text(field: str, text: str, longest: int) -> None:
         raise ValueError(f"{field}: {len(text)} characters, at most {longest}")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Pause:
+class Pause(Struct, frozen=True, kw_only=True):
     """An operator's order: nothing moves the task but a `move`, and a dead owner is not replaced."""
 
     asked: Asked
@@ -241,8 +237,7 @@ class Pause:
         check_range("pause.for_s", self.for_s, 1.0, MAX_FOR_S)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Pin:
+class Pin(Struct, frozen=True, kw_only=True):
     """An operator's order: the task belongs on ``node`` and moves for an escape only, or (hard) for nothing."""
 
     node: NodeId
@@ -271,8 +266,7 @@ class LinkSource(StrEnum):
     TRACE = "trace"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Link:
+class Link(Struct, frozen=True, kw_only=True):
     """One radio or wired link as its node measures it.
 
     ``peer`` is the node at the other end, or ``None`` for "the way to everybody" (the access point, the cable).
@@ -305,8 +299,7 @@ class WorkerState(StrEnum):
     FAILED = "failed"  # too many failures in the window, or it said that it cannot: the node is not eligible
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Jobs:
+class Jobs(Struct, frozen=True, kw_only=True):
     """A worker's report of its jobs, smoothed (`zsched.core.profile.jobs`).
 
     A job is one input sample and its callback. Times are seconds per job, means over the done jobs; rates are jobs per
@@ -351,8 +344,7 @@ class Renewal(StrEnum):
     LEAVES = "leaves"  # as the owner it gives the task away first
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WorkerLoad:
+class WorkerLoad(Struct, frozen=True, kw_only=True):
     """One task's worker on one node: its state and what its process tree uses now (cores, MiB)."""
 
     task: TaskId
@@ -376,8 +368,7 @@ class WorkerLoad:
         check_range("worker.wanted_cores", self.wanted_cores, 0.0, MAX_CPU_CORES)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TaskProgress:
+class TaskProgress(Struct, frozen=True, kw_only=True):
     """A robot's view of a task with `output_deadline_s`: do its inputs of ``epoch`` lead to outputs?"""
 
     task: TaskId
@@ -389,8 +380,7 @@ class TaskProgress:
         check_counter("progress.epoch", self.epoch)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DeviceSample:
+class DeviceSample(Struct, frozen=True, kw_only=True):
     """One raw reading of this machine by the device profiler.
 
     ``cpu_cores`` is what may be used (cgroup quota or number of CPUs), ``cpu_used_cores`` what was in use since the
@@ -414,8 +404,7 @@ class DeviceSample:
     """The newest readings of its gauges, raw."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LinkSample:
+class LinkSample(Struct, frozen=True, kw_only=True):
     """One raw reading of one link by a network profiler, with outliers and without smoothing."""
 
     source: LinkSource
@@ -428,8 +417,7 @@ class LinkSample:
 MAX_HELD_S = 3600.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Echo:
+class Echo(Struct, frozen=True, kw_only=True):
     """The newest profile that the sender has of another node, and how long it has held it."""
 
     node: NodeId
@@ -444,8 +432,7 @@ class Echo:
         check_range("echo.held_s", self.held_s, 0.0, MAX_HELD_S)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Profile:
+class Profile(Struct, frozen=True, kw_only=True):
     """The smoothed state of a node that goes to every robot's gateway (Alg. 1: beta, mu, lambda).
 
     CPU in cores: ``cpu_cores`` is Eq. 1's gamma, ``cpu_used_cores`` its beta. Memory in MiB: ``memory_mb`` is Eq. 2's
@@ -508,8 +495,7 @@ class Profile:
 # --- SCHEDULER -------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Utility:
+class Utility(Struct, frozen=True, kw_only=True):
     """One robot's score of one candidate: Eq. 4 and its terms, each in [0, 1] or absent (nobody measured it)."""
 
     candidate: NodeId
@@ -535,8 +521,7 @@ class Utility:
         return {"cpu": self.cpu, "memory": self.memory, "network": self.network, **dict(self.gauges)}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class UtilityVector:
+class UtilityVector(Struct, frozen=True, kw_only=True):
     """One robot's utilities of a task's candidates, in the candidates' order, under the tuning of ``revision``."""
 
     voter: NodeId
@@ -556,8 +541,7 @@ class UtilityVector:
             check_range("vector.penalties", penalty, 0.0, 1.0)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Proposal:
+class Proposal(Struct, frozen=True, kw_only=True):
     """One robot's ballot paper in Alg. 3: who should own ``task``, judged at ``base_revision``.
 
     ``aggregate`` is the joint utility that the robot computed for the candidate (a tie-break, rounded to 1/256);
@@ -583,8 +567,7 @@ class Proposal:
 # --- VOTE: the register ----------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Allocation:
+class Allocation(Struct, frozen=True, kw_only=True):
     """The register's value: who owns the task, and how it is tuned.
 
     ``revision`` rises by one with every change, ``epoch`` only when ``owner`` changes. Revision 0 is "nothing agreed
@@ -627,8 +610,7 @@ class Allocation:
             check_name("allocation.owner", self.owner)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, order=True)
-class Ballot:
+class Ballot(Struct, frozen=True, kw_only=True, order=True):
     """A proposer's attempt, totally ordered by (counter, node, incarnation, disk)."""
 
     counter: int
@@ -667,16 +649,14 @@ else:
 """What a register holds; a generic value that is named without it is of a task's register."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Acceptance(Generic[V]):
+class Acceptance(Struct, Generic[V], frozen=True, kw_only=True):
     """What an elector has accepted: a value under a ballot."""
 
     ballot: Ballot
     value: V
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RegisterState(Generic[V]):
+class RegisterState(Struct, Generic[V], frozen=True, kw_only=True):
     """The durable part of one register on one node; written before any answer leaves."""
 
     task: TaskId
@@ -699,8 +679,7 @@ class PeerState(StrEnum):
     GONE = "gone"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Grant:
+class Grant(Struct, frozen=True, kw_only=True):
     """An exclusive task's lease in numbers: beat ``number`` of ``owner``'s life ``incarnation``, working in ``epoch``.
 
     In an elector's beat it is the grant (an echo); in the owner's, a release of all numbers up to this one.
@@ -720,8 +699,7 @@ class Grant:
         check_counter("grant.number", self.number)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Beat:
+class Beat(Struct, frozen=True, kw_only=True):
     """The heartbeat, sent from the decision loop itself (a wedged loop stops it; zenoh's own keep-alives go on)."""
 
     node: NodeId

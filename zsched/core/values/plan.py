@@ -10,6 +10,7 @@ from enum import StrEnum
 
 from zsched.core.values.limits import Range, check_ranges, key
 from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.struct import Struct
 
 
 class Direction(StrEnum):
@@ -103,8 +104,7 @@ class ServiceSettings:
         check_ranges(self)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Route:
+class Route(Struct, frozen=True, kw_only=True):
     """One stream of one robot for one owner, with every placeholder filled in (concrete key expressions)."""
 
     stream: str
@@ -117,8 +117,7 @@ class Route:
     """Services only."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Slot:
+class Slot(Struct, frozen=True, kw_only=True):
     """The routes of one task towards one owner in one epoch."""
 
     epoch: int
@@ -135,8 +134,7 @@ class RoutePhase(StrEnum):
     CLOSE = "close"  # drop every old slot
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RoutePlan:
+class RoutePlan(Struct, frozen=True, kw_only=True):
     """What this node's relay shall do for one task; the newest plan of a task replaces the previous one whole.
 
     ``predecessors`` are the slots that were left and have not drained, the oldest first, and last the one that carries
@@ -159,8 +157,7 @@ class WorkerRole(StrEnum):
     DRAINING = "draining"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Role:
+class Role(Struct, frozen=True, kw_only=True):
     """The role of this node's worker for one task; ``epoch`` is 0 while idle.
 
     ``predecessor`` is the owner of the epoch before, whose worker may still have a snapshot of its state; ``None`` when
@@ -177,8 +174,7 @@ class Role:
     predecessor: NodeId | None = None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StreamCount:
+class StreamCount(Struct, frozen=True, kw_only=True):
     """Counters of one stream since the relay started."""
 
     stream: str

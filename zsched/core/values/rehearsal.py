@@ -5,12 +5,12 @@ Knows: fields and their ranges. Does not know: which step comes when (`zsched.co
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
 from zsched.core.values.document import Text
 from zsched.core.values.model import MAX_REASON, Asked, NodeId, TaskId, check_name
+from zsched.core.values.struct import Struct
 from zsched.core.values.words import check_range
 
 MAX_CUT_S: Final = 60.0
@@ -33,8 +33,7 @@ FAULTS: Final = (Step.WORKER, Step.DAEMON, Step.LINK)
 """The steps that the owner's node carries out itself."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Promised:
+class Promised(Struct, frozen=True, kw_only=True):
     """What the documents promise of one step, for one task of one fleet file."""
 
     step: Step
@@ -46,8 +45,7 @@ class Promised:
     """The streams that lose nothing."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Strike:
+class Strike(Struct, frozen=True, kw_only=True):
     """Operator command to the owner: do this to yourself, so that the operator sees what the fleet makes of it."""
 
     task: TaskId
@@ -65,8 +63,7 @@ class Strike:
             raise ValueError(f"strike.step: {self.step} is not done by a node to itself")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class KeepRehearsal:
+class KeepRehearsal(Struct, frozen=True, kw_only=True):
     """Operator command to one node: keep what a rehearsal has found."""
 
     task: TaskId
@@ -87,8 +84,7 @@ class KeepRehearsal:
             raise ValueError(f"rehearsal.body: larger than {MAX_KEPT_BYTES} bytes")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReadRehearsals:
+class ReadRehearsals(Struct, frozen=True, kw_only=True):
     """Operator's question to one node: what it promises for a task, or what it has kept."""
 
     task: TaskId = ""
@@ -103,8 +99,7 @@ class ReadRehearsals:
             check_name("rehearsals.name", self.name)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RehearsalsTold:
+class RehearsalsTold(Struct, frozen=True, kw_only=True):
     """The answer to `ReadRehearsals`."""
 
     node: NodeId

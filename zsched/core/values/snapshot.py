@@ -8,11 +8,11 @@ Fields are only ever added within a major version of the schema. Times are ages 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import StrEnum
 
 from zsched.core.values.model import Link, NodeId, TaskId, Tuning, Utility, WorkerLoad
 from zsched.core.values.plan import StreamCount
+from zsched.core.values.struct import Struct
 from zsched.core.values.words import Readings
 
 SCHEMA = "zsched.status/1"
@@ -31,8 +31,7 @@ class Exposure(StrEnum):
     """Everybody in the node's network."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FlagStatus:
+class FlagStatus(Struct, frozen=True, kw_only=True):
     """What an operator has said of a node, as the answering node knows it."""
 
     kind: str
@@ -46,8 +45,7 @@ class FlagStatus:
     """How long it lasts; ``None``: until it is taken back."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NodeStatus:
+class NodeStatus(Struct, frozen=True, kw_only=True):
     """One node as the answering node sees it; ratios in [0, 1], ``None`` when not measured."""
 
     name: NodeId
@@ -75,8 +73,7 @@ class NodeStatus:
     """Of the measured ones: GPU in use and battery in [0, 1], temperature in °C."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DecisionStatus:
+class DecisionStatus(Struct, frozen=True, kw_only=True):
     """The last round of one task at this robot."""
 
     outcome: str
@@ -95,8 +92,7 @@ class DecisionStatus:
     """Robots whose utilities did not come in time."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class VoteStatus:
+class VoteStatus(Struct, frozen=True, kw_only=True):
     """The last vote of one task that this node heard: who proposed whom, and the outcome."""
 
     base_revision: int
@@ -106,8 +102,7 @@ class VoteStatus:
     age_s: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class HoldStatus:
+class HoldStatus(Struct, frozen=True, kw_only=True):
     """An operator's pause or pin of a task, as the answering node knows it."""
 
     by: str
@@ -123,8 +118,7 @@ class HoldStatus:
     """A pin: no other node gets the task."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RolloutStatus:
+class RolloutStatus(Struct, frozen=True, kw_only=True):
     """A task whose changed worker only some nodes run, until an operator goes on, as the answering node knows it."""
 
     by: str
@@ -138,8 +132,7 @@ class RolloutStatus:
     """These run the worker of before."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PastAllocation:
+class PastAllocation(Struct, frozen=True, kw_only=True):
     """One allocation that this node has learnt since it started."""
 
     epoch: int
@@ -151,8 +144,7 @@ class PastAllocation:
     """The operator who ordered it, user@node; empty: the fleet decided it."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TaskStatus:
+class TaskStatus(Struct, frozen=True, kw_only=True):
     """One task as this node sees it."""
 
     name: TaskId
@@ -189,8 +181,7 @@ class TaskStatus:
     one of this owner; ``None``: this owner has not answered yet, no other one answered before, or it is an edge."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class QuorumStatus:
+class QuorumStatus(Struct, frozen=True, kw_only=True):
     """Whether a change could be committed now, as far as this node knows."""
 
     electors: int
@@ -222,8 +213,7 @@ class QuorumStatus:
     """The node on which that generation was recovered; empty: it was founded."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Snapshot:
+class Snapshot(Struct, frozen=True, kw_only=True):
     """The whole answer."""
 
     schema: str

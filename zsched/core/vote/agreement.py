@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import replace
 from random import Random
 from types import MappingProxyType
 
@@ -48,6 +47,7 @@ from zsched.core.values.model import (
     TaskId,
     Weights,
 )
+from zsched.core.values.struct import replace
 from zsched.core.vote.belief import GENERATION_STEP, MAX_GENERATION, is_fit, is_proven
 from zsched.core.vote.generations import way_out
 from zsched.core.vote.lease import Leases, hold_s

@@ -12,9 +12,9 @@ machine is not noticed.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 from zsched.core.events import ClockCompared
+from zsched.core.values.struct import Struct
 from zsched.core.vote.lease import RHO
 
 JUMP_S = 1e-3
@@ -28,8 +28,7 @@ def is_bad(event: ClockCompared) -> bool:
     return abs(event.error_ratio) > RHO or abs(event.jump_s) > JUMP_S + RHO * event.since_s
 
 
-@dataclass(slots=True)
-class ClockDoubt:
+class ClockDoubt(Struct):
     """Decides whether this machine's clock is in doubt."""
 
     complaint: str | None = None

@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 
 from zsched.core.values.change import SetHold
 from zsched.core.values.model import Allocation, TaskId
+from zsched.core.values.struct import Struct, field
 
 SPREAD_S = 0.5
 """A node proposes the end this much later than the node before it in the fleet file: usually one proposal is enough."""
@@ -22,8 +22,7 @@ AGAIN_S = 5.0
 """The end of an order that was not agreed is proposed again after this time."""
 
 
-@dataclass(slots=True)
-class Expiry:
+class Expiry(Struct):
     """All tasks' orders at one node.
 
     ``rank`` is this node's place in the fleet file. Times are monotonic seconds.

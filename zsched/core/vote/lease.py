@@ -41,6 +41,7 @@ from dataclasses import dataclass, field
 from zsched.core.values.fleet import Fleet, lease_terms
 from zsched.core.values.model import Allocation, Beat, Grant, NodeId, TaskId
 from zsched.core.values.quorum import majority
+from zsched.core.values.struct import Struct
 
 RHO = 1e-3
 """Bound on the relative difference of two clocks' rates (a crystal is within 1e-4)."""
@@ -278,8 +279,7 @@ class Holder:
         )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BeatParts:
+class BeatParts(Struct, frozen=True, kw_only=True):
     """The parts of this node's beat about leases."""
 
     echoes: tuple[Grant, ...]

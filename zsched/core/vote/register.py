@@ -22,7 +22,6 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from random import Random
 from typing import Generic
@@ -33,6 +32,7 @@ from zsched.core.values.electorate import Electorate, electorate_of
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refusal, Refused
 from zsched.core.values.model import Acceptance, Ballot, NodeId, RegisterState, V
 from zsched.core.values.quorum import majority
+from zsched.core.values.struct import Struct, field, replace
 
 BACKOFF_CAP_S = 5.0
 FROM_A_PEER = "learnt from a peer"
@@ -47,8 +47,7 @@ class _Phase(StrEnum):
     ACCEPT = "accept"
 
 
-@dataclass(slots=True)
-class _Round(Generic[V]):
+class _Round(Struct, Generic[V]):
     """One proposer's attempts at one change (or, without a change, an identity round)."""
 
     change: Rewrite[V] | None

@@ -12,12 +12,13 @@ Knows: which fields differ, whose turn it is. Does not know: how a value is agre
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import fields
 from typing import Any
 
 from zsched.core.values.change import Retune
 from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.model import Allocation, NodeId, TaskId, Tuning
+from zsched.core.values.struct import Struct, field, replace
 
 RANK_S = 0.5
 """The next node in rank proposes a changed tuning of the fleet file this much later."""
@@ -25,16 +26,14 @@ AGAIN_S = 5.0
 """A changed tuning of the fleet file that found no quorum is proposed again this much later."""
 
 
-@dataclass(slots=True)
-class _Wish:
+class _Wish(Struct):
     seen: Tuning
     """The agreed tuning when the file was taken over."""
     wanted: Tuning
     at: float
 
 
-@dataclass(slots=True)
-class Retuning:
+class Retuning(Struct):
     """What one node wants changed in agreed tunings."""
 
     me: NodeId

@@ -12,12 +12,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
 from enum import StrEnum
 
 from zsched.core.scheduler.scoring import rounded
 from zsched.core.values.model import NodeId, Proposal
 from zsched.core.values.quorum import majority
+from zsched.core.values.struct import Struct
 
 
 class VoteOutcome(StrEnum):
@@ -29,8 +29,7 @@ class VoteOutcome(StrEnum):
     NO_QUORUM = "no_quorum"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Tally:
+class Tally(Struct, frozen=True, kw_only=True):
     """The count of one vote."""
 
     outcome: VoteOutcome

@@ -27,7 +27,6 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Iterable
-from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final
 
@@ -39,6 +38,7 @@ from zsched.core.relay_protocol import ERROR_ENCODING, REFUSED_ENCODING, Service
 from zsched.core.route.keyexpr import is_wild
 from zsched.core.route.wildcards import Rewriter, rewriter
 from zsched.core.values.plan import Route, StreamCount
+from zsched.core.values.struct import Struct, field
 from zsched.guard import guarded, tolerant
 from zsched.relay.services.replies import Replies
 from zsched.relay.streams.counter import StreamCounter
@@ -63,8 +63,7 @@ class _Outcome(Enum):
     TIMED_OUT = "timed out"
 
 
-@dataclass(slots=True, eq=False)
-class _Asked:
+class _Asked(Struct, eq=False):
     """One request at the owner."""
 
     key: str
@@ -74,8 +73,7 @@ class _Asked:
     """When nobody was found to answer under the key, and nobody since."""
 
 
-@dataclass(slots=True, eq=False)
-class _ServiceSlot:
+class _ServiceSlot(Struct, eq=False):
     """One owner of the service. The queriers only tell whether anybody is there: requests have their own time."""
 
     session: Session

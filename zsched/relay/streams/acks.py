@@ -11,7 +11,6 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Final
 from weakref import WeakSet
 
@@ -21,6 +20,7 @@ from zsched.clock import monotonic_s
 from zsched.core.relay_protocol import StreamAck, StreamAcks
 from zsched.core.values.fleet import Timing
 from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.struct import Struct
 from zsched.errors import WireError
 from zsched.guard import tolerant
 from zsched.hop.acknowledger import Acknowledger
@@ -139,8 +139,7 @@ class Acks:
             _log.exception("an acknowledgement failed")
 
 
-@dataclass(frozen=True, slots=True)
-class WorkerAcks:
+class WorkerAcks(Struct, frozen=True):
     """`Acks` for the streams of one slot: of its owner's worker alone."""
 
     acks: Acks

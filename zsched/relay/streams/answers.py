@@ -12,7 +12,6 @@ waits. The stream's lock guards it.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
 from typing import Final, cast
 
 import zenoh
@@ -21,6 +20,7 @@ from zenoh import Priority, Sample, SampleKind
 from zsched.core.hop.receiver import GIVE_UP_S, SourceName
 from zsched.core.hop.serial import serial_of
 from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker
+from zsched.core.values.struct import Struct, field
 from zsched.hop.acknowledger import Acknowledger
 from zsched.ipc.pipe import decode_end
 from zsched.relay.streams.counter import StreamCounter
@@ -30,8 +30,7 @@ MAX_WAITING_BYTES: Final = 32 << 20
 """Early answers of one publisher that wait; further ones are dropped here, and come again."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Resent:
+class _Resent(Struct, frozen=True):
     """What the relay reads of a sample, under the key that it was first sent on (zenoh lets nobody make a sample)."""
 
     key_expr: str
@@ -45,8 +44,7 @@ class _Resent:
     kind: SampleKind
 
 
-@dataclass(slots=True)
-class _Early:
+class _Early(Struct):
     samples: dict[int, Sample] = field(default_factory=dict)
     size: int = 0
 

@@ -20,7 +20,6 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from typing import Final
 
 import zenoh
@@ -28,6 +27,7 @@ from zenoh import CongestionControl, Sample, SampleKind, Session, Timestamp
 
 from zsched.clock import monotonic_s
 from zsched.core.hop.serial import serial_of
+from zsched.core.values.struct import Struct
 from zsched.relay.streams.lanes import Lane
 from zsched.sessions.config import DROP_WAIT_S
 from zsched.sessions.link_sockets import LinkSocket, LinkSockets, with_room
@@ -55,8 +55,7 @@ _feeders: dict[str, None] = {}
 _log = logging.getLogger("zsched.relay")
 
 
-@dataclass(slots=True, eq=False)
-class Reader:
+class Reader(Struct, eq=False):
     """A link that may lead to an application that receives the stream."""
 
     link: LinkSocket

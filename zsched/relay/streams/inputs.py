@@ -16,7 +16,6 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Final
 
 import zenoh
@@ -24,6 +23,7 @@ from zenoh import Sample, Session, Timestamp
 
 from zsched.clock import monotonic_s
 from zsched.core.values.plan import OnCrash, Route, StreamClass, StreamCount
+from zsched.core.values.struct import Struct
 from zsched.relay.streams.acks import WorkerAcks
 from zsched.relay.streams.answer_times import AnswerTimes
 from zsched.relay.streams.counter import StreamCounter
@@ -51,8 +51,7 @@ def _never(_stamp: Timestamp) -> bool:
     return False
 
 
-@dataclass(slots=True)
-class _InputSlot:
+class _InputSlot(Struct):
     outlet: Outlet
     route: Route
     epoch: int

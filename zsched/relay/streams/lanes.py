@@ -6,7 +6,6 @@ Knows: zenoh's publishers, how a sample is put on, and put again. Does not know:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final
 
 import zenoh
@@ -21,8 +20,7 @@ _Plain = zenoh.Publisher
 _SourceInfo = zenoh.SourceInfo
 
 
-@dataclass(slots=True, eq=False, kw_only=True)
-class Lane(Sender):
+class Lane(Sender, kw_only=True, eq=False):
     """A concrete key with one priority and express flag."""
 
     key: str

@@ -13,7 +13,6 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Final
 
 import zenoh
@@ -22,6 +21,7 @@ from zenoh import CongestionControl, Sample, Session, Timestamp
 from zsched.clock import monotonic_s
 from zsched.core.hop.receiver import SourceName
 from zsched.core.values.plan import HandoverRule, Route, StreamClass, StreamCount
+from zsched.core.values.struct import replace
 from zsched.guard import tolerant
 from zsched.hop.acknowledger import Acknowledger
 from zsched.ipc.pipe import decode_end

@@ -14,8 +14,9 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass, field
 from typing import Final
+
+from zsched.core.values.struct import Struct, field
 
 ADVANCED: Final = "@adv"
 MAX_PENDING: Final = 64
@@ -33,8 +34,7 @@ Publisher = tuple[str, str, str]
 """Its key, its session, its number there (or ``uhlc``)."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Question:
+class Question(Struct, frozen=True, kw_only=True):
     """One query, and what comes of it."""
 
     selector: str
@@ -44,8 +44,7 @@ class Question:
     answers: Counter[Publisher] = field(default_factory=Counter)
 
 
-@dataclass(slots=True)
-class _Unanswered:
+class _Unanswered(Struct):
     due_s: float
     tries: int = 0
 

@@ -9,7 +9,6 @@ not heard while another one is; and one ends nothing any more when something com
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field, replace
 from typing import Final
 
 from zenoh import Sample
@@ -18,6 +17,7 @@ from zsched.core.hop.receiver import Source, SourceName
 from zsched.core.hop.serial import number_near, serial_of
 from zsched.core.relay_protocol import EndMarker
 from zsched.core.route import keyexpr
+from zsched.core.values.struct import Struct, field, replace
 from zsched.relay.streams.answers import Answers
 from zsched.relay.streams.counter import StreamCounter
 from zsched.relay.streams.receive import Receiver
@@ -28,8 +28,7 @@ QUIET_S: Final = 1.0
 """A worker that has put nothing here (it was restarted) may end others' slots when nothing has come for this long."""
 
 
-@dataclass(slots=True)
-class KeyState:
+class KeyState(Struct):
     """What came on one concrete key of a slot, and what its end marker said."""
 
     name: str = ""
@@ -115,8 +114,7 @@ class KeyState:
         return max(0, self.end.count - self.last_number - 1)
 
 
-@dataclass(slots=True, eq=False)
-class Feed:
+class Feed(Struct, eq=False):
     """A subscription to an owner's output and the slot it feeds."""
 
     slot: OutputSlot
@@ -131,8 +129,7 @@ class Feed:
                 receiver.close()
 
 
-@dataclass(slots=True, eq=False)
-class OutputSlot:
+class OutputSlot(Struct, eq=False):
     """One owner's epoch: what feeds it, what waits in it, how far its handover is."""
 
     epoch: int

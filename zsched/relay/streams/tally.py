@@ -6,13 +6,13 @@ Knows: lanes. Does not know: zenoh, why anything was lost.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import fields
 
 from zsched.core.hop.sender import Sender, Sums
+from zsched.core.values.struct import Struct
 
 
-@dataclass(slots=True)
-class Tally:
+class Tally(Struct):
     """Sums over publishers that there are or were; all counts of samples."""
 
     acknowledged: int = 0

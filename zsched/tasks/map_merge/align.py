@@ -11,12 +11,12 @@ wall cells, its neighbours looked up in a distance transform instead of a tree (
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
+from zsched.core.values.struct import Struct
 from zsched.tasks.map_merge.compose import resample
 from zsched.tasks.map_merge.geometry import FloatArray, Pose2, difference
 from zsched.tasks.map_merge.grid import Grid, Mask
@@ -34,8 +34,7 @@ MAX_ICP_STEPS = 40
 _OVERLAP_POINTS = 4000
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class WallMap:
+class WallMap(Struct, frozen=True, kw_only=True, eq=False):
     """A grid prepared for alignment: wall points of its own, and lookups for the points of others.
 
     ``walls`` (N, 2) and ``known`` (M, 2, a sample) are cell centres in the map frame, in metres; ``anchors`` (N, 2) are
@@ -72,8 +71,7 @@ class WallMap:
         return np.where(inside, row * width + column, 0), inside
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Fit:
+class Fit(Struct, frozen=True, kw_only=True):
     """How well map b lies on map a under ``a_t_b``.
 
     ``score`` in [0, 1]: wall cells of b that meet a wall of a, divided by those plus the ones that lie on a's free

@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import math
 import struct
-from dataclasses import dataclass
 
 import numpy as np
 
+from zsched.core.values.struct import Struct
 from zsched.errors import WireError
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import MAX_CELLS, MAX_SIDE_CELLS, Grid
@@ -32,8 +32,7 @@ class CdrError(WireError):
     """Bytes that are no valid message; ``reason`` is one short word for a counter."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StampedTransform:
+class StampedTransform(Struct, frozen=True, kw_only=True):
     """The pose of frame ``child`` in frame ``parent`` at ``stamp_ns`` (planar part of TransformStamped)."""
 
     parent: str

@@ -12,12 +12,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
+from zsched.core.values.struct import Struct, replace
 from zsched.tasks.map_merge.geometry import FloatArray, Pose2
 from zsched.tasks.map_merge.grid import MAX_CELLS, MAX_SIDE_CELLS, OCCUPIED, UNKNOWN, Cells, Grid, same_resolution
 
@@ -29,8 +29,7 @@ Levels = npt.NDArray[np.uint8]
 """Cells shifted by one so that unknown is 0: what OpenCV can warp, dilate and pad without a special case."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Extent:
+class Extent(Struct, frozen=True, kw_only=True):
     """A rectangle of lattice cells; ``low`` inclusive, ``high`` exclusive."""
 
     low_x: int

@@ -8,10 +8,11 @@ Knows: SE(2). Does not know: grids, robots or messages.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+
+from zsched.core.values.struct import Struct
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -21,8 +22,7 @@ def wrap_angle(angle: float) -> float:
     return math.pi - (math.pi - angle) % math.tau
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Pose2:
+class Pose2(Struct, frozen=True, kw_only=True):
     """A pose in the plane: metres, and radians counter-clockwise."""
 
     x: float = 0.0

@@ -6,11 +6,11 @@ Knows: cells, resolution, the grid's place in its map frame. Does not know: byte
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
+from zsched.core.values.struct import Struct, replace
 from zsched.tasks.map_merge.geometry import FloatArray, Pose2
 
 Cells = npt.NDArray[np.int8]
@@ -29,8 +29,7 @@ MAX_ORIGIN_M = 1e8
 RESOLUTION_RANGE_M = (0.005, 5.0)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Grid:
+class Grid(Struct, frozen=True, kw_only=True, eq=False):
     """An occupancy grid as in nav_msgs/msg/OccupancyGrid.
 
     ``data`` is int8 (height, width), row 0 at the origin: -1 unknown, 0 free .. 100 occupied. ``origin`` is the pose of

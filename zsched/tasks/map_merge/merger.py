@@ -13,10 +13,11 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from enum import StrEnum
 from typing import Any
 
+from zsched.core.values.struct import Struct, field
 from zsched.tasks.map_merge.align import Fit, prepare
 from zsched.tasks.map_merge.compose import Extent, compose, extent_of
 from zsched.tasks.map_merge.geometry import Pose2
@@ -57,8 +58,7 @@ class RobotState(StrEnum):
     REFUSED = "refused"  # judged, and not accepted
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MergerSettings:
+class MergerSettings(Struct, frozen=True, kw_only=True):
     """What the operator sets; ``resolution`` of the merged map in metres per cell, ``poses`` of map frames."""
 
     mode: Mode
@@ -68,8 +68,7 @@ class MergerSettings:
     world_frame: str = "world"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RobotStatus:
+class RobotStatus(Struct, frozen=True, kw_only=True):
     """One robot's part in the newest merge; figures are ``None`` where nothing was measured.
 
     ``partner`` is the robot that the figures were measured against.
@@ -85,8 +84,7 @@ class RobotStatus:
     margin: float | None = None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class MergeResult:
+class MergeResult(Struct, frozen=True, kw_only=True, eq=False):
     """One merge: the map (``None``: nothing to publish yet), every robot's status, and the attached map frames.
 
     ``transforms`` {robot: pose of its map frame in the world}; ``inputs`` {robot: stamp_ns} of the merged grids;

@@ -17,8 +17,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
 
+from zsched.core.values.struct import Struct, replace
 from zsched.tasks.map_merge.align import Fit, WallMap, fit, refine
 from zsched.tasks.map_merge.geometry import Pose2, difference
 from zsched.tasks.map_merge.search import Estimate, estimate
@@ -39,8 +39,7 @@ CONTRADICTIONS_TO_DROP = 5
 """A kept alignment under this score, this many times in a row, is dropped: the maps say that it is wrong."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Rule:
+class Rule(Struct, frozen=True, kw_only=True):
     """The acceptance rule; ``min_agreeing`` in cells of 0.05 m."""
 
     min_score: float = 0.75
@@ -63,8 +62,7 @@ class Rule:
         return ""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Alignment:
+class Alignment(Struct, frozen=True, kw_only=True):
     """What is known about one pair: the transform in use (if accepted), or the best refused one, with its figures.
 
     ``fit.a_t_b`` is the pose of the second robot's map frame in the first's. ``reason`` says why it is refused, or for
@@ -78,8 +76,7 @@ class Alignment:
     reason: str = ""
 
 
-@dataclass(slots=True)
-class _PairState:
+class _PairState(Struct):
     """The book-keeping of one pair."""
 
     alignment: Alignment | None = None
@@ -97,8 +94,7 @@ class _PairState:
         return self.alignment if self.alignment is not None and self.alignment.is_accepted else None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class MapVersion:
+class MapVersion(Struct, frozen=True, kw_only=True, eq=False):
     """One robot's newest map, prepared, with a number that rises with every new map and its known area in m2."""
 
     number: int
@@ -106,8 +102,7 @@ class MapVersion:
     area_m2: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SearchJob:
+class SearchJob(Struct, frozen=True, kw_only=True, eq=False):
     """One search to run: pure, so it may run in any thread while merging goes on."""
 
     number: int

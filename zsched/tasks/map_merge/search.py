@@ -12,12 +12,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
+from zsched.core.values.struct import Struct
 from zsched.tasks.map_merge.align import Fit, WallMap, fit, refine
 from zsched.tasks.map_merge.compose import resample
 from zsched.tasks.map_merge.geometry import FloatArray, Pose2, difference
@@ -41,8 +41,7 @@ DISTINCT_RAD = math.radians(10.0)
 _Signal = npt.NDArray[np.float32]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Estimate:
+class Estimate(Struct, frozen=True, kw_only=True):
     """The best alignment found, and how clearly it is the best.
 
     ``margin`` = its quality over that of the next distinct candidate; ``None`` when there is no other candidate at all.
@@ -132,8 +131,7 @@ def _features(grid: Grid) -> tuple[FloatArray, npt.NDArray[np.uint8]]:
 # --- correlation -----------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class _Peak:
+class _Peak(Struct, frozen=True):
     value: float
     a_t_b: Pose2
 

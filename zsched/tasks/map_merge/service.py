@@ -17,10 +17,10 @@ import queue
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Protocol
 
+from zsched.core.values.struct import Struct
 from zsched.core.values.words import NAME
 from zsched.guard import guarded
 from zsched.tasks.map_merge.cdr import CdrError, StampedTransform, decode_grid, encode_grid, encode_transforms
@@ -77,8 +77,7 @@ class Publish(Protocol):
         """Send ``payload``."""
 
 
-@dataclass(slots=True)
-class _Input:
+class _Input(Struct):
     """What came in for one robot."""
 
     maps: int = 0
