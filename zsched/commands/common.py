@@ -32,6 +32,8 @@ NAMED_OTHERWISE: Final = {
 }
 LONGEST_SENTENCE: Final = 1000
 """Characters."""
+ARGUMENT: Final = "argument"
+"""As typer calls such a parameter."""
 MIN_WIDTH: Final = 60
 """Of what is written for people; a terminal that is narrower breaks the lines itself."""
 SCHEMAS: Final = Path(__file__).parents[1] / "schemas"
@@ -108,12 +110,37 @@ def known_majors(schema: str) -> list[str]:
     return sorted(middle for file in files if (middle := file.name[len(schema) + 1 : -len(".json")]).isdigit())
 
 
+def shown_argument(param: Any) -> str:
+    """An argument in a line of usage: ``TASK``, ``[TASK]``, ``[NODE]...``."""
+    name = str(param.metavar or param.name.upper())
+    return name if param.required or name.startswith("[") else f"[{name}]"
+
+
 class Verb(TyperCommand):
     """One verb of the command line."""
 
     def get_help_option(self, ctx: Any) -> Any:
         """As typer's."""
         return no_help_yet(super().get_help_option(ctx))
+
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        """Its arguments as they are declared: versions of typer put them into brackets in different ways."""
+        arguments = (param for param in self.get_params(ctx) if param.param_type_name == ARGUMENT)
+        return [self.options_metavar or "", *(shown_argument(param) for param in arguments)]
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Arguments and options; of an argument no type of Python's."""
+        rows: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": []}
+        for param in self.get_params(ctx):
+            record = param.get_help_record(ctx)
+            if record is not None and param.param_type_name == ARGUMENT:
+                rows["Arguments"].append((shown_argument(param), record[1]))
+            elif record is not None:
+                rows["Options"].append(record)
+        for title, found in rows.items():
+            if found:
+                with formatter.section(title):
+                    formatter.write_dl(found)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Read its options and arguments, without pydantic if possible: its import takes as long as all of `status`.

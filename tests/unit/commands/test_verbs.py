@@ -6,8 +6,10 @@ import json
 import os
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
+import typer.main
 from typer.testing import CliRunner, Result
 
 from zsched import __version__
@@ -391,3 +393,31 @@ def test_what_a_ping_found_wraps_between_words_and_leaves_an_address_whole(
     lines = capsys.readouterr().out.splitlines()
     assert (len(lines), max(map(len, lines)) <= screen) == (2, True)
     assert endpoint in lines[0]
+
+
+@pytest.mark.parametrize(
+    ("verb", "usage", "argument"),
+    [
+        ("move", "[OPTIONS] TASK NODE", "TASK"),
+        ("history", "[OPTIONS] [TASK]", "[TASK]"),
+        ("drain", "[OPTIONS] [NODE]...", "[NODE]..."),
+        ("replay", "[OPTIONS] FILE", "FILE"),
+        ("tune", "[OPTIONS] [TASK] [KEY=VALUE]...", "[KEY=VALUE]..."),
+        ("dev", "[OPTIONS] [FILE]", "[FILE]"),
+        ("status", "[OPTIONS]", ""),
+    ],
+)
+def test_help_shows_arguments_as_they_are_typed(verb: str, usage: str, argument: str) -> None:
+    told = run(verb, "--help").stdout
+    assert told.splitlines()[0] == f"Usage: zsched {verb} {usage}"
+    assert ("Arguments:" in told, f"\n  {argument}  " in told) == (bool(argument), bool(argument))
+    assert "<" not in told.partition("Options:")[0], "no type of Python's"
+
+
+def test_every_argument_of_every_verb_says_how_it_is_typed() -> None:
+    group: Any = typer.main.get_command(app)
+    verbs = list(group.commands.values())
+    verbs += [verb for one in verbs for verb in getattr(one, "commands", {}).values()]
+    arguments = [(verb.name, one) for verb in verbs for one in verb.params if one.param_type_name == "argument"]
+    assert len(arguments) > 20
+    assert [(verb, one.name) for verb, one in arguments if not one.metavar] == []
