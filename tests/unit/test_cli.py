@@ -443,6 +443,14 @@ def test_logs_shows_the_owner_s_lines_page_after_page(daemon: Daemon) -> None:
     assert ([faults(body) for body in bodies], {body["node"] for body in bodies}) == ([[], [], []], {"edge2"})
 
 
+def test_logs_of_a_worker_that_has_printed_nothing_says_so(daemon: Daemon) -> None:
+    daemon.lines = []
+    result = run("logs", "echo")
+    told = "the worker of echo on edge1 has printed nothing since the daemon there started\n"
+    assert (result.exit_code, result.stdout, result.stderr) == (0, "", told)
+    assert run("logs", "echo", "--level", "error").stderr == told.replace("nothing", "nothing at error or above")
+
+
 def test_logs_of_a_node_that_starts_no_worker_says_so(daemon: Daemon) -> None:
     daemon.is_here = False
     result = run("logs", "echo", "robot2")

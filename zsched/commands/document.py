@@ -7,6 +7,8 @@ does to the fleet (`zsched.config.difference`), how it is agreed.
 from __future__ import annotations
 
 import contextlib
+import os
+import shlex
 import sys
 import time
 from collections.abc import Sequence
@@ -14,6 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
+from zsched import paths as places
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json
@@ -90,7 +93,7 @@ def document_text(held: InForce) -> str:
         CliError: none is agreed, or this node has not fetched it yet.
     """
     if not held.document:
-        advice = "agree one: zsched apply /etc/zsched/fleet.yaml"
+        advice = f"agree one: zsched apply {shlex.quote(str(places.config_path(None, os.environ)))}"
         raise CliError(EXIT_FAILED, f"{held.fleet} goes by the file on each machine, and has no document yet; {advice}")
     if not held.text:
         advice = "ask another node with --node, or again in a moment"

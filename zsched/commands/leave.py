@@ -225,7 +225,7 @@ def _danger(way: _Way, status: Json, held: InForce, members: tuple[str, ...]) ->
         return None
     if not held.document:
         told = f"{held.fleet} goes by the file on each machine: take {me} out of it there, or agree a document first"
-        return NOT_TOLD, f"{told} (zsched apply {paths.SYSTEM_CONFIG})"
+        return NOT_TOLD, f"{told} (zsched apply {way.order.places.config})"
     if not quorum["ok"]:
         told = f"{quorum['alive']} of {quorum['electors']} electors can answer, {quorum['needed']} needed"
         return NOT_TOLD, f"{told}. The others are not told: `zsched node forget {me}` tells them"

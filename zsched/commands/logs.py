@@ -92,6 +92,9 @@ def show_logs(view: LogsView, task: str, whose: str | None) -> int:
     lines, after = _all_lines(asked, task, 0)
     lines = sieve.of(lines)
     _print(view, node, task, lines[len(lines) - min(view.most, len(lines)) :])
+    if not lines:
+        least = "" if view.level is None else f" at {view.level} or above"
+        sys.stderr.write(f"the worker of {task} on {node} has printed nothing{least} since the daemon there started\n")
     try:
         while view.is_followed:
             time.sleep(PAUSE_S)

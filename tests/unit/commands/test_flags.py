@@ -192,11 +192,12 @@ def test_with_force_the_deadline_does_not_count(daemon: Daemon) -> None:
     assert run("drain", "edge1", "--yes", "--force", "--deadline", "0s").exit_code == 0
 
 
-def test_a_fleet_without_an_agreed_document_says_what_to_do(daemon: Daemon) -> None:
+def test_a_fleet_without_an_agreed_document_says_what_to_do(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ZSCHED_CONFIG", "/my fleet.yaml")
     daemon.document = ""
     result = run("drain", "edge1", "--yes")
     assert (result.exit_code, daemon.changes) == (1, [])
-    assert "has no document yet; agree one: zsched apply" in result.stderr
+    assert result.stderr.endswith("has no document yet; agree one: zsched apply '/my fleet.yaml'\n")
 
 
 def test_an_overtaken_revision_and_an_unknown_node_are_refused(daemon: Daemon) -> None:
