@@ -7,8 +7,10 @@ let in.
 from __future__ import annotations
 
 import contextlib
+import getpass
 import os
 import sys
+import warnings
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -383,14 +385,22 @@ def _passphrase(authority: Authority) -> bytes:
         return b""
     if PASSPHRASE in os.environ:
         return os.environ[PASSPHRASE].encode()
-    text: str = typer.prompt(f"Passphrase of {authority.key_path}", hide_input=True, err=True)
-    return text.encode()
+    return _asked(f"Passphrase of {authority.key_path}")
 
 
 def _new_passphrase() -> bytes:
     if os.environ.get(PASSPHRASE):
         return os.environ[PASSPHRASE].encode()
-    text: str = typer.prompt("Passphrase of the new key", hide_input=True, confirmation_prompt=True, err=True)
+    return _asked("Passphrase of the new key", is_new=True)
+
+
+def _asked(what: str, *, is_new: bool = False) -> bytes:
+    try:
+        with warnings.catch_warnings(action="ignore", category=getpass.GetPassWarning):  # there is no terminal
+            text: str = typer.prompt(what, hide_input=True, confirmation_prompt=is_new, err=True)
+    except typer.Abort:
+        text = f"nobody has typed it ({what}): run this on a terminal, or set {PASSPHRASE}"
+        raise CliError(EXIT_FAILED, text) from None
     return text.encode()
 
 

@@ -74,6 +74,8 @@ def test_names_that_the_fleet_file_does_not_fit_are_refused_or_told(here: Path) 
 def test_a_locked_key_asks_for_its_passphrase(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pki("init", "--passphrase", told="open sesame\nopen sesame\n")
     assert "the passphrase is wrong" in pki("issue", "robot1", code=1, told="open\n").stderr
+    nobody = pki("issue", "robot1", code=1, told="").stderr  # as a timer, without a terminal
+    assert "run this on a terminal, or set ZSCHED_AUTHORITY_PASSPHRASE" in nobody
     monkeypatch.setenv("ZSCHED_AUTHORITY_PASSPHRASE", "open sesame")
     pki("issue", "robot1")
     assert (here / "robot1" / "key.pem").exists()
