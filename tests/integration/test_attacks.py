@@ -31,12 +31,14 @@ from zsched.config.load import check_file
 from zsched.core import events as ev
 from zsched.core.values.certificates import Role
 from zsched.core.values.fleet import Fleet
+from zsched.core.values.messages import Learnt
 from zsched.pki.authority import Authority
 from zsched.runtime.access_rules import Side, common_names_of, names_of
 from zsched.runtime.tls import session_text
 from zsched.sessions import config as zenoh_config
 from zsched.sessions import expulsion
 from zsched.sessions.expulsion import HOLD_S, MAX_SHOWN, Expulsion, members_of
+from zsched.wire import codec as wire
 from zsched.wire.keyspace import Keyspace
 
 FLEET = """\
@@ -326,16 +328,19 @@ def test_who_is_dialled_because_a_member_named_its_address_says_and_hears_nothin
 
 
 @contextlib.contextmanager
-def _bus(yard: Yard) -> Iterator[tuple[ControlBus, Victim, list[ev.Event]]]:
+def _bus(yard: Yard, *, has_rules: bool = True) -> Iterator[tuple[ControlBus, Victim, list[ev.Event]]]:
     """A daemon's control session, as robot1; where it listens; what it tells."""
     endpoint = free_endpoint().replace("tcp/", "tls/")
+    config = json.loads(yard.text("robot1", listen=(endpoint,)))
+    if not has_rules:
+        del config["access_control"]
     fleet, events = yard.fleet("robot1"), list[ev.Event]()
     assert fleet.security is not None
     bus = ControlBus(
         fleet="yard",
         node="robot1",
         incarnation=1,
-        zenoh_config=yard.text("robot1", listen=(endpoint,)),
+        zenoh_config=json.dumps(config),
         post=events.append,
         members=common_names_of(fleet, fleet.security),
         limit=limit_for(fleet.timing, 1),
@@ -496,6 +501,28 @@ def test_a_member_that_answers_for_another_is_not_believed(fresh: Yard) -> None:
                 return {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
 
             assert until(answers, "the member's own answer") == {own}
+
+
+def test_an_answer_in_a_name_that_is_not_the_links_is_counted_where_no_rule_stops_it(fresh: Yard) -> None:
+    """zenoh's rules drop it and tell nobody; the daemon looks itself, at what zenoh tells the link of."""
+    with _bus(fresh, has_rules=False) as (bus, victim, events), fresh.member("robot2", victim) as session:
+
+        def answer(query: zenoh.Query) -> None:
+            owner = str(query.key_expr).split("/")[3]
+            with query:
+                query.reply(str(query.key_expr), wire.encode(Learnt(node=owner, values=())))
+
+        for owner in ("edge1", "robot2"):
+            session.declare_queryable(KEYS.learnt(owner, "robot1"), answer)
+
+        def told(owner: str) -> set[str]:
+            bus.ask_learnt(owner, ANSWER_S)
+            learnt = {f"learnt/{one.learnt.node}" for one in events if isinstance(one, ev.LearntReceived)}
+            return learnt | _dropped(bus, events)
+
+        until(lambda: "allocation/link" in told("edge1"), "the answer for another is counted")
+        until(lambda: "learnt/robot2" in told("robot2"), "its own answer is taken")
+        assert "learnt/edge1" not in told("edge1")
 
 
 # --- guests and operators --------------------------------------------------------------------------------------------

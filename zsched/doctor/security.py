@@ -32,6 +32,20 @@ OWN_SOON: Final = timedelta(days=7)
 MAX_BYTES: Final = 1 << 20
 MEND: Final = "mend the file that the fleet file names under `zenoh: {config: ...}`"
 
+REFUSED: Final = {
+    "dropped_link_stranger": "links of a certificate that is not let in",
+    "dropped_link_too_many": "links of a certificate with too many sessions",
+    "dropped_data_link_stranger": "links to the relay of a certificate that is not let in",
+    "dropped_data_link_too_many": "links to the relay of a certificate with too many sessions",
+    "dropped_alive_too_many": "tokens of a node that shows too many",
+}
+UNPROVEN: Final = {
+    "_link": "answers in another name than their link's certificate",
+    "_signer": "frames that their signer may not say",
+    "_signature": "frames with a wrong signature",
+}
+"""{end of a counter's name: what it counts}."""
+
 
 def nothing_in_plain_text(scene: Scene) -> Result:
     """Whether, with TLS, this node listens with TLS only."""
@@ -164,3 +178,19 @@ def _addresses(scene: Scene, endpoint: str) -> Iterator[Address]:
     """The addresses of this machine at which an endpoint takes connections; none of a host name."""
     host = endpoint.partition("/")[2].partition("?")[0].partition("#")[0].rpartition(":")[0].strip("[]")
     yield from addresses_at(scene.root, host)
+
+
+def nobody_is_refused(scene: Scene) -> Result:
+    """Whether everybody who has linked or spoken since the daemon's start had the certificate and key for it."""
+    counters = scene.status["counters"]
+    found = [f"{told}: {counters[name]} (`{name}`)" for name, told in REFUSED.items() if counters.get(name)]
+    ends = tuple(UNPROVEN)
+    for name in sorted(counters):
+        if name.startswith("dropped_") and name not in REFUSED and name.endswith(ends) and counters[name]:
+            told = next(UNPROVEN[end] for end in ends if name.endswith(end))
+            found.append(f"{told}: {counters[name]} (`{name}`)")
+    if not found:
+        return passed("nobody was refused since it started")
+    return warned(
+        *found, fix="the daemon's log names certificate and address; a node that is new or revoked dials, too"
+    )

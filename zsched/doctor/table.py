@@ -98,6 +98,12 @@ CHECKS: Final[tuple[Check, ...]] = (
         run=security.certificates_last,
     ),
     Check(name="tls.key", asks="Does nobody but its owner read its key?", run=security.keys_are_private),
+    Check(
+        name="tls.refused",
+        asks="Was nobody refused who linked or spoke?",
+        run=security.nobody_is_refused,
+        needs=Needs.STATUS,
+    ),
     Check(name="tls.open", asks="Is it closed to the internet, or secured?", run=security.is_not_open_to_everybody),
     Check(name="worker.command", asks="Are its workers' programs there?", run=workers.commands_are_there),
     Check(name="worker.imports", asks="Do they find what they import?", run=workers.packages_are_there),

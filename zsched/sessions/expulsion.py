@@ -21,7 +21,7 @@ from typing import Final
 import zenoh
 
 from zsched.clock import monotonic_s
-from zsched.core.values.certificates import parse_common_name
+from zsched.core.values.certificates import Role, parse_common_name
 from zsched.guard import guarded, tolerant
 from zsched.sessions.link_sockets import LinkSocket, LinkSockets
 
@@ -87,6 +87,8 @@ class Expulsion:
         """{node: tokens}; whoever shows one in a node's name has its certificate."""
         self._linked: dict[str, set[str]] = {}
         """{common name: its sessions}."""
+        self._names: dict[str, str] = {}
+        """{session that is let in: its common name}."""
         self._watch = session.info.declare_link_events_listener(tolerant(self._on_link, "link"), history=True)
 
     def close(self) -> None:
@@ -105,6 +107,12 @@ class Expulsion:
         if count % MAX_SHOWN == 1:
             self._end(lambda link: self._holder(link) == node)
         return False
+
+    def contradicts(self, zid: str, node: str) -> bool:
+        """Whether a session that is linked to this one has the certificate of somebody else than ``node``."""
+        name = self._names.get(zid)
+        holder = None if name is None else parse_common_name(name, self._fleet)
+        return holder is not None and (holder.name, holder.role) != (node, Role.NODE)
 
     def _on_link(self, event: zenoh.LinkEvent) -> None:
         """Only linked nodes' names count here; zenoh's access rules check a frame's sender against its link."""
@@ -129,12 +137,14 @@ class Expulsion:
         held = self._linked.setdefault(name, set())
         if not is_present:
             held.discard(zid)
+            self._names.pop(zid, None)
             if not held:
                 del self._linked[name]
             return True
         if len(held) >= self._max_sessions and zid not in held:
             return False
         held.add(zid)
+        self._names[zid] = name
         return True
 
     def _holder(self, link: zenoh.Link) -> str:

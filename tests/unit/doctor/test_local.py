@@ -290,6 +290,18 @@ def test_what_the_daemon_names_is_told(tmp_path: Path) -> None:
     assert_finds(run("daemon.problems", scene), WARN, "the relay is down")
 
 
+def test_who_was_refused_is_told_with_the_counter(tmp_path: Path) -> None:
+    scene = scene_of(tmp_path)
+    assert run("tls.refused", scene).verdict is PASS
+    counters = {"dropped_data_link_stranger": 3, "dropped_allocation_link": 2, "dropped_beat_rate": 9}
+    refused = answer(scene, counters={**scene.status["counters"], **counters})
+    found = run("tls.refused", refused)
+    assert_finds(
+        found, WARN, "not let in: 3 (`dropped_data_link_stranger`)", "another name", "2 (`dropped_allocation_link`)"
+    )
+    assert "beat_rate" not in str(found)
+
+
 def test_a_task_without_an_owner_and_a_lost_quorum_are_found(tmp_path: Path) -> None:
     scene = scene_of(tmp_path)
     assert run("task.owners", scene).verdict is PASS

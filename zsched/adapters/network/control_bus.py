@@ -533,15 +533,16 @@ class ControlBus:
             key = parse(str(sample.key_expr))
             if not self._is_let_in("answer", "key" if key is None else key.kind, "" if key is None else key.owner):
                 return
+            replier = reply.replier_id
+            zid = "" if replier is None else str(replier.zid)
             try:
+                self._judge_link(key, zid)
                 self._judge_answer(key, sample, question)
                 value = wire.decode(sample.payload.to_bytes(), *classes)
             except WireError as error:
                 self._post(ev.FrameDropped(kind=key.kind if key is not None else "key", reason=error.reason))
                 return
             if key is not None:
-                replier = reply.replier_id
-                zid = "" if replier is None else str(replier.zid)
                 if zid and (key.owner in self._zids or len(self._zids) < MAX_LIVES):
                     self._zids[key.owner] = zid
                 on_answer(key.owner, value, zid)
@@ -572,6 +573,12 @@ class ControlBus:
         if kind not in sealing.QUESTIONS:
             return sealing.nonce()
         return self._seals.seal(Act.QUESTION, selector, payload or b"", life=0)
+
+    def _judge_link(self, key: ParsedKey | None, zid: str) -> None:
+        """An answer is in the name of the certificate at the other end of its link; of a put zenoh tells no link."""
+        if key is not None and self._expulsion is not None and self._expulsion.contradicts(zid, key.owner):
+            log.warning("an answer in the name of %s came from %s, whose certificate is another", key.owner, zid)
+            raise WireError("link", "another certificate")
 
     def _judge_answer(self, key: ParsedKey | None, sample: zenoh.Sample, question: bytes) -> None:
         if self._seals is None or key is None or key.kind not in sealing.ANSWERS:
