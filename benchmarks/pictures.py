@@ -97,7 +97,7 @@ def main() -> None:
             publisher = app.declare_publisher(key)
             stack.enter_context(at_pace(hz, partial(publisher.put, b"1" * size)))
         for file in taken(bed, given.seconds, given.out):
-            Image.open(file).convert("RGB").quantize(256).save(file, optimize=True)
+            Image.open(file).convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE).save(file, optimize=True)
             print(file)
         for columns, lines in SCREENS:
             print(f"--- top, {columns}x{lines}", zsched(bed, "top", "--once", columns=columns, lines=lines), sep="\n")

@@ -64,6 +64,7 @@ class Work:
         """The package of a tree, as `make deb` builds it."""
         if name not in self.packages:
             out = self.folder / "debs" / name
+            shutil.rmtree(out, ignore_errors=True)  # of an earlier run
             command = [sys.executable, str(tree / "package/deb/build.py"), "--out", str(out)]
             run(*command, "--work", str(REPO / "build/deb"), "--compression", self.compression, *options)
             (self.packages[name],) = out.glob("*.deb")

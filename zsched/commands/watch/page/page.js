@@ -116,7 +116,7 @@ function window_() {
 }
 function longer(view) {
   const first = Math.min(...state.moves.map((move) => seconds(move.at)), view.from);
-  return { from: Math.max(first - 30, view.to - LONGEST_S), to: view.to };
+  return { from: Math.max(first - Math.min(30, (view.to - first) / 20), view.to - LONGEST_S), to: view.to };
 }
 const across = (at, view, width) => ((at - view.from) / (view.to - view.from)) * width;
 
