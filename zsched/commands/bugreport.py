@@ -10,7 +10,6 @@ import json
 import os
 import platform
 import subprocess
-import sys
 import tarfile
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
@@ -18,9 +17,9 @@ from pathlib import Path
 from typing import Final
 
 from zsched.clock import wall_ns
-from zsched.commands.common import CliError, Json, print_json
+from zsched.commands.common import CliError, Json, print_json, say
 from zsched.commands.doctor import as_json, as_text
-from zsched.commands.page import harmless, size
+from zsched.commands.page import size
 from zsched.commands.redaction import clean, clean_json, clean_yaml, secrets_of
 from zsched.commands.versions import versions
 from zsched.config.reader import MAX_FILE_BYTES
@@ -63,7 +62,8 @@ def report(machine: Machine, file: Path | None, *, is_json: bool) -> int:
     if is_json:
         print_json(_as_json(path, members))
     else:
-        sys.stdout.write("".join(f"{harmless(line)}\n" for line in _lines(path, members)))
+        for line in _lines(path, members):
+            say(line, indent=4)
     return EXIT_OK
 
 

@@ -204,14 +204,21 @@ def say(text: str, indent: int = 2) -> None:
     sys.stdout.flush()
 
 
-def warn(text: str) -> None:
+def warn(text: str, indent: int = 2) -> None:
     """The same on stderr."""
-    sys.stderr.write(f"{_fitted(text, sys.stderr)}\n")
+    sys.stderr.write(f"{_fitted(text, sys.stderr, indent)}\n")
+    sys.stderr.flush()
 
 
-def _fitted(text: str, stream: TextIO, indent: int = 2) -> str:
-    shown = harmless(text)
-    return wrapped(shown, max(shutil.get_terminal_size().columns, MIN_WIDTH), indent) if is_screen(stream) else shown
+def _fitted(text: str, stream: TextIO, indent: int) -> str:
+    shown, width = harmless(text), screen_width(stream)
+    return shown if width is None else wrapped(shown, width, indent)
+
+
+def screen_width(stream: TextIO | None = None) -> int | None:
+    """How many columns there are for people (of stdout, if no other is meant); ``None``: nobody looks."""
+    is_seen = is_screen(sys.stdout if stream is None else stream)
+    return max(shutil.get_terminal_size().columns, MIN_WIDTH) if is_seen else None
 
 
 def is_screen(stream: TextIO) -> bool:

@@ -70,6 +70,11 @@ class Page:
         self.lines.append(line.rstrip())
 
 
+def counted(number: int, noun: str) -> str:
+    """``1 message``, ``2 messages``."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
 def harmless(text: str) -> str:
     """The text with every character that a terminal would obey, but line ends and tabs, replaced by ``?``."""
     return text if text.isprintable() else "".join(c if c.isprintable() or c in "\n\t" else "?" for c in text)

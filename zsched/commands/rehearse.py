@@ -20,11 +20,11 @@ from typing import Any, Final, TypeVar
 from zsched import paths as places
 from zsched.clock import monotonic_s, wall_s
 from zsched.commands.ask import Door, ask_door
-from zsched.commands.common import CliError, Json, nearest, print_json
+from zsched.commands.common import CliError, Json, nearest, print_json, screen_width, warn
 from zsched.commands.document import IN_FORCE_S, document_text, in_force
 from zsched.commands.flags import drain_quietly, is_given_by, lift_quietly
 from zsched.commands.orders import OrderView, Row, begin, user_name
-from zsched.commands.page import harmless
+from zsched.commands.page import counted, harmless
 from zsched.commands.rehearse_report import SCHEMA, as_json, table
 from zsched.commands.wait import Condition, missing
 from zsched.core.rehearsal.programme import MIN_CALM_S, Do, Lift, Look, Over, Programme, Result, Sight
@@ -109,7 +109,7 @@ def show_kept(door: Door, name: str | None, *, is_json: bool) -> int:
     if is_json:
         print_json({"schema": SCHEMA, "node": told["node"], "names": names, "rehearsal": kept})
     elif kept is not None:
-        sys.stdout.write(table(kept))
+        sys.stdout.write(table(kept, screen_width()))
     elif not names:
         sys.stdout.write(f"{told['node']} has kept no rehearsal\n")
     else:
@@ -197,7 +197,7 @@ def _play(view: OrderView, order: RehearseOrder, stage: Stage) -> int:
     if view.is_json:
         print_json({"schema": SCHEMA, "node": kept_by, "names": [stage.name], "rehearsal": body})
     else:
-        sys.stdout.write(table(body))
+        sys.stdout.write(table(body, screen_width()))
     if over.is_kept:
         return EXIT_OK
     return EXIT_FAILED if any(result.broken for result in programme.results) and not interrupted else EXIT_TIMED_OUT
@@ -247,8 +247,7 @@ def _run(programme: Programme, stage: Stage) -> Over:
 
 
 def _say(text: str) -> None:
-    sys.stderr.write(f"{harmless(text)}\n")
-    sys.stderr.flush()
+    warn(text, indent=4)
 
 
 def _line(result: Result) -> str:
@@ -556,7 +555,7 @@ class Stage:
 def _told(body: Json) -> str:
     done = sum(1 for one in body["steps_done"] if not one["left_out"])
     word = "every promise was kept" if body["is_kept"] else str(body["why"])
-    return f"{done} steps, {word}; `zsched rehearse --show {body['id']}`"
+    return f"{counted(done, 'step')}, {word}; `zsched rehearse --show {body['id']}`"
 
 
 def _promised(one: Json) -> Promised:

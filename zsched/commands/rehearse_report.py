@@ -11,13 +11,15 @@ from typing import Final
 
 from zsched.commands.common import Json
 from zsched.commands.history import wall_text
-from zsched.commands.page import harmless
+from zsched.commands.page import cut, harmless, wrapped
 from zsched.core.rehearsal.programme import TELLS_S, Over, Result
 from zsched.core.values.rehearsal import Promised, Step
 
 SCHEMA: Final = "zsched.rehearse/1"
 COUNTS: Final = ("lost", "at most lost", "doubled")
+LEFT_OUT: Final = "left out"
 HEADS: Final = ("STEP", "WHAT", "WHERE", "P50", "MAX", "N", "USUAL", "PROMISED", "RESULT")
+WHERE: Final = HEADS.index("WHERE")
 
 
 def as_json(
@@ -82,7 +84,7 @@ def rows(results: Sequence[Result], promised: Mapping[Step, Promised]) -> Iterat
         of_step = [result for result in results if result.step is step]
         done = [result for result in of_step if not result.left_out]
         if not done:
-            yield _row(step, "left out", of_step[0].left_out, [], None, None)
+            yield _row(step, LEFT_OUT, of_step[0].left_out, [], None, None)
             continue
         promise = promised[step]
         for robot, stream in sorted({(gap.robot, gap.stream) for result in done for gap in result.gaps}):
@@ -129,16 +131,32 @@ def _counts(step: Step, what: str, values: Sequence[int], done: Sequence[Result]
 # --- text ------------------------------------------------------------------------------------------------------------
 
 
-def table(body: Json) -> str:
-    """The outcome for people."""
+def table(body: Json, width: int | None) -> str:
+    """The outcome for people, in ``width`` columns; ``None``: as many as it takes.
+
+    What was left out stands below, for why takes a sentence.
+    """
     verdict = "every promise was kept" if body["is_kept"] else f"STOPPED: {body['why']}"
     head = (
         f"rehearsal {body['id']} of {body['task']}, {body['at']}, by {body['by']}, timing {body['timing']}: {verdict}"
     )
-    cells = [HEADS, *(_cells(row) for row in body["rows"])]
+    played = [row for row in body["rows"] if row["what"] != LEFT_OUT]
+    lines = list(_lines([HEADS, *map(_cells, played)], width)) if played else []
+    left_out = [f"{row['step']} left out: {row['where']}" for row in body["rows"] if row["what"] == LEFT_OUT]
+    told = [harmless(line) for line in (head, *lines, *left_out, str(body["way_back"]))]
+    return "\n".join(told if width is None else [wrapped(line, width) for line in told]) + "\n"
+
+
+def _lines(cells: Sequence[tuple[str, ...]], width: int | None) -> Iterator[str]:
+    """The cells as columns; where they are too wide, columns are closer, and what WHERE says is cut."""
     widths = [max(len(line[at]) for line in cells) for at in range(len(HEADS))]
-    lines = ["  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in cells]
-    return "\n".join(harmless(line) for line in (head, *lines, str(body["way_back"]))) + "\n"
+    gap = "  "
+    if width is not None and sum(widths) + len(gap) * (len(widths) - 1) > width:
+        gap = " "
+        rest = sum(widths) - widths[WHERE] + len(widths) - 1
+        widths[WHERE] = min(widths[WHERE], max(width - rest, len(HEADS[WHERE])))
+    for line in cells:
+        yield gap.join(cut(cell, wide).ljust(wide) for cell, wide in zip(line, widths, strict=True)).rstrip()
 
 
 def _cells(row: Json) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from zsched.adapters.host.decision_log import is_torn
 from zsched.commands.common import CliError, print_json
-from zsched.commands.page import harmless
+from zsched.commands.page import counted, harmless
 from zsched.core.scheduler.decision import decide_again, verdict_of
 from zsched.core.values.decision import Decision
 from zsched.errors import WireError
@@ -62,7 +62,7 @@ def replay(file: Path, *, is_json: bool) -> int:
             {"schema": SCHEMA, "judged": done, "equal": True, "line": None, "was": None, "is": None, "torn": torn}
         )
     else:
-        sys.stdout.write(f"{done} judgements made again, all equal\n")
+        sys.stdout.write(f"{counted(done, 'judgement')} made again, all equal\n")
         if torn:
             where = ", ".join(map(str, torn))
             sys.stdout.write(f"left out, for a power cut or a full disk has torn it: line {where}\n")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door, find_door
 from zsched.commands.common import CliError, Json, nearest, print_json
-from zsched.commands.page import Page, harmless, since_drop, size, span
+from zsched.commands.page import Page, counted, harmless, since_drop, size, span
 from zsched.core.route import keyexpr
 from zsched.core.values.struct import Struct, field
 from zsched.errors import AdapterError
@@ -269,7 +269,7 @@ def _print_rates(view: StreamView, verb: str, found: dict[tuple[str, str], KeySt
 
 
 def _hz_text(row: Json) -> str:
-    text = f"{row['hz']:.2f} Hz, {row['messages']} messages"
+    text = f"{row['hz']:.2f} Hz, {counted(row['messages'], 'message')}"
     if row["max_gap_s"] is not None:
         text += f", gaps {row['min_gap_s'] * 1000:.1f}..{row['max_gap_s'] * 1000:.1f} ms"
     return text
@@ -277,7 +277,7 @@ def _hz_text(row: Json) -> str:
 
 def _bw_text(row: Json) -> str:
     sizes = f"{size(row['min_bytes'])}..{size(row['max_bytes'])}"
-    return f"{size(round(row['bytes_per_s']))}/s, {row['messages']} messages of {sizes}"
+    return f"{size(round(row['bytes_per_s']))}/s, {counted(row['messages'], 'message')} of {sizes}"
 
 
 def show_tail(view: StreamView, word: str | None) -> int:

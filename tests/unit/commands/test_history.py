@@ -357,7 +357,7 @@ def test_a_line_that_a_power_cut_has_torn_is_left_out_and_told(tmp_path: Path, c
     whole = file.read_bytes()
     file.write_bytes(whole[: whole[:-1].rindex(b"\n") + 1 + cut] + filled)
     done = run("replay", file)
-    assert (done.exit_code, done.stdout.splitlines()[0]) == (0, "1 judgements made again, all equal")
+    assert (done.exit_code, done.stdout.splitlines()[0]) == (0, "1 judgement made again, all equal")
     assert done.stdout.splitlines()[1].endswith("has torn it: line 3")
     log_of(tmp_path, decision(0.9))
     body = json.loads(run("replay", file, "--json").stdout)
