@@ -421,7 +421,8 @@ MANY: Final = 4
 def reference() -> str:
     """The reference of every key as Markdown: one table per section, sections in the order of the file.
 
-    `docs/guide/fleet-file.md` holds it, and a test compares the two. Settings that sections share are in the first one.
+    `docs/guide/fleet-file.md` holds it, and a test compares the two. Settings that sections share are in the first one;
+    a range alone is of numbers.
     """
     sections: dict[int, tuple[Record, list[str]]] = {}
     _collect(FLEET, "", sections)
@@ -455,7 +456,7 @@ def _section(record: Record, paths: list[str], before: dict[str, list[str]]) -> 
     heading = ", ".join(f"`{path}`" for path in paths) if paths != [""] else "The file"
     rows = []
     for name, item in record.items.items():
-        takes = _KEYS_BELOW.sub("a mapping", item.block.says())
+        takes = _KEYS_BELOW.sub("a mapping", item.block.says()).replace("a number ", "")
         rows.append(f"| `{name}` | {takes} | {'required' if item.required else item.default} | {item.doc} |")
     model = max(before, key=lambda name: len(set(before[name]) & set(rows)), default="")
     shared = [row for row in rows if row in before.get(model, ())]
