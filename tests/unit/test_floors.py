@@ -52,6 +52,7 @@ CORE_MAY: Final = frozenset(
             "bisect",
             "collections",
             "collections.abc",
+            "copy",
             "dataclasses",
             "enum",
             "functools",

@@ -7,6 +7,7 @@ see `msgspec.Struct` and the typed `dataclasses.replace`. Does not know: any val
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from dataclasses import Field
 from typing import TYPE_CHECKING, Any, ClassVar, Final
@@ -21,32 +22,40 @@ _FIELDS: Final[dict[type, dict[str, Field[Any]]]] = {}
 """By class, filled when asked: most are never asked."""
 
 
-def _fields(kind: type[msgspec.Struct]) -> dict[str, Field[Any]]:
-    names, defaults = kind.__struct_fields__, kind.__struct_defaults__
-    hints: dict[str, Any] = {}
-    for one in reversed(kind.__mro__):
-        hints |= vars(one).get("__annotations__", {})
-    held = dict(zip(names[len(names) - len(defaults) :], defaults, strict=True))
-    spec = [(name, hints[name], _field(held.get(name, NODEFAULT))) for name in names]
-    like = dataclasses.make_dataclass(kind.__name__, spec, init=False, repr=False, eq=False, kw_only=True)
-    return {one.name: one for one in dataclasses.fields(like)}
-
-
 class _Probe(msgspec.Struct):
     """Has a default that is made: what msgspec keeps of one has no public name."""
 
     one: list[Any] = field(default_factory=list)
 
 
+@dataclasses.dataclass(kw_only=True)
+class _Like:
+    """Has a field as `dataclasses.fields` takes it: the mark on it has no public name either."""
+
+    one: int
+
+
 _MADE: Final = type(_Probe.__struct_defaults__[0])
+_FIELD: Final[Field[Any]] = dataclasses.fields(_Like)[0]
 
 
-def _field(default: Any) -> Any:
-    if default is NODEFAULT:
-        return dataclasses.field()
+def _fields(kind: type[msgspec.Struct]) -> dict[str, Field[Any]]:
+    names, defaults = kind.__struct_fields__, kind.__struct_defaults__
+    hints: dict[str, Any] = {}
+    for one in reversed(kind.__mro__):
+        hints |= vars(one).get("__annotations__", {})
+    held = dict(zip(names[len(names) - len(defaults) :], defaults, strict=True))
+    return {name: _field(name, hints[name], held.get(name, NODEFAULT)) for name in names}
+
+
+def _field(name: str, hint: Any, default: Any) -> Field[Any]:
+    made = copy.copy(_FIELD)
+    made.name, made.type = name, hint
     if isinstance(default, _MADE):
-        return dataclasses.field(default_factory=default.factory)
-    return dataclasses.field(default=default)
+        made.default_factory = default.factory
+    elif default is not NODEFAULT:
+        made.default = default
+    return made
 
 
 class _Fields:
