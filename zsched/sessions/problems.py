@@ -20,6 +20,8 @@ MAX_NAMED: Final = 4
 
 _SOURCE_LINE: Final = re.compile(r" at \S+\.rs:\d+\.?")
 _BOUND_TO: Final = re.compile(r"bound to (\S+?)(?:#\S*?)?:? ")
+_NO_ANSWER: Final = "Unable to connect to any of"
+_ASKED: Final = re.compile(r"Single\(([^)]+)\)")
 _OS_ERROR: Final = re.compile(r"os error (\d+)")
 
 
@@ -35,8 +37,14 @@ def why_not_open(config: str, error: Exception) -> str:
     number = _OS_ERROR.search(text)
     why, remedy = _explained(int(number.group(1)) if number is not None else 0, endpoints, text)
     if not endpoints:
-        return f"cannot be joined: {text[:MAX_WHY]}; is its router up?"
+        return f"cannot be joined: {_unanswered(text)[:MAX_WHY]}; is its router up?"
     return f"cannot listen on {' or '.join(endpoints)}: {why}; {remedy}"
+
+
+def _unanswered(text: str) -> str:
+    """Whom a client has asked in vain; zenoh's own text where it says something else."""
+    asked = _ASKED.findall(text) if _NO_ANSWER in text else []
+    return f"nobody answers at {' or '.join(asked)} in time" if asked else text
 
 
 def _explained(number: int, endpoints: tuple[str, ...], text: str) -> tuple[str, str]:
