@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TextIO
 
 from zsched.commands.ask import Door
-from zsched.commands.common import CliError, Json, check_reason, nearest, print_json
+from zsched.commands.common import CliError, Json, check_reason, nearest, print_json, say, warn
 from zsched.commands.document import (
     QUESTION,
     InForce,
@@ -156,7 +156,7 @@ def agree(door: Door, view: ApplyView, plan: Plan) -> int:
     if plan.is_nothing:
         return _tell(view, plan, "unchanged", held.revision, EXIT_OK)
     if not view.is_json:
-        view.out.write(harmless(table(plan)) + "\n")
+        (warn if view.is_data else say)(table(plan), indent=6)
     if view.is_plan:
         return _tell(view, plan, "planned", held.revision, EXIT_WOULD_CHANGE)
     missing = [(name, means) for name, means in plan.dangers if name not in view.accepted]

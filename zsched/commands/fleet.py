@@ -16,9 +16,8 @@ from typing import Any
 
 from zsched.commands.apply import ApplyView, apply, read_text
 from zsched.commands.ask import Door
-from zsched.commands.common import CliError, Json, print_json
+from zsched.commands.common import CliError, Json, print_json, say
 from zsched.commands.document import QUESTION, InForce, ask_all, document_text, in_force, status_of
-from zsched.commands.page import harmless
 from zsched.errors import ConfigError
 from zsched.exits import EXIT_FAILED, EXIT_OK
 from zsched.files import write_regular
@@ -41,7 +40,7 @@ def show(door: Door, *, is_json: bool) -> int:
         body |= {"number": held.number, "settled": held.is_settled, "document": held.document}
         print_json({**body, "electors": electors, "nodes": told})
     else:
-        sys.stdout.write(harmless(_text(held, told)))
+        say(_text(held, told).rstrip("\n"), indent=4)
     return EXIT_OK
 
 

@@ -138,6 +138,16 @@ def test_a_plan_shows_before_and_after_in_the_files_words_and_changes_nothing(no
     assert [one["path"] for one in body["changes"]] == ["tasks.merge.weights.cpu", "tasks.merge.weights.memory"]
 
 
+@pytest.mark.usefixtures("node")
+def test_a_plan_fits_a_terminal(screen: int, tmp_path: Path) -> None:
+    file = changed(tmp_path, "fleet: hall", "shared_memory: auto\nfleet: hall")
+    lines = run("apply", file, "--plan").stdout.splitlines()
+    assert (max(map(len, lines)) <= screen, len(lines) > 3) == (True, True)
+    assert " ".join(" ".join(lines).split()).startswith("hall, revision 7: shared_memory off -> auto every daemon must")
+    assert run("fleet", "show").exit_code == 0
+    assert max(map(len, run("fleet", "show").stdout.splitlines())) <= screen
+
+
 def test_what_a_daemon_cannot_take_over_while_it_runs_is_told_with_its_nodes(node: Node, tmp_path: Path) -> None:
     file = changed(tmp_path, "fleet: hall", "shared_memory: auto\nfleet: hall")
     result = run("apply", file, "--plan")
