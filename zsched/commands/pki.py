@@ -334,13 +334,19 @@ def _lacking(fleet: Fleet, name: str, role: Role) -> str:
     if security is None:
         return "next: write a `security:` section into the fleet file; without it no certificate is asked for"
     named = {Role.NODE: [name], Role.OPERATOR: security.operators, Role.GUEST: security.guests}[role]
-    return "" if name in named else f"next: write {name} under `security: {{{role}s: [...]}}` of every fleet file"
+    if name in named:
+        return ""
+    return (
+        f"next: write {name} under `security: {{{role}s: [...]}}` with `zsched edit` (or in every fleet file); "
+        "who it is gets in once the daemons have begun anew"
+    )
 
 
 def _how_to_install(folder: Path, role: Role, *, has_key: bool) -> str:
     if role is not Role.NODE:
         return (
-            "next: bring that folder to the machine as `pki`, beside its fleet file; `zsched status --connect tls/NODE`"
+            "next: bring that folder to the machine as `pki`, beside a fleet file (`zsched fleet export`), and there: "
+            "ZSCHED_CONFIG=fleet.yaml zsched status --connect tls/NODE"
         )
     if not has_key:
         return f"next, on the node: sudo install -m 644 {folder}/*.pem /etc/zsched/pki/ (its key lies there already)"
