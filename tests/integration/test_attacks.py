@@ -370,6 +370,8 @@ def test_who_shows_thousands_of_tokens_loses_its_link(
             until(lambda: counted in _dropped(bus, events), f"{counted} to be counted")
             assert len(held) == TOKENS
             until(lambda: "is ended" in caplog.text, "the link is ended")
+            if holder == "robot2":
+                until(lambda: "link/shut_out" in _dropped(bus, events), "its next link is refused before its tokens")
         until(lambda: not bus.peers(), "the link to end")
     here = Counter(event.node for event in events if isinstance(event, ev.TokenSeen))
     here.subtract(event.node for event in events if isinstance(event, ev.TokenLost))

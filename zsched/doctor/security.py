@@ -35,6 +35,7 @@ MEND: Final = "mend the file that the fleet file names under `zenoh: {config: ..
 REFUSED: Final = {
     "dropped_link_stranger": "links of a certificate that is not let in",
     "dropped_link_too_many": "links of a certificate with too many sessions",
+    "dropped_link_shut_out": "links of a node that had shown too many tokens",
     "dropped_data_link_stranger": "links to the relay of a certificate that is not let in",
     "dropped_data_link_too_many": "links to the relay of a certificate with too many sessions",
     "dropped_alive_too_many": "tokens of a node that shows too many",

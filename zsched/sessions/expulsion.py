@@ -27,6 +27,8 @@ from zsched.sessions.link_sockets import LinkSocket, LinkSockets
 
 MAX_SHOWN: Final = 64
 """Tokens of one node: it has one for each of its lives, and of those that have ended some may not be gone yet."""
+SHUT_OUT_S: Final = 30.0
+"""Who has shown more gets no link for so long: each one would bring the tokens again before it is held."""
 MAX_SESSIONS: Final = 32
 """Of one certificate: a daemon has one, and each verb that asks one more. zenoh takes 1000 in all, then nobody."""
 MAX_DATA_SESSIONS: Final = 128
@@ -48,6 +50,7 @@ class Refusal(StrEnum):
 
     STRANGER = "stranger"  # its certificate is not let in
     TOO_MANY = "too_many"  # its certificate has too many sessions here
+    SHUT_OUT = "shut_out"  # its node has just shown too many tokens
 
 
 def members_of(config: str) -> frozenset[str] | None:
@@ -85,6 +88,8 @@ class Expulsion:
         """{link: when it ends}; the thread's own."""
         self._shown: dict[str, int] = {}
         """{node: tokens}; whoever shows one in a node's name has its certificate."""
+        self._shut_out: dict[str, float] = {}
+        """{node that has shown too many: until when}."""
         self._linked: dict[str, set[str]] = {}
         """{common name: its sessions}."""
         self._names: dict[str, str] = {}
@@ -104,6 +109,7 @@ class Expulsion:
             del self._shown[node]
         if not is_present or count <= MAX_SHOWN:
             return True
+        self._shut_out[node] = monotonic_s() + SHUT_OUT_S
         if count % MAX_SHOWN == 1:
             self._end(lambda link: self._holder(link) == node)
         return False
@@ -122,7 +128,11 @@ class Expulsion:
             event.kind == zenoh.SampleKind.PUT,
         )
         if name in self._members:
-            if not self._has_room(name, zid, is_present=is_present):
+            holder = parse_common_name(name, self._fleet)
+            is_shut_out = holder is not None and self._shut_out.get(holder.name, 0.0) > monotonic_s()
+            if is_present and is_shut_out:
+                self._refuse(zid, Refusal.SHUT_OUT)
+            elif not self._has_room(name, zid, is_present=is_present):
                 self._refuse(zid, Refusal.TOO_MANY)
         elif is_present:
             _log.warning("stranger certificate=%r address=%s: it may nothing here", name, event.link.dst)
