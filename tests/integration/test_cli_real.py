@@ -239,12 +239,13 @@ def look_from_a_machine_without_a_daemon(folder: Path, here: Site, there: Site) 
     for verb in (
         ("wait", "--for", "settled=echo"),
         ("metrics", "print"),
-        ("logs", "echo"),
         ("weights", "echo"),
         ("stream", "list", "--node", there.node, "--window", "0.2"),
     ):
         done = laptop.zsched(*verb, "--connect", endpoint)
         assert (done.returncode, done.stderr) == (0, ""), verb
+    silent = laptop.zsched("logs", "echo", "--connect", endpoint)
+    assert (silent.returncode, silent.stdout, "has printed nothing" in silent.stderr) == (0, "", True), silent
     unknown = laptop.zsched("status", "--connect", endpoint, "--node", "robot9")
     assert (unknown.returncode, "robot9 did not answer within 3 s" in unknown.stderr) == (3, True)
 
