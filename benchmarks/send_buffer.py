@@ -76,7 +76,7 @@ def main() -> None:
                     )
                     for listen, connect in (((end,), ()), ((), (end,)))
                 ]
-                taken = round_trips(*ends, given.count)
+                taken = round_trips(ends[0], ends[1], given.count)
                 slow = sum(one > SLOW_MS for one in taken)
                 told = f"p50 {percentile(taken, 0.5):.1f} p99 {percentile(taken, 0.99):.1f} ms (n={len(taken)})"
                 print(f"{protocol}  send buffer {size or 'of the kernel':<18} {told}, {slow} above 150 ms", flush=True)
