@@ -19,6 +19,7 @@ from zsched.commands.ask import Door
 from zsched.commands.common import CliError, Json, check_reason, nearest, print_json, say, warn
 from zsched.commands.document import (
     QUESTION,
+    ConflictError,
     InForce,
     ask_all,
     change,
@@ -48,6 +49,8 @@ OPEN_NETWORK = "open-network"
 DANGERS = (*(danger.value for danger in Danger), OTHER_FILES, OPEN_NETWORK)
 PATH_ROOM, VALUE_ROOM = 44, 28
 STDIN = "-"
+TRIES = 4
+"""How often a document is asked for while the fleet changes its electors by itself."""
 
 
 class ApplyView(Struct, frozen=True, kw_only=True):
@@ -353,8 +356,7 @@ def _commit(door: Door, view: ApplyView, plan: Plan) -> int:
     for number, step in enumerate(steps):
         try:
             _check_same(held, document)
-            answer = change(door, {**step, "base_revision": held.revision, "reason": _reason(view)})
-            held = wait_until_settled(door, int(answer["revision"]))
+            held = wait_until_settled(door, _agreed(door, step, held, view))
         except CliError as error:
             if number == 0 or error.code == EXIT_TIMED_OUT:
                 raise
@@ -362,6 +364,31 @@ def _commit(door: Door, view: ApplyView, plan: Plan) -> int:
             raise CliError(EXIT_TIMED_OUT, f"{done}: {error}; give the command again") from error
         document = held.document if "text" in step else document
     return _tell(view, plan, "ok", held.revision, EXIT_OK)
+
+
+def _agreed(door: Door, step: Json, held: InForce, view: ApplyView) -> int:
+    """The revision that one change made.
+
+    A fleet also changes its electors by itself. That is no reason to refuse another document: it is asked for again on
+    the newest revision, as long as the document and the orders are those that were looked at.
+
+    Raises:
+        CliError: it is refused; somebody else was first, or the fleet does not come to rest.
+    """
+    base = held.revision
+    for left in reversed(range(TRIES)):
+        try:
+            answer = change(door, {**step, "base_revision": base, "reason": _reason(view)})
+        except ConflictError:
+            now = in_force(door)
+            is_same = (now.document, now.flags, now.rollouts) == (held.document, held.flags, held.rollouts)
+            is_ours = "text" in step and view.revision is None
+            if not left or not is_same or not is_ours or now.revision == base:
+                raise
+            base = now.revision
+        else:
+            return int(answer["revision"])
+    raise AssertionError
 
 
 def _reason(view: ApplyView) -> str:

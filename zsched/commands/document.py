@@ -41,6 +41,10 @@ ADVICE = {
 }
 
 
+class ConflictError(CliError):
+    """The fleet's value had changed meanwhile."""
+
+
 class InForce(Struct, frozen=True, kw_only=True):
     """What one node goes by."""
 
@@ -150,6 +154,7 @@ def change(door: Door, what: Json) -> Json:
     """Propose a change of the fleet, and return what became of it.
 
     Raises:
+        ConflictError: the fleet is at another revision than the change's base.
         CliError: nobody answers, or the change did not come about (1, 4, 5).
     """
     answer = ask_door(door, {"verb": "change", **what}, timeout_s=IN_FORCE_S)
@@ -158,7 +163,8 @@ def change(door: Door, what: Json) -> Json:
         return answer
     advice = ADVICE.get(outcome, "")
     words = f"{outcome.replace('_', ' ')}: {detail}{'; ' if advice else ''}{advice}"
-    raise CliError(CODES.get(outcome, EXIT_FAILED), words)
+    kind = ConflictError if outcome == "conflict" else CliError
+    raise kind(CODES.get(outcome, EXIT_FAILED), words)
 
 
 def wait_until_settled(door: Door, revision: int) -> InForce:

@@ -52,6 +52,8 @@ class Node:
         self.rollouts: list[Json] = []
         self.refused = "nothing"
         """The kind of change that another operator has overtaken."""
+        self.meanwhile: list[tuple[str, list[str]]] = []
+        """(document, electors) of what comes first at each change."""
 
     def answer(self, request: Json) -> Json:
         verb, node = request["verb"], str(request.get("node") or "robot1")
@@ -77,6 +79,10 @@ class Node:
         assert verb == "change"
         self.changes.append(request)
         if self.refused in request:
+            return {"outcome": "conflict", "detail": "it was overtaken", "revision": None}
+        if self.meanwhile:
+            self.revision += 1
+            self.document, self.electors = self.meanwhile.pop()
             return {"outcome": "conflict", "detail": "it was overtaken", "revision": None}
         if self.outcome != "ok":
             return {"outcome": self.outcome, "detail": "it was so", "revision": None}
@@ -203,6 +209,26 @@ def test_a_revision_that_was_overtaken_is_refused_with_the_one_there_is(node: No
     assert (result.exit_code, node.changes) == (1, [])
     assert "revision 6 is overtaken: hall has revision 7" in result.stderr
     assert run("apply", file, "--yes", "--revision", 7).exit_code == 0
+
+
+def test_electors_that_the_fleet_changes_by_itself_are_no_conflict_with_another_document(
+    node: Node, tmp_path: Path
+) -> None:
+    node.meanwhile = [(node.document, ["edge1", "robot1"]), (node.document, ["edge1", "robot1", "robot2"])]
+    file = changed(tmp_path, "cpu: 0.5, memory: 0.5", "cpu: 1")
+    result = run("apply", file, "--yes")
+    assert (result.exit_code, [one["base_revision"] for one in node.changes]) == (0, [7, 8, 9]), result.output
+    assert node.text == file.read_text()
+
+
+@pytest.mark.parametrize("words", [(), ("--revision", 7)])
+def test_another_document_or_a_revision_that_was_named_is_not_overtaken(
+    node: Node, tmp_path: Path, words: tuple[object, ...]
+) -> None:
+    node.meanwhile = [(node.document if words else "ef56" * 8, node.electors)]
+    result = run("apply", changed(tmp_path, "cpu: 0.5, memory: 0.5", "cpu: 1"), "--yes", *words)
+    assert (result.exit_code, len(node.changes)) == (1, 1)
+    assert "conflict: it was overtaken" in result.stderr
 
 
 @pytest.mark.parametrize(("outcome", "code"), [("conflict", 1), ("invalid", 1), ("no_quorum", 4), ("unknown", 5)])
