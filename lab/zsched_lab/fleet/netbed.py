@@ -38,7 +38,8 @@ CONTROL_PORT, DATA_PORT = 7457, 7458
 PROBE = (sys.executable, "-m", "zsched_lab.fleet.probe")
 
 _STAMP = re.compile(r"(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d),(\d{3}) ")
-_LEARNT = re.compile(r"task=(\S+) epoch=(\d+) learnt revision (\d+): owner (\S+), (.*)")
+_LEARNT = re.compile(r"task=(\S+) epoch=(\d+) learnt revision (\d+): owner (\S+), (.*?)(?:, known from [^=]*)?$")
+"""The value alone: what a node knew of it before is not part of it."""
 _CHANGE = re.compile(r"zsched\.membership (\S+) (\w+) -> (\w+): (.*)")
 _STARTED = re.compile(r"no_state|ready node=")
 
