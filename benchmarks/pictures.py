@@ -60,7 +60,7 @@ def zsched(bed: Testbed, *words: str, columns: int = 100, lines: int = 40) -> st
 
 
 def taken(bed: Testbed, seconds: float, folder: Path) -> list[Path]:
-    """Move tasks for so long, then take the pictures."""
+    """Move tasks for this time, then take the pictures."""
     found = []
     with ExitStack() as stack:
         _, (host, port) = stack.enter_context(web_server(str(bed.folder)))

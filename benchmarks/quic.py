@@ -35,7 +35,7 @@ PORT = 7990
 
 
 def send(configs: list[str], seconds: float) -> None:
-    """The robot: put both for so long."""
+    """The robot: put both for this time."""
     sessions = [zenoh.open(zenoh.Config.from_json5(text)) for text in configs]
     kinds = {
         "control": (sessions[0], zenoh.Priority.INTERACTIVE_HIGH, True),

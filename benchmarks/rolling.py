@@ -30,7 +30,7 @@ OLD = "0+old."
 """Begins the version of the older code."""
 WAIT_S = 120.0
 QUIET_S = 2.0
-"""Behind a restart the streams run on for so long."""
+"""Behind a restart the streams run on for this time."""
 
 
 def code_of(ref: str, folder: Path) -> Path:

@@ -51,7 +51,7 @@ STILL_S: Final = 8.0
 """Its streams are counted every second; after this long without a count they hang on something, though it lives."""
 EVICT_S: Final = 2.0
 WARM_S: Final = 4.0
-"""So long a relay that is to be replaced carries on, until the next one has loaded its code."""
+"""A relay that is to be replaced carries on for at most this time, until the next one has loaded its code."""
 
 _log = logging.getLogger("zsched.streams")
 
@@ -256,11 +256,8 @@ class RelayHandle:
         link, here = found
         self._reopens = here.reopens
         how = ", and opens its data session anew" if here.reopens else ""
-        how += (
-            ""
-            if note.code == code_digest()
-            else "; its code stays that of another version until the service is stopped"
-        )
+        if note.code != code_digest():
+            how += "; its code stays that of another version until the service is stopped"
         _log.info("the relay that runs here (pid %d) is taken over%s", here.pid, how)
         return RelayChild(pid=here.pid, link=link, door=bequest.door)
 
