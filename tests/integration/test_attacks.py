@@ -254,7 +254,9 @@ def test_a_certificate_that_the_file_does_not_let_in_speaks_and_hears_nothing(
             if who == "robot3.k2":
                 until(lambda: KEYS.beat("robot3") in victim.heard, "the member's own beat")
                 until(lambda: got["robot3.k2"], "the victim's beat at the member")
+                until(lambda: victim.tokens, "the member's token")
         until_alone(victim)
+    until(lambda: len(victim.tokens) > 1, "the member's token to go")
     assert not got[stranger]
     assert not said[stranger]
     assert {key.split("/")[3] if key.startswith("@") else key.split("/")[2] for key in victim.heard} == {"robot3"}
@@ -522,6 +524,10 @@ def test_an_answer_in_a_name_that_is_not_the_links_is_counted_where_no_rule_stop
             learnt = {f"learnt/{one.learnt.node}" for one in events if isinstance(one, ev.LearntReceived)}
             return learnt | _dropped(bus, events)
 
+        watched = bus._expulsion
+        assert watched is not None
+        until(lambda: watched._names, "the link's event")
+        watched._names.clear()  # as while that event is on its way
         until(lambda: "allocation/link" in told("edge1"), "the answer for another is counted")
         until(lambda: "learnt/robot2" in told("robot2"), "its own answer is taken")
         assert "learnt/edge1" not in told("edge1")

@@ -10,6 +10,7 @@ access rules, what tokens mean.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import queue
@@ -116,9 +117,16 @@ class Expulsion:
 
     def contradicts(self, zid: str, node: str) -> bool:
         """Whether a session that is linked to this one has the certificate of somebody else than ``node``."""
-        name = self._names.get(zid)
-        holder = None if name is None else parse_common_name(name, self._fleet)
+        name = self._names.get(zid) or self._name_of(zid)
+        holder = parse_common_name(name, self._fleet)
         return holder is not None and (holder.name, holder.role) != (node, Role.NODE)
+
+    def _name_of(self, zid: str) -> str:
+        """The common name at the other end of a link whose event is still on its way; empty: there is no such link."""
+        with contextlib.suppress(zenoh.ZError):  # the session is being closed
+            links = (link for link in self._session.info.links() if str(link.zid) == zid)
+            return next((link.auth_identifier or "" for link in links), "")
+        return ""
 
     def _on_link(self, event: zenoh.LinkEvent) -> None:
         """Only linked nodes' names count here; zenoh's access rules check a frame's sender against its link."""
