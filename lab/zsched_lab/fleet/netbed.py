@@ -105,9 +105,9 @@ class Probe:
         found = [one for one in newest if one.epoch is None and one.node != but_of]
         return min(found, key=lambda one: one.at, default=None)
 
-    def is_flowing(self) -> bool:
-        """Whether something came back that was sent within the last half second."""
-        return self.first_after(monotonic_s() - 0.5) is not None
+    def is_flowing(self, within_s: float = 0.5) -> bool:
+        """Whether something came back that was sent at most ``within_s`` ago."""
+        return self.first_after(monotonic_s() - within_s) is not None
 
     def owners(self, key: str) -> list[NodeId]:
         """Whose samples came under ``key``, in order, each run of one node once."""

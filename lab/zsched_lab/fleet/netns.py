@@ -1,4 +1,4 @@
-"""Network namespaces for tests: one per node on a bridge of their own, with loss, cuts and narrow links on demand.
+"""Network namespaces for tests: one per node on a bridge of their own, with loss, cuts, thin and long links on demand.
 
 Knows: ip, nft, tc, nsenter; whose namespaces are left over. Does not know: fleets, daemons, what is tested.
 
@@ -16,6 +16,7 @@ import re
 import shutil
 import signal
 import subprocess
+import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -103,6 +104,12 @@ class Network:
         self._hub = f"{self._prefix}-hub"
         self._addresses: dict[str, str] = {}
         self._rules: dict[str, dict[str, tuple[str, ...]]] = {}
+        self._lines: list[subprocess.Popen[str]] = []
+        """Delay lines."""
+        self._ports: dict[str, str] = {}
+        """{name: its interface at the bridge}."""
+        self._given = 0
+        """Addresses given so far; none is given twice."""
         try:
             run("ip", "netns", "add", self._hub)
             run("ip", "-n", self._hub, "link", "add", "bridge", "type", "bridge")
@@ -120,8 +127,8 @@ class Network:
             NetworkError: a tool fails.
         """
         space, port = self.name_of(name), f"port{len(self._addresses) + 1}"
-        address = f"{NET}.{len(self._addresses) + 1}"
-        self._addresses[name] = address
+        address = self._next_address()
+        self._addresses[name], self._ports[name] = address, port
         run("ip", "netns", "add", space)
         batch = "\n".join(
             (
@@ -133,6 +140,10 @@ class Network:
         run("ip", "-n", self._hub, "-batch", "-", text=batch)
         inside = "\n".join((f"address add {address}/24 dev {INTERFACE}", f"link set {INTERFACE} up", "link set lo up"))
         run("ip", "-n", space, "-batch", "-", text=inside)
+
+    def _next_address(self) -> str:
+        self._given += 1
+        return f"{NET}.{self._given}"
 
     def name_of(self, name: str) -> str:
         """What the kernel calls a namespace."""
@@ -184,8 +195,33 @@ class Network:
 
     def link(self, name: str, *, is_up: bool) -> None:
         """Pull or plug a namespace's cable at the bridge's end."""
-        number = list(self._addresses).index(name) + 1
-        run("ip", "-n", self._hub, "link", "set", f"port{number}", "up" if is_up else "down")
+        run("ip", "-n", self._hub, "link", "set", self._ports[name], "up" if is_up else "down")
+
+    def lengthen(self, name: str, delay_s: float) -> None:
+        """Everything to and from a namespace takes this much longer from now on; call it before anything runs there.
+
+        Raises:
+            NetworkError: the delay line could not be made.
+        """
+        space, port = self.name_of(name), self._ports[name]
+        run("ip", "-n", self._hub, "link", "del", port)
+        command = (sys.executable, "-m", "zsched_lab.fleet.delay_line", str(delay_s), self._hub, port, space, INTERFACE)
+        line = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self._lines.append(line)
+        assert line.stdout is not None
+        if line.stdout.readline() != "ready\n":
+            raise NetworkError(f"{name}: no delay line: it ended with {line.wait(COMMAND_S)}")
+        run("ip", "-n", self._hub, "link", "set", port, "master", "bridge", "up")
+        inside = f"address add {self._addresses[name]}/24 dev {INTERFACE}\nlink set {INTERFACE} up"
+        run("ip", "-n", space, "-batch", "-", text=inside)
+
+    def renumber(self, name: str) -> str:
+        """A namespace gets another address, as a robot that roams does; its connections are dead. The new address."""
+        space, old = self.name_of(name), self._addresses[name]
+        self._addresses[name] = new = self._next_address()
+        run("ip", "-n", space, "address", "del", f"{old}/24", "dev", INTERFACE)
+        run("ip", "-n", space, "address", "add", f"{new}/24", "dev", INTERFACE)
+        return new
 
     def heal(self, *names: str) -> None:
         """End cuts and losses of ``names`` (default: of all)."""
@@ -210,6 +246,10 @@ class Network:
 
     def close(self) -> None:
         """Kill what still runs inside and remove everything; safe to call twice."""
+        while self._lines:
+            line = self._lines.pop()
+            line.kill()
+            line.communicate(timeout=COMMAND_S)
         for name in (*map(self.name_of, self._addresses), self._hub):
             if Path("/run/netns", name).exists():
                 _remove(name)
