@@ -67,6 +67,7 @@ from zsched.runtime.memory import shared_memory_objection
 from zsched.runtime.recipes import Recipes
 from zsched.runtime.reload import Reload
 from zsched.runtime.reopening import Moved, Reopening, turns
+from zsched.runtime.roaming import Roaming, addresses_towards, places_of
 from zsched.runtime.sampler import Sampler
 from zsched.runtime.sealing import seals_of
 from zsched.runtime.secured import digest_of, require_own
@@ -83,6 +84,8 @@ FINISH_WORKERS_S = 4.0
 LOOP_MAX_WAIT_S = 1.0
 LOOK_S = 30.0
 """How often the certificate's files are looked at."""
+PLACE_LOOK_S = 1.0
+"""How often a node without an address in the fleet file looks which one it has."""
 SPARE_NODES = 2
 """A relay is carried on while its fleet grows by at most this many nodes."""
 CERTIFICATE = "certificate"
@@ -134,6 +137,10 @@ class Daemon:
         self._certificate = ""
         """Digest of the certificate that open sessions listen with."""
         self._next_look = 0.0
+        self._places: tuple[str, ...] = ()
+        """The addresses towards which this machine looks for its own; none: the fleet file says where it is."""
+        self._roaming = Roaming(began_at=())
+        self._has_roamed, self._next_place = False, 0.0
         self.begins_anew = False
         """The process is to become another daemon, in place, once this one has ended."""
         self._has_foreign_state = False
@@ -169,6 +176,9 @@ class Daemon:
             points = endpoints_for(
                 self._fleet, self._spec, functools.partial(self._data_port, stack), is_here, self._protocol
             )
+            if points.data_by_gossip or points.control_by_gossip:
+                self._places = places_of(node.host for node in self._fleet.nodes if node is not self._spec)
+                self._roaming = Roaming(began_at=addresses_towards(self._places))
             self._handle_signals(stack)  # first: a stop that comes while things open is an orderly one, too
             shell = self._build(stack, state_file, incarnation, points)
             node = Node(
@@ -375,7 +385,7 @@ class Daemon:
             door=self._door,
             orphan_s=fleet.relay_orphan_s,
             incarnation=incarnation,
-            digest="",
+            digest=" ".join(self._gossiped(points)) if not self._spec.local else "",
             listen=points.data_listen[0],
             certificate="" if fleet.security is None else digest_of(fleet.security),
             tasks=tasks,
@@ -385,7 +395,7 @@ class Daemon:
             fleet=fleet.name,
             node=self._spec.name,
             zenoh_config=zenoh_config.data_config(
-                listen=points.data_listen,
+                listen=self._data_listen(points),
                 connect=points.data_connect,
                 timing=fleet.timing,
                 shared_memory=self._memory_objection == "",
@@ -398,6 +408,20 @@ class Daemon:
             silence_s=max(SILENCE_S, fleet.timing.zenoh_lease_s + 0.5),
             bequest=bequest if fleet.relay_orphan_s > 0 else None,
         )
+
+    def _gossiped(self, points: Endpoints) -> tuple[str, ...]:
+        """The addresses at which others learn by gossip that this node's data session listens."""
+        return self._roaming.began_at if points.data_by_gossip else ()
+
+    def _data_listen(self, points: Endpoints) -> tuple[str, ...]:
+        """A relay keeps its process when it roams, and zenoh the addresses of its process: they are named, then.
+
+        Without a local side the host's applications join this session at any address, and the process is replaced.
+        """
+        gossiped = self._gossiped(points)
+        if not self._spec.local or not gossiped:
+            return points.data_listen
+        return tuple(dial_endpoint(points.data_listen[0], host) for host in ("127.0.0.1", *gossiped))
 
     def _supervisor(
         self, stack: contextlib.ExitStack, shell: Shell, incarnation: int, points: Endpoints
@@ -473,6 +497,7 @@ class Daemon:
                 is_first = leaving.ask(node.owned(), now, begins_anew=self.begins_anew)
                 if is_first and not self.begins_anew:
                     self._notify.stopping()
+            self._look_around(now)
             if self._may_begin_again and leaving.asked_at is None:
                 self._tend_sessions(node, now)
             if leaving.asked_at is not None and leaving.is_over(
@@ -495,7 +520,14 @@ class Daemon:
 
     @property
     def _may_begin_again(self) -> bool:
-        return self._fleet.security is not None or self._moved.is_any or self._reopening.due_at is not None
+        is_due = self._has_roamed or self._reopening.due_at is not None
+        return is_due or self._fleet.security is not None or self._moved.is_any
+
+    def _look_around(self, now: float) -> None:
+        """Where the fleet file does not say where this machine is, the others know it by its sessions."""
+        if self._places and now >= self._next_place:
+            self._next_place = now + PLACE_LOOK_S
+            self._has_roamed = self._roaming.is_elsewhere(addresses_towards(self._places), now)
 
     def _take_certificate(self, pem: str) -> CommandResult:
         result = renewal.take(self._fleet, self._options.state_dir, pem)
@@ -518,8 +550,10 @@ class Daemon:
                 candidates = [task.candidates for task in node.fleet.tasks]
                 order = turns((*alive, node.me), electors, node.tenure.voters, candidates)
                 self._reopening.want(order, lives, now)
-            else:
+            elif not self._has_roamed:
                 self._reopening.forget()
+        if self._has_roamed:
+            self._reopening.want(((node.me,),), lives, now, first_s=0.0)  # nobody else begins again for it
         lacks = () if self._reopening.due_at is None else node.lacking(now)
         awaited = [name for name in electors if name not in left]  # who has left is heard again only afterwards
         is_due = self._reopening.is_due(awaited, lives, now, lack=[lack.sparing for lack in lacks])
@@ -533,7 +567,8 @@ class Daemon:
             self._reopening.put_off(now)
             return
         log.info(
-            "sessions node=%s are opened anew: others are let in or dialled, or its certificate is another", node.me
+            "sessions node=%s are opened anew: others are let in or dialled, or its certificate or address is another",
+            node.me,
         )
         with contextlib.suppress(OSError):  # without it an operator's command says that there is no daemon
             places.again_path(self._options.runtime_dir, node.me).touch()

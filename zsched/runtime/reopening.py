@@ -81,17 +81,24 @@ class Reopening(Struct):
     _anew_at: float | None = None
     """Since when all of them are heard in a new life."""
 
-    def want(self, order: Sequence[Collection[NodeId]], lives: Mapping[NodeId, int | None], now: float) -> None:
+    def want(
+        self,
+        order: Sequence[Collection[NodeId]],
+        lives: Mapping[NodeId, int | None],
+        now: float,
+        first_s: float = FIRST_S,
+    ) -> None:
         """Something has changed for all of ``order``, this node among them; a turn that is set stays.
 
         Args:
             order: the nodes of each turn (`turns`).
             lives: {node: its incarnation, as far as it was heard}.
             now: monotonic seconds.
+            first_s: the first one waits this long.
         """
         if self.due_at is None:
             count = next(number for number, names in enumerate(order) if self.me in names)
-            self._first_at, self.due_at = now + FIRST_S, now + FIRST_S + TURN_S * count
+            self._first_at, self.due_at = now + first_s, now + first_s + TURN_S * count
             self._before = {name: lives.get(name) for names in order[:count] for name in names}
             self._anew_at = None
 
