@@ -72,7 +72,7 @@ def pass_time(bed: Netbed, seconds: float) -> None:
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         time.sleep(min(5.0, max(end - time.monotonic(), 0.0)))
-        for node in bed.names:
+        for node in bed.running():
             if not Path(f"/proc/{bed.pid(node)}").exists():
                 raise SystemExit(f"{node} has died:\n{bed.log(node)[-2000:]}")
 
