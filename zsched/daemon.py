@@ -67,7 +67,7 @@ from zsched.runtime.memory import shared_memory_objection
 from zsched.runtime.recipes import Recipes
 from zsched.runtime.reload import Reload
 from zsched.runtime.reopening import Moved, Reopening, turns
-from zsched.runtime.roaming import Roaming, addresses_towards, places_of
+from zsched.runtime.roaming import Roaming, addresses_towards, gone_from, numeric, places_of
 from zsched.runtime.sampler import Sampler
 from zsched.runtime.sealing import seals_of
 from zsched.runtime.secured import digest_of, require_own
@@ -85,7 +85,7 @@ LOOP_MAX_WAIT_S = 1.0
 LOOK_S = 30.0
 """How often the certificate's files are looked at."""
 PLACE_LOOK_S = 1.0
-"""How often a node without an address in the fleet file looks which one it has."""
+"""How often a node looks which address it has."""
 SPARE_NODES = 2
 """A relay is carried on while its fleet grows by at most this many nodes."""
 CERTIFICATE = "certificate"
@@ -94,6 +94,8 @@ SESSIONS = "sessions"
 """Of the problem that sessions cannot be opened again."""
 TURN = "turn"
 """Of the problem that this node waits to begin anew, for a task of its would have no owner."""
+ADDRESS = "address"
+"""Of the problem that this machine is not where the others dial it."""
 STDERR = 2
 RESTART_SIGNAL = signal.SIGUSR2
 """As SIGTERM, but the relay stays and carries the streams on for the daemon that follows (`systemctl restart`)."""
@@ -140,6 +142,8 @@ class Daemon:
         self._places: tuple[str, ...] = ()
         """The addresses towards which this machine looks for its own; none: the fleet file says where it is."""
         self._roaming = Roaming(began_at=())
+        self._home = ""
+        """The address at which the others dial this machine, if it had it at the start."""
         self._has_roamed, self._next_place = False, 0.0
         self.begins_anew = False
         """The process is to become another daemon, in place, once this one has ended."""
@@ -179,6 +183,8 @@ class Daemon:
             if points.data_by_gossip or points.control_by_gossip:
                 self._places = places_of(node.host for node in self._fleet.nodes if node is not self._spec)
                 self._roaming = Roaming(began_at=addresses_towards(self._places))
+            elif self._spec.host and is_here(self._spec.host):
+                self._home = numeric(self._spec.host)
             self._handle_signals(stack)  # first: a stop that comes while things open is an orderly one, too
             shell = self._build(stack, state_file, incarnation, points)
             node = Node(
@@ -497,7 +503,7 @@ class Daemon:
                 is_first = leaving.ask(node.owned(), now, begins_anew=self.begins_anew)
                 if is_first and not self.begins_anew:
                     self._notify.stopping()
-            self._look_around(now)
+            self._look_around(node, now)
             if self._may_begin_again and leaving.asked_at is None:
                 self._tend_sessions(node, now)
             if leaving.asked_at is not None and leaving.is_over(
@@ -523,11 +529,15 @@ class Daemon:
         is_due = self._has_roamed or self._reopening.due_at is not None
         return is_due or self._fleet.security is not None or self._moved.is_any
 
-    def _look_around(self, now: float) -> None:
-        """Where the fleet file does not say where this machine is, the others know it by its sessions."""
-        if self._places and now >= self._next_place:
-            self._next_place = now + PLACE_LOOK_S
+    def _look_around(self, node: Node, now: float) -> None:
+        """Whether this machine is where the others know it: by the fleet file, or else by its sessions."""
+        if now < self._next_place:
+            return
+        self._next_place = now + PLACE_LOOK_S
+        if self._places:
             self._has_roamed = self._roaming.is_elsewhere(addresses_towards(self._places), now)
+        elif self._home:
+            node.set_problem(ADDRESS, None if is_here(self._home) else gone_from(self._home))
 
     def _take_certificate(self, pem: str) -> CommandResult:
         result = renewal.take(self._fleet, self._options.state_dir, pem)

@@ -68,3 +68,23 @@ def test_a_robot_that_roams_is_served_again_and_its_lost_samples_are_counted(
         if has_local_side:
             bed.wait(lambda: missing(probe) <= told(bed), 30, "the counters to tell of what was lost")
             assert len({one.number for one in probe.received}) == len(probe.received), "none came twice"
+
+
+def test_a_node_that_the_others_dial_where_it_is_no_more_says_so_and_no_longer_when_it_is_back(tmp_path: Path) -> None:
+    reason = netns.why_not()
+    if reason is not None:
+        pytest.skip(f"no network namespaces here: {reason}")
+    with Bed(tmp_path, echo_fleet(robots=2, edges=1)) as bed:
+        bed.init()
+        bed.start()
+        bed.wait_whole()
+        home = bed.network.address(ROBOT)
+        bed.network.renumber(ROBOT)
+
+        def says() -> bool:
+            return any(f"dial this machine at {home}, which is none" in one for one in bed.status(ROBOT)["problems"])
+
+        bed.wait(says, 30, "the problem")
+        bed.network.renumber(ROBOT, home)
+        bed.wait(lambda: not says(), 30, "the problem to go")
+        bed.wait_whole()

@@ -35,13 +35,38 @@ def places_of(hosts: Iterable[str]) -> tuple[str, ...]:
     """
     found: list[str] = []
     for host in hosts:
-        try:
-            place = host if not ipaddress.ip_address(host.strip("[]")).is_loopback else ""
-        except ValueError:
-            place = ANY_HOST if host not in ("", "localhost") else ""
+        place = numeric(host) or ("" if _is_loopback(host) else ANY_HOST)
         if place and place not in found:
             found.append(place)
     return tuple(found[:MOST_HOSTS])
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return host in ("", "localhost")
+
+
+def numeric(host: str) -> str:
+    """``host`` if it is an address of a network, else empty: names are not looked up again and again.
+
+    >>> numeric("198.18.0.3"), numeric("edge2.local"), numeric("127.0.0.1")
+    ('198.18.0.3', '', '')
+    """
+    try:
+        ipaddress.ip_address(host.strip("[]"))
+    except ValueError:
+        return ""
+    return "" if _is_loopback(host) else host
+
+
+def gone_from(home: str) -> str:
+    """The problem of a machine that is not any more where the fleet file says."""
+    return (
+        f"the others dial this machine at {home}, which is none of its addresses any more: give it that address again, "
+        f"or change its `host:` for all (`zsched edit`)"
+    )
 
 
 def addresses_towards(places: Iterable[str]) -> tuple[str, ...]:

@@ -215,10 +215,10 @@ class Network:
         inside = f"address add {self._addresses[name]}/24 dev {INTERFACE}\nlink set {INTERFACE} up"
         run("ip", "-n", space, "-batch", "-", text=inside)
 
-    def renumber(self, name: str) -> str:
+    def renumber(self, name: str, address: str = "") -> str:
         """A namespace gets another address, as a robot that roams does; its connections are dead. The new address."""
         space, old = self.name_of(name), self._addresses[name]
-        self._addresses[name] = new = self._next_address()
+        self._addresses[name] = new = address or self._next_address()
         run("ip", "-n", space, "address", "del", f"{old}/24", "dev", INTERFACE)
         run("ip", "-n", space, "address", "add", f"{new}/24", "dev", INTERFACE)
         return new
