@@ -224,10 +224,20 @@ def _ask_elsewhere(door: Door, request: Json) -> Json:
     from zsched.runtime.shell import answer_json, command_of  # noqa: PLC0415 - loads zenoh, which no socket needs
 
     command = None if request["verb"] == "status" else command_of(request)
+    visit = _visit(door.endpoint)
+    if visit.is_guest and command is not None:
+        raise CliError(EXIT_FAILED, _guest_may_not(visit))
     try:
         return answer_json(_client(door.endpoint).ask(door.node, command))
     except AdapterError as error:
         raise CliError(EXIT_UNREACHABLE, str(error)) from error
+
+
+def _guest_may_not(visit: _Visit) -> str:
+    return (
+        f"{visit.asker} is a guest of fleet {visit.fleet} and may only ask for its status and read streams; "
+        "ask with an operator's certificate (`zsched pki issue NAME --role operator` where the fleet's authority is)"
+    )
 
 
 @cache
@@ -250,8 +260,10 @@ class _Visit(Struct, frozen=True, kw_only=True):
     asker: str
     fleet: str
     seals: Seals | None = None
+    is_guest: bool = False
 
 
+@cache
 def _visit(endpoint: str) -> _Visit:
     """With the certificates that the fleet file of this machine names, where the endpoint is a secured one.
 
@@ -263,15 +275,19 @@ def _visit(endpoint: str) -> _Visit:
     if endpoint.startswith("tcp/"):
         return _Visit(text="", asker=asker, fleet="*")
     from zsched.config.load import load_fleet  # noqa: PLC0415 - ruamel.yaml is slow to import
+    from zsched.core.values.certificates import Role  # noqa: PLC0415 - as above
     from zsched.runtime.access_rules import Side  # noqa: PLC0415 - as above
     from zsched.runtime.sealing import seals_of  # noqa: PLC0415 - as above
-    from zsched.runtime.tls import asker_in, session_text  # noqa: PLC0415 - as above
+    from zsched.runtime.secured import identity_of  # noqa: PLC0415 - as above
+    from zsched.runtime.tls import session_text  # noqa: PLC0415 - as above
 
     fleet = load_fleet(places.config_path(None, os.environ))
     text = session_text(fleet, Side.VISIT)
     if fleet.security is None:
-        return _Visit(text=text, asker=asker_in(fleet, asker), fleet="*")
-    return _Visit(text=text, asker=asker_in(fleet, asker), fleet=fleet.name, seals=seals_of(fleet))
+        return _Visit(text=text, asker=asker, fleet="*")
+    holder = identity_of(fleet, fleet.security).holder
+    is_guest = holder.role is Role.GUEST
+    return _Visit(text=text, asker=holder.name, fleet=fleet.name, seals=seals_of(fleet), is_guest=is_guest)
 
 
 def _unanswered(door: Door, error: AdapterError) -> CliError:
