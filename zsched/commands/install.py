@@ -15,7 +15,7 @@ from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Final
 
-from zsched.commands.common import CliError
+from zsched.commands.common import CliError, say
 from zsched.commands.completion import SCRIPTS, script_file
 from zsched.core.values.struct import Struct
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_WOULD_CHANGE
@@ -25,6 +25,8 @@ DROP_INS: Final = ("zsched.service.d/10-user.conf", "zsched-web.service.d/10-use
 OPT: Final = "/opt/zsched"
 """The installation that the units as shipped are for."""
 USER: Final = "zsched"
+MANUAL: Final = "man/man1"
+OLD_PAGE: Final = "manual page of a verb that this version has not"
 HIDDEN: Final = ("/home", "/root", "/tmp", "/var/tmp", "/run/user")  # noqa: S108 - what the unit hides from the service
 COMPLETIONS: Final = {
     "bash": "usr/local/share/bash-completion/completions",
@@ -100,20 +102,25 @@ def install(root: Path, *, is_plan: bool) -> int:
             f"{blocked[0]}: is there and not zsched's{_and_others(len(blocked))}; move it away. Nothing was written",
         )
     missing = [piece for piece in pieces if not piece.is_there()]
+    old = _old_pages(prefix, root, pieces)
     needs_user = _is_this_machine(root) and not _has_user()
     if is_plan:
         _print(f"would make {piece.path}: {piece.what}" for piece in missing)
+        _print(f"would remove {path}: {OLD_PAGE}" for path in old)
         _print([f"would make the user and group {USER}"] if needs_user else [])
-        return EXIT_WOULD_CHANGE if missing or needs_user else EXIT_OK
+        return EXIT_WOULD_CHANGE if missing or old or needs_user else EXIT_OK
     _need_rights(root)
     for piece in missing:
         _carefully(piece.path, piece.make)
         _print([f"{piece.path}: {piece.what}"])
+    for path in old:
+        _carefully(path, path.unlink)
+        _print([f"removed {path}: {OLD_PAGE}"])
     if needs_user:
         _make_user(root)
         _print([f"user and group {USER}: the daemon's; members of the group may ask it and give orders"])
     _reload(root)
-    if not missing and not needs_user:
+    if not missing and not old and not needs_user:
         _print(["everything is there already"])
     _print([f"next: {_next(root)}"])
     return EXIT_OK
@@ -128,6 +135,7 @@ def uninstall(root: Path, *, is_plan: bool) -> int:
     prefix = Path(sys.prefix)
     _check(prefix, root)
     pieces = list(_pieces(prefix, root))
+    pieces += [Piece(path=path, what=OLD_PAGE, target=path.readlink()) for path in _old_pages(prefix, root, pieces)]
     ours = [piece for piece in pieces if piece.is_ours()]
     if is_plan:
         _print(f"would stop, disable and remove {piece.path}" for piece in ours if piece.path.suffix == ".service")
@@ -184,8 +192,15 @@ def _pieces(prefix: Path, root: Path) -> Iterator[Piece]:
     for shell, folder in COMPLETIONS.items():
         path = root / folder / SCRIPTS[shell]
         yield Piece(path=path, what=f"completion in {shell}", target=script_file(shell))
-    for page in sorted((share / "man/man1").glob("*.1")):
-        yield Piece(path=root / "usr/local/share/man/man1" / page.name, what="manual page", target=page)
+    for page in sorted((share / MANUAL).glob("*.1")):
+        yield Piece(path=root / "usr/local/share" / MANUAL / page.name, what="manual page", target=page)
+
+
+def _old_pages(prefix: Path, root: Path, pieces: Iterable[Piece]) -> list[Path]:
+    """Links to pages of this installation that its version no longer has: of a verb that an older one had."""
+    links = sorted((root / "usr/local/share" / MANUAL).glob("*.1"))
+    known, pages = {piece.path for piece in pieces}, prefix / "share" / MANUAL
+    return [link for link in links if link not in known and link.is_symlink() and link.readlink().parent == pages]
 
 
 def _next(root: Path) -> str:
@@ -273,4 +288,4 @@ def _first_line(path: Path) -> str:
 
 def _print(lines: Iterable[str]) -> None:
     for line in lines:
-        print(line)
+        say(line)

@@ -99,6 +99,32 @@ def test_a_second_time_it_renews_what_is_old(prefix: Path, root: Path) -> None:
     assert "everything is there already" in run("install", root).output
 
 
+def test_a_newer_version_takes_the_pages_of_verbs_away_that_it_no_longer_has(prefix: Path, root: Path) -> None:
+    pages, links = prefix / "share/man/man1", root / "usr/local/share/man/man1"
+    (pages / "zsched-juggle.1").write_text(".TH ZSCHED-JUGGLE 1\n")
+    run("install", root)
+    (links / "other.1").write_text(".TH OTHER 1\n")
+    (links / "another.1").symlink_to("/opt/other/share/man/man1/another.1")
+    before = files_in(root)
+    (pages / "zsched-juggle.1").unlink()  # as pip does, which installs the newer version
+    planned = run("install", root, "--plan")
+    assert (planned.exit_code, files_in(root)) == (10, before)
+    assert f"would remove {links}/zsched-juggle.1" in planned.output
+    result = run("install", root)
+    assert result.exit_code == 0
+    assert f"removed {links}/zsched-juggle.1: manual page of a verb that this version has not" in result.output
+    assert before - files_in(root) == {"usr/local/share/man/man1/zsched-juggle.1"}
+    assert "everything is there already" in run("install", root).output
+
+
+def test_uninstall_takes_an_old_page_away_too(prefix: Path, root: Path) -> None:
+    (prefix / "share/man/man1/zsched-juggle.1").write_text(".TH ZSCHED-JUGGLE 1\n")
+    run("install", root)
+    (prefix / "share/man/man1/zsched-juggle.1").unlink()
+    assert run("uninstall", root).exit_code == 0
+    assert files_in(root) == set()
+
+
 def test_what_is_not_zscheds_is_left_alone_and_stops_install_before_it_writes(prefix: Path, root: Path) -> None:
     assert prefix.exists()
     stranger = root / "usr/local/bin/zsched"
