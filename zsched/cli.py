@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from zsched.commands.common import CliError, Json, Verb, Verbs, print_json, say
+from zsched.commands.common import CliError, Json, Verb, Verbs, print_json, say, warn
 from zsched.commands.example import Example, write_example
 from zsched.commands.flag_verbs import add_flag_verbs
 from zsched.commands.fleet_verbs import (
@@ -224,25 +224,25 @@ def init(
     state = places.state_folder(state_dir, os.environ)
     if settle:
         done = settle_dispute(fleet, name, state)
-        typer.echo(f"{name}: {'settled; restart its daemon' if done else 'there was no dispute'}")
+        say(f"{name}: {'settled; restart its daemon' if done else 'there was no dispute'}")
         return
     if force and not generation:
         raise CliError(EXIT_USAGE, "--force goes with --generation G")
     standing = standing_state(fleet, name, state)
     if standing is not None and generation in (0, standing.generation):
         text = f"{name} has its state in fleet {fleet.name}, generation {standing.generation}: nothing to do"
-        typer.echo(f"{state}: {text}")
+        say(f"{state}: {text}")
         return
     heard = check_blank(fleet, name, state, generation, standing, is_forced=force)
     side = heard.side
     path = init_state(fleet, name, state, generation) if side is None else begin_anew(fleet, name, state, side)
-    _say(_heard(heard, name, generation, is_elector=name in fleet.electors))
-    typer.echo(f"a core of this machine has speed {core_speed.kept_or_new(state):.2f}")
+    warn(_heard(heard, name, generation, is_elector=name in fleet.electors))
+    say(f"a core of this machine has speed {core_speed.kept_or_new(state):.2f}")
     if side is not None:
         text = "the others know it as an elector with another disk: it is a new member, and no elector until"
-        typer.echo(f"{path}: blank state of {name} in fleet {fleet.name}; {text} it is added as one")
+        say(f"{path}: blank state of {name} in fleet {fleet.name}; {text} it is added as one")
         return
-    typer.echo(f"{path}: blank state of {name} in fleet {fleet.name}, generation {generation}")
+    say(f"{path}: blank state of {name} in fleet {fleet.name}, generation {generation}")
 
 
 @app.command(cls=Verb)
@@ -315,9 +315,9 @@ def _place(config: Path | None, node: str | None, state_dir: Path | None) -> Pla
 
 def _write_example(example: Example, folder: Path) -> None:
     for path in write_example(example, folder):
-        typer.echo(str(path))
+        say(str(path))
     words = shlex.join(("zsched", "dev", *(() if folder == Path() else (str(folder),))))
-    _say(f"next: `{words}`; it prints the line that starts the application in another terminal")
+    warn(f"next: `{words}`; it prints the line that starts the application in another terminal")
 
 
 def _heard(heard: Heard, name: str, generation: int, *, is_elector: bool) -> str:
@@ -793,7 +793,7 @@ def check(
         body = {"schema": "zsched.check/1", "file": result.file, "ok": fleet is not None, "hash": digest}
         print_json({**body, "fleet": named, **found})
     elif report := result.report():
-        _say(report)
+        warn(report)
     if counts is None:
         raise typer.Exit(EXIT_CONFIG)
     if not json_:
@@ -967,7 +967,7 @@ def man(folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where to.")]
         raise CliError(
             EXIT_FAILED, f"{error.filename or folder}: {error.strerror}; give a folder to write to"
         ) from error
-    typer.echo(f"{folder}: {_count(len(found), 'pages')}")
+    say(f"{folder}: {_count(len(found), 'pages')}")
 
 
 def _count(number: int, plural: str) -> str:
@@ -1004,11 +1004,6 @@ def _need_file(file: Path) -> None:
         ) from error
 
 
-def _say(text: str) -> None:
-    """For people, on stderr."""
-    typer.echo(text, err=True)
-
-
 NEED_ALL = ("complete", "man")
 """Verbs that tell of the others."""
 
@@ -1039,7 +1034,7 @@ def main() -> None:
         if error.errno not in UNWRITABLE or error.filename is not None:
             raise
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the interpreter will try once more
-        _say(f"zsched: the answer cannot be written: {error.strerror}; see where stdout goes")
+        warn(f"zsched: the answer cannot be written: {error.strerror}; see where stdout goes")
     _end(code)
 
 

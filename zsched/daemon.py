@@ -74,6 +74,7 @@ from zsched.runtime.secured import digest_of, require_own
 from zsched.runtime.sessions import SessionsRead
 from zsched.runtime.shell import Desk, Inbox, Shell
 from zsched.runtime.strikes import Strikes
+from zsched.screen import fitted
 from zsched.sessions import config as zenoh_config
 
 NAME_TAKEN_WAIT_S = 5.0
@@ -669,15 +670,15 @@ def main(arguments: list[str] | None = None) -> int:
         daemon = Daemon(options)
         code = daemon.run()
     except ConfigError as error:
-        print(error, file=sys.stderr)
+        print(fitted(str(error), sys.stderr), file=sys.stderr)
         return EXIT_CONFIG
     except NameTakenError as error:
         # It may have been somebody's forgery, so the service tries again; not at once, for each try disturbs the other.
-        print(error, file=sys.stderr, flush=True)
+        print(fitted(str(error), sys.stderr), file=sys.stderr, flush=True)
         time.sleep(NAME_TAKEN_WAIT_S)
         return EXIT_NAME_TAKEN
     except AdapterError as error:
-        print(f"zsched up: {error}", file=sys.stderr)
+        print(fitted(f"zsched up: {error}", sys.stderr), file=sys.stderr)
         return EXIT_FAILED
     if daemon.begins_anew:
         _begin_anew()

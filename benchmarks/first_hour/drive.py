@@ -92,7 +92,7 @@ def play_task(example: str, play: dict[str, Any], terminal: Terminal) -> dict[st
     terminal.wait(re.compile(rb": on \w+ \(epoch 1"), FLEET_S, started)
     placed_s = time.monotonic() - began
     other = Terminal(HOME)
-    printed = re.compile(rb"dev: the application, in another terminal: ([^\r\n]+)")
+    printed = re.compile(rb"dev: the application, in another terminal:\s+([^\r\n]+)")
     other.type(terminal.wait(printed, COMMAND_S, started)[1].decode())
     other.wait(answer, ANSWER_S)
     answered_s = time.monotonic() - began

@@ -87,7 +87,7 @@ class Dev:
     @property
     def application(self) -> list[str]:
         """The words of the line that starts the example's application."""
-        return shlex.split(self.wait(r"the application, in another terminal: (.+)\n")[1])
+        return shlex.split(self.wait(r"the application, in another terminal:\s+(.+)\n")[1])
 
     def left(self) -> list[str]:
         """What there still is of the run: its folder, and processes that work in the example's folder."""

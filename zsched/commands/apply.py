@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TextIO
 
 from zsched.commands.ask import Door
-from zsched.commands.common import CliError, Json, check_reason, nearest, print_json, say, warn
+from zsched.commands.common import CliError, Json, check_reason, nearest, print_json, say, says_yes, warn
 from zsched.commands.document import (
     QUESTION,
     ConflictError,
@@ -29,7 +29,7 @@ from zsched.commands.document import (
     wait_until_settled,
 )
 from zsched.commands.orders import asker
-from zsched.commands.page import cut, harmless
+from zsched.commands.page import cut
 from zsched.commands.rollout import Wave, begun, kept_rollouts, told_in
 from zsched.config.difference import Change, Danger, difference, wanted_electors, warnings_in_force
 from zsched.config.load import check_bytes
@@ -155,7 +155,7 @@ def agree(door: Door, view: ApplyView, plan: Plan) -> int:
     if view.revision is not None and view.revision != held.revision:
         raise CliError(EXIT_FAILED, f"revision {view.revision} is overtaken: {held.fleet} has revision {held.revision}")
     if plan.warnings and not view.is_json:
-        sys.stderr.write(harmless(plan.warnings) + "\n")
+        warn(plan.warnings)
     if plan.is_nothing:
         return _tell(view, plan, "unchanged", held.revision, EXIT_OK)
     if not view.is_json:
@@ -338,10 +338,8 @@ def _confirm(view: ApplyView, plan: Plan) -> None:
     if view.is_sure:
         return
     if not sys.stdin.isatty() or view.words[-1] == STDIN:
-        raise CliError(EXIT_USAGE, f"nothing was changed; to change it without being asked: {view.again('--yes')}")
-    sys.stderr.write(f"Change {plan.held.fleet} for all its nodes? [y/N] ")
-    sys.stderr.flush()
-    if sys.stdin.readline().strip().lower() not in ("y", "yes"):
+        raise CliError(EXIT_USAGE, f"nothing was changed; to change it without being asked:\n{view.again('--yes')}")
+    if not says_yes(f"Change {plan.held.fleet} for all its nodes?", sys.stderr):
         raise CliError(EXIT_FAILED, "nothing was changed")
 
 

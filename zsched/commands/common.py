@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,10 +15,10 @@ from typing import Any, Final, TextIO
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from zsched.commands.page import harmless, wrapped
 from zsched.core.values.words import MAX_ASKED
 from zsched.errors import AdapterError, ConfigError, ZschedError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE
+from zsched.screen import fitted
 
 Json = dict[str, Any]
 NAMED_OTHERWISE: Final = {
@@ -34,8 +33,6 @@ LONGEST_SENTENCE: Final = 1000
 """Characters."""
 ARGUMENT: Final = "argument"
 """As typer calls such a parameter."""
-MIN_WIDTH: Final = 60
-"""Of what is written for people; a terminal that is narrower breaks the lines itself."""
 SCHEMAS: Final = Path(__file__).parents[1] / "schemas"
 """A JSON Schema per kind of output and major version."""
 
@@ -184,7 +181,7 @@ class Verbs(TyperGroup):
             code, text = EXIT_FAILED, str(error)
         # a fleet file's faults start with its name, like a compiler's: nothing goes in front of them
         prefix = "" if code == EXIT_CONFIG else f"{ctx.command_path} {ctx.invoked_subcommand}: "
-        typer.echo(f"{prefix}{harmless(text)}", err=True)
+        warn(f"{prefix}{text}")
         raise typer.Exit(code)
 
 
@@ -200,30 +197,21 @@ def say(text: str, indent: int = 2) -> None:
 
     On a terminal they wrap at its width, and go on at ``indent``; for a file or another program a line stays a line.
     """
-    sys.stdout.write(f"{_fitted(text, sys.stdout, indent)}\n")
+    sys.stdout.write(f"{fitted(text, sys.stdout, indent)}\n")
     sys.stdout.flush()
 
 
 def warn(text: str, indent: int = 2) -> None:
     """The same on stderr."""
-    sys.stderr.write(f"{_fitted(text, sys.stderr, indent)}\n")
+    sys.stderr.write(f"{fitted(text, sys.stderr, indent)}\n")
     sys.stderr.flush()
 
 
-def _fitted(text: str, stream: TextIO, indent: int) -> str:
-    shown, width = harmless(text), screen_width(stream)
-    return shown if width is None else wrapped(shown, width, indent)
-
-
-def screen_width(stream: TextIO | None = None) -> int | None:
-    """How many columns there are for people (of stdout, if no other is meant); ``None``: nobody looks."""
-    is_seen = is_screen(sys.stdout if stream is None else stream)
-    return max(shutil.get_terminal_size().columns, MIN_WIDTH) if is_seen else None
-
-
-def is_screen(stream: TextIO) -> bool:
-    """Whether people look at what is written there."""
-    return stream.isatty()
+def says_yes(question: str, stream: TextIO) -> bool:
+    """Ask whoever sits at the terminal; anything but yes is no."""
+    stream.write(f"{fitted(question, stream, 0)} [y/N] ")
+    stream.flush()
+    return sys.stdin.readline().strip().lower() in ("y", "yes")
 
 
 def check_reason(reason: str) -> None:

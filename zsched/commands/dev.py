@@ -16,9 +16,8 @@ from pathlib import Path
 from typing import Final
 
 from zsched import paths as places
-from zsched.commands.common import CliError, Json, nearest, wants_color
+from zsched.commands.common import CliError, Json, nearest, say, wants_color
 from zsched.commands.example import APPLICATION
-from zsched.commands.page import harmless
 from zsched.commands.report import render_status
 from zsched.config.load import load_fleet
 from zsched.core.route.templates import routes_for
@@ -33,9 +32,12 @@ from zsched.dev.terminal import Keys
 from zsched.dev.watch import Watched
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE
 from zsched.runtime.endpoints import DATA_PORT, PortClaim, claim_port, free_port
+from zsched.screen import harmless
 
 HERE: Final = Path("fleet.yaml")
 ENTER: Final = "enter.sh"
+INDENT: Final = "    "
+"""Of what is there to be copied."""
 PORT_STEP: Final = 10
 """From one robot's data port to the next one's."""
 NARROW: Final = 80
@@ -172,15 +174,17 @@ def _introduce(
     robot = next((name for name in nodes.names if fleet.node(name).kind is NodeKind.ROBOT), nodes.names[0])
     for task in fleet.tasks:
         _say_streams(task, robot)
-    print(f"\nAn application of {robot} joins by this configuration of zenoh (JSON5):\n")
-    print(textwrap.indent(json5(addresses[robot].joins), "    "))
-    print('\nIn Python: zenoh.open(zenoh.Config.from_json5("""..."""))\n')
+    say(f"\nAn application of {robot} joins by this configuration of zenoh (JSON5):\n")
+    _say_to_copy(json5(addresses[robot].joins))
+    say('\nIn Python: zenoh.open(zenoh.Config.from_json5("""..."""))\n')
     if (words := application(nodes.work_folder, fleet.tasks[0].worker.command, addresses[robot].joins)) is not None:
-        _say(f"the application, in another terminal: {words}")
+        _say("the application, in another terminal:")
+        _say_to_copy(words)
     enter = nodes.folder / ENTER
     enter.write_text(entrance(nodes, robot), encoding="utf-8")
-    _say(f"another terminal begins with: source {shlex.quote(str(enter))}")
-    _say(f"this fleet there: zsched status; elsewhere: zsched status --runtime-dir {nodes.folder} --node {robot}")
+    _say("zsched asks this fleet in a terminal that begins with:")
+    _say_to_copy(f"source {shlex.quote(str(enter))}")
+    _say(f"in others: `zsched status --runtime-dir {nodes.folder} --node {robot}`")
 
 
 def entrance(nodes: Nodes, robot: NodeId) -> str:
@@ -232,7 +236,13 @@ def _say_streams(task: TaskSpec, robot: NodeId) -> None:
 
 
 def _say(text: str) -> None:
-    print(f"dev: {harmless(text)}", flush=True)
+    say(f"dev: {text}", indent=len("dev: "))
+
+
+def _say_to_copy(text: str) -> None:
+    """Lines that are copied as they are, though a terminal may be narrower."""
+    sys.stdout.write(f"{textwrap.indent(harmless(text), INDENT)}\n")
+    sys.stdout.flush()
 
 
 def _show(status: Json) -> None:

@@ -17,11 +17,12 @@ from typing import Final
 from zsched import paths as places
 from zsched.commands.ask import name_here
 from zsched.commands.common import Json, print_json, wants_color
-from zsched.commands.page import Page, harmless
+from zsched.commands.page import Page
 from zsched.doctor.look import Machine, look
 from zsched.doctor.model import Check, Result, Scene, Verdict
 from zsched.doctor.table import run_all, worst
 from zsched.exits import EXIT_FAILED, EXIT_OK
+from zsched.screen import harmless
 
 SCHEMA: Final = "zsched.doctor/1"
 STYLES: Final = {Verdict.PASS: "green", Verdict.SKIP: "dim", Verdict.WARN: "yellow", Verdict.FAIL: "alarm"}

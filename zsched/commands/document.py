@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import os
 import shlex
-import sys
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -19,7 +18,7 @@ from pathlib import Path
 from zsched import paths as places
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door
-from zsched.commands.common import CliError, Json
+from zsched.commands.common import CliError, Json, warn
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.struct import Struct
 from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_TIMED_OUT
@@ -181,7 +180,7 @@ def wait_until_settled(door: Door, revision: int) -> InForce:
             return held
         if not is_told and monotonic_s() > start + TELL_S:
             is_told = True
-            sys.stderr.write(f"revision {revision} is agreed, and is being settled; Ctrl-C takes nothing back\n")
+            warn(f"revision {revision} is agreed, and is being settled; Ctrl-C takes nothing back")
         if monotonic_s() > start + IN_FORCE_S:
             why = "has not fetched its document" if held.is_settled else f"number {held.number} is not settled"
             raise CliError(

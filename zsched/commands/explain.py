@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 
 from zsched.commands.ask import Door, ask_door
-from zsched.commands.common import CliError, Json, print_json
+from zsched.commands.common import CliError, Json, print_json, warn
 from zsched.commands.history import age_s_of, is_known, is_move, wall_text, where_of
 from zsched.commands.page import Cell, Page, memory, span
 from zsched.commands.report import printable
@@ -112,7 +112,7 @@ def _of_robot(door: Door, task: str, robot: str) -> tuple[Json, Json]:
     try:
         return explanation(door.to(robot), task)
     except CliError as error:
-        sys.stderr.write(f"zsched explain: {error}; this is what {body['node']} has heard of {robot}\n")
+        warn(f"zsched explain: {error}; this is what {body['node']} has heard of {robot}")
         return body, written
 
 

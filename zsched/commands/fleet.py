@@ -93,7 +93,7 @@ def export(door: Door, file: Path | None) -> int:
         write_regular(file, text.encode())
     except OSError as error:
         raise CliError(EXIT_FAILED, f"{file}: {error.strerror}; give a file that can be written") from error
-    sys.stdout.write(f"{file}: {held.fleet}, revision {held.revision}\n")
+    say(f"{file}: {held.fleet}, revision {held.revision}")
     return EXIT_OK
 
 

@@ -8,15 +8,14 @@ Times are by the wall clock of the node that wrote them. Ages are from the same 
 from __future__ import annotations
 
 import re
-import sys
 import time
 from collections.abc import Container, Iterable, Iterator
 from datetime import UTC, datetime
 from typing import Final
 
 from zsched.commands.ask import Door, ask_door
-from zsched.commands.common import CliError, Json, nearest, print_json, say
-from zsched.commands.page import harmless, span
+from zsched.commands.common import CliError, Json, nearest, print_json, say, warn
+from zsched.commands.page import span
 from zsched.commands.report import millis, printable
 from zsched.core.values.struct import Struct
 from zsched.exits import EXIT_OK, EXIT_UNREACHABLE, EXIT_USAGE
@@ -136,7 +135,7 @@ def events(door: Door, view: EventsView) -> int:
                 if error.code != EXIT_UNREACHABLE:
                     raise
                 if not is_away:
-                    sys.stderr.write(f"zsched events: {harmless(str(error))}; asking again until Ctrl-C\n")
+                    warn(f"zsched events: {error}; asking again until Ctrl-C")
                 is_away = True
             else:
                 is_away = False

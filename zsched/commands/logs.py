@@ -14,10 +14,11 @@ from typing import Final
 
 from zsched.clock import wall_ns
 from zsched.commands.ask import Door, ask_door, find_door
-from zsched.commands.common import CliError, Json, nearest, print_json
-from zsched.commands.page import clock_time, harmless
+from zsched.commands.common import CliError, Json, nearest, print_json, warn
+from zsched.commands.page import clock_time
 from zsched.core.values.struct import Struct
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE
+from zsched.screen import harmless
 
 SCHEMA: Final = "zsched.logs/1"
 PAUSE_S: Final = 0.5
@@ -94,14 +95,14 @@ def show_logs(view: LogsView, task: str, whose: str | None) -> int:
     _print(view, node, task, lines[len(lines) - min(view.most, len(lines)) :])
     if not lines:
         least = "" if view.level is None else f" at {view.level} or above"
-        sys.stderr.write(f"the worker of {task} on {node} has printed nothing{least} since the daemon there started\n")
+        warn(f"the worker of {task} on {node} has printed nothing{least} since the daemon there started")
     try:
         while view.is_followed:
             time.sleep(PAUSE_S)
             try:
                 lines, after = _all_lines(asked, task, after)
             except CliError as error:
-                sys.stderr.write(f"zsched logs: {harmless(str(error))}; asking again until Ctrl-C\n")
+                warn(f"zsched logs: {error}; asking again until Ctrl-C")
                 continue
             _print(view, node, task, sieve.of(lines))
     except KeyboardInterrupt:

@@ -19,7 +19,7 @@ from typing import Final
 from zsched import paths as places
 from zsched.commands.apply import ApplyView, apply
 from zsched.commands.ask import CONTROL_PORT, Door, ask_door
-from zsched.commands.common import CliError, Json, nearest, print_json, say
+from zsched.commands.common import CliError, Json, nearest, print_json, say, warn
 from zsched.commands.document import InForce, document_text, in_force, status_of
 from zsched.commands.entries import DOCUMENT, HERE
 from zsched.commands.papers import FirstPapers, ask_for_certificate, check_request, papers_for, refuse_open_network
@@ -399,9 +399,9 @@ def _write(invitation: Invitation, guest: Guest, file: Path | None) -> None:
     where = "this file" if file is None else str(file)
     secret = f"; {where} holds its private key: only you may read it, bring it there by a way that nobody else reads"
     name = f"{guest.name}.invite" if file is None else file.name
-    sys.stderr.write(
+    warn(
         f"{invitation.fleet}: {guest.name} may join{secret if has_key else ''}\n"
-        f"next, on that machine: sudo zsched join {shlex.quote(name)}\n"
+        f"next, on that machine: sudo zsched join {shlex.quote(name)}"
     )
 
 

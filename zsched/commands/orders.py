@@ -18,8 +18,8 @@ from typing import Any, Final
 
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door
-from zsched.commands.common import CliError, Json, check_reason, nearest, print_json, say
-from zsched.commands.page import harmless, span
+from zsched.commands.common import CliError, Json, check_reason, nearest, print_json, say, says_yes
+from zsched.commands.page import span
 from zsched.commands.report import FLAGS, millis, told_flag, told_hold, told_rollout
 from zsched.commands.wait import Condition, missing
 from zsched.commands.weight_words import NAMES, shares
@@ -28,6 +28,7 @@ from zsched.core.values.model import MAX_FOR_S, Aggregate, PairReading, Reach, S
 from zsched.core.values.struct import Struct, replace
 from zsched.core.values.words import MAX_ASKER
 from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE, EXIT_WOULD_CHANGE
+from zsched.screen import harmless
 
 MOVE_SCHEMA: Final = "zsched.move/1"
 TASK_SCHEMA: Final = "zsched.task/1"
@@ -241,7 +242,7 @@ def _list_holds(view: OrderView, verb: str, tasks: Sequence[Json]) -> int:
         print_json({"schema": TASK_SCHEMA, "tasks": [_held(task) for task in held]})
         return EXIT_OK
     if not held:
-        sys.stdout.write(f"no task is {verb}{'ned' if verb == 'pin' else 'd'}\n")
+        say(f"no task is {verb}{'ned' if verb == 'pin' else 'd'}")
     for task in held:
         age = span(task[verb]["known_s"])
         say(f"{task['name']}: {told_hold(verb, task[verb])}, known for {age}")
@@ -297,8 +298,7 @@ def move(view: OrderView, order: MoveOrder) -> int:
         raise _refused(order.task, result)
     watch = not order.is_detached
     if watch and not view.is_json:
-        sys.stdout.write("It is agreed. Ctrl-C ends the watching, not the move.\n")
-        sys.stdout.flush()
+        say("It is agreed. Ctrl-C ends the watching, not the move.")
     found, lacks = _watch(view.door, order, int(result["revision"])) if watch else ({}, [])
     return _tell_move(view, order, str(task["owner"] or ""), result, before, found, lacks)
 
@@ -599,7 +599,7 @@ def maint(door: Door, *, is_json: bool) -> int:
     ]
     rows += [(name, "stopping", "hands its tasks over and takes none", "") for name in stopping]
     if not rows:
-        sys.stdout.write(f"no order is in force, as {status['node']} knows\n")
+        say(f"no order is in force, as {status['node']} knows")
     _table(("WHAT", "KIND", "ORDER", "SINCE"), rows)
     return EXIT_OK
 
@@ -646,18 +646,16 @@ def begin(
         return EXIT_WOULD_CHANGE if is_change else EXIT_OK
     if not is_change:
         if not view.is_json:
-            sys.stdout.write("Nothing would change.\n")
+            say("Nothing would change.")
             return EXIT_OK
         return None
     if view.is_yes:
         return None
     if not sys.stdin.isatty() or view.is_json:
         command = shlex.join(["zsched", *sys.argv[1:], "--yes"])
-        raise CliError(EXIT_USAGE, f"nothing was done, for nobody can be asked here; to do it: {command}")
-    sys.stdout.write(f"{warning}{' ' if warning else ''}Do it? [y/N] ")
-    sys.stdout.flush()
-    if sys.stdin.readline().strip().lower() not in ("y", "yes"):
-        sys.stdout.write("Nothing was done.\n")
+        raise CliError(EXIT_USAGE, f"nothing was done, for nobody can be asked here; to do it:\n{command}")
+    if not says_yes(f"{warning}{' ' if warning else ''}Do it?", sys.stdout):
+        say("Nothing was done.")
         return EXIT_FAILED
     return None
 

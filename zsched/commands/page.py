@@ -75,26 +75,6 @@ def counted(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
-def harmless(text: str) -> str:
-    """The text with every character that a terminal would obey, but line ends and tabs, replaced by ``?``."""
-    return text if text.isprintable() else "".join(c if c.isprintable() or c in "\n\t" else "?" for c in text)
-
-
-def wrapped(text: str, width: int, indent: int = 2) -> str:
-    """Lines of at most ``width`` columns: one that is longer is broken between its words, and goes on at ``indent``.
-
-    A word that is longer than that stays whole: it is a path or a command, which people copy.
-    """
-    return "\n".join(
-        "\n".join(
-            textwrap.wrap(line, width, subsequent_indent=" " * indent, break_long_words=False, break_on_hyphens=False)
-        )
-        if len(line) > width
-        else line
-        for line in text.split("\n")
-    )
-
-
 def cut(text: str, width: int) -> str:
     """At most ``width`` characters; a dot at the end shows that there were more."""
     return text if len(text) <= width else text[: max(width - 1, 0)] + "…"[:width]

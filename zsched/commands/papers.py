@@ -9,7 +9,6 @@ from __future__ import annotations
 import ipaddress
 import os
 import socket
-import sys
 from collections.abc import Collection, Iterable
 from contextlib import suppress
 from pathlib import Path
@@ -17,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 
 from zsched import paths as places
 from zsched.commands.apply import DANGERS, OPEN_NETWORK
-from zsched.commands.common import CliError, nearest
+from zsched.commands.common import CliError, nearest, warn
 from zsched.commands.pki import begin_for, holds_authority, issue_for
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId
@@ -107,7 +106,7 @@ def papers_for(fleet: Fleet, node: NodeId, authority: Path | None, request: Path
     issued = issue_for(fleet, node, authority, b"" if request is None else read_request(request))
     if issued is None:
         advice = f"where it is: zsched pki issue {node}; bring its files to the machine before it starts"
-        sys.stderr.write(f"the invitation has no certificate: the fleet's authority is not on this machine; {advice}\n")
+        warn(f"the invitation has no certificate: the fleet's authority is not on this machine; {advice}")
         return None
     certificate, key, trusted = (pem.decode("ascii") for pem in (issued.certificate, issued.key, issued.trusted))
     return Papers(certificate=certificate, key=key, trusted=trusted)

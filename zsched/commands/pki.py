@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import getpass
 import os
-import sys
 import warnings
 from collections.abc import Iterator
 from datetime import UTC, datetime
@@ -21,9 +20,8 @@ import typer
 from zsched import paths as places
 from zsched.clock import wall_ns
 from zsched.commands.ask import Door, ask_door, find_door
-from zsched.commands.common import CliError, Json, nearest, print_json
+from zsched.commands.common import CliError, Json, nearest, print_json, say, warn
 from zsched.commands.document import fleet_here
-from zsched.commands.page import harmless
 from zsched.config.load import load_fleet
 from zsched.core.values.certificates import Role, parse_label
 from zsched.core.values.fleet import Fleet
@@ -211,10 +209,10 @@ def _send(door: Door, entry: Entry) -> bool:
     try:
         answer = ask_door(there, {"verb": "certificate", "certificate": entry.certificate})
     except CliError as error:
-        sys.stderr.write(f"{entry.label}: {error}\n")
+        warn(f"{entry.label}: {error}")
         return False
     outcome = str(answer["outcome"])
-    _say(f"{entry.label}: {harmless(str(answer['detail']))}")
+    _say(f"{entry.label}: {answer['detail']}")
     return outcome in ("ok", "unchanged")
 
 
@@ -456,4 +454,5 @@ def _now() -> datetime:
 
 
 def _say(*lines: str) -> None:
-    sys.stdout.write("".join(f"{line}\n" for line in lines if line))
+    if shown := [line for line in lines if line]:
+        say("\n".join(shown))

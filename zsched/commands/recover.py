@@ -11,8 +11,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from zsched.commands.common import CliError, nearest
-from zsched.commands.page import harmless
+from zsched.commands.common import CliError, nearest, say, says_yes
 from zsched.core.electorate.recovery import Danger, Recovery, consider
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import SAID_DIGITS, FleetValue
@@ -63,7 +62,7 @@ def recover(place: Place, manner: Manner, brought: Sequence[Path]) -> int:
     if isinstance(plan, str):
         raise CliError(EXIT_FAILED, f"nothing was changed: {plan}")
     draft = plan.carry_out(generation_id="0", disk="", incarnation=0, hardware="")
-    _say(_table(plan, draft))
+    say(_table(plan, draft))
     if manner.is_plan:
         return EXIT_WOULD_CHANGE
     missing = [(danger, means) for danger, means in plan.dangers if danger.value not in manner.accepted]
@@ -73,7 +72,7 @@ def recover(place: Place, manner: Manner, brought: Sequence[Path]) -> int:
         raise CliError(EXIT_FAILED, f"nothing was changed; if this may be:\n{lines}\n{manner.again(*names)}")
     _confirm(manner, f"Make {place.node} the only elector of a new generation of {place.fleet.name}?")
     state = runtime.recover(plan, place.config, place.folder, brought)
-    _say(_next(plan, _value_of(state)))
+    say(_next(plan, _value_of(state)))
     return EXIT_OK
 
 
@@ -89,18 +88,14 @@ def rejoin(place: Place, manner: Manner, wanted: str) -> int:
         raise CliError(EXIT_FAILED, f"nothing was changed: {side}")
     by = f", recovered by {side.recovered_by}" if side.recovered_by else ""
     told = f"generation {side.generation_id[:SAID_DIGITS]}{by} ({', '.join(side.nodes)} count by it)"
-    _say(f"{place.node}: follows {told}, and starts blank there; what it knew of its own generation is dropped")
+    say(f"{place.node}: follows {told}, and starts blank there; what it knew of its own generation is dropped")
     if manner.is_plan:
         return EXIT_WOULD_CHANGE
     _confirm(manner, f"Let {place.node} change sides?")
     path = runtime.rejoin(place.fleet, place.node, place.folder, own, side)
-    _say(f"{path}: blank state of {place.node}, which is to follow {side.generation_id[:SAID_DIGITS]}")
-    _say("next: start this daemon; it fetches the rest, and is no elector until it is added as one")
+    say(f"{path}: blank state of {place.node}, which is to follow {side.generation_id[:SAID_DIGITS]}")
+    say("next: start this daemon; it fetches the rest, and is no elector until it is added as one")
     return EXIT_OK
-
-
-def _say(text: str) -> None:
-    sys.stdout.write(f"{harmless(text)}\n")
 
 
 def _confirm(manner: Manner, question: str) -> None:
@@ -108,11 +103,9 @@ def _confirm(manner: Manner, question: str) -> None:
     if manner.is_sure:
         return
     if not sys.stdin.isatty():
-        raise CliError(EXIT_USAGE, f"nothing was changed; to change it without being asked: {manner.again('--yes')}")
+        raise CliError(EXIT_USAGE, f"nothing was changed; to change it without being asked:\n{manner.again('--yes')}")
     sys.stdout.flush()
-    sys.stderr.write(f"{question} [y/N] ")
-    sys.stderr.flush()
-    if sys.stdin.readline().strip().lower() not in ("y", "yes"):
+    if not says_yes(question, sys.stderr):
         raise CliError(EXIT_FAILED, "nothing was changed")
 
 

@@ -20,11 +20,11 @@ from typing import Any, Final, TypeVar
 from zsched import paths as places
 from zsched.clock import monotonic_s, wall_s
 from zsched.commands.ask import Door, ask_door
-from zsched.commands.common import CliError, Json, nearest, print_json, screen_width, warn
+from zsched.commands.common import CliError, Json, nearest, print_json, say, warn
 from zsched.commands.document import IN_FORCE_S, document_text, in_force
 from zsched.commands.flags import drain_quietly, is_given_by, lift_quietly
 from zsched.commands.orders import OrderView, Row, begin, user_name
-from zsched.commands.page import counted, harmless
+from zsched.commands.page import counted
 from zsched.commands.rehearse_report import SCHEMA, as_json, table
 from zsched.commands.wait import Condition, missing
 from zsched.core.rehearsal.programme import MIN_CALM_S, Do, Lift, Look, Over, Programme, Result, Sight
@@ -32,6 +32,7 @@ from zsched.core.values.rehearsal import FAULTS, MAX_CUT_S, Promised, Step
 from zsched.core.values.struct import Struct, field, replace
 from zsched.core.values.words import MAX_ASKED
 from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE
+from zsched.screen import screen_width
 
 LOOK_S: Final = 0.2
 """Between two looks at the fleet."""
@@ -111,9 +112,9 @@ def show_kept(door: Door, name: str | None, *, is_json: bool) -> int:
     elif kept is not None:
         sys.stdout.write(table(kept, screen_width()))
     elif not names:
-        sys.stdout.write(f"{told['node']} has kept no rehearsal\n")
+        say(f"{told['node']} has kept no rehearsal")
     else:
-        sys.stdout.writelines(f"{harmless(one)}\n" for one in names)
+        say("\n".join(names))
     return EXIT_OK
 
 
@@ -169,7 +170,7 @@ def _play(view: OrderView, order: RehearseOrder, stage: Stage) -> int:
             over = _run(programme, stage)
         except KeyboardInterrupt:
             interrupted = "interrupted"
-            sys.stderr.write("\ninterrupted: nothing more is done\n")
+            warn("\ninterrupted: nothing more is done")
         except CliError as error:
             over = Over(is_kept=False, why=str(error))
         finally:

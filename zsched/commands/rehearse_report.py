@@ -11,9 +11,10 @@ from typing import Final
 
 from zsched.commands.common import Json
 from zsched.commands.history import wall_text
-from zsched.commands.page import cut, harmless, wrapped
+from zsched.commands.page import cut
 from zsched.core.rehearsal.programme import TELLS_S, Over, Result
 from zsched.core.values.rehearsal import Promised, Step
+from zsched.screen import harmless, wrapped
 
 SCHEMA: Final = "zsched.rehearse/1"
 COUNTS: Final = ("lost", "at most lost", "doubled")

@@ -10,13 +10,14 @@ import sys
 from pathlib import Path
 
 from zsched.adapters.host.decision_log import is_torn
-from zsched.commands.common import CliError, print_json
-from zsched.commands.page import counted, harmless
+from zsched.commands.common import CliError, print_json, say
+from zsched.commands.page import counted
 from zsched.core.scheduler.decision import decide_again, verdict_of
 from zsched.core.values.decision import Decision
 from zsched.errors import WireError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE
 from zsched.files import read_packed
+from zsched.screen import harmless
 from zsched.wire.codec import as_plain, from_plain
 
 SCHEMA = "zsched.replay/1"
@@ -62,10 +63,10 @@ def replay(file: Path, *, is_json: bool) -> int:
             {"schema": SCHEMA, "judged": done, "equal": True, "line": None, "was": None, "is": None, "torn": torn}
         )
     else:
-        sys.stdout.write(f"{counted(done, 'judgement')} made again, all equal\n")
+        say(f"{counted(done, 'judgement')} made again, all equal")
         if torn:
             where = ", ".join(map(str, torn))
-            sys.stdout.write(f"left out, for a power cut or a full disk has torn it: line {where}\n")
+            say(f"left out, for a power cut or a full disk has torn it: line {where}")
     return EXIT_OK
 
 

@@ -12,11 +12,11 @@ from pathlib import Path
 
 from zsched.clock import wall_ns
 from zsched.commands.ask import Door, ask_door, find_door
-from zsched.commands.common import CliError, Json, print_json, wants_color
-from zsched.commands.page import harmless
+from zsched.commands.common import CliError, Json, print_json, wants_color, warn
 from zsched.commands.report import TROUBLES, degradations, render_status
 from zsched.core.values.struct import Struct
 from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK
+from zsched.screen import fitted
 
 MIN_WIDTH, DEFAULT_WIDTH, MAX_WIDTH = 60, 100, 160
 MAJOR = "1"
@@ -88,11 +88,11 @@ def _ask_again(door: Door) -> Json | CliError:
 
 def _print_next(view: StatusView, status: Json | CliError, *, is_screen: bool) -> None:
     if isinstance(status, CliError):
-        text = f"zsched status: {harmless(str(status))}\n"
+        text = f"zsched status: {status}"
         if not is_screen:
-            sys.stderr.write(text)
+            warn(text)
             return
-        text += "asking again until Ctrl-C\n"
+        text = fitted(f"{text}\nasking again until Ctrl-C\n", sys.stdout)
     elif view.is_json:
         print_json(_with_reasons(status), is_line=True)
         return

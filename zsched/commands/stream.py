@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door, find_door
-from zsched.commands.common import CliError, Json, nearest, print_json
-from zsched.commands.page import Page, counted, harmless, since_drop, size, span
+from zsched.commands.common import CliError, Json, nearest, print_json, say, warn
+from zsched.commands.page import Page, counted, since_drop, size, span
 from zsched.core.route import keyexpr
 from zsched.core.values.struct import Struct, field
 from zsched.errors import AdapterError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_UNREACHABLE, EXIT_USAGE
+from zsched.screen import harmless
 
 if TYPE_CHECKING:
     from zsched.adapters.network.stream_tap import StreamTap, Tapped
@@ -173,7 +174,7 @@ def keys_for(status: Json, word: str | None) -> tuple[str, ...]:
     if not any(_meets(word, str(stream.get(end, ""))) for stream in streams for end in ("from_expr", "to_expr")):
         names = ", ".join(stream["stream"] for stream in streams) or "none"
         text = f"no stream here is called {word!r} or touches such a key (there are {names}): listening on it as a key"
-        sys.stderr.write(harmless(f"{text}\n"))
+        warn(text)
     return (word,)
 
 
@@ -259,13 +260,12 @@ def _print_rates(view: StreamView, verb: str, found: dict[tuple[str, str], KeySt
         print_json({"schema": schema, "window_s": view.window_s, "missed": missed, "keys": keys}, is_line=True)
         return
     if not rows:
-        sys.stdout.write(f"nothing in {view.window_s:g} s\n")
+        say(f"nothing in {view.window_s:g} s")
     for (side, key), row in rows.items():
         where = f"{key} ({side} side)" if side != "fleet" else key
-        sys.stdout.write(harmless(f"{where}: {_hz_text(row) if verb == 'hz' else _bw_text(row)}") + "\n")
+        say(f"{where}: {_hz_text(row) if verb == 'hz' else _bw_text(row)}")
     if missed:
-        sys.stdout.write(f"... {missed} more samples came faster than they could be counted\n")
-    sys.stdout.flush()
+        say(f"... {missed} more samples came faster than they could be counted")
 
 
 def _hz_text(row: Json) -> str:
@@ -318,10 +318,7 @@ def _print_sample(view: StreamView, sample: Tapped) -> None:
     kind = "" if sample.kind == "put" else f" {sample.kind}"
     side = "" if sample.side == "fleet" else f" ({sample.side} side)"
     more = "…" if sample.size > PREVIEW else ""
-    sys.stdout.write(
-        harmless(f"{sample.key}{side}{kind} {size(sample.size)} {sample.encoding} {_shown(head)}{more}") + "\n"
-    )
-    sys.stdout.flush()
+    say(f"{sample.key}{side}{kind} {size(sample.size)} {sample.encoding} {_shown(head)}{more}")
 
 
 def _shown(head: bytes) -> str:
@@ -344,7 +341,7 @@ def _tap(view: StreamView, word: str | None) -> StreamTap:
     access = ask_door(Door(socket=door.socket), {"verb": "access", **_asked(door)})
     sides: dict[str, str] = access["sides"]
     if door.node is not None and access["via"] != door.node:
-        sys.stderr.write(f"zsched stream: {door.node} has no address in the fleet file; listening at {access['via']}\n")
+        warn(f"zsched stream: {door.node} has no address in the fleet file; listening at {access['via']}")
     from zsched.adapters.network.stream_tap import StreamTap  # noqa: PLC0415 - loads zenoh, which only these verbs need
 
     try:

@@ -5,11 +5,10 @@ Knows: outcomes as exit codes. Does not know: how weights are written, how a cha
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 
 from zsched.commands.ask import ask_door
-from zsched.commands.common import CliError, Json, nearest, print_json
+from zsched.commands.common import CliError, Json, nearest, print_json, say
 from zsched.commands.orders import OrderView, Row, begin, check_said
 from zsched.commands.weight_words import NAMES, parse_weights, shares
 from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE
@@ -82,4 +81,4 @@ def _print(
     notes = [f"revision {revision}"] if revision is not None else []
     notes += ["unchanged"] if more.get("outcome") == "unchanged" else []
     note = f" ({', '.join(notes)})" if notes else ""
-    sys.stdout.write(f"{task}: {text}{note}\n")
+    say(f"{task}: {text}{note}")

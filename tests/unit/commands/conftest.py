@@ -9,5 +9,5 @@ import pytest
 def screen(monkeypatch: pytest.MonkeyPatch) -> int:
     """People look, in so many columns."""
     monkeypatch.setenv("COLUMNS", "80")
-    monkeypatch.setattr("zsched.commands.common.is_screen", lambda _stream: True)
+    monkeypatch.setattr("zsched.screen.is_screen", lambda _stream: True)
     return 80

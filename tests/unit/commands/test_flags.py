@@ -102,7 +102,7 @@ def test_off_a_terminal_nothing_is_done_and_the_command_is_printed(daemon: Daemo
     result = run(*words)
     assert (result.exit_code, daemon.changes) == (2, [])
     assert result.stdout.splitlines()[0].split() == ["WHAT", "KIND", "NOW", "AFTER"]
-    assert "to do it: zsched " in result.stderr
+    assert "to do it:\nzsched " in result.stderr
 
 
 def test_a_plan_shows_the_nodes_and_what_becomes_of_their_tasks(daemon: Daemon) -> None:

@@ -214,7 +214,8 @@ def test_off_a_terminal_it_shows_the_change_and_prints_the_exact_command(
     told = result.stdout + result.stderr
     assert next(line for line in told.splitlines() if "NOW" in line or " -> " in line), "before and after"
     line = next(line for line in told.splitlines() if "--yes" in line)
-    command = shlex.split(line[line.rindex(": zsched ") + 2 :])
+    assert line.startswith("zsched "), "on a line of its own, to be copied"
+    command = shlex.split(line)
     assert sorted(command) == sorted(["zsched", *words, "--yes"]), "every word of it"
 
 

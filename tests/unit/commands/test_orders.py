@@ -93,7 +93,7 @@ def test_off_a_terminal_an_order_is_shown_and_not_given(daemon: Daemon, words: t
     result = run(*words)
     assert (result.exit_code, daemon.orders) == (2, [])
     assert result.stdout.splitlines()[0].split() == ["TASK", "WHAT", "NOW", "AFTER"]
-    assert "nobody can be asked here; to do it: zsched " in result.stderr
+    assert "nobody can be asked here; to do it:\nzsched " in result.stderr
     assert result.stderr.rstrip().endswith("--yes")
 
 

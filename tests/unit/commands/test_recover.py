@@ -156,7 +156,7 @@ def test_off_a_terminal_it_takes_yes_and_at_one_the_answer_counts(
     code, text = refusal(lambda: recover(hall.place("robot1"), accepted, ()))
     assert code == EXIT_USAGE
     again = "zsched recover --node robot1 --accept old-electors-are-off --accept newest-may-be-lost --yes"
-    assert text == f"nothing was changed; to change it without being asked: {again}"
+    assert text == f"nothing was changed; to change it without being asked:\n{again}"
     at_a_terminal(monkeypatch, "n")
     assert refusal(lambda: recover(hall.place("robot1"), accepted, ())) == (EXIT_FAILED, "nothing was changed")
     assert hall.file_of("robot1").read_bytes() == before

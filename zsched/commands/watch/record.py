@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import json
 import signal
-import sys
 import threading
 from collections import Counter
 from collections.abc import Iterator
@@ -18,8 +17,8 @@ from typing import TYPE_CHECKING, BinaryIO, Final
 
 from zsched.clock import monotonic_s, wall_s
 from zsched.commands.ask import Door, ask_door, find_door
-from zsched.commands.common import CliError, Json
-from zsched.commands.page import harmless, size
+from zsched.commands.common import CliError, Json, warn
+from zsched.commands.page import size
 from zsched.commands.watch import tracks
 from zsched.commands.watch.feed import Feed
 from zsched.core.route import keyexpr
@@ -91,10 +90,10 @@ def record(view: RecordView) -> int:
                 break
             news = feed.ask()
             if news.status is None:
-                sys.stderr.write(f"zsched record: {harmless(news.why)}; asking again\n")
+                warn(f"zsched record: {news.why}; asking again")
     told = f"{view.file}: {tape.messages} messages of {len(tape.topics)} topics, {size(view.file.stat().st_size)}"
     missed = f"; {tap.missed} samples came faster than they could be written" if tap is not None and tap.missed else ""
-    sys.stderr.write(f"{told}{missed}\n")
+    warn(f"{told}{missed}")
     return EXIT_OK
 
 

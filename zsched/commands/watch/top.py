@@ -13,10 +13,11 @@ from typing import Final
 
 from zsched.commands.brief import task_rows
 from zsched.commands.common import Json
-from zsched.commands.page import Cell, Page, clock_time, cut, harmless, size, span
+from zsched.commands.page import Cell, Page, clock_time, cut, size, span
 from zsched.commands.report import header, millis, node_rows, per_second, printable, troubles
 from zsched.commands.watch.past import Past, Point
 from zsched.core.values.struct import Struct
+from zsched.screen import harmless
 
 LEVELS: Final = "▁▂▃▄▅▆▇█"
 TOP: Final = 1.0

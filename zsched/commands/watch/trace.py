@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import secrets
 import signal
-import sys
 import threading
 from collections.abc import Iterable
 from pathlib import Path
@@ -15,8 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 from zsched.clock import wall_s
 from zsched.commands.ask import find_door
-from zsched.commands.common import CliError
-from zsched.commands.page import harmless
+from zsched.commands.common import CliError, warn
 from zsched.commands.watch.feed import Feed
 from zsched.commands.watch.spans import Moves, Span, trace_id
 from zsched.core.values.struct import Struct
@@ -62,11 +60,11 @@ def trace(view: TraceView) -> int:
     while not view.is_once and not ended.wait(PERIOD_S):
         news = feed.ask()
         if news.status is None:
-            sys.stderr.write(f"zsched trace: {harmless(news.why)}; asking again\n")
+            warn(f"zsched trace: {news.why}; asking again")
         sender.send((*moves.take(news.entries), *moves.overdue(wall_s())))
     if view.is_once:
         sender.send(span for span in moves.rest() if span.end >= oldest)
-    sys.stderr.write(f"{sender.sent} spans sent, {sender.refused} refused\n")
+    warn(f"{sender.sent} spans sent, {sender.refused} refused")
     return EXIT_FAILED if sender.refused else EXIT_OK
 
 

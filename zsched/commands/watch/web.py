@@ -17,7 +17,6 @@ import os
 import queue
 import signal
 import socket
-import sys
 import threading
 from importlib.resources import files
 from pathlib import Path
@@ -25,8 +24,7 @@ from typing import Any, Final
 
 from zsched.clock import monotonic_s
 from zsched.commands.ask import find_door
-from zsched.commands.common import CliError, Json
-from zsched.commands.page import harmless
+from zsched.commands.common import CliError, Json, warn
 from zsched.commands.watch.feed import Feed
 from zsched.commands.watch.gate import EXPLAIN, FILES, HEADERS, LEAST_TOKEN, LIVE, METRICS, Asked, Gate, Refusal, Route
 from zsched.commands.watch.hub import Hub
@@ -80,7 +78,7 @@ def web(view: WebView) -> int:
     except CliError as error:
         if error.code != EXIT_UNREACHABLE:
             raise
-        sys.stderr.write(f"zsched web: {harmless(str(error))}; asking again\n")
+        warn(f"zsched web: {error}; asking again")
     names = {"localhost", socket.gethostname().lower(), *(name.lower() for name in view.hosts)}
     server = WebServer(host, port, Gate(names=frozenset(names), token=token), Hub(feed))
     ended = threading.Event()
@@ -88,7 +86,7 @@ def web(view: WebView) -> int:
         signal.signal(number, lambda _number, _frame: ended.set())
     with contextlib.closing(server):
         server.start()
-        sys.stderr.write(f"zsched web: {server.address}{', with a token' if token else ''}; Ctrl-C ends it\n")
+        warn(f"zsched web: {server.address}{', with a token' if token else ''}; Ctrl-C ends it")
         ended.wait()
     return EXIT_OK
 
