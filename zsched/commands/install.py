@@ -22,6 +22,8 @@ from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_WOULD_CHANGE
 
 UNITS: Final = ("zsched.service", "zsched-web.service", "zsched-renew.service", "zsched-renew.timer")
 DROP_INS: Final = ("zsched.service.d/10-user.conf", "zsched-web.service.d/10-user.conf")
+MOST_LINKS: Final = 40
+"""As the kernel follows."""
 OPT: Final = "/opt/zsched"
 """The installation that the units as shipped are for."""
 USER: Final = "zsched"
@@ -179,6 +181,22 @@ def _check(prefix: Path, root: Path) -> None:
         raise CliError(
             EXIT_FAILED, f"{prefix}: the service cannot see {hidden} (ProtectHome, PrivateTmp); install zsched to {OPT}"
         )
+    link = next((link for link in _ways_to(prefix / "bin/python") if any(map(link.is_relative_to, HIDDEN))), None)
+    if link is not None and _is_this_machine(root):
+        raise CliError(
+            EXIT_FAILED,
+            f"{prefix}: its Python is {link}, which the service cannot see (ProtectHome, PrivateTmp); "
+            f"make {prefix} anew with a Python by its own path: sudo {link.resolve()} -m venv --clear {prefix}",
+        )
+
+
+def _ways_to(link: Path) -> Iterator[Path]:
+    """Where a link leads, step by step."""
+    for _ in range(MOST_LINKS):
+        if not link.is_symlink():
+            return
+        link = link.parent / link.readlink()
+        yield link
 
 
 def _pieces(prefix: Path, root: Path) -> Iterator[Piece]:

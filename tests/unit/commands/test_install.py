@@ -148,6 +148,19 @@ def test_without_an_installation_it_says_how_one_is_made(
     assert "pip install . makes one" in result.output
 
 
+def test_an_environment_whose_python_is_a_link_in_a_home_is_no_place_for_a_service(
+    prefix: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As `uv python install` makes one, and `python3.12 -m venv` takes it."""
+    (prefix / "bin").mkdir()
+    (prefix / "bin/python3.12").symlink_to("/root/.local/bin/python3.12")
+    (prefix / "bin/python").symlink_to("python3.12")
+    monkeypatch.setattr("zsched.commands.install.HIDDEN", ("/home", "/root"))
+    result = run("install", Path("/"), "--plan")
+    assert result.exit_code == 1
+    assert f"{prefix}: its Python is /root/.local/bin/python3.12, which the service cannot see" in result.output
+
+
 def test_a_home_is_no_place_for_a_service(prefix: Path) -> None:
     assert prefix.is_relative_to("/tmp"), "pytest's folder is one that the unit hides, too"  # noqa: S108 - as it says
     result = run("install", Path("/"), "--plan")
