@@ -255,7 +255,11 @@ def _refusal(spec: TaskSpec, allocation: Allocation, profile: Profile, demand: D
 def _beyond_limits(spec: TaskSpec, profile: Profile, *, is_owner: bool) -> str:
     """Why the machine's gauges forbid the task; empty: they do not."""
     readings = _readings(spec, profile, is_owner=is_owner) if spec.gauge_limits else {}
-    faults = (BY_NAME[name].fault(readings.get(name), limit, is_owner=is_owner) for name, limit in spec.gauge_limits)
+    added = {"gpu"} if spec.demand.gpu and not is_owner else set[str]()
+    faults = (
+        BY_NAME[name].fault(readings.get(name), limit, is_owner=is_owner, is_reckoned=name in added)
+        for name, limit in spec.gauge_limits
+    )
     return next((fault for fault in faults if fault), "")
 
 

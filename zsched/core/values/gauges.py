@@ -52,13 +52,14 @@ class Gauge(Struct, frozen=True, kw_only=True):
         """
         return f"{reading * 100:.0f} %" if not self.unit else f"{reading:.0f} {self.unit}"
 
-    def fault(self, reading: float | None, limit: float, *, is_owner: bool) -> str:
+    def fault(self, reading: float | None, limit: float, *, is_owner: bool, is_reckoned: bool = False) -> str:
         """Why a node with this reading may not have a task with this limit; empty: it may.
 
         Args:
             reading: in the gauge's unit, predicted with the task; ``None``: not measured.
             limit: the task's.
             is_owner: whether it has the task: it is left at the limit, and got back inside the margin only.
+            is_reckoned: whether the reading has what the task would add.
 
         >>> battery = GAUGES[1]
         >>> battery.fault(0.18, 0.2, is_owner=True)
@@ -70,12 +71,13 @@ class Gauge(Struct, frozen=True, kw_only=True):
             return f"{self.name} is not measured" if self.is_needed else ""
         sign = 1.0 if self.is_floor else -1.0
         inside = sign * (reading - limit)
+        at = f"{'would be' if is_reckoned else 'is'} at {self.shown(reading)}"
         if inside < 0.0:
-            return f"{self.name} is at {self.shown(reading)}, limit {self.shown(limit)}"
+            return f"{self.name} {at}, limit {self.shown(limit)}"
         back = limit + sign * self.margin
         if is_owner or sign * (reading - back) >= 0.0:
             return ""
-        return f"{self.name} is at {self.shown(reading)}, limit {self.shown(limit)}, back from {self.shown(back)} on"
+        return f"{self.name} {at}, limit {self.shown(limit)}, back from {self.shown(back)} on"
 
 
 GAUGES: Final = (

@@ -467,6 +467,16 @@ def test_a_demand_of_the_gpu_is_predicted_for_every_candidate_alike() -> None:
     assert terms_of(vector) == {"edge1": {"gpu": 0.6}, "edge2": {"gpu": 0.6}}
 
 
+def test_a_limit_of_the_gpu_tells_what_the_task_would_make_of_it() -> None:
+    spec = replace(SPEC, demand=Demand(gpu=0.4), gauge_limits=(("gpu", 0.9),))
+    vector = scored(gauged("edge2", gpu=0.8), gauged("edge3"), spec=spec)
+    assert dict(vector.refused) | {"edge1": ""} == {
+        "edge1": "",
+        "edge2": "gpu would be at 120 %, limit 90 %",
+        "edge3": "gpu is not measured",
+    }
+
+
 @pytest.mark.parametrize(
     ("gauges", "why"),
     [
