@@ -21,12 +21,14 @@ from zsched.commands.common import CliError, Json, nearest
 from zsched.core.values.struct import Struct, replace
 from zsched.core.values.words import NAME
 from zsched.errors import AdapterError
-from zsched.exits import EXIT_FAILED, EXIT_TIMED_OUT, EXIT_UNREACHABLE, EXIT_USAGE
+from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_TIMED_OUT, EXIT_UNREACHABLE, EXIT_USAGE
 
 if TYPE_CHECKING:
     from zsched.adapters.network.fleet_client import FleetClient  # imports zenoh
     from zsched.adapters.network.seals import Seals
 
+PLAIN, TLS = "tcp/", "tls/"
+SECURE_PAGE = "docs/guide/secure.md"
 CONTROL_PORT = 7457
 """Where a node's control session listens by the guides."""
 AGAIN_S, LOOK_S = 30.0, 0.05
@@ -230,7 +232,9 @@ def _ask_elsewhere(door: Door, request: Json) -> Json:
     try:
         return answer_json(_client(door.endpoint).ask(door.node, command))
     except AdapterError as error:
-        raise CliError(EXIT_UNREACHABLE, str(error)) from error
+        secured = f"; a secured fleet is asked at {TLS}{door.endpoint.removeprefix(PLAIN)}"
+        advice = secured if door.endpoint.startswith(PLAIN) else ""
+        raise CliError(EXIT_UNREACHABLE, f"{error}{advice}") from error
 
 
 def _guest_may_not(visit: _Visit) -> str:
@@ -268,11 +272,12 @@ def _visit(endpoint: str) -> _Visit:
     """With the certificates that the fleet file of this machine names, where the endpoint is a secured one.
 
     Raises:
-        ConfigError: there is no such fleet file, or no certificate.
+        CliError: there is no such fleet file (78).
+        ConfigError: it has faults, or there is no certificate.
     """
     name = places.node_name(None, os.environ)
     asker = name if NAME.fullmatch(name) else "operator"
-    if endpoint.startswith("tcp/"):
+    if endpoint.startswith(PLAIN):
         return _Visit(text="", asker=asker, fleet="*")
     from zsched.config.load import load_fleet  # noqa: PLC0415 - ruamel.yaml is slow to import
     from zsched.core.values.certificates import Role  # noqa: PLC0415 - as above
@@ -281,7 +286,14 @@ def _visit(endpoint: str) -> _Visit:
     from zsched.runtime.secured import identity_of  # noqa: PLC0415 - as above
     from zsched.runtime.tls import session_text  # noqa: PLC0415 - as above
 
-    fleet = load_fleet(places.config_path(None, os.environ))
+    file = places.config_path(None, os.environ)
+    if not file.exists():
+        raise CliError(
+            EXIT_CONFIG,
+            f"{endpoint}: a secured fleet lets in who has its certificate, and {file}, which names it, is not there; "
+            f"set ZSCHED_CONFIG to the fleet file beside it ({SECURE_PAGE} says how to get both)",
+        )
+    fleet = load_fleet(file)
     text = session_text(fleet, Side.VISIT)
     if fleet.security is None:
         return _Visit(text=text, asker=asker, fleet="*")

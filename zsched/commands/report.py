@@ -46,7 +46,7 @@ def degradations(status: Json) -> tuple[str, ...]:
         )
     for task in status["tasks"]:
         if task["owner"] is None:
-            reasons.append(f"{task['name']} has no owner")
+            reasons.append(f"{task['name']} has no owner (`zsched explain {task['name']}` says why)")
         elif task["owner_state"] not in ("alive", "suspect"):
             reasons.append(f"{task['name']}: its owner {task['owner']} is {task['owner_state']}")
         elif (lack := _lack_of_worker(status, task)) is not None:

@@ -13,7 +13,7 @@ from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.commands import ask
 from zsched.commands.ask import AGAIN_S, Door, ask_door, find_door
 from zsched.commands.common import CliError
-from zsched.exits import EXIT_UNREACHABLE
+from zsched.exits import EXIT_CONFIG, EXIT_UNREACHABLE
 from zsched.paths import again_path, socket_path
 
 ENV = {"ZSCHED_NODE": "robot1"}
@@ -44,4 +44,20 @@ def test_one_that_never_came_back_is_no_daemon(tmp_path: Path, ago_s: float | No
         os.utime(mark, (time.time() - ago_s,) * 2)
     with pytest.raises(CliError, match="no daemon in") as caught:
         find_door(tmp_path, None, ENV)
+    assert caught.value.code == EXIT_UNREACHABLE
+
+
+def test_a_secured_endpoint_without_a_fleet_file_here_says_which_file_is_meant(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ZSCHED_CONFIG", str(tmp_path / "fleet.yaml"))
+    with pytest.raises(CliError, match=r"lets in who has its certificate, and .*fleet\.yaml, which names it") as caught:
+        ask_door(find_door(None, None, ENV, connect="tls/127.0.0.1:1"), {"verb": "status"})
+    assert caught.value.code == EXIT_CONFIG
+
+
+def test_nobody_at_a_plain_endpoint_may_be_a_secured_fleet(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ask, "CONNECT_S", 0.2)
+    with pytest.raises(CliError, match=r"; a secured fleet is asked at tls/127\.0\.0\.1:1$") as caught:
+        ask_door(find_door(None, None, ENV, connect="127.0.0.1:1"), {"verb": "status"})
     assert caught.value.code == EXIT_UNREACHABLE

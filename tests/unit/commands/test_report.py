@@ -373,7 +373,7 @@ def test_lost_quorum_and_lost_owner_are_degraded() -> None:
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
-        ({"owner": None, "owner_state": "none"}, ("echo has no owner",)),
+        ({"owner": None, "owner_state": "none"}, ("echo has no owner (`zsched explain echo` says why)",)),
         ({"owner_state": "unknown"}, ("echo: its owner edge1 is unknown",)),
         ({"owner_state": "suspect"}, ()),  # in grace: it may still refute
     ],

@@ -65,7 +65,7 @@ def _forgiven(node: Stages, whose: NodeId) -> str:
 def _on_explanation(node: Stages, event: ev.ExplanationAsked, todo: ToDo, now: float) -> None:
     task = event.command.task
     if task not in node.executors:
-        detail = f"no task {task!r}; there are {', '.join(node.executors)}"
+        detail = f"no task {task!r}; there are {', '.join(node.executors) or 'none'}"
         result = CommandResult(outcome=CommandOutcome.INVALID, detail=detail)
         todo.add(do.AnswerCommand(request=event.request, result=result))
     else:

@@ -146,7 +146,7 @@ def _on_kept(node: Stages, event: ev.RehearsalKept, todo: ToDo, _now: float) -> 
 def _on_asked(node: Stages, event: ev.RehearsalsAsked, todo: ToDo, _now: float) -> None:
     command = event.command
     if command.task and command.task not in node.registers:
-        detail = f"no task {command.task!r}; there are {', '.join(sorted(node.registers))}"
+        detail = f"no task {command.task!r}; there are {', '.join(sorted(node.registers)) or 'none'}"
         _answer(event.request, CommandOutcome.INVALID, detail, todo)
         return
     promised = promises(node.fleet, node.fleet.task(command.task)) if command.task else ()
