@@ -16,6 +16,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
+from zsched.adapters.host.decision_log import FILE_BYTES, NAME, OLD_NAME
 from zsched.clock import wall_ns
 from zsched.commands.common import CliError, Json, print_json, say
 from zsched.commands.doctor import as_json, as_text
@@ -89,10 +90,25 @@ def gathered(scene: Scene, journal: Journal | None = None) -> Iterator[Member]:
             yield _json(f"status/{name}.json", clean_json(statuses[name], secrets))
         else:
             yield Member(name=f"status/{name}.json", missing=f"{name} does not answer")
+    yield from _decision_logs(scene.state_folder, secrets)
     try:
         yield Member(name="journal.txt", content=clean((journal or _journal)(), secrets).encode())
     except OSError as error:
         yield Member(name="journal.txt", missing=str(error.strerror or error))
+
+
+def _decision_logs(folder: Path, secrets: tuple[str, ...]) -> Iterator[Member]:
+    """This machine's decision log, for `zsched replay`; the older of its two files is there once one was full."""
+    for name in (OLD_NAME, NAME):
+        try:
+            text = read_regular(folder / name, 2 * FILE_BYTES).decode("utf-8", errors="replace")
+        except FileNotFoundError as error:
+            if name == NAME:
+                yield Member(name=name, missing=f"{folder / name}: {error.strerror}")
+        except OSError as error:
+            yield Member(name=name, missing=f"{folder / name}: {error.strerror}")
+        else:
+            yield Member(name=name, content=clean(text, secrets).encode())
 
 
 def _cleaned(result: Result, secrets: tuple[str, ...]) -> Result:

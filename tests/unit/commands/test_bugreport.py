@@ -37,8 +37,14 @@ def test_every_node_s_status_the_doctor_s_words_and_no_secret_are_in_it(tmp_path
     scene = fleet_scene(tmp_path, TEXT)
     robot = scene.statuses["robot1"]
     robot["problems"].append(f"the worker printed {SECRET}")
+    told = '{"schema":"zsched.event/1","text":"the worker printed WORD"}\n'.replace("WORD", SECRET)
+    scene.state_folder.mkdir(exist_ok=True)
+    for name in ("decisions.1.ndjson", "decisions.ndjson"):
+        (scene.state_folder / name).write_text(told)
     members = {one.name: one for one in gathered(scene, lambda: f"12:00 edge1 zsched: token {SECRET} refused\n")}
     names = {"versions.json", "fleet.yaml", "doctor.txt", "doctor.json", "journal.txt"}
+    names |= {"decisions.1.ndjson", "decisions.ndjson"}
+    assert json.loads(members["decisions.ndjson"].content)["text"] == "the worker printed REMOVED"
     assert set(members) == names | {f"status/{name}.json" for name in ("edge1", "robot1", "robot2", "robot3")}
     assert not [one for one in members.values() if one.missing or SECRET.encode() in one.content]
     assert json.loads(members["status/robot1.json"].content)["problems"] == ["the worker printed REMOVED"]
@@ -51,7 +57,7 @@ def test_what_cannot_be_had_is_said(tmp_path: Path) -> None:
     scene.file.unlink()
     scene = replace(scene, statuses={name: one for name, one in scene.statuses.items() if name != "robot2"})
     missing = {one.name: one.missing for one in gathered(scene, no_journal) if one.missing}
-    assert set(missing) == {"fleet.yaml", "status/robot2.json", "journal.txt"}
+    assert set(missing) == {"fleet.yaml", "status/robot2.json", "decisions.ndjson", "journal.txt"}
     assert missing["journal.txt"].startswith("No journal files")
 
 
