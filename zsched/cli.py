@@ -1014,7 +1014,7 @@ def _leave_out_others(word: str) -> None:
     groups = [
         one for one in app.registered_groups if one.typer_instance is not None and one.typer_instance.info.name == word
     ]
-    if (commands or groups) and word not in NEED_ALL:
+    if (commands or groups or word == "--version") and word not in NEED_ALL:
         app.registered_commands, app.registered_groups = commands, groups
 
 

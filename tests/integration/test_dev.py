@@ -185,6 +185,7 @@ def test_keys_move_load_and_show(folder: Path) -> None:
         run.wait(f"{first} starts again")
         run.press("?")
         run.wait("keys: m moves the task", after=len(run.said) - 200)
+        assert [line for line in run.said.splitlines() if line.startswith("dev:") and len(line) > 80] == []
         run.press("\x03")  # Ctrl-C, as the terminal sends it: no signal here, since the run has a session of its own
         run.process.send_signal(signal.SIGINT)
         assert run.process.wait(END_S) == 0
