@@ -8,7 +8,16 @@ from __future__ import annotations
 from typing import Any
 
 from zsched.commands.page import DROPS_OVER_S, Cell, Page, clock_time, span
-from zsched.commands.report import STATE_STYLES, flag_rows, header, node_rows, per_second, printable, troubles
+from zsched.commands.report import (
+    STATE_STYLES,
+    flag_rows,
+    header,
+    node_rows,
+    per_second,
+    printable,
+    told_hold,
+    troubles,
+)
 
 Json = dict[str, Any]
 
@@ -22,6 +31,7 @@ def render_brief(status: Json, width: int, color: bool, at: float | None = None)
     node_rows(page, shown, "NODE")
     flag_rows(page, shown)
     task_rows(page, shown, at)
+    _pin_rows(page, shown)
     troubles(page, shown)
     return "\n".join(page.lines) + "\n"
 
@@ -37,6 +47,14 @@ def task_rows(page: Page, status: Json, at: float | None) -> None:
     for task in tasks:
         cells = _cells(task, at)
         page.row(*((text, wide, style) for (text, style), wide in zip(cells, columns, strict=True)))
+
+
+def _pin_rows(page: Page, status: Json) -> None:
+    """A line for each pin, with who asked and why; a pause is among the problems."""
+    for task in status["tasks"]:
+        if (pin := task.get("pin")) is not None:
+            text = f"{task['name']}: pinned to {told_hold('pin', pin)}, known for {span(pin['known_s'])}"
+            page.row((text, page.width, "yellow"))
 
 
 def _cells(task: Json, at: float | None) -> list[Cell]:

@@ -179,8 +179,10 @@ def test_a_pin_names_its_node_and_says_when_it_is_hard(daemon: Daemon) -> None:
     assert run("pin", "echo", "edge2", "--hard", "--yes").exit_code == 0
     assert (daemon.orders[0]["target"], daemon.orders[0]["hard"]) == ("edge2", True)
     assert run("pin").stdout.startswith("echo: edge2 (hard), ")
+    told_by = daemon.status["tasks"][0]["pin"]["by"]
     shown = [render(daemon.status, 100, color=False) for render in (render_brief, render_status)]
-    assert ["edge1 (pin)" in shown[0], "pinned to edge2 (hard), " in " ".join(shown[1].split())] == [True, True]
+    assert "edge1 (pin)" in shown[0]
+    assert [f"pinned to edge2 (hard), {told_by}" in " ".join(text.split()) for text in shown] == [True, True]
     assert run("pin", "echo", "egde2").exit_code == 2
 
 
