@@ -98,12 +98,13 @@ def shown_on_a_terminal(arguments: list[str], folder: Path) -> str:
             "say which one this",
         ),
         (["zsched", "check", "wrong.yaml"], "did you mean 'wifi'?"),
-        (["zsched", "dev", "nosuch"], "zsched init --example python"),
+        (["zsched", "dev", "empty"], "zsched init --example python empty"),
     ],
 )
 def test_what_a_verb_refuses_fits_the_terminal(arguments: list[str], words: str, tmp_path: Path) -> None:
     example = (Path(__file__).parents[2] / "zsched/examples/python/fleet.yaml").read_text()
     (tmp_path / "fleet.yaml").write_text(example)
+    (tmp_path / "empty").mkdir()
     (tmp_path / "wrong.yaml").write_text(f"timing: wlan\n{example}".replace("nodes:", "nodez:"))
     said = shown_on_a_terminal(arguments, tmp_path)
     assert words in " ".join(said.split())
