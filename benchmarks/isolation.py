@@ -22,7 +22,7 @@ import zenoh
 
 from benchmarks.common import at_pace, machine, percentile
 from zsched import paths as places
-from zsched.adapters.host.operator_socket import ask
+from zsched.adapters.host.operator_client import ask
 from zsched_lab.fleet.testbed import ECHO, Testbed, echo_fleet
 
 CLASSES = ("best_effort", "latest", "reliable")

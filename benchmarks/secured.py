@@ -30,7 +30,7 @@ import zenoh
 from benchmarks.common import machine, percentile
 from benchmarks.floods import secured
 from zsched import paths as places
-from zsched.adapters.host.operator_socket import ask
+from zsched.adapters.host.operator_client import ask
 from zsched.errors import AdapterError
 from zsched.pki.authority import opened
 from zsched.sessions.config import client_config

@@ -19,7 +19,7 @@ import pytest
 import zenoh
 
 from support.waiting import within
-from zsched.adapters.host.operator_socket import ask
+from zsched.adapters.host.operator_client import ask
 from zsched.adapters.machine.cgroup import LimitedGroup
 from zsched.core.values.model import Proposal
 from zsched.paths import socket_path

@@ -16,7 +16,7 @@ import pytest
 import zenoh
 
 from support.authorities import install, make_authority
-from zsched.adapters.host.operator_socket import ask
+from zsched.adapters.host.operator_client import ask
 from zsched.config.load import load_fleet
 from zsched.core.values.certificates import Role
 from zsched.core.values.messages import Accept, Prepare, Promise

@@ -23,7 +23,7 @@ import zenoh
 from support.sessions import matches
 from support.waiting import until
 from zsched import daemon
-from zsched.adapters.host.operator_socket import ask
+from zsched.adapters.host.operator_client import ask
 from zsched.adapters.host.state_file import StateFile
 from zsched.clock import ClockWatch, Drift
 from zsched.core import events as ev

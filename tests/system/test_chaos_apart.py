@@ -19,7 +19,7 @@ from pathlib import Path
 
 import pytest
 
-from zsched.adapters.host.operator_socket import ask
+from zsched.adapters.host.operator_client import ask
 from zsched.adapters.host.state_file import StateFile
 from zsched.clock import monotonic_s
 from zsched.core.values.model import NodeId

@@ -18,7 +18,7 @@ from pathlib import Path
 import msgpack
 import pytest
 
-from zsched.adapters.host.operator_socket import ask
+from zsched.adapters.host.operator_client import ask
 from zsched.core.membership.identity import TOLD_YOUNG_S
 from zsched.core.values.model import Beat
 from zsched.paths import socket_path

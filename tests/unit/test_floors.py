@@ -324,3 +324,19 @@ def test_planted_folders_without_code_are_found(tmp_path: Path) -> None:
         (tmp_path / folder).mkdir(parents=True)
         (tmp_path / folder / "test_one.py").touch()
     assert folders_without_code(tmp_path) == ["core/absent", "lab/core"]
+
+
+def test_a_verb_that_only_asks_loads_neither_zenoh_nor_logging() -> None:
+    """`status` must answer within 200 ms, most of which is the interpreter's and typer's."""
+    program = "sys.argv[1:] = ['status', '--runtime-dir', 'nobody']; import zsched.cli; run(zsched.cli.main)"
+    done = subprocess.run(
+        [sys.executable, "-c", LOADER.format(program=program)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=False,
+    )
+    assert "no daemon in nobody" in done.stderr
+    loaded = set(json.loads(done.stdout.splitlines()[-1]))
+    assert loaded & {"zenoh", "ruamel", "logging", "msgpack", "pydantic", "rich"} == set()

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from zsched import paths as places
-from zsched.adapters.host.operator_socket import ask
+from zsched.adapters.host.operator_client import ask
 from zsched.clock import wall_s
 from zsched.commands.common import CliError, Json, nearest
 from zsched.core.values.struct import Struct, replace

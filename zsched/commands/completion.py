@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from zsched import paths as places
-from zsched.adapters.host.operator_socket import ask
+from zsched.adapters.host.operator_client import ask
 from zsched.commands.common import Json
 from zsched.errors import AdapterError, ConfigError
 

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import IO, Any, Final, Self
 
 from zsched import paths
-from zsched.adapters.host.operator_socket import ask
+from zsched.adapters.host.operator_client import ask
 from zsched.adapters.machine import core_speed
 from zsched.adapters.workers import launch
 from zsched.clock import monotonic_s

@@ -13,7 +13,7 @@ from typing import Final
 
 from zsched import paths as places
 from zsched.adapters.host.document_store import DocumentStore
-from zsched.adapters.host.operator_socket import ask
+from zsched.adapters.host.operator_client import ask
 from zsched.adapters.host.state_file import StateFile
 from zsched.adapters.network.fleet_poll import ask_fleet
 from zsched.clock import monotonic_s

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from zsched.adapters.host.operator_socket import ask
+from zsched.adapters.host.operator_client import ask
 from zsched.clock import monotonic_s
 from zsched.core.values.model import NodeId
 from zsched.tasks.map_merge.geometry import Pose2

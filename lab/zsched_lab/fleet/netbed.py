@@ -23,7 +23,7 @@ from typing import IO
 
 import psutil
 
-from zsched.adapters.host.operator_socket import ask
+from zsched.adapters.host.operator_client import ask
 from zsched.clock import monotonic_s
 from zsched.core.values.fleet import Timing
 from zsched.core.values.model import NodeId, PeerState

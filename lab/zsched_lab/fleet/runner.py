@@ -29,7 +29,7 @@ POLL_S = 0.05
 Tree = dict[str, Any]
 """A fleet file as plain YAML data."""
 Ask = Callable[[Path, Tree, float], Tree]
-"""`zsched.adapters.host.operator_socket.ask`: (socket, request, seconds) -> answer."""
+"""`zsched.adapters.host.operator_client.ask`: (socket, request, seconds) -> answer."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

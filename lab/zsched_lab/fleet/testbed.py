@@ -25,7 +25,7 @@ import psutil
 import zenoh
 
 from zsched import paths as places
-from zsched.adapters.host.operator_socket import ask
+from zsched.adapters.host.operator_client import ask
 from zsched.config.load import load_fleet
 from zsched.core.hop.books import unaccounted
 from zsched.core.values.fleet import Fleet

@@ -20,7 +20,7 @@ from typing import Any
 
 from ruamel.yaml import YAML
 
-from zsched.adapters.host.operator_socket import ask
+from zsched.adapters.host.operator_client import ask
 from zsched.clock import monotonic_s
 from zsched.core.values.model import NodeId
 from zsched.tasks.map_merge.merger import Mode

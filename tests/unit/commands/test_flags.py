@@ -12,7 +12,7 @@ from typer.testing import CliRunner, Result
 
 from support.doors import STATUS, answering, living
 from support.schemas import faults
-from zsched.adapters.host.operator_socket import Json
+from zsched.adapters.host.operator_client import Json
 from zsched.cli import app
 from zsched.commands import flags as verbs
 from zsched.commands.brief import render_brief

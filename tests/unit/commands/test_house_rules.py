@@ -17,7 +17,7 @@ import typer.core
 from typer.testing import CliRunner, Result
 
 from support.doors import STATUS, answering, living
-from zsched.adapters.host.operator_socket import Json
+from zsched.adapters.host.operator_client import Json
 from zsched.cli import app
 
 DOCUMENT = (Path(__file__).parents[3] / "configs" / "fleet.yaml").read_text()

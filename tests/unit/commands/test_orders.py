@@ -13,7 +13,7 @@ from typer.testing import CliRunner, Result
 
 from support.doors import STATUS, answering, living
 from support.schemas import faults
-from zsched.adapters.host.operator_socket import Json
+from zsched.adapters.host.operator_client import Json
 from zsched.cli import app
 from zsched.commands.brief import render_brief
 from zsched.commands.common import CliError

@@ -15,7 +15,7 @@ from typer.testing import CliRunner, Result
 
 from support.doors import STATUS, answering, living
 from support.schemas import faults
-from zsched.adapters.host.operator_socket import Json
+from zsched.adapters.host.operator_client import Json
 from zsched.cli import app
 from zsched.commands import rehearse
 from zsched.commands.ask import Door

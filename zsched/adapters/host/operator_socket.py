@@ -174,27 +174,3 @@ class OperatorSocket:
         except Exception as error:
             log.exception("request_failed verb=%s", request["verb"])
             return {"error": f"{type(error).__name__}: {error}"}
-
-
-def ask(path: Path, request: Json, timeout_s: float = 5.0) -> Json:
-    """Ask the daemon behind ``path`` one thing.
-
-    Raises:
-        AdapterError: nobody listens there, no answer in time, or the answer is no JSON object.
-    """
-    try:
-        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
-            connection.settimeout(timeout_s)
-            connection.connect(str(path))
-            with contextlib.suppress(BrokenPipeError):  # it has said why already
-                connection.sendall(json.dumps(request).encode() + b"\n")
-            with connection.makefile("rb") as lines:
-                answer = json.loads(lines.readline())
-    except (BlockingIOError, TimeoutError) as error:  # the first: its queue of connections is full
-        raise AdapterError(f"the daemon at {path} did not answer within {timeout_s:g} s; is it wedged?") from error
-    except (OSError, ValueError) as error:
-        detail = getattr(error, "strerror", None) or error
-        raise AdapterError(f"no daemon answers at {path} ({detail}); start it with `zsched up`") from error
-    if not isinstance(answer, dict):
-        raise AdapterError(f"the daemon at {path} answered something that is no object")
-    return answer

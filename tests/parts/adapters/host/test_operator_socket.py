@@ -17,7 +17,8 @@ import pytest
 
 from support.waiting import until
 from zsched.adapters.host import operator_socket
-from zsched.adapters.host.operator_socket import MAX_CONNECTIONS, MAX_LINE, RETRY_S, OperatorSocket, ask
+from zsched.adapters.host.operator_client import ask
+from zsched.adapters.host.operator_socket import MAX_CONNECTIONS, MAX_LINE, RETRY_S, OperatorSocket
 from zsched.errors import AdapterError
 
 Json = dict[str, Any]

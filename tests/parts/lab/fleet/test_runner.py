@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from zsched.adapters.host.operator_socket import ask
+from zsched.adapters.host.operator_client import ask
 from zsched.config.load import load_fleet
 from zsched.errors import ConfigError
 from zsched.tasks.map_merge.geometry import Pose2
