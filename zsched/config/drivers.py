@@ -120,7 +120,8 @@ def command_of(section: Section, out: Collector) -> tuple[str, ...] | None:
     for other, own in _OWN.items():
         for name in own if other is not driver else ():
             if name in section.places and name not in _OWN[driver]:
-                hint = f"delete it, or say driver: {other}"
+                is_word = (driver, name) == (Driver.CONTAINER, "command")
+                hint = "what the container runs is `args`" if is_word else f"delete it, or say driver: {other}"
                 out.error(section.where(name), f"driver {driver} has no {name!r}", hint)
                 return None
     if driver is Driver.PROCESS:

@@ -74,6 +74,7 @@ def test_without_a_driver_the_command_is_the_operators() -> None:
         ("{driver: systemd, unit: '@.service'}", "is not a systemd service", 37),
         ("{driver: systemd, unit: '-f.service'}", "is not a systemd service", 37),
         ("{driver: container}", "driver container needs the key 'image'", 22),
+        ("{driver: container, image: a, command: [b]}", "hint: what the container runs is `args`", 52),
         ("{driver: container, image: a, unit: a.service}", "driver container has no 'unit'", 49),
         ("{command: [a], mounts: [/a:/b]}", "driver process has no 'mounts'", 36),
         ("{driver: container, image: -a}", "'-a' is not an image", 40),
