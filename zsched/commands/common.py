@@ -31,6 +31,8 @@ NAMED_OTHERWISE: Final = {
 }
 LONGEST_SENTENCE: Final = 1000
 """Characters."""
+USAGE_ERROR: Final = "Error: "
+"""What typer writes in front of a complaint."""
 ARGUMENT: Final = "argument"
 """As typer calls such a parameter."""
 SCHEMAS: Final = Path(__file__).parents[1] / "schemas"
@@ -145,6 +147,13 @@ class Verb(TyperCommand):
         If one of them is no `plain_value`, or something is wrong, all go typer's own way.
         """
         args = of_known_major(ctx, self, args)
+        try:
+            return self._parsed(ctx, args)
+        except Exception as error:
+            _fit_usage(error)
+            raise
+
+    def _parsed(self, ctx: Any, args: list[str]) -> list[str]:
         opts, rest, _ = self.make_parser(ctx).parse_args(args=list(args))
         params = [param for param in self.get_params(ctx) if param.expose_value or opts.get(param.name)]
         found = {param.name: plain_value(param, param.consume_value(ctx, opts)[0]) for param in params}
@@ -152,6 +161,13 @@ class Verb(TyperCommand):
             return super().parse_args(ctx, args)
         ctx.params.update({name: value for name, (value,) in found.items()})
         return rest
+
+
+def _fit_usage(error: Any) -> None:
+    """Let a complaint of typer's about a word fit the terminal, without pydantic's name for it."""
+    if hasattr(error, "format_message"):
+        text = fitted(f"{USAGE_ERROR}{error.format_message().replace('Value error, ', '')}", sys.stderr)
+        error.format_message = lambda: text.removeprefix(USAGE_ERROR)
 
 
 class Verbs(TyperGroup):

@@ -14,7 +14,8 @@ def valid(scene: Scene) -> Result:
     """Whether the fleet file has no fault."""
     fleet = scene.reading.fleet
     if fleet is None:
-        return failed(*_lines(scene, scene.reading.faults), fix=f"zsched check {scene.file}")
+        hints = [fault.hint for fault in scene.reading.faults if not fault.line and fault.hint]
+        return failed(*_lines(scene, scene.reading.faults), fix=(hints or [f"zsched check {scene.file}"])[0])
     if scene.document is not None:
         return passed(f"{scene.file} has no fault; nothing goes by it, for a document is agreed (file.in_force)")
     counts = ((len(fleet.nodes), "nodes"), (len(fleet.tasks), "tasks"), (len(fleet.electors), "electors"))
@@ -64,4 +65,7 @@ def in_force(scene: Scene) -> Result:
 
 
 def _lines(scene: Scene, faults: tuple[Fault, ...]) -> list[str]:
-    return [f"{scene.file}:{fault.line}:{fault.col}: {fault.message}" for fault in faults]
+    return [
+        f"{scene.file}:{fault.line}:{fault.col}: {fault.message}" if fault.line else f"{scene.file}: {fault.message}"
+        for fault in faults
+    ]

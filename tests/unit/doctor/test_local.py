@@ -19,7 +19,7 @@ from zsched.adapters.host.document_store import DocumentStore
 from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.adapters.radio.nl80211 import GenericNetlink, Interface
 from zsched.clock import ClockWatch, Drift
-from zsched.config.load import load_fleet
+from zsched.config.load import check_file, load_fleet
 from zsched.core.values.document import Document, Text
 from zsched.core.values.electorate import Elector, FleetValue
 from zsched.core.values.model import RegisterState
@@ -91,6 +91,14 @@ def test_a_wrong_fleet_file_is_found_and_what_needs_it_is_skipped(tmp_path: Path
     results = {check.name: result for check, result in run_all(scene)}
     assert_finds(results["file.valid"], FAIL, "fleet.yaml:4:", "ege")
     assert results["state.valid"].verdict is results["worker.imports"].verdict is SKIP
+
+
+def test_a_fleet_file_that_is_not_there_has_no_line_and_a_way_to_begin(tmp_path: Path) -> None:
+    scene = scene_of(tmp_path)
+    scene.file.unlink()
+    result = run("file.valid", replace(scene, reading=check_file(scene.file)))
+    assert result.evidence == (f"{scene.file}: cannot be read: No such file or directory",)
+    assert "zsched init --example python" in result.fix
 
 
 def test_a_fleet_file_that_may_be_better_is_a_warning(tmp_path: Path) -> None:
