@@ -306,6 +306,9 @@ class Schedule:
         if first is None or any(value != first for value in values.values()):
             told = {name: (value.revision, value.number) for name, value in values.items() if value is not None}
             return f"nodes know different fleet values: {told}"
+        newest = self._newest()
+        if newest is not None and newest.generation_id == first.generation_id and newest.revision > first.revision:
+            return f"revision {newest.revision} is chosen, and no node has learnt it yet"
         if not first.settled:
             return f"number {first.number} is not settled"
         said = self.sim.documents.says.get(first.document, self.fleet)
