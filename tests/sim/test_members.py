@@ -13,7 +13,7 @@ from support.plays import FLEET, TASK, Play
 from zsched.core.electorate.founding import founded_id
 from zsched.core.values.messages import Ballots
 from zsched_lab.sim import fleets
-from zsched_lab.sim.change_cost import measure
+from zsched_lab.sim.change_cost import ONE_WAY_S, measure
 from zsched_lab.sim.parts import Machine
 from zsched_lab.sim.recoveries import Recoveries
 from zsched_lab.sim.simulator import Simulator
@@ -108,10 +108,19 @@ def test_the_electors_of_a_change_take_turns_and_the_first_asks_for_each_task_on
     """Two other electors and a new one: ten tasks cost a prepare, an accept and the answers, as one task does."""
     cost, of_one = measure(10, exclusive=False), measure(1, exclusive=False)
     kinds = ("prepares of tasks", "accepts of tasks", "answers of tasks")
-    assert [of_one.frames[kind] for kind in kinds] == [3, 3, 6]
+    assert [of_one.frames[kind] for kind in kinds] == [0, 3, 3]
     assert [cost.frames[kind] for kind in kinds] == [0, 0, 0]
     assert [cost.frames[f"{kind} of several tasks"] for kind in ("questions", "answers")] == [6, 6]
     assert cost.writes == of_one.writes
+
+
+def test_a_change_is_settled_after_five_round_trips() -> None:
+    """Two until it is agreed, one in which the electors learn it and promise, one for the tasks, one for the fleet."""
+    cost = measure(10, exclusive=False)
+    trips = [round(seconds / (2 * ONE_WAY_S), 1) for seconds in (cost.agreed_s, cost.chosen_s, cost.settled_s)]
+    assert trips == [2.0, 5.0, 6.5]
+    assert cost.frames.total() <= 60
+    assert cost.after <= 12, "how often each elector has voted is asked once, by everybody"
 
 
 def test_electors_of_an_older_version_settle_too(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -135,3 +144,9 @@ def test_schedules_play_machines_that_come_and_go() -> None:
         done += did
     assert done["invited"]
     assert done["joined"]
+
+
+def test_a_fleet_is_not_at_rest_while_nobody_knows_what_was_chosen_last() -> None:
+    """In this schedule an elector is added in the moment in which the operator looks: the value before is outdated."""
+    violation, _ = fleets.play(80_000_100)
+    assert violation == ""

@@ -103,7 +103,7 @@ class SendBallots(Struct, frozen=True, kw_only=True):
 
     @property
     def parts(self) -> tuple[SendPrepare | SendAccept, ...]:
-        """The questions, each as it would go alone."""
+        """The questions to tasks' registers, each as it would go alone."""
         return (
             *(SendPrepare(prepare=one, deadline_s=self.deadline_s) for one in self.ballots.prepares),
             *(SendAccept(accept=one, deadline_s=self.deadline_s) for one in self.ballots.accepts),
@@ -125,7 +125,7 @@ class AnswerBallots(Struct, frozen=True, kw_only=True):
 
     @property
     def parts(self) -> tuple[AnswerElection, ...]:
-        """The answers, each as it would go alone."""
+        """The answers of tasks' registers, each as it would go alone."""
         return tuple(AnswerElection(request=self.request, answer=one) for one in self.votes.answers)
 
 
@@ -325,6 +325,8 @@ class AskElectors(Struct, frozen=True, kw_only=True):
     to: tuple[NodeId, ...]
     question: Prepare | Accept[FleetValue]
     deadline_s: float
+    may_join: bool = False
+    """It may go in one frame with questions of tasks' registers to the same electors (`SendBallots`)."""
 
 
 class TellFleet(Struct, frozen=True, kw_only=True):

@@ -128,8 +128,8 @@ class Node(Stages):
         self._promised = max(self._next_deadline(now), now)
         state = self.agreement.to_persist(now) if todo.must_persist else None
         first: tuple[do.Instruction, ...] = () if state is None else (do.PersistState(state=state),)
-        if len(todo.send) > 1:
-            todo.send = joined(todo.send)
+        if todo.send:
+            todo.send = joined(todo.send, self.agreement.unsettled)
         return (*first, *todo.send, *todo.apply)
 
     def _next_deadline(self, now: float) -> float:
@@ -144,7 +144,8 @@ class Node(Stages):
             self.tenure.next_deadline(now),
         )
         for executor in self.executors.values():
-            due = min(due, executor.next_deadline())
+            if (at := executor.next_deadline()) < due:
+                due = at
         return due
 
     # --- the stages, in the data's order -----------------------------------------------------------------------------
@@ -241,6 +242,8 @@ class Node(Stages):
             documents.take_effect(self, fleet, todo, now)
         if todo.must_tell:
             todo.must_tell = False
-            todo.add(do.PublishLearnt(learnt=self.agreement.learnt()))
+            if (word := self.agreement.word(now)) is not None:
+                todo.must_beat = True
+                todo.add(do.PublishLearnt(learnt=word))
         for value, reason in learnt:
             work.carry_out(self, value, reason, todo, now)

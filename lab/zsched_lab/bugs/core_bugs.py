@@ -730,8 +730,8 @@ VOTE_BUGS = (
     _bug(
         "each question of a frame counts at the rate",
         AGREEMENT,
-        "self.on_prepare(asked, todo, now, may_ask=may_ask)",
-        "self.on_prepare(asked, todo, now)",
+        "prepare=prepare), todo, now, may_ask=may_ask)",
+        "prepare=prepare), todo, now)",
         _JOINING,
     ),
     Bug(

@@ -159,8 +159,39 @@ ELECTOR_BUGS: tuple[Bug, ...] = (
     Bug(
         name="all electors settle at once",
         module=ROLL,
-        changes=(("self._jitter(), 0 if is_ours else 1 + self._rank())", "self._jitter(), 0)"),),
+        changes=(("self._jitter(), 1 + self._rank())", "self._jitter(), 0)"),),
         tests=("tests/sim/test_members.py",),
+        has_schedules=False,
+    ),
+    Bug(
+        name="a fleet value is learnt by anybody's word",
+        module=ROLL,
+        changes=(("is not None and accepted.value == value\n", "is not None\n"),),
+        tests=("tests/unit/core/vote/test_joining.py",),
+        has_schedules=False,
+    ),
+    Bug(
+        name="promises of a number serve the next one",
+        module=REGISTER,
+        changes=(
+            (
+                "        if running is not None and running.is_ahead:\n            self._round = None",
+                "        if running is not None and running.is_ahead:\n            pass",
+            ),
+        ),
+        tests=("tests/unit/core/vote/test_register_proposer.py",),
+        has_schedules=False,
+    ),
+    Bug(
+        name="a change asks again for what was promised ahead",
+        module=REGISTER,
+        changes=(
+            (
+                "            self._read(running, todo, now)\n\n    def settle",
+                "            self._prepare(todo, now)\n\n    def settle",
+            ),
+        ),
+        tests=("tests/unit/core/vote/test_register_proposer.py",),
         has_schedules=False,
     ),
     _bug(

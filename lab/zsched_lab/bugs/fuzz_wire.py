@@ -49,6 +49,7 @@ from zsched.core.values.messages import (
     SetWeights,
     Utilities,
     Votes,
+    fleet_answer,
     votes_of,
 )
 from zsched.core.values.model import (
@@ -132,10 +133,17 @@ def _dataclass(cls: Any, rng: Random) -> Any:
     if cls is FleetValue:
         return rng.choice(FOUNDED)
     if cls is Ballots:
-        return Ballots(prepares=(_dataclass(Prepare, rng),), accepts=(_dataclass(Accept, rng),))
+        return Ballots(
+            prepares=(_dataclass(Prepare, rng),),
+            accepts=(_dataclass(Accept, rng),),
+            ahead=_dataclass(Prepare, rng),
+            fleet=rng.choice(FOUNDED),
+        )
     if cls is Votes:
         elector = rng.choice(NAMES)
-        return votes_of(replace(_dataclass(kind, rng), elector=elector) for kind in (Promise, Accepted, Refused))
+        ahead = fleet_answer(replace(_dataclass(Accepted, rng), elector=elector))
+        answers = (replace(_dataclass(kind, rng), elector=elector) for kind in (Promise, Accepted, Refused))
+        return votes_of(answers, ahead)
     hints = wire.hints_of(cls)
     values = {one.name: sample(hints[one.name], rng, one.name) for one in fields(made)}
     if made is Accept:

@@ -5,8 +5,9 @@
 Knows: which messages belong to a change, where it begins and ends. Does not know: bytes, processors, real networks
 (`benchmarks.membership` has those).
 
-Every message takes the same time here, so times are told as round trips. What waits by a clock of its own is in them:
-the jitter before settling, and the guard time where a task is exclusive.
+Every message takes the same time here, so times are told as round trips; the guard time of exclusive tasks is in them.
+Frames are counted until every node knows the settled value, and until nothing more follows from it: then nodes have
+also asked each elector how often it has voted (`zsched.core.vote.witness`).
 """
 
 from __future__ import annotations
@@ -29,6 +30,8 @@ ELECTORS = ("robot1", "robot2", "robot3")
 ADDED = "edge1"
 NODES = (*ELECTORS, ADDED, "edge2")
 WAIT_S = 30.0
+CALM_S = 3.0
+"""So long after the last news nothing of a change is under way any more."""
 ASKED = {
     do.SendPrepare: "prepares of tasks",
     do.SendAccept: "accepts of tasks",
@@ -49,11 +52,16 @@ class Cost:
 
     frames: Counter[str] = field(default_factory=Counter)
     """{kind: frames that went to another machine}."""
+    after: int = 0
+    """Frames that followed when every node knew the settled value."""
     writes: Counter[str] = field(default_factory=Counter)
     """{machine: synced writes of its state}."""
     agreed_s: float = 0.0
     """Until the operator heard that it is agreed."""
+    chosen_s: float = 0.0
+    """Until the first node knew the settled value."""
     settled_s: float = 0.0
+    """Until every node did."""
 
 
 class _Counted(Simulator):
@@ -136,14 +144,23 @@ def measure(tasks: int, *, exclusive: bool, seed: int = 1) -> Cost:
     sim.deliver(sim.machines[ELECTORS[0]], ev.FleetCommanded(request=2, command=command))
     _wait(sim, lambda: any(one.request == 2 for one in sim.answers), "the change")
     sim.cost.agreed_s = sim.now - began_at
+    _wait(sim, lambda: any(_knows_settled(sim, 3)), "settled electors")
+    sim.cost.chosen_s = sim.now - began_at
     _wait(sim, lambda: _is_settled(sim, 3), "the settled electors")
-    sim.cost.settled_s = sim.now - began_at
-    return sim.cost
+    cost, sim.cost = sim.cost, Cost()
+    cost.settled_s = sim.now - began_at
+    sim.run(CALM_S)
+    cost.after = sim.cost.frames.total()
+    return cost
+
+
+def _knows_settled(sim: Simulator, number: int) -> list[bool]:
+    values = [sim.node(name).agreement.fleet_value for name in sim.running()]
+    return [value is not None and value.settled and value.number == number for value in values]
 
 
 def _is_settled(sim: Simulator, number: int) -> bool:
-    values = [sim.node(name).agreement.fleet_value for name in sim.running()]
-    return all(value is not None and value.settled and value.number == number for value in values)
+    return all(_knows_settled(sim, number))
 
 
 def _wait(sim: Simulator, condition: object, what: str) -> None:
@@ -155,10 +172,11 @@ def told(cost: Cost, tasks: int, *, exclusive: bool) -> str:
     """The counts as a row of a table."""
     trip_s = 2 * ONE_WAY_S
     most = max(cost.writes[name] for name in (*ELECTORS, ADDED))
+    trips = [f"{seconds / trip_s:.1f}" for seconds in (cost.agreed_s, cost.chosen_s, cost.settled_s)]
     kinds = ", ".join(f"{kind} {count}" for kind, count in sorted(cost.frames.items()))
     return (
-        f"| {tasks}{' exclusive' if exclusive else ''} | {cost.frames.total()} | {cost.agreed_s / trip_s:.1f} | "
-        f"{cost.settled_s / trip_s:.1f} | {most} | {kinds} |"
+        f"| {tasks}{' exclusive' if exclusive else ''} | {cost.frames.total()} | {cost.after} | "
+        f"{' | '.join(trips)} | {most} | {kinds} |"
     )
 
 
@@ -172,9 +190,10 @@ def main(arguments: list[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     print(f"one elector is added to three; 5 nodes; a round trip is {2000 * ONE_WAY_S:g} ms")
     print(
-        "| tasks | frames | round trips until agreed | until all know it settled | writes of an elector | frames of |"
+        "| tasks | frames | frames after | round trips until agreed | until settled | until all know it "
+        "| writes of an elector | frames of |"
     )
-    print("| ---: | ---: | ---: | ---: | ---: | --- |")
+    print("| ---: | ---: | ---: | ---: | ---: | ---: | ---: | --- |")
     for tasks in given.tasks:
         print(told(measure(tasks, exclusive=given.exclusive), tasks, exclusive=given.exclusive))
     return 0

@@ -86,6 +86,8 @@ class Documents:
         elif isinstance(instruction, do.SendBallots):
             for accept in instruction.ballots.accepts:
                 self.judge.note(accept)
+            if instruction.ballots.ahead is not None:
+                self.judge.note(instruction.ballots.ahead)
         elif isinstance(instruction, do.AskElectors):
             self.judge.note(instruction.question)
 

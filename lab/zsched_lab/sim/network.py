@@ -16,7 +16,7 @@ from random import Random
 from typing import Any
 
 from zsched.core import events as ev
-from zsched.core.values.messages import Ballots, Votes
+from zsched.core.values.messages import Ballots, Votes, fleet_answer
 from zsched.core.values.model import Ballot, NodeId
 from zsched.core.values.struct import replace
 from zsched.errors import InvariantError, WireError
@@ -210,7 +210,8 @@ def _forged_question(event: ev.PrepareAsked | ev.AcceptAsked, rng: Random) -> ev
 
 
 def _forged_ballots(event: ev.BallotsAsked, rng: Random) -> ev.Event:
-    """Such questions, all in one frame."""
+    """Such questions, all in one frame, and with them the word of a fleet value that nobody has chosen."""
+    told = event.ballots.fleet
     forged = [
         *(
             _forged_question(ev.PrepareAsked(request=FORGED, asker=event.asker, prepare=one), rng)
@@ -224,6 +225,7 @@ def _forged_ballots(event: ev.BallotsAsked, rng: Random) -> ev.Event:
     ballots = Ballots(
         prepares=tuple(one.prepare for one in forged if isinstance(one, ev.PrepareAsked)),
         accepts=tuple(one.accept for one in forged if isinstance(one, ev.AcceptAsked)),
+        fleet=None if told is None else replace(told, revision=min(told.revision + rng.choice(FAR), 2**53)),
     )
     return ev.BallotsAsked(request=FORGED, asker=GHOST if rng.random() < 0.5 else event.asker, ballots=ballots)
 
@@ -238,6 +240,7 @@ def _forged_votes(event: ev.VotesReceived, rng: Random) -> ev.Event:
             promises=tuple(replace(one, elector=GHOST) for one in votes.promises),
             accepted=tuple(replace(one, elector=GHOST) for one in votes.accepted),
             refused=tuple(replace(one, elector=GHOST) for one in votes.refused),
+            ahead=None if votes.ahead is None else fleet_answer(replace(votes.ahead.content, elector=GHOST)),
         )
     )
 

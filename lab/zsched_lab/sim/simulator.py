@@ -425,7 +425,8 @@ class Simulator(Links):
                     self.memory.on_vote(me)
                 self._answer(request, vote)
             case do.AnswerBallots(request=request, votes=votes):
-                for _ in (*votes.promises, *votes.accepted):
+                has_promised = votes.ahead is not None and votes.ahead.refused is None
+                for _ in range(len(votes.promises) + len(votes.accepted) + has_promised):
                     self.memory.on_vote(me)
                 self._answer(request, votes)
             case do.AnswerLearnt(request=request, learnt=learnt):

@@ -76,6 +76,7 @@ def test_golden_frames_of_kinds_that_are_gone_are_not_deleted() -> None:
 # --- round trips -----------------------------------------------------------------------------------------------------
 
 FOUNDED = founded("lab", 1, ("r1", "r2"))
+BALLOT = model.Ballot(counter=3, node="r1", incarnation=7)
 NAMES = st.from_regex(r"[a-z0-9][a-z0-9_-]{0,20}", fullmatch=True)
 TEXTS = st.text(st.characters(codec="utf-8"), max_size=60)
 ONE_OF: dict[type, tuple[str, ...]] = {
@@ -138,7 +139,14 @@ def batch_of(cls: type[Any], elector: str, parts: tuple[list[Any], ...]) -> Any:
     """Some questions of one proposer, or the answers of one elector."""
     if cls is messages.Votes:
         parts = tuple([replace(one, elector=elector) for one in part] for part in parts)
-    return cls(**{field.name: tuple(part) for field, part in zip(fields(cls), parts, strict=True)})
+    batch = cls(**{field.name: tuple(part) for field, part in zip(fields(cls), parts, strict=False)})
+    if cls is messages.Votes:
+        no = messages.Refused(
+            elector=elector, task="lab", ballot=BALLOT, refusal=messages.Refusal.NUMBER, promised=BALLOT, fleet=FOUNDED
+        )
+        return replace(batch, ahead=messages.fleet_answer(no))
+    first = messages.Prepare(task="lab", ballot=BALLOT, electorate="e", generation_id="ab", number=2)
+    return replace(batch, ahead=first, fleet=FOUNDED)
 
 
 def tuple_strategy(args: tuple[Any, ...], name: str) -> st.SearchStrategy[Any]:

@@ -53,7 +53,9 @@ class FleetRegister(Register[FleetValue]):
         return f"number {value.number} with {', '.join(value.electorate.names)}"
 
     def _ask(self, question: Prepare | Accept[FleetValue], todo: ToDo) -> None:
-        todo.fleet.append(AskElectors(to=self._count.names, question=question, deadline_s=self._ballot_s))
+        may_join = isinstance(question, Prepare) and self._running().is_ahead and self._may_join
+        ask = AskElectors(to=self._count.names, question=question, deadline_s=self._ballot_s, may_join=may_join)
+        todo.fleet.append(ask)
 
     def _hand_on(self, value: FleetValue, why: str, todo: ToDo) -> None:
         """The roll looks for it itself, at once: nothing may be answered before its registers count by it."""

@@ -260,17 +260,22 @@ class Numbers:
             self._after(before, todo)
         return self.value is not before
 
+    def has_accepted(self, value: FleetValue) -> bool:
+        """Whether this elector has itself accepted this very value, and not learnt it yet."""
+        return self.roll is not None and self.roll.has_accepted(value)
+
     def learn(self, value: FleetValue, teller: NodeId, todo: ToDo, now: float) -> bool:
         """A peer has answered what it has learnt; whether this node counts by it from now on."""
         before = self.value
         if self.roll is not None:
-            if self._is_news(value) and not self.documents.holds(value):
+            if self.is_news(value) and not self.documents.holds(value):
                 self._hold(value, teller, todo, now)
             self.roll.learn(value, todo, now)
             self._after(before, todo)
         return self.value is not before
 
-    def _is_news(self, value: FleetValue) -> bool:
+    def is_news(self, value: FleetValue) -> bool:
+        """Whether a fleet value is of this generation, and newer than the learnt one."""
         ours = self.value
         is_ours = ours is not None and (value.fleet, value.generation_id) == (ours.fleet, ours.generation_id)
         return is_ours and ours is not None and value.revision > ours.revision
@@ -278,7 +283,7 @@ class Numbers:
     def _readable(self, answer: Refused, todo: ToDo, now: float) -> Refused:
         """A refusal without its fleet value if that one's document is still to be fetched."""
         value = answer.fleet
-        if value is None or not self._is_news(value) or self.documents.holds(value):
+        if value is None or not self.is_news(value) or self.documents.holds(value):
             return answer
         self._hold(value, answer.elector, todo, now)
         return replace(answer, fleet=None)
@@ -398,9 +403,11 @@ class Numbers:
         """Ask for, or tell, what was learnt: fleet values travel with the tasks' values."""
         for order in todo.fleet:
             if isinstance(order, do.AskFleet):
-                todo.add(do.AskLearnt(peer=order.peer, deadline_s=self._fleet.timing.ballot_s))
+                ask = do.AskLearnt(peer=order.peer, deadline_s=self._fleet.timing.ballot_s)
+                if ask not in todo.send:  # a frame may hold many questions under a number that is not known here
+                    todo.add(ask)
             elif isinstance(order, do.TellFleet):
-                todo.must_beat = todo.must_tell = True  # who hears it asks
+                todo.must_tell = True  # who hears it asks
             else:
                 todo.add(order)
         todo.fleet.clear()

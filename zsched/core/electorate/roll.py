@@ -241,6 +241,11 @@ class Roll:
 
     # --- learner -----------------------------------------------------------------------------------------------------
 
+    def has_accepted(self, value: FleetValue) -> bool:
+        """Whether this elector has itself accepted this very value, and not learnt it yet."""
+        accepted = self.state.accepted
+        return self.is_elector and self.is_unlearnt and accepted is not None and accepted.value == value
+
     def learn(self, value: FleetValue, todo: ToDo, now: float) -> None:
         """A peer tells the fleet value that it has learnt."""
         if value.fleet != self.value.fleet:
@@ -273,7 +278,10 @@ class Roll:
         self._list(todo, now)
         if value.number != number:
             self._count(is_blank=seat != self.seat, is_new=True, now=now)
-        self._settling.begin(value, now + self._jitter(), 0 if is_ours else 1 + self._rank())
+        if is_ours:  # nobody else knows that this is chosen yet
+            self._settling.begin(value, now, 0)
+        else:
+            self._settling.begin(value, now + self._jitter(), 1 + self._rank())
 
     def _list(self, todo: ToDo, now: float) -> None:
         """Remove the registers that the document does not list, and begin those that are new."""
@@ -331,7 +339,9 @@ class Roll:
         if not self.is_elector or now < self._settling.due(self.value, self._registers.values()):
             return
         change = self._settling.tick(self.value, self._registers.values(), todo, now)
-        if change is not None and not self._register.is_busy:
+        if change is None and not self.value.is_exclusive:
+            self._register.prepare_ahead(todo, now)  # a round trip less once the tasks' registers are written
+        elif change is not None and not self._register.is_busy:
             self._register.propose(change, todo, now)
 
 

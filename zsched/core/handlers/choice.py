@@ -136,6 +136,8 @@ def _on_ballots(node: Stages, event: ev.BallotsAsked, todo: ToDo, now: float) ->
 
 
 def _on_votes(node: Stages, event: ev.VotesReceived, todo: ToDo, now: float) -> None:
+    if event.votes.ahead is not None:  # first: with the others the round that it belongs to may go on
+        node.agreement.on_fleet_answer(ev.FleetAnswered(answer=event.votes.ahead), todo, now)
     for answer in event.votes.answers:
         node.agreement.on_answer(ev.ElectorAnswered(answer=answer), todo, now)
 

@@ -134,16 +134,21 @@ MOST_BALLOTS = 24
 
 
 class Ballots(Struct, frozen=True, kw_only=True):
-    """Questions of several tasks' registers to an elector, in one frame: each counts as if it had come alone.
+    """Questions of several registers to an elector, in one frame: each counts as if it had come alone.
 
-    Only identity rounds travel so, and only at their first try: an elector of an older version does not read it.
+    Only what settles a fleet's electors travels so, and only at its first try: an elector of an older version does not
+    read it.
     """
 
     prepares: tuple[Prepare, ...] = ()
     accepts: tuple[Accept, ...] = ()
+    ahead: Prepare | None = None
+    """To the fleet's register, for the change that says that the electors are settled."""
+    fleet: FleetValue | None = None
+    """The learnt fleet value by whose number is asked, while that is not settled: an elector may not know it yet."""
 
     def __post_init__(self) -> None:
-        _check_batch("ballots", len(self.prepares) + len(self.accepts))
+        _check_batch("ballots", len(self.prepares) + len(self.accepts), has_more=self.ahead is not None)
 
 
 class Votes(Struct, frozen=True, kw_only=True):
@@ -152,29 +157,32 @@ class Votes(Struct, frozen=True, kw_only=True):
     promises: tuple[Promise, ...] = ()
     accepted: tuple[Accepted, ...] = ()
     refused: tuple[Refused, ...] = ()
+    ahead: FleetAnswer | None = None
+    """Of the fleet's register."""
 
     def __post_init__(self) -> None:
-        _check_batch("votes", len(self.answers))
-        if any(one.elector != self.elector for one in self.answers):
+        _check_batch("votes", len(self.answers), has_more=self.ahead is not None)
+        names = {one.elector for one in self.answers} | ({self.ahead.content.elector} if self.ahead else set())
+        if len(names) != 1:
             raise ValueError("votes: expected the answers of one elector")
 
     @property
     def answers(self) -> tuple[Promise | Accepted | Refused, ...]:
-        """All of them."""
+        """All those of tasks' registers."""
         return (*self.promises, *self.accepted, *self.refused)
 
     @property
     def elector(self) -> NodeId:
         """Whose answers they are."""
-        return self.answers[0].elector
+        return self.answers[0].elector if self.ahead is None else self.ahead.content.elector
 
 
-def _check_batch(what: str, count: int) -> None:
-    if not 1 <= count <= MOST_BALLOTS:
+def _check_batch(what: str, count: int, *, has_more: bool) -> None:
+    if not (0 if has_more else 1) <= count <= MOST_BALLOTS:
         raise ValueError(f"{what}: expected 1 to {MOST_BALLOTS}, not {count}")
 
 
-def votes_of(answers: Iterable[Promise | Accepted | Refused]) -> Votes:
+def votes_of(answers: Iterable[Promise | Accepted | Refused], ahead: FleetAnswer | None = None) -> Votes:
     """One elector's answers as they travel: the newest fleet value goes along once, not with each no."""
     promises: list[Promise] = []
     accepted: list[Accepted] = []
@@ -188,7 +196,7 @@ def votes_of(answers: Iterable[Promise | Accepted | Refused]) -> Votes:
         else:
             refused.append(replace(answer, fleet=None) if answer.fleet == told else answer)
             told = answer.fleet or told
-    return Votes(promises=tuple(promises), accepted=tuple(accepted), refused=tuple(refused))
+    return Votes(promises=tuple(promises), accepted=tuple(accepted), refused=tuple(refused), ahead=ahead)
 
 
 class FleetQuestion(Struct, frozen=True, kw_only=True):

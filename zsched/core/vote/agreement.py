@@ -29,6 +29,7 @@ from zsched.core.values.messages import (
     Accepted,
     CommandOutcome,
     CommandResult,
+    FleetQuestion,
     Learnt,
     Prepare,
     Promise,
@@ -59,6 +60,8 @@ SETTLE_AFTER_START_S = 0.3
 ASK_LEARNT_EVERY_S = 0.3
 ASK_AT_ONCE_S = 0.05
 """A peer whose beats, or word of a new value, tell of news is asked at most this often."""
+VOTES_WAIT_S = 1.0
+"""While the electors change, how often they have voted is asked for this much later."""
 READ_EVERY_S = 2.0
 """A value that one node's word does not prove is read from a majority at most this often."""
 PREPARES_PER_S = 20.0
@@ -171,6 +174,12 @@ class Agreement:
         self._settle_at = now + SETTLE_AFTER_START_S if self.is_elector else math.inf
         self._asked_at: dict[tuple[NodeId, bool], float] = {}
         """{(peer, whether for a newer revision): when}: news of votes must not delay a question about revisions."""
+        self._awaited = 0, -math.inf
+        """(fleet revision that a peer was asked for, until when no other peer is asked for it)."""
+        self._said = 0, -math.inf
+        """(newest fleet revision that everybody was told, when)."""
+        self._changing = 0, -math.inf
+        """(newest number whose electors were not settled, since when that is known here)."""
         self._read_at: dict[TaskId, float] = {}
         self.leases = Leases(
             fleet=fleet,
@@ -308,7 +317,8 @@ class Agreement:
         """When `tick` may have something to do."""
         due = min(self._settle_at, self._numbers.next_deadline())
         for register in self.registers.values():
-            due = min(due, register.next_deadline())
+            if (at := register.next_deadline()) < due:
+                due = at
         return min(due, *(deadline for _, deadline in self._parked.values())) if self._parked else due
 
     def accepted(self) -> Mapping[TaskId, tuple[NodeId, int]]:
@@ -367,17 +377,37 @@ class Agreement:
         They count as one question at the rate, for they cost one fsync. No accept waits here for an owner to leave: it
         is refused, and comes again alone.
         """
-        may_ask = not event.ballots.prepares or self._may_ask(event.asker, now)
+        ballots, request, asker = event.ballots, event.request, event.asker
+        may_ask = not (ballots.prepares or ballots.ahead) or self._may_ask(asker, now)
         sent, todo.send = todo.send, []
-        for prepare in event.ballots.prepares:
-            asked = ev.PrepareAsked(request=event.request, asker=event.asker, prepare=prepare)
-            self.on_prepare(asked, todo, now, may_ask=may_ask)
-        for accept in event.ballots.accepts:
-            self.on_accept(ev.AcceptAsked(request=event.request, asker=event.asker, accept=accept), todo, now, park_s=0)
-        answers = [one for one in todo.send if isinstance(one, do.AnswerElection) and one.request == event.request]
-        todo.send = [*sent, *(one for one in todo.send if one not in answers)]
-        if answers:
-            todo.add(do.AnswerBallots(request=event.request, votes=votes_of(one.answer for one in answers)))
+        if ballots.fleet is not None:
+            self._hear_fleet(ballots.fleet, asker, todo, now)
+        for prepare in ballots.prepares:
+            self.on_prepare(ev.PrepareAsked(request=request, asker=asker, prepare=prepare), todo, now, may_ask=may_ask)
+        for accept in ballots.accepts:
+            self.on_accept(ev.AcceptAsked(request=request, asker=asker, accept=accept), todo, now, park_s=0)
+        if ballots.ahead is not None:
+            question = FleetQuestion(prepare=ballots.ahead)
+            self.on_fleet_asked(ev.FleetAsked(request=request, asker=asker, question=question), todo, now, may_ask)
+        answers = [one for one in todo.send if isinstance(one, do.AnswerElection) and one.request == request]
+        ahead = [one for one in todo.send if isinstance(one, do.AnswerFleet) and one.request == request]
+        todo.send = [*sent, *(one for one in todo.send if one not in answers and one not in ahead)]
+        if answers or ahead:
+            votes = votes_of((one.answer for one in answers), ahead[0].answer if ahead else None)
+            todo.add(do.AnswerBallots(request=request, votes=votes))
+
+    def _hear_fleet(self, value: FleetValue, teller: NodeId, todo: ToDo, now: float) -> None:
+        """A peer says unasked that it has learnt a fleet value.
+
+        An elector that has itself accepted this very value takes its word; everybody else asks.
+        """
+        if teller == self._me or teller not in self._nodes:
+            return
+        if self._numbers.has_accepted(value):
+            if self._numbers.learn(value, teller, todo, now):
+                self._count_anew(todo)
+        elif self._numbers.is_news(value) and self._is_unasked(value.revision, now):
+            self._ask(teller, [], ASK_AT_ONCE_S, todo, now, is_news=True, of_fleet=value.revision)
 
     def on_prepare(self, event: ev.PrepareAsked, todo: ToDo, now: float, *, may_ask: bool | None = None) -> None:
         """A proposer asks for a promise: only for its own ballots, at a bounded rate (each promise costs an fsync).
@@ -406,14 +436,18 @@ class Agreement:
             self.witness.votes += isinstance(answer, Promise)
         todo.add(do.AnswerElection(request=event.request, answer=answer))
 
-    def on_fleet_asked(self, event: ev.FleetAsked, todo: ToDo, now: float) -> None:
-        """A proposer asks this elector's fleet register: only for its own ballots, at the rate of all prepares."""
+    def on_fleet_asked(self, event: ev.FleetAsked, todo: ToDo, now: float, may_ask: bool | None = None) -> None:
+        """A proposer asks this elector's fleet register: only for its own ballots, at the rate of all prepares.
+
+        ``may_ask``: whether the rate allows it, where that is known already.
+        """
         question = event.question.content
         if not self._is_its_own(event.question.ballot, event.asker):
             self.counters["fleet_foreign"] += 1
             return
         refusal = None
-        if isinstance(question, Prepare) and not self._may_ask(event.asker, now):
+        is_prepare = isinstance(question, Prepare)
+        if is_prepare and not (self._may_ask(event.asker, now) if may_ask is None else may_ask):
             self.counters["prepare_rate"] += 1
             refusal = Refusal.RATE
         elif self.is_elector and not self.witness.may_vote(now):
@@ -562,6 +596,12 @@ class Agreement:
         return self._numbers.value
 
     @property
+    def unsettled(self) -> FleetValue | None:
+        """The learnt fleet value while its electors are not settled."""
+        value = self._numbers.changed
+        return None if value is None or value.settled else value
+
+    @property
     def voters(self) -> tuple[NodeId, ...]:
         """The robots that count in votes."""
         return voters(self._fleet, self._numbers.changed)
@@ -667,9 +707,12 @@ class Agreement:
         if not self._is_our_generation(learnt.node, learnt.generation):
             return
         if not event.is_answer:
+            if learnt.fleet is not None and self._numbers.has_accepted(learnt.fleet):
+                self._hear_fleet(learnt.fleet, learnt.node, todo, now)
             newer = [(value.task, value.revision) for value in learnt.values]
-            is_news = learnt.fleet is not None and learnt.fleet.revision > self.fleet_revision
-            self._ask(learnt.node, newer, ASK_AT_ONCE_S, todo, now, is_news=is_news)
+            revision = 0 if learnt.fleet is None else learnt.fleet.revision
+            is_news = self._is_unasked(revision, now)
+            self._ask(learnt.node, newer, ASK_AT_ONCE_S, todo, now, is_news=is_news, of_fleet=revision)
             return
         if learnt.fleet is not None and self._numbers.learn(learnt.fleet, learnt.node, todo, now):
             self._count_anew(todo)
@@ -806,10 +849,40 @@ class Agreement:
         if not self._is_our_generation(beat.node, beat.generation):
             return
         is_news = beat.has_voted and beat.node not in self.voted and beat.node in self.electors
-        is_news |= self.witness.must_ask(beat) or beat.fleet_revision > self.fleet_revision
+        is_news |= self.witness.must_ask(beat) and not self._may_wait(beat, now)
+        is_news |= self._is_unasked(beat.fleet_revision, now)
         is_news |= self._is_guest_of(beat.generation) and beat.node in self.electors
         newer = [(task, revision) for task, revision, _ in beat.learnt]
-        self._ask(beat.node, newer, ASK_LEARNT_EVERY_S, todo, now, is_news=is_news)
+        self._ask(beat.node, newer, ASK_LEARNT_EVERY_S, todo, now, is_news=is_news, of_fleet=beat.fleet_revision)
+
+    def _may_wait(self, beat: Beat, now: float) -> bool:
+        """Whether a peer is asked later how often it has voted: the electors change just now.
+
+        Each of them votes several times in such a change. It is asked after `VOTES_WAIT_S` at the latest; whom this
+        elector has not asked since it started, at once.
+        """
+        number = max(beat.number, self.number)
+        if (number == self.number and self.unsettled is None) or not self.witness.has_asked(beat.node):
+            return False
+        if self._changing[0] != number:
+            self._changing = number, now
+        return now < self._changing[1] + VOTES_WAIT_S
+
+    def _is_unasked(self, revision: int, now: float) -> bool:
+        """Whether a fleet revision is newer than the learnt one, and no peer was asked for it just now.
+
+        That holds others up once for each revision: a beat is anybody's word, and must not keep a node from learning.
+        """
+        asked, until = self._awaited
+        return revision > self.fleet_revision and (revision != asked or now >= until)
+
+    def word(self, now: float) -> Learnt | None:
+        """What this node has learnt, for everybody; ``None``: it has said so just now."""
+        revision, at = self._said
+        if revision == self.fleet_revision and now < at + ASK_LEARNT_EVERY_S:
+            return None
+        self._said = self.fleet_revision, now
+        return self.learnt()
 
     def _ask(
         self,
@@ -820,8 +893,12 @@ class Agreement:
         now: float,
         *,
         is_news: bool = False,
+        of_fleet: int = 0,
     ) -> None:
-        """Ask a peer for its learnt values, because of a newer revision (or of other news)."""
+        """Ask a peer for its learnt values, because of a newer revision (or of other news).
+
+        ``of_fleet``: revision of the fleet value that it has learnt.
+        """
         is_behind = False
         for task, revision in told:
             register = self.registers.get(task)
@@ -831,6 +908,8 @@ class Agreement:
         if now - self._asked_at.get((peer, is_behind), -math.inf) < every_s:
             return
         self._asked_at[peer, is_behind] = now
+        if of_fleet > self.fleet_revision and of_fleet != self._awaited[0]:
+            self._awaited = of_fleet, now + ASK_LEARNT_EVERY_S
         todo.add(do.AskLearnt(peer=peer, deadline_s=self._fleet.timing.ballot_s))
 
     # --- proposers ---------------------------------------------------------------------------------------------------

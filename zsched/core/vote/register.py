@@ -45,6 +45,7 @@ class _Phase(StrEnum):
     WAIT = "wait"
     PREPARE = "prepare"
     ACCEPT = "accept"
+    HELD = "held"  # a majority has promised, and the change is still to come
 
 
 class _Round(Struct, Generic[V]):
@@ -67,6 +68,8 @@ class _Round(Struct, Generic[V]):
     attempt: int = 0
     is_alone: bool = False
     """Its questions go in frames of their own: the first try, maybe in a frame with others, had no success."""
+    is_ahead: bool = False
+    """Only its promises are wanted yet: the change that follows takes this ballot."""
 
 
 class Register(ABC, Generic[V]):
@@ -157,7 +160,9 @@ class Register(ABC, Generic[V]):
             self.state = replace(self.state, accepted=None)
             self._settle_at = math.inf
         running = self._round
-        if running is not None:
+        if running is not None and running.is_ahead:
+            self._round = None  # whoever wanted it asks under the new number again, if at all
+        elif running is not None:
             running.phase, running.deadline, running.ballot = _Phase.WAIT, now, None
 
     def close(self, todo: ToDo) -> None:
@@ -354,8 +359,30 @@ class Register(ABC, Generic[V]):
     def propose(self, change: Rewrite[V], todo: ToDo, now: float) -> None:
         """Try to commit a change; its end appears in `ToDo.ended`, of this or a later call."""
         self._queue.append(change)
-        if self._round is None:
+        running = self._round
+        if running is None:
             self._start_next(todo, now)
+        elif running.is_ahead:
+            self._take_up(running, todo, now)
+
+    def prepare_ahead(self, todo: ToDo, now: float) -> None:
+        """Ask for promises for a change that is to follow soon, unless a round is under way.
+
+        A ballot of which a majority has promised, and with which nothing was asked yet, stays as good as any. When
+        another one has overtaken it, the change is refused, and begins as it would without.
+        """
+        if self._round is None:
+            self._round = _Round(change=None, give_up_at=now + 6 * self._ballot_s, is_ahead=True)
+            self._prepare(todo, now)
+
+    def _take_up(self, running: _Round[V], todo: ToDo, now: float) -> None:
+        """A change has come for the round that was begun for it."""
+        running.change, running.is_ahead = self._queue.pop(0), False
+        running.give_up_at = now + 6 * self._ballot_s
+        if self._outcome_by(self.value) is not None:
+            self._finish(todo, RoundOutcome.CONFLICT, now)
+        elif running.phase is _Phase.HELD:
+            self._read(running, todo, now)
 
     def settle(self, todo: ToDo, now: float) -> None:
         """Run an identity round, unless a round is under way: learn the earlier acceptances."""
@@ -443,6 +470,9 @@ class Register(ABC, Generic[V]):
             return
         if not self._may_carry(read):
             self._again(running, todo, now)
+            return
+        if running.is_ahead and read.revision == self.value.revision:
+            running.phase, running.deadline = _Phase.HELD, running.give_up_at
             return
         is_identity = running.change is None or running.sent is not None
         if is_identity and newest is None:

@@ -58,9 +58,13 @@ class Witness:
         is_enough = len(known.intersection(self.electors)) >= majority(len(self.electors))
         return is_enough and (known == self.nodes or now >= self.started_at + ASK_ALL_S)
 
+    def has_asked(self, peer: NodeId) -> bool:
+        """Whether this node has asked a peer in this life, as an elector has to before it votes."""
+        return self.me not in self.electors or peer in self._answered
+
     def must_ask(self, beat: Beat) -> bool:
         """Whether to ask a peer: it was not asked in this life, or its count has risen."""
-        if self.me in self.electors and beat.node not in self._answered:
+        if not self.has_asked(beat.node):
             return True
         return beat.node in self.electors and beat.votes > self.seen.get(beat.node, (0, 0))[1]
 

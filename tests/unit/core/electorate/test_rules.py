@@ -21,7 +21,7 @@ from zsched_lab.sim.chosen import ChosenError
 from zsched_lab.sim.electors import Ask, AskRoll, Machine, Machines, Message, Say, SayRoll
 
 AT_ONCE_S = 0.01
-"""Long enough for messages, too short for an elector to begin to settle."""
+"""Long enough for messages, too short for another elector to begin to settle; who proposes the change stays still."""
 
 
 def value_of(machine: Machine) -> FleetValue:
@@ -33,14 +33,14 @@ def add(world: Machines, by: str, name: str, *, for_s: float = 3.0, among: str =
     """Add an elector and let it be settled."""
     machine, disk = world.machine(by), world.machine(name).disk.id
     assert world.change(machine, AddElector(base_revision=value_of(machine).revision, name=name, disk=disk)) == ""
-    world.run(*among, for_s=for_s)
+    world.run(*among, for_s=for_s, still=(by,) if for_s == AT_ONCE_S else ())
 
 
 def remove(world: Machines, by: str, name: str, *, for_s: float = 3.0, among: str = "") -> None:
     """Remove an elector and let that be settled."""
     machine = world.machine(by)
     assert world.change(machine, RemoveElector(base_revision=value_of(machine).revision, name=name)) == ""
-    world.run(*among, for_s=for_s)
+    world.run(*among, for_s=for_s, still=(by,) if for_s == AT_ONCE_S else ())
 
 
 def moved(world: Machines, by: str, among: str, task: str = "t1") -> bool:
@@ -144,7 +144,7 @@ def test_chosen_value_survives_two_changes_that_come_at_once() -> None:
     change = AddElector(base_revision=value_of(machine).revision, name="d", disk=world.machine("d").disk.id)
     assert world.change(machine, change) == "number 2 is not settled"
     world.tell(world.machine("b"), "c")
-    world.run("b", "c", "d", for_s=AT_ONCE_S)
+    world.run("b", "c", "d", for_s=AT_ONCE_S, still=("b",))
     world.tell(world.machine("c"), "d")
     world.run("c", "d")
     assert moved(world, "c", "bcd")
@@ -299,7 +299,7 @@ def test_round_ends_when_its_node_learns_another_number() -> None:
     world.pool = list(late)
     give(world, late)
     assert not any(isinstance(one.body, Ask) for one in world.pool), "promises of number 1 lead to no accept"
-    world.run("a", "b")
+    world.run("a", "b", still=("b",))
     assert machine.registers["t1"].value.owner is not None, "it is tried again under number 2"
 
 

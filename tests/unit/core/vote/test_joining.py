@@ -10,11 +10,14 @@ import pytest
 
 from support.allocations import allocation_of
 from support.ballots import ballot_of
+from support.beats import beat_of
 from support.fleets import fleet_of, tuning_of
 from support.states import state_of
 from support.todos import agreed
 from zsched.core import events as ev
 from zsched.core import instructions as do
+from zsched.core.electorate.changes import AddElector, AdoptDocument
+from zsched.core.electorate.founding import founded
 from zsched.core.todo import ToDo
 from zsched.core.values.electorate import Elector, FleetValue
 from zsched.core.values.fleet import TaskSpec
@@ -32,7 +35,7 @@ from zsched.core.values.messages import (
     votes_of,
 )
 from zsched.core.values.model import Acceptance, RegisterState
-from zsched.core.vote.agreement import PREPARE_BURST, Agreement
+from zsched.core.vote.agreement import ASK_LEARNT_EVERY_S, PREPARE_BURST, VOTES_WAIT_S, Agreement
 from zsched.core.vote.joining import joined
 
 ROBOTS = ("robot1", "robot2", "robot3")
@@ -242,3 +245,147 @@ def test_the_answers_of_two_electors_are_no_frame() -> None:
     yes = Promise(elector="robot1", task="merge", ballot=ballot_of(5, "robot2"))
     with pytest.raises(ValueError, match="one elector"):
         Votes(promises=(yes, replace(yes, elector="robot2")))
+
+
+# --- with the fleet value that brought the number --------------------------------------------------------------------
+
+FIRST = founded(FLEET.name, 0, ROBOTS)
+AGREED = replace(
+    AdoptDocument(base_revision=1, document="0d", tasks=tuple((name, False) for name in TASKS), lease_s=1.0).apply(
+        FIRST
+    ),
+    settled=True,
+)
+CHANGED = AddElector(base_revision=2, name="edge1", disk="ed").apply(AGREED)
+
+
+def elector_of_a_change(*, has_accepted: bool = True) -> Agreement:
+    """It goes by `AGREED`; ``has_accepted``: a proposer has asked it to accept `CHANGED`."""
+    held = RegisterState(task=FLEET.name, learnt=AGREED)
+    if has_accepted:
+        held = replace(held, accepted=Acceptance(ballot=ballot_of(4, "robot2"), value=CHANGED))
+    agreement = Agreement(
+        fleet=FLEET,
+        me="robot1",
+        durable=replace(state_of("robot1"), disk="d1", fleet_register=held),
+        incarnation=7,
+        electorate="e",
+        rng=Random(1),
+        now=100.0,
+        stored={"0d": FLEET},
+    )
+    for name in ROBOTS[1:]:
+        agreement.witness.on_answer(Learnt(node=name, values=()))
+    return agreement
+
+
+def settling(fleet: FleetValue | None = CHANGED) -> ev.BallotsAsked:
+    """The first frame with which the proposer of `CHANGED` settles it."""
+    asked = [
+        replace(prepare(name), generation_id=CHANGED.generation_id, number=CHANGED.number)
+        for name in (*TASKS, FLEET.name)
+    ]
+    ballots = Ballots(prepares=tuple(asked[:-1]), ahead=asked[-1], fleet=fleet)
+    return ev.BallotsAsked(request=9, asker="robot2", ballots=ballots)
+
+
+def test_who_has_accepted_the_fleet_value_that_comes_along_learns_it_and_answers_after_one_write() -> None:
+    one = elector_of_a_change()
+    todo = agreed(one.on_ballots, settling(), 100.0)
+    told = votes(todo)
+    assert [it.task for it in told.promises] == list(TASKS)
+    assert told.ahead is not None
+    assert isinstance(told.ahead.content, Promise)
+    assert told.refused == ()
+    assert todo.must_persist
+    written = one.to_persist(100.0)
+    assert written is not None
+    assert written.fleet_register is not None
+    assert written.fleet_register.learnt == CHANGED, "on disk before the first answer under it"
+    promised = [state.promised for state in written.registers] + [written.fleet_register.promised]
+    assert set(promised) == {ballot_of(5, "robot2")}
+    assert one.witness.votes == len(TASKS) + 1
+
+
+FOREIGN_VALUES = [
+    replace(CHANGED, settled=True),
+    replace(CHANGED, revision=CHANGED.revision + 1),
+    replace(CHANGED, electors=CHANGED.electors[:1]),
+    replace(CHANGED, lease_s=0.9),
+]
+
+
+@pytest.mark.parametrize(("has_accepted", "told"), [(False, CHANGED), *((True, value) for value in FOREIGN_VALUES)])
+def test_a_fleet_value_that_this_elector_has_not_accepted_is_asked_for_and_not_learnt(
+    has_accepted: bool, told: FleetValue
+) -> None:
+    """Anybody who can reach the network could have said it."""
+    one = elector_of_a_change(has_accepted=has_accepted)
+    todo = agreed(one.on_ballots, settling(told), 100.0)
+    (answered,) = [it for it in todo.send if isinstance(it, do.AnswerBallots)]
+    assert {it.refusal for it in answered.votes.refused} == {Refusal.NUMBER}
+    assert not answered.votes.promises
+    assert one.fleet_value == AGREED
+    assert [it.peer for it in todo.send if isinstance(it, do.AskLearnt)] == ["robot2"], "once, for all questions"
+
+
+def test_the_word_of_a_change_is_proof_only_to_who_has_accepted_it() -> None:
+    said = ev.LearntReceived(learnt=Learnt(node="robot3", values=(), fleet=CHANGED))
+    one = elector_of_a_change()
+    todo = agreed(one.on_learnt, said, 100.0)
+    assert (one.fleet_value, todo.must_persist, todo.send) == (CHANGED, True, [])
+    other = elector_of_a_change(has_accepted=False)
+    todo = agreed(other.on_learnt, said, 100.0)
+    assert (other.fleet_value, todo.must_persist) == (AGREED, False)
+    assert todo.send == [do.AskLearnt(peer="robot3", deadline_s=FLEET.timing.ballot_s)]
+
+
+def test_one_peer_is_asked_for_a_fleet_value_and_another_one_when_it_does_not_answer() -> None:
+    one = elector_of_a_change(has_accepted=False)
+    asked: list[str] = []
+    for now in (100.0, 100.0 + ASK_LEARNT_EVERY_S - 0.01, 100.0 + ASK_LEARNT_EVERY_S):
+        for name in ("robot2", "robot3"):
+            heard = beat_of(name, fleet_revision=CHANGED.revision, number=CHANGED.number)
+            todo = agreed(one.compare, heard, now)
+            asked += [it.peer for it in todo.send if isinstance(it, do.AskLearnt)]
+    assert asked == ["robot2", "robot3"]
+
+
+def test_forged_beats_do_not_keep_a_node_from_asking_for_a_fleet_value() -> None:
+    """A stranger tells of some revision in a silent peer's name, again and again."""
+    one, asked = elector_of_a_change(has_accepted=False), []
+    for step in range(10):
+        for name, revision in (("robot3", CHANGED.revision + step % 2), ("robot2", CHANGED.revision)):
+            heard = beat_of(name, fleet_revision=revision, number=CHANGED.number)
+            todo = agreed(one.compare, heard, 100.0 + 0.2 * step)
+            asked += [it.peer for it in todo.send if isinstance(it, do.AskLearnt)]
+    assert asked.count("robot2") >= 3
+
+
+def test_while_the_electors_change_they_are_not_asked_how_often_they_have_voted_but_not_for_long() -> None:
+    one = elector_of_a_change()
+    agreed(one.on_ballots, settling(), 100.0)
+    heard = beat_of("robot2", votes=7, fleet_revision=CHANGED.revision, number=CHANGED.number)
+    assert agreed(one.compare, heard, 100.1).send == []
+    assert agreed(one.compare, heard, 100.1 + VOTES_WAIT_S).send != []
+
+
+def test_the_word_goes_behind_the_questions_that_bring_the_fleet_value() -> None:
+    word = do.PublishLearnt(learnt=Learnt(node="robot2", values=()))
+    first = Prepare(task=FLEET.name, ballot=ballot_of(5, "robot2"), electorate="e")
+    ahead = do.AskElectors(to=ROBOTS, question=first, deadline_s=0.2, may_join=True)
+    batch: list[do.Instruction] = [word, sent("guard"), ahead]
+    ballots = Ballots(prepares=(prepare("guard"),), ahead=first, fleet=CHANGED)
+    assert joined(batch, CHANGED) == [do.SendBallots(ballots=ballots, deadline_s=0.2), word]
+    assert joined([word, ahead], CHANGED) == [
+        do.SendBallots(ballots=Ballots(ahead=first, fleet=CHANGED), deadline_s=0.2),
+        word,
+    ], "a fleet without a task"
+    accepts: list[do.Instruction] = [do.SendAccept(accept=accept("merge"), deadline_s=0.3, may_join=True)]
+    assert joined(accepts, CHANGED) == accepts, "who has promised knows it"
+    assert joined([sent("guard", may_join=False)], CHANGED) == [sent("guard", may_join=False)]
+
+
+def test_only_the_first_of_many_frames_brings_it() -> None:
+    frames = joined([sent(f"task{number:02}") for number in range(MOST_BALLOTS + 2)], CHANGED)
+    assert [it.ballots.fleet for it in frames if isinstance(it, do.SendBallots)] == [CHANGED, None]

@@ -29,6 +29,7 @@ from support.registers import (
     promised,
 )
 from zsched.core.values.change import MoveOwner, Retune, RoundOutcome
+from zsched.core.values.electorate import Elector, Electorate
 from zsched.core.values.messages import Accepted, Promise, Refusal, Refused
 from zsched.core.values.model import Acceptance, Allocation
 from zsched.core.vote.task_register import TaskRegister
@@ -428,3 +429,73 @@ def test_who_is_overtaken_waits_no_longer_than_its_change_may_take_and_for_nobod
         promised(other, prepare(9))
     did(proposer.tick, BALLOT_S)
     assert did(proposer.tick, proposer.next_deadline()).prepare is not None, "who was asked to leave has left"
+
+
+# --- promises ahead --------------------------------------------------------------------------------------------------
+
+
+def ahead() -> list[TaskRegister]:
+    """Three electors; the first has asked all of them ahead, and a majority has promised."""
+    electors = [make(name) for name in ELECTORS]
+    assert promise_all(electors[0], did(electors[0].prepare_ahead, 0.0), electors[:2]) == Step()
+    assert not electors[0].is_busy
+    return electors
+
+
+def test_a_change_that_was_asked_for_ahead_needs_one_phase_only() -> None:
+    electors = ahead()
+    asked = did(electors[0].propose, FIRST, 1.0)
+    assert asked.prepare is None
+    assert accept_all(electors[0], asked, electors[1:]).finished == (FIRST, RoundOutcome.COMMITTED)
+    assert electors[0].value == allocation(1)
+
+
+def test_a_change_that_comes_before_the_promises_goes_on_with_them() -> None:
+    electors = [make(name) for name in ELECTORS]
+    asked = did(electors[0].prepare_ahead, 0.0)
+    assert did(electors[0].propose, FIRST, 0.01) == Step()
+    assert commit(electors[0], asked, electors[:2]).finished == (FIRST, RoundOutcome.COMMITTED)
+
+
+def test_a_ballot_that_was_overtaken_since_it_was_promised_carries_nothing() -> None:
+    """Another proposer has come between: what it has chosen stands."""
+    electors = ahead()
+    commit(electors[2], did(electors[2].propose, replace(FIRST, owner="e2"), 0.5), electors[1:])
+    asked = did(electors[0].propose, FIRST, 1.0)
+    assert asked.accept is not None
+    answers = [accepted(one, asked.accept, 1.0)[1] for one in electors[1:]]
+    assert [isinstance(one, Refused) and one.refusal is Refusal.BALLOT for one in answers] == [True, True]
+    assert electors[2].value.owner == "e2"
+
+
+def test_what_was_learnt_meanwhile_ends_a_change_that_is_based_on_the_value_before() -> None:
+    electors = ahead()
+    did(electors[0].learn, allocation(1), 0.5)
+    assert did(electors[0].propose, FIRST, 1.0).finished == (FIRST, RoundOutcome.CONFLICT)
+    assert electors[0].next_deadline() == math.inf
+
+
+def test_what_a_majority_has_accepted_is_settled_before_a_change_that_was_asked_for_ahead() -> None:
+    electors = [make(name) for name in ELECTORS]
+    accepted(electors[1], accept(1, allocation(1), "a"), 0.0)
+    asked = promise_all(electors[0], did(electors[0].prepare_ahead, 0.0), electors[1:])
+    assert asked.accept is not None, "an identity round"
+    assert accept_all(electors[0], asked, electors[1:]).learnt == allocation(1)
+    assert electors[0].next_deadline() == math.inf
+
+
+def test_promises_for_which_no_change_comes_are_forgotten() -> None:
+    proposer = ahead()[0]
+    did(proposer.tick, proposer.next_deadline())
+    assert proposer.next_deadline() == math.inf
+    assert did(proposer.propose, FIRST, 10.0).prepare is not None
+
+
+def test_promises_of_a_number_are_none_of_the_next_one() -> None:
+    proposer = ahead()[0]
+    count = Electorate(number=3, generation_id="ab", electors=tuple(Elector(name=name) for name in ELECTORS))
+    proposer.count_with(count, is_elector=True, is_blank=False, now=1.0)
+    assert proposer.next_deadline() == math.inf
+    asked = did(proposer.propose, FIRST, 1.0)
+    assert asked.prepare is not None
+    assert asked.prepare.number == 3
