@@ -28,6 +28,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from functools import cached_property
 
 from zsched.core.electorate.changes import AddElector, FleetChange, RemoveElector, SetAway
 from zsched.core.values.electorate import Elector, FleetValue
@@ -43,7 +44,7 @@ PAUSE_SHARE = 0.5
 """A node that has not looked for this share of the silence has paused itself: it listens anew."""
 
 
-class Course(Struct, frozen=True, kw_only=True):
+class Course(Struct, frozen=True, kw_only=True, dict=True):
     """What the document says about electors and robots."""
 
     members: tuple[tuple[NodeId, NodeKind], ...]
@@ -57,7 +58,12 @@ class Course(Struct, frozen=True, kw_only=True):
     leaving: tuple[NodeId, ...] = ()
     """Nodes that an operator takes out of the fleet."""
 
-    @property
+    @cached_property
+    def names(self) -> tuple[NodeId, ...]:
+        """All nodes."""
+        return tuple(name for name, _ in self.members)
+
+    @cached_property
     def robots(self) -> tuple[NodeId, ...]:
         """The nodes that vote, sorted."""
         return tuple(name for name, kind in self.members if kind is NodeKind.ROBOT)
@@ -142,7 +148,7 @@ class Pilot:
         self.now = now
         if tuple(self._seats) != value.electors:
             self._seats = {seat: self._seats.get(seat, now) for seat in value.electors}
-        for name in [name for name in self._peers if all(name != member for member, _ in course.members)]:
+        for name in [name for name in self._peers if name not in course.names]:
             if value.electorate.seat(name) is None:
                 del self._peers[name]
 

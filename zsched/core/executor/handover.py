@@ -143,6 +143,8 @@ class Executor:
 
     def next_deadline(self) -> float:
         """When `tick` may have something to do; infinity when never."""
+        if not self._old:
+            return self._role_deadline
         return min((self._role_deadline, *(old.until for old in self._old)))
 
     def start(self, todo: ToDo) -> None:

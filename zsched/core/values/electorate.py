@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from functools import cached_property
 from itertools import pairwise
 
 from zsched.core.values.model import NodeId, TaskId, check_counter, check_name
@@ -66,8 +67,11 @@ class Creation(Struct, frozen=True, kw_only=True):
         return self.number * CREATION_STEP
 
 
-class Electorate(Struct, frozen=True, kw_only=True):
-    """With whom a round counts: it belongs to one number of one generation."""
+class Electorate(Struct, frozen=True, kw_only=True, dict=True):
+    """With whom a round counts: it belongs to one number of one generation.
+
+    What follows from its fields is worked out once (``dict``): every beat asks for it.
+    """
 
     generation_id: str = ""
     number: int = 0
@@ -81,12 +85,12 @@ class Electorate(Struct, frozen=True, kw_only=True):
         """The seat of ``name``; ``None``: it is no elector."""
         return next((one for one in self.electors if one.name == name), None)
 
-    @property
+    @cached_property
     def is_founding(self) -> bool:
         """Whether these are a fleet file's electors, which no change has touched; nodes compare their files then."""
-        return _is_founding(self.number, self.electors)
+        return self.number <= 1 and all(one.joining == 0 for one in self.electors)
 
-    @property
+    @cached_property
     def names(self) -> tuple[NodeId, ...]:
         """The electors' names."""
         return tuple(one.name for one in self.electors)
@@ -111,19 +115,16 @@ def generation_in(terms: str) -> str:
     return named if is_named else ""
 
 
-def _is_founding(number: int, electors: tuple[Elector, ...]) -> bool:
-    return number <= 1 and all(one.joining == 0 for one in electors)
-
-
 def electorate_of(names: Iterable[NodeId]) -> Electorate:
     """Electors without a number: of a register that no fleet value governs."""
     return Electorate(electors=tuple(Elector(name=name) for name in names))
 
 
-class FleetValue(Struct, frozen=True, kw_only=True):
+class FleetValue(Struct, frozen=True, kw_only=True, dict=True):
     """What the fleet register holds.
 
     ``revision`` rises by one with every change, ``number`` only when the electors or the lease length change.
+    What follows from the fields is worked out once (``dict``): every beat asks for it.
     """
 
     fleet: str
@@ -176,7 +177,7 @@ class FleetValue(Struct, frozen=True, kw_only=True):
         """The name of its register: the fleet's."""
         return self.fleet
 
-    @property
+    @cached_property
     def electorate(self) -> Electorate:
         """With whom rounds under this value count."""
         return Electorate(generation_id=self.generation_id, number=self.number, electors=self.electors)
@@ -189,7 +190,7 @@ class FleetValue(Struct, frozen=True, kw_only=True):
     @property
     def is_founding(self) -> bool:
         """Whether its electorate is one that no change has touched (`Electorate.is_founding`)."""
-        return _is_founding(self.number, self.electors)
+        return self.electorate.is_founding
 
     def creation(self, task: TaskId) -> Creation | None:
         """The creation of ``task``; ``None``: the document does not list it."""

@@ -7,7 +7,7 @@ range stand there only: `zsched.config.keys` makes the fleet file's schema of th
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 from zsched.core.values.words import check_range
 
@@ -40,9 +40,15 @@ def key(default: T, doc: str, bounds: Range | None = None, *, name: str = "", sh
     return field(default=default, metadata={"key": Key(doc, bounds, name, shown)})
 
 
+_RANGES: Final[dict[type, list[tuple[str, Range]]]] = {}
+"""{class: its fields that have a range}, filled when asked."""
+
+
 def check_ranges(value: Any, prefix: str = "") -> None:
     """Raise `ValueError` unless every field of a dataclass is in its range (``None``, "not given", passes)."""
-    for one in fields(value):
-        held: Key | None = one.metadata.get("key")
-        if held is not None and held.range is not None:
-            check_range(f"{prefix}{one.name}", getattr(value, one.name), held.range.low, held.range.high)
+    kind = type(value)
+    if kind not in _RANGES:
+        held: list[tuple[str, Key | None]] = [(one.name, one.metadata.get("key")) for one in fields(value)]
+        _RANGES[kind] = [(name, key.range) for name, key in held if key is not None and key.range is not None]
+    for name, bounds in _RANGES[kind]:
+        check_range(f"{prefix}{name}", getattr(value, name), bounds.low, bounds.high)
