@@ -23,6 +23,8 @@ SETTLE_S = 1.0
 """Once all before it are heard in a new life, the next one waits this long: their workers start meanwhile."""
 OWNER_S = 30.0
 """An owner waits this much longer for another candidate that starts: without one its task would have no owner."""
+LEAST_ELECTORS = 3
+"""Of so many, one may be away and the others agree: so one goes with the first turn of the others."""
 LONGEST_WAIT_S = 120.0
 """An elector waits this long for the others; one that is away for good must not keep a new node out."""
 
@@ -35,9 +37,9 @@ def turns(
 ) -> tuple[tuple[NodeId, ...], ...]:
     """The nodes in the turns in which they begin again: electors one at a time, the others several at once.
 
-    A new node counts as soon as it hears a majority of the electors. So only one turn of others comes before them, and
-    the new node waits for the same number of turns in a fleet of any size. In one turn are fewer robots than would be
-    missed in a vote, and never all candidates of a task.
+    A new node counts as soon as it hears a majority of the electors. So only one turn of others comes before them, one
+    elector goes with it, and the new node waits for at most as many turns as a majority of the electors has, in a fleet
+    of any size. In one turn are fewer robots than would be missed in a vote, and never all candidates of a task.
 
     Args:
         nodes: that live.
@@ -45,20 +47,22 @@ def turns(
         robots: whose votes count; those without one that begins again have to be a majority.
         tasks: the candidates of each task.
 
-    >>> turns(("edge1", "edge2", "edge3", "robot1"), ("edge1", "robot1"), tasks=[("edge2", "edge3")])
-    (('edge2',), ('edge1',), ('robot1',), ('edge3',))
+    >>> electors = ("edge1", "robot1", "robot2")
+    >>> turns((*electors, "edge2", "edge3"), electors, tasks=[("edge2", "edge3")])
+    (('robot2', 'edge2'), ('edge1',), ('robot1',), ('edge3',))
     """
     most = max((len(robots) - 1) // 2, 1)
-    waves: list[list[NodeId]] = []
-    for name in sorted(set(nodes).difference(electors)):
+    singly, others = sorted(set(nodes).intersection(electors)), sorted(set(nodes).difference(electors))
+    # The last one: an operator often commands the machine that founded the fleet, and may give it the next command.
+    waves = [[singly.pop()]] if others and len(singly) >= LEAST_ELECTORS else []
+    for name in others:
         fitting = (wave for wave in waves if _fits(name, wave, nodes, tasks))
         wave = next((one for one in fitting if name not in robots or len(set(robots) & {*one, name}) <= most), None)
         if wave is None:
             waves.append(wave := [])
         wave.append(name)
-    singly = ((name,) for name in sorted(set(nodes).intersection(electors)))
     first, *later = map(tuple, waves or [[]])
-    return (*((first,) if first else ()), *singly, *later)
+    return (*((first,) if first else ()), *((name,) for name in singly), *later)
 
 
 def _fits(

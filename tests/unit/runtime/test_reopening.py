@@ -29,13 +29,16 @@ def wanting(me: str, now: float = 0.0) -> Reopening:
     return one
 
 
-def test_one_turn_of_others_comes_before_the_electors_so_a_new_node_waits_as_long_in_any_fleet() -> None:
-    assert ORDER == (("edge2",), ("edge1",), ("robot1",), ("robot2",))
+def test_one_turn_of_others_and_an_elector_comes_first_so_a_new_node_waits_as_long_in_any_fleet() -> None:
+    assert ORDER == (("robot2", "edge2"), ("edge1",), ("robot1",))
     assert turns(("robot1", "robot2"), ("robot1", "robot2")) == (("robot1",), ("robot2",))
+    pair = turns(NODES[:3], ELECTORS[:2])
+    assert pair == (("edge2",), ("edge1",), ("robot1",)), "one of two electors is half of them"
     large = [f"m{number:02d}" for number in range(1, 25)]
     order = turns(large, large[:5], robots=large[::2], tasks=[large[10:14]])
-    assert order[1:6] == tuple((name,) for name in large[:5])
-    assert len(order) <= 5 + 3, "the other nineteen take as many turns as votes and tasks ask for"
+    assert order[1:5] == tuple((name,) for name in large[:4])
+    assert large[4] in order[0], "two more, and three of five know the new rules"
+    assert len(order) <= 4 + 3, "the other nineteen take as many turns as votes and tasks ask for"
     assert sorted(name for wave in order for name in wave) == large
 
 
@@ -49,11 +52,16 @@ def test_a_turn_leaves_a_majority_of_the_robots_and_a_candidate_of_every_task() 
         assert not {"edge1", "edge2"} <= set(wave), "who is gone cannot have it meanwhile"
         assert not {"edge3", "robot7"} <= set(wave)
     assert len(order) == 3, "robot1, and two turns of all others"
+    electors = ("edge1", "edge3", "robot1")
+    tasks = [("edge2", "robot1")]
+    apart = (("robot1",), ("edge1",), ("edge3",))
+    assert turns((*electors, "edge2"), electors, (), tasks) == (*apart, ("edge2",)), "two candidates of a task"
+    assert turns((*electors, "robot2"), electors, ("robot1", "robot2")) == (*apart, ("robot2",)), "two of two votes"
     alone = turns(("edge1", "robot1"), (), ("robot1",), [("edge1",)])
     assert alone == (("edge1", "robot1"),), "a task with one candidate keeps nobody waiting"
 
 
-def test_no_two_have_the_same_latest_turn() -> None:
+def test_no_two_turns_have_the_same_latest() -> None:
     due = []
     for name in NODES:
         one = wanting(name, 100.0)
