@@ -342,20 +342,20 @@ def test_the_word_of_a_change_is_proof_only_to_who_has_accepted_it() -> None:
 
 def test_one_peer_is_asked_for_a_fleet_value_and_another_one_when_it_does_not_answer() -> None:
     one = elector_of_a_change(has_accepted=False)
-    asked: list[str] = []
-    for now in (100.0, 100.0 + ASK_LEARNT_EVERY_S - 0.01, 100.0 + ASK_LEARNT_EVERY_S):
+    for now, asked in ((100.0, ["robot2"]), (100.2, []), (100.01 + ASK_LEARNT_EVERY_S, ["robot2", "robot3"])):
+        found: list[str] = []
         for name in ("robot2", "robot3"):
             heard = beat_of(name, fleet_revision=CHANGED.revision, number=CHANGED.number)
             todo = agreed(one.compare, heard, now)
-            asked += [it.peer for it in todo.send if isinstance(it, do.AskLearnt)]
-    assert asked == ["robot2", "robot3"]
+            found += [it.peer for it in todo.send if isinstance(it, do.AskLearnt)]
+        assert found == asked
 
 
 def test_forged_beats_do_not_keep_a_node_from_asking_for_a_fleet_value() -> None:
     """A stranger tells of some revision in a silent peer's name, again and again."""
     one, asked = elector_of_a_change(has_accepted=False), []
     for step in range(10):
-        for name, revision in (("robot3", CHANGED.revision + step % 2), ("robot2", CHANGED.revision)):
+        for name, revision in (("robot3", CHANGED.revision + 1 + step), ("robot2", CHANGED.revision)):
             heard = beat_of(name, fleet_revision=revision, number=CHANGED.number)
             todo = agreed(one.compare, heard, 100.0 + 0.2 * step)
             asked += [it.peer for it in todo.send if isinstance(it, do.AskLearnt)]
@@ -368,6 +368,9 @@ def test_while_the_electors_change_they_are_not_asked_how_often_they_have_voted_
     heard = beat_of("robot2", votes=7, fleet_revision=CHANGED.revision, number=CHANGED.number)
     assert agreed(one.compare, heard, 100.1).send == []
     assert agreed(one.compare, heard, 100.1 + VOTES_WAIT_S).send != []
+    one.witness._answered.discard("robot3")
+    heard = beat_of("robot3", fleet_revision=CHANGED.revision, number=CHANGED.number)
+    assert agreed(one.compare, heard, 100.2).send != [], "it has just started, and has to know"
 
 
 def test_the_word_goes_behind_the_questions_that_bring_the_fleet_value() -> None:
