@@ -146,7 +146,7 @@ def find_side(fleet: Fleet, node: NodeId, folder: Path, wanted: str) -> tuple[Du
     with file:
         file.check_owner()
         own = file.load().state
-    return own, choose_side(own, sides_of(ask_others(fleet, node).answers), wanted)
+    return own, choose_side(fleet, own, sides_of(ask_others(fleet, node).answers), wanted)
 
 
 def rejoin(fleet: Fleet, node: NodeId, folder: Path, own: DurableState | None, side: Sides) -> Path:

@@ -13,9 +13,11 @@ from typing import Final
 from zsched.core.electorate.recovery import (
     Found,
     Recovery,
+    Sides,
     choose_side,
     consider,
     generation_of,
+    is_named_in,
     rejoined,
     sides_of,
 )
@@ -120,7 +122,9 @@ class Recoveries(Members):
             self.sim.crash(name)
             own = machine.disk.state
             answers = self._snapshots(*(one for one in self.names() if one != name))
-            side = choose_side(own, sides_of(answers), self.generation_id)
+            sides_told = sides_of(answers)
+            self._bring_document(machine, sides_told)
+            side = choose_side(machine.fleet, own, sides_told, self.generation_id)
             if isinstance(side, str):
                 raise DisagreementError(f"{name} cannot change sides: {side}")
             machine.is_durable = False
@@ -135,6 +139,17 @@ class Recoveries(Members):
             self.sim.start(name)
             self.done["rejoined"] += 1
             self.sim.run(self.rng.choice((0.0, 0.3, 2.0)))
+
+    def _bring_document(self, machine: Machine, told: tuple[Sides, ...], generation_id: str = "") -> None:
+        """`zsched rejoin` asks for it where the fleet file names nobody of the generation to follow."""
+        wanted = generation_id or self.generation_id
+        side = next((one for one in told if one.generation_id == wanted), None)
+        judge = self.sim.documents.judge
+        assert judge is not None
+        value = judge.newest_fleet(wanted)
+        if side is not None and not is_named_in(machine.fleet, side):
+            machine.fleet = self.sim.documents.says[value.document]
+            self.done["document brought"] += 1
 
     def _check_strangers(self, one_side: list[NodeId], other_side: list[NodeId]) -> None:
         """Nodes of two generations show each other, and nothing of the other's is learnt."""
@@ -206,7 +221,9 @@ class Recoveries(Members):
             machine = self.sim.machines[name]
             self.sim.crash(name)
             own = machine.disk.state
-            chosen = choose_side(own, sides_of(self._snapshots(survivor)), generation_id)
+            sides_told = sides_of(self._snapshots(survivor))
+            self._bring_document(machine, sides_told, generation_id)
+            chosen = choose_side(machine.fleet, own, sides_told, generation_id)
             if isinstance(chosen, str):
                 raise DisagreementError(f"{name} cannot change sides: {chosen}")
             state = rejoined(

@@ -289,10 +289,13 @@ def sides_of(answers: Sequence[Snapshot]) -> tuple[Sides, ...]:
     return tuple(sorted(sides, key=lambda side: (-len(side.nodes), side.generation_id)))
 
 
-def choose_side(own: DurableState | None, sides: Sequence[Sides], wanted: str) -> Sides | str:
+def choose_side(fleet: Fleet, own: DurableState | None, sides: Sequence[Sides], wanted: str) -> Sides | str:
     """The generation that a node changes to, or why there is none.
 
+    A node that changes sides starts blank: it hears those only that its fleet file names.
+
     Args:
+        fleet: the node's fleet file.
         own: the node's state.
         sides: of the nodes that have answered.
         wanted: the beginning of a generation id; empty: the only one that is not this node's.
@@ -300,7 +303,7 @@ def choose_side(own: DurableState | None, sides: Sequence[Sides], wanted: str) -
     here = "" if own is None else generation_of(own)
     others = [side for side in sides if side.generation_id != here and side.generation_id.startswith(wanted)]
     if len(others) == 1:
-        return others[0]
+        return others[0] if is_named_in(fleet, others[0]) else _unknown(others[0])
     told = "; ".join(f"{side.generation_id[:SAID_DIGITS]}: {', '.join(side.nodes)}" for side in sides)
     if not sides:
         return "no other node answers, so there is no generation to join; start one that counts by it"
@@ -311,6 +314,19 @@ def choose_side(own: DurableState | None, sides: Sequence[Sides], wanted: str) -
     if wanted:
         return f"no node that answers is of a generation {wanted}; there are {told}"
     return f"all nodes that answer are of this node's generation: start zsched, it follows by itself ({told})"
+
+
+def is_named_in(fleet: Fleet, side: Sides) -> bool:
+    """Whether a fleet file names a node that counts by a generation."""
+    return any(node.name in side.nodes for node in fleet.nodes)
+
+
+def _unknown(side: Sides) -> str:
+    names = ", ".join(side.nodes)
+    return (
+        f"the fleet file here names none of {names}, so this daemon would not hear them; first bring the fleet's "
+        f"document as that file: `zsched fleet export` on {side.nodes[0]}"
+    )
 
 
 def new_member(me: NodeId, generation: int, answers: Sequence[Snapshot]) -> Sides | None:

@@ -280,8 +280,19 @@ RIGHT = replace(ADOPTED, generation_id="bb" * 16, recovered_by="robot3")
 )
 def test_the_side_is_named_or_the_only_other_one(values: list[FleetValue], wanted: str, expected: str) -> None:
     answers = [answer_of(name, value) for name, value in zip(ROBOTS[1:], values, strict=False)]
-    side = choose_side(state_of("robot1"), sides_of(answers), wanted)
+    side = choose_side(FLEET, state_of("robot1"), sides_of(answers), wanted)
     assert expected in (side if isinstance(side, str) else side.generation_id)
+
+
+def test_who_would_hear_nobody_of_the_other_side_does_not_change_to_it() -> None:
+    """All who count by it came by invitation, after this fleet file was written."""
+    sides = sides_of([answer_of("robot8", LEFT), answer_of("robot9", LEFT)])
+    told = choose_side(FLEET, state_of("robot1"), sides, "")
+    assert isinstance(told, str)
+    assert told.startswith("the fleet file here names none of robot8, robot9")
+    assert "`zsched fleet export` on robot8" in told
+    known = sides_of([answer_of("robot2", LEFT), answer_of("robot9", LEFT)])
+    assert choose_side(FLEET, state_of("robot1"), known, "") == known[0]
 
 
 def test_who_changes_sides_starts_blank_as_another_member_and_is_no_elector() -> None:
