@@ -194,6 +194,19 @@ def test_a_value_is_accepted_once_its_document_is_stored() -> None:
     assert agreement.fleet_value == FIRST, "accepted is not learnt"
 
 
+def test_the_document_of_an_accepted_value_stays_however_many_others_come() -> None:
+    """The state names it: after a restart the value could not be read without it."""
+    agreement = make()
+    asked(agreement, prepare_of())
+    agreed(agreement.on_stored, ev.DocumentStored(document="0d", fleet=SAID), 100.2)
+    asked(agreement, accept_of(ADOPT.apply(FIRST)))
+    for number in range(RECENT + 2):
+        todo = agreed(agreement.on_stored, ev.DocumentStored(document=f"a{number}", fleet=SAID), 100.3)
+    (kept,) = of(todo, do.KeepDocuments)
+    assert "0d" in kept.documents
+    assert len(kept.documents) == 1 + RECENT
+
+
 def test_a_value_is_refused_for_good_while_its_document_is_not_valid_here() -> None:
     agreement = make()
     asked(agreement, prepare_of())
