@@ -187,8 +187,8 @@ ELECTOR_BUGS: tuple[Bug, ...] = (
         module=REGISTER,
         changes=(
             (
-                "            self._read(running, todo, now)\n\n    def settle",
-                "            self._prepare(todo, now)\n\n    def settle",
+                "            self._read(running, todo, now)\n\n    def prepare_ahead",
+                "            self._prepare(todo, now)\n\n    def prepare_ahead",
             ),
         ),
         tests=("tests/unit/core/vote/test_register_proposer.py",),

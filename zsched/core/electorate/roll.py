@@ -342,7 +342,7 @@ class Roll:
         if change is None and not self.value.is_exclusive:
             self._register.prepare_ahead(todo, now)  # a round trip less once the tasks' registers are written
         elif change is not None and not self._register.is_busy:
-            self._register.propose(change, todo, now)
+            self._register.propose_prepared(change, todo, now)
 
 
 def _ballot_of(question: Prepare | Accept | Accept[FleetValue]) -> Ballot:

@@ -359,30 +359,33 @@ class Register(ABC, Generic[V]):
     def propose(self, change: Rewrite[V], todo: ToDo, now: float) -> None:
         """Try to commit a change; its end appears in `ToDo.ended`, of this or a later call."""
         self._queue.append(change)
-        running = self._round
-        if running is None:
-            self._start_next(todo, now)
-        elif running.is_ahead:
-            self._take_up(running, todo, now)
-
-    def prepare_ahead(self, todo: ToDo, now: float) -> None:
-        """Ask for promises for a change that is to follow soon, unless a round is under way.
-
-        A ballot of which a majority has promised, and with which nothing was asked yet, stays as good as any. When
-        another one has overtaken it, the change is refused, and begins as it would without.
-        """
+        if self._round is not None and self._round.is_ahead:
+            self._round = None  # those promises are for another change
         if self._round is None:
-            self._round = _Round(change=None, give_up_at=now + 6 * self._ballot_s, is_ahead=True)
-            self._prepare(todo, now)
+            self._start_next(todo, now)
 
-    def _take_up(self, running: _Round[V], todo: ToDo, now: float) -> None:
-        """A change has come for the round that was begun for it."""
-        running.change, running.is_ahead = self._queue.pop(0), False
+    def propose_prepared(self, change: Rewrite[V], todo: ToDo, now: float) -> None:
+        """Try to commit the change for which promises were asked ahead, if they are still wanted."""
+        running = self._round
+        if running is None or not running.is_ahead:
+            self.propose(change, todo, now)
+            return
+        running.change, running.is_ahead = change, False
         running.give_up_at = now + 6 * self._ballot_s
         if self._outcome_by(self.value) is not None:
             self._finish(todo, RoundOutcome.CONFLICT, now)
         elif running.phase is _Phase.HELD:
             self._read(running, todo, now)
+
+    def prepare_ahead(self, todo: ToDo, now: float) -> None:
+        """Ask for promises for a change that is to follow soon, unless a round is under way.
+
+        A ballot that a majority has promised, and with which nothing was asked yet, stays as good as any. When another
+        one has overtaken it, the change is refused, and its end may be unknown: who wants it looks, and tries again.
+        """
+        if self._round is None:
+            self._round = _Round(change=None, give_up_at=now + 6 * self._ballot_s, is_ahead=True)
+            self._prepare(todo, now)
 
     def settle(self, todo: ToDo, now: float) -> None:
         """Run an identity round, unless a round is under way: learn the earlier acceptances."""

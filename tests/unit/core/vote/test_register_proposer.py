@@ -444,7 +444,7 @@ def ahead() -> list[TaskRegister]:
 
 def test_a_change_that_was_asked_for_ahead_needs_one_phase_only() -> None:
     electors = ahead()
-    asked = did(electors[0].propose, FIRST, 1.0)
+    asked = did(electors[0].propose_prepared, FIRST, 1.0)
     assert asked.prepare is None
     assert accept_all(electors[0], asked, electors[1:]).finished == (FIRST, RoundOutcome.COMMITTED)
     assert electors[0].value == allocation(1)
@@ -453,7 +453,7 @@ def test_a_change_that_was_asked_for_ahead_needs_one_phase_only() -> None:
 def test_a_change_that_comes_before_the_promises_goes_on_with_them() -> None:
     electors = [make(name) for name in ELECTORS]
     asked = did(electors[0].prepare_ahead, 0.0)
-    assert did(electors[0].propose, FIRST, 0.01) == Step()
+    assert did(electors[0].propose_prepared, FIRST, 0.01) == Step()
     assert commit(electors[0], asked, electors[:2]).finished == (FIRST, RoundOutcome.COMMITTED)
 
 
@@ -461,7 +461,7 @@ def test_a_ballot_that_was_overtaken_since_it_was_promised_carries_nothing() -> 
     """Another proposer has come between: what it has chosen stands."""
     electors = ahead()
     commit(electors[2], did(electors[2].propose, replace(FIRST, owner="e2"), 0.5), electors[1:])
-    asked = did(electors[0].propose, FIRST, 1.0)
+    asked = did(electors[0].propose_prepared, FIRST, 1.0)
     assert asked.accept is not None
     answers = [accepted(one, asked.accept, 1.0)[1] for one in electors[1:]]
     assert [isinstance(one, Refused) and one.refusal is Refusal.BALLOT for one in answers] == [True, True]
@@ -471,7 +471,7 @@ def test_a_ballot_that_was_overtaken_since_it_was_promised_carries_nothing() -> 
 def test_what_was_learnt_meanwhile_ends_a_change_that_is_based_on_the_value_before() -> None:
     electors = ahead()
     did(electors[0].learn, allocation(1), 0.5)
-    assert did(electors[0].propose, FIRST, 1.0).finished == (FIRST, RoundOutcome.CONFLICT)
+    assert did(electors[0].propose_prepared, FIRST, 1.0).finished == (FIRST, RoundOutcome.CONFLICT)
     assert electors[0].next_deadline() == math.inf
 
 
@@ -488,7 +488,7 @@ def test_promises_for_which_no_change_comes_are_forgotten() -> None:
     proposer = ahead()[0]
     did(proposer.tick, proposer.next_deadline())
     assert proposer.next_deadline() == math.inf
-    assert did(proposer.propose, FIRST, 10.0).prepare is not None
+    assert did(proposer.propose_prepared, FIRST, 10.0).prepare is not None
 
 
 def test_promises_of_a_number_are_none_of_the_next_one() -> None:
@@ -496,6 +496,14 @@ def test_promises_of_a_number_are_none_of_the_next_one() -> None:
     count = Electorate(number=3, generation_id="ab", electors=tuple(Elector(name=name) for name in ELECTORS))
     proposer.count_with(count, is_elector=True, is_blank=False, now=1.0)
     assert proposer.next_deadline() == math.inf
-    asked = did(proposer.propose, FIRST, 1.0)
+    asked = did(proposer.propose_prepared, FIRST, 1.0)
     assert asked.prepare is not None
     assert asked.prepare.number == 3
+
+
+def test_another_change_begins_with_promises_of_its_own() -> None:
+    """An operator's: with a ballot that was overtaken its end would be unknown."""
+    electors = ahead()
+    asked = did(electors[0].propose, FIRST, 1.0)
+    assert asked.prepare is not None
+    assert commit(electors[0], asked, electors[1:], 1.0).finished == (FIRST, RoundOutcome.COMMITTED)
