@@ -7,7 +7,8 @@ Steps (all of them unless some are named), each of which says `ok`, `FAILED` wit
     bookworm trixie  the package as it is shipped, in a booted Debian 12 and 13: from the older version REF and back
     jammy            the same in Ubuntu 22.04, whose python3 is too old: with a Python of its own (PYTHON_DIST)
     pip              a virtual environment and `zsched install`, upgraded, rolled back and taken away
-    relay            an upgrade to a relay of other code, which goes on; one to other words, which replaces the relay
+    relay            upgrades from a relay of other code, of more words and of fewer, which goes on; and from one of
+                     other words, which is replaced
     arm              the package for aarch64: what is in it, and its Python under qemu where that is installed
     image            the container image: built, run, asked, stopped
 
@@ -47,7 +48,9 @@ E_MACHINE = {"x86_64": 62, "aarch64": 183}
 """Of ELF files, by machine."""
 RELAYS_CODE = "lib/site-packages/zsched/relay/process.py"
 RELAYS_WORDS = "lib/site-packages/zsched/core/values/plan.py"
-OTHER_WORDS = ("    exclusive: bool = False\n", "    exclusive: bool = False\n    urgency: int = 0\n")
+ONE_MORE = ("    exclusive: bool = False\n", "    exclusive: bool = False\n    urgency: int = 0\n")
+OTHER = ("    keep_last: int = key(1,", "    keep_last: int = key(2,")
+"""A default: left out by the one, it means something else to the other."""
 
 
 @dataclass(slots=True)
@@ -100,7 +103,7 @@ def told(package: Path) -> str:
 
 def tried(work: Work, suite: str, old: Path, new: Path) -> None:
     """The life of a package in a booted system: the test's verdict, and what it took."""
-    same = relay_words(old, work.folder) == relay_words(new, work.folder)
+    same = relay_goes_on(old, new, work.folder)
     report = work.folder / f"report-{suite}-{old.stem[-12:]}.json"
     report.unlink(missing_ok=True)
     given = {"suite": suite, "old": str(old), "new": str(new), "same_relay": same, "report": str(report)}
@@ -124,7 +127,7 @@ def tried(work: Work, suite: str, old: Path, new: Path) -> None:
 
 def say_report(report: dict[str, Any], *, same: bool, took_s: float) -> None:
     """Figures of a life."""
-    print(f"  the relay {'goes on: it is told the same words' if same else 'is replaced'}; {took_s:.0f} s in all")
+    print(f"  the relay {'goes on' if same else 'is replaced'}; {took_s:.0f} s in all")
     print(f"  install {report['install']['seconds']} s")
     for step in ("upgrade", "downgrade"):
         found = report.get(step, {})
@@ -136,8 +139,21 @@ def say_report(report: dict[str, Any], *, same: bool, took_s: float) -> None:
     print(f"  left after the purge: {report.get('left')}")
 
 
-def relay_words(package: Path, folder: Path) -> str:
-    """The digest by which its daemon goes on with a relay. Before 2026-11-25 versions went by the code."""
+def relay_goes_on(old: Path, new: Path, folder: Path) -> bool:
+    """Whether the new version's daemon goes on with the old version's relay, by what both say of their words."""
+    before, after = unpacked(old, folder), unpacked(new, folder)
+    if not all((site / "zsched/ipc/vocabulary.py").exists() for site in (before, after)):
+        return relay_words(before) == relay_words(after)
+    said = asked(before, "from zsched.ipc.vocabulary import own, written; print(written(own()))")
+    judge = "from zsched.ipc.vocabulary import misunderstanding, own, read"
+    why = asked(after, f"{judge}; print(misunderstanding(read({said!r}), own()))")
+    if why:
+        print(f"  {why}")
+    return not why
+
+
+def unpacked(package: Path, folder: Path) -> Path:
+    """Where the program of a package, or of a folder with a wheel, can be imported."""
     tree = folder / f"digest-{package.parent.name}-{package.stem}"
     shutil.rmtree(tree, ignore_errors=True)
     site = tree / "opt/zsched/lib/site-packages"
@@ -146,8 +162,17 @@ def relay_words(package: Path, folder: Path) -> str:
         run(sys.executable, "-m", "zipfile", "-e", str(wheel), str(site))
     else:
         run("dpkg-deb", "-x", str(package), str(tree))
+    return site
+
+
+def relay_words(site: Path) -> str:
+    """The digest by which earlier versions' daemons go on with a relay. Before 2026-11-25 they went by the code."""
     word = "ipc.words import words" if (site / "zsched/ipc/words.py").exists() else "ipc.takeover import code"
-    ask = f"from zsched.{word}_digest as digest; print(digest())"
+    return asked(site, f"from zsched.{word}_digest as digest; print(digest())")
+
+
+def asked(site: Path, ask: str) -> str:
+    """What a version's own program prints."""
     return run(sys.executable, "-I", "-c", f"import sys; sys.path.insert(0, {str(site)!r}); {ask}").strip()
 
 
@@ -165,19 +190,27 @@ def in_jammy(work: Work) -> None:
 
 
 def other_relay(work: Work) -> None:
-    """The relay goes on when its code is another one, and is replaced when it is told other words."""
+    """A relay of other code, more words or fewer goes on; one that takes a word for something else is replaced."""
 
     def code(home: Path) -> None:
         path = home / RELAYS_CODE
         path.write_text(path.read_text() + "\n# Other code.\n")
 
-    def words(home: Path) -> None:
-        path = home / RELAYS_WORDS
-        path.write_text(path.read_text().replace(*OTHER_WORDS, 1))
+    def words(old: str, new: str) -> Callable[[Path], None]:
+        def change(home: Path) -> None:
+            path = home / RELAYS_WORDS
+            text = path.read_text()
+            if old not in text:
+                raise FailedError(f"{RELAYS_WORDS} has no {old!r}")
+            path.write_text(text.replace(old, new, 1))
+
+        return change
 
     new = work.new()
     tried(work, SUITE, another(new, "0.0.2", work.folder, code), new)
-    tried(work, SUITE, another(new, "0.0.3", work.folder, words), new)
+    tried(work, SUITE, another(new, "0.0.3", work.folder, words(*ONE_MORE)), new)
+    tried(work, SUITE, new, another(new, "9.0.4", work.folder, words(*ONE_MORE)))
+    tried(work, SUITE, another(new, "0.0.5", work.folder, words(*OTHER)), new)
 
 
 def by_pip(work: Work) -> None:

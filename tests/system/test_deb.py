@@ -60,9 +60,13 @@ def furnish(root: Path) -> None:
 
 
 def other_relay(home: Path) -> None:
-    """The older version's relay has other code, and is told the same words."""
+    """The older version's relay has other code, and knows a word that the newer version's daemon does not say."""
     with (home / "lib/site-packages/zsched/relay/process.py").open("a") as file:
         file.write("# Of the older version.\n")
+    path, exclusive = home / "lib/site-packages/zsched/core/values/plan.py", "    exclusive: bool = False\n"
+    text = path.read_text()
+    assert exclusive in text
+    path.write_text(text.replace(exclusive, f"{exclusive}    urgency: int = 0\n", 1))
 
 
 @pytest.fixture(scope="module")
@@ -140,7 +144,7 @@ def test_another_version_comes_under_a_reliable_stream_that_loses_nothing(
     assert stream["sent"] > 100, found
     assert (stream["doubled"], stream["in_order"]) == (0, True), json.dumps(report, indent=1)
     stays = given.get("same_relay", True)
-    assert found["same_relay"] == stays, "who is told the same words carries the stream on"
+    assert found["same_relay"] == stays, "a relay that understands the other version carries the stream on"
     if stays:
         assert stream["missing"] == [], json.dumps(report, indent=1)
     else:

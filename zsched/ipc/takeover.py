@@ -1,7 +1,7 @@
-"""Where a relay that outlived its daemon is found again: a socket, a lock and a note in the runtime folder.
+"""Where a relay that outlived its daemon is found again: a socket, a lock with a note, and the words it says.
 
-Knows: the two files of a node's relay, flock(2), the words before the pipe's first frame. Does not know: how relays are
-started, zenoh, plans.
+Knows: the three files of a node's relay in the runtime folder, flock(2), the words before the pipe's first frame. Does
+not know: how relays are started, zenoh, plans.
 
 The lock is held by the relay process alone, by a file description it inherits, so the kernel gives it back however the
 relay ends: as long as it is held there is exactly one relay, and the note in the file is about it. The relay accepts
@@ -31,6 +31,7 @@ from zsched.core.values.struct import Struct
 from zsched.errors import AdapterError, WireError
 from zsched.ipc.pipe import read_frame, write_frame
 from zsched.ipc.protocol import RelayHello, RelayHere, RelayRefused
+from zsched.ipc.vocabulary import Vocabulary, own, read, written
 from zsched.wire import codec as wire
 
 PACKAGE: Final = Path(__file__).parents[1]
@@ -56,8 +57,9 @@ THE_RELAYS: Final = (
 )
 """What a relay may load, of this package: a test holds it to the imports."""
 PROTOCOL: Final = 1
-"""Raised whenever a relay and a daemon of other code would misunderstand each other: by the same words
-(`zsched.ipc.words`), or by the configurations that go before them."""
+"""Raised whenever a relay and a daemon of other code would misunderstand each other all the same: words with another
+meaning, a report that the daemon waits for and an earlier relay never sends (`zsched.ipc.vocabulary`), or other
+configurations before them."""
 GREETING_S: Final = 1.0
 """A relay that does not answer for this long is no relay to go on with."""
 _ANSWERS: Final[tuple[type[Any], ...]] = (RelayHere, RelayRefused)
@@ -88,9 +90,10 @@ class Claim(Struct, kw_only=True):
 
 
 class Door:
-    """The two files of one node's relay."""
+    """The files of one node's relay."""
 
     def __init__(self, folder: Path, node: NodeId) -> None:
+        self._words = folder / f"{node}.relay.words"
         self._socket = folder / f"{node}.relay"
         self._next = folder / f"{node}.relay.next"
         self._lock = folder / f"{node}{_LOCK}"
@@ -145,8 +148,19 @@ class Door:
         except OSError as error:
             raise AdapterError(f"cannot listen on {self._socket}: {error}; check --runtime-dir") from error
 
+    def words(self, note: Note) -> Vocabulary | None:
+        """What the relay of the note can be told and tells; ``None``: it is not known."""
+        try:
+            pid, _, text = self._words.read_text(encoding="utf-8").partition("\n")
+        except (OSError, ValueError):
+            return None
+        return read(text) if pid == str(note.pid) else None
+
     def sign(self, claim: Claim, note: Note) -> None:
-        """Write down which relay has taken the claim."""
+        """Write down which relay has taken the claim; it is of this version, and says this version's words."""
+        with contextlib.suppress(OSError):  # without them a daemon of other words replaces it
+            self._words.write_text(f"{note.pid}\n{written(own())}", encoding="utf-8")
+            self._words.chmod(0o600)
         os.ftruncate(claim.lock, 0)
         os.pwrite(claim.lock, json.dumps(asdict(note)).encode(), 0)
 
@@ -178,8 +192,8 @@ class Door:
         return "it went away" if answer is None else answer.reason
 
     def remove(self) -> None:
-        """Remove both files, once the relay is gone."""
-        for path in (self._socket, self._next, self._lock):
+        """Remove the files, once the relay is gone."""
+        for path in (self._socket, self._next, self._words, self._lock):
             with contextlib.suppress(OSError):
                 path.unlink(missing_ok=True)
 

@@ -48,7 +48,7 @@ def _collect(hint: Any, found: dict[str, str]) -> None:
     for argument in get_args(hint):
         _collect(argument, found)
     cls = get_origin(hint) or hint
-    if not isinstance(cls, type) or (name := _name(hint)) in found:
+    if not isinstance(cls, type) or (name := name_of(hint)) in found:
         return
     if issubclass(cls, Enum):
         found[name] = f"{name}: {', '.join(str(member.value) for member in cls)}"
@@ -62,15 +62,15 @@ def _fields(hint: Any) -> Iterator[str]:
     hints = wire.hints_of(hint)
     for one in fields(get_origin(hint) or hint):
         default = "" if one.default is MISSING else f" = {one.default!r}"
-        yield f"{one.name}: {_name(hints[one.name])}{default}"
+        yield f"{one.name}: {name_of(hints[one.name])}{default}"
 
 
-def _name(hint: Any) -> str:
+def name_of(hint: Any) -> str:
     """A type's name, whatever module it is in."""
     if hint is Ellipsis:
         return "..."
     origin, arguments = get_origin(hint), get_args(hint)
     if origin in (Union, types.UnionType):
-        return " | ".join(_name(one) for one in arguments)
+        return " | ".join(name_of(one) for one in arguments)
     own = getattr(origin or hint, "__qualname__", str(origin or hint))
-    return own if not arguments else f"{own}[{', '.join(_name(one) for one in arguments)}]"
+    return own if not arguments else f"{own}[{', '.join(name_of(one) for one in arguments)}]"

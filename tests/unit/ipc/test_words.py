@@ -10,8 +10,10 @@ from zsched.core.values.plan import WorkerRole
 from zsched.ipc import words
 
 TODAY = "e9c137180f7db2bb"
-"""Another digest means: an upgrade from the version before replaces every relay, and its robot's applications are cut
-off for a second. Say so in the CHANGELOG, and write the new one here."""
+"""Another digest means: relays of the version before say other words. Where they were only added, with a default, those
+relays go on until somebody uses what is new (`zsched.ipc.vocabulary`); where the daemon waits for a new report, raise
+`PROTOCOL`. All else replaces every relay at an upgrade, and its robot's applications are cut off for a second: say so
+in the CHANGELOG. Then write the new digest here."""
 
 
 def test_the_words_are_those_of_the_versions_before() -> None:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import logging
 import os
 import select
+import socket
 import sys
 import threading
 from collections.abc import Callable
@@ -25,12 +26,13 @@ from zsched.core.events import ProblemReported, RelayChanged
 from zsched.core.relay_protocol import HandleReport, RelayStarted, RelayStop, TaskEnded, WorkerWatch
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.plan import Role, RoutePlan
-from zsched.core.values.struct import Struct, field
+from zsched.core.values.struct import Struct, field, replace
 from zsched.errors import AdapterError, WireError
 from zsched.guard import guarded
 from zsched.ipc.pipe import REPORTS, read_frame, write_frame
-from zsched.ipc.protocol import RelayHello, RelayPulse
-from zsched.ipc.takeover import GREETING_S, Door, code_digest, digest_of
+from zsched.ipc.protocol import RelayHello, RelayHere, RelayPulse
+from zsched.ipc.takeover import GREETING_S, Door, Note, code_digest, digest_of
+from zsched.ipc.vocabulary import Vocabulary, lack, misunderstanding, own
 from zsched.ipc.words import words_digest
 from zsched.wire import codec as wire
 
@@ -140,7 +142,8 @@ class RelayHandle:
         self._command += ["--threads", str(threads + spare), "--parent", str(os.getpid())]
         self._command += ["--local"] if local_config else []
         if bequest is not None:
-            digest = digest_of(bequest.digest, words_digest(), python, local_config)
+            self._kept = (bequest.digest, python, local_config)
+            digest = self._digest(words_digest())
             session = digest_of(zenoh_config, bequest.certificate)
             self._hello = RelayHello(
                 fleet=fleet,
@@ -159,6 +162,10 @@ class RelayHandle:
         self._relay: RelayChild | None = None
         self._reopens = False
         """The relay that was taken over waits for the configuration of its data session."""
+        self._its_words: Vocabulary | None = None
+        """Of a relay that was taken over and has other words than we..."""
+        self._lack = ""
+        """...and what we have to say that it does not know: another one has to follow."""
         self._stopping = threading.Event()
         self._is_leaving = False
         self._thread = guarded(self._supervise, name="relay")
@@ -236,6 +243,9 @@ class RelayHandle:
             found = None
             if self._stopping.is_set():
                 return
+            if (relay := self._relay) is not None and self._lack:
+                found = self._outgrown(relay)
+                continue
             backoff = 0.0 if awake_s() - started_at > CALM_S else backoff
             _log.warning("the relay is gone (%s), next one in %.1f s", reason, backoff)
             self._on_report(RelayChanged(is_running=False, reason=reason))
@@ -249,7 +259,11 @@ class RelayHandle:
         if bequest is None or note is None:
             return None
         silence = Silence(note.pid, GREETING_S)
-        found = bequest.door.connect(self._hello, lambda asked_s, took_s: not silence.go_on(asked_s, took_s))
+        hello = self._hello_to(note, bequest)
+        if isinstance(hello, str):
+            found: tuple[socket.socket, RelayHere] | str = hello
+        else:
+            found = bequest.door.connect(hello, lambda asked_s, took_s: not silence.go_on(asked_s, took_s))
         if isinstance(found, str):
             _log.warning("the relay that runs here (pid %d) is replaced: %s", note.pid, found)
             return self._replaced(RelayChild(pid=note.pid, link=None, door=bequest.door))
@@ -260,6 +274,29 @@ class RelayHandle:
             how += "; its code stays that of another version until the service is stopped"
         _log.info("the relay that runs here (pid %d) is taken over%s", here.pid, how)
         return RelayChild(pid=here.pid, link=link, door=bequest.door)
+
+    def _hello_to(self, note: Note, bequest: Bequest) -> RelayHello | str:
+        """How we greet the relay of the note, or why we do not: it has other words, and we would misunderstand it."""
+        words = bequest.door.words(note)
+        if words is None or words.digest == words_digest():
+            return self._hello
+        if reason := misunderstanding(words, own()):
+            return f"its words are another version's: {reason}"
+        self._its_words = words
+        return replace(self._hello, digest=self._digest(words.digest))
+
+    def _digest(self, words: str) -> str:
+        """Over all that a relay of these words must have been started with, for us to go on with it."""
+        daemons, python, local_config = self._kept
+        return digest_of(daemons, words, python, local_config)
+
+    def _outgrown(self, relay: RelayChild) -> RelayChild | None:
+        """The relay that follows one which cannot be told what there is to say."""
+        reason, self._lack = f"it does not know {self._lack}, which is needed now", ""
+        _log.warning("the relay that runs here (pid %d) is replaced: %s", relay.pid, reason)
+        self._on_report(RelayChanged(is_running=False, reason=reason))
+        door = None if self._bequest is None else self._bequest.door
+        return self._replaced(RelayChild(pid=relay.pid, link=None, door=door))
 
     def _replaced(self, other: RelayChild) -> RelayChild | None:
         """The relay that follows ``other``; ``None``: it could not be started yet.
@@ -305,7 +342,7 @@ class RelayHandle:
         try:
             reason = self._listen(relay)
         finally:
-            if not self._is_leaving:
+            if not self._is_leaving and not self._lack:
                 if not reason:  # it ends itself: its exit code says more than our SIGKILL's
                     relay.wait(ENDING_S)
                 relay.kill()
@@ -315,6 +352,7 @@ class RelayHandle:
         return reason or relay.ending
 
     def _start(self, ends_other: Callable[[RelayChild], None] = lambda _next: None) -> RelayChild:
+        self._its_words = None
         if self._bequest is None:
             return start_relay(self._command)
         return start_relay(self._command, self._bequest.door, self._bequest.listen, code_digest(), ends_other)
@@ -325,6 +363,10 @@ class RelayHandle:
             for text in texts:
                 write_frame(relay.descriptor, text)
             while (value := outbox.take()) is not None:
+                if self._its_words is not None and (found := lack(value, self._its_words)):
+                    self._lack = found
+                    relay.hang_up()  # it carries on alone, as without a daemon, until the next one is ready
+                    return
                 try:
                     frame = wire.encode(value)
                 except WireError as error:
@@ -355,6 +397,8 @@ class RelayHandle:
             except ConnectionResetError:  # it ended before it had read all that we said
                 return last_word
             except (WireError, OSError) as error:
+                if self._its_words is not None and isinstance(error, WireError) and error.reason == "kind":
+                    continue  # a newer relay tells more than we read
                 return f"unreadable report: {error}"
             if isinstance(report, RelayPulse):
                 if report.counted_s > STILL_S:

@@ -27,6 +27,7 @@ from zsched.core.values.plan import RoutePhase, RoutePlan
 from zsched.ipc.pipe import read_frame, write_frame
 from zsched.ipc.protocol import RelayHello
 from zsched.ipc.takeover import GREETING_S, Door, code_digest, digest_of
+from zsched.ipc.vocabulary import own
 from zsched.ipc.words import words_digest
 from zsched.sessions.config import data_config
 from zsched.wire import codec as wire
@@ -186,23 +187,18 @@ def test_a_relay_that_is_replaced_carries_on_until_the_next_one_is_ready(
 
 
 OTHER_CODE = ("relay/task.py", "", "# a line more\n")
-OTHER_WORDS = (
-    "core/values/plan.py",
-    "    exclusive: bool = False\n",
-    "    exclusive: bool = False\n    urgency: int = 0\n",
-)
+EXCLUSIVE = "    exclusive: bool = False\n"
+MORE_WORDS = ("core/values/plan.py", EXCLUSIVE, EXCLUSIVE + "    urgency: int = 0\n")
+FEWER_WORDS = ("core/values/plan.py", EXCLUSIVE, "    exclusive = False\n")
+OTHER_WORDS = ("core/values/plan.py", EXCLUSIVE, "    exclusive: bool = True\n")
 
 
-@pytest.mark.parametrize(
-    ("change", "stays"), [(OTHER_CODE, True), (OTHER_WORDS, False)], ids=["other code", "other words"]
-)
-def test_a_relay_of_another_version_goes_on_while_the_words_are_the_same(
-    tmp_path: Path, change: tuple[str, str, str], *, stays: bool
-) -> None:
-    """And needs nothing of its version, which an upgrade has taken away by then."""
+@pytest.fixture
+def older(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[First]:
+    """A daemon of another version, whose files are gone when it has crashed: a text of one of them is another one."""
     package = Path(zsched.__file__).parent
     copy = shutil.copytree(package, tmp_path / "code" / "zsched", ignore=shutil.ignore_patterns("__pycache__"))
-    name, before, after = change
+    name, before, after = request.param
     text = (copy / name).read_text()
     (copy / name).write_text(text.replace(before, after, 1) if before else text + after)
     assert (copy / name).read_text() != text
@@ -215,17 +211,51 @@ def test_a_relay_of_another_version_goes_on_while_the_words_are_the_same(
         assert note.code != code_digest(), "who asks learns that it runs other code"
         first.crash()
         shutil.rmtree(tmp_path / "code")
-        second = Second(run)
-        try:
-            assert (second.handle.pid == first.relay) is stays
-            plan = RoutePlan(task="merge", phase=RoutePhase.CLOSE, current=None)
-            second.handle.apply(plan)
-            until(lambda: any(isinstance(report, StreamsCounted) for report in second.reports), "it counts streams")
-            assert not [one for one in second.reports if isinstance(one, ProblemReported)], second.reports
-        finally:
-            second.handle.stop(2.0)
+        yield first
     finally:
         first.close()
+
+
+@pytest.mark.parametrize(
+    ("older", "stays"),
+    [(OTHER_CODE, True), (MORE_WORDS, True), (FEWER_WORDS, True), (OTHER_WORDS, False)],
+    indirect=["older"],
+    ids=["other code", "more words", "fewer words", "other words"],
+)
+def test_a_relay_of_another_version_goes_on_while_both_understand_each_other(
+    tmp_path: Path, older: First, *, stays: bool
+) -> None:
+    """And needs nothing of its version, which an upgrade has taken away by then."""
+    second = Second(tmp_path / "run")
+    try:
+        assert (second.handle.pid == older.relay) is stays
+        plan = RoutePlan(task="merge", phase=RoutePhase.CLOSE, current=None)
+        second.handle.apply(plan)
+        until(lambda: any(isinstance(report, StreamsCounted) for report in second.reports), "it counts streams")
+        assert not [one for one in second.reports if isinstance(one, ProblemReported)], second.reports
+        assert (second.handle.pid == older.relay) is stays
+    finally:
+        second.handle.stop(2.0)
+    assert list((tmp_path / "run").iterdir()) == []
+
+
+@pytest.mark.parametrize("older", [FEWER_WORDS], indirect=True)
+def test_a_relay_is_replaced_once_it_is_to_be_told_what_it_does_not_know(tmp_path: Path, older: First) -> None:
+    second = Second(tmp_path / "run")
+    try:
+        assert second.handle.pid == older.relay
+        second.handle.apply(RoutePlan(task="merge", phase=RoutePhase.CLOSE, current=None, exclusive=True))
+        until(lambda: second.handle.pid not in (None, older.relay), "another relay")
+        reasons = [one.reason for one in second.reports if isinstance(one, RelayChanged) and not one.is_running]
+        assert reasons == ["it does not know RoutePlan.exclusive, which is needed now"]
+        until(lambda: any(isinstance(one, StreamsCounted) for one in second.reports), "it obeys the plan")
+        assert not is_there(older.relay)
+        door = Door(tmp_path / "run", "robot1")
+        note = door.note()
+        assert note is not None
+        assert door.words(note) == own(), "the next daemon finds this version's words"
+    finally:
+        second.handle.stop(2.0)
 
 
 def test_an_orphan_that_waits_for_a_processor_is_waited_for(
