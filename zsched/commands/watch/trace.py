@@ -5,12 +5,15 @@ Knows: the feed, OpenTelemetry's SDK, signals. Does not know: what belongs to a 
 
 from __future__ import annotations
 
+import logging
+import re
 import secrets
 import signal
 import threading
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
+from urllib.parse import urlsplit
 
 from zsched.clock import wall_s
 from zsched.commands.ask import find_door
@@ -25,6 +28,10 @@ if TYPE_CHECKING:
 
 PERIOD_S: Final = 1.0
 SEND_S: Final = 5.0
+LIBRARY: Final = "opentelemetry"
+"""Its loggers tell of each attempt..."""
+MAX_WHY: Final = 160
+"""...and we of the first one, in at most as many characters."""
 
 
 class TraceView(Struct, frozen=True, kw_only=True):
@@ -44,8 +51,11 @@ def trace(view: TraceView) -> int:
     """Send spans until Ctrl-C or SIGTERM; returns the exit code.
 
     Raises:
-        CliError: nobody answers (3), another machine's log is meant (2), or the library that sends is not there (1).
+        CliError: nobody answers (3), another machine's log or no address of a collector is meant (2), or the library
+            that sends is not there (1).
     """
+    if urlsplit(view.url).scheme not in ("http", "https") or not urlsplit(view.url).netloc:
+        raise CliError(EXIT_USAGE, f"--otlp {view.url}: no address of a collector; write it as http://HOST:4318")
     feed = Feed(lambda: find_door(view.runtime_dir, view.node))
     if feed.door().node is not None:
         raise CliError(EXIT_USAGE, f"the log of {view.node} lies on its machine: ask there")
@@ -66,6 +76,18 @@ def trace(view: TraceView) -> int:
         sender.send(span for span in moves.rest() if span.end >= oldest)
     warn(f"{sender.sent} spans sent, {sender.refused} refused")
     return EXIT_FAILED if sender.refused else EXIT_OK
+
+
+class _Complaints(logging.Handler):
+    """Keeps the library's newest complaint, which would be a line of the log for each attempt."""
+
+    why = "no answer"
+
+    def emit(self, record: logging.LogRecord) -> None:
+        text = record.getMessage()
+        if "code:" in text or "rror" in text:
+            found = re.search(r"\[Errno -?\d+\] ([^\"')]+)", text)
+            self.why = (found[1] if found else text)[:MAX_WHY]
 
 
 class Sender:
@@ -99,6 +121,10 @@ class Sender:
                 return secrets.randbits(64) or 1
 
         self._fleet, self._names = fleet, Named()
+        self._url, self._is_refused = url, False
+        self._complaints = _Complaints()
+        logger = logging.getLogger(LIBRARY)
+        logger.handlers, logger.propagate = [self._complaints], False
         self._exporter = OTLPSpanExporter(endpoint=f"{url.rstrip('/')}/v1/traces", timeout=SEND_S)
         about = {"service.name": "zsched", "service.namespace": fleet, "service.instance.id": node}
         self._provider: TracerProvider = TracerProvider(
@@ -122,6 +148,16 @@ class Sender:
             is_taken = self._exporter.export([made]) is SpanExportResult.SUCCESS
             self.sent += is_taken
             self.refused += not is_taken
+            self._tell(is_refused=not is_taken)
+
+    def _tell(self, *, is_refused: bool) -> None:
+        """Say that the collector takes nothing any more, or takes spans again."""
+        if is_refused and not self._is_refused:
+            why = f"takes no spans ({self._complaints.why}): is it a collector, for OTLP over HTTP?"
+            warn(f"zsched trace: {self._url} {why} Spans are counted meanwhile, and not kept")
+        elif self._is_refused and not is_refused:
+            warn(f"zsched trace: {self._url} takes spans again")
+        self._is_refused = is_refused
 
 
 def _attributes(span: Span) -> dict[str, str | int | float]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import http.server
 import json
+import socket
 import sys
 import threading
 from collections.abc import Iterator
@@ -95,6 +96,14 @@ def move(at: float, epoch: int, owner: str) -> list[dict[str, Any]]:
     ]
 
 
+@contextlib.contextmanager
+def closing_endpoint() -> Iterator[str]:
+    """A port that is bound, where nobody listens."""
+    with socket.socket() as bound:
+        bound.bind(("127.0.0.1", 0))
+        yield f"http://127.0.0.1:{bound.getsockname()[1]}"
+
+
 def run(collector: Collector, *arguments: str) -> Result:
     return CliRunner().invoke(app, ["trace", "--otlp", collector.url, "--once", *arguments])
 
@@ -130,6 +139,23 @@ def test_spans_that_nobody_takes_are_counted(collector: Collector, folder: Path)
     collector.code = 400
     done = run(collector, "--since", "1m")
     assert (done.exit_code, "0 spans sent, 1 refused" in done.stderr) == (1, True)
+
+
+def test_a_collector_that_is_not_there_is_told_of_once(folder: Path) -> None:
+    assert folder.exists()
+    with closing_endpoint() as url:
+        done = CliRunner().invoke(app, ["trace", "--otlp", url, "--once", "--since", "1d"])
+    assert done.exit_code == 1
+    told = " ".join(done.stderr.split())
+    assert told.count(f"zsched trace: {url} takes no spans (Connection refused): is it a collector") == 1
+    assert told.endswith("and not kept 0 spans sent, 2 refused")
+
+
+@pytest.mark.parametrize("url", ["nonsense", "127.0.0.1:4318", "grpc://127.0.0.1:4317", "http://"])
+def test_what_is_no_address_of_a_collector_is_refused(folder: Path, url: str) -> None:
+    assert folder.exists()
+    refused = CliRunner().invoke(app, ["trace", "--otlp", url, "--once"])
+    assert (refused.exit_code, f"--otlp {url}: no address of a collector" in refused.stderr) == (2, True)
 
 
 def test_without_the_library_it_says_what_to_install(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
