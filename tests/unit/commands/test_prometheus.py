@@ -132,6 +132,14 @@ def test_what_alerts_say_by_a_label_is_kept_by_their_expression() -> None:
         assert kept is None or used <= kept, rule["alert"]
 
 
+def test_a_legend_says_all_that_grafanas_schema_asks_for() -> None:
+    """As `tests/live/grafana_schema.py` found, by the types that Grafana writes itself by."""
+    legends = [panel["options"]["legend"] for panel in dashboard()["panels"] if "legend" in panel["options"]]
+    assert len(legends) > 5
+    for legend in legends:
+        assert legend.keys() >= {"displayMode", "placement", "showLegend", "calcs"}
+
+
 def test_panels_of_the_dashboard_have_their_places() -> None:
     panels = dashboard()["panels"]
     assert [panel["id"] for panel in panels] == list(range(1, len(panels) + 1))
