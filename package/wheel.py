@@ -52,7 +52,7 @@ def copied(folder: Path) -> Path:
     for name in listed.stdout.split("\0"):
         if name and (REPO / name).is_file():
             (source / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(REPO / name, source / name)
+            shutil.copy2(REPO / name, source / name, follow_symlinks=False)
     git = REPO / ".git"
     (source / ".git").write_text(git.read_text() if git.is_file() else f"gitdir: {git}\n")
     return source

@@ -9,6 +9,7 @@ import io
 import json
 import shutil
 import subprocess
+import sys
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -54,6 +55,26 @@ def test_the_version_is_gits_and_one_everywhere(wheel: zipfile.ZipFile) -> None:
             check=True,
         ).stdout
         assert f"g{head}" in version or version in tags
+
+
+def test_of_a_tagged_commit_the_version_is_the_tag(tmp_path: Path) -> None:
+    """Git must take the copy that a wheel is built from for the clean tree that it is of, links and all."""
+    if not (shutil.which("git") and (REPO / ".git").exists()):
+        pytest.skip("this tree is not git's")
+    tree = tmp_path / "tree"
+    for arguments in (("clone", "--quiet", "--no-tags", str(REPO), str(tree)), ("-C", str(tree), "tag", "v9.8.7")):
+        subprocess.run(["git", *arguments], timeout=60, check=True)
+    shutil.copy(REPO / "package/wheel.py", tree / "package/wheel.py")
+    subprocess.run(
+        ["git", "-C", str(tree), "update-index", "--assume-unchanged", "package/wheel.py"], timeout=60, check=True
+    )
+    ask = "import sys, wheel; from pathlib import Path; print(wheel.copied(Path(sys.argv[1])))"
+    told = [[sys.executable, "-c", ask, str(tmp_path)], [sys.executable, "-m", "setuptools_scm"]]
+    places = [tree / "package", tmp_path / "source"]
+    for command, place in zip(told, places, strict=True):
+        done = subprocess.run(command, cwd=place, capture_output=True, text=True, timeout=60, check=False)
+        assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == "9.8.7"
 
 
 def test_the_sbom_is_cyclonedx_and_names_what_the_wheel_needs(wheel: zipfile.ZipFile) -> None:
