@@ -5,6 +5,7 @@ Knows: what stands where, and what is left out first where the screen is low. Do
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from enum import IntEnum
 from itertools import groupby
@@ -28,6 +29,8 @@ GAP: Final = 2
 """A judgement stays for this many columns when no other follows it."""
 LEAST_MOVES: Final = 3
 """This many moves are shown before streams are."""
+REASON: Final = 45
+"""The column of a move's reason."""
 MIN_WIDTH, MIN_HEIGHT = 60, 12
 
 
@@ -72,6 +75,8 @@ def render_top(past: Past, frame: Frame) -> list[str]:
     least = min(len(moves), LEAST_MOVES + 1)
     body = _tasks(past, shown, frame, max(room - least, 1))
     left = max(room - len(body), 0)
+    whole = _moves(past, frame, is_whole=True)
+    moves = whole if len(whole) <= left else moves
     # the title stays, and the newest moves come first
     lines = [*head, *body, *(moves[:left] if left > 1 else [])]
     lines += [""] * (frame.height - len(lines) - len(tail) - len(foot) if frame.is_live else 0)
@@ -229,8 +234,8 @@ def _streams(task: Json, frame: Frame) -> list[str]:
 # --- moves -----------------------------------------------------------------------------------------------------------
 
 
-def _moves(past: Past, frame: Frame) -> list[str]:
-    """A title and a line per move, the newest first."""
+def _moves(past: Past, frame: Frame, *, is_whole: bool = False) -> list[str]:
+    """A title and a line per move, the newest first; ``is_whole``: more lines where its reason needs them."""
     page = _page(frame)
     moves = printable([move for move in past.moves() if not move["is_known"]])
     if not moves:
@@ -240,7 +245,10 @@ def _moves(past: Past, frame: Frame) -> list[str]:
         where = f"{move['from'] or 'nobody'} -> {move['to'] or 'nobody'}"
         took = "" if move["switched_s"] is None else f" ({millis(move['switched_s'])})"
         cells: list[Cell] = [(f"{span(move['age_s'])} ago", ""), (move["task"], "bold"), (where, "")]
+        reason = f"{move['reason']}{took}"
+        first, *rest = textwrap.wrap(reason, frame.width - REASON) if is_whole and reason else [reason]
         widths = (-10, 12, 20, frame.width)
-        reason = (f"{move['reason']}{took}", "dim")
-        page.row(*((text, wide, style) for (text, style), wide in zip([*cells, reason], widths, strict=True)))
+        page.row(*((text, wide, style) for (text, style), wide in zip([*cells, (first, "dim")], widths, strict=True)))
+        for more in rest:
+            page.row((more, frame.width, "dim"), indent=REASON)
     return page.lines

@@ -210,6 +210,16 @@ def test_a_judgement_that_is_told_twice_is_one_point() -> None:
     assert {len(points) for points in past.points.values()} == {1}
 
 
+def test_reasons_of_moves_are_whole_where_the_screen_has_room_and_cut_where_it_is_low() -> None:
+    past, low = past_of(), replace(SMALL, height=13)
+    high = replace(SMALL, height=40)
+    told = " ".join(" ".join(render_top(past, high)).split())
+    assert "edge2 leads by 0.2 over edge1 with its bonus; staying has cost 0.21 (43 ms)" in told
+    assert all(len(line) <= high.width for line in render_top(past, high))
+    assert "staying has cost 0.21" not in " ".join(render_top(past, low))
+    assert any("edge2 leads" in line and line.endswith("…") for line in render_top(past, replace(SMALL, height=20)))
+
+
 def test_without_a_log_the_moves_are_those_that_the_status_remembers() -> None:
     past, status = Past(), recorded()
     status["tasks"] = status["tasks"][:1]

@@ -140,8 +140,8 @@ function chart(task, view) {
     }
     if (path) parts.push(s("path", { class: `curve s${colour(name)}${name === task.owner ? " thick" : ""}`, d: path }));
   }
-  parts.push(s("text", { class: "dim small", x: width - 2, y: 11, "text-anchor": "end" }, `last ${span(view.to - view.from)}`));
-  return s("svg", { viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `utilities of ${task.name} over time` }, parts);
+  parts.push(s("text", { class: "dim small", x: width - 2, y: height + 9, "text-anchor": "end" }, `last ${span(view.to - view.from)}`));
+  return s("svg", { viewBox: `0 0 ${width} ${height + 12}`, role: "img", "aria-label": `utilities of ${task.name} over time` }, parts);
 }
 
 function taskCard(task, view) {
