@@ -66,7 +66,9 @@ class Number(Struct, frozen=True):
             return None
         value = float(node.text)
         if not self.low <= value <= self.high:
-            out.error(node.place, f"{node.text} is not in the allowed range {self._range()}")
+            is_percent = (self.low, self.high, self.unit) == (0.0, 1.0, "") and 2.0 <= value <= 100.0
+            hint = f"a share: {node.text} % is {plain_number(value / 100.0)}" if is_percent else ""
+            out.error(node.place, f"{node.text} is not in the allowed range {self._range()}", hint)
             return None
         return value
 

@@ -116,6 +116,8 @@ DRIVER_KEYS: Final = {
 
 def command_of(section: Section, out: Collector) -> tuple[str, ...] | None:
     """The command that the worker's driver stands for; ``None``: the driver is a process, or has a fault."""
+    if "driver" in section.places and section.get("driver") is None:
+        return None  # that it is none is said already
     driver: Driver = section.get("driver", Driver.PROCESS)
     for other, own in _OWN.items():
         for name in own if other is not driver else ():

@@ -113,7 +113,15 @@ def render_all(file: str, faults: tuple[Fault, ...], severity: str = "error") ->
     return "\n".join(shown)
 
 
-_MEANT: Final = {"wlan": "wifi", "wi-fi": "wifi", "wireless": "wifi", "lan": "wired", "ethernet": "wired"}
+_MEANT: Final = {
+    "wlan": "wifi",
+    "wi-fi": "wifi",
+    "wireless": "wifi",
+    "lan": "wired",
+    "ethernet": "wired",
+    "docker": "container",
+    "podman": "container",
+}
 """Other words for what a fleet file says, which are spelled like something else."""
 
 

@@ -90,3 +90,9 @@ def test_a_fault_stands_at_its_key(worker: str, said: str, column: int) -> None:
     report = result.report()
     assert said in report
     assert f"fleet.yaml:9:{column}: error" in report, report
+
+
+@pytest.mark.parametrize("engine", ["docker", "podman"])
+def test_an_engine_in_place_of_a_driver_is_one_fault_with_the_word_to_write(engine: str) -> None:
+    faults = check(f"{{driver: {engine}, image: a}}").faults
+    assert [fault.hint for fault in faults] == ["did you mean 'container'?"]

@@ -576,6 +576,19 @@ def test_missing_file_is_a_fault_not_an_exception(tmp_path: Path) -> None:
     assert check_file("a\0b").fleet is None
 
 
+@pytest.mark.parametrize(("given", "hint"), [("20", "a share: 20 % is 0.2"), ("1.2", ""), ("200", "")])
+def test_a_percentage_in_place_of_a_share_is_told_as_one(given: str, hint: str) -> None:
+    weights = "    weights: {cpu: 1, memory: 0, network: 0}\n"
+    text = (
+        "fleet: f\nnodes:\n"
+        "  r1: {kind: robot, wired: true, host: h, listen: {control: tcp/0.0.0.0:1, data: tcp/0.0.0.0:2}}\n"
+        "  edge1: {kind: edge}\ntasks:\n  t:\n    candidates: {kind: edge}\n"
+        f"{weights}    limits: {{battery: {given}}}\n    worker: {{command: [x]}}\n"
+    )
+    (fault,) = check_bytes(text.encode()).faults
+    assert (fault.message, fault.hint) == (f"{given} is not in the allowed range 0..1", hint)
+
+
 ONE_FAULT = [
     ("fleet: warehouse", "fleet: Ware", "is not a name", "Ware"),
     ("  robot3: {kind", "  Robot3: {kind", "is not a name", "Robot3"),

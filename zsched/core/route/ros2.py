@@ -123,11 +123,17 @@ def node_name_fault(node: str) -> str | None:
     return "letters, digits and single '_', and no digit first"
 
 
+_OTHERWISE: Final = re.compile(r"([a-z][a-z0-9_]*)(?:/|::(?:msg|srv)::(?:dds_::)?)([A-Z][A-Za-z0-9]*)_?")
+"""As ROS 1 names a type, C++ or DDS."""
+
+
 def type_fault(type_name: str, *, is_service: bool) -> str | None:
     """Why ``type_name`` is neither ``any`` nor the type of a service (or topic); ``None`` when it is.
 
     >>> type_fault("nav_msgs/msg/OccupancyGrid", is_service=False)
     >>> type_fault("nav2_msgs/action/Spin_SendGoal", is_service=True)
+    >>> type_fault("nav_msgs/Path", is_service=False), type_fault("std_srvs::srv::dds_::Empty_", is_service=True)
+    ('a type is PACKAGE/msg/NAME, so nav_msgs/msg/Path', 'a type is PACKAGE/srv/NAME, so std_srvs/srv/Empty')
     """
     match = _TYPE.fullmatch(type_name)
     if type_name == ANY:
@@ -135,7 +141,9 @@ def type_fault(type_name: str, *, is_service: bool) -> str | None:
     if match is None:
         if "/action/" in type_name:
             return "an action goes under `actions:`; its parts are NAME_SendGoal, NAME_GetResult, NAME_FeedbackMessage"
-        return f"a type is PACKAGE/{'srv' if is_service else 'msg'}/NAME"
+        kind = "srv" if is_service else "msg"
+        named = _OTHERWISE.fullmatch(type_name)
+        return f"a type is PACKAGE/{kind}/NAME" + ("" if named is None else f", so {named[1]}/{kind}/{named[2]}")
     is_of_service = match["kind"] == "srv" or (match["part"] is not None and match["part"] != _FEEDBACK)
     if is_of_service == is_service:
         return None
