@@ -31,6 +31,11 @@ PLAIN, TLS = "tcp/", "tls/"
 SECURE_PAGE = "docs/guide/secure.md"
 CONTROL_PORT = 7457
 """Where a node's control session listens by the guides."""
+UNITS = tuple(
+    Path(folder, "zsched.service")
+    for folder in ("/etc/systemd/system", "/usr/lib/systemd/system", "/lib/systemd/system")
+)
+"""Where one of them is, systemd starts this machine's daemon."""
 AGAIN_S, LOOK_S = 30.0, 0.05
 """A daemon that begins again is waited for this long from when it said so, with a look this often."""
 CONNECT_S = 3.0
@@ -111,9 +116,11 @@ def _no_socket(runtime: Path) -> str:
             f"may not look into {closed} (the folder cannot be read); run this as root, or, where the service's user "
             "has a name, as a member of its group (docs/guide/install.md)"
         )
-    return (
-        f"no daemon in {runtime} (no socket there); start one with `zsched up`, or say where it is with --runtime-dir"
-    )
+    if runtime == places.SYSTEM_RUNTIME and any(unit.exists() for unit in UNITS):
+        start = "start it with `sudo systemctl start zsched` (why it does not run: `systemctl status zsched`)"
+    else:
+        start = "start one with `zsched up`"
+    return f"no daemon in {runtime} (no socket there); {start}, or say where it is with --runtime-dir"
 
 
 def name_here(given: str | None, runtime_dir: Path | None, env: Mapping[str, str] = os.environ) -> str:

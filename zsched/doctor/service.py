@@ -39,7 +39,7 @@ def is_installed(scene: Scene) -> Result:
         return passed(f"{unit}")
     return warned(
         f"there is no {UNIT} in {', '.join(FOLDERS[:2])}: the daemon does not start by itself",
-        fix=f"sudo install -m 644 /opt/zsched/share/zsched/{UNIT} /etc/systemd/system/ && sudo systemctl daemon-reload",
+        fix="sudo /opt/zsched/bin/zsched install",
     )
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from zsched import paths as places
 from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.commands import ask
 from zsched.commands.ask import AGAIN_S, Door, ask_door, find_door
@@ -61,3 +62,20 @@ def test_nobody_at_a_plain_endpoint_may_be_a_secured_fleet(monkeypatch: pytest.M
     with pytest.raises(CliError, match=r"; a secured fleet is asked at tls/127\.0\.0\.1:1$") as caught:
         ask_door(find_door(None, None, ENV, connect="127.0.0.1:1"), {"verb": "status"})
     assert caught.value.code == EXIT_UNREACHABLE
+
+
+def test_where_systemd_has_the_unit_it_says_how_systemd_starts_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`zsched up` by hand would leave files of root where the service's user writes."""
+    unit = tmp_path / "zsched.service"
+    monkeypatch.setattr(ask, "UNITS", (unit,))
+    monkeypatch.setattr(places, "SYSTEM_RUNTIME", tmp_path)
+    with pytest.raises(CliError, match="start one with `zsched up`"):
+        find_door(tmp_path, None, ENV)
+    unit.touch()
+    with pytest.raises(CliError, match="start it with `sudo systemctl start zsched`"):
+        find_door(tmp_path, None, ENV)
+    (tmp_path / "mine").mkdir()
+    with pytest.raises(CliError, match="start one with `zsched up`"):
+        find_door(tmp_path / "mine", None, ENV)
