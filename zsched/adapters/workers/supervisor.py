@@ -23,12 +23,13 @@ import logging
 import math
 import os
 import random
+import re
 import signal
 from collections import deque
 from collections.abc import Callable, Mapping
 from enum import StrEnum
 from functools import partial
-from typing import Protocol
+from typing import Final, Protocol
 
 from zsched.adapters.workers.kept_lines import KeptLines
 from zsched.adapters.workers.launch import EXIT_CANNOT
@@ -549,8 +550,17 @@ def _told_again(reason: str, count: int, most: int) -> str:
     return told if len(told) <= MAX_REASON else f"{RESTARTING}: {reason}"
 
 
+_LACKS_ROS: Final = re.compile(
+    r"No module named '(rclpy|ament_\w+|\w+_msgs|std_srvs)\b"
+    r"|\blibrcl\w*\.so|cannot run 'ros2'|\bros2: (command )?not found"
+)
+"""How a program ends that was started without ROS's environment."""
+
+
 def _describe_exit(returncode: int, last_line: str) -> str:
     if returncode < 0:
         return f"killed by signal {-returncode} ({signal.strsignal(-returncode)})"
     said = f": {as_reason(last_line, MAX_LINE)}" if last_line else ""
+    if _LACKS_ROS.search(last_line):
+        said += "; is ROS there, and its setup.bash sourced in the command?"
     return f"exited with status {returncode}{said}"

@@ -247,6 +247,25 @@ def test_worker_that_says_it_cannot_fails_at_once(command: tuple[str, ...], reas
         assert [call[0] for call in recorder.calls] == ["started", "exited", "failed"]
 
 
+@pytest.mark.parametrize(
+    ("said", "asks"),
+    [
+        ("ModuleNotFoundError: No module named 'rclpy'", True),
+        ("ModuleNotFoundError: No module named 'nav_msgs'", True),
+        ("librclcpp.so: cannot open shared object file: No such file or directory", True),
+        ("bash: line 1: ros2: command not found", True),
+        ("ModuleNotFoundError: No module named 'numpy'", False),
+        ("the map is broken", False),
+    ],
+)
+def test_a_worker_that_lacks_ros_is_asked_for_its_environment(said: str, *, asks: bool) -> None:
+    with supervised(python(f"print({said!r}); raise SystemExit(78)")) as (supervisor, recorder):
+        supervisor.start("merge")
+        reason = str(recorder.wait("failed")[2])
+        assert reason.startswith(f"exited with status 78: {said}")
+        assert reason.endswith("; is ROS there, and its setup.bash sourced in the command?") == asks
+
+
 def test_crashed_worker_is_started_again_with_a_new_incarnation() -> None:
     with supervised(python(SLEEP)) as (supervisor, recorder):
         supervisor.start("merge")
