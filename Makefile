@@ -76,10 +76,13 @@ deb: $(VENV)/.dev  ## Build dist/zsched_*.deb (ARCH=aarch64; PYTHON_DIST=FILE: w
 	$(BIN)/python package/deb/build.py $(if $(ARCH),--arch $(ARCH)) $(if $(PYTHON_DIST),--python-dist $(PYTHON_DIST))
 
 wheel: $(VENV)/.dev  ## Build dist/zsched-*.whl, with its SBOM
+	rm -f dist/zsched-*.whl
 	$(BIN)/python package/wheel.py dist
 
-image: wheel  ## Build the container image (podman; BASE=IMAGE, IMAGE_ARGS="..." to choose)
-	podman build $(if $(BASE),--build-arg BASE=$(BASE)) $(IMAGE_ARGS) -f package/Containerfile -t zsched .
+# The image takes the wheel in dist/: there may be one only.
+ENGINE ?= $(if $(shell command -v podman),podman,docker)
+image: wheel  ## Build the container image (podman, else docker; ENGINE, BASE=IMAGE, IMAGE_ARGS="..." to choose)
+	$(ENGINE) build $(if $(BASE),--build-arg BASE=$(BASE)) $(IMAGE_ARGS) -f package/Containerfile -t zsched .
 
 lock: $(VENV)/.dev  ## Write package/requirements.lock anew: the newest releases that pyproject.toml allows
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv

@@ -1,0 +1,41 @@
+"""What `make` would run."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+def planned(folder: Path, *programs: str, target: str = "image") -> str:
+    """The commands of a target on a machine that has these programs."""
+    make = shutil.which("make")
+    if make is None:
+        pytest.skip("no make here")
+    for name in programs:
+        (folder / name).write_text("#!/bin/sh\n")
+        (folder / name).chmod(0o755)
+    command = [make, "--dry-run", "--always-make", target]
+    env = {**os.environ, "PATH": f"{folder}:/nowhere", "SHELL": "/bin/sh"}
+    done = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, timeout=60, check=True)
+    return done.stdout
+
+
+@pytest.mark.parametrize(
+    ("programs", "engine"), [(("podman", "docker"), "podman"), (("podman",), "podman"), (("docker",), "docker")]
+)
+def test_the_image_is_built_by_what_there_is(tmp_path: Path, programs: tuple[str, ...], engine: str) -> None:
+    assert f"{engine} build" in planned(tmp_path, *programs)
+
+
+def test_a_wheel_of_before_does_not_come_into_the_image(tmp_path: Path) -> None:
+    """Of two wheels pip would have to install both."""
+    lines = planned(tmp_path, "docker").splitlines()
+    removed = next(number for number, line in enumerate(lines) if "rm -f dist/zsched-*.whl" in line)
+    built = next(number for number, line in enumerate(lines) if "package/wheel.py" in line)
+    assert removed < built
