@@ -65,7 +65,9 @@ def top(view: TopView, *, is_once: bool) -> int:
             EXIT_USAGE, "a full screen needs a terminal; print it with --once, or see `zsched status --watch`"
         )
     if is_once:
-        lines = render_top(past, replace(_frame(view, 0), is_live=False))
+        frame = _frame(view, 0)
+        width, height = max(frame.width, MIN_WIDTH), max(frame.height, MIN_HEIGHT)
+        lines = render_top(past, replace(frame, width=width, height=height, is_live=False))
         sys.stdout.write("\n".join(lines) + "\n")
         return code_of(first.status)
     _live(view, feed, past)
@@ -132,8 +134,8 @@ def _screen(wake: int) -> Iterator[None]:
 def _frame(view: TopView, first_task: int) -> Frame:
     columns, lines = shutil.get_terminal_size((100, 30))
     return Frame(
-        width=max(columns, MIN_WIDTH),
-        height=max(lines, MIN_HEIGHT),
+        width=columns,
+        height=lines,
         is_colored=wants_color(view.is_plain),
         now=wall_s(),
         first_task=first_task,

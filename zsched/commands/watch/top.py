@@ -63,6 +63,9 @@ def render_top(past: Past, frame: Frame) -> list[str]:
 
     Text that came from other nodes cannot steer the terminal.
     """
+    if frame.width < MIN_WIDTH or frame.height < MIN_HEIGHT:
+        told = f"this window has {frame.width} columns and {frame.height} lines: {MIN_WIDTH} and {MIN_HEIGHT} at least"
+        return [*textwrap.wrap(told, frame.width), "q ends"[: frame.width]][: frame.height]
     status = past.status
     if status is None:
         return [harmless(past.why)[: frame.width], "asking again; q ends"][: frame.height]

@@ -220,6 +220,15 @@ def test_reasons_of_moves_are_whole_where_the_screen_has_room_and_cut_where_it_i
     assert any("edge2 leads" in line and line.endswith("…") for line in render_top(past, replace(SMALL, height=20)))
 
 
+@pytest.mark.parametrize(("width", "height"), [(59, 24), (80, 11), (12, 6), (1, 1)])
+def test_a_window_that_is_too_small_says_so_within_its_size(width: int, height: int) -> None:
+    lines = render_top(past_of(), replace(SMALL, width=width, height=height))
+    assert len(lines) <= height
+    assert all(len(line) <= width for line in lines)
+    if width > 10:
+        assert "60 and 12 at least" in " ".join(lines)
+
+
 def test_without_a_log_the_moves_are_those_that_the_status_remembers() -> None:
     past, status = Past(), recorded()
     status["tasks"] = status["tasks"][:1]
