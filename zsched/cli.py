@@ -127,7 +127,8 @@ RuntimeOption = Annotated[
     typer.Option("--runtime-dir", metavar="DIR", help="Operator sockets. [ZSCHED_RUNTIME_DIR, else /run/zsched]"),
 ]
 AskedOption = Annotated[
-    str | None, typer.Option("--node", "-n", metavar="NAME", help="Ask this node, here or anywhere in the fleet.")
+    str | None,
+    typer.Option("--node", "-n", metavar="NAME", help="Ask this node of the fleet, or CELL/NODE of another one."),
 ]
 HereOption = Annotated[
     str | None, typer.Option("--node", "-n", metavar="NAME", help="Which daemon on this machine, if there are several.")
@@ -378,6 +379,18 @@ def status(
         runtime_dir=runtime_dir, node=node, is_json=json_, is_plain=no_color, is_whole=verbose, connect=connect
     )
     raise typer.Exit(watch_on(view, interval) if watch else show(view))
+
+
+@app.command(cls=Verb)
+def site(json_: JsonOption = False, node: AskedOption = None, runtime_dir: RuntimeOption = None) -> None:
+    """Ask every fleet of the site how it is: nodes alive, tasks and their owners.
+
+    The fleets are those under `site:` in the document, or in the fleet file. `--node CELL/NODE` of the other verbs
+    asks a node of one of them. Exits with 4 when a cell does not answer or is degraded, with 3 when none answers.
+    """
+    from zsched.commands.cells import show_site  # noqa: PLC0415 - each verb imports what it needs
+
+    raise typer.Exit(show_site(runtime_dir, node, is_json=json_))
 
 
 @app.command(cls=Verb)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import atexit
 import contextlib
 import os
+import socket
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
@@ -24,8 +25,11 @@ from zsched.errors import AdapterError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_TIMED_OUT, EXIT_UNREACHABLE, EXIT_USAGE
 
 if TYPE_CHECKING:
+    from zsched.adapters.network.control_bus import Answer  # imports zenoh
     from zsched.adapters.network.fleet_client import FleetClient  # imports zenoh
     from zsched.adapters.network.seals import Seals
+    from zsched.core.values.fleet import Cell, Fleet
+    from zsched.core.values.messages import Command
 
 PLAIN, TLS = "tcp/", "tls/"
 SECURE_PAGE = "docs/guide/secure.md"
@@ -39,6 +43,8 @@ UNITS = tuple(
 AGAIN_S, LOOK_S = 30.0, 0.05
 """A daemon that begins again is waited for this long from when it said so, with a look this often."""
 CONNECT_S = 3.0
+ONLY_THERE = frozenset({"access", "leave", "log"})
+"""What a daemon answers on its own machine only."""
 ASK_TIMEOUT_S = 5.0
 """Above the daemon's own limits (3 s for its loop, 3 s for another node), so that their reasons arrive."""
 
@@ -50,6 +56,10 @@ class Door(Struct, frozen=True, kw_only=True):
     node: str | None = None
     endpoint: str = ""
     """Where no daemon of this machine is asked: the control endpoint of some node."""
+    cell: Cell | None = None
+    """Another fleet of the site: one of its gateways is asked, and ``endpoint`` is the first."""
+    asked_from: str = ""
+    """With a cell: the fleet and the node, or the host, from which it is asked."""
 
     def to(self, node: str) -> Door:
         """The same way, to a node."""
@@ -61,6 +71,8 @@ def find_door(
 ) -> Door:
     """The socket that is meant: ``node``'s own, else any other that passes the question on.
 
+    ``CELL/NODE`` is a node of another fleet of the site, which one of that fleet's gateways asks.
+
     With ``connect`` no socket of this machine: the node at that endpoint is asked, and passes the question on.
     Without ``node``: this node's own (``ZSCHED_NODE``, host name). Where nothing but the host name says which is this
     node, the only one there is.
@@ -68,6 +80,8 @@ def find_door(
     Raises:
         CliError: there is no daemon, not the one that is meant (3), or there are several and none is meant (2).
     """
+    if connect is None and node is not None and "/" in node:
+        return _door_of_cell(runtime_dir, node, env)
     if connect is not None:
         if node is not None and not NAME.fullmatch(node):
             raise CliError(EXIT_USAGE, f"--node: {node!r} is not a name")
@@ -95,6 +109,74 @@ def find_door(
     if is_told:
         raise CliError(EXIT_USAGE, f"ZSCHED_NODE: fleet {fleet} has no node {own!r}{nearest(own, names)}")
     raise CliError(EXIT_USAGE, f"several daemons in {runtime}: {here}; say which one with --node or ZSCHED_NODE")
+
+
+def _door_of_cell(runtime_dir: Path | None, word: str, env: Mapping[str, str]) -> Door:
+    """The door to ``CELL/NODE``, by the document or the fleet file that this machine goes by.
+
+    Raises:
+        CliError: it is no such word, or the site has no such cell (2).
+        ConfigError: there is no document, and the fleet file cannot be used.
+    """
+    name, _, node = word.partition("/")
+    if not (NAME.fullmatch(name) and NAME.fullmatch(node)):
+        raise CliError(EXIT_USAGE, f"--node: {word!r} is neither a node's name nor CELL/NODE")
+    here = door_here(runtime_dir, None, env)
+    fleet = fleet_here(here, places.config_path(None, env))
+    if name == fleet.name:
+        return find_door(runtime_dir, node, env)
+    cell = next((one for one in fleet.cells if one.name == name), None)
+    if cell is None:
+        known = [one.name for one in fleet.cells]
+        hint = nearest(name, known) if known else f"; fleet {fleet.name} names no other under `site:`"
+        raise CliError(EXIT_USAGE, f"--node: the site has no cell {name!r}{hint}")
+    return door_of(cell, fleet.name, here, node)
+
+
+def door_here(runtime_dir: Path | None, node: str | None, env: Mapping[str, str] = os.environ) -> Door | None:
+    """As `find_door`; ``None`` on a machine without a daemon, which goes by its fleet file.
+
+    Raises:
+        CliError: there are several daemons, and none is meant (2).
+    """
+    try:
+        return find_door(runtime_dir, node, env)
+    except CliError as error:
+        if error.code != EXIT_UNREACHABLE:
+            raise
+        return None
+
+
+def fleet_here(door: Door | None, config: Path) -> Fleet:
+    """The fleet by which this machine goes: the document in force, by the daemon here; else its fleet file.
+
+    Once a document is agreed the file may be a copy of an older one.
+
+    Args:
+        door: of the daemon here; ``None``: none runs.
+        config: the fleet file.
+
+    Raises:
+        ConfigError: there is no document, and the file cannot be used.
+    """
+    from zsched.config.load import check_bytes, load_fleet  # noqa: PLC0415 - ruamel.yaml is slow to import
+
+    if door is not None:
+        with contextlib.suppress(CliError):
+            text = ask_door(door, {"verb": "fleet"}).get("text")
+            known = check_bytes(text.encode(), str(config)).fleet if text else None
+            if known is not None:
+                return known
+    return load_fleet(config)
+
+
+def door_of(cell: Cell, fleet: str, here: Door | None, node: str | None = None) -> Door:
+    """The door to a cell: to one of its nodes, or to whichever gateway answers.
+
+    ``fleet``: this machine's; ``here``: the daemon on it, if one runs.
+    """
+    place = socket.gethostname() if here is None else here.socket.stem
+    return Door(socket=Path(), node=node, endpoint=cell.gateways[0], cell=cell, asked_from=f"{fleet}/{place}")
 
 
 def await_beginners(runtime: Path) -> None:
@@ -232,15 +314,19 @@ def _ask_elsewhere(door: Door, request: Json) -> Json:
     """The answer of a node of a fleet that has no daemon here."""
     from zsched.runtime.shell import answer_json, command_of  # noqa: PLC0415 - loads zenoh, which no socket needs
 
+    if request["verb"] in ONLY_THERE:
+        raise CliError(EXIT_USAGE, f"only the machine of a node tells its {request['verb']}: run this there")
     command = None if request["verb"] == "status" else command_of(request)
-    visit = _visit(door.endpoint)
+    visit = _visit(door.endpoint, door.cell)
     if visit.is_guest and command is not None:
         raise CliError(EXIT_FAILED, _guest_may_not(visit))
     try:
+        if door.cell is not None:
+            return answer_json(_ask_cell(door.cell, door.node, command))
         return answer_json(_client(door.endpoint).ask(door.node, command))
     except AdapterError as error:
         secured = f"; a secured fleet is asked at {TLS}{door.endpoint.removeprefix(PLAIN)}"
-        advice = secured if door.endpoint.startswith(PLAIN) else ""
+        advice = secured if door.cell is None and door.endpoint.startswith(PLAIN) else ""
         raise CliError(EXIT_UNREACHABLE, f"{error}{advice}") from error
 
 
@@ -251,13 +337,39 @@ def _guest_may_not(visit: _Visit) -> str:
     )
 
 
+def _ask_cell(cell: Cell, node: str | None, command: Command | None) -> Answer:
+    """The answer of a node of a cell, by the first gateway that finds it; of the gateway itself when none is named.
+
+    A command goes to the gateway by which the node has just told its status, once: a second one might do it twice.
+
+    Raises:
+        AdapterError: no gateway finds it, or the command was not answered.
+    """
+    failures = []
+    for gateway in sorted(cell.gateways, key=lambda one: one != _answered.get(cell.name)):
+        try:
+            client = _client(gateway, cell)
+            status = client.ask(node, None)
+        except AdapterError as error:
+            failures.append(f"by {gateway}: {str(error).removeprefix(gateway).strip()}")
+            continue
+        _answered[cell.name] = gateway
+        return status if command is None else client.ask(node, command)
+    whom = f"{cell.name}/{node}" if node is not None else f"cell {cell.name}"
+    raise AdapterError(f"{whom} cannot be asked; {'; '.join(failures)}")
+
+
+_answered: dict[str, str] = {}
+"""{cell: the gateway that answered last}, which is asked first."""
+
+
 @cache
-def _client(endpoint: str) -> FleetClient:
+def _client(endpoint: str, cell: Cell | None = None) -> FleetClient:
     """The one session to an endpoint, until the program ends."""
     from zsched.adapters.network.fleet_client import FleetClient  # noqa: PLC0415 - loads zenoh
     from zsched.sessions.config import client_config  # noqa: PLC0415 - as above
 
-    visit = _visit(endpoint)
+    visit = _visit(endpoint, cell)
     config = client_config(connect=(endpoint,), operator_json5=visit.text, connect_s=CONNECT_S)
     client = FleetClient(endpoint, config, visit.asker, visit.fleet, visit.seals)
     atexit.register(client.close)
@@ -275,8 +387,8 @@ class _Visit(Struct, frozen=True, kw_only=True):
 
 
 @cache
-def _visit(endpoint: str) -> _Visit:
-    """With the certificates that the fleet file of this machine names, where the endpoint is a secured one.
+def _visit(endpoint: str, cell: Cell | None) -> _Visit:
+    """With the certificates that the fleet file of this machine or of the cell names, where the endpoint is secured.
 
     Raises:
         CliError: there is no such fleet file (78).
@@ -284,8 +396,9 @@ def _visit(endpoint: str) -> _Visit:
     """
     name = places.node_name(None, os.environ)
     asker = name if NAME.fullmatch(name) else "operator"
+    any_fleet = "*" if cell is None else cell.name
     if endpoint.startswith(PLAIN):
-        return _Visit(text="", asker=asker, fleet="*")
+        return _Visit(text="", asker=asker, fleet=any_fleet)
     from zsched.config.load import load_fleet  # noqa: PLC0415 - ruamel.yaml is slow to import
     from zsched.core.values.certificates import Role  # noqa: PLC0415 - as above
     from zsched.runtime.access_rules import Side  # noqa: PLC0415 - as above
@@ -293,17 +406,19 @@ def _visit(endpoint: str) -> _Visit:
     from zsched.runtime.secured import identity_of  # noqa: PLC0415 - as above
     from zsched.runtime.tls import session_text  # noqa: PLC0415 - as above
 
-    file = places.config_path(None, os.environ)
+    file = places.config_path(None, os.environ) if cell is None else Path(cell.file)
     if not file.exists():
+        own = f"set ZSCHED_CONFIG to the fleet file beside it ({SECURE_PAGE} says how to get both)"
+        advice = own if cell is None else f"put a copy of {cell.name}'s fleet file there (docs/guide/scale.md)"
         raise CliError(
             EXIT_CONFIG,
             f"{endpoint}: a secured fleet lets in who has its certificate, and {file}, which names it, is not there; "
-            f"set ZSCHED_CONFIG to the fleet file beside it ({SECURE_PAGE} says how to get both)",
+            f"{advice}",
         )
     fleet = load_fleet(file)
     text = session_text(fleet, Side.VISIT)
     if fleet.security is None:
-        return _Visit(text=text, asker=asker, fleet="*")
+        return _Visit(text=text, asker=asker, fleet=any_fleet)
     holder = identity_of(fleet, fleet.security).holder
     is_guest = holder.role is Role.GUEST
     return _Visit(text=text, asker=holder.name, fleet=fleet.name, seals=seals_of(fleet), is_guest=is_guest)

@@ -6,20 +6,17 @@ does to the fleet (`zsched.config.difference`), how it is agreed.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import shlex
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from pathlib import Path
 
 from zsched import paths as places
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, warn
-from zsched.core.values.fleet import Fleet
 from zsched.core.values.struct import Struct
 from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_TIMED_OUT
 
@@ -102,29 +99,6 @@ def document_text(held: InForce) -> str:
         advice = "ask another node with --node, or again in a moment"
         raise CliError(EXIT_FAILED, f"{held.node} has not fetched document {held.document[:12]} yet; {advice}")
     return held.text
-
-
-def fleet_here(door: Door | None, config: Path) -> Fleet:
-    """The fleet by which this machine goes: the document in force, by the daemon here; else its fleet file.
-
-    Once a document is agreed the file may be a copy of an older one.
-
-    Args:
-        door: of the daemon here; ``None``: none runs.
-        config: the fleet file.
-
-    Raises:
-        ConfigError: there is no document, and the file cannot be used.
-    """
-    from zsched.config.load import check_bytes, load_fleet  # noqa: PLC0415 - ruamel.yaml is slow to import
-
-    if door is not None:
-        with contextlib.suppress(CliError):
-            text = in_force(door).text
-            known = check_bytes(text.encode(), str(config)).fleet if text else None
-            if known is not None:
-                return known
-    return load_fleet(config)
 
 
 def status_of(door: Door) -> Json:

@@ -36,7 +36,8 @@ AcceptOption = Annotated[
 ReasonOption = Annotated[str, typer.Option("--reason", "-m", metavar="TEXT", help="Why; the journal shows it.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="JSON, with its schema; --json=1: of that version.")]
 AskedOption = Annotated[
-    str | None, typer.Option("--node", "-n", metavar="NAME", help="Ask this node, here or anywhere in the fleet.")
+    str | None,
+    typer.Option("--node", "-n", metavar="NAME", help="Ask this node of the fleet, or CELL/NODE of another one."),
 ]
 RuntimeOption = Annotated[
     Path | None,

@@ -21,7 +21,8 @@ TaskArgument = Annotated[str, typer.Argument(metavar="TASK", help="A task of the
 TasksArgument = Annotated[list[str] | None, typer.Argument(metavar="[TASK]...", help="Tasks of the fleet file.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="JSON, with its schema; --json=1: of that version.")]
 AskedOption = Annotated[
-    str | None, typer.Option("--node", "-n", metavar="NAME", help="Ask this node, here or anywhere in the fleet.")
+    str | None,
+    typer.Option("--node", "-n", metavar="NAME", help="Ask this node of the fleet, or CELL/NODE of another one."),
 ]
 RuntimeOption = Annotated[
     Path | None,

@@ -77,8 +77,8 @@ class OrderView(Struct, frozen=True, kw_only=True):
 
 
 def asker(door: Door) -> str:
-    """user@node of the person that runs this program, as orders carry it."""
-    place = door.socket.stem or socket.gethostname()  # no daemon of this machine is asked
+    """user@node of the person that runs this program, as orders carry it; in another cell user@fleet/node."""
+    place = door.asked_from or door.socket.stem or socket.gethostname()  # no daemon of this machine is asked
     return f"{user_name()}@{place}"[:MAX_ASKER]
 
 

@@ -16,9 +16,8 @@ from typing import Final
 from zsched import paths as places
 from zsched.adapters.network.node_ping import Pinged, ping
 from zsched.clock import monotonic_s
-from zsched.commands.ask import Door, ask_door, name_here
+from zsched.commands.ask import Door, ask_door, fleet_here, name_here
 from zsched.commands.common import CliError, Json, nearest, print_json, say
-from zsched.commands.document import fleet_here
 from zsched.core.values.fleet import Fleet, NodeSpec, dial_endpoint
 from zsched.core.values.model import NodeId
 from zsched.core.values.snapshot import Snapshot

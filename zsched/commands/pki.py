@@ -19,9 +19,8 @@ import typer
 
 from zsched import paths as places
 from zsched.clock import wall_ns
-from zsched.commands.ask import Door, ask_door, find_door
+from zsched.commands.ask import Door, ask_door, find_door, fleet_here
 from zsched.commands.common import CliError, Json, nearest, print_json, say, warn
-from zsched.commands.document import fleet_here
 from zsched.config.load import load_fleet
 from zsched.core.values.certificates import Role, parse_label
 from zsched.core.values.fleet import Fleet

@@ -22,6 +22,7 @@ from zsched.config.rows import rows
 from zsched.core.route.route import outputs_of
 from zsched.core.route.templates import named_rules
 from zsched.core.values.fleet import (
+    Cell,
     Fleet,
     NodeSpec,
     Security,
@@ -234,12 +235,19 @@ def _verdicts(old: Fleet, new: Fleet, owners: Mapping[TaskId, NodeId | None]) ->
     for name in ("replace_s", "away_s"):
         if getattr(old, name) != getattr(new, name):
             yield _set(AT_ONCE, name, getattr(old, name), getattr(new, name))
+    if _cells(old) != _cells(new):
+        yield _set(AT_ONCE, "site", *(", ".join(cell.name for cell in fleet.cells) for fleet in (old, new)))
     if old.is_auto is not new.is_auto:
         text = "electors that are gone are replaced by themselves" if new.is_auto else "electors are replaced no more"
         words = ["auto" if fleet.is_auto else "named" for fleet in (old, new)]
         yield _set(replace(AT_ONCE, text=text), "electorate", *words)
     if old.shared_memory is not new.shared_memory:
         yield _restart(EVERY_DAEMON, "shared_memory", old.shared_memory, new.shared_memory)
+
+
+def _cells(fleet: Fleet) -> list[Cell]:
+    """The other cells; of their files' paths only the name counts."""
+    return [replace(cell, file=cell.file.rpartition("/")[2]) for cell in fleet.cells]
 
 
 def _dialled(fleet: Fleet) -> list[NodeId]:

@@ -15,6 +15,7 @@ from zsched.config.nodes import Cast, read_nodes, select, warn_missing
 from zsched.config.reader import MAX_FILE_BYTES, Collector, Fault, Place, nearest, read_yaml, render_all
 from zsched.config.schema import FLEET
 from zsched.config.security import read_security
+from zsched.config.site import read_site
 from zsched.config.tasks import read_tasks
 from zsched.config.timing import WIFI, timing_faults
 from zsched.core.membership.beat_room import MAX_BEAT_BYTES, most_bytes
@@ -122,6 +123,7 @@ def _fleet(section: Section, folder: Path, size: int, out: Collector) -> Fleet |
     tasks = read_tasks(section, cast, out)
     zenoh_config = _zenoh_config(section, folder, out)
     security = read_security(section, cast, folder, out)
+    cells = read_site(section, folder, out)
     if out.count:
         return None
     fleet = Fleet(
@@ -134,6 +136,7 @@ def _fleet(section: Section, folder: Path, size: int, out: Collector) -> Fleet |
         seeds=seeds,
         zenoh_config=zenoh_config,
         security=security,
+        cells=cells,
         **{name: section.get(name) for name in _PLAIN if name in section.values},
     )
     _check_size(size, section.where("tasks"), out)

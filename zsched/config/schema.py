@@ -381,6 +381,18 @@ SECURITY: Final = Record(
     },
 )
 
+CELL: Final = Record(
+    "a cell",
+    {
+        "gateways": Field(
+            _ENDPOINTS, "Control endpoints of two nodes of that fleet; they are tried in this order.", required=True
+        ),
+        "file": Field(
+            _FILE, "Its fleet file, relative to this one; needed where it is secured, for its certificates' folder."
+        ),
+    },
+)
+
 FLEET: Final = Record(
     "the fleet file",
     {
@@ -404,6 +416,7 @@ FLEET: Final = Record(
             ),
             "Settings of zenoh itself.",
         ),
+        "site": Field(MapOf(NAME_BLOCK, CELL), "The other fleets of the site, by their names; verbs ask them, too."),
         "security": Field(SECURITY, "Certificates of the fleet's own authority: only its members are let in."),
         **keys(Fleet),
     },

@@ -45,6 +45,7 @@ OTHERS = {
         "up",
         "dev",
         "status",
+        "site",
         "top",
         "web",
         "record",

@@ -12,7 +12,7 @@ import pytest
 from zsched.config.difference import Change, Danger, Effect, difference, wanted_electors
 from zsched.config.editing import add_entries
 from zsched.config.load import check_bytes
-from zsched.core.values.fleet import Fleet, LinkSpec, LocalSide, NodeSpec, TaskSpec
+from zsched.core.values.fleet import Cell, Fleet, LinkSpec, LocalSide, NodeSpec, TaskSpec
 from zsched.core.values.model import LinkSource, NodeKind, Weights
 from zsched.runtime.restarts import restarts
 
@@ -207,6 +207,8 @@ def differing(value: Any, *left_out: str) -> list[Any]:
             found.append(replace(value, weights=Weights(cpu=1.0, memory=0.0, network=0.0)))
         elif one.name == "gauge_limits":
             found.append(replace(value, gauge_limits=(("battery", 0.2),)))
+        elif one.name == "cells":
+            found.append(replace(value, cells=(Cell(name="other", gateways=("tcp/192.0.2.31:7457",)),)))
         elif hasattr(held, "__dataclass_fields__"):
             found += [replace(value, **{one.name: inner}) for inner in differing(held)]
         elif held is not None:

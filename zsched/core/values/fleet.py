@@ -335,6 +335,17 @@ class Security(Struct, frozen=True, kw_only=True):
     signatures: Signatures = Signatures.REQUIRED
 
 
+class Cell(Struct, frozen=True, kw_only=True):
+    """Another fleet of the same site, and how it is asked."""
+
+    name: str
+    """The fleet's own name."""
+    gateways: tuple[str, ...]
+    """Control endpoints of some of its nodes, in the order in which they are tried."""
+    file: str = ""
+    """Path of its fleet file, by which its certificates are found; empty: it is not secured."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fleet:
     """The whole fleet file, validated and with every name resolved."""
@@ -365,6 +376,8 @@ class Fleet:
     """Path of a zenoh JSON5 file, passed through untouched; empty: none."""
     security: Security | None = None
     """``None``: there is no `security:` section."""
+    cells: tuple[Cell, ...] = ()
+    """Sorted by name; the other fleets of the site, which agree on nothing with this one."""
     relay_orphan_s: float = key(
         10.0, "How long a relay carries the streams on when its daemon is gone; 0: not at all.", Range(0, 600, "s")
     )
@@ -449,12 +462,13 @@ def _digest(kind: str, value: object) -> str:
     return state.hexdigest()
 
 
-_PATHS = frozenset({("Fleet", "zenoh_config"), ("LinkSpec", "value"), ("Security", "folder")})
+_PATHS = frozenset({("Fleet", "zenoh_config"), ("LinkSpec", "value"), ("Security", "folder"), ("Cell", "file")})
 """Fields that may hold a path: relative to the fleet file, hence another one on every machine."""
 
 
 _LATER = frozenset(
     {("Weights", "gauges"), ("Demand", "gpu"), ("TaskSpec", "gauge_limits"), ("TaskSpec", "rollout")}
+    | {("Fleet", "cells")}
     | {("Tuning", name) for name in (*TUNED_RULES, *TUNED_LINKS)}
 )
 """Fields that came later: left out where they say nothing, so that nodes of two versions see the same file."""

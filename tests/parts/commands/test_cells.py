@@ -1,0 +1,76 @@
+"""`--node CELL/NODE` and `zsched site` where there is no such cell, nobody answers, or the machine has no daemon."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from zsched.commands import ask
+from zsched.commands.ask import ask_door, find_door
+from zsched.commands.cells import show_site
+from zsched.commands.common import CliError
+from zsched.commands.orders import asker, user_name
+from zsched.exits import EXIT_UNREACHABLE, EXIT_USAGE
+from zsched.runtime.endpoints import free_port
+
+
+@pytest.fixture
+def gateways(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[str, str]]:
+    """A machine without a daemon, whose fleet file names a cell at two addresses where nobody listens."""
+    ends = (f"tcp/127.0.0.1:{free_port()}", f"tcp/127.0.0.1:{free_port()}")
+    listen = {"control": f"tcp/127.0.0.1:{free_port()}", "data": f"tcp/127.0.0.1:{free_port()}"}
+    robot = {"kind": "robot", "host": "127.0.0.1", "listen": listen}
+    tree = {"fleet": "hall-a", "nodes": {"robot1": robot}, "site": {"hall-b": {"gateways": list(ends)}}}
+    file = tmp_path / "fleet.yaml"
+    file.write_text(json.dumps(tree))
+    monkeypatch.setenv("ZSCHED_CONFIG", str(file))
+    monkeypatch.setenv("ZSCHED_RUNTIME_DIR", str(tmp_path / "run"))
+    monkeypatch.setattr(ask, "CONNECT_S", 0.2)
+    yield ends
+    ask._answered.clear()
+
+
+@pytest.mark.parametrize(
+    ("word", "told"),
+    [
+        ("hall-x/robot7", "the site has no cell 'hall-x'"),
+        ("hall-b/Robot7", "'hall-b/Robot7' is neither a node's name nor CELL/NODE"),
+        ("hall-b/", "'hall-b/' is neither a node's name nor CELL/NODE"),
+    ],
+)
+@pytest.mark.usefixtures("gateways")
+def test_a_cell_that_there_is_not_is_a_fault_of_usage(word: str, told: str) -> None:
+    with pytest.raises(CliError, match=told) as refused:
+        find_door(None, word)
+    assert refused.value.code == EXIT_USAGE
+
+
+def test_a_cell_without_an_answer_names_each_gateway(gateways: tuple[str, str]) -> None:
+    door = find_door(None, "hall-b/robot7")
+    with pytest.raises(CliError, match=r"hall-b/robot7 cannot be asked; by tcp/.*; by tcp/") as refused:
+        ask_door(door, {"verb": "status"})
+    assert refused.value.code == EXIT_UNREACHABLE
+    assert all(f"by {gateway}" in str(refused.value) for gateway in gateways)
+
+
+@pytest.mark.usefixtures("gateways")
+def test_what_only_a_machine_itself_tells_is_refused_before_anybody_is_asked() -> None:
+    with pytest.raises(CliError, match="only the machine of a node tells its log") as refused:
+        ask_door(find_door(None, "hall-b/robot7"), {"verb": "log"})
+    assert refused.value.code == EXIT_USAGE
+
+
+@pytest.mark.usefixtures("gateways")
+def test_an_order_tells_the_fleet_and_the_machine_it_comes_from() -> None:
+    name, _, place = asker(find_door(None, "hall-b/robot7")).partition("@hall-a/")
+    assert name == user_name()
+    assert place
+
+
+@pytest.mark.usefixtures("gateways")
+def test_a_site_of_which_no_cell_answers_exits_with_3(capsys: pytest.CaptureFixture[str]) -> None:
+    assert show_site(None, None, is_json=False) == EXIT_UNREACHABLE
+    assert "hall-b: cell hall-b cannot be asked" in capsys.readouterr().out
