@@ -16,6 +16,8 @@ from typing import Any
 
 import pytest
 
+from support.authorities import install, make_authority
+from zsched.core.values.certificates import Role
 from zsched.core.values.fleet import dial_endpoint
 from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 
@@ -105,3 +107,31 @@ def test_a_node_of_one_cell_asks_and_commands_the_other_while_its_gateways_die(s
     listed = here.json("site")["cells"]
     assert [(cell["name"], cell["error"] is None) for cell in listed] == [(A, True), (B, False)]
     there.bed.send("edge2", signal.SIGCONT)
+
+
+def test_a_secured_cell_is_asked_with_a_certificate_of_its_own_authority(tmp_path: Path) -> None:
+    tree = {**echo_fleet(robots=1, edges=2), "fleet": B, "security": {"operators": ["ana"]}}
+    tree["electorate"] = sorted(tree["nodes"])
+    for node in tree["nodes"].values():
+        node["listen"] = {kind: end.replace("tcp/", "tls/") for kind, end in node["listen"].items()}
+    authority = make_authority(tmp_path / "authority", B)
+    for name in tree["nodes"]:
+        install(authority, tmp_path / "pki" / name, name)
+    desk = tmp_path / "desk"  # of a machine of the other cell, which runs no daemon
+    install(authority, desk / "pki-b", "ana", Role.OPERATOR)
+    (desk / "hall-b.yaml").write_text(json.dumps({**tree, "security": {"operators": ["ana"], "folder": "pki-b"}}))
+    own = {**echo_fleet(robots=1, edges=0), "fleet": A}
+    own["site"] = {B: {"gateways": gateways(tree), "file": "hall-b.yaml"}}
+    with Testbed(tmp_path, tree) as bed:
+        bed.init()
+        bed.start()
+        bed.wait_settled(90)
+        here = Cell(bed=Testbed(desk, own))
+        status = here.json("status", "--node", f"{B}/robot1")
+        assert (status["fleet"], status["node"]) == (B, "robot1")
+        done = here.zsched("pause", TASK, "--node", f"{B}/edge1", "--yes")
+        assert done.returncode == 0, done.stderr
+        assert bed.task("robot1")["pause"]["by"] == "ana.operator"
+        passed_on = here.zsched("resume", TASK, "--node", f"{B}/robot1", "--yes")
+        assert passed_on.returncode == 3  # nodes of a secured fleet pass on no commands
+        assert "robot1 did not answer" in passed_on.stderr
