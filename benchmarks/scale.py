@@ -1,13 +1,14 @@
 """Trigger -> committed with 3, 6, 12, 24 and 48 nodes, and how messages and CPU grow with their number.
 
-``python -m benchmarks.scale [--nodes 3 6 12 24 48] [--n 20] [--timing wifi] [--out FOLDER]``; with ``--out`` a size
-that is done is not measured again. Half of the nodes are robots (voters and
+``python -m benchmarks.scale [--nodes 3 6 12 24 48] [--n 20] [--timing wifi] [--together] [--out FOLDER]``; with
+``--out`` a size that is done is not measured again. Half of the nodes are robots (voters and
 electors; of three nodes one is, and all elect), half edges; every pair has a zenoh link on loopback.
 
 What runs: the real `Node`, `ControlBus` (a zenoh session per node, meshed by gossip), codec and state file (fsync
-included), one loop thread per node, as many processes as there are cores. What is left out: relays, workers (reported
-ready as soon as they shall start), profilers (a fixed sample per period), the operator's socket. Node loops of one
-process share one GIL, so the figures of large fleets on few cores are upper bounds.
+included), a process per node. What is left out: relays, workers (reported ready as soon as they shall start), profilers
+(a fixed sample per period), the operator's socket. With ``--together`` there are only as many processes as cores: the
+loops of one process then wait for one another at Python's lock. Where all nodes together need more CPU than there is,
+the figures are of the cores, not of zsched: "busy" says how much of them the fleet has at rest.
 
 A trigger is a failure of the owner's worker, told by its profile: from the first robot's proposal to the first node
 that learns the newer epoch (committed), and to the last (everywhere).
@@ -177,7 +178,7 @@ def _write(lines: queue.SimpleQueue[dict[str, Any]]) -> None:
 class Group:
     """The processes of one fleet size."""
 
-    def __init__(self, nodes: int, timing: str, folder: Path) -> None:
+    def __init__(self, nodes: int, timing: str, folder: Path, *, is_together: bool) -> None:
         edges = max(nodes // 2, 2)  # with one there is nowhere to go
         tree = echo_fleet(robots=nodes - edges, edges=edges, timing=timing)
         if nodes - edges < 3:
@@ -192,7 +193,7 @@ class Group:
         self.stories: list[dict[str, Any]] = []
         self.counts: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         self._children = []
-        count = min(os.cpu_count() or 1, nodes)
+        count = min(os.cpu_count() or 1, nodes) if is_together else nodes
         for index in range(count):
             command = [sys.executable, "-m", "benchmarks.scale", "--child", str(self.file), str(folder)]
             process = subprocess.Popen(
@@ -281,7 +282,7 @@ def measure(group: Group, count: int) -> Row:
     return {"committed": committed, "everywhere": everywhere, "idle": rates}
 
 
-def report(record: Record, timing: str, folder: Path | None) -> None:
+def report(record: Record, timing: str, folder: Path | None, name: str) -> None:
     """Print what there is, and keep it."""
     rows = sorted(record.having(timing=timing), key=lambda row: row["nodes"])
     figures = []
@@ -289,11 +290,14 @@ def report(record: Record, timing: str, folder: Path | None) -> None:
         figures.append((f"{row['nodes']} nodes: trigger -> committed", row["committed"], GOAL))
         figures.append((f"{row['nodes']} nodes: trigger -> known everywhere", row["everywhere"], "-"))
     print(table(figures, f"ms ({timing})"))
-    print("| idle, per node | puts/s | frames/s in | % of a core |", "| --- | --- | --- | --- |", sep="\n")
+    print("| idle, per node | puts/s | frames/s in | % of a core | busy |", "| --- | --- | --- | --- | --- |", sep="\n")
+    cores = os.cpu_count() or 1
     for row in rows:
         idle = row["idle"]
-        print(f"| {row['nodes']} nodes | {idle['sent']:.1f} | {idle['received']:.1f} | {100 * idle['cpu_s']:.1f} |")
-    save(folder, f"scale-{timing}", {"rows": rows})
+        busy = 100 * idle["cpu_s"] * row["nodes"] / cores
+        rates = f"{idle['sent']:.1f} | {idle['received']:.1f} | {100 * idle['cpu_s']:.1f}"
+        print(f"| {row['nodes']} nodes | {rates} | {busy:.0f} % |")
+    save(folder, name, {"rows": rows})
 
 
 def main() -> None:
@@ -306,22 +310,24 @@ def main() -> None:
     parser.add_argument("--nodes", type=int, nargs="+", default=[3, 6, 12, 24, 48])
     parser.add_argument("--n", type=int, default=20)
     parser.add_argument("--timing", default="wifi", choices=["wifi", "wired"])
+    parser.add_argument("--together", action="store_true", help="as many processes as cores, not one per node")
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
     print(machine(), flush=True)
-    record = Record(given.out, f"scale-{given.timing}")
+    name = f"scale-{given.timing}{'-together' * given.together}"
+    record = Record(given.out, name)
     for nodes in given.nodes:
         if any(len(row["committed"]) >= given.n for row in record.having(nodes=nodes, timing=given.timing)):
             continue
         with tempfile.TemporaryDirectory() as folder:
-            group = Group(nodes, given.timing, Path(folder))
+            group = Group(nodes, given.timing, Path(folder), is_together=given.together)
             try:
                 record.add({"nodes": nodes, "timing": given.timing} | measure(group, given.n))
             except SystemExit as error:
                 progress(f"{nodes} nodes: {error}")
             finally:
                 group.close()
-    report(record, given.timing, given.out)
+    report(record, given.timing, given.out, name)
 
 
 if __name__ == "__main__":
