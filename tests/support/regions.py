@@ -8,10 +8,11 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from zsched.runtime.endpoints import free_port
+from zsched_lab.fleet.loopback import free_endpoints
 
 if TYPE_CHECKING:
     from typing import Self
@@ -99,7 +100,11 @@ ALL_MESSAGES: Final = (
     "liveliness_query",
     "declare_liveliness_subscriber",
 )
-SETTLE_S: Final = 1.5
+SETTLED_S, SETTLE_S, LOOK_S = 0.5, 30.0, 0.2
+"""Nothing more comes once nothing has come for the first; a site has all its links within the second."""
+
+_PATIENT: Final = {"congestion_control": {"drop": {"wait_before_drop": 1_000_000}}}
+"""Microseconds: on a busy machine a put waits for its link, so that only what zenoh does itself is lost."""
 
 
 class Site:
@@ -109,20 +114,28 @@ class Site:
     """
 
     def __init__(
-        self, *, mode: str = "peer", robots: str = "peer", lease_ms: int = 10_000, more: Settings | None = None
+        self,
+        *,
+        mode: str = "peer",
+        robots: str = "peer",
+        lease_ms: int = 10_000,
+        more: Settings | None = None,
+        crossing: tuple[str, ...] = (*ROBOTS, *GATEWAYS),
     ) -> None:
-        """Open all eight sessions, and declare everything in each."""
+        """Open all eight sessions, declare everything in each, and wait until all robots reach ``crossing``."""
         self._mode, self._robots, self._lease_ms, self._more = mode, robots, lease_ms, more or {}
-        self._ports = {name: free_port() for name in (*ROBOTS, *GATEWAYS)}
+        self._endpoints = dict(zip((*ROBOTS, *GATEWAYS), free_endpoints(8), strict=True))
         self.sessions: dict[str, Session] = {}
         for at, name in enumerate(GATEWAYS):
             self._open_gateway(name, GATEWAYS[:at])
         for name in ROBOTS:
             self.sessions[name] = self._robot(name)
-        time.sleep(SETTLE_S)
+        self._wait_links()
         for name in self.sessions:
             self._declare(name)
-        time.sleep(SETTLE_S)
+        for name in ROBOTS:
+            self.wait_answers(name, crossing)
+        time.sleep(SETTLED_S)
 
     def __enter__(self) -> Self:
         return self
@@ -146,8 +159,13 @@ class Site:
         self.heard()
         for number in range(count):
             self.sessions[name].ask("put", "x/data", number)
-        time.sleep(0.5)
-        return {other: len(numbers) for other, numbers in self.heard().items() if other != name}
+        found, last = dict.fromkeys(self._living(), 0), -1
+        while last != sum(found.values()):
+            last = sum(found.values())
+            time.sleep(SETTLED_S)
+            for other, numbers in self.heard().items():
+                found[other] += len(numbers)
+        return {other: number for other, number in found.items() if other != name}
 
     def heard(self) -> dict[str, list[int]]:
         """{session: the numbers that have come since the last call}, of those that live."""
@@ -160,6 +178,18 @@ class Site:
         found: list[str] = self.sessions[name].ask("get", "q/*")["words"]
         return found
 
+    def neighbours(self, name: str) -> list[str]:
+        """Which sessions have a link to one."""
+        names = {session.zid: other for other, session in self.sessions.items()}
+        return sorted(names[zid] for zid in self.sessions[name].ask("neighbours"))
+
+    def wait_answers(self, name: str, wanted: Iterable[str]) -> None:
+        """Until a question of one session reaches all of these; raises after `SETTLE_S`."""
+        end = time.monotonic() + SETTLE_S
+        while missing := set(wanted) - set(self.answers(name)):
+            assert time.monotonic() < end, f"{name} does not reach {sorted(missing)}"
+            time.sleep(LOOK_S)
+
     def tokens(self, name: str) -> list[str]:
         """Whose tokens a question finds, sorted."""
         return [str(key).removeprefix("t/") for key in self.sessions[name].ask("tokens", "t/*")]
@@ -167,6 +197,16 @@ class Site:
     def token_changes(self, name: str) -> list[tuple[str, str]]:
         """The comings and goings of tokens since the last call."""
         return [(kind, str(key).removeprefix("t/")) for kind, key, _ in self.sessions[name].ask("seen")]
+
+    def _wait_links(self) -> None:
+        """Until every peer has a link to all of its own region, and every gateway to all others."""
+        end = time.monotonic() + SETTLE_S
+        wanted = dict.fromkeys(ROBOTS, 3) | dict.fromkeys(GATEWAYS, 5)
+        if self._robots == "client":
+            wanted = dict.fromkeys(ROBOTS, 1) | dict.fromkeys(GATEWAYS, 3)
+        while any(len(self.sessions[name].ask("neighbours")) < count for name, count in wanted.items()):
+            assert time.monotonic() < end, "the sessions do not meet"
+            time.sleep(LOOK_S)
 
     def _living(self) -> dict[str, Session]:
         return {name: session for name, session in self.sessions.items() if session.is_up}
@@ -198,22 +238,19 @@ class Site:
         retry = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
         return {
             "mode": mode,
-            "listen": {"endpoints": [self._endpoint(name) for name in listen]},
+            "listen": {"endpoints": [self._endpoints[name] for name in listen]},
             "connect": {
-                "endpoints": [self._endpoint(name) for name in connect],
+                "endpoints": [self._endpoints[name] for name in connect],
                 "retry": retry,
                 "exit_on_failure": False,
                 "timeout_ms": -1 if mode == "client" else 0,
             },
             "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": True}},
             "transport": {
-                "link": {"tx": {"lease": self._lease_ms, "keep_alive": 4}},
+                "link": {"tx": {"lease": self._lease_ms, "keep_alive": 4, "queue": _PATIENT}},
                 "shared_memory": {"enabled": False},
             },
         }
-
-    def _endpoint(self, name: str) -> str:
-        return f"tcp/127.0.0.1:{self._ports[name]}"
 
 
 def kept_inside(*key_exprs: str) -> Settings:

@@ -14,15 +14,15 @@ from zsched.commands.cells import show_site
 from zsched.commands.common import CliError
 from zsched.commands.orders import asker, user_name
 from zsched.exits import EXIT_UNREACHABLE, EXIT_USAGE
-from zsched.runtime.endpoints import free_port
+from zsched_lab.fleet.loopback import free_endpoint, own_address
 
 
 @pytest.fixture
 def gateways(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[str, str]]:
     """A machine without a daemon, whose fleet file names a cell at two addresses where nobody listens."""
-    ends = (f"tcp/127.0.0.1:{free_port()}", f"tcp/127.0.0.1:{free_port()}")
-    listen = {"control": f"tcp/127.0.0.1:{free_port()}", "data": f"tcp/127.0.0.1:{free_port()}"}
-    robot = {"kind": "robot", "host": "127.0.0.1", "listen": listen}
+    ends = (free_endpoint(), free_endpoint())
+    listen = {"control": free_endpoint(), "data": free_endpoint()}
+    robot = {"kind": "robot", "host": own_address(), "listen": listen}
     tree = {"fleet": "hall-a", "nodes": {"robot1": robot}, "site": {"hall-b": {"gateways": list(ends)}}}
     file = tmp_path / "fleet.yaml"
     file.write_text(json.dumps(tree))
