@@ -21,6 +21,8 @@ import threading
 import time
 from typing import Final
 
+from zsched.guard import guarded
+
 TUNSETIFF: Final = 0x400454CA
 IFF_TAP, IFF_NO_PI = 0x0002, 0x1000
 FRAME: Final = 65_536
@@ -71,7 +73,7 @@ def copy(source: int, target: int, delay_s: float) -> None:
             with contextlib.suppress(OSError):  # the other end is down: the frame is lost
                 os.write(target, frame)
 
-    threading.Thread(target=deliver, daemon=True).start()
+    guarded(deliver, name="delay-line").start()
     while True:
         try:
             frame = os.read(source, FRAME)
@@ -87,7 +89,7 @@ def main() -> int:
     delay_s, outer, outer_if, inner, inner_if = float(sys.argv[1]), *sys.argv[2:6]
     ends = open_tap(outer, outer_if), open_tap(inner, inner_if)
     for source, target in (ends, ends[::-1]):
-        threading.Thread(target=copy, args=(source, target, delay_s), daemon=True).start()
+        guarded(copy, source, target, delay_s, name="delay-line").start()
     print("ready", flush=True)
     sys.stdin.read()
     return 0
