@@ -1,10 +1,10 @@
 """The owner fails in four ways -> detected -> committed -> first message through the new owner; and a cut that heals.
 
 ``python -m benchmarks.detection [--timing wired wifi] [--case killed worker frozen cut heal] [--n N] [--kills N]
-[--out FOLDER] [--table]``. Needs root: six daemons in network namespaces with echo workers and a cool-down of 0, an
-application on robot1 that publishes at 200 Hz on its own key. Several timings run side by side, each with a fleet of
-its own. With ``--out`` every cycle is on disk at once: the same command goes on where it was interrupted, ``--table``
-only prints what is there.
+[--rest S] [--out FOLDER] [--table]``. Needs root: six daemons in network namespaces with echo workers and a cool-down
+of 0, an application on robot1 that publishes at 200 Hz on its own key. Several timings run side by side, each with a
+fleet of its own. With ``--rest 6`` each fault meets a fleet at rest, whose beats are slow. With ``--out`` every cycle
+is on disk at once: the same command goes on where it was interrupted, ``--table`` only prints what is there.
 
 * detected: the first robot holds the owner for gone (``worker``: its daemon sees the process end);
 * committed: the first node learns a newer epoch (``worker``: no move, the worker restarts in place);
@@ -74,8 +74,8 @@ class Cycle:
 class Cases:
     """One fleet and the faults it goes through."""
 
-    def __init__(self, bed: Netbed, probe: Probe) -> None:
-        self.bed, self.probe = bed, probe
+    def __init__(self, bed: Netbed, probe: Probe, rest_s: float) -> None:
+        self.bed, self.probe, self.rest_s = bed, probe, rest_s
         self.next_at = 0.0
 
     def is_ready(self) -> bool:
@@ -113,7 +113,8 @@ class Cases:
     def run(self, name: str, fault: Callable[[NodeId], Callable[[], None]]) -> dict[str, float]:
         """One cycle; {step: milliseconds} of the steps that were seen."""
         self.bed.wait(self.is_ready, CALM_S, "a calm fleet")
-        self.bed.wait(lambda: monotonic_s() > self.next_at, CYCLE_S + 1, "the next cycle")
+        self.next_at = max(self.next_at, monotonic_s() + self.rest_s)
+        self.bed.wait(lambda: monotonic_s() > self.next_at, CYCLE_S + self.rest_s + 1, "the next cycle")
         self.next_at = monotonic_s() + CYCLE_S
         owner = self.bed.owner() or ""
         others = tuple(node for node in self.bed.names if node != owner)
@@ -183,7 +184,7 @@ def run(record: Record, given: argparse.Namespace, timing: str) -> None:
         failures = 0
         while len(record.having(case=name, timing=timing)) < count:
             try:
-                with_fleet(timing, lambda cases: measure(cases, record, name, count, timing))  # noqa: B023 - called at once
+                with_fleet(timing, given.rest, lambda cases: measure(cases, record, name, count, timing))  # noqa: B023 - called at once
             except TestbedError as error:
                 failures += 1
                 record.add({"case": f"{name}, failed", "timing": timing, "why": str(error)[:4000]})
@@ -192,14 +193,14 @@ def run(record: Record, given: argparse.Namespace, timing: str) -> None:
                     raise
 
 
-def with_fleet(timing: str, use: Callable[[Cases], None]) -> None:
-    """A fleet and an application for some cycles."""
+def with_fleet(timing: str, rest_s: float, use: Callable[[Cases], None]) -> None:
+    """A fleet and an application for some cycles, each of which begins after ``rest_s`` of calm."""
     tree = echo_fleet(timing=timing)
     tree["tasks"][TASK]["worker"] |= {"max_failures": 100, "failure_window_s": 1}  # many deaths on purpose
     with tempfile.TemporaryDirectory() as folder, Netbed(Path(folder), tree) as bed:
         bed.init()
         bed.start()
-        use(Cases(bed, bed.probe("robot1", put="robot1/in", hz=200, watch=["robot1/out"])))
+        use(Cases(bed, bed.probe("robot1", put="robot1/in", hz=200, watch=["robot1/out"]), rest_s))
 
 
 def report(records: dict[str, Record], folder: Path | None) -> None:
@@ -226,6 +227,7 @@ def main() -> int:
     parser.add_argument("--n", type=int, default=40)
     parser.add_argument("--kills", type=int, default=200)
     parser.add_argument("--heals", type=int, default=5)
+    parser.add_argument("--rest", type=float, default=0.0, help="seconds of calm before each fault")
     parser.add_argument("--out", type=Path)
     parser.add_argument("--table", action="store_true")
     parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
@@ -243,6 +245,7 @@ def main() -> int:
         if not given.table:
             print(machine(), flush=True)
             numbers = ["--n", given.n, "--kills", given.kills, "--heals", given.heals, "--out", folder, "--child"]
+            numbers += ["--rest", given.rest]
             shared = [*map(str, numbers), "--case", *given.case]
             code = together("benchmarks.detection", [["--timing", timing] for timing in given.timing], shared)
         report({timing: Record(folder, f"detection-{timing}") for timing in given.timing}, given.out)
