@@ -103,7 +103,7 @@ class Node(Stages):
 
         A later deadline is not worth computing then: waking up once too early costs less than thirty beats a second.
         """
-        if now >= self._promised or now >= self.beat_at or now >= self.rounds.next_deadline():
+        if now >= self._promised or self.beat_at < self._promised or now >= self.rounds.next_deadline():
             return False
         return self._todo.is_only_sent and not (self.tenure.is_busy or self.agreement.has_parked)
 
@@ -158,6 +158,7 @@ class Node(Stages):
         self._agree(todo, now)  # VOTE
         self._settle(now)
         self._execute(todo, now)  # EXECUTOR, ROUTE
+        beats.tend_pace(self, now)
         if todo.must_beat or now >= self.beat_at:
             beats.send_beat(self, todo, now)
             self._settle(now)

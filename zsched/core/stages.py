@@ -28,6 +28,7 @@ from zsched.core.membership.beat_room import BeatRoom
 from zsched.core.membership.identity import Identity
 from zsched.core.membership.knocking import Knocking
 from zsched.core.membership.namesakes import Namesakes
+from zsched.core.membership.pace import Pace
 from zsched.core.membership.peers import Membership
 from zsched.core.membership.relink import Introductions, MuteLinks
 from zsched.core.membership.solitude import Solitude
@@ -185,7 +186,7 @@ class Stages:
         # membership
         self.membership = Membership(me, tuple(node.name for node in fleet.nodes), fleet.timing)
         self.identity = Identity(me, incarnation, self.fleet_file, now, fleet.timing.beat_s)
-        self.namesakes = Namesakes(fleet.timing.beat_s)
+        self.namesakes = Namesakes(fleet.timing.rest_beat_s)
         self.knocking = Knocking(self.fleet_file)
         self.introductions, self.mute_links = Introductions(), MuteLinks()
         self.solitude = Solitude(timing=fleet.timing, started_at=now)
@@ -197,6 +198,7 @@ class Stages:
         self.beat_at = now
         """When the next beat is due that nothing brings forward."""
         self.beat_sequence = 0
+        self.pace = Pace(timing=fleet.timing)
         # what the door (`zsched.core.node`) keeps from one event to the next
         self._promised = math.inf
         """The deadline that the last batch was given out with."""

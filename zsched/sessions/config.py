@@ -25,6 +25,8 @@ DATA_SEND_BUFFER: Final = 65536
 """Kernel send buffer of data links in bytes: bounds what lies between a publisher and a slow radio."""
 CONTROL_MAX_MESSAGE: Final = 1 << 20
 """Largest control message a peer may make us assemble, bytes (zenoh's default is 1 GiB)."""
+CONTROL_KEEP_ALIVE: Final = 3
+"""Signs of life in a lease of the control session, whose beats are more frequent than that, at rest, too."""
 LOOPBACK_LISTEN: Final = "tcp/127.0.0.1:0"
 
 OPEN_TIMEOUT_S: Final = 1.5
@@ -79,6 +81,7 @@ def control_config(
     """
     settings = _peer(listen, connect, timing)
     settings["connect/retry"] = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
+    settings["transport/link/tx/keep_alive"] = CONTROL_KEEP_ALIVE
     settings["transport/shared_memory/enabled"] = False
     settings["transport/link/rx/max_message_size"] = CONTROL_MAX_MESSAGE
     _set_gossip(settings, dials=dials_by_gossip)

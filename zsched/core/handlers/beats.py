@@ -6,6 +6,7 @@ leases, sealing), the scheduler's and the executor's own events.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, Final
 
@@ -56,7 +57,8 @@ def send_beat(node: Stages, todo: ToDo, now: float) -> None:
         may_return=node.agreement.may_return,
     )
     node.loop_lag_s = 0.0
-    node.beat_at = now + node.fleet.timing.beat_s
+    beat = node.pace.marked(beat, now, is_restless=is_news or is_restless(node, now))
+    node.beat_at = node.pace.next_at(beat, are_all_calm=node.membership.are_calm)
     todo.add(do.PublishBeat(beat=_fitting(node, beat), is_news=is_news))
     node.agreement.helm.tick(todo, now)
     _seal(node, todo, now)
@@ -67,6 +69,21 @@ def send_beat(node: Stages, todo: ToDo, now: float) -> None:
         todo.add(do.EndLinks(nodes=mute))
     if node.solitude.must_try(now, has_heard=node.membership.has_heard):
         todo.add(do.TryAddresses(addresses=node.solitude.dialled))
+
+
+def is_restless(node: Stages, now: float) -> bool:
+    """Whether anything goes on here for which beats must come at full pace, besides what they say themselves."""
+    if node.tenure.exclusive or not node.votes.is_idle or node.membership.is_uneasy(now):
+        return True
+    is_agreeing = node.agreement.has_parked or node.agreement.next_deadline() < math.inf
+    is_moving = any(executor.next_deadline() < math.inf for executor in node.executors.values())
+    return is_agreeing or is_moving or any(name.startswith("fleet/") for name in node.problems)
+
+
+def tend_pace(node: Stages, now: float) -> None:
+    """Bring the next beat forward where something goes on since the last one."""
+    if node.pace.is_slow and is_restless(node, now):
+        node.beat_at = node.pace.hasten(node.beat_at, now)
 
 
 def _fitting(node: Stages, beat: Beat) -> Beat:
@@ -116,6 +133,8 @@ def _on_beat(node: Stages, event: ev.BeatReceived, todo: ToDo, now: float) -> No
     if node.membership.is_doubtful(beat.node):
         node.counters["beat_doubtful"] += 1
         return
+    if not beat.calm:
+        node.beat_at = node.pace.hasten(node.beat_at, now)
     if node.me in beat.twins:
         node.agreement.witness.on_twin()
         if node.identity.must_ask(beat.node, now):

@@ -76,7 +76,8 @@ def _adopt_nodes(node: Stages, fleet: Fleet) -> None:
     names = frozenset(one.name for one in fleet.nodes)
     node.membership.adopt(tuple(one.name for one in fleet.nodes), fleet.timing)
     node.identity.fleet_file, node.identity.beat_s = node.fleet_file, fleet.timing.beat_s
-    node.namesakes.adopt(fleet.timing.beat_s)
+    node.namesakes.adopt(fleet.timing.rest_beat_s)
+    node.pace.timing = fleet.timing
     for name in [name for name in node.namesakes.nodes if name not in names]:
         node.namesakes.forget(name)
     node.knocking.adopt(node.fleet_file, names)

@@ -29,6 +29,10 @@ from zsched.core.values.struct import Struct, field
 SMALL_FLEET = 3
 """Up to this size nobody waits for a second observer: there is at most one, and it may be the next to go."""
 MAX_LAG_FACTOR = 3.0
+LATE_BEATS = 2.5
+"""A beat that comes later than so many periods is late: up to two wait until the receiver's loop is awake."""
+CALM_LAG_FACTOR = 1.1
+"""Below it this node's loop does not lag."""
 IN_FLIGHT_S = 0.03
 """A beat this soon after its sender's token went was sent before that: it refutes nothing."""
 
@@ -60,6 +64,10 @@ class _Peer(Struct):
     back_at: float = -math.inf
     """When it last came back from gone in the same life."""
     suspects: tuple[NodeId, ...] = ()
+    is_calm: bool = False
+    """Its newest beat said so: the next one may come at the slow pace."""
+    has_missed: bool = False
+    """A beat of its was missing just before the newest."""
 
 
 class Membership:
@@ -142,6 +150,22 @@ class Membership:
         return self._misses_anybody
 
     @property
+    def are_calm(self) -> bool:
+        """Whether every living peer's newest beat says that nothing goes on there."""
+        return all(peer.is_calm for peer in self._peers.values() if peer.state is PeerState.ALIVE)
+
+    def is_uneasy(self, now: float) -> bool:
+        """Whether somebody is suspect, a beat was missing or is late, or this node's own loop lags."""
+        if self._has_suspect or self._lag_factor > CALM_LAG_FACTOR:
+            return True
+        living = (peer for peer in self._peers.values() if peer.state is PeerState.ALIVE)
+        return any(peer.has_missed or now >= peer.beat_at + LATE_BEATS * self._period_s(peer) for peer in living)
+
+    def _period_s(self, peer: _Peer) -> float:
+        """How soon its next beat is due."""
+        return self._timing.rest_beat_s if peer.is_calm else self._timing.beat_s
+
+    @property
     def gone(self) -> tuple[NodeId, ...]:
         """Who is gone, in the order of the fleet file."""
         return tuple(name for name, state in self._states.items() if state is PeerState.GONE)
@@ -170,7 +194,7 @@ class Membership:
         peer = self._peers.get(beat.node)
         if peer is None:
             return ()
-        known = peer.track.incarnation
+        known, sequence = peer.track.incarnation, peer.track.sequence
         peer.order = peer.track.judge(
             beat.incarnation, beat.sequence, now, may_begin=self._may_begin(peer, beat.incarnation, now)
         )
@@ -184,6 +208,7 @@ class Membership:
         peer.beat_at = now
         self._has_heard = True
         peer.suspects, peer.token_lost = beat.suspects, False
+        peer.is_calm, peer.has_missed = beat.calm, sequence >= 0 and not restarted and beat.sequence > sequence + 1
         changes = []
         if before is not PeerState.ALIVE:
             changes.append(self._change(beat.node, PeerState.ALIVE, "beats again" if restarted else "beats", now))
@@ -212,7 +237,7 @@ class Membership:
         made anew).
         """
         if incarnation > peer.track.incarnation:
-            return peer.state is not PeerState.ALIVE or now >= peer.beat_at + 2 * self._timing.beat_s
+            return peer.state is not PeerState.ALIVE or now >= peer.beat_at + 2 * self._period_s(peer)
         is_silent = peer.state is PeerState.GONE or now >= peer.beat_at + self._timing.suspect_s
         return is_silent and peer.state is not PeerState.ALIVE
 

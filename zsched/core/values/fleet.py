@@ -302,6 +302,11 @@ class Timing:
     stagger_s: float = key(0.03, "Wait per rank before a proposer starts.", Range(0, 10, "s"))
     lease_s: float = key(1.0, "Exclusive tasks: how long an owner may work on the echoes of one beat.", SECONDS)
 
+    @property
+    def rest_beat_s(self) -> float:
+        """Period of the beat while nothing goes on: three of them fit into the silence that makes a peer suspect."""
+        return max(min(2 * self.beat_s, self.suspect_s / 3), self.beat_s)
+
 
 class SharedMemory(StrEnum):
     """Whether large payloads may pass between processes of one machine through shared memory."""

@@ -748,6 +748,8 @@ class Beat(Struct, frozen=True, kw_only=True):
     """Robots that this elector takes for away."""
     may_return: bool = False
     """With `has_lost_state`: once its seat is given up, this node can be added as an elector again."""
+    calm: bool = False
+    """Nothing goes on at this node: its next beat may come at the slow pace (`zsched.core.membership.pace`)."""
 
     def __post_init__(self) -> None:
         check_name("beat.node", self.node)

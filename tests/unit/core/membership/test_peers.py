@@ -494,3 +494,70 @@ def test_a_restart_of_the_very_first_life_refutes_the_end_of_its_token_at_once()
         ear.members.absorb_token_lost("a", 0, 0.01)
         assert ear.members.state("a") is SUSPECT
         assert ear.beat("a", 0.02, incarnation=incarnation) == expected
+
+
+# --- the pace of beats ------------------------------------------------------------------------------------------------
+
+
+def calm_ear() -> Ear:
+    """Everybody's newest beat, number 2, was calm, at time 0."""
+    ear = Ear(LARGE)
+    ear.members.tick(-60.0)
+    for node in ("a", "b", "c"):
+        ear.members.absorb_beat(beat_of(node, 1, calm=True), -0.4)
+        ear.members.absorb_beat(beat_of(node, 2, calm=True), 0.0)
+    return ear
+
+
+def test_a_fleet_is_calm_when_every_living_peer_says_so() -> None:
+    ear = calm_ear()
+    found = [ear.members.are_calm]
+    for sequence, is_calm in ((3, False), (4, True)):
+        ear.members.absorb_beat(beat_of("b", sequence, calm=is_calm), 0.4 * (sequence - 2))
+        found.append(ear.members.are_calm)
+    assert found == [True, False, True]
+    assert not ear.members.is_uneasy(0.8)
+
+
+def test_who_is_gone_keeps_nobody_from_being_calm() -> None:
+    ear = calm_ear()
+    ear.members.absorb_beat(beat_of("b", 3), 0.4)
+    ear.members.absorb_token_lost("b", 1, 1.0)
+    assert ear.members.are_calm, "its last word counts no more"
+    assert ear.members.is_uneasy(1.0), "somebody is suspect"
+
+
+def test_a_missing_beat_is_uneasy_until_the_next_one_comes_in_order() -> None:
+    ear = calm_ear()
+    ear.members.absorb_beat(beat_of("c", 4, calm=True), 0.4)
+    assert ear.members.is_uneasy(0.4)
+    ear.members.absorb_beat(beat_of("c", 5, calm=True), 0.8)
+    assert not ear.members.is_uneasy(0.8)
+
+
+@pytest.mark.parametrize(("calm", "late_s"), [(True, 1.0), (False, 0.5)])
+def test_a_late_beat_is_uneasy_by_the_pace_that_its_sender_has_told(calm: bool, late_s: float) -> None:
+    ear = heard(("me", "a"))
+    ear.members.absorb_beat(beat_of("a", ear.sequence + 1, calm=calm), 0.0)
+    assert not ear.members.is_uneasy(late_s - 0.01)
+    assert ear.members.is_uneasy(late_s)
+
+
+def test_a_lagging_loop_is_uneasy() -> None:
+    ear = calm_ear()
+    ear.members.note_lag(0.05)
+    assert ear.members.is_uneasy(0.1)
+    for _ in range(3):
+        ear.members.fade_lag_factor()
+    assert not ear.members.is_uneasy(0.1)
+
+
+@pytest.mark.parametrize("calm", [True, False])
+def test_another_life_begins_once_two_beats_of_the_pace_are_missing(calm: bool) -> None:
+    ear = heard(LARGE)
+    ear.members.absorb_beat(beat_of("a", 9, calm=calm), 0.0)
+    period_s = WIFI.rest_beat_s if calm else WIFI.beat_s
+    ear.members.absorb_beat(beat_of("a", 1, incarnation=2), 2 * period_s - 0.01)
+    assert ear.members.incarnation("a") == 1
+    ear.members.absorb_beat(beat_of("a", 2, incarnation=2), 2 * period_s + 0.01)
+    assert ear.members.incarnation("a") == 2

@@ -8,8 +8,11 @@ from dataclasses import replace
 import pytest
 
 from support.allocations import allocation_of
+from support.beats import beat_of
 from support.fleets import fleet_of, tuning_of
+from zsched.core import events as ev
 from zsched.core import instructions as do
+from zsched.core.membership.pace import FULL_S
 from zsched.core.values.fleet import StreamRule, TaskSpec, WorkerSpec
 from zsched.core.values.messages import Accepted, Promise
 from zsched.core.values.model import Acceptance, Allocation, Ballot, NodeId, PeerState
@@ -229,3 +232,66 @@ def test_two_acceptances_in_one_write_are_two_and_an_older_one_after_that_is_fou
     sim.invariants.on_handled(machine, sim.now, sim.now)
     with pytest.raises(InvariantError, match="below what it had promised"):
         answer(first)
+
+
+# --- a fleet at rest --------------------------------------------------------------------------------------------------
+
+
+def at_rest() -> Simulator:
+    sim = settled()
+    sim.run(FULL_S + 1.0)
+    return sim
+
+
+def beats_sent(sim: Simulator, seconds: float) -> dict[NodeId, int]:
+    before = {name: sim.node(name).beat_sequence for name in sim.running()}
+    sim.run(seconds)
+    return {name: sim.node(name).beat_sequence - count for name, count in before.items()}
+
+
+def test_a_fleet_at_rest_beats_slowly_and_at_full_pace_once_a_node_is_killed() -> None:
+    sim = at_rest()
+    assert set(beats_sent(sim, 4.0).values()) == {10}
+    sim.crash("robot3")
+    sim.run(0.5)
+    assert all(19 <= count <= 22 for count in beats_sent(sim, 4.0).values())
+    sim.run(FULL_S + 1.0)
+    assert set(beats_sent(sim, 4.0).values()) == {10}, "who is gone keeps nobody awake"
+
+
+def test_who_is_accused_at_rest_refutes_before_it_is_taken_for_gone() -> None:
+    sim = at_rest()
+    node, now = sim.node("robot1"), sim.now
+    changes = node.membership.absorb_token_lost("edge1", node.membership.incarnation("edge1") or 0, now)
+    assert [change.after for change in changes] == [PeerState.SUSPECT]
+    sim.run(0.35)
+    assert sim.sees("robot1", "edge1") is PeerState.ALIVE
+
+
+@pytest.mark.parametrize("has_candidates", [True, False])
+def test_an_exclusive_task_keeps_its_fleet_at_full_pace(*, has_candidates: bool) -> None:
+    """Also while it has no owner, and beats say nothing new."""
+    tasks = tuple(replace(task, exclusive=True) for task in FLEET.tasks)
+    sim = Simulator(fleet=replace(FLEET, tasks=tasks), seed=1)
+    sim.start(*(FLEET.task("merge").candidates if has_candidates else ()), *FLEET.voters)
+    sim.run(FULL_S + 5.0)
+    assert all(19 <= count <= 22 for count in beats_sent(sim, 4.0).values())
+
+
+def test_what_begins_at_a_node_at_rest_brings_its_next_beat_forward() -> None:
+    sim = at_rest()
+    node = sim.node("robot1")
+    assert sim.run_until(lambda: node.beat_at - sim.now > 0.39, 1.0)
+    node.membership.note_lag(0.05)
+    node.handle(ev.DeadlineReached(), sim.now)
+    assert node.next_deadline() <= sim.now + 0.2
+
+
+def test_a_restless_peer_brings_the_next_beat_of_all_others_forward() -> None:
+    sim = at_rest()
+    node = sim.node("robot1")
+    assert sim.run_until(lambda: node.beat_at - sim.now > 0.39, 1.0)
+    peer = sim.node("edge1")
+    beat = beat_of("edge1", peer.beat_sequence + 1, incarnation=peer.incarnation)
+    node.handle(ev.BeatReceived(beat=beat), sim.now)
+    assert node.next_deadline() <= sim.now + 0.2

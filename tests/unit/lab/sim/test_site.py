@@ -28,7 +28,7 @@ def test_a_cell_survives_each_of_its_faults_in_time(cell: Played) -> None:
 
 def test_what_a_node_hears_at_rest_is_what_the_others_say(cell: Played) -> None:
     beats = cell.heard["BeatReceived"] / cell.nodes / 10.0
-    assert beats == pytest.approx((cell.nodes - 1) / Timing().beat_s, rel=0.05)
+    assert beats == pytest.approx((cell.nodes - 1) / Timing().rest_beat_s, rel=0.05)
     assert cell.heard_hz > beats
     assert cell.core_percent > 0
 
