@@ -359,7 +359,15 @@ class Daemon:
         shell.relay = relay = self._relay(shell, incarnation, points)
         shell.crew.supervisor = supervisor = self._supervisor(stack, shell, incarnation, points)
         shell.crew.begin()
-        sampler = Sampler(self._spec, fleet.timing.sample_s, self._options.state_dir, shell, self._inbox)
+        sampler = Sampler(
+            self._spec,
+            fleet.timing.sample_s,
+            self._options.state_dir,
+            shell,
+            self._inbox,
+            is_watched=is_exclusive,
+        )
+        shell.measure_soon = sampler.hurry
         adoption = Adoption(
             me=me,
             started_with=fleet,

@@ -28,7 +28,7 @@ from zsched.adapters.host.state_file import StateFile
 from zsched.clock import ClockWatch, Drift
 from zsched.core import events as ev
 from zsched.core.values.fleet import Fleet, NodeSpec, Timing
-from zsched.core.values.model import NodeKind
+from zsched.core.values.model import DeviceSample, NodeKind
 from zsched.core.vote.clocks import is_bad
 from zsched.errors import AdapterError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_OK
@@ -270,6 +270,24 @@ def test_samplers_problem_is_told_once_and_ends(tmp_path: Path, monkeypatch: pyt
     until(sampled, "samples again")
     sampler.stop()
     assert inbox.take(0.0) is None, "and told once"
+
+
+def test_work_wakes_a_sampler_at_rest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The readings are ours: the machine that runs this test is not at rest."""
+    inbox, shell = Inbox(), SimpleNamespace(crew=SimpleNamespace(supervisor=None, sessions={}))
+    sampler = Sampler(spec("a"), 0.001, tmp_path, shell, inbox, is_watched=False)  # type: ignore[arg-type]
+    idle = DeviceSample(cpu_cores=1.0, cpu_used_cores=0.0, memory_mb=1024.0, memory_used_mb=100.0)
+    monkeypatch.setattr(sampler._device, "sample", lambda _: idle)
+    monkeypatch.setattr("zsched.core.profile.sampling.CHANGING_S", 0.05)
+    monkeypatch.setattr("zsched.core.profile.sampling.REST_S", 3600.0)
+    sampler.start()
+    until(lambda: sampler._wait_s == 3600.0, "rest")
+    list(inbox.waiting())
+    sampler.hurry()
+    until(lambda: next(inbox.waiting(), None) or inbox.take(0.0), "a sample")
+    until(lambda: sampler._wait_s == 3600.0, "rest again")
+    sampler.stop()
+    assert not sampler._thread.is_alive(), "and a stop does not wait"
 
 
 def test_the_sampler_tells_the_node_of_a_slew_and_a_jump(tmp_path: Path) -> None:

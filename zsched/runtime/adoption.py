@@ -74,9 +74,10 @@ class Adoption(Struct, kw_only=True):
         self.crew.adopt(fleet, self.recipes.paths)
         self.supervisor.adopt(self.recipes.specs)
         self.access.adopt(fleet)
-        self.sampler.adopt(fleet.node(self.me), fleet.timing.sample_s)
+        is_exclusive = any(task.exclusive for task in fleet.tasks)
+        self.sampler.adopt(fleet.node(self.me), fleet.timing.sample_s, is_watched=is_exclusive)
         self.bus.know(names_of(fleet))
-        if any(task.exclusive for task in fleet.tasks):
+        if is_exclusive:
             self.bus.hear_all_at_once()
         self._tell_watches(fleet)
         self.compare_sessions(opens_anew(self.started_with, fleet), moved(self.started_with, fleet, self.me))

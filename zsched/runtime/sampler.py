@@ -15,6 +15,7 @@ from zsched.adapters.machine.gauges import GaugeWatch
 from zsched.adapters.radio.network_profiler import readers_for
 from zsched.clock import ClockWatch, monotonic_s
 from zsched.core import events as ev
+from zsched.core.profile.sampling import Sampling
 from zsched.core.values.fleet import NodeSpec
 from zsched.core.values.struct import replace
 from zsched.core.vote.clocks import is_bad
@@ -28,12 +29,27 @@ log = logging.getLogger("zsched.daemon")
 class Sampler:
     """Measures the machine and its links in a thread of its own: a slow driver must not stop the beats."""
 
-    def __init__(self, spec: NodeSpec, period_s: float, state_dir: Path, shell: Shell, inbox: Inbox) -> None:
+    def __init__(
+        self,
+        spec: NodeSpec,
+        period_s: float,
+        state_dir: Path,
+        shell: Shell,
+        inbox: Inbox,
+        *,
+        is_watched: bool = True,
+    ) -> None:
+        """``period_s``: at most so long lies between two samples while anything changes.
+
+        ``is_watched``: the clocks must be compared as often at all times, for an exclusive task.
+        """
         self._links, self._readers = spec.links, readers_for(spec)
         self._state_dir = state_dir
         self._device, self._clocks, self._gauges = DeviceProfiler(), ClockWatch(), GaugeWatch()
-        self._period_s, self._shell, self._inbox = period_s, shell, inbox
-        self._stop = threading.Event()
+        self._shell, self._inbox = shell, inbox
+        self._pace, self._is_watched = Sampling(period_s=period_s), is_watched
+        self._wait_s = period_s
+        self._stop, self._wake = threading.Event(), threading.Event()
         self._problems: dict[str, str | None] = {}
         self._thread = guarded(self._run, name="zsched-sampler")
 
@@ -42,15 +58,21 @@ class Sampler:
         self._gauges.start()
         self._thread.start()
 
-    def adopt(self, spec: NodeSpec, period_s: float) -> None:
+    def hurry(self) -> None:
+        """Something happens here that a sample may show: measure often again; from any thread."""
+        if self._wait_s > self._pace.period_s:
+            self._wake.set()
+
+    def adopt(self, spec: NodeSpec, period_s: float, *, is_watched: bool = True) -> None:
         """Measure these links, at this pace, from the next time on."""
-        self._period_s = period_s
+        self._pace.period_s, self._is_watched = period_s, is_watched
         if spec.links != self._links:
             self._links, self._readers = spec.links, readers_for(spec)
 
     def stop(self) -> None:
         """End measuring; the thread ends with its current reading."""
         self._stop.set()
+        self._wake.set()
         self._gauges.stop()
         self._thread.join(timeout=0.5)
 
@@ -65,7 +87,9 @@ class Sampler:
                 self._report("profile", f"cannot measure: {error}")
             else:
                 self._report("profile", None)
-            self._stop.wait(self._period_s)
+            if self._wake.wait(self._wait_s):
+                self._wake.clear()
+                self._pace.hurry(monotonic_s())
 
     def _report(self, source: str, problem: str | None) -> None:
         """Report a problem, or its end, when it is news."""
@@ -93,7 +117,13 @@ class Sampler:
         device = replace(device, gauges=self._gauges.newest(monotonic_s()))
         readers = self._readers
         links = tuple(reader.read() for reader in readers)
-        self._inbox.post_quietly(ev.ProfileSampled(device=device, links=links))
+        was_resting = self._wait_s > self._pace.period_s
+        self._wait_s = self._pace.next_s(device, links, monotonic_s(), is_watched=self._is_watched)
+        sampled = ev.ProfileSampled(device=device, links=links)
+        if was_resting and self._wait_s <= self._pace.period_s:
+            self._inbox.post(sampled)  # it shows a change: the loop may sleep for a while
+        else:
+            self._inbox.post_quietly(sampled)
         for index, reader in enumerate(readers):
             self._report(f"profile/link{index}", reader.problem)
 

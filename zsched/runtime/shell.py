@@ -459,6 +459,8 @@ class Shell:
         self.log: DecisionLog | None = None
         self.follow: Callable[[Fleet, bool], None] = lambda _fleet, _is_agreed: None
         """Lets the adapters follow another fleet (`zsched.runtime.adoption`), once they are all made."""
+        self.measure_soon: Callable[[], None] = lambda: None
+        """Told that work begins, ends or goes on here (`zsched.runtime.sampler`)."""
         self.take_certificate: Callable[[str], CommandResult] = _no_certificate
         """Keeps a newer certificate (`zsched.runtime.renewal`)."""
         self.stand_down = ""
@@ -561,8 +563,10 @@ class Shell:
                 self._streams().end(task)
             case do.SetRole(role=role):
                 self._streams().set_role(role)
+                self.measure_soon()
             case do.StartWorker(task=task):
                 self._workers().start(task)
+                self.measure_soon()
             case do.StopWorker(task=task):
                 self._workers().stop(task)
             case do.ResetWorker(task=task):
@@ -661,6 +665,7 @@ class Shell:
         if isinstance(report, ev.WorkerJobs):
             if self.crew.is_ours(report):
                 self._inbox.post_quietly(report)
+                self.measure_soon()
             return
         if not isinstance(report, WorkerSeen):
             self._inbox.post(report)

@@ -344,6 +344,16 @@ def test_relays_other_reports_are_events_as_they_are(house: House) -> None:
     assert house.events() == [ev.SlotReady(task="merge", epoch=1)]
 
 
+def test_work_is_told_to_the_sampler(house: House) -> None:
+    told: list[str] = []
+    house.shell.measure_soon = lambda: told.append("soon")
+    house.shell.carry_out((do.SetRole(role=ROLE),))
+    house.shell.carry_out((do.StartWorker(task="merge"),))
+    assert len(told) == 2
+    house.shell.on_report(ev.WorkerJobs(task="merge", incarnation="1", at_s=1.0, done=1))
+    assert len(told) == 3
+
+
 # --- the desk --------------------------------------------------------------------------------------------------------
 
 
