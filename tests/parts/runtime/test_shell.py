@@ -49,7 +49,7 @@ from zsched.core.values.messages import (
     Votes,
 )
 from zsched.core.values.model import Acceptance, Asked, Tuning, Weights, WorkerState
-from zsched.core.values.plan import Role, RoutePhase, RoutePlan, WorkerRole
+from zsched.core.values.plan import Role, RoutePhase, RoutePlan, StreamCount, WorkerRole
 from zsched.errors import AdapterError, WireError
 from zsched.runtime import shell as shell_module
 from zsched.runtime.library import Library
@@ -57,6 +57,7 @@ from zsched.runtime.shell import (
     INBOX_LIMIT,
     LOCAL_REQUESTS_FROM,
     PROBLEM_TTL_S,
+    STILL_S,
     WAITING_LIMIT,
     Desk,
     Inbox,
@@ -342,6 +343,24 @@ def test_relays_other_reports_are_events_as_they_are(house: House) -> None:
     house.shell.on_report(RelayStarted(pid=1, zid="z"))
     house.shell.on_report(ev.SlotReady(task="merge", epoch=1))
     assert house.events() == [ev.SlotReady(task="merge", epoch=1)]
+
+
+@pytest.mark.parametrize(
+    ("count", "wakes"),
+    [
+        (StreamCount(stream="s"), False),
+        (StreamCount(stream="s", messages=7, last_seen_s=STILL_S, in_flight=0), False),
+        (StreamCount(stream="s", messages=7, last_seen_s=STILL_S - 0.1, in_flight=0), True),
+        (StreamCount(stream="s", messages=7, last_seen_s=9.0, in_flight=1), True),
+    ],
+)
+def test_counters_wake_the_loop_only_while_something_flows_or_is_under_way(
+    house: House, count: StreamCount, *, wakes: bool
+) -> None:
+    report = ev.StreamsCounted(counts=(StreamCount(stream="still"), count))
+    house.shell.on_report(report)
+    assert house.events() == [report] * wakes
+    assert list(house.inbox.waiting()) == [report] * (not wakes)
 
 
 def test_work_is_told_to_the_sampler(house: House) -> None:
