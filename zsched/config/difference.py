@@ -347,7 +347,7 @@ def _node(old: NodeSpec, new: NodeSpec) -> Iterator[_Verdict]:
     if old.host != new.host:
         text = f"the others dial {old.name} there once it is gone from where it was"
         yield _restart(text, f"{path}.host", old.host, new.host)
-    for name in ("control", "data"):
+    for name in ("control", "data", "streams"):
         before, after = getattr(old, f"listen_{name}"), getattr(new, f"listen_{name}")
         if before != after:
             yield _restart(restart, f"{path}.listen.{name}", before, after)

@@ -169,6 +169,10 @@ NODE: Final = Record(
                         "Endpoint of the data session, another port.",
                         default="port 7458 if it is free, else any free port",
                     ),
+                    "streams": Field(
+                        _ENDPOINT,
+                        "Where workers dial an application of this robot that uses `zsched.stream`; a fixed port.",
+                    ),
                 },
             ),
             "Where this node listens; the others find it by gossip from the seeds.",

@@ -15,7 +15,7 @@ from typing import Final
 
 from zsched.core.values.fleet import Fleet, NodeSpec, dial_endpoint
 from zsched.core.values.model import NodeId, NodeKind
-from zsched.core.values.struct import Struct
+from zsched.core.values.struct import Struct, replace
 
 PORT_RANGE: Final = Path("/proc/sys/net/ipv4/ip_local_port_range")
 MIN_PORT: Final = 20_000
@@ -54,7 +54,8 @@ def endpoints_for(
     A link is dialled by one side only: of two that redial each other one may take the other's new link for a part of
     its old session, and tells it nothing again (eclipse-zenoh/zenoh#2806). A node without an address dials every node
     that has one; two without one meet by gossip, and zenoh's ids decide which one dials. Workers dial their own
-    relay first, then the robots', and listen nowhere, so nobody dials them.
+    relay first, then the robots', and listen nowhere, so nobody dials them: an application that has its streams itself
+    (`zsched.stream`) listens, and they dial it.
     Our own address on another machine (``is_here``) is dialled too: there a twin of ours may be, and must be heard.
     """
     robots = [node for node in fleet.nodes if node.kind is NodeKind.ROBOT and node.name != me.name]
@@ -67,7 +68,12 @@ def endpoints_for(
         control_connect=_dialled(_targets(fleet, me, _control, is_here), _control),
         data_listen=(data_listen,),
         data_connect=_dialled(_targets(fleet, me, _data), _data),
-        worker_connect=(dial_endpoint(data_listen, "127.0.0.1"), *_dialled(robots, _data)),
+        worker_connect=(
+            dial_endpoint(data_listen, "127.0.0.1"),
+            *_dialled(robots, _data),
+            *_dialled([replace(me, host="127.0.0.1")] if me.kind is NodeKind.ROBOT else [], _streams),
+            *_dialled(robots, _streams),
+        ),
         control_by_gossip=not _dialled([me], _control) and len(_hidden(list(fleet.nodes), _control)) > 1,
         data_by_gossip=not _dialled([me], _data),
         worker_by_gossip=bool(_hidden(robots, _data)),
@@ -80,6 +86,10 @@ def _control(node: NodeSpec) -> str:
 
 def _data(node: NodeSpec) -> str:
     return node.listen_data
+
+
+def _streams(node: NodeSpec) -> str:
+    return node.listen_streams
 
 
 def _targets(

@@ -21,7 +21,12 @@ _FIELDS = (
     ("shared_memory", "`shared_memory`"),
     ("relay_orphan_s", "`relay_orphan_s`"),
 )
-_OWN = (("listen_control", "`listen: {control}`"), ("listen_data", "`listen: {data}`"), ("local", "`local`"))
+_OWN = (
+    ("listen_control", "`listen: {control}`"),
+    ("listen_data", "`listen: {data}`"),
+    ("listen_streams", "`listen: {streams}`"),
+    ("local", "`local`"),
+)
 
 
 def restarts(old: Fleet, new: Fleet, me: NodeId, *, is_agreed: bool = False) -> tuple[str, ...]:

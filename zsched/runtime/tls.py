@@ -102,7 +102,7 @@ def _is_loopback(endpoint: str) -> bool:
 
 def plain_text_problem(me: NodeSpec, protocol: str) -> str | None:
     """Where this node listens in plain text although the fleet has TLS, because the fleet file says so."""
-    given = (me.listen_control, me.listen_data)
+    given = (me.listen_control, me.listen_data, me.listen_streams)
     plain = [end for end in given if end and _scheme(end) not in ENCRYPTED]
     if protocol == PLAIN or not plain:
         return None

@@ -118,6 +118,8 @@ class NodeSpec(Struct, frozen=True, kw_only=True):
     listen_control: str = ""
     """zenoh endpoint of the control session, e.g. ``tcp/0.0.0.0:7457``."""
     listen_data: str = ""
+    listen_streams: str = ""
+    """Where an application of this robot that has its streams itself (`zsched.stream`) is dialled by workers."""
     labels: tuple[tuple[str, str], ...] = ()
     links: tuple[LinkSpec, ...] = ()
     local: LocalSide | None = None
