@@ -173,3 +173,49 @@ def test_what_has_not_gone_out_can_be_taken_back() -> None:
     receiver.gate.set()
     until(lambda: receiver.got == [0, "end"], "what was in hand, and the marker")
     assert queue.close() == 0
+
+
+def test_a_claimed_action_is_done_by_its_claimant_and_what_comes_meanwhile_follows() -> None:
+    receiver = Receiver()
+    queue = SendQueue("t", depth=10, sheds=False)
+    assert queue.claim(receiver.take(0), "zero")
+    assert queue.in_hand == "zero"
+    assert not queue.claim(receiver.take(1)), "one at a time"
+    queue.send("a", receiver.take(1), 1)
+    queue.then(receiver.take("end"))
+    queue.kick()
+    time.sleep(0.05)
+    assert receiver.got == [], "nothing overtakes what is claimed"
+    queue.do_claimed()
+    until(lambda: receiver.got == [0, 1, "end"], "all, in order")
+    until(lambda: queue.claim(receiver.take(2)), "nothing waits any more")
+    queue.do_claimed()
+    queue.do_claimed()
+    assert receiver.got == [0, 1, "end", 2], "once"
+    queue.close()
+
+
+def test_nothing_is_claimed_while_something_waits_or_is_being_done() -> None:
+    receiver = Receiver()
+    receiver.gate.clear()
+    queue = SendQueue("t", depth=10, sheds=False)
+    queue.send("a", receiver.take(0), 1)
+    until(lambda: queue.is_busy, "the put is under way")
+    assert not queue.claim(receiver.take(1))
+    receiver.gate.set()
+    until(lambda: queue.claim(receiver.take(1)), "it has ended")
+    queue.do_claimed()
+    queue.close()
+    assert not queue.claim(receiver.take(2)), "closed"
+    assert receiver.got == [0, 1]
+
+
+def test_the_last_thing_waits_for_what_is_claimed() -> None:
+    receiver = Receiver()
+    queue = SendQueue("t", depth=10, sheds=False)
+    assert queue.claim(receiver.take(0))
+    queue.close(receiver.take("last"))
+    time.sleep(0.05)
+    assert receiver.got == []
+    queue.do_claimed()
+    until(lambda: receiver.got == [0, "last"], "behind it")

@@ -82,8 +82,13 @@ class InputStream:
         own_ids: frozenset[str],
         local: Session | None = None,
         times: AnswerTimes | None = None,
+        *,
+        is_ours: bool = False,
     ) -> None:
-        """Subscribe on ``local``, the host's own side, if there is one; ``session`` is the fleet's."""
+        """Subscribe on ``local``, the host's own side, if there is one; ``session`` is the fleet's.
+
+        ``is_ours``: nothing is subscribed to, samples come by `give`.
+        """
         self.route = route
         self._times = times
         self._session = session
@@ -122,15 +127,32 @@ class InputStream:
         self._stamps: Stamps | None = None
         side = self._clock = local or session  # the fleet's may be closed for a moment
         self._loop_ids = own_ids - {str(side.zid())}
-        self._receiver = Receiver(
+        self._giving = threading.Lock()
+        self._in_hand: Outlet | None = None
+        """Where the sample that is given goes, if its put is left to the giver (`_giving` and our lock guard it)."""
+        self._receiver = None if is_ours else self._subscribe(side)
+
+    def _subscribe(self, side: Session) -> Receiver:
+        return Receiver(
             side,
-            route.from_expr,
-            route.settings,
+            self.route.from_expr,
+            self.route.settings,
             self._carry,
             with_history=True,
             give_way=self._give_way,
             origin=zenoh.Locality.ANY,
         )
+
+    def give(self, sample: Sample) -> None:
+        """Carry a sample of this process; it is put in this thread where nothing waits before it (`is_ours`).
+
+        What a full queue or link holds up is this thread, and nobody else: a flip does not wait for it.
+        """
+        with self._giving:
+            self._carry(sample, is_given=True)
+            outlet, self._in_hand = self._in_hand, None
+            if outlet is not None:
+                outlet.put_claimed()
 
     def open(self, epoch: int, route: Route, acks: WorkerAcks | None = None, stamps: Stamps | None = None) -> None:
         """Declare the publishers of a slot; it carries nothing yet. With ``acks`` its worker counts what it gets.
@@ -150,6 +172,11 @@ class InputStream:
         """True when somebody subscribes to the slot's keys."""
         slot = self._slots.get(epoch)
         return slot is not None and slot.outlet.is_matching
+
+    @property
+    def has_way(self) -> bool:
+        """True when what comes goes to an owner, or waits for the one that is flipped to."""
+        return self._active is not None or self._next is not None
 
     def warm_up(self, epoch: int) -> int:
         """Send every kept value to a worker that has just become ready (again); answers how many."""
@@ -206,6 +233,13 @@ class InputStream:
             self._settle(slot)
             self._end_hold_behind(slot, has_answer)
 
+    def end(self) -> None:
+        """Nothing more will be given (`is_ours`): put the end marker of the slot that is fed behind its last sample."""
+        with self._lock:
+            slot = self._active
+        if slot is not None:
+            slot.outlet.send_end(slot.epoch)
+
     def send_end(self, epoch: int) -> None:
         """Put the end marker behind the slot's last sample (it must not be the active one); may block on its link."""
         slot = self._slots.get(epoch)
@@ -259,7 +293,8 @@ class InputStream:
 
     def close(self) -> None:
         """Unsubscribe and close every slot."""
-        self._receiver.close()
+        if self._receiver is not None:
+            self._receiver.close()
         with self._lock:
             self._counter.dropped("closed", len(self._paused))
             self._paused.clear()
@@ -426,7 +461,7 @@ class InputStream:
 
     # --- one sample --------------------------------------------------------------------------------------------------
 
-    def _carry(self, sample: Sample) -> None:
+    def _carry(self, sample: Sample, *, is_given: bool = False) -> None:
         active, size = self._active, len(sample.payload)
         if active is not None and self._is_patient and not self._is_paused:
             active.outlet.wait_for_room(size)
@@ -443,7 +478,7 @@ class InputStream:
             if pace is not None and not pace.passes(str(sample.key_expr), (sample, stamp), monotonic_s()):
                 self._counter.dropped("thinned")
             elif not self._is_paused:
-                self._route_on(sample, stamp, size)
+                self._route_on(sample, stamp, size, is_given=is_given)
             elif self._keep_last:
                 self._counter.unsent += 1
             elif len(self._paused) < MAX_PAUSED and self._paused_bytes + size <= MAX_BYTES // 2:
@@ -452,10 +487,10 @@ class InputStream:
             else:
                 self._counter.dropped("overflow")
 
-    def _route_on(self, sample: Sample, stamp: Timestamp | None, size: int) -> None:
+    def _route_on(self, sample: Sample, stamp: Timestamp | None, size: int, *, is_given: bool = False) -> None:
         if self._active is not None:
             self._active.sent = self._number
-            self._send(sample, stamp, size)
+            self._send(sample, stamp, size, is_given=is_given)
         elif self._next is not None:
             self._held.append((sample, stamp))
             self._held_bytes += size
@@ -474,13 +509,18 @@ class InputStream:
             self._counter.seen(len(sample.payload))
             self._counter.dropped("overflow")
 
-    def _send(self, sample: Sample, stamp: Timestamp | None, size: int | None = None) -> None:
+    def _send(
+        self, sample: Sample, stamp: Timestamp | None, size: int | None = None, *, is_given: bool = False
+    ) -> None:
         if self._active is not None:
             if self._times is not None:
                 self._times.sent(stamp or sample.timestamp)
-            reason, dropped = self._active.outlet.send(sample, stamp, size)
-            if dropped:
-                self._counter.dropped(reason, dropped)
+            if is_given and self._active.outlet.claim(sample, stamp):
+                self._in_hand = self._active.outlet
+            else:
+                reason, dropped = self._active.outlet.send(sample, stamp, size)
+                if dropped:
+                    self._counter.dropped(reason, dropped)
         if self._mirror is not None:
             self._counter.repeated += 1
             self._counter.dropped(*self._mirror.outlet.send(sample, stamp, size))

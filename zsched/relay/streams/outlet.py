@@ -52,6 +52,10 @@ MAX_OWED: Final = 4096
 SKIP_EPOCH: Final = 0
 """Epoch of a marker that ends nothing: no number below its count will come any more."""
 
+WAITED_S: Final = 0.02
+"""A put in its giver's thread that takes this long has waited for its link..."""
+QUEUED_S: Final = 1.0
+"""...and for this long what follows is left to the queue, so that the giver waits for a full one only."""
 MAX_PATIENT: Final = 3
 """Streams that may wait for room at one time: each holds one of zenoh's receive threads (six by default)."""
 
@@ -103,6 +107,8 @@ class Outlet:
         """Samples taken and not dropped (the stream's lock guards it)..."""
         self._left = 0
         """...and those of them that have left the queue, or could not (our lock)."""
+        self._waited_at: float | None = None
+        """When a put that its giver had claimed has waited for its link."""
         self._left_told = 0
         """How much of the tally's `at_most_lost` has been taken."""
         self._replays = settings.on_crash is OnCrash.REPLAY and acks is not None
@@ -170,6 +176,35 @@ class Outlet:
         dropped = self._queue.send(lane, action, size, (sample, stamp))
         self._handed += 1 - dropped
         return ("overflow", dropped) if dropped else _ALL_WENT
+
+    def claim(self, sample: Sample, stamp: Timestamp | None) -> bool:
+        """Take one sample whose put is left to this thread (`put_claimed`); ``False``: it has to be sent (`send`).
+
+        Of class ``reliable`` only: its publisher may wait, that of ``latest`` never does. Behind a put that has waited
+        the queue takes what comes, for a while.
+        """
+        if self._queue is None or not self._is_reliable or not self._is_open(greets=False):
+            return False
+        if self._waited_at is not None and monotonic_s() - self._waited_at < QUEUED_S:
+            return False
+        lane = self._lane(sample)
+        if lane is None:
+            return False
+        stamp, size = sample.timestamp or stamp, len(sample.payload)
+        if not self._queue.claim(lambda: self._put(lane, sample, stamp, size), (sample, stamp)):
+            return False
+        self._handed += 1
+        return True
+
+    def put_claimed(self) -> None:
+        """Put the sample that was claimed; may wait for its link (under no lock)."""
+        if self._queue is None:
+            return
+        began = monotonic_s()
+        self._queue.do_claimed()
+        now = monotonic_s()
+        if now - began > WAITED_S:
+            self._waited_at = now
 
     def wait_for_room(self, size: int) -> None:
         """Class ``reliable``: wait while the queue is full and its receiver takes something now and then.
@@ -423,13 +458,18 @@ class Outlet:
         lane.base = lane.count
         self.tally.unconfirmed += 1
 
-    def _is_open(self) -> bool:
-        """Class ``reliable``: nothing goes out to a worker that was not greeted, and no more than can be sent again."""
+    def _is_open(self, *, greets: bool = True) -> bool:
+        """Class ``reliable``: nothing goes out to a worker that was not greeted, and no more than can be sent again.
+
+        ``greets``: in the queue's thread, which may put a marker.
+        """
+        if not self._is_reliable or self._acks is None:
+            return True
         greetings = self._greetings
         if greetings is not None:
             if not greetings.is_there(self._lanes, is_matching=self.is_matching):
                 return False
-            if greetings.is_waiting and not greetings.greet(len(self._lanes)):
+            if greetings.is_waiting and not (greets and greetings.greet(len(self._lanes))):
                 return False
         main = self._main
         if main is not None and len(self._lanes) == 1:  # the usual case, asked before every sample
