@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import zenoh
 
@@ -24,6 +24,7 @@ from benchmarks.rig import until
 from zsched.core.values.plan import Direction, HandoverRule, Route, StreamClass, StreamSettings
 from zsched.relay.streams.acks import Acks
 from zsched.relay.streams.inputs import InputStream
+from zsched.relay.streams.outlet import Outlet
 from zsched.relay.streams.outputs import OutputStream
 from zsched.relay.streams.receive import undeclare
 from zsched.sessions.config import data_config, worker_config
@@ -137,7 +138,7 @@ def outward(relay: zenoh.Session, stream_class: StreamClass) -> Way:
     slot = stream._slots[1]  # noqa: SLF001 - the one that its receiver feeds
 
     def sent() -> bool:
-        queue = stream._outlet._queue  # noqa: SLF001 - how far its queue is
+        queue = cast("Outlet", stream._outlet)._queue  # noqa: SLF001 - how far its queue is
         return queue is None or (not queue._items and queue._busy_since is None)  # noqa: SLF001
 
     return lambda sample: stream._carry(slot, sample), sent, stream.close  # noqa: SLF001

@@ -4,6 +4,7 @@ Knows: the command line, signals, the parent's death. Does not know: streams.
 
 ``python -m zsched.relay --fleet F --node N [--threads T] [--parent PID] [--local]``; the first frame on stdin is
 the zenoh session as JSON (with ``--local`` the second one is that of the host's own side). Logs go to stderr.
+With ``--streams PATH --streams-listen ENDPOINT`` an application of this node may have its streams itself.
 With ``--door FD --orphan S`` it outlives its daemon for S seconds and obeys the next one that comes through the door;
 without, it dies with its parent.
 """
@@ -17,6 +18,7 @@ import logging
 import os
 import signal
 import sys
+from pathlib import Path
 
 from zsched.heap import share_heaps
 from zsched.ipc.protocol import RelayHello
@@ -55,7 +57,15 @@ def main() -> None:
             session=arguments.session,
             threads=arguments.threads,
         )
-        code = run(me, *pipes, has_local_side=arguments.local, door=arguments.door, orphan_s=arguments.orphan)
+        code = run(
+            me,
+            *pipes,
+            has_local_side=arguments.local,
+            door=arguments.door,
+            orphan_s=arguments.orphan,
+            streams=Path(arguments.streams) if arguments.streams else None,
+            streams_listen=arguments.streams_listen,
+        )
     except SystemExit:
         code = 0
     except BaseException:
@@ -78,6 +88,8 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--incarnation", type=int, default=0, help="of the daemon that starts us")
     parser.add_argument("--digest", default="", help="what the next daemon must have been started with")
     parser.add_argument("--session", default="", help="a digest over what the data session is opened with")
+    parser.add_argument("--streams", default="", help="the socket for an application that has its streams itself")
+    parser.add_argument("--streams-listen", default="", help="the endpoint at which workers dial that application")
     parser.add_argument("--log-level", default="WARNING")
     return parser.parse_args()
 

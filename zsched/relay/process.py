@@ -20,6 +20,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Collection
+from pathlib import Path
 from typing import Final
 
 import zenoh
@@ -35,6 +36,7 @@ from zsched.guard import guarded, on_failure
 from zsched.heap import give_back
 from zsched.ipc.pipe import COMMANDS, read_frame, wait_readable, write_frame
 from zsched.ipc.protocol import RelayHello, RelayPulse
+from zsched.relay.application import Application
 from zsched.relay.graph import GraphMirror
 from zsched.relay.local_side import LocalSide
 from zsched.relay.matching import Matching
@@ -161,8 +163,10 @@ class RelayProcess:
         introducer: Introducer | None = None,
         link_lease_s: float = DEFAULT_LEASE_S,
         members: frozenset[str] | None = None,
+        application: Application | None = None,
     ) -> None:
         """``link_lease_s``: zenoh's, on the session's links. ``members``: the common names that it lets in, if any."""
+        self._application = application or Application(fleet, node, None, "", reporter.report)
         self._session, self._fleet = session, fleet
         self._counting, self._refused = threading.Lock(), Counter[Refusal]()
         self._expulsion = self._expel_from(session, members)
@@ -226,6 +230,7 @@ class RelayProcess:
                     part.rejoin(session)
             for task in tasks:
                 task.rejoin(session, self._own_ids)
+            self._application.open(config)
         _log.warning(
             "the data session is opened anew: streams waited %.2f s for what was under way, it took %.2f s",
             left_at - began,
@@ -303,6 +308,7 @@ class RelayProcess:
     def go_on_alone(self) -> None:
         """The daemon is gone, and nobody says what holds: see the module's first lines."""
         self._roles.forget()
+        self._application.lose_daemon()
         for task in tuple(self._tasks.values()):
             task.lose_daemon()
 
@@ -341,6 +347,7 @@ class RelayProcess:
     def _end(self, name: TaskId) -> None:
         self._roles.end(name)
         self._matching.forget(name)
+        self._application.end(name)
         with self._lock:
             for table in (self._waiting, self._standbys, self._unowned):
                 table.pop(name, None)
@@ -352,9 +359,11 @@ class RelayProcess:
 
     def _listen(self, task: TaskId, routes: tuple[Route, ...], graph: GraphMirror) -> None:
         if routes:
+            self._application.unowned(task, routes)
             self._task(task, graph).listen(routes)
 
     def _apply(self, plan: RoutePlan, graph: GraphMirror) -> None:
+        self._application.plan(plan)
         self._task(plan.task, graph).apply(plan)
 
     def _task(self, name: TaskId, graph: GraphMirror) -> TaskRelay:
@@ -366,7 +375,7 @@ class RelayProcess:
                 self._tokens,
                 self._acks,
                 self._own_ids,
-                self._reporter.report,
+                self._application.report,
                 graph,
                 self._local,
             )
@@ -398,7 +407,7 @@ class RelayProcess:
             due = max(due + COUNT_S, awake_s())  # none is made up for
             pause.wait(due - awake_s())
             counts = tuple(count for task in tuple(self._tasks.values()) for count in task.counts())
-            self._reporter.report(StreamsCounted(counts=counts))
+            self._reporter.report(StreamsCounted(counts=self._application.added(counts)))
             self._tell_refused()
             is_missing = any(task.misses_its_worker for task in tuple(self._tasks.values()))
             if introductions.is_due(awake_s(), is_missing=is_missing) and self._introducer is not None:
@@ -434,9 +443,12 @@ def run(
     has_local_side: bool = False,
     door: int | None = None,
     orphan_s: float = 0.0,
+    streams: Path | None = None,
+    streams_listen: str = "",
 ) -> int:
     """Serve until told to stop; the exit code: 0 stopped, 1 the session could not be opened.
 
+    ``streams`` is the socket for an application that has its streams itself, which listens at ``streams_listen``.
     ``door`` is a listening socket: through it the daemon's successor comes, within ``orphan_s`` of the daemon's end.
     """
     reporter = Reporter(reports)
@@ -453,6 +465,7 @@ def run(
         reporter.report(ProblemReported(source=SOURCE, problem=problem))
         reporter.flush(CLOSE_S)
         return 1
+    application = Application(me.fleet, me.node, streams, streams_listen, reporter.report)
     relay = RelayProcess(
         session,
         me.fleet,
@@ -462,7 +475,10 @@ def run(
         Introducer(config),
         lease_s(config),
         members_of(config),
+        application,
     )
+    if streams is not None:
+        application.open(config)
     give_back()
     successors = None if door is None else Successors(socket.socket(fileno=door), me, reopens=has_local_side)
     wakeups, parent = _signals_wake(), os.getppid()

@@ -361,6 +361,9 @@ class TaskRelay:
     def _take_input(self, route: Route) -> InputStream:
         return InputStream(self._session, route, self._own_ids, self._local, self._times)
 
+    def _take_output(self, route: Route) -> OutputStream:
+        return OutputStream(self._session, route, self._own_ids, self.wake, self._local, self._times)
+
     def _take(self, plan: RoutePlan) -> None:
         self._plan = plan
         self._flip_by = None
@@ -466,9 +469,7 @@ class TaskRelay:
         if sink is None or (sink.route.to_expr, sink.route.settings) != (route.to_expr, route.settings):
             if sink is not None:
                 sink.close()
-            sink = self._outputs[route.stream] = OutputStream(
-                self._session, route, self._own_ids, self.wake, self._local, self._times
-            )
+            sink = self._outputs[route.stream] = self._take_output(route)
         sink.know(route.from_expr, notes_stamps=_replays(slot))
         sink.open(epoch, route, acks, is_from_start=is_from_start)
 

@@ -192,6 +192,23 @@ def client_config(
     return _render(settings, operator_json5)
 
 
+def application_config(session: str, listen: str) -> str:
+    """Of a relay's data session (its configuration): that of an application which has its streams itself.
+
+    It listens at ``listen``, where workers dial it, and dials nobody; nobody hears of it by gossip.
+    """
+    import zenoh  # noqa: PLC0415 - the operator's own settings (TLS, access control) hold here, too
+
+    config = zenoh.Config.from_json5(session)
+    for path, value in {
+        "listen/endpoints": list(_small_buffers((listen,))),
+        "connect/endpoints": [],
+        "scouting/gossip/enabled": False,
+    }.items():
+        config.insert_json5(path, json.dumps(value))
+    return str(config)
+
+
 def introduction_config(session: str) -> str | None:
     """Of a session (its configuration) that meets others by gossip: one that dials the same nodes and their peers.
 

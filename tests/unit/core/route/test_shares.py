@@ -1,0 +1,151 @@
+"""What an application beside its relay is told, and what counts of its words."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from zsched.core.events import SlotDrained
+from zsched.core.hop.books import unaccounted
+from zsched.core.relay_protocol import SlotLost, WorkerWatch
+from zsched.core.route.shares import Shares
+from zsched.core.values.plan import (
+    Direction,
+    ReadyWhen,
+    Route,
+    RoutePhase,
+    RoutePlan,
+    Slot,
+    StreamClass,
+    StreamCount,
+    StreamSettings,
+)
+
+RELIABLE = StreamSettings(stream_class=StreamClass.RELIABLE)
+
+
+def route(stream: str, direction: Direction, near: str, far: str) -> Route:
+    ends = (near, far) if direction is Direction.INPUT else (far, near)
+    return Route(stream=stream, direction=direction, from_expr=ends[0], to_expr=ends[1], settings=RELIABLE)
+
+
+JOBS = route("t/in/0", Direction.INPUT, "robot1/jobs", "edge1/t/robot1/jobs")
+SCANS = route("t/in/1", Direction.INPUT, "robot1/scan/*", "edge1/t/robot1/scan/*")
+PLAN = route("t/out/0", Direction.OUTPUT, "robot1/plan", "edge1/t/1/robot1/plan")
+MERGE = route("t/srv/0", Direction.SERVICE, "robot1/merge", "edge1/t/robot1/merge")
+
+
+def slot(epoch: int, *routes: Route) -> Slot:
+    return Slot(epoch=epoch, owner="edge1", routes=routes, ready_when=ReadyWhen.TOKEN)
+
+
+def plan(*routes: Route, epoch: int = 1, old: int | None = None) -> RoutePlan:
+    olds = () if old is None else (slot(old, *routes),)
+    return RoutePlan(task="t", phase=RoutePhase.PREPARE, current=slot(epoch, *routes), predecessors=olds)
+
+
+ALL = (JOBS, SCANS, PLAN, MERGE)
+
+
+def shares(*keys: str) -> Shares:
+    made = Shares()
+    made.note_plan(plan(*ALL))
+    made.name(keys)
+    return made
+
+
+def test_an_application_is_told_its_own_routes_only() -> None:
+    made = Shares()
+    assert made.note_plan(plan(*ALL)) == (), "there is none"
+    assert made.note_unowned("t", (JOBS, SCANS)) == ()
+    assert made.name(("robot1/jobs", "robot1/plan")) == (WorkerWatch(task="t", unowned=(JOBS,)), plan(JOBS, PLAN))
+    assert made.taken() == ("robot1/jobs", "robot1/plan")
+    assert made.note_plan(plan(*ALL, epoch=2, old=1)) == (plan(JOBS, PLAN, epoch=2, old=1),)
+
+
+def test_a_key_below_a_rule_with_wildcards_is_its_streams_and_a_services_is_none() -> None:
+    made = shares("robot1/scan/front", "robot1/merge", "robot1/other", "robot1/**")
+    assert made.taken() == ("robot1/scan/front",)
+    assert made.note_plan(plan(*ALL)) == (plan(SCANS),)
+
+
+def test_other_tasks_are_not_told_of_and_a_known_one_is_when_its_routes_go() -> None:
+    made = shares("robot1/other")
+    assert made.note_plan(plan(*ALL)) == ()
+    made.name(("robot1/jobs",))
+    assert made.note_plan(plan(SCANS)) == (plan(),), "its last route is closed by that"
+    assert made.end("t")
+    assert not made.end("t")
+
+
+def test_a_slot_has_drained_when_both_say_so() -> None:
+    word = SlotDrained(task="t", epoch=1)
+    made = shares("robot1/jobs")
+    assert made.relay_drained(word) is None
+    assert made.heard(word) == (word,)
+    assert made.heard(word) == (), "once"
+    made = shares("robot1/jobs")
+    assert made.heard(word) == ()
+    assert made.relay_drained(word) == word
+
+
+def test_a_slot_without_a_part_of_the_application_has_drained_when_the_relay_says_so() -> None:
+    word = SlotDrained(task="t", epoch=1)
+    assert shares("robot1/other").relay_drained(word) == word
+    assert shares().relay_drained(word) == word
+    made = shares("robot1/jobs")
+    assert made.relay_drained(SlotDrained(task="t", epoch=7)) == SlotDrained(task="t", epoch=7)
+    assert made.heard(SlotDrained(task="t", epoch=7)) == (), "an epoch that it was never told of"
+
+
+def test_a_word_that_waits_is_said_when_the_application_goes_and_not_behind_the_slots_end() -> None:
+    word = SlotDrained(task="t", epoch=1)
+    made = shares("robot1/jobs")
+    made.relay_drained(word)
+    assert made.go() == (word,)
+    made = shares("robot1/jobs")
+    made.relay_drained(word)
+    made.note_plan(plan(*ALL, epoch=2))
+    assert made.heard(word) == ()
+    assert made.go() == ()
+
+
+def test_what_it_left_open_is_heard_behind_the_slots_end_and_of_its_own_slots_only() -> None:
+    made = shares("robot1/jobs")
+    made.note_plan(plan(*ALL, epoch=2))
+    lost = SlotLost(task="t", epoch=1, owner="edge1", samples=3)
+    assert made.heard(lost) == (lost,)
+    assert made.heard(SlotLost(task="t", epoch=9, owner="edge1", samples=3)) == ()
+    assert made.heard(SlotLost(task="u", epoch=1, owner="edge1", samples=3)) == ()
+
+
+def count(messages: int, acknowledged: int, in_flight: int, stream: str = "t/in/0", **more: Any) -> StreamCount:
+    return StreamCount(stream=stream, messages=messages, acknowledged=acknowledged, in_flight=in_flight, **more)
+
+
+def test_counters_add_up_and_the_books_balance_also_when_an_application_dies() -> None:
+    made, relays = shares("robot1/jobs"), (count(10, 8, 2), StreamCount(stream="t/out/0", messages=5))
+    assert made.added(relays) == relays
+    made.note_counts((count(100, 90, 7, lost=1, drops=(("overflow", 2),)),))
+    total = made.added(relays)[0]
+    assert (total.messages, total.acknowledged, total.in_flight, total.lost) == (110, 98, 9, 1)
+    assert total.drops == (("overflow", 2),)
+    assert unaccounted(total) == 0
+    assert made.go() == (SlotLost(task="t", epoch=1, owner="edge1", samples=7),)
+    total = made.added(relays)[0]
+    assert (total.messages, total.in_flight, total.at_most_lost) == (110, 2, 7)
+    assert unaccounted(total) == 0
+    made.name(("robot1/jobs",))
+    made.note_counts((count(3, 3, 0),))
+    made.go()
+    made.name(("robot1/jobs",))
+    made.note_counts((count(1, 0, 1),))
+    total = made.added(relays)[0]
+    assert (total.messages, total.acknowledged, total.in_flight, total.at_most_lost) == (114, 101, 3, 7)
+    assert unaccounted(total) == 0
+
+
+def test_counters_of_streams_that_are_not_its_own_are_not_taken() -> None:
+    made = shares("robot1/jobs")
+    made.note_counts((count(5, 5, 0, stream="t/in/1"), count(5, 5, 0, stream="u/in/0")))
+    relays = (count(1, 1, 0, stream="t/in/1"),)
+    assert made.added(relays) == relays
