@@ -111,6 +111,8 @@ class Rig:
     reports: dict[str, Reports] = field(default_factory=dict)
     workers: list[subprocess.Popen[bytes]] = field(default_factory=list)
     incarnation: int = 0
+    dialled: tuple[str, ...] = ()
+    """What workers dial beside."""
 
     def start(self) -> None:
         seed = self.endpoint(ROBOT)
@@ -143,7 +145,7 @@ class Rig:
         self.incarnation += 1
         path = self.folder / f"{task}-{node}.json5"
         # its own relay first, then the robot's, as `zsched.runtime.endpoints` has it: what is dialled is dialled again
-        connect = tuple(dict.fromkeys((self.endpoint(node), self.endpoint(ROBOT))))
+        connect = tuple(dict.fromkeys((self.endpoint(node), self.endpoint(ROBOT), *self.dialled)))
         text = worker_config(connect=connect, timing=self.timing, shared_memory=False, operator_json5=operator_json5)
         path.write_text(text)
         env = os.environ | {

@@ -32,7 +32,7 @@ FLOORS: Final[tuple[tuple[str, int, str], ...]] = (
     (r"adapters\.(\w+)(?:\..+)?", 5, "adapters: \\1"),
     (r"adapters", 5, "adapters"),
     (r"(pki|relay|worker)(?:\..+)?", 5, "\\1"),
-    (r"(drivers|runtime)(?:\..+)?", 6, "\\1"),
+    (r"(drivers|runtime|stream)(?:\..+)?", 6, "\\1"),
     (r"tasks(?:\.(\w+))?(?:\..+)?", 7, "tasks: \\1"),
     (r"examples(?:\.(\w+))?(?:\..+)?", 7, "tasks: example \\1"),  # programs that `zsched init --example` copies
     (r"daemon", 7, "daemon"),
@@ -72,7 +72,7 @@ HEAVY: Final = frozenset(
 )
 OUTSIDE: Final[dict[str, str]] = {
     # library: who alone may import it, besides lab and tasks
-    "zenoh": r"(adapters\.network|relay|worker|sessions)(\..+)?|drivers\.ros2_lifecycle",
+    "zenoh": r"(adapters\.network|relay|stream|worker|sessions)(\..+)?|drivers\.ros2_lifecycle",
     "msgpack": r"wire\.codec",
     "msgspec": r"core\.values\.struct",  # makes classes, reads and writes nothing (decision 0091)
     "ruamel": r"config\.(reader|editing)",
@@ -252,6 +252,7 @@ PROGRAMS: Final[dict[str, str]] = {
     "daemon": "import zsched.daemon",
     "relay": "import zsched.relay.__main__, zsched.relay.process",
     "worker": "import zsched.worker",
+    "stream": "import zsched.stream",
     "cli": "import zsched.cli",
     "cli check": "sys.argv[1:] = ['check', 'configs/fleet.yaml']; import zsched.cli; run(zsched.cli.main)",
     "cli help": "sys.argv[1:] = ['--help']; import zsched.cli; run(zsched.cli.main)",

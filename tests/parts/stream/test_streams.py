@@ -1,0 +1,249 @@
+"""An application with its own streams, the relay's side of its socket, and a real worker that dials it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import cast
+
+import pytest
+import zenoh
+
+from support.hand_relay import Relay
+from support.waiting import free_endpoint, until
+from zsched.core.events import SlotDrained
+from zsched.core.hop.books import unaccounted
+from zsched.core.relay_protocol import RelayReport, SlotLost
+from zsched.core.values.plan import (
+    Direction,
+    HandoverRule,
+    ReadyWhen,
+    Route,
+    RoutePhase,
+    RoutePlan,
+    Slot,
+    StreamClass,
+    StreamCount,
+    StreamSettings,
+    WorkerRole,
+)
+from zsched.errors import AdapterError
+from zsched.relay.application import Application
+from zsched.relay.streams.inputs import InputStream
+from zsched.relay.streams.lanes import Lane
+from zsched.sessions.config import data_config, worker_config
+from zsched.stream import Received, Streams, streams
+from zsched.stream.samples import Given
+from zsched.stream.task import OwnTask
+from zsched.worker import Received as Input
+from zsched.worker import Worker
+
+SETTINGS = StreamSettings(stream_class=StreamClass.RELIABLE, depth=1000, handover=HandoverRule.ALL)
+IN = Route(
+    stream="t/in/0",
+    direction=Direction.INPUT,
+    from_expr="robot1/*/in",
+    to_expr="edge1/t/robot1/*/in",
+    settings=SETTINGS,
+)
+OUT = Route(
+    stream="t/out/0",
+    direction=Direction.OUTPUT,
+    from_expr="edge1/t/1/robot1/out",
+    to_expr="robot1/out",
+    settings=SETTINGS,
+)
+SLOT = Slot(epoch=1, owner="edge1", routes=(IN, OUT), ready_when=ReadyWhen.TOKEN)
+PLAN = RoutePlan(task="t", phase=RoutePhase.CLOSE, current=SLOT)
+NONE = (StreamCount(stream="t/in/0", acknowledged=0, in_flight=0), StreamCount(stream="t/out/0"))
+
+
+@dataclass
+class Bench:
+    """A worker on edge1 that answers everything, and the place of an application of robot1."""
+
+    folder: Path
+    own: str = field(default_factory=free_endpoint)
+    reports: list[RelayReport] = field(default_factory=list)
+    taken: list[bytes] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.relay = Relay()
+        path = self.folder / "worker.json5"
+        path.write_text(
+            worker_config(
+                connect=(self.relay.endpoint, self.own), listen=(), shared_memory=False, dials_by_gossip=False
+            )
+        )
+        names = {"FLEET": "test", "NODE": "edge1", "TASK": "t", "INCARNATION": "3", "ZENOH_CONFIG": str(path)}
+        self.worker = Worker.from_env({f"ZSCHED_{name}": value for name, value in names.items()})
+        self._answers = self.worker.publisher("{prefix}/{epoch}/robot1/out", reliable=True)
+        self.worker.subscribe("{prefix}/robot1/*/in", self._echo)
+        self.worker.ready()
+        self.relay.tell(WorkerRole.ACTIVE, 1)
+        until(lambda: self.worker.role.role is WorkerRole.ACTIVE, "the worker is the owner")
+        self.application = self.open()
+
+    def open(self) -> Application:
+        """The relay's side, as it is after the relay's start."""
+        made = Application("test", "robot1", self.folder / "robot1.streams", self.own, self.reports.append)
+        made.unowned("t", (IN,))
+        made.open(data_config(listen=(free_endpoint(),), connect=(), shared_memory=False))
+        made.plan(PLAN)
+        return made
+
+    def _echo(self, sample: Input) -> None:
+        self.taken.append(sample.payload.to_bytes())
+        self._answers.put(sample.payload.to_bytes())
+
+    def join(self) -> Streams:
+        return Streams.join(runtime_dir=self.folder)
+
+    def count(self) -> StreamCount:
+        return self.application.added(NONE)[0]
+
+    def close(self) -> None:
+        self.worker.close()
+        self.relay.session.close()
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    made = Bench(tmp_path)
+    yield made
+    made.close()
+
+
+def test_what_is_put_is_processed_answered_and_counted_and_the_streams_outlive_the_relay(bench: Bench) -> None:
+    back: list[tuple[str, int]] = []
+
+    def take(answer: Received) -> None:
+        back.append((answer.key, int(answer.payload.to_bytes())))
+
+    with bench.join() as own:
+        assert own.node == "robot1"
+        own.subscribe("robot1/out", take)
+        publisher = own.publisher("robot1/front/in")
+        for number in range(200):
+            assert publisher.put(str(number))
+        until(lambda: len(back) == 200, "all answers")
+        assert back == [("robot1/out", number) for number in range(200)]
+        until(lambda: bench.count().acknowledged == 200, "the relay's counters have them")
+        bench.application.lose_daemon()
+        old, bench.application = bench.application, bench.open()
+        assert old._link is not None
+        old._link.hang_up()
+        publisher.put("200")
+        until(lambda: len(back) == 201, "answers without a relay")
+        until(lambda: bench.count().acknowledged == 201, "the next relay's counters have all")
+    assert not publisher.put("201"), "closed"
+    assert unaccounted(bench.count()) == 0
+    assert bench.count().at_most_lost == 0
+    assert bench.taken == [str(number).encode() for number in range(201)]
+
+
+def test_closing_waits_for_what_was_put_and_for_its_answers(bench: Bench) -> None:
+    back: list[bytes] = []
+
+    def take(answer: Received) -> None:
+        time.sleep(0.005)
+        back.append(answer.payload.to_bytes())
+
+    with bench.join() as own:
+        own.subscribe("robot1/out", take)
+        publisher = own.publisher("robot1/front/in")
+        for number in range(50):
+            publisher.put(str(number))
+    assert back == [str(number).encode() for number in range(50)]
+    assert bench.count().acknowledged == 50
+
+
+def test_what_is_put_first_has_a_way_already(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    take = OwnTask._take
+
+    def slow(task: OwnTask, plan: RoutePlan) -> None:
+        time.sleep(0.3)
+        take(task, plan)
+
+    monkeypatch.setattr(OwnTask, "_take", slow)
+    with bench.join() as own:
+        publisher = own.publisher("robot1/front/in")
+        for number in range(5):
+            publisher.put(str(number))
+    assert (bench.count().acknowledged, bench.count().drops) == (5, ())
+
+
+def test_an_application_that_has_ended_is_not_waited_for_when_the_task_moves(bench: Bench) -> None:
+    with bench.join() as own:
+        own.publisher("robot1/front/in").put("0")
+    bench.relay.tell(WorkerRole.DRAINING, 1)
+    until(lambda: bench.relay.ends, "the worker has ended the epoch: all its inputs have")
+
+
+def test_an_application_is_told_why_it_cannot_have_a_stream(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(streams, "KNOWN_S", 0.3)
+    with bench.join() as own:
+        with pytest.raises(AdapterError, match="has streams of robot1 itself, and one at a time may"):
+            bench.join()
+        with pytest.raises(ValueError, match="no input rule takes 'robot1/other' on robot1"):
+            own.publisher("robot1/other")
+        with pytest.raises(ValueError, match="it has wildcards"):
+            own.publisher("robot1/*/in")
+        with pytest.raises(ValueError, match="no output rule has 'robot1/none' on robot1"):
+            own.subscribe("robot1/none", lambda _answer: None)
+    with pytest.raises(AdapterError, match="no relay lets applications have their streams themselves in"):
+        Streams.join(runtime_dir=bench.folder / "elsewhere", wait_s=0.0)
+
+
+def test_a_stranger_at_the_socket_raises_nothing(bench: Bench) -> None:
+    """What it says of slots and streams that are not its own counts for nothing, and garbage ends its link."""
+    with bench.join() as own:
+        own.publisher("robot1/front/in")
+        own._link.say(SlotLost(task="t", epoch=77, owner="edge1", samples=9))
+        own._link.say(SlotDrained(task="u", epoch=1))
+        own._link._socket.sendall(b"\xff" * 64)
+        until(lambda: bench.application._link is None, "it is heard no more")
+        assert not [word for word in bench.reports if isinstance(word, SlotLost | SlotDrained)]
+        until(lambda: bench.application._link is not None, "it comes again")
+
+
+def test_a_flip_does_not_wait_for_a_put_that_waits_for_its_link(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    gate, began, put = threading.Event(), threading.Event(), Lane.put
+
+    def slow(lane: Lane, sample: zenoh.Sample, stamp: zenoh.Timestamp | None) -> None:
+        began.set()
+        gate.wait(10)
+        put(lane, sample, stamp)
+
+    monkeypatch.setattr(Lane, "put", slow)
+    session = bench.relay.session
+    stream = InputStream(session, IN, frozenset(), is_ours=True)
+    heard: list[bytes] = []
+    kept = [
+        session.declare_subscriber(f"e{epoch}/*", lambda sample: heard.append(sample.payload.to_bytes()))
+        for epoch in (1, 2)
+    ]
+    for epoch in (1, 2):
+        to = Route(
+            stream=IN.stream, direction=IN.direction, from_expr=IN.from_expr, to_expr=f"e{epoch}/*", settings=SETTINGS
+        )
+        stream.open(epoch, to)
+    stream.flip(1)
+    given = [cast("zenoh.Sample", Given("robot1/a/in", zenoh.ZBytes(str(number)))) for number in range(2)]
+    first = threading.Thread(target=stream.give, args=(given[0],), daemon=True)
+    first.start()
+    assert began.wait(5)
+    flip = threading.Thread(target=stream.flip, args=(2,), daemon=True)
+    flip.start()
+    flip.join(2)
+    assert not flip.is_alive(), "the flip waits"
+    gate.set()
+    first.join(5)
+    stream.give(given[1])
+    until(lambda: sorted(heard) == [b"0", b"1"], "both, each to its owner")
+    stream.close()
+    for one in kept:
+        one.undeclare()

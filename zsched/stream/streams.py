@@ -1,0 +1,357 @@
+"""The library of an application that has its streams itself: no relay between it and the owner's worker.
+
+Knows: the application's keys and callbacks, the session that workers dial, what the relay tells of the plans. Does not
+know: how a stream keeps its promises (`zsched.relay.task` and below, which run here as they do in a relay).
+
+    with Streams.join() as streams:
+        streams.subscribe("robot1/plan", on_plan)
+        jobs = streams.publisher("robot1/jobs")
+        jobs.put(b"...")
+
+The keys are those of the fleet file, as with a session that is the relay's client. What this process puts goes to the
+owner's worker by a link of its own, and to nobody else; what others publish under the same key goes by the relay, as
+before. So a sample goes one way only, and nothing has to be handed over when an application starts or ends.
+
+Without a relay (it has died, the daemon is stopped) everything goes on as it was for `ALONE_S`, then the slots close.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, Self, cast
+
+import zenoh
+from zenoh import Sample
+
+from zsched.clock import monotonic_s
+from zsched.core.events import ProblemReported, SlotDrained, SlotReady, StreamsCounted
+from zsched.core.relay_protocol import RelayReport, SlotLost, TaskEnded, WorkerWatch
+from zsched.core.route.keyexpr import fault, includes, is_wild
+from zsched.core.values.model import MAX_REASON, TaskId
+from zsched.core.values.plan import RoutePhase, RoutePlan
+from zsched.errors import AdapterError
+from zsched.guard import guarded
+from zsched.ipc.protocol import DaemonGone, StreamKeys, StreamsTaken
+from zsched.log_limit import limit_library
+from zsched.relay.streams.acks import Acks
+from zsched.relay.tokens import Tokens
+from zsched.sessions.config import lease_s
+from zsched.sessions.link_sockets import opened
+from zsched.sessions.problems import why_not_open
+from zsched.stream.link import Link, RefusedError, place_of
+from zsched.stream.samples import PLAIN, Given, Received
+from zsched.stream.task import OwnTask
+from zsched.wire.keyspace import Keyspace
+
+COUNT_S: Final = 1.0
+"""Period of the counters."""
+AGAIN_S: Final = 0.2
+"""A relay that is gone is looked for this often."""
+ALONE_S: Final = 10.0
+"""Without a relay the newest plans hold for this long."""
+KNOWN_S: Final = 5.0
+"""A key is known to be a stream's within this time of joining, also while the daemon starts."""
+FED_S: Final = 1.0
+"""A stream whose task has an owner leads there within this time; what is put before would be without a way."""
+FREED_S: Final = 1.0
+"""An application that has just ended is gone from its place within this time."""
+FINISH_S: Final = 2.0
+"""What was put is processed within this time of `Streams.close`, or counted as at most lost."""
+LOOK_S: Final = 0.01
+JOIN_S: Final = 0.3
+CLOSE_S: Final = 0.6
+"""Closing a session towards a stopped peer can take seconds; we wait at most this long."""
+
+_log = logging.getLogger("zsched.streams")
+
+Payload = bytes | bytearray | str | zenoh.ZBytes
+
+
+class Publisher:
+    """One key of the application that a task's input takes; `put` from any thread."""
+
+    def __init__(self, key: str, task: OwnTask, stream: str, closing: threading.Event) -> None:
+        self.key = key
+        self._task, self._stream = task, stream
+        self._closing = closing
+
+    def put(
+        self,
+        payload: Payload,
+        *,
+        attachment: Payload | None = None,
+        encoding: zenoh.Encoding = PLAIN,
+        timestamp: zenoh.Timestamp | None = None,
+    ) -> bool:
+        """Put one sample on its way to the owner; ``False``: it went nowhere (streams closed, or the rule is gone).
+
+        Class ``reliable`` waits while the queue towards the owner is full, and once for a link that has become full.
+        """
+        stream = self._task.input(self._stream)
+        if stream is None or self._closing.is_set():
+            return False
+        given = Given(
+            self.key, _bytes(payload), encoding, None if attachment is None else _bytes(attachment), timestamp
+        )
+        stream.give(cast("Sample", given))
+        return True
+
+
+class Streams:
+    """An application's part of its robot's streams. A context manager: leaving it ends them in order."""
+
+    def __init__(self, path: Path, link: Link) -> None:
+        """Open the session at which workers dial us; `join` is the usual way.
+
+        Raises:
+            AdapterError: the session cannot be opened.
+        """
+        limit_library()
+        self.node = link.node
+        self._path, self._link = path, link
+        self._config = link.session
+        try:
+            self._session = opened(link.session)
+        except (zenoh.ZError, ValueError) as error:
+            link.hang_up()
+            raise AdapterError(f"the streams' session {why_not_open(link.session, error)}") from error
+        self._lock = threading.Lock()
+        self._changed = threading.Condition(self._lock)
+        self._keys: tuple[str, ...] = ()
+        self._taken: frozenset[str] = frozenset()
+        self._callbacks: tuple[tuple[str, Callable[[Received], None]], ...] = ()
+        self._tasks: dict[TaskId, OwnTask] = {}
+        self._drained: deque[SlotDrained] = deque(maxlen=64)
+        """Said again to the next relay, which would wait for it."""
+        self._closing = threading.Event()
+        keyspace = Keyspace(link.fleet)
+        self._acks = Acks(
+            self._session, keyspace, link.node, self._has_worker, lease_s(link.session), is_application=True
+        )
+        self._tokens = Tokens(self._session, keyspace, lambda _seen: None, lambda _node, _ended: None, self._wake)
+        self._thread = guarded(self._run, name="zsched streams")
+        self._thread.start()
+        guarded(self._count, name="zsched counters").start()
+
+    @classmethod
+    def join(
+        cls,
+        *,
+        node: str = "",
+        runtime_dir: Path | None = None,
+        wait_s: float = 10.0,
+        env: Mapping[str, str] = os.environ,
+    ) -> Self:
+        """Join this machine's node, waiting at most ``wait_s`` for its relay.
+
+        ``node`` says which where the machine has several (``ZSCHED_NODE`` too); ``runtime_dir`` is the daemon's.
+
+        Raises:
+            AdapterError: there is no such relay, another application has the streams, or the session cannot be opened.
+        """
+        began = monotonic_s()
+        while True:
+            try:
+                path = place_of(runtime_dir, node or env.get("ZSCHED_NODE", ""), env)
+                return cls(path, Link(path, ()))
+            except AdapterError as error:
+                is_refused = isinstance(error, RefusedError)
+                if monotonic_s() - began >= (FREED_S if is_refused else wait_s):
+                    raise
+            time.sleep(AGAIN_S)
+
+    # --- what an application does ------------------------------------------------------------------------------------
+
+    def publisher(self, key: str) -> Publisher:
+        """A key that an input of a task takes, such as ``robot1/jobs``.
+
+        Raises:
+            ValueError: it is no key without wildcards, or no input rule of this robot takes it.
+        """
+        if (wrong := fault(key)) is not None or is_wild(key):
+            raise ValueError(f"{key!r} is no key that can be published: {wrong or 'it has wildcards'}")
+        self._name(key)
+        until = monotonic_s() + KNOWN_S
+        while monotonic_s() < until:
+            is_told = key in self._taken  # behind the plans
+            for task in tuple(self._tasks.values()) if is_told else ():
+                if (stream := task.input_of(key)) is not None:
+                    task.wait_fed(stream, FED_S)
+                    return Publisher(key, task, stream, self._closing)
+            time.sleep(LOOK_S)
+        self._forget(key)
+        raise ValueError(f"no input rule takes {key!r} on {self.node}: see `inputs` of the fleet file's tasks (`from`)")
+
+    def subscribe(self, key_expr: str, on_sample: Callable[[Received], None]) -> None:
+        """Take the answers under a key that an output of a task has, such as ``robot1/plan``.
+
+        Call it before `publisher`: a worker that is greeted for a ``reliable`` input knows this subscription by then.
+        ``on_sample`` runs in a thread of the output, one answer after another; what it raises is logged.
+
+        Raises:
+            ValueError: it is no key expression, or no output rule of this robot has it.
+        """
+        if (wrong := fault(key_expr)) is not None:
+            raise ValueError(f"{key_expr!r} is no key expression: {wrong}")
+        with self._lock:
+            self._callbacks = (*self._callbacks, (key_expr, on_sample))
+        self._name(key_expr)
+        with self._changed:
+            if self._changed.wait_for(lambda: key_expr in self._taken, KNOWN_S):
+                return
+            self._callbacks = tuple(one for one in self._callbacks if one != (key_expr, on_sample))
+        self._forget(key_expr)
+        raise ValueError(
+            f"no output rule has {key_expr!r} on {self.node}: see `outputs` of the fleet file's tasks (`to`)"
+        )
+
+    def close(self) -> None:
+        """Put the ends behind what was put, wait for it to be processed (`FINISH_S`), and close the session."""
+        if self._closing.is_set():
+            return
+        self._closing.set()
+        tasks = tuple(self._tasks.values())
+        for task in tasks:
+            task.end_inputs()
+        until = monotonic_s() + FINISH_S
+        while any(task.under_way() or not task.has_handed() for task in tasks) and monotonic_s() < until:
+            time.sleep(LOOK_S)
+        self._acks.flush()
+        self._say_counts()
+        self._link.hang_up()
+        self._thread.join(JOIN_S)
+        for task in tasks:
+            task.end()
+        closing = guarded(self._session.close, name="zsched close", is_lasting=False)
+        closing.start()
+        closing.join(CLOSE_S)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    # --- keys --------------------------------------------------------------------------------------------------------
+
+    def _name(self, key: str) -> None:
+        with self._lock:
+            if key in self._keys:
+                return
+            self._keys = (*self._keys, key)
+        self._link.say(StreamKeys(keys=self._keys, pid=os.getpid()))
+
+    def _forget(self, key: str) -> None:
+        with self._lock:
+            self._keys = tuple(one for one in self._keys if one != key)
+        self._link.say(StreamKeys(keys=self._keys, pid=os.getpid()))
+
+    def _deliver(self, received: Received) -> None:
+        for key_expr, on_sample in self._callbacks:
+            if includes(key_expr, received.key):
+                on_sample(received)
+
+    # --- the relay's words -------------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        while not self._closing.is_set():
+            while (word := self._link.read()) is not None:
+                self._take(word)
+            self._link.close()
+            if not self._closing.is_set():
+                self._come_again()
+        self._link.close()
+
+    def _take(self, word: Any) -> None:
+        if isinstance(word, StreamsTaken):
+            with self._changed:
+                self._taken = frozenset(word.keys)
+                self._changed.notify_all()
+        elif isinstance(word, DaemonGone):
+            self._lose_daemon()
+        elif isinstance(word, TaskEnded):
+            if (task := self._tasks.pop(word.task, None)) is not None:
+                task.end()
+        elif isinstance(word, WorkerWatch):
+            self._task(word.task).listen(word.unowned)
+        elif isinstance(word, RoutePlan):
+            self._task(word.task).apply(word)
+
+    def _task(self, name: TaskId) -> OwnTask:
+        task = self._tasks.get(name)
+        if task is None:
+            task = OwnTask(self._session, self.node, name, self._tokens, self._acks, self._report, self._deliver)
+            self._tasks[name] = task
+        return task
+
+    def _lose_daemon(self) -> None:
+        for task in tuple(self._tasks.values()):
+            task.lose_daemon()
+
+    def _come_again(self) -> None:
+        """The relay is gone: look for the next one, and end what nobody tells us of for too long."""
+        self._lose_daemon()
+        alone_since: float | None = monotonic_s()
+        _log.warning("the relay of %s is gone: its plans hold for %g s", self.node, ALONE_S)
+        while not self._closing.wait(AGAIN_S):
+            try:
+                self._link = Link(self._path, self._keys)
+            except AdapterError as error:
+                if alone_since is not None and monotonic_s() - alone_since > ALONE_S:
+                    alone_since = None
+                    _log.warning("%s: nobody tells who owns what: no sample goes out until it comes", error)
+                    for name, task in tuple(self._tasks.items()):
+                        task.apply(RoutePlan(task=name, phase=RoutePhase.CLOSE, current=None))
+                continue
+            if self._link.session != self._config:
+                text = "its session is that of an earlier configuration: start the application again"
+                self._link.say(ProblemReported(source="", problem=text))
+            for drained in tuple(self._drained):
+                self._link.say(drained)
+            _log.warning("the relay of %s is there again", self.node)
+            if self._closing.is_set():
+                self._link.hang_up()
+            return
+
+    # --- what we say -------------------------------------------------------------------------------------------------
+
+    def _report(self, word: RelayReport) -> None:
+        """A task's word (its thread)."""
+        if isinstance(word, SlotDrained):
+            self._drained.append(word)
+        if isinstance(word, SlotDrained | SlotLost | ProblemReported):
+            self._link.say(word)
+        elif isinstance(word, SlotReady) and word.has_token is not None and not word.is_ready:
+            text = f"{word.task}: the owner's worker has no link to the application"
+            _log.warning("%s (does it dial our `listen: {streams}`?)", text)
+            self._link.say(ProblemReported(source="", problem=text[:MAX_REASON]))
+        elif isinstance(word, SlotReady) and word.is_ready:
+            self._link.say(ProblemReported(source="", problem=None))
+
+    def _count(self) -> None:
+        while not self._closing.wait(COUNT_S):
+            self._say_counts()
+
+    def _say_counts(self) -> None:
+        counts = tuple(count for task in tuple(self._tasks.values()) for count in task.counts())
+        self._link.say(StreamsCounted(counts=counts))
+
+    def _has_worker(self, node: str, task: str, incarnation: str) -> bool:
+        return self._tokens.has_worker(node, task, incarnation)
+
+    def _wake(self) -> None:
+        for task in tuple(self._tasks.values()):
+            task.wake()
+
+
+def _bytes(payload: Payload) -> zenoh.ZBytes:
+    return payload if isinstance(payload, zenoh.ZBytes) else zenoh.ZBytes(payload)

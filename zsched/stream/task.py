@@ -1,0 +1,103 @@
+"""The streams of one task that an application has itself: the relay's own code, without what lies between.
+
+Knows: where the application's samples enter and its answers leave. Does not know: slots, moves, numbers
+(`zsched.relay.task` and below), who tells the plans.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Final
+
+from zenoh import Session
+
+from zsched.clock import monotonic_s
+from zsched.core.relay_protocol import RelayReport
+from zsched.core.route.keyexpr import includes
+from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.plan import Route, RoutePlan
+from zsched.relay.graph import GraphMirror
+from zsched.relay.streams.acks import Acks
+from zsched.relay.streams.inputs import InputStream
+from zsched.relay.streams.outputs import OutputStream
+from zsched.relay.task import TaskRelay
+from zsched.relay.tokens import Tokens
+from zsched.stream.hand import Hand
+from zsched.stream.samples import Received
+
+LOOK_S: Final = 0.005
+
+
+class NoGraph(GraphMirror):
+    """The ROS graph is the relay's to mirror: what an application announces itself is there already."""
+
+    def set_routes(self, task: TaskId, routes: tuple[Route, ...]) -> None:
+        """Nothing."""
+
+
+class OwnTask(TaskRelay):
+    """One task's streams in this process."""
+
+    def __init__(
+        self,
+        session: Session,
+        node: NodeId,
+        task: TaskId,
+        tokens: Tokens,
+        acks: Acks,
+        report: Callable[[RelayReport], None],
+        deliver: Callable[[Received], None],
+    ) -> None:
+        """``deliver`` gets every answer, in a thread for each output."""
+        self._deliver = deliver
+        self._has_owner = False
+        self._hands: dict[str, Hand] = {}
+        own_ids = frozenset({str(session.zid())})
+        super().__init__(session, task, tokens, acks, own_ids, report, NoGraph(session, None, node))
+
+    def input(self, stream: str) -> InputStream | None:
+        """An input by its stream's name, as it is now."""
+        return self._inputs.get(stream)
+
+    def input_of(self, key: str) -> str | None:
+        """The name of the input stream that takes a key."""
+        return next((name for name, one in tuple(self._inputs.items()) if includes(one.route.from_expr, key)), None)
+
+    def wait_fed(self, stream: str, timeout_s: float) -> None:
+        """Wait until what is put into an input goes to the owner, where the task has one."""
+        until = monotonic_s() + timeout_s
+        while (source := self.input(stream)) is not None and not source.has_way and monotonic_s() < until:
+            if not self.is_owned:
+                return
+            time.sleep(LOOK_S)
+
+    @property
+    def is_owned(self) -> bool:
+        """Whether the newest plan names an owner, as far as it is told (`apply`)."""
+        return self._has_owner
+
+    def apply(self, plan: RoutePlan) -> None:
+        """Take the newest plan."""
+        self._has_owner = plan.current is not None
+        super().apply(plan)
+
+    def under_way(self) -> int:
+        """How many samples have been taken and not processed, as far as is known."""
+        return sum(source.under_way() for source in tuple(self._inputs.values()))
+
+    def has_handed(self) -> bool:
+        """Whether the callbacks have returned for every answer that has come."""
+        return all(hand.is_empty for hand in tuple(self._hands.values()))
+
+    def end_inputs(self) -> None:
+        """Nothing more will be put."""
+        for source in tuple(self._inputs.values()):
+            source.end()
+
+    def _take_input(self, route: Route) -> InputStream:
+        return InputStream(self._session, route, self._own_ids, None, self._times, is_ours=True)
+
+    def _take_output(self, route: Route) -> OutputStream:
+        way = self._hands[route.stream] = Hand(route, self._deliver)
+        return OutputStream(self._session, route, self._own_ids, self.wake, None, self._times, way)
