@@ -83,15 +83,19 @@ if way == "stream":
     session = Streams.join(runtime_dir=Path(where), node="robot1")
     publisher = session.publisher(key)
     matches = lambda: True
+    is_there = lambda: not any(task.under_way() for task in session._tasks.values())
 else:
     import zenoh
     session = zenoh.open(zenoh.Config.from_json5(where))
     publisher = session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK)
     matches = lambda: publisher.matching_status.matching
+    is_there = lambda: True
 while not matches():
     time.sleep(0.01)
 publisher.put(struct.pack("<dq", time.monotonic(), -1) + bytes(size - 16))
-time.sleep(2.5)  # links are up, the first sample has come
+while not is_there():
+    time.sleep(0.01)
+time.sleep(1.0)  # links are up, the first sample has come
 print("up", flush=True)
 sys.stdin.readline()
 padding, count, end = bytes(size - 16), 0, time.monotonic() + seconds

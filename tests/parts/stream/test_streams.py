@@ -30,6 +30,7 @@ from zsched.core.values.plan import (
     StreamSettings,
     WorkerRole,
 )
+from zsched.core.values.struct import replace
 from zsched.errors import AdapterError
 from zsched.relay.application import Application
 from zsched.relay.streams.inputs import InputStream
@@ -159,6 +160,32 @@ def test_closing_waits_for_what_was_put_and_for_its_answers(bench: Bench) -> Non
             publisher.put(str(number))
     assert back == [str(number).encode() for number in range(50)]
     assert bench.count().acknowledged == 50
+
+
+@pytest.mark.parametrize("stream_class", [StreamClass.BEST_EFFORT, StreamClass.LATEST])
+def test_the_other_classes_arrive_and_a_kept_value_goes_to_the_next_owner(
+    bench: Bench, stream_class: StreamClass
+) -> None:
+    keep_last = 1 if stream_class is StreamClass.LATEST else 0
+    route = replace(IN, settings=StreamSettings(stream_class=stream_class, depth=1000, keep_last=keep_last))
+    bench.application.unowned("t", (route,))
+    bench.application.plan(replace(PLAN, current=replace(SLOT, routes=(route,))))
+    with bench.join() as own:
+        publisher = own.publisher("robot1/front/in")
+        source = own._tasks["t"].input("t/in/0")
+        assert source is not None
+        until(lambda: source.is_matching(1), "the worker subscribes")
+        for number in range(50):
+            publisher.put(str(number))
+        until(lambda: bench.taken and bench.taken[-1] == b"49", "the newest")
+        until(lambda: bench.count().messages == 50 and not bench.count().in_flight, "it is counted")
+        assert unaccounted(bench.count()) == 0
+        del bench.taken[:]
+        bench.application.plan(replace(PLAN, current=replace(SLOT, epoch=2, routes=(route,))))
+        if stream_class is StreamClass.LATEST:
+            until(lambda: bench.taken[:1] == [b"49"], "the kept value, at least once more")
+        publisher.put("50")
+        until(lambda: bench.taken and bench.taken[-1] == b"50", "by the next slot")
 
 
 def test_what_is_put_first_has_a_way_already(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
