@@ -22,7 +22,14 @@ from zsched.commands.ask import CONTROL_PORT, Door, ask_door
 from zsched.commands.common import CliError, Json, nearest, print_json, say, warn
 from zsched.commands.document import InForce, document_text, in_force, status_of
 from zsched.commands.entries import DOCUMENT, HERE
-from zsched.commands.papers import FirstPapers, ask_for_certificate, check_request, papers_for, refuse_open_network
+from zsched.commands.papers import (
+    FirstPapers,
+    ask_for_certificate,
+    check_request,
+    key_to_papers,
+    papers_for,
+    refuse_open_network,
+)
 from zsched.config.editing import add_entries, add_names, is_list
 from zsched.config.load import check_bytes
 from zsched.core.values.document import Document
@@ -285,6 +292,7 @@ def invite(door: Door, view: ApplyView, guest: Guest, file: Path | None) -> int:
     held = in_force(door)
     fleet = _fleet_of(document_text(held))
     check_request(fleet, guest.request, guest.authority)
+    secret = b"" if view.is_plan else key_to_papers(fleet, guest.authority)
     if fleet.security is None and guest.address is not None:
         refuse_open_network((address_of(guest.address).host,), view.accepted)
     if any(node.name == guest.name for node in fleet.nodes):
@@ -295,7 +303,7 @@ def invite(door: Door, view: ApplyView, guest: Guest, file: Path | None) -> int:
         if code != EXIT_OK:
             return code
     if not view.is_plan:
-        _write(_invitation(door, guest), guest, file)
+        _write(_invitation(door, guest, secret), guest, file)
     return EXIT_OK
 
 
@@ -362,7 +370,7 @@ def _with_candidate(text: str, fleet: Fleet, task: str, guest: Guest) -> str:
     return text
 
 
-def _invitation(door: Door, guest: Guest) -> Invitation:
+def _invitation(door: Door, guest: Guest, secret: bytes) -> Invitation:
     """What the node at the door goes by now, with a certificate for the new one."""
     told = ask_door(door, {"verb": "fleet"})
     try:
@@ -373,7 +381,7 @@ def _invitation(door: Door, guest: Guest) -> Invitation:
         raise CliError(EXIT_FAILED, f"{told['node']} does not tell its fleet value: update zsched there") from error
     fleet = _fleet_of(document.text)
     addresses = [dial_endpoint(node.listen_control, node.host) for node in fleet.nodes if node.name != guest.name]
-    papers = papers_for(fleet, guest.name, guest.authority, guest.request)
+    papers = papers_for(fleet, guest.name, guest.authority, guest.request, secret)
     return Invitation(
         node=guest.name,
         value=value,

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 from zsched import paths as places
 from zsched.commands.apply import DANGERS, OPEN_NETWORK
 from zsched.commands.common import CliError, nearest, warn
-from zsched.commands.pki import begin_for, holds_authority, issue_for
+from zsched.commands.pki import begin_for, holds_authority, issue_for, passphrase_for
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId
 from zsched.core.values.words import NAME
@@ -95,15 +95,29 @@ class FirstPapers:
         return f"{said}. To take it offline, {how}; {last}"
 
 
-def papers_for(fleet: Fleet, node: NodeId, authority: Path | None, request: Path | None) -> Papers | None:
+def key_to_papers(fleet: Fleet, authority: Path | None) -> bytes:
+    """What opens the authority's key, asked for before anything is changed; empty: nothing is needed.
+
+    Raises:
+        CliError: nobody types it.
+        AdapterError: it is wrong, or the authority cannot be used.
+    """
+    return b"" if fleet.security is None else passphrase_for(fleet, authority) or b""
+
+
+def papers_for(
+    fleet: Fleet, node: NodeId, authority: Path | None, request: Path | None, secret: bytes
+) -> Papers | None:
     """The certificate of an invited node; ``None``: the fleet has none, or the authority is not on this machine.
+
+    ``secret``: of `key_to_papers`.
 
     Raises:
         AdapterError: the node has a certificate already, or a file cannot be used.
     """
     if fleet.security is None:
         return None
-    issued = issue_for(fleet, node, authority, b"" if request is None else read_request(request))
+    issued = issue_for(fleet, node, authority, secret, b"" if request is None else read_request(request))
     if issued is None:
         advice = f"where it is: zsched pki issue {node}; bring its files to the machine before it starts"
         warn(f"the invitation has no certificate: the fleet's authority is not on this machine; {advice}")

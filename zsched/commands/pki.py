@@ -129,9 +129,28 @@ def holds_authority(fleet: str, given: Path | None) -> Path | None:
     return folder if (folder / RECORD).exists() else None
 
 
-def issue_for(fleet: Fleet, node: str, given: Path | None, request: bytes = b"") -> Issued | None:
+def passphrase_for(fleet: Fleet, given: Path | None) -> bytes | None:
+    """What opens the key of a fleet's authority on this machine (empty: it is not locked); ``None``: there is none.
+
+    Raises:
+        CliError: nobody types it.
+        AdapterError: it is wrong, or the authority cannot be used.
+    """
+    folder = holds_authority(fleet.name, given)
+    if folder is None:
+        return None
+    from zsched.pki.authority import opened  # noqa: PLC0415 - imports cryptography
+
+    with opened(folder, fleet.name) as authority:
+        secret = _passphrase(authority)
+        authority.check(secret)
+    return secret
+
+
+def issue_for(fleet: Fleet, node: str, given: Path | None, secret: bytes, request: bytes = b"") -> Issued | None:
     """The first certificate of a node; ``None``: this machine holds no authority of the fleet.
 
+    ``secret`` opens its key (`passphrase_for`).
     ``request``: a certificate request (PEM) for a key that was made elsewhere; without it there is a new key.
 
     Raises:
@@ -144,7 +163,7 @@ def issue_for(fleet: Fleet, node: str, given: Path | None, request: bytes = b"")
 
     hosts = _check_name(fleet, node, Role.NODE)
     with opened(folder, fleet.name) as authority:
-        return authority.issue(node, Role.NODE, hosts, request, _passphrase(authority), _now())
+        return authority.issue(node, Role.NODE, hosts, request, secret, _now())
 
 
 def renew(where: Where, label: str | None, request: Path | None, out: Path | None) -> int:
@@ -261,7 +280,7 @@ def rotate(where: Where, *, is_end: bool) -> int:
 
     Raises:
         AdapterError: a rotation is under way, or there is none.
-        CliError: certificates of the former authority are left.
+        CliError: certificates of the former authority are left, or nodes do not have theirs of the new one.
     """
     with _opened(where) as (_, authority):
         if not is_end:
@@ -269,21 +288,47 @@ def rotate(where: Where, *, is_end: bool) -> int:
             _say(
                 f"authority {authority.record.number} signs from now on; the former one is trusted until the end",
                 f"1. put {authority.folder / TRUSTED} on every machine as {TRUSTED}: daemons begin anew in turn",
-                "2. `zsched pki renew`: put every new certificate in its place, and wait likewise",
+                "2. `zsched pki renew`: put every new certificate in its place (`--deliver` sends the nodes theirs), and "
+                "wait likewise",
                 f"3. `zsched pki rotate --finish`; put {TRUSTED} on every machine once more",
             )
             return EXIT_OK
-        left = authority.finish()
+        left = authority.left()
         if left:
             names = ", ".join(one.label for one in left)
             raise CliError(
                 EXIT_FAILED, f"the former authority has signed the certificates of {names}: `zsched pki renew` first"
             )
+        _see_delivered(authority)
+        authority.finish()
         _say(
             "the former authority is not trusted any more, and its key is deleted",
             f"next: put {authority.folder / TRUSTED} on every machine as {TRUSTED}: daemons begin anew in turn",
         )
     return EXIT_OK
+
+
+def _see_delivered(authority: Authority) -> None:
+    """Refuse to go on while a node of the fleet has no certificate of the new authority: the others would not know it.
+
+    Raises:
+        CliError: some have not, or do not answer.
+    """
+    told: Json = {}
+    with contextlib.suppress(CliError):
+        door = find_door(None, None)
+        told = ask_door(door, {"verb": "status"})
+    if told.get("fleet") != authority.record.fleet:
+        _say("no daemon of the fleet answers here: nobody has seen whether every node has its new certificate")
+        return
+    members = {str(one["name"]) for one in told["nodes"]}
+    live = [one for one in authority.record.entries if one.revoked is None and one.holder.role is Role.NODE]
+    lacking = [one.label for one in live if one.holder.name in members and not _send(door, one)]
+    if lacking:
+        advice = "bring them, then again; of a machine that never comes back: `zsched pki revoke`"
+        raise CliError(
+            EXIT_FAILED, f"{', '.join(lacking)}: no certificate of the new authority there, so it stays; {advice}"
+        )
 
 
 # --- parts -----------------------------------------------------------------------------------------------------------

@@ -129,6 +129,14 @@ class Authority:
 
     # --- what it does ------------------------------------------------------------------------------------------------
 
+    def check(self, passphrase: bytes) -> None:
+        """See that the key can sign, before anything is changed.
+
+        Raises:
+            AdapterError: it is not there, the passphrase is wrong, or it is another one's.
+        """
+        self._signer(passphrase)
+
     def issue(
         self, name: str, role: Role, hosts: Sequence[str], request: bytes, passphrase: bytes, now: datetime
     ) -> Issued:
@@ -185,27 +193,36 @@ class Authority:
         return entry
 
     def rotate(self, passphrase: bytes, now: datetime) -> None:
-        """Begin with a new authority; the former one stays trusted until `finish`.
+        """Begin with a new authority, whose key gets the same passphrase; the former one stays trusted until `finish`.
 
         Raises:
-            AdapterError: the rotation before it is not finished, or a file cannot be written.
+            AdapterError: the rotation before it is not finished, the passphrase is wrong, or a file cannot be written.
         """
         if self.is_rotating:
             raise AdapterError("the rotation before this one is not finished: `zsched pki rotate --finish` first")
+        self.check(passphrase)  # nobody could open a key that a slip of the hand has locked
         self._found(passphrase, now)
+
+    def left(self) -> tuple[Entry, ...]:
+        """The entries, not revoked, whose certificates are of the former authority.
+
+        Raises:
+            AdapterError: there is no rotation to finish.
+        """
+        if not self.is_rotating:
+            raise AdapterError("there is no rotation to finish")
+        return tuple(one for one in self.record.entries if one.revoked is None and one.authority != self.record.number)
 
     def finish(self) -> tuple[Entry, ...]:
         """End a rotation: only the new authority is trusted.
 
         Returns:
-            The entries, not revoked, whose certificates are of the former one; with any of them nothing is done.
+            What is `left`; with any of them nothing is done.
 
         Raises:
             AdapterError: there is no rotation to finish, or a file cannot be written.
         """
-        if not self.is_rotating:
-            raise AdapterError("there is no rotation to finish")
-        left = tuple(one for one in self.record.entries if one.revoked is None and one.authority != self.record.number)
+        left = self.left()
         if not left:
             former = self._folder / key_name(self.record.number - 1)
             self._save(replace(self.record, trusted=self.record.trusted[:1]))

@@ -480,6 +480,21 @@ def test_a_request_that_cannot_be_answered_changes_nothing(node: Node, tmp_path:
     assert not (tmp_path / "x").exists()
 
 
+def test_a_wrong_passphrase_invites_nobody(node: Node, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ZSCHED_AUTHORITY_PASSPHRASE", "secret")
+    secured(tmp_path, node)
+    words = ("invite", "robot2", "--address", "192.0.2.12", "--yes", "-o", tmp_path / "robot2.invite")
+    monkeypatch.setenv("ZSCHED_AUTHORITY_PASSPHRASE", "secrte")
+    refused = run(*words)
+    assert refused.exit_code == 1
+    assert "the passphrase is wrong" in refused.stderr
+    assert node.changes == []
+    monkeypatch.setenv("ZSCHED_AUTHORITY_PASSPHRASE", "secret")
+    done = run(*words)
+    assert done.exit_code == 0, done.stderr
+    assert len(node.changes) == 1
+
+
 def test_another_machines_certificate_is_left_as_it_is(node: Node, tmp_path: Path) -> None:
     secured(tmp_path, node)
     node.states["robot2"] = node.states["robot4"] = "gone"
@@ -516,6 +531,6 @@ def test_a_file_on_stdout_with_a_key_is_for_its_owner_only(
         monkeypatch.setattr("sys.stdout", out)
         from zsched.commands.ask import find_door
 
-        membership._write(membership._invitation(find_door(None, None), guest), guest, None)
+        membership._write(membership._invitation(find_door(None, None), guest, b""), guest, None)
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
     assert decode_invitation(file.read_bytes()).papers is not None

@@ -177,3 +177,46 @@ def test_a_rotation_ends_once_everything_is_renewed(here: Path) -> None:
     assert (here / "robot1" / "ca.pem").read_text().count("BEGIN CERTIFICATE") == 2
     pki("rotate", "--finish")
     assert (here / "authority" / "ca.pem").read_text().count("BEGIN CERTIFICATE") == 1
+
+
+def test_a_rotation_does_not_end_while_a_node_has_no_certificate_of_the_new_authority(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The others would trust the former one no more, and cut it off."""
+    told: Json = {"fleet": "yard", "nodes": [{"name": "robot1"}, {"name": "robot2"}]}
+    outcomes = {"robot1": "unchanged", "robot2": "invalid"}
+
+    def answer(request: Json) -> Json:
+        if request["verb"] == "status":
+            return told
+        return {"outcome": outcomes[request["node"]], "detail": "as it is", "revision": None}
+
+    pki("init")
+    for name in ("robot1", "robot2"):
+        pki("issue", name)
+    pki("rotate")
+    pki("renew")
+    monkeypatch.setenv("ZSCHED_RUNTIME_DIR", str(here))
+    with closing(OperatorSocket(here / "robot1.sock", answer)) as door:
+        door.open()
+        refused = pki("rotate", "--finish", code=1)
+        assert "robot2: no certificate of the new authority there" in refused.stderr
+        assert (here / "authority" / "ca.pem").read_text().count("BEGIN CERTIFICATE") == 2
+        assert (here / "authority" / "ca-1.key").exists()
+        told["nodes"] = told["nodes"][:1]  # robot2 has left the fleet
+        pki("rotate", "--finish")
+    assert (here / "authority" / "ca.pem").read_text().count("BEGIN CERTIFICATE") == 1
+
+
+def test_a_daemon_of_another_fleet_is_not_asked_at_the_end_of_a_rotation(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def answer(request: Json) -> Json:
+        return {"status": {"fleet": "hall", "nodes": []}}[request["verb"]]
+
+    pki("init")
+    pki("rotate")
+    monkeypatch.setenv("ZSCHED_RUNTIME_DIR", str(here))
+    with closing(OperatorSocket(here / "robot1.sock", answer)) as door:
+        door.open()
+        assert "no daemon of the fleet answers here" in pki("rotate", "--finish").stdout

@@ -172,6 +172,19 @@ def test_an_entry_is_due_after_two_thirds_of_its_life(authority: Authority) -> N
     assert entry.is_due(begun, 2)
 
 
+def test_a_rotation_by_a_mistyped_passphrase_changes_nothing(tmp_path: Path) -> None:
+    """The next key would be locked by it, and nobody knows it."""
+    folder = tmp_path / "locked"
+    create(folder, "yard", b"secret", NOW)
+    with opened(folder, "yard") as locked:
+        with pytest.raises(AdapterError, match="the passphrase is wrong"):
+            locked.rotate(b"secrte", NOW)
+        assert locked.record.number == 1
+        locked.rotate(b"secret", NOW)
+        locked.issue("robot1", Role.NODE, (), b"", b"secret", NOW)
+    assert sorted(path.name for path in folder.glob("*.key")) == [key_name(1), key_name(2)]
+
+
 def test_a_rotation_trusts_both_until_no_certificate_is_of_the_former(authority: Authority) -> None:
     issue(authority)
     issue(authority, "ana", Role.OPERATOR)
