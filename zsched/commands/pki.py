@@ -39,6 +39,8 @@ RECORD: Final = "authority.json"
 """What is in every authority's folder."""
 PASSPHRASE: Final = "ZSCHED_AUTHORITY_PASSPHRASE"
 MAX_BYTES: Final = 1 << 20
+SENT, HAD = "ok", "unchanged"
+"""How a node answers to its certificate."""
 DUE, REVOKED, ENDED, VALID = "due", "revoked", "ended", "valid"
 
 
@@ -218,20 +220,19 @@ def deliver(where: Where, door: Door, label: str | None) -> int:
             authority.renew(one, None, b"", secret, _now())
         newest = [entry for one in named if (entry := authority.record.entry(one.label)) is not None]
     results = [_send(door, entry) for entry in newest if entry.holder.name in members]
-    return EXIT_OK if all(results) else EXIT_FAILED
+    return EXIT_OK if all(one in (SENT, HAD) for one in results) else EXIT_FAILED
 
 
-def _send(door: Door, entry: Entry) -> bool:
-    """Send a node its certificate; whether it has it now."""
+def _send(door: Door, entry: Entry) -> str:
+    """Send a node its certificate: `SENT`, `HAD` (it had it before), or why not."""
     there = Door(socket=door.socket, node=entry.holder.name)
     try:
         answer = ask_door(there, {"verb": "certificate", "certificate": entry.certificate})
     except CliError as error:
         warn(f"{entry.label}: {error}")
-        return False
-    outcome = str(answer["outcome"])
+        return "silent"
     _say(f"{entry.label}: {answer['detail']}")
-    return outcome in ("ok", "unchanged")
+    return str(answer["outcome"])
 
 
 def show(where: Where, *, is_json: bool) -> int:
@@ -288,8 +289,8 @@ def rotate(where: Where, *, is_end: bool) -> int:
             _say(
                 f"authority {authority.record.number} signs from now on; the former one is trusted until the end",
                 f"1. put {authority.folder / TRUSTED} on every machine as {TRUSTED}: daemons begin anew in turn",
-                "2. `zsched pki renew`: put every new certificate in its place (`--deliver` sends the nodes theirs), and "
-                "wait likewise",
+                "2. `zsched pki renew`: put every new certificate in its place, and wait likewise; `--deliver` sends the "
+                "nodes theirs",
                 f"3. `zsched pki rotate --finish`; put {TRUSTED} on every machine once more",
             )
             return EXIT_OK
@@ -323,12 +324,14 @@ def _see_delivered(authority: Authority) -> None:
         return
     members = {str(one["name"]) for one in told["nodes"]}
     live = [one for one in authority.record.entries if one.revoked is None and one.holder.role is Role.NODE]
-    lacking = [one.label for one in live if one.holder.name in members and not _send(door, one)]
-    if lacking:
+    results = {one.label: _send(door, one) for one in live if one.holder.name in members}
+    if lacking := [label for label, result in results.items() if result not in (SENT, HAD)]:
         advice = "bring them, then again; of a machine that never comes back: `zsched pki revoke`"
         raise CliError(
             EXIT_FAILED, f"{', '.join(lacking)}: no certificate of the new authority there, so it stays; {advice}"
         )
+    if sent := [label for label, result in results.items() if result == SENT]:
+        raise CliError(EXIT_FAILED, f"{', '.join(sent)}: sent just now; again once the daemon there has begun anew")
 
 
 # --- parts -----------------------------------------------------------------------------------------------------------

@@ -203,6 +203,9 @@ def test_a_rotation_does_not_end_while_a_node_has_no_certificate_of_the_new_auth
         assert "robot2: no certificate of the new authority there" in refused.stderr
         assert (here / "authority" / "ca.pem").read_text().count("BEGIN CERTIFICATE") == 2
         assert (here / "authority" / "ca-1.key").exists()
+        outcomes["robot2"] = "ok"
+        assert "robot2: sent just now; again once" in pki("rotate", "--finish", code=1).stderr
+        outcomes["robot2"] = "invalid"
         told["nodes"] = told["nodes"][:1]  # robot2 has left the fleet
         pki("rotate", "--finish")
     assert (here / "authority" / "ca.pem").read_text().count("BEGIN CERTIFICATE") == 1
