@@ -289,8 +289,8 @@ def rotate(where: Where, *, is_end: bool) -> int:
             _say(
                 f"authority {authority.record.number} signs from now on; the former one is trusted until the end",
                 f"1. put {authority.folder / TRUSTED} on every machine as {TRUSTED}: daemons begin anew in turn",
-                "2. `zsched pki renew`: put every new certificate in its place, and wait likewise; `--deliver` sends the "
-                "nodes theirs",
+                "2. `zsched pki renew`: put every new certificate in its place, and wait likewise "
+                "(with --deliver the nodes get theirs by themselves)",
                 f"3. `zsched pki rotate --finish`; put {TRUSTED} on every machine once more",
             )
             return EXIT_OK
