@@ -264,6 +264,7 @@ class TaskRelay:
         for sink in self._outputs.values():
             sink.look_after()
         self._services.look_after()
+        self._acks.stalled.buffers.look()
         if self._leaving is not None:
             self._leave_when_still(self._leaving)
         elif self._resume_by is not None:

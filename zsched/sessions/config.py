@@ -16,13 +16,14 @@ import json
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final
 
+from zsched.core.hop.room import SMALL
 from zsched.core.values.fleet import LocalMode, LocalSide, Timing, WorkerLink
 
 if TYPE_CHECKING:
     import zenoh
 
-DATA_SEND_BUFFER: Final = 65536
-"""Kernel send buffer of data links in bytes: bounds what lies between a publisher and a slow radio."""
+DATA_SEND_BUFFER: Final = SMALL
+"""Kernel send buffer of data links in bytes at first: bounds what lies between a publisher and a slow radio."""
 CONTROL_MAX_MESSAGE: Final = 1 << 20
 """Largest control message a peer may make us assemble, bytes (zenoh's default is 1 GiB)."""
 CONTROL_KEEP_ALIVE: Final = 3

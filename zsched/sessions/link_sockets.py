@@ -5,15 +5,16 @@ about a slow receiver.
 
 zenoh tells nobody that a receiver takes nothing: a put waits, or drops, in silence. The kernel knows it for every link:
 whether there is room in its send buffer, and how many bytes the other end has taken. The descriptors are zenoh's; they
-are only looked at, but for `cut`, `hold` and `abort`, which look twice, and `hold_back_silent`. zenoh's admin space
-names subscribers; but a question to it from within its own process stops for ever when somebody declares something at
-the same moment (1.10.2).
+are only looked at, but for `cut`, `hold`, `abort` and `set_send_buffer`, which look twice, and `hold_back_silent`.
+zenoh's admin space names subscribers; but a question to it from within its own process stops for ever when somebody
+declares something at the same moment (1.10.2).
 """
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
+import fcntl
 import re
 import select
 import socket
@@ -25,6 +26,7 @@ from typing import Final
 import zenoh
 from zenoh import Session
 
+from zsched.core.hop.room import LARGE, OWN, Account
 from zsched.core.values.struct import Struct
 
 SILENT_S: Final = 3600
@@ -38,6 +40,18 @@ _BYTES_ACKED_AT: Final = 120
 _LAST_DATA_RECV: Final = struct.Struct("<I")
 _LAST_DATA_RECV_AT: Final = 52
 """Where ``tcpi_last_data_recv`` stands there, in ms."""
+_TCP_INFO_BYTES: Final = 152
+"""Up to ``tcpi_min_rtt`` (4.6 and later)."""
+_MIN_RTT: Final = struct.Struct("<I")
+_MIN_RTT_AT: Final = 148
+"""Where ``tcpi_min_rtt`` stands there, in us; all ones: not measured."""
+_INT: Final = struct.Struct("=i")
+_UNMEASURED: Final = 0xFFFFFFFF
+_SIOCOUTQ: Final = 0x5411
+"""How much of what was written is not acknowledged (tcp(7))."""
+_SO_BUF_LOCK: Final = 72
+"""Which buffers the kernel may not size by itself (5.15 and later)."""
+_SNDBUF_LOCKED: Final = 1
 _ADDRESS: Final = re.compile(r"(?:tcp|tls)/\[?([^\]#?]+)\]?:(\d+)")
 _NEVER: Final = 1 << 30
 _NOBODY: Final = struct.pack("=H14x", socket.AF_UNSPEC)
@@ -72,6 +86,38 @@ class LinkSocket(Struct, frozen=True):
         with contextlib.suppress(OSError, struct.error), _borrowed(self.fd) as held:
             return int(value.unpack_from(held.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, at + value.size), at)[0])
         return 0
+
+    def account(self) -> Account | None:
+        """What TCP has counted about the link; ``None``: it is gone, or the kernel does not count it."""
+        with contextlib.suppress(OSError, struct.error), _borrowed(self.fd) as held:
+            if _ends_of(held) != self.ends:
+                return None
+            told = held.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _TCP_INFO_BYTES)
+            round_trip = _MIN_RTT.unpack_from(told, _MIN_RTT_AT)[0]
+            return Account(
+                acked=_BYTES_ACKED.unpack_from(told, _BYTES_ACKED_AT)[0],
+                held=_INT.unpack(fcntl.ioctl(held, _SIOCOUTQ, bytes(_INT.size)))[0],
+                round_trip_s=0.0 if round_trip == _UNMEASURED else round_trip / 1e6,
+            )
+        return None
+
+    def send_buffer(self) -> int:
+        """The size of its send buffer as it was asked for, in bytes; 0: the kernel's own, or the link is gone."""
+        with contextlib.suppress(OSError), _borrowed(self.fd) as held:
+            if _ends_of(held) == self.ends and _is_set(held):
+                return held.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF) // 2  # the kernel doubles it, socket(7)
+        return 0
+
+    def set_send_buffer(self, size: int) -> bool:
+        """Make its send buffer so large, in bytes (`OWN`: as the kernel likes); what it holds stays."""
+        with contextlib.suppress(OSError), _borrowed(self.fd) as held:
+            if _ends_of(held) == self.ends:
+                if size == OWN and _can_unset(held):
+                    held.setsockopt(socket.SOL_SOCKET, _SO_BUF_LOCK, 0)
+                else:
+                    held.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, size or 2 * LARGE)
+                return True
+        return False
 
     def cut(self) -> bool:
         """End the connection; ``False`` when the descriptor is another one's by now."""
@@ -172,6 +218,19 @@ def _borrowed(fd: int) -> Iterator[socket.socket]:
         yield held
     finally:
         held.detach()
+
+
+def _can_unset(held: socket.socket) -> bool:
+    """Whether the kernel knows how to size a buffer by itself again."""
+    with contextlib.suppress(OSError):
+        held.getsockopt(socket.SOL_SOCKET, _SO_BUF_LOCK)
+        return True
+    return False
+
+
+def _is_set(held: socket.socket) -> bool:
+    """Whether somebody has set the send buffer's size; an older kernel does not tell."""
+    return not _can_unset(held) or bool(held.getsockopt(socket.SOL_SOCKET, _SO_BUF_LOCK) & _SNDBUF_LOCKED)
 
 
 def _ends_of(held: socket.socket) -> _Ends:

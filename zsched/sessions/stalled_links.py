@@ -8,6 +8,8 @@ it waits. zenoh ends a link whose lease is over; but it first takes back what is
 that put has given up: 5 s, longer with every fragment of a large sample, and on when the receiver is awake again
 (1.10). A link that ends while its lease still holds lets the put go at once. So the link is ended here, before. What it
 held is not lost: it is kept until it is acknowledged, and sent again.
+
+While anything is put, its thread also sizes the links' send buffers (`zsched.sessions.link_buffers`).
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ from zenoh import Session
 
 from zsched.clock import monotonic_s
 from zsched.guard import guarded
+from zsched.sessions.link_buffers import LinkBuffers
 from zsched.sessions.link_sockets import LinkSocket, LinkSockets, with_room
 
 SILENT_RATIO: Final = 0.7
@@ -45,6 +48,8 @@ class StalledLinks(contextlib.AbstractContextManager[None]):
         """
         self._full_s = full_s
         self._sockets = LinkSockets(session)
+        self.buffers = LinkBuffers(session)
+        """Of the same links."""
         self._silent_s = SILENT_RATIO * lease_s
         self._puts: dict[int, float] = {}
         """{thread: since when it puts}."""
@@ -64,6 +69,11 @@ class StalledLinks(contextlib.AbstractContextManager[None]):
 
     def __exit__(self, *_: object) -> None:
         self._puts.pop(threading.get_ident(), None)
+
+    @property
+    def is_resting(self) -> bool:
+        """Whether nothing was put for a while, so that nobody looks."""
+        return not self._wake.is_set()
 
     def close(self) -> None:
         """End the thread."""
@@ -86,6 +96,7 @@ class StalledLinks(contextlib.AbstractContextManager[None]):
             elif now - busy_at > REST_S:
                 self._rest()
                 busy_at = monotonic_s()
+            self.buffers.look()
             self._look(now)
 
     def _rest(self) -> None:

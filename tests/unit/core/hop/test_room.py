@@ -1,0 +1,175 @@
+"""`zsched.core.hop.room`: a fast link's buffer grows, a thin radio's stays small, whatever else goes by it."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from zsched.core.hop.room import AHEAD_S, LARGE, MAX_PAUSE_S, OWN, PAUSE_S, SLOW_TIMES, SMALL, Account, Room
+
+LOOK_S = 0.05
+MBIT = 1e6 / 8
+BOUNDLESS = 4 << 20
+"""What a buffer that the kernel sizes may hold."""
+
+
+class Link:
+    """A link that takes ``rate`` bytes a second behind a buffer; puts wait for room."""
+
+    def __init__(self, rate: float, round_trip_s: float = 0.0005) -> None:
+        self.room = Room()
+        self.rate, self.round_trip_s = rate, round_trip_s
+        self.acked = self.unsent = 0.0
+        self.now = 0.0
+        self.sizes = [SMALL]
+
+    @property
+    def holds(self) -> float:
+        return min(self.unsent, BOUNDLESS if self.room.size == OWN else self.room.size)
+
+    def put(self, size: int) -> None:
+        self.unsent += size
+
+    def run(self, seconds: float, look_s: float = LOOK_S) -> None:
+        for _ in range(round(seconds / look_s)):
+            limit = BOUNDLESS if self.room.size == OWN else self.room.size
+            rate = min(self.rate, limit / self.round_trip_s)
+            taken = min(self.unsent, rate * look_s)
+            self.unsent -= taken
+            self.acked += taken
+            self.now += look_s
+            seen = Account(acked=int(self.acked), held=int(self.holds), round_trip_s=self.round_trip_s)
+            self.sizes.append(self.room.look(seen, self.now))
+
+    @property
+    def largest(self) -> float:
+        return max(math.inf if size == OWN else size for size in self.sizes)
+
+
+def test_a_fast_links_buffer_grows_to_the_kernels_own_in_a_few_samples() -> None:
+    link = Link(rate=10_000 * MBIT)
+    for _ in range(6):
+        link.put(1 << 20)
+        link.run(0.1)
+    assert link.room.size == OWN
+
+
+def test_a_large_sample_now_and_then_is_enough_though_looks_are_far_apart() -> None:
+    link = Link(rate=10_000 * MBIT)
+    for _ in range(6):
+        link.put(1 << 20)
+        link.run(1.0, look_s=1.0)
+    assert link.room.size == OWN
+
+
+def test_small_samples_in_between_that_wait_for_their_acknowledgement_change_nothing() -> None:
+    link = Link(rate=10_000 * MBIT)
+    for _ in range(20):
+        link.put(1 << 20)
+        for _ in range(4):
+            link.run(LOOK_S)
+            link.put(4096)
+    assert link.room.size == OWN
+
+
+@pytest.mark.parametrize("mbit", [1, 5, 20])
+def test_a_thin_links_buffer_stays_small_under_maps(mbit: float) -> None:
+    link = Link(rate=mbit * MBIT, round_trip_s=0.002)
+    link.put(64 << 20)
+    link.run(10.0)
+    assert link.largest == SMALL
+
+
+def test_a_thin_link_that_looks_fast_for_a_moment_is_found_out_and_left_alone_for_longer_each_time() -> None:
+    link = Link(rate=20 * MBIT, round_trip_s=0.002)
+    larger_s = 0.0
+    for _ in range(100):
+        link.put(200_000)  # 80 ms of the link
+        link.run(0.1)
+    for _ in range(100):
+        link.put(250_000)  # all that it takes, and a little more
+        link.run(0.1)
+        larger_s += 0.1 * (link.room.size != SMALL)
+    assert link.largest <= 4 * SMALL
+    assert link.room.size == SMALL
+    assert larger_s < 2.0
+
+
+@pytest.mark.parametrize(("mbit", "expected"), [(40, SMALL), (60, 2 * SMALL), (110, 4 * SMALL), (250, LARGE)])
+def test_a_link_in_between_holds_what_it_takes_in_time(mbit: float, expected: int) -> None:
+    link = Link(rate=mbit * MBIT)
+    link.put(1 << 30)
+    link.run(10.0)
+    assert link.room.size == expected
+    assert expected / link.rate <= AHEAD_S
+
+
+def test_a_link_that_becomes_thin_gets_a_small_buffer_within_few_looks() -> None:
+    link = Link(rate=10_000 * MBIT)
+    for _ in range(6):
+        link.put(1 << 20)
+        link.run(0.1)
+    assert link.room.size == OWN
+    link.rate = 20 * MBIT
+    link.put(4 << 20)
+    link.run(LOOK_S * (SLOW_TIMES + 1))
+    assert link.room.size == SMALL
+
+
+def test_a_receiver_that_stands_still_gets_a_small_buffer() -> None:
+    link = Link(rate=10_000 * MBIT)
+    link.put(64 << 20)
+    link.run(1.0)
+    link.rate = 0.0
+    link.put(4 << 20)
+    link.run(LOOK_S * (SLOW_TIMES + 1))
+    assert link.room.size == SMALL
+
+
+def test_one_pause_makes_no_buffer_smaller() -> None:
+    link = Link(rate=10_000 * MBIT)
+    for _ in range(6):
+        link.put(1 << 20)
+        link.run(0.1)
+    rate, link.rate = link.rate, 0.0
+    link.put(1 << 20)
+    link.run(2 * LOOK_S)
+    link.rate = rate
+    link.run(LOOK_S)
+    assert link.room.size == OWN
+
+
+def test_a_long_way_gets_a_buffer_for_what_is_under_way() -> None:
+    link = Link(rate=100 * MBIT, round_trip_s=0.3)
+    link.put(1 << 30)
+    link.run(20.0)
+    assert link.room.size == OWN
+
+
+def test_after_a_pause_it_grows_again_and_the_pause_begins_short_once_the_link_was_fast() -> None:
+    room = Room()
+    grown: list[float] = []
+    now, acked = 0.0, 0
+    for _ in range(3):
+        while room.size == SMALL:
+            now, acked = now + LOOK_S, acked + 200_000
+            room.look(Account(acked=acked, held=0, round_trip_s=0.0), now)
+        grown.append(now)
+        for _ in range(SLOW_TIMES + 1):
+            now += LOOK_S
+            room.look(Account(acked=acked, held=2 * SMALL, round_trip_s=0.0), now)
+        assert room.size == SMALL
+    first, second = grown[1] - grown[0], grown[2] - grown[1]
+    assert PAUSE_S <= first < 2 * PAUSE_S <= second < 4 * PAUSE_S < MAX_PAUSE_S
+    while room.size != OWN:
+        now, acked = now + LOOK_S, acked + (4 << 20)
+        room.look(Account(acked=acked, held=0, round_trip_s=0.0), now)
+    for _ in range(SLOW_TIMES + 1):
+        now += LOOK_S
+        room.look(Account(acked=acked, held=2 * SMALL, round_trip_s=0.0), now)
+    shrunk = now
+    while room.size == SMALL:
+        now, acked = now + LOOK_S, acked + 200_000
+        room.look(Account(acked=acked, held=0, round_trip_s=0.0), now)
+    assert now - shrunk < 2 * PAUSE_S
