@@ -1,8 +1,8 @@
 """What certificates, access rules and signatures cost: a secured fleet beside the same one in plain text, in one run.
 
-``python -m benchmarks.secured [--rounds 3] [--hops 200] [--idle 10]``. Two fleets of two robots and two edges on one
-machine, `reliable` streams; the one that is not measured stands still (SIGSTOP). The round trip is that of an
-application on robot1's local side: relay, owner's worker, relay. A commit is `zsched weights`, until the answer. A
+``python -m benchmarks.secured [--rounds 3] [--hops 200] [--takeovers 1] [--idle 10]``. Two fleets of two robots and two
+edges on one machine, `reliable` streams; the one that is not measured stands still (SIGSTOP). The round trip is that of
+an application on robot1's local side: relay, owner's worker, relay. A commit is `zsched weights`, until the answer. A
 takeover: the owner is killed, until the first answer to a message that was sent afterwards. CPU is a robot's daemon and
 relay, of one core. At the end robot1 of the secured fleet gets a renewed certificate, and begins anew while a 100 Hz
 stream runs.
@@ -40,6 +40,7 @@ from zsched_lab.fleet.testbed import TASK, Json, Testbed, TestbedError, echo_fle
 ROBOT, KIB, MIB = "robot1", 1 << 10, 1 << 20
 OPTIONS: dict[str, Any] = {"robots": 2, "edges": 2, "stream_class": "reliable"}
 DIGITS = 12
+REST_S = 3.0
 PLAIN, SECURED = "plain", "secured"
 
 
@@ -148,13 +149,9 @@ def measure(bed: Testbed, figures: Figures, given: argparse.Namespace) -> None:
             figures.hops[size] += [one for one in taken if one is not None]
         for number in range(given.commits):
             figures.commits.append(commit(bed, 0.5 if number % 2 else 0.25))
-        bed.wait_settled()
-        owner = bed.owner()
-        assert owner is not None
-        app.until_answered()
-        began = time.monotonic()
-        bed.kill(owner)
-        figures.takeovers.append(1000 * (app.until_answered() - began))
+        for _ in range(given.takeovers):
+            bed.wait_whole()
+            figures.takeovers.append(takeover(bed, app))
     finally:
         app.close()
     bed.wait_whole()
@@ -162,6 +159,16 @@ def measure(bed: Testbed, figures: Figures, given: argparse.Namespace) -> None:
     before = cpu_s(bed)
     time.sleep(given.idle)
     figures.cpu.append(100 * (cpu_s(bed) - before) / given.idle)
+
+
+def takeover(bed: Testbed, app: Application) -> float:
+    """Milliseconds from the end of the owner's processes to the first answer to a message that was sent afterwards."""
+    time.sleep(REST_S)
+    owner = bed.wait_settled()
+    app.until_answered()
+    began = time.monotonic()
+    bed.kill(owner)
+    return 1000 * (app.until_answered() - began)
 
 
 def commit(bed: Testbed, cpu: float) -> float:
@@ -220,6 +227,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--hops", type=int, default=200)
     parser.add_argument("--commits", type=int, default=20)
+    parser.add_argument("--takeovers", type=int, default=1, help="in each round")
     parser.add_argument("--idle", type=float, default=10.0)
     given = parser.parse_args()
     print(machine())
