@@ -113,7 +113,8 @@ class LinkSocket(Struct, frozen=True):
         with contextlib.suppress(OSError), _borrowed(self.fd) as held:
             if _ends_of(held) == self.ends:
                 if size == OWN and _can_unset(held):
-                    held.setsockopt(socket.SOL_SOCKET, _SO_BUF_LOCK, 0)
+                    others = held.getsockopt(socket.SOL_SOCKET, _SO_BUF_LOCK) & ~_SNDBUF_LOCKED
+                    held.setsockopt(socket.SOL_SOCKET, _SO_BUF_LOCK, others)
                 else:
                     held.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, size or 2 * LARGE)
                 return True

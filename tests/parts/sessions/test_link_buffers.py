@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -24,6 +25,7 @@ from zsched_lab.fleet import netns
 WHY_NOT = netns.why_not()
 MIB = 1 << 20
 PORT = 7458
+SO_BUF_LOCK, RCVBUF_LOCKED = 72, 2
 LISTENER = """
 import sys, zenoh
 session = zenoh.open(zenoh.Config.from_json5(sys.argv[1]))
@@ -138,6 +140,16 @@ def test_a_link_that_was_dialled_by_gossip_begins_small_too() -> None:
         buffers = LinkBuffers(session)
         buffers.look()
         assert link.send_buffer() == SMALL
+
+
+def test_the_receive_buffer_stays_as_the_operator_has_set_it() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server, socket.create_connection(server.getsockname()) as ours:
+        ours.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 20_000)
+        ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SMALL)
+        link = LinkSocket("zid", (ours.getsockname(), ours.getpeername()), ours.fileno())
+        assert link.set_send_buffer(OWN)
+        assert link.send_buffer() == OWN
+        assert ours.getsockopt(socket.SOL_SOCKET, SO_BUF_LOCK) == RCVBUF_LOCKED
 
 
 def test_a_session_that_rests_is_not_looked_at_by_anybody() -> None:
