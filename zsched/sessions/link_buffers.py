@@ -23,7 +23,8 @@ from zsched.sessions.link_sockets import LinkSocket, LinkSockets
 LOOK_S: Final = 0.04
 """A look that comes sooner than this after another one does nothing..."""
 REST_S: Final = 0.25
-"""...or than this, when no link has taken so much as a small buffer holds since the look before."""
+"""...or than this, when for `CALM_S` no link has taken so much as a small buffer holds between two looks."""
+CALM_S: Final = 1.0
 
 _log = logging.getLogger("zsched.streams")
 
@@ -38,12 +39,13 @@ class LinkBuffers:
         """``None``: its buffer is not ours to size."""
         self._acked: dict[LinkSocket, int] = {}
         self._looked_at = 0.0
-        self._is_at_rest = False
+        self._moved_at = 0.0
         self._lock = threading.Lock()
 
     def look(self, *, at_once: bool = False) -> None:
         """See how fast each link has been, and size its buffer; ``at_once``: however soon after the look before."""
-        now, pause_s = monotonic_s(), REST_S if self._is_at_rest else LOOK_S
+        now = monotonic_s()
+        pause_s = REST_S if now - self._moved_at > CALM_S else LOOK_S
         if (now - self._looked_at < pause_s and not at_once) or not self._lock.acquire(blocking=False):
             return
         try:
@@ -57,15 +59,14 @@ class LinkBuffers:
     def _look(self, now: float) -> None:
         rooms, self._rooms = self._rooms, {}
         before, self._acked = self._acked, {}
-        self._is_at_rest = True
         for link in self._sockets.links():
             room = self._rooms[link] = rooms[link] if link in rooms else _room(link)
             account = None if room is None else link.account()
             if room is None or account is None:
                 continue
             self._acked[link] = account.acked
-            is_moving = account.acked - before.get(link, account.acked) >= SMALL or account.held > SMALL // 2
-            self._is_at_rest &= not is_moving
+            if account.acked - before.get(link, account.acked) >= SMALL or account.held > SMALL // 2:
+                self._moved_at = now
             size = room.size
             if room.look(account, now) != size and link.set_send_buffer(room.size):
                 told = "the kernel's own size" if room.size == OWN else f"{room.size} bytes"

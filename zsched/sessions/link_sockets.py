@@ -109,12 +109,16 @@ class LinkSocket(Struct, frozen=True):
         return 0
 
     def set_send_buffer(self, size: int) -> bool:
-        """Make its send buffer so large, in bytes (`OWN`: as the kernel likes); what it holds stays."""
+        """Make its send buffer so large, in bytes; what it holds stays.
+
+        `OWN`: as the kernel likes, for what is under way, and 1 MiB for what has not been sent.
+        """
         with contextlib.suppress(OSError), _borrowed(self.fd) as held:
             if _ends_of(held) == self.ends:
                 if size == OWN and _can_unset(held):
                     others = held.getsockopt(socket.SOL_SOCKET, _SO_BUF_LOCK) & ~_SNDBUF_LOCKED
                     held.setsockopt(socket.SOL_SOCKET, _SO_BUF_LOCK, others)
+                    held.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, 2 * LARGE)
                 else:
                     held.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, size or 2 * LARGE)
                 return True

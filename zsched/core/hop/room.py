@@ -26,7 +26,9 @@ AHEAD_S: Final = 0.02
 STALE_S: Final = 0.6
 """Of looks that are further apart (beyond two round trips) nobody knows what was between."""
 SLOW_TIMES: Final = 2
-"""A buffer shrinks when its link was too slow for it so many times, and not fast enough in between."""
+"""A buffer shrinks when its link was too slow for it so many looks in succession..."""
+BACKLOG_S: Final = 0.7
+"""...or since its buffer began to hold something all the time, this long ago. TLS and lost packets pause for 0.4 s."""
 PAUSE_S, MAX_PAUSE_S = 2.0, 64.0
 """After it shrank it grows by steps no sooner; twice as long each time."""
 
@@ -50,6 +52,9 @@ class Room:
         self.size = SMALL
         """In bytes, or `OWN`."""
         self._last: tuple[Account, float] | None = None
+        self._backlog: tuple[int, float] | None = None
+        """(acknowledged then, since when the buffer was never nearly empty)."""
+        self._has_paused = False
         self._slow = 0
         self._grows_at = 0.0
         self._pause_s = PAUSE_S
@@ -65,20 +70,45 @@ class Room:
         self._last = seen, now
         acked = seen.acked - last.acked
         is_close = passed_s <= STALE_S + 2 * seen.round_trip_s
-        if is_close and last.held > SMALL // 2 and (acked < last.held or seen.held > SMALL // 2):
-            self._fit(acked / passed_s, seen.round_trip_s, now)
+        had_backlog = is_close and last.held > SMALL // 2
+        has_paused, self._has_paused = self._has_paused, had_backlog and acked == 0
+        if self._is_backlog(seen, now, had_backlog=had_backlog):
+            return self.size
+        if had_backlog and (acked < last.held or seen.held > SMALL // 2):
+            if not self._has_paused and not has_paused:  # else it says how long the pause was
+                self._fit_twice(_fitting(acked / passed_s, seen.round_trip_s), now)
+                return self.size
         elif acked >= 2 * self.size and self.size != OWN and now >= self._grows_at:
-            self._grow(OWN if self.size >= LARGE else 2 * self.size)
+            shown = _fitting(acked / passed_s, seen.round_trip_s)  # it is at least so fast
+            self._grow(max(OWN if self.size >= LARGE else 2 * self.size, shown, key=_order))
+        self._slow = 0
         return self.size
 
-    def _fit(self, rate: float, round_trip_s: float, now: float) -> None:
-        """The link had something to send all the time, and took so many bytes a second."""
-        wanted = _fitting(rate, round_trip_s)
+    def _is_backlog(self, seen: Account, now: float, *, had_backlog: bool) -> bool:
+        """Whether the buffer has just been fitted to what went out of it for `BACKLOG_S` and two round trips."""
+        if seen.held <= SMALL // 2:
+            self._backlog = None
+            return False
+        if self._backlog is None or not had_backlog:
+            self._backlog = seen.acked, now
+            return False
+        acked, since = self._backlog
+        if now - since < BACKLOG_S + 2 * seen.round_trip_s:
+            return False
+        self._backlog = seen.acked, now
+        self._fit(_fitting((seen.acked - acked) / (now - since), seen.round_trip_s), now)
+        return True
+
+    def _fit_twice(self, wanted: int, now: float) -> None:
+        if _order(wanted) < _order(self.size) and self._slow + 1 < SLOW_TIMES:
+            self._slow += 1
+        else:
+            self._fit(wanted, now)
+
+    def _fit(self, wanted: int, now: float) -> None:
+        """The link had something to send all the time, and this is the size for what it took."""
         if _order(wanted) >= _order(self.size):
             self._grow(wanted)
-            return
-        self._slow += 1
-        if self._slow < SLOW_TIMES:
             return
         self.size, self._slow = wanted, 0
         self._grows_at = now + self._pause_s
