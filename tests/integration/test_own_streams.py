@@ -268,7 +268,7 @@ def test_a_real_fleet_moves_and_restarts_its_daemon_under_an_application(tmp_pat
     with Testbed(tmp_path, tree) as bed:
         bed.init()
         bed.start()
-        first = bed.wait_settled()
+        first = bed.wait_whole()
         other = "edge2" if first == "edge1" else "edge1"
         with Streams.join(runtime_dir=tmp_path) as streams:
             own = Own(streams, attachment=None)
@@ -279,7 +279,7 @@ def test_a_real_fleet_moves_and_restarts_its_daemon_under_an_application(tmp_pat
             at = len(own.back)
             bed.wait(lambda: len(own.back) > at + 40, 30, "answers without a daemon")
             bed.start("robot1")
-            bed.wait_settled()
+            bed.wait_whole()
             move(bed, first)
             own.halt(thread)
             bed.wait(lambda: len(own.back) >= own.sent, 30, f"all answers: {len(own.back)} of {own.sent}")

@@ -102,10 +102,15 @@ class Application:
         self._is_orphaned = False
 
     def open(self, data_session: str) -> None:
-        """Let an application in, whose session is made of ours (its configuration); a problem is reported."""
+        """Let an application in, whose session is made of ours (its configuration); a problem is reported.
+
+        Nothing where no application may have streams itself.
+        """
+        if self._path is None:
+            return
         is_first = not self._session
         self._session = application_config(data_session, self._listen)
-        if self._path is None or not is_first:
+        if not is_first:
             with self._lock:
                 if self._link is not None:
                     self._link.hang_up()  # it comes again, for another session

@@ -477,8 +477,7 @@ def run(
         members_of(config),
         application,
     )
-    if streams is not None:
-        application.open(config)
+    application.open(config)
     give_back()
     successors = None if door is None else Successors(socket.socket(fileno=door), me, reopens=has_local_side)
     wakeups, parent = _signals_wake(), os.getppid()
