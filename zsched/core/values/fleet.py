@@ -475,7 +475,7 @@ _PATHS = frozenset({("Fleet", "zenoh_config"), ("LinkSpec", "value"), ("Security
 
 _LATER = frozenset(
     {("Weights", "gauges"), ("Demand", "gpu"), ("TaskSpec", "gauge_limits"), ("TaskSpec", "rollout")}
-    | {("Fleet", "cells")}
+    | {("Fleet", "cells"), ("NodeSpec", "listen_streams")}
     | {("Tuning", name) for name in (*TUNED_RULES, *TUNED_LINKS)}
 )
 """Fields that came later: left out where they say nothing, so that nodes of two versions see the same file."""
