@@ -39,7 +39,8 @@ def turns(
 
     A new node counts as soon as it hears a majority of the electors. So only one turn of others comes before them, one
     elector goes with it, and the new node waits for at most as many turns as a majority of the electors has, in a fleet
-    of any size. In one turn are fewer robots than would be missed in a vote, and never all candidates of a task.
+    of any size. In one turn are fewer robots than would be missed in a vote, and never all candidates of a task. Each
+    elector comes before the same others in every node's order, whomever that one hears.
 
     Args:
         nodes: that live.
@@ -53,8 +54,10 @@ def turns(
     """
     most = max((len(robots) - 1) // 2, 1)
     singly, others = sorted(set(nodes).intersection(electors)), sorted(set(nodes).difference(electors))
-    # The last one: an operator often commands the machine that founded the fleet, and may give it the next command.
-    waves = [[singly.pop()]] if others and len(singly) >= LEAST_ELECTORS else []
+    # The last of all, not of those that live: nodes that hear others must not take two of them for the first.
+    # The last one, since operators often command the machine that founded the fleet.
+    last = max(electors) if len(electors) >= LEAST_ELECTORS else None
+    waves = [[singly.pop()]] if last in singly else []
     for name in others:
         fitting = (wave for wave in waves if _fits(name, wave, nodes, tasks))
         wave = next((one for one in fitting if name not in robots or len(set(robots) & {*one, name}) <= most), None)

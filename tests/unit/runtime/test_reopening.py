@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 from zsched.core.executor.sparing import Sparing
 from zsched.runtime.reopening import FIRST_S, LONGEST_WAIT_S, OWNER_S, SETTLE_S, TURN_S, Moved, Reopening, turns
 
@@ -40,6 +42,18 @@ def test_one_turn_of_others_and_an_elector_comes_first_so_a_new_node_waits_as_lo
     assert large[4] in order[0], "two more, and three of five know the new rules"
     assert len(order) <= 4 + 3, "the other nineteen take as many turns as votes and tasks ask for"
     assert sorted(name for wave in order for name in wave) == large
+
+
+def test_electors_have_the_same_order_whomever_a_node_hears() -> None:
+    """Two nodes may hear others in the moment of the change: no two electors may think that they come first."""
+    electors = ("e1", "e2", "e3", "e4")
+    others = ("n1", "n2")
+    whole = [name for wave in turns((*electors, *others), electors) for name in wave if name in electors]
+    for count in range(1, len(electors) + 1):
+        for heard in combinations(electors, count):
+            for more in ((), others):
+                order = [name for wave in turns((*heard, *more), electors) for name in wave if name in electors]
+                assert order == [name for name in whole if name in heard]
 
 
 def test_a_turn_leaves_a_majority_of_the_robots_and_a_candidate_of_every_task() -> None:
