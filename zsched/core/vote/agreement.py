@@ -175,11 +175,11 @@ class Agreement:
         self._asked_at: dict[tuple[NodeId, bool], float] = {}
         """{(peer, whether for a newer revision): when}: news of votes must not delay a question about revisions."""
         self._awaited = 0, -math.inf
-        """(fleet revision that a peer was asked for, until when no other peer is asked for it)."""
+        """(highest fleet revision that a peer was asked for, until when no other peer is asked for it)."""
         self._said = 0, -math.inf
         """(newest fleet revision that everybody was told, when)."""
         self._changing = 0, -math.inf
-        """(newest number whose electors were not settled, since when that is known here)."""
+        """(highest number that was heard while electors were not settled, since when)."""
         self._read_at: dict[TaskId, float] = {}
         self.leases = Leases(
             fleet=fleet,
@@ -859,19 +859,21 @@ class Agreement:
         """Whether a peer is asked later how often it has voted: the electors change just now.
 
         Each of them votes several times in such a change. It is asked after `VOTES_WAIT_S` at the latest; whom this
-        elector has not asked since it started, at once.
+        elector has not asked since it started, at once. So is it once a higher number was heard: a beat is anybody's
+        word, and numbers by turns must not begin the time again.
         """
         number = max(beat.number, self.number)
         if (number == self.number and self.unsettled is None) or not self.witness.has_asked(beat.node):
             return False
-        if self._changing[0] != number:
+        if number > self._changing[0]:
             self._changing = number, now
-        return now < self._changing[1] + VOTES_WAIT_S
+        return number == self._changing[0] and now < self._changing[1] + VOTES_WAIT_S
 
     def _is_unasked(self, revision: int, now: float) -> bool:
         """Whether a fleet revision is newer than the learnt one, and no peer was asked for it just now.
 
-        That holds others up once for each revision: a beat is anybody's word, and must not keep a node from learning.
+        That holds others up once for each revision, and for none that is lower than one asked for before: a beat is
+        anybody's word, and must not keep a node from learning.
         """
         asked, until = self._awaited
         return revision > self.fleet_revision and (revision != asked or now >= until)
@@ -908,7 +910,7 @@ class Agreement:
         if now - self._asked_at.get((peer, is_behind), -math.inf) < every_s:
             return
         self._asked_at[peer, is_behind] = now
-        if of_fleet > self.fleet_revision and of_fleet != self._awaited[0]:
+        if of_fleet > max(self.fleet_revision, self._awaited[0]):
             self._awaited = of_fleet, now + ASK_LEARNT_EVERY_S
         todo.add(do.AskLearnt(peer=peer, deadline_s=self._fleet.timing.ballot_s))
 

@@ -362,6 +362,19 @@ def test_forged_beats_do_not_keep_a_node_from_asking_for_a_fleet_value() -> None
     assert asked.count("robot2") >= 3
 
 
+def test_forged_words_of_two_revisions_do_not_keep_a_node_from_asking_either() -> None:
+    """In a silent peer's name, by turns: each revision holds others up once, whatever was told in between."""
+    one, asked = elector_of_a_change(has_accepted=False), []
+    for step in range(10):
+        for revision, at in ((CHANGED.revision + 1, 0.0), (CHANGED.revision, 0.06)):
+            word = Learnt(node="robot3", values=(), fleet=replace(CHANGED, revision=revision))
+            agreed(one.on_learnt, ev.LearntReceived(learnt=word), 100.0 + 0.2 * step + at)
+        heard = beat_of("robot2", fleet_revision=CHANGED.revision, number=CHANGED.number)
+        todo = agreed(one.compare, heard, 100.1 + 0.2 * step)
+        asked += [it.peer for it in todo.send if isinstance(it, do.AskLearnt)]
+    assert asked.count("robot2") >= 3
+
+
 def test_while_the_electors_change_they_are_not_asked_how_often_they_have_voted_but_not_for_long() -> None:
     one = elector_of_a_change()
     agreed(one.on_ballots, settling(), 100.0)
@@ -371,6 +384,19 @@ def test_while_the_electors_change_they_are_not_asked_how_often_they_have_voted_
     one.witness._answered.discard("robot3")
     heard = beat_of("robot3", fleet_revision=CHANGED.revision, number=CHANGED.number)
     assert agreed(one.compare, heard, 100.2).send != [], "it has just started, and has to know"
+
+
+def test_beats_of_two_numbers_do_not_keep_a_node_from_asking_how_often_others_have_voted() -> None:
+    """Who is behind may hear others that are, and others that are not; or a stranger's beats between the real ones."""
+    one, asked = elector_of_a_change(), []
+    agreed(one.on_ballots, settling(), 100.0)
+    for step in range(10):
+        now = 100.0 + 0.4 * step
+        for name, number, votes in (("robot2", CHANGED.number, 7 + step), ("robot3", CHANGED.number + 1 + step % 3, 9)):
+            heard = beat_of(name, votes=votes, fleet_revision=CHANGED.revision, number=number)
+            todo = agreed(one.compare, heard, now)
+            asked += [(it.peer, step) for it in todo.send if isinstance(it, do.AskLearnt)]
+    assert {step for name, step in asked if name == "robot2"} >= set(range(3, 10)), "each time that it has voted"
 
 
 def test_the_word_goes_behind_the_questions_that_bring_the_fleet_value() -> None:
