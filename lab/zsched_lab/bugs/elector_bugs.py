@@ -248,7 +248,7 @@ ELECTOR_BUGS: tuple[Bug, ...] = (
     _numbers_bug(
         "an elector grants to a beat of another number",
         LEASE,
-        ("accepted.get(task) if self._counts_like_us(beat) else None", "accepted.get(task)"),
+        ("if self._grants and self._counts_like_us(beat) else None", "if self._grants else None"),
     ),
     _numbers_bug(
         "an echo of another number counts",

@@ -13,6 +13,8 @@ own.
   its echo of that number never counts. It grants the real, lower numbers again once they are believed
   (`zsched.core.sequence`).
 * Electors grant only a task that is *leased* for everybody (`Allocation.leased`, `zsched.core.executor.sealing`).
+* A node that is no elector grants nothing, even where its name has a seat (of a disk that it has lost). Nobody would
+  wait for such a grant to end.
 * An elector never grants to two owners, or to two lives of one, at once: to another only after the hold or a release.
 * An elector that granted refuses an accept for another owner until L(1+rho)/(1-rho) after its last grant on its own
   clock, or until the owner released. An elector that has just started does so for the same time with every owner but
@@ -313,6 +315,8 @@ class Leases:
     lease_s: float = field(init=False)
     is_in_doubt: bool = False
     """This node's clock is in doubt: it holds and grants nothing."""
+    _grants: bool = field(init=False)
+    """Whether this node is an elector: its name alone may have a seat, that of another disk."""
     _others: dict[NodeId, str] = field(default_factory=dict)
     """{node: its terms} of the nodes whose terms differ from ours."""
     _granters: dict[TaskId, Granter] = field(init=False)
@@ -322,7 +326,7 @@ class Leases:
     def __post_init__(self) -> None:
         self.terms = lease_terms(self.fleet)
         self.electors, self.lease_s = self.fleet.electors, self.fleet.timing.lease_s
-        self._granters = {}
+        self._granters, self._grants = {}, bool(self.standing)
         for task in self.fleet.tasks:
             value = self.standing.get(task.name)
             is_leased = task.exclusive or (value is not None and value.leased)
@@ -391,6 +395,7 @@ class Leases:
             granter.lease_s = lease_s  # a grant of before is remembered with its own length
         for holder in self._holders.values():
             holder.count_with(electors, lease_s)
+        self._grants = bool(standing)  # what was granted before stays remembered
         if standing:
             self.standing = standing
         for task, value in standing.items():
@@ -405,7 +410,7 @@ class Leases:
             standing: as at the start, by the tasks of ``fleet``.
             now: monotonic seconds. What an earlier time here may have granted of a task that comes is over in a lease.
         """
-        self.fleet, self.standing = fleet, standing
+        self.fleet, self.standing, self._grants = fleet, standing, bool(standing)
         leased = {task.name for task in fleet.tasks if task.exclusive}
         leased |= {task for task, value in standing.items() if value is not None and value.leased}
         until = math.inf if self.is_in_doubt else now + hold_s(max(self.lease_s, self.granted_s))
@@ -541,7 +546,7 @@ class Leases:
         """This node's beat ``number`` leaves: its parts about leases."""
         for holder in self._holders.values():
             holder.on_sent(number, now)
-        echoes = [granter.echo(now) for granter in self._granters.values()]
+        echoes = [granter.echo(now) for granter in self._granters.values()] if self._grants else []
         asked = [granter.asked_to_leave(now) for granter in self._granters.values()]
         return BeatParts(
             echoes=tuple(echo for echo in echoes if echo is not None),
@@ -555,7 +560,7 @@ class Leases:
         """A beat came, or our own left: grant, count echoes, note who must leave. Whether to beat at once."""
         is_new = False
         for task, granter in self._granters.items():
-            owned = accepted.get(task) if self._counts_like_us(beat) else None
+            owned = accepted.get(task) if self._grants and self._counts_like_us(beat) else None
             is_new |= granter.on_beat(beat, owned, now, is_newest=is_newest)
         if beat.lease_terms == self.terms:
             self._others.pop(beat.node, None)

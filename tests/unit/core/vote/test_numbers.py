@@ -317,6 +317,30 @@ def test_an_owner_of_another_generation_is_granted_nothing_though_number_and_epo
     assert bool(elector.on_sent(1, 10.0).echoes) is grants
 
 
+def test_who_is_no_elector_any_more_grants_nothing_and_still_knows_what_it_has_granted() -> None:
+    """Its name may have a seat yet: another disk's."""
+    elector = renumbered(leases())
+    assert elector.on_beat(beat(2), OWNERS, 10.0)
+    elector.count_with(ROBOTS, terms="t/3", number=3, lease_s=L, standing={})
+    assert not elector.on_beat(beat(3, sequence=6), OWNERS, 10.1)
+    assert elector.on_sent(1, 10.1).echoes == ()
+    renumbered(elector, 4)
+    assert not elector.may_accept("merge", "robot3", 10.0 + hold_s(L) - 0.01)
+    assert elector.may_accept("merge", "robot3", 10.0 + hold_s(L))
+
+
+@pytest.mark.parametrize(("disk", "grants"), [("d1", True), ("e0", False)])
+def test_a_node_that_starts_grants_only_for_a_seat_of_its_own_disk(*, disk: str, grants: bool) -> None:
+    """A lost disk's seat is still its name's until it is given up; a new generation may begin meanwhile."""
+    seats = tuple(replace(one, disk=disk) if one.name == "robot1" else one for one in WITH_EDGE.electors)
+    one = make(replace(WITH_EDGE, electors=seats))
+    assert one.is_elector is grants
+    after = 100.0 + hold_s(L) + 0.01
+    heard = replace(beat(one.number), lease_terms=one.leases.terms)
+    assert one.leases.on_beat(heard, OWNERS, after) is grants
+    assert bool(one.leases.on_sent(1, after).echoes) is grants
+
+
 def test_another_generation_with_the_same_number_is_counted_anew() -> None:
     one = renumbered(leases())
     one.count_with(("robot1",), terms="u/2", number=2, lease_s=L, standing={"merge": HELD})
