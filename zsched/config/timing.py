@@ -26,7 +26,7 @@ WAN: Final = replace(
     decide_s=1.0,
     gather_s=0.5,
     ballot_s=1.0,
-    stagger_s=0.3,  # over 150 ms each way the next proposer has heard of the first one by then, and gives way
+    stagger_s=0.6,  # over 150 ms each way the first proposer has committed by then; two that meet need seconds
     lease_s=3.0,
 )
 PROFILES: Final[Mapping[str, Timing]] = {profile.name: profile for profile in (WIRED, WIFI, WAN)}

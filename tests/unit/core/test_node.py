@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from dataclasses import fields, is_dataclass, replace
 from random import Random
@@ -24,14 +23,12 @@ from zsched.core.membership.identity import QUIET_S
 from zsched.core.membership.knocking import KNOCKERS_KEPT, SHOWN_AFTER_S
 from zsched.core.node import Node
 from zsched.core.status import build_snapshot
-from zsched.core.todo import ToDo
 from zsched.core.values.document import Text
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import CREATION_STEP
 from zsched.core.values.fleet import StreamRule, TaskSpec, WorkerSpec, electorate_hash
 from zsched.core.values.messages import (
     Accept,
-    Ballots,
     CommandOutcome,
     Learnt,
     Prepare,
@@ -57,7 +54,6 @@ from zsched.core.values.model import (
     WorkerState,
 )
 from zsched.core.values.plan import Direction, ReadyWhen, RoutePhase, WorkerRole
-from zsched.core.vote.voting import Voting
 
 T = TypeVar("T")
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
@@ -159,38 +155,6 @@ def digest(thing: Any, seen: frozenset[int] = frozenset()) -> Any:
     names += [name for name in getattr(type(thing), "__slots__", ()) if hasattr(thing, name)]
     skipped = {"counters", "frames_dropped_at", "knocking", "_handlers", "fleet", "_fleet"}
     return {name: digest(getattr(thing, name), seen) for name in names if name not in skipped}
-
-
-# --- two that commit one winner --------------------------------------------------------------------------------------
-
-
-def with_a_winner(node: Node) -> Voting:
-    """It, and another robot, have voted for edge1."""
-    for voter in (node.me, "robot1"):
-        paper = proposal_of(voter, "edge1", task="merge", base_revision=0)
-        node.votes.absorb(paper, node.registers["merge"].value, node.membership.states(), ToDo(), 100.0)
-    return node.votes.tasks["merge"]
-
-
-@pytest.mark.parametrize("is_batch", [False, True])
-def test_a_voter_that_promises_anothers_ballot_lets_it_commit(*, is_batch: bool) -> None:
-    node = started("robot2")
-    voting, asked = with_a_winner(node), prepare(9, "robot1")
-    due = voting.commit_at
-    assert voting.commit is not None
-    assert due < math.inf
-    both = ev.BallotsAsked(request=1, asker="robot1", ballots=Ballots(prepares=(asked.prepare,)))
-    node.handle(both if is_batch else asked, 100.0)
-    assert voting.commit_at == pytest.approx(due + FLEET.timing.ballot_s)
-
-
-def test_a_refused_ballot_holds_no_commit_back() -> None:
-    node = started("robot2")
-    node.handle(prepare(9, "robot3"), 90.0)
-    voting = with_a_winner(node)
-    due = voting.commit_at
-    node.handle(prepare(5, "robot1"), 100.0)
-    assert voting.commit_at == due < math.inf
 
 
 # --- strangers -------------------------------------------------------------------------------------------------------

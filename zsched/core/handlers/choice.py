@@ -5,7 +5,7 @@ Knows: which stage takes each of them, and when a decision may be needed. Does n
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any, Final
 
 from zsched.core import events as ev
@@ -14,7 +14,6 @@ from zsched.core.executor.workers import failed_workers, given_away
 from zsched.core.handlers.beats import on_twins
 from zsched.core.stages import Handler, Stages
 from zsched.core.todo import ToDo
-from zsched.core.values.messages import Prepare
 from zsched.core.values.model import Proposal
 from zsched.core.values.struct import replace
 
@@ -122,7 +121,6 @@ def _is_ours(node: Stages, proposal: Proposal) -> bool:
 
 def _on_prepare(node: Stages, event: ev.PrepareAsked, todo: ToDo, now: float) -> None:
     node.agreement.on_prepare(event, todo, now)
-    _give_way(node, (event.prepare,), now)
 
 
 def _on_accept(node: Stages, event: ev.AcceptAsked, todo: ToDo, now: float) -> None:
@@ -135,15 +133,6 @@ def _on_answer(node: Stages, event: ev.ElectorAnswered, todo: ToDo, now: float) 
 
 def _on_ballots(node: Stages, event: ev.BallotsAsked, todo: ToDo, now: float) -> None:
     node.agreement.on_ballots(event, todo, now)
-    _give_way(node, event.ballots.prepares, now)
-
-
-def _give_way(node: Stages, prepares: Iterable[Prepare], now: float) -> None:
-    """Two nodes that commit one winner would end each other's ballots, and try again after a back-off."""
-    for prepare in prepares:
-        register = node.registers.get(prepare.task)
-        if register is not None and prepare.ballot.node != node.me and register.state.promised == prepare.ballot:
-            node.votes.give_way(prepare.task, now)
 
 
 def _on_votes(node: Stages, event: ev.VotesReceived, todo: ToDo, now: float) -> None:

@@ -94,11 +94,6 @@ class Votes:
         due = ((name, voting.take_commit(now)) for name, voting in self.tasks.items())
         return [(name, change) for name, change in due if change is not None]
 
-    def give_way(self, task: TaskId, now: float) -> None:
-        """Another node's ballot on this task has just got our promise."""
-        if task in self.tasks:
-            self.tasks[task].give_way(now)
-
     def on_commit_ended(self, task: TaskId) -> None:
         """Our change was committed, overtaken or given up: votes may be called again."""
         if task in self.tasks:  # it may have left the fleet file

@@ -7,7 +7,6 @@ of a robot's proposal (`zsched.core.scheduler.rounds`), the count's rules (`tall
 The first proposal for a move *opens* a vote and so calls all other robots to it. A robot that has proposed within
 `vote_time` has already answered. A proposal is fresh for the same time: twice a gather, since an answer may take a
 whole gather when a peer is frozen. The winner's voters commit it, staggered by rank, so that usually one suffices.
-Where a commit takes longer than the stagger, a voter that has just promised another one's ballot gives way to it, once.
 """
 
 from __future__ import annotations
@@ -51,8 +50,6 @@ class Voting:
         self.commit_at = math.inf
         self.awaited_until = -math.inf
         """A vote on a move was won: until when its value should be learnt."""
-        self._other_until = -math.inf
-        """Another one's ballot is under way, at most until then; ours would only end it."""
         self.adopt(fleet)
 
     def adopt(self, fleet: Fleet) -> None:
@@ -141,18 +138,9 @@ class Voting:
         if self._me not in supporters or counted.winner is None:
             return
         self.commit = MoveOwner(base_revision=allocation.revision, owner=counted.winner, reason=fresh[self._me].reason)
-        rank = supporters.index(self._me)
-        self.commit_at = max(now, self._other_until) + self._timing.stagger_s * rank
+        self.commit_at = now + self._timing.stagger_s * supporters.index(self._me)
 
     # --- the commit ----------------------------------------------------------------------------------------------
-
-    def give_way(self, now: float) -> None:
-        """Another node's ballot on this task has just got our promise: a commit of ours waits for its outcome, once."""
-        if now < self._other_until:
-            return
-        self._other_until = now + self._timing.ballot_s
-        if self.commit is not None and self.commit_at < math.inf:
-            self.commit_at += self._timing.ballot_s
 
     def take_commit(self, now: float) -> MoveOwner | None:
         """The change that is due now; it is handed out once."""
@@ -164,13 +152,11 @@ class Voting:
     def end_commit(self) -> None:
         """Our change was committed, overtaken or given up: votes may be called again."""
         self.commit, self.commit_at, self.awaited_until = None, math.inf, -math.inf
-        self._other_until = -math.inf
 
     def on_learnt(self) -> None:
         """A newer revision is known: drop proposals on older bases, and a commit that is not handed out yet."""
         self.proposals.clear()
         self.opened_at, self.awaited_until = None, -math.inf
-        self._other_until = -math.inf
         if self._first_call_at is not None:
             self.called_at, self._first_call_at = self._first_call_at, None
         if self.commit is not None and self.commit_at < math.inf:

@@ -68,41 +68,6 @@ def test_a_majority_ends_it_and_its_voters_commit_in_turn_once() -> None:
     assert voting.next_deadline() == math.inf
 
 
-def won(voting: Voting, now: float) -> None:
-    voting.absorb(paper("robot3"), VALUE, now)
-    voting.absorb(paper("robot2"), VALUE, now)
-    assert voting.count(VALUE, ALL, now) is not None
-
-
-@pytest.mark.parametrize("is_before", [False, True])
-def test_who_has_promised_anothers_ballot_gives_way_to_its_commit_once(*, is_before: bool) -> None:
-    voting, timing = Voting(FLEET, "robot3"), FLEET.timing
-    if is_before:  # the other one has counted first
-        voting.give_way(10.0)
-    won(voting, 10.0)
-    for again in (0.0, timing.ballot_s / 2):
-        voting.give_way(10.0 + again)
-    assert voting.commit_at == pytest.approx(10.0 + timing.ballot_s + timing.stagger_s)
-    assert voting.take_commit(10.0 + timing.ballot_s) is None
-    assert voting.take_commit(voting.commit_at) is not None, "the other one has failed"
-
-
-def test_what_was_under_way_before_the_value_delays_no_later_commit() -> None:
-    voting = Voting(FLEET, "robot3")
-    voting.give_way(10.0)
-    voting.on_learnt()
-    won(voting, 10.0)
-    assert voting.commit_at == pytest.approx(10.0 + FLEET.timing.stagger_s)
-
-
-def test_a_commit_that_the_register_has_is_not_held_back() -> None:
-    voting = Voting(FLEET, "robot3")
-    won(voting, 10.0)
-    assert voting.take_commit(11.0) is not None
-    voting.give_way(11.0)
-    assert voting.take_commit(99.0) is None
-
-
 def test_what_nobody_completes_ends_with_its_time_and_old_papers_do_not_count() -> None:
     voting = Voting(FLEET, "robot1")
     voting.absorb(paper("robot2"), VALUE, 10.0)
