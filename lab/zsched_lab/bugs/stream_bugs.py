@@ -49,8 +49,8 @@ STREAM_BUGS = (
     _bug(
         "a new lane does not wait for its greeting's answer",
         OUTLET,
-        "if greetings.is_waiting and not greetings.greet(len(self._lanes)):\n                return False",
-        "if greetings.is_waiting:\n                greetings.greet(len(self._lanes))",
+        "if greetings.is_waiting and not (greets and greetings.greet(len(self._lanes))):\n                return False",
+        "if greetings.is_waiting and greets:\n                greetings.greet(len(self._lanes))",
         _GREETINGS,
     ),
     _bug(
