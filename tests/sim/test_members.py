@@ -67,6 +67,28 @@ def test_an_invited_machine_starts_blank_with_the_generation_s_id_and_a_disk_of_
     assert state.disk not in {play.disk(name) for name in play.sim.machines if name != "robot5"}
 
 
+@pytest.mark.parametrize("is_elector", [True, False])
+def test_a_machine_that_was_started_before_its_lost_disk_is_initialised_runs_with_the_new_state(
+    *, is_elector: bool
+) -> None:
+    """No command writes a state under a daemon: its lock is held, so its operator stops it first."""
+    play = Play()
+    play.adopt()
+    members = members_of(play)
+    machine = play.sim.machines["robot3" if is_elector else "edge1"]
+    play.sim.crash(machine.key)
+    machine.disk.wipe()
+    machine.is_durable = False
+    play.sim.start(machine.key)
+    members.calm()
+    members.start_all()
+    node, state = play.sim.node(machine.key), play.sim.disk(machine.key)
+    assert state is not None
+    held = node.agreement.to_persist(play.sim.now)
+    assert held is not None
+    assert (held.disk, held.incarnation) == (state.disk, state.incarnation)
+
+
 def test_a_majority_that_is_lost_for_good_is_recovered_and_the_dead_are_taken_out() -> None:
     play = Play()
     play.adopt()

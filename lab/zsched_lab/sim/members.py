@@ -334,6 +334,9 @@ class Members:
         return False
 
     def _write_state(self, machine: Machine, state: DurableState) -> None:
+        """As every command that writes a state: the operator has stopped the daemon, which locks the folder."""
+        if machine.node is not None:
+            self.sim.crash(machine.key)
         machine.disk.write(state)
         machine.disk.sync()
 
