@@ -251,6 +251,11 @@ ELECTOR_BUGS: tuple[Bug, ...] = (
         ("if self._grants and self._counts_like_us(beat) else None", "if self._grants else None"),
     ),
     _numbers_bug(
+        "an elector by the agreed value alone grants at its start",
+        LEASE,
+        ("math.inf if self.is_in_doubt else self.over_at", "math.inf if self.is_in_doubt else -math.inf"),
+    ),
+    _numbers_bug(
         "an echo of another number counts",
         LEASE,
         ("beat.lease_terms == self.terms and self._counts_like_us(beat)", "beat.lease_terms == self.terms"),

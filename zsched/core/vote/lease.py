@@ -400,7 +400,7 @@ class Leases:
             self.standing = standing
         for task, value in standing.items():
             if task not in self._granters and value is not None and value.leased:
-                self._watch(task, value.owner, math.inf if self.is_in_doubt else -math.inf)
+                self._watch(task, value.owner, math.inf if self.is_in_doubt else self.over_at)
 
     def adopt(self, fleet: Fleet, standing: Mapping[TaskId, Allocation | None], now: float) -> None:
         """Take the exclusive tasks from ``fleet``, with the same electors and length of leases.

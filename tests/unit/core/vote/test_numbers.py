@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from random import Random
+from types import MappingProxyType
 from typing import TypeVar
 
 import pytest
@@ -19,7 +21,7 @@ from zsched.core.todo import ToDo
 from zsched.core.values.change import MoveOwner
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import FleetValue
-from zsched.core.values.fleet import TaskSpec
+from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.messages import Accept, Accepted, Learnt, Prepare, Promise, Refusal, Refused
 from zsched.core.values.model import NO_BALLOT, Acceptance, Allocation, Ballot, Beat, Grant, RegisterState
 from zsched.core.vote.agreement import Agreement
@@ -39,7 +41,14 @@ WITH_EDGE = AddElector(base_revision=2, name="edge1", disk="ed").apply(replace(A
 WITHOUT_ROBOT1 = RemoveElector(base_revision=2, name="robot1").apply(replace(ADOPTED, settled=True))
 
 
-def make(fleet_value: FleetValue | None = None, *, me: str = "robot1", has_state: bool = True) -> Agreement:
+def make(
+    fleet_value: FleetValue | None = None,
+    *,
+    me: str = "robot1",
+    has_state: bool = True,
+    registers: tuple[RegisterState, ...] = (),
+    stored: Mapping[str, Fleet] = MappingProxyType({"0d": FLEET}),
+) -> Agreement:
     held = None if fleet_value is None else RegisterState(task=FLEET.name, learnt=fleet_value)
     state = DurableState(
         fleet=FLEET.name,
@@ -50,6 +59,7 @@ def make(fleet_value: FleetValue | None = None, *, me: str = "robot1", has_state
         electorate="e",
         disk="d1",
         fleet_register=held,
+        registers=registers,
     )
     agreement = Agreement(
         fleet=FLEET,
@@ -59,7 +69,7 @@ def make(fleet_value: FleetValue | None = None, *, me: str = "robot1", has_state
         electorate="e",
         rng=Random(1),
         now=100.0,
-        stored={"0d": FLEET},
+        stored=stored,
     )
     for name in NAMES:
         if name != me:
@@ -339,6 +349,22 @@ def test_a_node_that_starts_grants_only_for_a_seat_of_its_own_disk(*, disk: str,
     heard = replace(beat(one.number), lease_terms=one.leases.terms)
     assert one.leases.on_beat(heard, OWNERS, after) is grants
     assert bool(one.leases.on_sent(1, after).echoes) is grants
+
+
+def test_an_elector_that_its_file_does_not_name_waits_a_lease_after_its_start() -> None:
+    """Its document is missing, so it is an elector by the agreed value alone; its life before may have granted."""
+    seats = tuple(replace(one, disk="d1") if one.name == "edge1" else one for one in WITH_EDGE.electors)
+    number = WITH_EDGE.creation("merge")
+    assert number is not None
+    register = RegisterState(task="merge", creation=number.number, learnt=HELD)
+    one = make(replace(WITH_EDGE, electors=seats), me="edge1", registers=(register,), stored={})
+    assert one.is_elector
+    heard = replace(beat(one.number), lease_terms=one.leases.terms)
+    over_at = 100.0 + hold_s(L)
+    for now, is_over in ((100.0, False), (over_at - 0.01, False), (over_at, True)):
+        assert one.leases.may_accept("merge", "robot2", now), "its own owner may go on"
+        assert one.leases.may_accept("merge", "robot3", now) is is_over
+        assert one.leases.on_beat(heard, OWNERS, now) is is_over
 
 
 def test_another_generation_with_the_same_number_is_counted_anew() -> None:
