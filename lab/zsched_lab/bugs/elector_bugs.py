@@ -256,6 +256,16 @@ ELECTOR_BUGS: tuple[Bug, ...] = (
         ("math.inf if self.is_in_doubt else self.over_at", "math.inf if self.is_in_doubt else -math.inf"),
     ),
     _numbers_bug(
+        "a task that comes with a missing document begins blank",
+        NUMBERS,
+        ("state=self._recall(creation) or RegisterState(", "state=RegisterState("),
+    ),
+    _numbers_bug(
+        "a node without its document writes only the tasks of its file",
+        AGREEMENT,
+        ("return self.document is not None", "return bool(self.fleet_value and self.fleet_value.document)"),
+    ),
+    _numbers_bug(
         "an echo of another number counts",
         LEASE,
         ("beat.lease_terms == self.terms and self._counts_like_us(beat)", "beat.lease_terms == self.terms"),

@@ -8,7 +8,7 @@ wants a change (`zsched.core.electorate.orders`).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from random import Random
 from types import MappingProxyType
 
@@ -39,6 +39,7 @@ class Numbers:
         durable: its state, or ``None``.
         incarnation: of this daemon.
         registers: its tasks' registers, which the roll renumbers.
+        recall: what the state holds of a created task that has no register yet; ``None``: nothing.
         rng: for back-off.
         stored: {hash: what it says} of the documents on this node's disk that its state names.
         flags: {hash: its flags} of those of them that have any.
@@ -52,12 +53,13 @@ class Numbers:
         durable: DurableState | None,
         incarnation: int,
         registers: dict[TaskId, TaskRegister],
+        recall: Callable[[Creation], RegisterState | None],
         rng: Random,
         stored: Mapping[str, Fleet],
         flags: Mapping[str, tuple[Flag, ...]] = MappingProxyType({}),
     ) -> None:
         self._fleet, self._me, self._incarnation = fleet, me, incarnation
-        self._registers, self._rng = registers, rng
+        self._registers, self._recall, self._rng = registers, recall, rng
         self.disk = "" if durable is None else durable.disk
         self._stored = None if durable is None else durable.fleet_register
         self._joins = "" if durable is None else durable.joins
@@ -96,7 +98,7 @@ class Numbers:
             self._want(self.roll.value, (), todo, now)
 
     def _created(self, creation: Creation) -> TaskRegister | None:
-        """The blank register of a task that the document lists; its electors are told by the roll."""
+        """The register of a task that the document lists, mostly a blank one; its electors are told by the roll."""
         stored = None if self._stored is None else self._stored.learnt
         value = stored if self.roll is None else self.roll.value
         fleet = self._fleet if value is None else self.documents.fleet(value.document)
@@ -110,7 +112,7 @@ class Numbers:
             electorate="",
             is_elector=False,
             initial=task.first_value(creation.start),
-            state=RegisterState(task=creation.task, creation=creation.number),
+            state=self._recall(creation) or RegisterState(task=creation.task, creation=creation.number),
             ballot_s=self._fleet.timing.ballot_s,
             stagger_s=self._fleet.timing.stagger_s,
             rng=self._rng,

@@ -23,7 +23,15 @@ from zsched.core.todo import ToDo
 from zsched.core.values.change import Change, Ended, MoveOwner, Retune, RoundOutcome, SetLeased
 from zsched.core.values.document import Flag
 from zsched.core.values.durable import DurableState
-from zsched.core.values.electorate import CREATION_STEP, SAID_DIGITS, TOLD_DIGITS, Elector, FleetValue, terms_of
+from zsched.core.values.electorate import (
+    CREATION_STEP,
+    SAID_DIGITS,
+    TOLD_DIGITS,
+    Creation,
+    Elector,
+    FleetValue,
+    terms_of,
+)
 from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.messages import (
     Accepted,
@@ -151,12 +159,15 @@ class Agreement:
             task.name: self._register(task, states.get(task.name) or self._blank(task.name, agreed))
             for task in fleet.tasks
         }
+        # A task that left the fleet file may come back: its promises must not be forgotten.
+        self._foreign = tuple(states[name] for name in sorted(states) if name not in self.registers)
         self._numbers = Numbers(
             fleet=fleet,
             me=me,
             durable=durable,
             incarnation=incarnation,
             registers=self.registers,
+            recall=self._recall,
             rng=rng,
             stored=stored,
             flags=flags,
@@ -169,8 +180,6 @@ class Agreement:
         if self.generation is not None:
             may_elect = durable is not None and not self._disputed and not self._lost
             self._numbers.begin(self.generation, self._by_file, self.at_start, now, may_elect=may_elect)
-        # A task that left the fleet file may come back: its promises must not be forgotten.
-        self._foreign = tuple(states[name] for name in sorted(states) if name not in self.registers)
         self._settle_at = now + SETTLE_AFTER_START_S if self.is_elector else math.inf
         self._asked_at: dict[tuple[NodeId, bool], float] = {}
         """{(peer, whether for a newer revision): when}: news of votes must not delay a question about revisions."""
@@ -221,6 +230,11 @@ class Agreement:
         creation = None if value is None else value.creation(task)
         return RegisterState(task=task, creation=(self.generation or 0) if creation is None else creation.number)
 
+    def _recall(self, creation: Creation) -> RegisterState | None:
+        """What is remembered of a task that the fleet file lacks, and that the document lists."""
+        held = (one for one in self._foreign if (one.task, one.creation) == (creation.task, creation.number))
+        return next(held, None)
+
     def adopt(self, fleet: Fleet, todo: ToDo, now: float) -> None:
         """Take nodes, tasks and times from ``fleet``, with the electors in force; changes of tasks that go end.
 
@@ -234,9 +248,9 @@ class Agreement:
         self.registers.clear()  # the roll goes by the same table
         away = {state.task: state for state in self._foreign}
         for task in fleet.tasks:
-            register = kept.pop(task.name, None)
+            register, remembered = kept.pop(task.name, None), away.pop(task.name, None)
             if register is None:
-                state = away.pop(task.name, None) or self._blank(task.name, self._numbers.changed)
+                state = remembered or self._blank(task.name, self._numbers.changed)
                 register = self._register(task, state)
                 self._numbers.count_in(register, now)
                 self._settle_at = now + SETTLE_AFTER_START_S if self.is_elector else math.inf
@@ -355,9 +369,11 @@ class Agreement:
 
     @property
     def _is_agreed(self) -> bool:
-        """Whether a document says which tasks have a register: of any other task nothing is remembered."""
-        value = self._numbers.changed
-        return value is not None and bool(value.document)
+        """Whether a document says which tasks have a register: of any other task nothing is remembered.
+
+        While it is not stored here, the tasks that the fleet file lacks have no register, and are remembered.
+        """
+        return self.document is not None
 
     @property
     def must_persist(self) -> bool:

@@ -278,6 +278,38 @@ def test_ballots_of_today_s_fleets_carry_no_disk() -> None:
     assert proposed(make()).ballot == Ballot(counter=1, node="robot1", incarnation=7)
 
 
+# --- a document that is missing at the start -------------------------------------------------------------------------
+
+
+def test_an_elector_without_its_document_remembers_the_tasks_that_its_file_lacks() -> None:
+    """Its register begins when the document comes; a second start before that forgets nothing either."""
+    document = replace(FLEET, tasks=(TASK, replace(TASK, name="other")))
+    adopt = AdoptDocument(base_revision=1, document="0d", tasks=(("merge", True), ("other", True)), lease_s=1.0)
+    value = adopt.apply(FIRST)
+    ballot = Ballot(counter=9, node="robot2", incarnation=3)
+    states = tuple(
+        RegisterState(
+            task=one.task,
+            creation=one.number,
+            promised=ballot,
+            accepted=Acceptance(ballot=ballot, value=replace(HELD, task=one.task)),
+        )
+        for one in value.tasks
+    )
+    elector = make(value, registers=states, stored={})
+    assert (elector.is_elector, tuple(elector.registers)) == (True, ("merge",))
+    written = elector.to_persist(100.0)
+    assert written is not None
+    assert written.registers == states
+    todo = ToDo()
+    elector.on_stored(ev.DocumentStored(document="0d", fleet=document), todo, 100.1)
+    elector.adopt(document, todo, 100.1)
+    assert tuple(register.state for register in elector.registers.values()) == states
+    again = elector.to_persist(100.2)
+    assert again is not None
+    assert again.registers == states
+
+
 # --- leases over numbers ---------------------------------------------------------------------------------------------
 
 HELD = Allocation(task="merge", revision=7, epoch=3, owner="robot2", tuning=TASK.tuning, leased=True)
