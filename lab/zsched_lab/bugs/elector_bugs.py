@@ -271,6 +271,14 @@ ELECTOR_BUGS: tuple[Bug, ...] = (
         ("beat.lease_terms == self.terms and self._counts_like_us(beat)", "beat.lease_terms == self.terms"),
     ),
     _numbers_bug(
+        "an elector with a shorter lease forgets its longer grants when it starts again",
+        LEASE,
+        (
+            "own_s = max((self.lease_s, *(granter.longer_s(now) for granter in self._granters.values())))",
+            "own_s = self.lease_s",
+        ),
+    ),
+    _numbers_bug(
         "a longer lease counts from a beat of the number before",
         LEASE,
         ("self.first_number = max(self.first_number, self._sent[-1][0] + 1)", "self.first_number += 0"),

@@ -139,6 +139,11 @@ class Granter:
         if last is not None and (last.owner, last.incarnation) == key and last.number <= grant.number:
             self._last, self._granted_at = None, -math.inf
 
+    def longer_s(self, now: float) -> float:
+        """The hold of a grant of this life under a longer lease than today's, while it may last; else zero."""
+        is_longer = self._hold_s > hold_s(self.lease_s) and now < self._granted_at + self._hold_s
+        return self._hold_s if is_longer else 0.0
+
     def _is_silenced(self, owner: NodeId, epoch: int, now: float) -> bool:
         return self._silent_for == (owner, epoch) and now < self._silent_until
 
@@ -444,7 +449,7 @@ class Leases:
 
     def to_remember_s(self, now: float) -> float:
         """The longest lease of a grant of this elector, or of its life before, for its next life."""
-        own_s = self.lease_s
+        own_s = max((self.lease_s, *(granter.longer_s(now) for granter in self._granters.values())))
         return own_s if now >= self.now + hold_s(self.granted_s) else max(own_s, self.granted_s)
 
     def stop_granting(self) -> None:

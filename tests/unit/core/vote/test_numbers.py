@@ -487,6 +487,23 @@ def test_lease_shortened_a_later_grant_does_not_end_an_earlier_longer_one() -> N
     assert elector.may_accept("merge", "robot3", 10.0 + hold_s(L))
 
 
+def test_lease_shortened_the_next_life_still_waits_for_a_grant_of_before() -> None:
+    """The state file says how long a grant of this elector may last, whatever the lease is by now."""
+    elector = leases()
+    assert elector.on_beat(beat(0), OWNERS, 10.0)
+    assert elector.to_remember_s(10.0) == L
+    renumbered(elector, lease_s=L / 10)
+    over_at = 10.0 + hold_s(L)
+    assert elector.to_remember_s(10.1) >= L
+    assert elector.to_remember_s(over_at - 0.01) >= L
+    assert elector.to_remember_s(over_at) == L / 10
+    elector.on_beat(beat(2, sequence=7), OWNERS, 10.2)
+    shorter = replace(FLEET, timing=replace(FLEET.timing, lease_s=L / 10))
+    granted_s = elector.to_remember_s(10.3)
+    next_life = Leases(fleet=shorter, me="robot1", incarnation=2, standing={}, now=10.3, granted_s=granted_s)
+    assert next_life.over_at >= over_at
+
+
 def test_lease_lengthened_a_beat_of_before_holds_no_longer_than_its_grant_is_guarded() -> None:
     """Electors may echo what they granted under the number before; they guard it with the shorter length."""
     one = renumbered(holder(), lease_s=10 * L)
