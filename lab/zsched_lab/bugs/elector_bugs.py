@@ -279,6 +279,11 @@ ELECTOR_BUGS: tuple[Bug, ...] = (
         ),
     ),
     _numbers_bug(
+        "a clock in doubt ends the guard of a longer grant",
+        LEASE,
+        ("now + max(least_s, self._hold_s)", "now + least_s"),
+    ),
+    _numbers_bug(
         "a longer lease counts from a beat of the number before",
         LEASE,
         ("self.first_number = max(self.first_number, self._sent[-1][0] + 1)", "self.first_number += 0"),

@@ -141,8 +141,8 @@ class Granter:
 
     def longer_s(self, now: float) -> float:
         """The hold of a grant of this life under a longer lease than today's, while it may last; else zero."""
-        is_longer = self._hold_s > hold_s(self.lease_s) and now < self._granted_at + self._hold_s
-        return self._hold_s if is_longer else 0.0
+        is_over = now >= max(self.until, self._granted_at + self._hold_s)  # in doubt, when it was is forgotten
+        return self._hold_s if self._hold_s > hold_s(self.lease_s) and not is_over else 0.0
 
     def _is_silenced(self, owner: NodeId, epoch: int, now: float) -> bool:
         return self._silent_for == (owner, epoch) and now < self._silent_until
@@ -152,6 +152,10 @@ class Granter:
         self.standing, self.until = None if standing is None else standing.owner, until
         self._last, self._granted_at = None, -math.inf
         self.on_newer_value()
+
+    def resume(self, standing: Allocation | None, now: float, least_s: float) -> None:
+        """The clock is right again: what was granted, maybe by a longer lease than today's, is over in a hold."""
+        self.restart(standing, now + max(least_s, self._hold_s))
 
     def may_accept(self, owner: NodeId | None, now: float) -> bool:
         """Whether a value with this owner may be accepted now; a no starts the silence towards the present owner."""
@@ -367,7 +371,7 @@ class Leases:
         """The clock is right again: begin anew, with beats after ``number``."""
         self.is_in_doubt = False
         for task, granter in self._granters.items():
-            granter.restart(standing[task], now + hold_s(self.lease_s))
+            granter.resume(standing[task], now, hold_s(max(self.lease_s, self.granted_s)))
         for task in tuple(self._holders):
             holder = self._holders.pop(task)
             self.begin(task, holder.epoch, number + 1)

@@ -504,6 +504,28 @@ def test_lease_shortened_the_next_life_still_waits_for_a_grant_of_before() -> No
     assert next_life.over_at >= over_at
 
 
+def test_lease_shortened_a_clock_in_doubt_does_not_end_the_guard_of_a_grant_of_before() -> None:
+    elector = leases()
+    assert elector.on_beat(beat(0), OWNERS, 10.0)
+    renumbered(elector, lease_s=L / 10)
+    elector.doubt({"merge": HELD})
+    assert elector.to_remember_s(10.1) >= L
+    elector.trust({"merge": HELD}, 9, 10.2)
+    over_at = 10.2 + hold_s(L)
+    assert elector.to_remember_s(over_at - 0.01) >= L
+    assert not elector.may_accept("merge", "robot3", over_at - 0.01)
+    assert elector.may_accept("merge", "robot3", over_at)
+    assert elector.to_remember_s(over_at) == L / 10
+
+
+def test_a_clock_in_doubt_after_a_start_does_not_end_the_guard_of_the_life_before() -> None:
+    elector = Leases(fleet=FLEET, me="robot1", incarnation=1, standing={"merge": HELD}, now=0.0, granted_s=3 * L)
+    elector.doubt({"merge": HELD})
+    elector.trust({"merge": HELD}, 9, 0.2)
+    assert not elector.may_accept("merge", "robot3", hold_s(3 * L) - 0.01)
+    assert elector.may_accept("merge", "robot3", 0.2 + hold_s(3 * L))
+
+
 def test_lease_lengthened_a_beat_of_before_holds_no_longer_than_its_grant_is_guarded() -> None:
     """Electors may echo what they granted under the number before; they guard it with the shorter length."""
     one = renumbered(holder(), lease_s=10 * L)
