@@ -286,8 +286,9 @@ def test_a_real_fleet_moves_and_restarts_its_daemon_under_an_application(tmp_pat
             assert own.back == list(range(own.sent))
 
             def told() -> StreamCount | None:
-                count = next(count for count in bed.counts("robot1") if count.stream == f"{ECHO}/in/0")
-                return count if count.messages == own.sent and not count.in_flight else None
+                found = (count for count in bed.counts("robot1") if count.stream == f"{ECHO}/in/0")
+                count = next(found, None)  # a daemon that has just begun was told of none yet
+                return count if count is not None and count.messages == own.sent and not count.in_flight else None
 
             count = bed.wait(told, 30, "the counters")
             assert count is not None

@@ -221,7 +221,7 @@ class Streams:
         for task in tasks:
             task.end_inputs()
         until = monotonic_s() + FINISH_S
-        while any(task.under_way() or not task.has_handed() for task in tasks) and monotonic_s() < until:
+        while not all(_is_over(task) for task in tasks) and monotonic_s() < until:
             time.sleep(LOOK_S)
         self._acks.flush()
         self._say_counts()
@@ -355,3 +355,7 @@ class Streams:
 
 def _bytes(payload: Payload) -> zenoh.ZBytes:
     return payload if isinstance(payload, zenoh.ZBytes) else zenoh.ZBytes(payload)
+
+
+def _is_over(task: OwnTask) -> bool:
+    return task.has_ended() and not task.under_way() and task.has_handed()

@@ -6,6 +6,7 @@ Knows: where the application's samples enter and its answers leave. Does not kno
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from typing import Final
@@ -53,6 +54,7 @@ class OwnTask(TaskRelay):
         self._deliver = deliver
         self._has_owner = False
         self._hands: dict[str, Hand] = {}
+        self._ends: list[threading.Event] = []
         own_ids = frozenset({str(session.zid())})
         super().__init__(session, task, tokens, acks, own_ids, report, NoGraph(session, None, node))
 
@@ -92,8 +94,11 @@ class OwnTask(TaskRelay):
 
     def end_inputs(self) -> None:
         """Nothing more will be put."""
-        for source in tuple(self._inputs.values()):
-            source.end()
+        self._ends = [source.end() for source in tuple(self._inputs.values())]
+
+    def has_ended(self) -> bool:
+        """Whether the ends of all inputs have been put: a worker that misses one waits for it at the next move."""
+        return all(end.is_set() for end in self._ends)
 
     def _take_input(self, route: Route) -> InputStream:
         return InputStream(self._session, route, self._own_ids, None, self._times, is_ours=True)

@@ -233,12 +233,19 @@ class InputStream:
             self._settle(slot)
             self._end_hold_behind(slot, has_answer)
 
-    def end(self) -> None:
-        """Nothing more will be given (`is_ours`): put the end marker of the slot that is fed behind its last sample."""
+    def end(self) -> threading.Event:
+        """Nothing more will be given (`is_ours`): put the end marker of the slot that is fed behind its last sample.
+
+        The event is set when it has been put.
+        """
+        ended = threading.Event()
         with self._lock:
             slot = self._active
-        if slot is not None:
-            slot.outlet.send_end(slot.epoch)
+        if slot is None:
+            ended.set()
+        else:
+            slot.outlet.send_end(slot.epoch, ended.set)
+        return ended
 
     def send_end(self, epoch: int) -> None:
         """Put the end marker behind the slot's last sample (it must not be the active one); may block on its link."""
