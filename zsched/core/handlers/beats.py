@@ -17,6 +17,10 @@ from zsched.core.membership.peers import Transition
 from zsched.core.stages import Handler, Stages
 from zsched.core.todo import ToDo
 from zsched.core.values.model import Beat, NodeId, PeerState
+from zsched.core.values.plan import StreamCount
+
+STREAM_REST_S: Final = 2.0
+"""A stream that had nothing for this long is at rest; its counters come once a second."""
 
 # --- sent ------------------------------------------------------------------------------------------------------------
 
@@ -77,7 +81,19 @@ def is_restless(node: Stages, now: float) -> bool:
         return True
     is_agreeing = node.agreement.has_parked or node.agreement.next_deadline() < math.inf
     is_moving = any(executor.next_deadline() < math.inf for executor in node.executors.values())
-    return is_agreeing or is_moving or any(name.startswith("fleet/") for name in node.problems)
+    return (
+        is_agreeing
+        or is_moving
+        or _are_flowing(node.stream_counts)
+        or any(name.startswith("fleet/") for name in node.problems)
+    )
+
+
+def _are_flowing(counts: tuple[StreamCount, ...]) -> bool:
+    """Whether this node's streams flow: what they fill a radio with may delay beats, so slow ones come too late."""
+    return any(
+        count.in_flight or (count.last_seen_s is not None and count.last_seen_s < STREAM_REST_S) for count in counts
+    )
 
 
 def tend_pace(node: Stages, now: float) -> None:

@@ -16,7 +16,7 @@ from zsched.core.membership.pace import FULL_S
 from zsched.core.values.fleet import StreamRule, TaskSpec, WorkerSpec
 from zsched.core.values.messages import Accepted, Promise
 from zsched.core.values.model import Acceptance, Allocation, Ballot, NodeId, PeerState
-from zsched.core.values.plan import Direction, Role, WorkerRole
+from zsched.core.values.plan import Direction, Role, StreamCount, WorkerRole
 from zsched.errors import InvariantError
 from zsched_lab.sim.simulator import RESTART_S, TOKEN_DELAY_S, Simulator
 
@@ -295,3 +295,21 @@ def test_a_restless_peer_brings_the_next_beat_of_all_others_forward() -> None:
     beat = beat_of("edge1", peer.beat_sequence + 1, incarnation=peer.incarnation)
     node.handle(ev.BeatReceived(beat=beat), sim.now)
     assert node.next_deadline() <= sim.now + 0.2
+
+
+@pytest.mark.parametrize(
+    ("count", "is_slow"),
+    [
+        (StreamCount(stream="merge/in/0", messages=9, last_seen_s=0.1), False),
+        (StreamCount(stream="merge/in/0", messages=9, last_seen_s=30.0, in_flight=1), False),
+        (StreamCount(stream="merge/in/0", messages=9, last_seen_s=30.0, in_flight=0), True),
+        (StreamCount(stream="merge/in/0"), True),
+    ],
+)
+def test_a_fleet_whose_streams_flow_keeps_the_full_pace(count: StreamCount, *, is_slow: bool) -> None:
+    """A full radio delays beats: with slow ones a robot was taken for dead whose uplink was saturated."""
+    sim = at_rest()
+    sim.node("robot1").handle(ev.StreamsCounted(counts=(count,)), sim.now)
+    sim.run(1.0)
+    assert sim.node("robot1").pace.is_slow is is_slow
+    assert sim.node("edge1").pace.is_slow is is_slow
