@@ -66,7 +66,7 @@ FINISH_S: Final = 2.0
 """What was put is processed within this time of `Streams.close`, or counted as at most lost."""
 LOOK_S: Final = 0.01
 JOIN_S: Final = 0.3
-CLOSE_S: Final = 0.6
+CLOSE_S: Final = 3.0
 """Closing a session towards a stopped peer can take seconds; we wait at most this long."""
 
 _log = logging.getLogger("zsched.streams")
