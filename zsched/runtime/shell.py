@@ -76,8 +76,6 @@ WAITING_LIMIT = 64
 ANSWER_TIMEOUT_S = 3.0
 PROBLEM_TTL_S = 60.0
 """An instruction that failed and was never tried again is no problem any more after this time."""
-STILL_S = 2.0
-"""A stream without a message for this long is still: nothing has come for two periods of the counters."""
 LOCAL_REQUESTS_FROM = 1 << 40
 """Numbers of questions that came over the operator socket; smaller ones came over the bus."""
 
@@ -430,13 +428,6 @@ def _fleet_json(told: FleetTold) -> dict[str, Any]:
     }
 
 
-def _are_still(report: ev.StreamsCounted) -> bool:
-    """Whether nothing flows and nothing is under way: such counters can wait until the loop is awake."""
-    return all(
-        not count.in_flight and (count.last_seen_s is None or count.last_seen_s >= STILL_S) for count in report.counts
-    )
-
-
 def _no_certificate(_pem: str) -> CommandResult:
     return CommandResult(outcome=CommandOutcome.INVALID, detail="this node's fleet has no certificates")
 
@@ -676,7 +667,8 @@ class Shell:
                 self._inbox.post_quietly(report)
                 self.measure_soon()
             return
-        if isinstance(report, ev.StreamsCounted) and _are_still(report):
+        if isinstance(report, ev.StreamsCounted) and all(count.is_still for count in report.counts):
+            # they can wait until the loop is awake
             self._inbox.post_quietly(report)
             return
         if not isinstance(report, WorkerSeen):

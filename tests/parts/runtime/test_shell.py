@@ -49,7 +49,7 @@ from zsched.core.values.messages import (
     Votes,
 )
 from zsched.core.values.model import Acceptance, Asked, Tuning, Weights, WorkerState
-from zsched.core.values.plan import Role, RoutePhase, RoutePlan, StreamCount, WorkerRole
+from zsched.core.values.plan import STILL_S, Role, RoutePhase, RoutePlan, StreamCount, WorkerRole
 from zsched.errors import AdapterError, WireError
 from zsched.runtime import shell as shell_module
 from zsched.runtime.library import Library
@@ -57,7 +57,6 @@ from zsched.runtime.shell import (
     INBOX_LIMIT,
     LOCAL_REQUESTS_FROM,
     PROBLEM_TTL_S,
-    STILL_S,
     WAITING_LIMIT,
     Desk,
     Inbox,

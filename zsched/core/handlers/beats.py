@@ -17,10 +17,6 @@ from zsched.core.membership.peers import Transition
 from zsched.core.stages import Handler, Stages
 from zsched.core.todo import ToDo
 from zsched.core.values.model import Beat, NodeId, PeerState
-from zsched.core.values.plan import StreamCount
-
-STREAM_REST_S: Final = 2.0
-"""A stream that had nothing for this long is at rest; its counters come once a second."""
 
 # --- sent ------------------------------------------------------------------------------------------------------------
 
@@ -84,15 +80,8 @@ def is_restless(node: Stages, now: float) -> bool:
     return (
         is_agreeing
         or is_moving
-        or _are_flowing(node.stream_counts)
+        or not all(count.is_still for count in node.stream_counts)  # a full radio delays beats; slow ones are too late
         or any(name.startswith("fleet/") for name in node.problems)
-    )
-
-
-def _are_flowing(counts: tuple[StreamCount, ...]) -> bool:
-    """Whether this node's streams flow: what they fill a radio with may delay beats, so slow ones come too late."""
-    return any(
-        count.in_flight or (count.last_seen_s is not None and count.last_seen_s < STREAM_REST_S) for count in counts
     )
 
 

@@ -174,6 +174,10 @@ class Role(Struct, frozen=True, kw_only=True):
     predecessor: NodeId | None = None
 
 
+STILL_S = 2.0
+"""A stream without a message for this long is still: nothing has come for two periods of the counters."""
+
+
 class StreamCount(Struct, frozen=True, kw_only=True):
     """Counters of one stream since the relay started."""
 
@@ -223,3 +227,8 @@ class StreamCount(Struct, frozen=True, kw_only=True):
     hz: float | None = None
     """Filled in by the status: messages per second over the last seconds, ``None`` while that is not known."""
     bytes_per_s: float | None = None
+
+    @property
+    def is_still(self) -> bool:
+        """Whether nothing flows and nothing is under way."""
+        return not self.in_flight and (self.last_seen_s is None or self.last_seen_s >= STILL_S)
