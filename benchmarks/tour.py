@@ -65,11 +65,8 @@ ON_PAGE: Final = (
     "status",
     "explain echo",
     "history echo",
-    "ping edge1 -c 3",
     "drain edge2 --yes -m tour",
-    "maint",
     "rehearse echo --steps move,drain --yes",
-    "wait --for healthy --timeout 30",
 )
 """What the page shows; the recording has every verb."""
 PLACES: Final = (("/state", "/var/lib/zsched"), ("/etc", "/etc/zsched"), ("/run", "/run/zsched"))
