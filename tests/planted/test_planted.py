@@ -106,7 +106,7 @@ def test_table_names_survivors() -> None:
             Verdict(bug=BUGS[1], found_by="", seconds=2.0),
             Verdict(bug=BUGS[2], found_by=failed, seconds=3.0),
         ]
-    ).splitlines()[2:]
-    assert rows[0] == "| quorum off by one | `core/values/quorum.py` | seed 1 | 1.0 |"
-    assert "**survived**" in rows[1]
-    assert "| `test_a_rule` |" in rows[2]
+    ).splitlines()[1:]
+    assert rows[0] == "quorum off by one,core/values/quorum.py,seed 1,1.0"
+    assert rows[1].endswith(",survived,2.0")
+    assert rows[2].endswith(",test_a_rule,3.0")

@@ -5,6 +5,7 @@ Run as a program, this file writes the tables of docs/design/wire.md anew.
 
 from __future__ import annotations
 
+import csv
 import inspect
 import re
 import types
@@ -126,6 +127,7 @@ def test_named_tests_exist() -> None:
     defined = set(re.findall(r"def (test_\w+)", code))
     modules = {path.stem for path in (ROOT / "tests").rglob("test_*.py")}
     named = {word for name in NAMES for word in re.findall(r"`(test_\w+)`", text_of(name))}
+    named |= set(re.findall(r",(test_\w+),", text_of(BUG_LIST)))
     assert sorted(named - defined - modules) == []
 
 
@@ -368,28 +370,37 @@ def test_decisions_that_the_code_cites_exist() -> None:
 # --- planted bugs ----------------------------------------------------------------------------------------------------
 
 
-def faults_of_bug_table(text: str, bugs: Sequence[Bug]) -> list[str]:
-    """Differences of docs/develop/planted-bugs.md from the code: how many bugs, which, where, in which order."""
-    found = [] if f"each of these {len(bugs)} bugs" in text else [f"there are {len(bugs)}"]
-    cells = [line.split("|") for line in text.splitlines() if line.startswith("| ")][2:]
-    rows = [(row[1].strip(), row[2].strip()) for row in cells]
+BUG_LIST: Final = "docs/develop/planted-bugs.csv"
+
+
+def faults_of_bug_list(text: str, bugs: Sequence[Bug]) -> list[str]:
+    """Differences of docs/develop/planted-bugs.csv from the code: which bugs, where, in which order."""
+    rows = [(row["bug"], row["in"]) for row in csv.DictReader(text.splitlines())]
     expected = [(bug.name, places(bug)) for bug in bugs]
-    found += [f"no row of {name}" for name, _ in expected if name not in dict(rows)]
+    found = [f"no row of {name}" for name, _ in expected if name not in dict(rows)]
     found += [f"no such bug: {name}" for name, _ in rows if name not in dict(expected)]
     return found if found or rows == expected else ["rows in another order, of other modules, or twice"]
 
 
 def test_every_planted_bug_has_a_row() -> None:
-    assert faults_of_bug_table(text_of("docs/develop/planted-bugs.md"), BUGS) == []
+    assert faults_of_bug_list(text_of(BUG_LIST), BUGS) == []
 
 
-def test_planted_faults_of_the_bug_table_are_found() -> None:
-    text = text_of("docs/develop/planted-bugs.md")
-    row = next(line for line in text.splitlines() if line.startswith(f"| {BUGS[0].name} |"))
-    assert faults_of_bug_table(text.replace(row + "\n", ""), BUGS) == [f"no row of {BUGS[0].name}"]
-    assert faults_of_bug_table(text, BUGS[1:]) == [f"there are {len(BUGS) - 1}", f"no such bug: {BUGS[0].name}"]
-    assert faults_of_bug_table(text.replace(row, f"{row}\n{row}"), BUGS) != []
-    assert faults_of_bug_table(text.replace(row, row.replace(".py", ".pyc", 1)), BUGS) != []
+def test_the_page_of_planted_bugs_counts_them() -> None:
+    found_by = [row["found by"] for row in csv.DictReader(text_of(BUG_LIST).splitlines())]
+    by_seed = sum(how.startswith("seed ") for how in found_by)
+    page = text_of("docs/develop/planted-bugs.md")
+    assert f"by {len(found_by)} deliberate bugs" in page
+    assert f"find {by_seed} of them, directed tests {len(found_by) - by_seed}." in page
+
+
+def test_planted_faults_of_the_bug_list_are_found() -> None:
+    text = text_of(BUG_LIST)
+    row = next(line for line in text.splitlines() if line.startswith(f"{BUGS[0].name},"))
+    assert faults_of_bug_list(text.replace(row + "\n", ""), BUGS) == [f"no row of {BUGS[0].name}"]
+    assert faults_of_bug_list(text, BUGS[1:]) == [f"no such bug: {BUGS[0].name}"]
+    assert faults_of_bug_list(text.replace(row, f"{row}\n{row}"), BUGS) != []
+    assert faults_of_bug_list(text.replace(row, row.replace(".py", ".pyc", 1)), BUGS) != []
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Plants one bug at a time into the code and lets the suite find it: ``python -m zsched_lab.bugs.planted``.
 
-Knows: how a bug is planted (an import hook in a process of its own; no file is touched), the budget of each, the table.
+Knows: how a bug is planted (an import hook in a process of its own; no file is touched), the budget of each, the list.
 Does not know: what the bugs are (`zsched_lab.bugs.core_bugs`, `elector_bugs`, `stream_bugs`), what finds them.
 
 For every bug the simulator plays schedules until one is violated; when none is within the budget, the bug's directed
@@ -11,9 +11,11 @@ Must be run in the source tree: the directed tests are there.
 from __future__ import annotations
 
 import argparse
+import csv
 import importlib.abc
 import importlib.machinery
 import importlib.util
+import io
 import os
 import re
 import resource
@@ -56,7 +58,7 @@ STUCK_S = 120.0
 LONGEST_S = 1800.0
 """Of the wall clock, on a machine that is busy with other work; a bug that is not judged by then counts as survived."""
 CELL = 100
-"""Characters of a violation in the table."""
+"""Characters of a violation in the list."""
 FOUND = 10
 """Exit code of a process that has found the bug planted in it (0: it has not; anything else: it broke down)."""
 MAX_SEEDS = 100_000
@@ -225,28 +227,30 @@ def _found(bug: Bug, how: str, budget_s: float) -> str:
 
 
 def table(verdicts: Sequence[Verdict]) -> str:
-    """The verdicts as Markdown, as docs/develop/planted-bugs.md keeps them."""
-    rows = ["| bug | in | found by | s |", "| --- | --- | --- | ---: |"]
-    rows += [f"| {one.bug.name} | {places(one.bug)} | {_short(one.found_by)} | {one.seconds:.1f} |" for one in verdicts]
-    return "\n".join(rows)
+    """The verdicts as docs/develop/planted-bugs.csv keeps them."""
+    text = io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(("bug", "in", "found by", "s"))
+    rows.writerows((one.bug.name, places(one.bug), _short(one.found_by), f"{one.seconds:.1f}") for one in verdicts)
+    return text.getvalue()
 
 
 def places(bug: Bug) -> str:
-    """The modules that a bug is in, as the table names them."""
-    return ", ".join(f"`{part.module.removeprefix('zsched.').replace('.', '/')}.py`" for part in bug.parts)
+    """The modules that a bug is in, as the list names them."""
+    return " ".join(f"{part.module.removeprefix('zsched.').replace('.', '/')}.py" for part in bug.parts)
 
 
 def _short(found_by: str) -> str:
-    """What found a bug, in a table's cell: the schedule's seed, or the test's name."""
+    """What found a bug, in a cell of the list: the schedule's seed, or the test's name."""
     if found_by.startswith("FAILED "):
-        return f"`{found_by.partition('::')[2].partition(' - ')[0].partition('[')[0]}`"
+        return found_by.partition("::")[2].partition(" - ")[0].partition("[")[0]
     seed = re.match(r"seed \d+", found_by)
-    text = seed.group(0) if seed else found_by.replace("|", "/") or "**survived**"
+    text = seed.group(0) if seed else found_by or "survived"
     return text if len(text) <= CELL else f"{text[:CELL]} …"
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Hunt all bugs (or ``--only`` one), print the table, return the exit code."""
+    """Hunt all bugs (or ``--only`` one), print the list, return the exit code."""
     parser = argparse.ArgumentParser(prog="python -m zsched_lab.bugs.planted", description=__doc__)
     parser.add_argument("--only", help="the name of one bug")
     parser.add_argument("--budget", type=float, default=BUDGET_S, help="seconds of schedules for one bug")
