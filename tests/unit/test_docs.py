@@ -241,17 +241,26 @@ def shown(hint: Any) -> str:
 
 
 def fields_of(cls: type) -> str:
+    """A value's fields behind their types; what may be left out ends with a question mark."""
     hints = wire.hints_of(cls)
-    parts = [f"`{f.name}{'' if f.default is MISSING else '?'}` {shown(hints[f.name])}" for f in fields(cls)]
-    return "; ".join(parts) or "none"
+    by_type: dict[str, list[str]] = {}
+    for f in fields(cls):
+        by_type.setdefault(shown(hints[f.name]), []).append(f"{f.name}{'' if f.default is MISSING else '?'}")
+    return "; ".join(f"{kind}: `{' '.join(names)}`" for kind, names in by_type.items()) or "none"
+
+
+def title(kind: str, cls: type) -> str:
+    """A kind, and its class where that is not the kind's name in capitals."""
+    usual = cls.__name__ == "".join(word.title() for word in kind.split("_"))
+    return f"`{kind}`" if usual else f"`{kind}` (`{cls.__name__}`)"
 
 
 def kinds_table() -> str:
     assert relay_pipe.REPORTS  # imported for its registrations
-    lines = ["| kind | value | at most, bytes | fields |", "| --- | --- | --- | --- |"]
+    lines = ["| kind | at most, bytes | fields |", "| --- | --- | --- |"]
     for kind, (cls, bound) in wire.KINDS.items():
         if cls.__module__.startswith("zsched."):
-            lines.append(f"| `{kind}` | `{cls.__name__}` | {bound} | {fields_of(cls)} |")
+            lines.append(f"| {title(kind, cls)} | {bound} | {fields_of(cls)} |")
     return "\n".join(lines)
 
 
