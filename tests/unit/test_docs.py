@@ -360,10 +360,29 @@ def test_decisions_have_a_number_each() -> None:
     assert numbers == sorted(set(numbers))
 
 
+PARTS: Final = ["Context", "Decision", "Consequences", "Alternatives refused"]
+
+
+def has_its_parts(record: str) -> bool:
+    """Whether a record has a status and its four parts; one that is replaced names its successor in their place."""
+    headings = re.findall(r"^## (.*)$", record, re.MULTILINE)
+    if re.search(r"^Status: replaced[^\n]*\]\(\d{4}-", record, re.MULTILINE):
+        return headings == []
+    return "\nStatus: " in record and headings == PARTS
+
+
 @pytest.mark.parametrize("name", DECISIONS)
-def test_decision_has_its_four_parts(name: str) -> None:
-    headings = re.findall(r"^## (.*)$", text_of(name), re.MULTILINE)
-    assert headings == ["Context", "Decision", "Consequences", "Alternatives refused"]
+def test_decision_has_its_four_parts_or_a_successor(name: str) -> None:
+    assert has_its_parts(text_of(name))
+
+
+def test_planted_faults_of_a_record_are_found() -> None:
+    status, parts = "# 0001: x\n\nStatus: accepted.\n", "".join(f"\n## {part}\n" for part in PARTS)
+    replaced = status.replace("accepted", "replaced by [0002](0002-y.md)")
+    assert has_its_parts(status + parts)
+    assert has_its_parts(replaced)
+    for broken in (status, parts, replaced + parts, status + parts.replace("\n## Decision\n", "")):
+        assert not has_its_parts(broken)
 
 
 def test_decisions_that_the_code_cites_exist() -> None:
