@@ -1,10 +1,11 @@
 """The owner fails in four ways -> detected -> committed -> first message through the new owner; and a cut that heals.
 
 ``python -m benchmarks.detection [--timing wired wifi] [--case killed worker frozen cut heal] [--n N] [--kills N]
-[--rest S] [--out FOLDER] [--table]``. Needs root: six daemons in network namespaces with echo workers and a cool-down
-of 0, an application on robot1 that publishes at 200 Hz on its own key. Several timings run side by side, each with a
-fleet of its own. With ``--rest 6`` each fault meets a fleet at rest, whose beats are slow. With ``--out`` every cycle
-is on disk at once: the same command goes on where it was interrupted, ``--table`` only prints what is there.
+[--rest S] [--loss P] [--out FOLDER] [--table]``. Needs root: six daemons in network namespaces with echo workers and a
+cool-down of 0, an application on robot1 that publishes at 200 Hz on its own key. Several timings run side by side, each
+with a fleet of its own. With ``--rest 6`` each fault meets a fleet at rest, whose beats are slow; with ``--loss 20``
+one whose links lose that many of 100 packets. With ``--out`` every cycle is on disk at once: the same command goes on
+where it was interrupted, ``--table`` only prints what is there.
 
 * detected: the first robot holds the owner for gone (``worker``: its daemon sees the process end);
 * committed: the first node learns a newer epoch (``worker``: no move, the worker restarts in place);
@@ -74,9 +75,16 @@ class Cycle:
 class Cases:
     """One fleet and the faults it goes through."""
 
-    def __init__(self, bed: Netbed, probe: Probe, rest_s: float) -> None:
-        self.bed, self.probe, self.rest_s = bed, probe, rest_s
+    def __init__(self, bed: Netbed, probe: Probe, rest_s: float, loss: int) -> None:
+        self.bed, self.probe, self.rest_s, self.loss = bed, probe, rest_s, loss
+        self._heal()
         self.next_at = 0.0
+
+    def _heal(self) -> None:
+        """End every cut; what links lose, they lose on."""
+        self.bed.network.heal()
+        if self.loss:
+            self.bed.network.lose(self.loss, *self.bed.names)
 
     def is_ready(self) -> bool:
         """Whether everybody is alive, every worker ready, and messages flow."""
@@ -102,7 +110,7 @@ class Cases:
     def cut(self, owner: NodeId) -> Callable[[], None]:
         """No packet in or out any more."""
         self.bed.network.cut(owner)
-        return self.bed.network.heal
+        return self._heal
 
     def kill_worker(self, owner: NodeId) -> Callable[[], None]:
         """SIGKILL the worker process; its daemon starts another."""
@@ -150,7 +158,7 @@ class Cases:
         self.bed.network.separate(ours, theirs)
         start = monotonic_s()
         self.bed.wait(lambda: monotonic_s() > start + CUT_S, CUT_S + 5, "the cut")
-        self.bed.network.heal()
+        self._heal()
         healed = monotonic_s()
         self.bed.wait(lambda: self._revisions() == 1, 30, "one revision")
         agreed = (monotonic_s() - healed) * 1000
@@ -184,7 +192,7 @@ def run(record: Record, given: argparse.Namespace, timing: str) -> None:
         failures = 0
         while len(record.having(case=name, timing=timing)) < count:
             try:
-                with_fleet(timing, given.rest, lambda cases: measure(cases, record, name, count, timing))  # noqa: B023 - called at once
+                with_fleet(timing, given.rest, given.loss, lambda cases: measure(cases, record, name, count, timing))  # noqa: B023 - called at once
             except TestbedError as error:
                 failures += 1
                 record.add({"case": f"{name}, failed", "timing": timing, "why": str(error)[:4000]})
@@ -193,14 +201,14 @@ def run(record: Record, given: argparse.Namespace, timing: str) -> None:
                     raise
 
 
-def with_fleet(timing: str, rest_s: float, use: Callable[[Cases], None]) -> None:
+def with_fleet(timing: str, rest_s: float, loss: int, use: Callable[[Cases], None]) -> None:
     """A fleet and an application for some cycles, each of which begins after ``rest_s`` of calm."""
     tree = echo_fleet(timing=timing)
     tree["tasks"][TASK]["worker"] |= {"max_failures": 100, "failure_window_s": 1}  # many deaths on purpose
     with tempfile.TemporaryDirectory() as folder, Netbed(Path(folder), tree) as bed:
         bed.init()
         bed.start()
-        use(Cases(bed, bed.probe("robot1", put="robot1/in", hz=200, watch=["robot1/out"]), rest_s))
+        use(Cases(bed, bed.probe("robot1", put="robot1/in", hz=200, watch=["robot1/out"]), rest_s, loss))
 
 
 def report(records: dict[str, Record], folder: Path | None) -> None:
@@ -228,6 +236,7 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=200)
     parser.add_argument("--heals", type=int, default=5)
     parser.add_argument("--rest", type=float, default=0.0, help="seconds of calm before each fault")
+    parser.add_argument("--loss", type=int, default=0, help="packets of 100 that are lost on their way in")
     parser.add_argument("--out", type=Path)
     parser.add_argument("--table", action="store_true")
     parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
@@ -245,7 +254,7 @@ def main() -> int:
         if not given.table:
             print(machine(), flush=True)
             numbers = ["--n", given.n, "--kills", given.kills, "--heals", given.heals, "--out", folder, "--child"]
-            numbers += ["--rest", given.rest]
+            numbers += ["--rest", given.rest, "--loss", given.loss]
             shared = [*map(str, numbers), "--case", *given.case]
             code = together("benchmarks.detection", [["--timing", timing] for timing in given.timing], shared)
         report({timing: Record(folder, f"detection-{timing}") for timing in given.timing}, given.out)

@@ -82,6 +82,7 @@ def control_config(
     """
     settings = _peer(listen, connect, timing)
     settings["connect/retry"] = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
+    settings["transport/link/tx/lease"] = round(timing.control_lease_s * 1000)
     settings["transport/link/tx/keep_alive"] = CONTROL_KEEP_ALIVE
     settings["transport/shared_memory/enabled"] = False
     settings["transport/link/rx/max_message_size"] = CONTROL_MAX_MESSAGE

@@ -1,4 +1,4 @@
-"""Gives each data link the send buffer that its speed allows (`zsched.core.hop.room`).
+"""Gives each data link the send buffer that its speed allows (`zsched.core.hop.room`), and steady waits after a loss.
 
 Knows: the sockets beneath a session, what Linux counts about them, which size they began with. Does not know: streams,
 which size is right.
@@ -74,6 +74,7 @@ class LinkBuffers:
 
 
 def _room(link: LinkSocket) -> Room | None:
+    link.retry_steadily()
     size = link.send_buffer()
     if size == OWN:
         link.set_send_buffer(SMALL)

@@ -692,7 +692,7 @@ MEMBERSHIP_BUGS = (
     _bug(
         "the old link's token accuses a node that has just come back",
         MEMBERSHIP,
-        "if now < peer.back_at + self._timing.zenoh_lease_s:",
+        "if now < peer.back_at + self._timing.control_lease_s:",
         "if now < peer.back_at:",
         _MEMBERSHIP,
     ),

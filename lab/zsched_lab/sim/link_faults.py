@@ -87,7 +87,7 @@ class LinkFaults:
     def _cut(self, fault: Fault) -> None:
         pairs, sim = self._pairs(fault), self.scene.sim
         sim.cuts |= pairs
-        self.scene.then(sim.fleet.timing.zenoh_lease_s, lambda: self._links_end(pairs & sim.cuts))
+        self.scene.then(sim.fleet.timing.control_lease_s, lambda: self._links_end(pairs & sim.cuts))
         self.scene.then(fault.seconds, lambda: sim.cuts.difference_update(pairs))
 
     def _links_end(self, pairs: set[Pair]) -> None:
@@ -107,7 +107,7 @@ class LinkFaults:
             pairs = {pair for pair in pairs if (pair[0] in fault.nodes) == (fault.size < 0.25)}
         sim.hold(pairs, until=sim.now + fault.seconds)
         self.scene.then(
-            sim.fleet.timing.zenoh_lease_s,
+            sim.fleet.timing.control_lease_s,
             lambda: self._links_end({pair for pair in pairs if sim.held[pair].until > sim.now}),
         )
 

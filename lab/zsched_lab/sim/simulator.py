@@ -164,7 +164,7 @@ class Simulator(Links):
         if machine.node is None:
             return
         incarnation = machine.node.incarnation
-        delay_s = self.fleet.timing.zenoh_lease_s if is_power_lost else TOKEN_DELAY_S
+        delay_s = self.fleet.timing.control_lease_s if is_power_lost else TOKEN_DELAY_S
         for other in self.machines.values():
             if other is not machine and (machine.key, other.key) not in self.cuts:
                 self.work.lose(machine, other, delay_s)

@@ -4,7 +4,8 @@ from dataclasses import asdict, fields, replace
 
 import pytest
 
-from zsched.config.timing import PROFILES, WIFI, timing_faults
+from zsched.config.timing import PROFILES, WAN, WIFI, WIRED, timing_faults
+from zsched.core.membership.peers import LOSS_FACTOR
 from zsched.core.values.fleet import Timing
 
 
@@ -56,3 +57,10 @@ def test_every_clock_stands_in_some_relation() -> None:
         if field.name != "name":
             absurd = [changed(field.name, value) for value in (0.01, 3000.0)]
             assert any(timing_faults(timing) for timing in absurd), field.name
+
+
+def test_a_link_that_is_held_up_outlives_what_makes_its_node_suspect() -> None:
+    """zenoh ends it after three quarters of its lease; in `wan` the lease is meant to be the first to tell."""
+    for timing in (WIFI, WIRED):
+        assert 0.75 * timing.control_lease_s >= LOSS_FACTOR * timing.suspect_s
+    assert WAN.control_lease_s == WAN.zenoh_lease_s < WAN.suspect_s

@@ -921,3 +921,25 @@ def test_profiles_are_echoed_in_a_fleet_with_a_deadline_and_only_there() -> None
         assert {name: round(far_s, 3) for name, far_s in node.round_trips.seconds().items()} == (
             {"edge1": 0.02} if is_echoed else {}
         )
+
+
+def test_links_that_begin_and_cease_to_hold_beats_up_are_in_the_story() -> None:
+    """One peer's every third beat comes 0.7 s late for ten seconds, then all come in time."""
+    node, now, sequence = started(), 100.0, 1
+    told: list[str] = []
+    while now < 140.0:
+        sequence += 1
+        due = now + (0.7 if sequence % 3 == 0 and now < 110.0 else 0.2)
+        while node.next_deadline() <= due:
+            now = max(now, node.next_deadline())
+            told += [one.text for one in of(node.handle(ev.DeadlineReached(), now), do.RecordStory)]
+        now = due
+        for name in (*ROBOTS, *EDGES):
+            number = sequence if name == "edge1" else round(now * 100)
+            batch = node.handle(ev.BeatReceived(beat=beat(name, number)), now) if name != "robot1" else ()
+            told += [one.text for one in of(batch, do.RecordStory)]
+    assert [text for text in told if text.startswith("links")] == [
+        "links lose packets and hold beats up: a peer is suspect after 1.68 s of silence",
+        "links hold no beats up any more: a peer is suspect after 1.2 s of silence",
+    ]
+    assert node.counters["links_lossy"] == 1

@@ -61,6 +61,7 @@ from zsched.core.values.words import NAME
 from zsched.errors import AdapterError, WireError
 from zsched.guard import guarded, tolerant
 from zsched.sessions.expulsion import Expulsion, Refusal
+from zsched.sessions.link_retries import LinkRetries
 from zsched.sessions.link_sockets import LinkSockets, opened
 from zsched.sessions.problems import why_not_open
 from zsched.sessions.relink import Introducer
@@ -168,6 +169,7 @@ class ControlBus:
         self._zids: dict[NodeId, str] = {}
         """{node: the session that answered in its name last}."""
         self._sockets: LinkSockets | None = None
+        self._retries: LinkRetries | None = None
         self._post = post
         self._questions = Questions(self._sealed_answer)
         self._session: zenoh.Session | None = None
@@ -187,7 +189,7 @@ class ControlBus:
             session = opened(self._config)
         except zenoh.ZError as error:
             raise AdapterError(f"the control session {why_not_open(self._config, error)}") from error
-        self._session, self._sockets = session, LinkSockets(session)
+        self._session, self._sockets, self._retries = session, LinkSockets(session), LinkRetries(session)
         if self._members is not None:
             self._expulsion = Expulsion(session, self._fleet, self._members, self._refused)
         keys, node = self._keys, self._node
@@ -242,6 +244,8 @@ class ControlBus:
 
     def waiting(self) -> Iterator[ev.Event]:
         """The periodic beats and profiles that have come since the last call, and what was dropped (the loop)."""
+        if self._retries is not None:
+            self._retries.look()
         ring = self._ring
         while ring is not None and (sample := ring.handler.try_recv()) is not None:
             if (event := self._event(sample)) is not None:

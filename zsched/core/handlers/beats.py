@@ -13,7 +13,7 @@ from typing import Any, Final
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.membership.identity import Verdict
-from zsched.core.membership.peers import Transition
+from zsched.core.membership.peers import LOSS_FACTOR, Transition
 from zsched.core.stages import Handler, Stages
 from zsched.core.todo import ToDo
 from zsched.core.values.model import Beat, NodeId, PeerState
@@ -135,6 +135,8 @@ def _on_beat(node: Stages, event: ev.BeatReceived, todo: ToDo, now: float) -> No
         _ask(node, beat.node, todo)
     for change in node.membership.absorb_beat(beat, now):
         on_transition(node, change, todo, now)
+    if (is_lossy := node.membership.way_changes(now)) is not None:
+        _tell_of_way(node, todo, is_lossy=is_lossy)
     if node.membership.is_doubtful(beat.node):
         node.counters["beat_doubtful"] += 1
         return
@@ -161,6 +163,13 @@ def _on_beat(node: Stages, event: ev.BeatReceived, todo: ToDo, now: float) -> No
     if beat.fleet_file != node.fleet_file or node.problems:
         node.set_problem(f"fleet/{beat.node}", node.identity.file_complaint(beat, node.fleet_path))
     _hear_leases(node, beat, todo, now, is_newest=node.membership.is_newest(beat.node))
+
+
+def _tell_of_way(node: Stages, todo: ToDo, *, is_lossy: bool) -> None:
+    limit_s = node.fleet.timing.suspect_s * (LOSS_FACTOR if is_lossy else 1.0)
+    text = "links lose packets and hold beats up" if is_lossy else "links hold no beats up any more"
+    todo.add(do.RecordStory(stage="membership", text=f"{text}: a peer is suspect after {limit_s:g} s of silence"))
+    node.counters["links_lossy"] += is_lossy
 
 
 def _ask(node: Stages, peer: NodeId, todo: ToDo) -> None:

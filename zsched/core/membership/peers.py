@@ -12,6 +12,9 @@ A node whose own loop lags mistrusts itself first: the lag factor lengthens its 
 Lifeguard, arXiv 1707.00788). An observer that has watched for a while without ever hearing a peer accuses it as well:
 it must not speak for a peer that it does not know.
 
+Links that lose packets hold beats up: TCP sends them again, and then several come at once. Where that happens again and
+again, a longer silence is needed to suspect (`LOSS_FACTOR`).
+
 The first peer that is heard after a cut is heard before the others behind the same cut. While its beats do not accuse
 them, they are *suspect*, not gone. Otherwise a robot that hears the first node of a healed network would flee from an
 owner that all others hear.
@@ -33,6 +36,15 @@ LATE_BEATS = 2.5
 """A beat that comes later than so many periods is late: up to two wait until the receiver's loop is awake."""
 CALM_LAG_FACTOR = 1.1
 """Below it this node's loop does not lag."""
+LOSS_FACTOR = 1.4
+"""How much longer a peer may be silent while links hold beats up."""
+HELD_UP = (0.5, 2.0)
+"""A beat was held up on its way when it is the next one and comes after a silence of these shares of ``suspect_s``: a
+longer one is a cut..."""
+SENDERS_LAG = 0.25
+"""...of which less than this share is its sender's lag."""
+LOSSY_S = 15.0
+"""Beats that are held up twice within this time make the links lossy, for as long behind the last of them."""
 IN_FLIGHT_S = 0.03
 """A beat this soon after its sender's token went was sent before that: it refutes nothing."""
 
@@ -77,6 +89,10 @@ class Membership:
         self._me = me
         self._peers: dict[NodeId, _Peer] = {}
         self._lag_factor = 1.0
+        self._held_up_at = -math.inf
+        """When a beat that was held up came last."""
+        self._lossy_until = -math.inf
+        self._was_lossy = False
         self._started_at = math.inf
         self._has_heard = False
         self._has_watched = False
@@ -194,7 +210,7 @@ class Membership:
         peer = self._peers.get(beat.node)
         if peer is None:
             return ()
-        known, sequence = peer.track.incarnation, peer.track.sequence
+        known, sequence, silent_s = peer.track.incarnation, peer.track.sequence, now - peer.beat_at
         peer.order = peer.track.judge(
             beat.incarnation, beat.sequence, now, may_begin=self._may_begin(peer, beat.incarnation, now)
         )
@@ -208,6 +224,8 @@ class Membership:
         peer.beat_at = now
         self._has_heard = True
         peer.suspects, peer.token_lost = beat.suspects, False
+        if known == beat.incarnation and beat.sequence == sequence + 1:
+            self._note_way(silent_s, beat.loop_lag_s, now)
         peer.is_calm, peer.has_missed = beat.calm, sequence >= 0 and not restarted and beat.sequence > sequence + 1
         changes = []
         if before is not PeerState.ALIVE:
@@ -219,6 +237,24 @@ class Membership:
         elif restarted:
             changes.append(Transition(node=beat.node, before=before, after=before, reason="restarted"))
         return (*changes, *self._review(now)) if self._has_suspect else tuple(changes)
+
+    def _note_way(self, silent_s: float, senders_lag_s: float, now: float) -> None:
+        """A beat has followed the one before after so long a silence: its sender, its way or this node was slow."""
+        least, most = (share * self._timing.suspect_s for share in HELD_UP)
+        is_way = senders_lag_s < SENDERS_LAG * silent_s and self._lag_factor < CALM_LAG_FACTOR
+        if not (is_way and least <= silent_s <= most) or now < self._held_up_at + self._timing.suspect_s:
+            return  # what one cut holds up by several links, comes at once
+        if now < self._held_up_at + LOSSY_S:
+            self._lossy_until = now + LOSSY_S
+        self._held_up_at = now
+
+    def way_changes(self, now: float) -> bool | None:
+        """Whether links hold beats up, if that has changed since the last call; ``None``: it has not."""
+        is_lossy = now < self._lossy_until
+        if is_lossy is self._was_lossy:
+            return None
+        self._was_lossy = is_lossy
+        return is_lossy
 
     def _take_word(self, beat: Beat, now: float) -> list[Transition]:
         """A lost peer is back. Lost peers that it does not accuse should be heard soon."""
@@ -250,7 +286,7 @@ class Membership:
         peer = self._peers.get(node)
         if peer is None or peer.track.incarnation != incarnation or peer.state is not PeerState.ALIVE:
             return ()
-        if now < peer.back_at + self._timing.zenoh_lease_s:
+        if now < peer.back_at + self._timing.control_lease_s:
             return ()
         peer.token_lost, peer.token_lost_at = True, now
         return (self._change(node, PeerState.SUSPECT, "its token went", now), *self._review(now))
@@ -265,7 +301,7 @@ class Membership:
             return ()  # silence and reviews have their times; a peer's word is reviewed when it comes
         self._deadline = None
         for name, peer in self._peers.items():
-            if peer.state is PeerState.ALIVE and now >= peer.beat_at + limit:
+            if peer.state is PeerState.ALIVE and now >= self._peer_deadline(peer, limit):
                 silent = now - peer.beat_at
                 changes.append(self._change(name, PeerState.SUSPECT, f"silent for {silent:.2f} s", now))
         return (*changes, *self._review(now))
@@ -281,7 +317,8 @@ class Membership:
 
     def _peer_deadline(self, peer: _Peer, limit: float) -> float:
         if peer.state is PeerState.ALIVE:
-            return peer.beat_at + limit
+            lossy_until = min(self._lossy_until, peer.beat_at + LOSS_FACTOR * limit)
+            return max(peer.beat_at + limit, lossy_until)
         if peer.state is PeerState.SUSPECT:
             return self._review_at(peer)
         return math.inf

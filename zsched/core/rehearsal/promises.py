@@ -47,7 +47,7 @@ def promises(fleet: Fleet, task: TaskSpec) -> tuple[Promised, ...]:
 
 def _silent_s(timing: Timing) -> float:
     """Silence is found up to one beat late, by the beats or by zenoh's lease."""
-    return min(timing.suspect_s + timing.rest_beat_s, timing.zenoh_lease_s)
+    return min(timing.suspect_s + timing.rest_beat_s, timing.control_lease_s)
 
 
 def _whole(task: TaskSpec, *, is_planned: bool) -> Iterator[str]:

@@ -309,6 +309,16 @@ class Timing:
         """Period of the beat while nothing goes on: three of them fit into the silence that makes a peer suspect."""
         return max(min(2 * self.beat_s, self.suspect_s / 3), self.beat_s)
 
+    @property
+    def control_lease_s(self) -> float:
+        """How long a link that carries beats may be silent before zenoh ends it.
+
+        Where beats find silence first, a link is not ended while they are held up (at most 1.4 x ``suspect_s``); zenoh
+        may end it after three quarters of this.
+        """
+        is_second = self.zenoh_lease_s >= self.suspect_s
+        return max(self.zenoh_lease_s, 2 * self.suspect_s) if is_second else self.zenoh_lease_s
+
 
 class SharedMemory(StrEnum):
     """Whether large payloads may pass between processes of one machine through shared memory."""

@@ -112,7 +112,7 @@ def until_lost(parent: Parent, spawn: Spawn, incarnation: int, fault: signal.Sig
 
 
 def test_token_of_a_stopped_process_goes_within_its_lease(parent: Parent, spawn: Spawn) -> None:
-    within(until_lost(parent, spawn, 5, signal.SIGSTOP), Timing().zenoh_lease_s + 1.0)
+    within(until_lost(parent, spawn, 5, signal.SIGSTOP), Timing().control_lease_s + 1.0)
 
 
 def test_orderly_close_withdraws_the_token(parent: Parent, spawn: Spawn) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from support.beats import beat_of
 from zsched.config.timing import WAN, WIFI, WIRED
-from zsched.core.membership.peers import MAX_LAG_FACTOR, Membership
+from zsched.core.membership.peers import LOSS_FACTOR, LOSSY_S, MAX_LAG_FACTOR, Membership
 from zsched.core.values.fleet import Timing
 from zsched.core.values.model import NodeId, PeerState
 
@@ -371,7 +371,7 @@ def test_token_that_goes_just_after_its_node_came_back_is_the_old_link_s(node: s
         ear.beat(heard_again, now)
     assert ear.members.absorb_token_lost(node, 1, now + 0.03) == ()
     assert ear.members.state(node) is ALIVE
-    later = now + WIFI.zenoh_lease_s
+    later = now + WIFI.control_lease_s
     ear.run(now, later, LARGE[1:])
     (change,) = ear.members.absorb_token_lost(node, 1, later)
     assert change.after is SUSPECT
@@ -561,3 +561,77 @@ def test_another_life_begins_once_two_beats_of_the_pace_are_missing(calm: bool) 
     assert ear.members.incarnation("a") == 1
     ear.members.absorb_beat(beat_of("a", 2, incarnation=2), 2 * period_s + 0.01)
     assert ear.members.incarnation("a") == 2
+
+
+# --- links that lose packets -----------------------------------------------------------------------------------------
+
+
+def hold_up(ear: Ear, node: NodeId, now: float, *, silent_s: float, missing: int = 0, lag_s: float = 0.0) -> float:
+    """The node beats at ``now``, and next after this silence, of which ``lag_s`` was its own; the time of that."""
+    for at, lag in ((now, 0.0), (now + silent_s, lag_s)):
+        ear.sequence += 1 + (missing if at > now else 0)
+        ear.members.absorb_beat(replace(beat_of(node, ear.sequence), loop_lag_s=lag), at)
+    return now + silent_s
+
+
+def silence_before_suspicion(ear: Ear, node: NodeId, now: float) -> float:
+    """How long ``node`` may be silent after a beat at ``now``."""
+    ear.beat(node, now)
+    seen = ear.run(now + 0.01, now + 5.0, ())
+    return round(next(at for at, name, state in seen if name == node and state is SUSPECT) - now, 6)
+
+
+def test_beats_that_are_held_up_twice_lengthen_the_silence_that_counts() -> None:
+    ear = heard(LARGE)
+    at = hold_up(ear, "a", 10.0, silent_s=0.7)
+    at = hold_up(ear, "b", at + 5.0, silent_s=0.7)
+    assert silence_before_suspicion(ear, "c", at) == pytest.approx(LOSS_FACTOR * WIFI.suspect_s)
+
+
+def test_one_beat_that_is_held_up_changes_nothing() -> None:
+    ear = heard(LARGE)
+    at = hold_up(ear, "a", 10.0, silent_s=0.7)
+    assert silence_before_suspicion(ear, "c", at) == pytest.approx(WIFI.suspect_s)
+    at = hold_up(ear, "a", at + LOSSY_S + 5.0, silent_s=0.7)
+    assert silence_before_suspicion(ear, "c", at) == pytest.approx(WIFI.suspect_s)
+
+
+def test_one_moment_that_holds_several_up_changes_nothing() -> None:
+    ear = heard(LARGE)
+    for node in ("a", "b"):
+        at = hold_up(ear, node, 10.0, silent_s=0.7)
+    assert silence_before_suspicion(ear, "c", at) == pytest.approx(WIFI.suspect_s)
+
+
+@pytest.mark.parametrize(
+    "what", [{"silent_s": 0.5}, {"silent_s": 2.6}, {"silent_s": 0.7, "missing": 1}, {"silent_s": 0.7, "lag_s": 0.4}]
+)
+def test_what_is_no_loss_on_the_way_changes_nothing(what: dict[str, float]) -> None:
+    """A beat in its time, a cut, a beat that never came, a sender that slept."""
+    ear = heard(LARGE)
+    at = 10.0
+    for node in ("a", "b", "a"):
+        at = hold_up(ear, node, at + 3.0, **what)  # type: ignore[arg-type]  # the keywords of the table
+    assert silence_before_suspicion(ear, "c", at) == pytest.approx(WIFI.suspect_s)
+
+
+def test_own_lag_is_not_taken_for_loss() -> None:
+    ear = heard(LARGE)
+    at = 10.0
+    for node in ("a", "b"):
+        ear.members.note_lag(0.3)
+        at = hold_up(ear, node, at + 3.0, silent_s=0.7)
+    for _ in range(20):
+        ear.members.fade_lag_factor()
+    assert silence_before_suspicion(ear, "c", at) == pytest.approx(WIFI.suspect_s, abs=0.01)
+
+
+def test_the_longer_silence_ends_with_the_losses() -> None:
+    ear = heard(LARGE)
+    at = hold_up(ear, "a", 10.0, silent_s=0.7)
+    at = hold_up(ear, "b", at + 5.0, silent_s=0.7)
+    assert silence_before_suspicion(ear, "c", at + LOSSY_S - 1.5) == pytest.approx(1.5)
+    ear = heard(LARGE)
+    at = hold_up(ear, "a", 10.0, silent_s=0.7)
+    at = hold_up(ear, "b", at + 5.0, silent_s=0.7)
+    assert silence_before_suspicion(ear, "c", at + LOSSY_S) == pytest.approx(WIFI.suspect_s)
