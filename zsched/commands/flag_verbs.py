@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from zsched.commands.common import CliError, Verb
-from zsched.commands.fleet_verbs import AcceptOption, ConnectOption, PlanOption, RevisionOption
-from zsched.commands.order_verbs import AskedOption, ForOption, JsonOption, ReasonOption, RuntimeOption, YesOption
+from zsched.commands.fleet_verbs import AcceptOption, PlanOption, RevisionOption
+from zsched.commands.options import AskedOption, ConnectOption, JsonOption, RuntimeOption
+from zsched.commands.order_verbs import ForOption, ReasonOption, YesOption
 from zsched.exits import EXIT_USAGE
 
 if TYPE_CHECKING:

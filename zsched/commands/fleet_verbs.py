@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from zsched.commands.common import Verb, Verbs
+from zsched.commands.options import AskedOption, ConnectOption, JsonOption, RuntimeOption
 
 if TYPE_CHECKING:
     from zsched.commands.apply import ApplyView
@@ -34,15 +35,6 @@ AcceptOption = Annotated[
     list[str] | None, typer.Option("--accept", metavar="DANGER", help="Accept this danger; give it once for each.")
 ]
 ReasonOption = Annotated[str, typer.Option("--reason", "-m", metavar="TEXT", help="Why; the journal shows it.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="JSON, with its schema; --json=1: of that version.")]
-AskedOption = Annotated[
-    str | None,
-    typer.Option("--node", "-n", metavar="NAME", help="Ask this node of the fleet, or CELL/NODE of another one."),
-]
-RuntimeOption = Annotated[
-    Path | None,
-    typer.Option("--runtime-dir", metavar="DIR", help="Operator sockets. [ZSCHED_RUNTIME_DIR, else /run/zsched]"),
-]
 PauseAfterOption = Annotated[
     int | None,
     typer.Option(
@@ -52,10 +44,6 @@ PauseAfterOption = Annotated[
         metavar="N",
         help="Changed workers start on N candidates, and wait for `zsched task promote`.",
     ),
-]
-ConnectOption = Annotated[
-    str | None,
-    typer.Option("--connect", metavar="ENDPOINT", help="No daemon here: ask at this node's control endpoint."),
 ]
 
 

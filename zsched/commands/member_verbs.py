@@ -17,17 +17,14 @@ import typer
 from zsched.commands.common import Verb
 from zsched.commands.fleet_verbs import (
     AcceptOption,
-    AskedOption,
-    ConnectOption,
-    JsonOption,
     PlanOption,
     ReasonOption,
     RevisionOption,
-    RuntimeOption,
     YesOption,
     fleet_app,
     view_of,
 )
+from zsched.commands.options import AskedOption, ConfigOption, ConnectOption, JsonOption, RuntimeOption, StateOption
 
 if TYPE_CHECKING:
     from zsched.runtime.membership import Places
@@ -48,14 +45,6 @@ class Profile(StrEnum):
     WAN = "wan"
 
 
-ConfigOption = Annotated[
-    Path | None,
-    typer.Option("--config", "-c", metavar="FILE", help="Fleet file. [ZSCHED_CONFIG, else /etc/zsched/fleet.yaml]"),
-]
-StateOption = Annotated[
-    Path | None,
-    typer.Option("--state-dir", metavar="DIR", help="Durable state. [ZSCHED_STATE_DIR, else /var/lib/zsched]"),
-]
 AddressHelp = "HOST or HOST:PORT of its control session; its data session has the next port."
 OnlyPlanOption = Annotated[
     bool, typer.Option("--plan", "--dry-run", help="Only show what would be written; exits with 10.")

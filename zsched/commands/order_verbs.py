@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from zsched.commands.common import CliError, Verb
+from zsched.commands.options import AskedOption, ConnectOption, JsonOption, RuntimeOption
 from zsched.exits import EXIT_USAGE
 
 if TYPE_CHECKING:
@@ -19,15 +20,6 @@ if TYPE_CHECKING:
 
 TaskArgument = Annotated[str, typer.Argument(metavar="TASK", help="A task of the fleet file.")]
 TasksArgument = Annotated[list[str] | None, typer.Argument(metavar="[TASK]...", help="Tasks of the fleet file.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="JSON, with its schema; --json=1: of that version.")]
-AskedOption = Annotated[
-    str | None,
-    typer.Option("--node", "-n", metavar="NAME", help="Ask this node of the fleet, or CELL/NODE of another one."),
-]
-RuntimeOption = Annotated[
-    Path | None,
-    typer.Option("--runtime-dir", metavar="DIR", help="Operator sockets. [ZSCHED_RUNTIME_DIR, else /run/zsched]"),
-]
 ReasonOption = Annotated[
     str, typer.Option("--reason", "-m", metavar="TEXT", help="Why; status and history of every node show it.")
 ]
@@ -38,10 +30,6 @@ RevisionOption = Annotated[
 ]
 ForOption = Annotated[
     str | None, typer.Option("--for", metavar="DURATION", help="End it by itself: 90s, 10m, 2h, 1d. [until taken back]")
-]
-ConnectOption = Annotated[
-    str | None,
-    typer.Option("--connect", metavar="ENDPOINT", help="No daemon here: ask at this node's control endpoint."),
 ]
 AllOption = Annotated[bool, typer.Option("--all", help="Every task.")]
 

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from zsched.commands.common import Verb, Verbs
-from zsched.commands.fleet_verbs import AskedOption, RuntimeOption
+from zsched.commands.options import AskedOption, ConfigOption, RuntimeOption
 from zsched.core.values.certificates import Role
 
 pki_app = typer.Typer(
@@ -22,10 +22,6 @@ pki_app = typer.Typer(
     rich_markup_mode=None,
 )
 
-ConfigOption = Annotated[
-    Path | None,
-    typer.Option("--config", "-c", metavar="FILE", help="Fleet file. [ZSCHED_CONFIG, else /etc/zsched/fleet.yaml]"),
-]
 AuthorityOption = Annotated[
     Path | None,
     typer.Option("--authority", metavar="DIR", help="Its folder. [ZSCHED_AUTHORITY, else below ~/.local/share/zsched]"),

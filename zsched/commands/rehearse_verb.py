@@ -11,15 +11,8 @@ from typing import Annotated
 import typer
 
 from zsched.commands.common import CliError, Verb
-from zsched.commands.order_verbs import (
-    AskedOption,
-    JsonOption,
-    PlanOption,
-    ReasonOption,
-    RevisionOption,
-    RuntimeOption,
-    YesOption,
-)
+from zsched.commands.options import AskedOption, JsonOption, RuntimeOption
+from zsched.commands.order_verbs import PlanOption, ReasonOption, RevisionOption, YesOption
 from zsched.exits import EXIT_USAGE
 
 

@@ -12,6 +12,7 @@ from typing import Annotated
 import typer
 
 from zsched.commands.common import Verb, Verbs
+from zsched.commands.options import ConnectOption, JsonOption, RuntimeOption
 
 stream_app = typer.Typer(
     name="stream",
@@ -28,18 +29,9 @@ KeyArgument = Annotated[
 NodeOption = Annotated[
     str | None, typer.Option("--node", "-n", metavar="NAME", help="At this node, here or anywhere in the fleet.")
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="JSON, with its schema; --json=1: of that version.")]
 WindowOption = Annotated[float, typer.Option("--window", min=0.1, max=3600.0, metavar="S", help="Seconds to look at.")]
 CountOption = Annotated[
     int | None, typer.Option("--count", min=1, metavar="N", help="End after N of them. [go on until Ctrl-C]")
-]
-ConnectOption = Annotated[
-    str | None,
-    typer.Option("--connect", metavar="ENDPOINT", help="No daemon here: ask at this node's control endpoint."),
-]
-RuntimeOption = Annotated[
-    Path | None,
-    typer.Option("--runtime-dir", metavar="DIR", help="Operator sockets. [ZSCHED_RUNTIME_DIR, else /run/zsched]"),
 ]
 
 
