@@ -223,6 +223,15 @@ def warn(text: str, indent: int = 2) -> None:
     sys.stderr.flush()
 
 
+def counted(number: int, plural: str) -> str:
+    """A number and what it counts.
+
+    >>> counted(1, "nodes"), counted(2, "nodes")
+    ('1 node', '2 nodes')
+    """
+    return f"{number} {plural if number != 1 else plural.removesuffix('s')}"
+
+
 def says_yes(question: str, stream: TextIO) -> bool:
     """Ask whoever sits at the terminal; anything but yes is no."""
     stream.write(f"{fitted(question, stream, 0)} [y/N] ")

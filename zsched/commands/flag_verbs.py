@@ -5,29 +5,17 @@ Knows: options. Does not know: how anything is done (`zsched.commands.flags`, im
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from zsched.commands.common import CliError, Verb
+from zsched.commands.common import CliError
 from zsched.commands.fleet_verbs import AcceptOption, PlanOption, RevisionOption
 from zsched.commands.options import AskedOption, ConnectOption, JsonOption, RuntimeOption
-from zsched.commands.order_verbs import ForOption, ReasonOption, YesOption
+from zsched.commands.order_verbs import ForOption, ReasonOption, YesOption, order_view
 from zsched.exits import EXIT_USAGE
 
-if TYPE_CHECKING:
-    from zsched.commands.orders import OrderView
-
 NodesArgument = Annotated[list[str] | None, typer.Argument(metavar="[NODE]...", help="Nodes of the fleet.")]
-
-
-def add_flag_verbs(app: typer.Typer) -> None:
-    """Add the verbs to the program."""
-    verbs: tuple[Callable[..., None], ...] = (drain, undrain, eligible)
-    for verb in verbs:
-        app.command(cls=Verb)(verb)
 
 
 def drain(
@@ -70,7 +58,7 @@ def drain(
         deadline_s=None if force else duration_s(deadline),
         accepted=tuple(accept or ()),
     )
-    view = _view(node, runtime_dir, connect, reason, revision, for_, json_=json_, yes=yes, plan=plan)
+    view = order_view(node, runtime_dir, connect, reason, revision, for_, json_=json_, yes=yes, plan=plan)
     raise typer.Exit(give(view, order))
 
 
@@ -93,7 +81,7 @@ def undrain(
     """
     from zsched.commands.flags import undrain as give  # noqa: PLC0415 - each verb imports what it needs
 
-    view = _view(node, runtime_dir, connect, reason, revision, None, json_=json_, yes=yes, plan=plan)
+    view = order_view(node, runtime_dir, connect, reason, revision, None, json_=json_, yes=yes, plan=plan)
     raise typer.Exit(give(view, nodes or ()))
 
 
@@ -117,32 +105,5 @@ def eligible(
     """
     from zsched.commands.flags import eligible as give  # noqa: PLC0415 - each verb imports what it needs
 
-    view = _view(node, runtime_dir, connect, reason, revision, for_, json_=json_, yes=yes, plan=plan)
+    view = order_view(node, runtime_dir, connect, reason, revision, for_, json_=json_, yes=yes, plan=plan)
     raise typer.Exit(give(view, name, word, tuple(accept or ())))
-
-
-def _view(
-    node: str | None,
-    runtime_dir: Path | None,
-    connect: str | None,
-    reason: str,
-    revision: int | None,
-    for_: str | None,
-    *,
-    json_: bool,
-    yes: bool,
-    plan: bool,
-) -> OrderView:
-    from zsched.commands.ask import find_door  # noqa: PLC0415 - as above
-    from zsched.commands.history import duration_s  # noqa: PLC0415 - as above
-    from zsched.commands.orders import OrderView  # noqa: PLC0415 - as above
-
-    return OrderView(
-        door=find_door(runtime_dir, node, connect=connect),
-        is_json=json_,
-        is_yes=yes,
-        is_plan=plan,
-        reason=reason,
-        revision=revision,
-        for_s=None if for_ is None else duration_s(for_),
-    )

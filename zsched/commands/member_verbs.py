@@ -7,7 +7,6 @@ the verb that runs).
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -49,13 +48,6 @@ AddressHelp = "HOST or HOST:PORT of its control session; its data session has th
 OnlyPlanOption = Annotated[
     bool, typer.Option("--plan", "--dry-run", help="Only show what would be written; exits with 10.")
 ]
-
-
-def add_member_verbs(app: typer.Typer) -> None:
-    """Add the verbs to the program."""
-    verbs: tuple[Callable[..., None], ...] = (invite, join, leave)
-    for verb in verbs:
-        app.command(cls=Verb)(verb)
 
 
 def _places(config: Path | None, state_dir: Path | None) -> Places:

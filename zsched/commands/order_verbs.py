@@ -5,13 +5,12 @@ Knows: options. Does not know: how anything is done (`zsched.commands.orders`, i
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from zsched.commands.common import CliError, Verb
+from zsched.commands.common import CliError
 from zsched.commands.options import AskedOption, ConnectOption, JsonOption, RuntimeOption
 from zsched.exits import EXIT_USAGE
 
@@ -32,13 +31,6 @@ ForOption = Annotated[
     str | None, typer.Option("--for", metavar="DURATION", help="End it by itself: 90s, 10m, 2h, 1d. [until taken back]")
 ]
 AllOption = Annotated[bool, typer.Option("--all", help="Every task.")]
-
-
-def add_order_verbs(app: typer.Typer) -> None:
-    """Add the verbs to the program."""
-    verbs: tuple[Callable[..., None], ...] = (move, pin, unpin, pause, resume, tune, weights, maint, restart, retry)
-    for verb in verbs:
-        app.command(cls=Verb)(verb)
 
 
 def move(
@@ -64,7 +56,7 @@ def move(
     from zsched.commands.orders import MoveOrder  # noqa: PLC0415 - each verb imports what it needs
     from zsched.commands.orders import move as give  # noqa: PLC0415 - as above
 
-    view = _view(node, runtime_dir, connect, reason, revision, None, json_=json_, yes=yes, plan=plan)
+    view = order_view(node, runtime_dir, connect, reason, revision, None, json_=json_, yes=yes, plan=plan)
     order = MoveOrder(task=task, node=to, origin=origin, is_detached=detach, timeout_s=timeout)
     raise typer.Exit(give(view, order))
 
@@ -87,7 +79,7 @@ def pin(
 
     Without a task it lists the pins.
     """
-    view = _view(node, runtime_dir, connect, reason, revision, for_, json_=json_, yes=yes, plan=plan)
+    view = order_view(node, runtime_dir, connect, reason, revision, for_, json_=json_, yes=yes, plan=plan)
     _hold(view, "pin", [task] if task else [], to, is_hard=hard)
 
 
@@ -104,7 +96,7 @@ def unpin(
 ) -> None:
     """End a task's pin: the fleet places it again. Without a task it lists the pins."""
     _hold(
-        _view(node, runtime_dir, connect, reason, revision, None, json_=json_, yes=yes, plan=plan),
+        order_view(node, runtime_dir, connect, reason, revision, None, json_=json_, yes=yes, plan=plan),
         "unpin",
         [task] if task else [],
     )
@@ -130,7 +122,7 @@ def pause(
 
     Without a task it lists the pauses.
     """
-    view = _view(node, runtime_dir, connect, reason, revision, for_, json_=json_, yes=yes, plan=plan)
+    view = order_view(node, runtime_dir, connect, reason, revision, for_, json_=json_, yes=yes, plan=plan)
     _hold(view, "pause", tasks or [], is_all=all_, is_waiting=wait)
 
 
@@ -147,7 +139,7 @@ def resume(
     connect: ConnectOption = None,
 ) -> None:
     """End the pause of tasks. Without a task it lists the pauses."""
-    view = _view(node, runtime_dir, connect, reason, revision, None, json_=json_, yes=yes, plan=plan)
+    view = order_view(node, runtime_dir, connect, reason, revision, None, json_=json_, yes=yes, plan=plan)
     _hold(view, "resume", tasks or [], is_all=all_)
 
 
@@ -175,7 +167,7 @@ def tune(
     """
     from zsched.commands.orders import tune as give  # noqa: PLC0415 - each verb imports what it needs
 
-    view = _view(node, runtime_dir, connect, reason, revision, None, json_=json_, yes=yes, plan=plan)
+    view = order_view(node, runtime_dir, connect, reason, revision, None, json_=json_, yes=yes, plan=plan)
     raise typer.Exit(give(view, task, pairs or []))
 
 
@@ -204,7 +196,7 @@ def weights(
 
     if revision is not None and not pairs:
         raise CliError(EXIT_USAGE, "--revision goes with new weights, e.g. cpu=0.6 memory=0.4")
-    view = _view(node, runtime_dir, connect, reason, revision, None, json_=json_, yes=yes, plan=plan)
+    view = order_view(node, runtime_dir, connect, reason, revision, None, json_=json_, yes=yes, plan=plan)
     raise typer.Exit(give(view, task, pairs or []))
 
 
@@ -226,7 +218,7 @@ def restart(
     from zsched.commands.restart import restart as give  # noqa: PLC0415 - each verb imports what it needs
 
     raise typer.Exit(
-        give(_view(node, runtime_dir, connect, reason, None, None, json_=json_, yes=yes, plan=plan), task, whose)
+        give(order_view(node, runtime_dir, connect, reason, None, None, json_=json_, yes=yes, plan=plan), task, whose)
     )
 
 
@@ -250,7 +242,7 @@ def retry(
     from zsched.commands.retry import retry as give  # noqa: PLC0415 - each verb imports what it needs
 
     raise typer.Exit(
-        give(_view(node, runtime_dir, connect, reason, None, None, json_=json_, yes=yes, plan=plan), task, whose)
+        give(order_view(node, runtime_dir, connect, reason, None, None, json_=json_, yes=yes, plan=plan), task, whose)
     )
 
 
@@ -267,7 +259,7 @@ def maint(
     raise typer.Exit(show(find_door(runtime_dir, node, connect=connect), is_json=json_))
 
 
-def _view(
+def order_view(
     node: str | None,
     runtime_dir: Path | None,
     connect: str | None,
@@ -279,6 +271,7 @@ def _view(
     yes: bool,
     plan: bool,
 ) -> OrderView:
+    """The options of every verb that gives an order; ``for_``: how long it holds."""
     from zsched.commands.ask import find_door  # noqa: PLC0415 - as above
     from zsched.commands.history import duration_s  # noqa: PLC0415 - as above
     from zsched.commands.orders import OrderView  # noqa: PLC0415 - as above

@@ -10,15 +10,10 @@ from typing import Annotated
 
 import typer
 
-from zsched.commands.common import CliError, Verb
+from zsched.commands.common import CliError
 from zsched.commands.options import AskedOption, JsonOption, RuntimeOption
 from zsched.commands.order_verbs import PlanOption, ReasonOption, RevisionOption, YesOption
 from zsched.exits import EXIT_USAGE
-
-
-def add_rehearse_verb(app: typer.Typer) -> None:
-    """Add the verb to the program."""
-    app.command(cls=Verb)(rehearse)
 
 
 def rehearse(

@@ -1,0 +1,40 @@
+"""What this machine goes by: its own node's name, and a fleet file that can be read.
+
+Knows: where the words come from, what to say of a wrong one. Does not know: what is in the file, any verb.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from zsched import paths as places
+from zsched.commands.common import CliError
+from zsched.config.reader import MAX_FILE_BYTES
+from zsched.core.values.words import NAME
+from zsched.exits import EXIT_CONFIG, EXIT_USAGE
+from zsched.files import owner_of, read_regular
+
+
+def own_name(given: str | None) -> str:
+    """This node's name. Raises `CliError` (2) when it is no name."""
+    name = places.node_name(given, os.environ)
+    if NAME.fullmatch(name) is None:
+        where = "--node" if given else "ZSCHED_NODE" if os.environ.get("ZSCHED_NODE") else "the host name"
+        raise CliError(
+            EXIT_USAGE,
+            f"{where}: {name!r} is not a name ([a-z0-9][a-z0-9_-]{{0,62}}); give the fleet file's with --node",
+        )
+    return name
+
+
+def need_file(file: Path) -> None:
+    """Raise `CliError` (78) unless the fleet file can be read."""
+    try:
+        read_regular(file, MAX_FILE_BYTES)
+    except PermissionError as error:
+        raise CliError(EXIT_CONFIG, f"{file}: cannot be read: {error.strerror}; {owner_of(file)}") from error
+    except OSError as error:
+        raise CliError(
+            EXIT_CONFIG, f"{file}: cannot be read: {error.strerror}; name the fleet file with --config or ZSCHED_CONFIG"
+        ) from error

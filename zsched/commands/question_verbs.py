@@ -1,0 +1,229 @@
+"""The verbs that ask and change nothing: of the fleet now, of its past, and what to wait for.
+
+Knows: options. Does not know: how anything is done (files of the verbs' names, imported by the verb that runs).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from zsched.commands.common import CliError, Verb, Verbs
+from zsched.commands.options import AskedOption, ConnectOption, HereOption, JsonOption, RuntimeOption
+from zsched.exits import EXIT_USAGE
+
+metrics_app = typer.Typer(
+    name="metrics", cls=Verbs, help="Figures for Prometheus.", no_args_is_help=True, rich_markup_mode=None
+)
+
+
+def status(
+    json_: JsonOption = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="All six stages, not only a line per task.")] = False,
+    watch: Annotated[bool, typer.Option("--watch", "-w", help="Again and again; with --json one line each.")] = False,
+    interval: Annotated[float, typer.Option(min=0.1, max=3600.0, metavar="S", help="Seconds between two.")] = 1.0,
+    node: AskedOption = None,
+    runtime_dir: RuntimeOption = None,
+    connect: ConnectOption = None,
+    no_color: Annotated[bool, typer.Option("--no-color", help="Plain text (also: NO_COLOR).")] = False,
+) -> None:
+    """Show nodes, tasks, owners and what is wrong; with -v also decisions, votes and streams.
+
+    Exits with 4 while the fleet is degraded: no quorum, or a task without a live owner.
+    """
+    from zsched.commands.status import StatusView, show, watch_on  # noqa: PLC0415 - each verb imports what it needs
+
+    view = StatusView(
+        runtime_dir=runtime_dir, node=node, is_json=json_, is_plain=no_color, is_whole=verbose, connect=connect
+    )
+    raise typer.Exit(watch_on(view, interval) if watch else show(view))
+
+
+def site(json_: JsonOption = False, node: AskedOption = None, runtime_dir: RuntimeOption = None) -> None:
+    """Ask every fleet of the site how it is: nodes alive, tasks and their owners.
+
+    The fleets are those under `site:` in the document, or in the fleet file. `--node CELL/NODE` of the other verbs
+    asks a node of one of them. Exits with 4 when a cell does not answer or is degraded, with 3 when none answers.
+    """
+    from zsched.commands.cells import show_site  # noqa: PLC0415 - each verb imports what it needs
+
+    raise typer.Exit(show_site(runtime_dir, node, is_json=json_))
+
+
+def explain(
+    task: Annotated[str, typer.Argument(metavar="TASK", help="A task of the fleet file.")],
+    plan: Annotated[
+        str | None, typer.Option("--plan", metavar="NODE=down", help="Reckon again without that node; 10: it moves.")
+    ] = None,
+    at: Annotated[
+        str | None,
+        typer.Option("--at", metavar="EPOCH|AGE|TIME", help="The judgement before that, from this machine's log."),
+    ] = None,
+    robot: Annotated[
+        str | None, typer.Option("--robot", metavar="NAME", help="Only what this robot sees: its terms, whom it hears.")
+    ] = None,
+    json_: JsonOption = False,
+    node: AskedOption = None,
+    runtime_dir: RuntimeOption = None,
+    connect: ConnectOption = None,
+    no_color: Annotated[bool, typer.Option("--no-color", help="Plain text (also: NO_COLOR).")] = False,
+) -> None:
+    """Show a robot's last judgement of a task with all its figures, and what would have to change for a move.
+
+    On an edge, which decides nothing, a robot is asked in its place. With --at 12 it shows the judgement that came
+    before the move to epoch 12, and that move; with an age or a time, the one of that moment.
+    """
+    from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.common import wants_color  # noqa: PLC0415 - as above
+    from zsched.commands.explain import ExplainView  # noqa: PLC0415 - as above
+    from zsched.commands.explain import explain as ask_why  # noqa: PLC0415 - as above
+
+    view = ExplainView(plan=plan, at=at, robot=robot, is_json=json_, is_colored=wants_color(no_color))
+    raise typer.Exit(ask_why(find_door(runtime_dir, node, connect=connect), task, view))
+
+
+def history(
+    task: Annotated[str | None, typer.Argument(metavar="[TASK]", help="Only its moves.")] = None,
+    about: Annotated[
+        str | None, typer.Option("--for", metavar="node/NAME", help="Only moves to this node or away from it.")
+    ] = None,
+    since: Annotated[str | None, typer.Option("--since", metavar="AGE", help="Not older: 90s, 10m, 2h, 1d.")] = None,
+    json_: JsonOption = False,
+    node: HereOption = None,
+    runtime_dir: RuntimeOption = None,
+) -> None:
+    """Show every change of owner in the decision log: when, from where to where, why, and who voted for it."""
+    from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.history import duration_s, subject_of  # noqa: PLC0415 - as above
+    from zsched.commands.history import history as show_moves  # noqa: PLC0415 - as above
+
+    of_task, of_node = (None, None) if about is None else subject_of(about)
+    since_s = None if since is None else duration_s(since)
+    if task is not None and of_task not in (None, task):
+        raise CliError(EXIT_USAGE, f"{task} and --for {about} are two tasks; name one")
+    door = find_door(runtime_dir, node)
+    raise typer.Exit(show_moves(door, task or of_task, about=of_node, since_s=since_s, is_json=json_))
+
+
+def events(
+    follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on until Ctrl-C.")] = False,
+    since: Annotated[str | None, typer.Option("--since", metavar="AGE", help="Not older: 90s, 10m, 2h, 1d.")] = None,
+    about: Annotated[
+        str | None, typer.Option("--for", metavar="task/NAME", help="Or node/NAME: only what is about it.")
+    ] = None,
+    types: Annotated[
+        str | None, typer.Option("--types", metavar="A,B", help="Only moves, or stages: move, vote, executor, ...")
+    ] = None,
+    json_: Annotated[bool, typer.Option("--json", help="One JSON object per line.")] = False,
+    node: HereOption = None,
+    runtime_dir: RuntimeOption = None,
+) -> None:
+    """Show what the decision log tells: judgements that changed, votes, moves, steps of handovers, workers, peers."""
+    from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.history import EventsView, duration_s, subject_of, types_of  # noqa: PLC0415 - as above
+    from zsched.commands.history import events as show_events  # noqa: PLC0415 - as above
+
+    of_task, of_node = (None, None) if about is None else subject_of(about)
+    view = EventsView(
+        task=of_task,
+        node=of_node,
+        since_s=None if since is None else duration_s(since),
+        types=() if types is None else types_of(types),
+        is_following=follow,
+        is_json=json_,
+    )
+    raise typer.Exit(show_events(find_door(runtime_dir, node), view))
+
+
+def replay(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A decision log; may be packed (.gz).")],
+    json_: JsonOption = False,
+) -> None:
+    """Make every judgement of a decision log again from its figures; exits with 1 at the first that differs."""
+    from zsched.commands.replay import replay as make_again  # noqa: PLC0415 - each verb imports what it needs
+
+    raise typer.Exit(make_again(file, is_json=json_))
+
+
+def wait(
+    condition: Annotated[
+        str,
+        typer.Option(
+            "--for",
+            metavar="CONDITION",
+            help="healthy, quorum, owner=TASK@NODE, settled=TASK, empty=NODE.",
+        ),
+    ],
+    timeout: Annotated[
+        float, typer.Option("--timeout", min=0.0, max=86400.0, metavar="S", help="Seconds; 0: look once.")
+    ] = 30.0,
+    json_: JsonOption = False,
+    node: AskedOption = None,
+    runtime_dir: RuntimeOption = None,
+    connect: ConnectOption = None,
+) -> None:
+    """Wait until a condition holds; say what is missing if it does not in time.
+
+    Exits with 5 when the time is over, with 3 when nobody answers then. A daemon that is not there yet is waited for.
+    """
+    from zsched.commands.wait import WaitView, wait_for  # noqa: PLC0415 - each verb imports what it needs
+
+    view = WaitView(runtime_dir=runtime_dir, node=node, connect=connect, timeout_s=timeout, is_json=json_)
+    raise typer.Exit(wait_for(view, condition))
+
+
+@metrics_app.command("print", cls=Verb)
+def metrics_print(node: AskedOption = None, runtime_dir: RuntimeOption = None, connect: ConnectOption = None) -> None:
+    """Print a node's figures in Prometheus' text format."""
+    from zsched.commands.metrics import print_metrics  # noqa: PLC0415 - each verb imports what it needs
+
+    raise typer.Exit(print_metrics(runtime_dir, node, connect))
+
+
+@metrics_app.command("write", cls=Verb)
+def metrics_write(
+    path: Annotated[Path, typer.Argument(metavar="PATH", help="As /var/lib/node_exporter/zsched.prom.")],
+    node: AskedOption = None,
+    runtime_dir: RuntimeOption = None,
+    connect: ConnectOption = None,
+) -> None:
+    """Write them to a file, whole or not at all, for node_exporter's textfile collector.
+
+    Where nobody answers the file says zsched_up 0, and this exits with 3.
+    """
+    from zsched.commands.metrics import write_metrics  # noqa: PLC0415 - each verb imports what it needs
+
+    raise typer.Exit(write_metrics(path, runtime_dir, node, connect))
+
+
+def logs(
+    task: Annotated[str, typer.Argument(metavar="TASK", help="A task of the fleet file.")],
+    whose: Annotated[str | None, typer.Argument(metavar="[NODE]", help="Whose worker; without it the owner's.")] = None,
+    follow: Annotated[bool, typer.Option("--follow", "-f", help="Also what it prints from now on.")] = False,
+    lines: Annotated[int, typer.Option("--lines", min=0, max=400, metavar="N", help="The newest N.")] = 100,
+    level: Annotated[
+        str | None, typer.Option("--level", metavar="LEVEL", help="At least: debug, info, warning, error, critical.")
+    ] = None,
+    json_: JsonOption = False,
+    node: AskedOption = None,
+    runtime_dir: RuntimeOption = None,
+    connect: ConnectOption = None,
+) -> None:
+    """Show what a task's worker has printed lately, on whichever node it runs.
+
+    A daemon keeps the last 400 lines of each of its workers since its own start; that machine's journal has older ones.
+    """
+    from zsched.commands.logs import LogsView, show_logs  # noqa: PLC0415 - each verb imports what it needs
+
+    view = LogsView(
+        runtime_dir=runtime_dir,
+        node=node,
+        connect=connect,
+        is_json=json_,
+        is_followed=follow,
+        most=lines,
+        level=level,
+    )
+    raise typer.Exit(show_logs(view, task, whose))
