@@ -5,13 +5,11 @@ Knows: options. Does not know: how anything is done (`zsched.commands.apply` and
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from zsched.commands.common import Json, counted, print_json, say, warn
 from zsched.commands.fleet_verbs import (
     AcceptOption,
     PauseAfterOption,
@@ -21,7 +19,6 @@ from zsched.commands.fleet_verbs import (
     YesOption,
 )
 from zsched.commands.options import AskedOption, ConfigOption, ConnectOption, JsonOption, RuntimeOption
-from zsched.exits import EXIT_CONFIG
 
 
 def check(
@@ -33,35 +30,9 @@ def check(
 
     Of a file without fault it says in words when each task moves, setting by setting, once for tasks alike.
     """
-    from zsched import paths as places  # noqa: PLC0415 - each verb imports what it needs
-    from zsched.commands.rules import told_once  # noqa: PLC0415 - as above
-    from zsched.config.load import check_file  # noqa: PLC0415 - ruamel.yaml is slow to import
-    from zsched.core.values.fleet import fleet_hash  # noqa: PLC0415 - as above
+    from zsched.commands.check import show_faults  # noqa: PLC0415 - each verb imports what it needs
 
-    result = check_file(places.config_path(file or config, os.environ))
-    fleet = result.fleet
-    counts: Json | None = None
-    digest = None if fleet is None else fleet_hash(fleet)
-    if fleet is not None:
-        counts = {"nodes": len(fleet.nodes), "tasks": len(fleet.tasks), "electors": len(fleet.electors)}
-    if json_:
-        lists = {"faults": result.faults, "warnings": result.warnings}
-        keys = ("line", "col", "message", "hint", "source_line")
-        found = {name: [{key: getattr(fault, key) for key in keys} for fault in items] for name, items in lists.items()}
-        named = None if fleet is None else {"name": fleet.name, **(counts or {})}
-        body = {"schema": "zsched.check/1", "file": result.file, "ok": fleet is not None, "hash": digest}
-        print_json({**body, "fleet": named, **found})
-    elif report := result.report():
-        warn(report)
-    if counts is None:
-        raise typer.Exit(EXIT_CONFIG)
-    if not json_:
-        say("ok: " + ", ".join(counted(number, noun) for noun, number in counts.items()))
-        say(f"hash: {digest} (nodes whose files have another one say so in `zsched status`)")
-    for first, *more in told_once(fleet.tasks, fleet.timing) if fleet is not None and not json_ else ():
-        say(first)
-        for line in more:
-            say(f"  {line}", indent=4)
+    raise typer.Exit(show_faults(file or config, is_json=json_))
 
 
 def apply(

@@ -5,11 +5,12 @@ Knows: the examples that the package holds, and that nothing is overwritten. Doe
 
 from __future__ import annotations
 
+import shlex
 from enum import StrEnum
 from pathlib import Path
 from typing import Final
 
-from zsched.commands.common import CliError
+from zsched.commands.common import CliError, say, warn
 from zsched.exits import EXIT_FAILED
 from zsched.files import write_regular
 
@@ -31,6 +32,14 @@ class Example(StrEnum):
 def files_of(example: Example) -> dict[str, bytes]:
     """{name: content} of an example, by name."""
     return {path.name: path.read_bytes() for path in sorted((EXAMPLES / example.value).iterdir()) if path.is_file()}
+
+
+def give_example(example: Example, folder: Path) -> None:
+    """Write an example, say what is there now, and what comes next. Raises as `write_example`."""
+    for path in write_example(example, folder):
+        say(str(path))
+    words = shlex.join(("zsched", "dev", *(() if folder == Path() else (str(folder),))))
+    warn(f"next: `{words}`; it prints the line that starts the application in another terminal")
 
 
 def write_example(example: Example, folder: Path) -> tuple[Path, ...]:

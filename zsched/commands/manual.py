@@ -1,13 +1,35 @@
-"""Manual pages (man) out of the same texts as `--help`: one for the program, one for each verb (pure).
+"""Manual pages (man) out of the same texts as `--help`: one for the program, one for each verb.
 
-Knows: the tree of verbs as typer builds it, roff. Does not know: any verb, files.
+Knows: the tree of verbs as typer builds it, roff, files. Does not know: any verb.
 """
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
+
+from zsched.commands.common import CliError, counted, say
+from zsched.exits import EXIT_FAILED
+
+
+def write_pages(program: Any, folder: Path) -> None:
+    """Write the pages of ``program`` into a folder, which is made if it is not there.
+
+    Raises:
+        CliError: the folder cannot be written.
+    """
+    found = pages(program)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, text in found.items():
+            (folder / name).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise CliError(
+            EXIT_FAILED, f"{error.filename or folder}: {error.strerror}; give a folder to write to"
+        ) from error
+    say(f"{folder}: {counted(len(found), 'pages')}")
 
 
 def pages(program: Any) -> dict[str, str]:

@@ -11,20 +11,14 @@ from typing import Annotated
 
 import typer
 
-from zsched.commands.common import CliError, counted, print_json, say
 from zsched.commands.options import JsonOption
-from zsched.exits import EXIT_FAILED
 
 
 def version(json_: JsonOption = False) -> None:
     """Show the versions of zsched, its wire format, zenoh and Python."""
-    from zsched.commands.versions import versions  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.versions import show_versions  # noqa: PLC0415 - each verb imports what it needs
 
-    found = versions()
-    if json_:
-        print_json({"schema": "zsched.version/1", **found})
-    else:
-        typer.echo("\n".join(f"{name} {text}" for name, text in found.items()))
+    show_versions(is_json=json_)
 
 
 class Shell(StrEnum):
@@ -85,15 +79,6 @@ def uninstall(plan: PlanOnlyOption = False, root: RootOption = Path("/")) -> Non
 
 def man(ctx: typer.Context, folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where to.")]) -> None:
     """Write the manual pages of all verbs, as files for man."""
-    from zsched.commands.manual import pages  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.manual import write_pages  # noqa: PLC0415 - each verb imports what it needs
 
-    found = pages(ctx.find_root().command)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, text in found.items():
-            (folder / name).write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise CliError(
-            EXIT_FAILED, f"{error.filename or folder}: {error.strerror}; give a folder to write to"
-        ) from error
-    say(f"{folder}: {counted(len(found), 'pages')}")
+    write_pages(ctx.find_root().command, folder)

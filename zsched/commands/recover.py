@@ -6,12 +6,16 @@ Knows: tables, dangers that are accepted by name, what comes next. Does not know
 
 from __future__ import annotations
 
+import os
 import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from zsched import paths as places
 from zsched.commands.common import CliError, nearest, say, says_yes
+from zsched.commands.here import own_name
+from zsched.config.load import load_fleet, require_node
 from zsched.core.electorate.recovery import Danger, Recovery, consider
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import SAID_DIGITS, FleetValue
@@ -31,6 +35,21 @@ class Place(Struct, frozen=True, kw_only=True):
     node: NodeId
     config: Path
     folder: Path
+
+
+def place_of(config: Path | None, node: str | None, state_dir: Path | None) -> Place:
+    """The node that the options mean, or the environment. Raises `ConfigError`: the fleet file has no such node."""
+    file = places.config_path(config, os.environ)
+    fleet = load_fleet(file)
+    name = own_name(node)
+    require_node(fleet, name, file)
+    return Place(fleet=fleet, node=name, config=file, folder=places.state_folder(state_dir, os.environ))
+
+
+def words_of(config: Path | None, node: str | None, state_dir: Path | None) -> list[str]:
+    """The options that name a node and its files, as they were given."""
+    given = (("--config", config), ("--node", node), ("--state-dir", state_dir))
+    return [part for name, value in given if value is not None for part in (name, str(value))]
 
 
 class Manner(Struct, frozen=True, kw_only=True):

@@ -6,11 +6,12 @@ Knows: zsched, its wire format, zenoh, Python. Does not know: callers.
 from __future__ import annotations
 
 import platform
+import sys
 from importlib.metadata import PackageNotFoundError
 from importlib.metadata import version as installed
 
 from zsched import __version__
-from zsched.commands.common import Json
+from zsched.commands.common import Json, print_json
 from zsched.wire import codec as wire
 
 
@@ -21,3 +22,12 @@ def versions() -> Json:
     except PackageNotFoundError:
         zenoh = "not installed"
     return {"zsched": __version__, "wire": wire.VERSION, "zenoh": zenoh, "python": platform.python_version()}
+
+
+def show_versions(*, is_json: bool) -> None:
+    """Print them, a line each."""
+    found = versions()
+    if is_json:
+        print_json({"schema": "zsched.version/1", **found})
+    else:
+        sys.stdout.write("".join(f"{name} {text}\n" for name, text in found.items()))

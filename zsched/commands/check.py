@@ -1,0 +1,45 @@
+"""`zsched check`: shows what is wrong with a fleet file, or what it says.
+
+Knows: how faults and settings are shown. Does not know: what a fault is (`zsched.config`).
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from zsched import paths as places
+from zsched.commands.common import Json, counted, print_json, say, warn
+from zsched.commands.rules import told_once
+from zsched.config.load import check_file
+from zsched.core.values.fleet import fleet_hash
+from zsched.exits import EXIT_CONFIG, EXIT_OK
+
+
+def show_faults(given: Path | None, *, is_json: bool) -> int:
+    """Show the faults of a fleet file (``None``: this machine's own), or its counts and rules; the exit code."""
+    result = check_file(places.config_path(given, os.environ))
+    fleet = result.fleet
+    counts: Json | None = None
+    digest = None if fleet is None else fleet_hash(fleet)
+    if fleet is not None:
+        counts = {"nodes": len(fleet.nodes), "tasks": len(fleet.tasks), "electors": len(fleet.electors)}
+    if is_json:
+        lists = {"faults": result.faults, "warnings": result.warnings}
+        keys = ("line", "col", "message", "hint", "source_line")
+        found = {name: [{key: getattr(fault, key) for key in keys} for fault in items] for name, items in lists.items()}
+        named = None if fleet is None else {"name": fleet.name, **(counts or {})}
+        body = {"schema": "zsched.check/1", "file": result.file, "ok": fleet is not None, "hash": digest}
+        print_json({**body, "fleet": named, **found})
+    elif report := result.report():
+        warn(report)
+    if counts is None:
+        return EXIT_CONFIG
+    if not is_json:
+        say("ok: " + ", ".join(counted(number, noun) for noun, number in counts.items()))
+        say(f"hash: {digest} (nodes whose files have another one say so in `zsched status`)")
+    for first, *more in told_once(fleet.tasks, fleet.timing) if fleet is not None and not is_json else ():
+        say(first)
+        for line in more:
+            say(f"  {line}", indent=4)
+    return EXIT_OK

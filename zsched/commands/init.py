@@ -1,0 +1,90 @@
+"""`zsched init`: creates a node's blank state, or settles a dispute about its name.
+
+Knows: whom the others' answers let begin, in words. Does not know: states and sessions (`zsched.runtime.init`).
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from zsched import paths as places
+from zsched.adapters.machine import core_speed
+from zsched.commands.common import CliError, counted, say, warn
+from zsched.commands.here import own_name
+from zsched.config.load import load_fleet, require_node
+from zsched.core.vote.belief import MAX_GENERATION
+from zsched.errors import ConfigError
+from zsched.exits import EXIT_USAGE
+from zsched.runtime.init import Heard, begin_anew, check_blank, init_state, settle_dispute, standing_state
+
+
+def create_state(
+    config: Path | None,
+    node: str | None,
+    state_dir: Path | None,
+    generation: int,
+    *,
+    is_forced: bool,
+    is_settling: bool,
+) -> None:
+    """Write the blank state of this machine's node, where nothing speaks against it.
+
+    Args:
+        config: the fleet file, as for `up`.
+        node: this machine's name in it.
+        state_dir: where the state goes.
+        generation: above 0 the fleet starts anew with it.
+        is_forced: although nobody says that it is needed.
+        is_settling: write none, but make the node an elector again whose name another machine had.
+
+    Raises:
+        CliError: the words do not go together, or name no node.
+        ConfigError: the fleet file cannot be used.
+        AdapterError: something speaks against it, or the folder cannot be written.
+    """
+    if generation > MAX_GENERATION:
+        raise CliError(EXIT_USAGE, f"--generation {generation}: at most {MAX_GENERATION}")
+    file = places.config_path(config, os.environ)
+    fleet = load_fleet(file)
+    name = own_name(node)
+    try:
+        require_node(fleet, name, file)
+    except ConfigError as error:
+        if node is None:
+            raise
+        raise CliError(EXIT_USAGE, str(error)) from error  # a wrong word, and no wrong file
+    state = places.state_folder(state_dir, os.environ)
+    if is_settling:
+        done = settle_dispute(fleet, name, state)
+        say(f"{name}: {'settled; restart its daemon' if done else 'there was no dispute'}")
+        return
+    if is_forced and not generation:
+        raise CliError(EXIT_USAGE, "--force goes with --generation G")
+    standing = standing_state(fleet, name, state)
+    if standing is not None and generation in (0, standing.generation):
+        text = f"{name} has its state in fleet {fleet.name}, generation {standing.generation}: nothing to do"
+        say(f"{state}: {text}")
+        return
+    heard = check_blank(fleet, name, state, generation, standing, is_forced=is_forced)
+    side = heard.side
+    path = init_state(fleet, name, state, generation) if side is None else begin_anew(fleet, name, state, side)
+    warn(_heard(heard, name, generation, is_elector=name in fleet.electors))
+    say(f"a core of this machine has speed {core_speed.kept_or_new(state):.2f}")
+    if side is not None:
+        text = "the others know it as an elector with another disk: it is a new member, and no elector until"
+        say(f"{path}: blank state of {name} in fleet {fleet.name}; {text} it is added as one")
+        return
+    say(f"{path}: blank state of {name} in fleet {fleet.name}, generation {generation}")
+
+
+def _heard(heard: Heard, name: str, generation: int, *, is_elector: bool) -> str:
+    """Which nodes were asked before a blank state was written, and what their answers say."""
+    if not heard.asked:
+        return "no other node has an address in the fleet file: nobody was asked"
+    asked = f"asked {counted(heard.asked, 'other nodes')}"
+    if not heard.answers:
+        return f"{asked}: none answered" + (f", so nobody could say whether {name} has voted" if is_elector else "")
+    said = f"{asked}, {len(heard.answers)} answered"
+    where = f" in generation {generation}" if generation else ""
+    return f"{said}: none remembers a vote of {name}{where}" if is_elector else said
