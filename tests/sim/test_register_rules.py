@@ -119,8 +119,10 @@ def test_a_ballot_that_is_not_its_asker_s_or_a_stranger_s_gets_no_answer(node: s
     prepare = Prepare(task="merge", ballot=ballot, electorate=electorate)
     value = replace(INITIAL, revision=1, epoch=1, owner="r2")
     accept = Accept(task="merge", acceptance=Acceptance(ballot=ballot, value=value), electorate=electorate)
-    assert not agreed(elector.on_prepare, PrepareAsked(request=1, asker=asker, prepare=prepare), 1.0).send
-    assert not agreed(elector.on_accept, AcceptAsked(request=2, asker=asker, accept=accept), 1.0).send
+    assert not agreed(elector.acceptor.on_prepare, PrepareAsked(request=1, asker=asker, prepare=prepare), 1.0).send
+    assert not agreed(elector.acceptor.on_accept, AcceptAsked(request=2, asker=asker, accept=accept), 1.0).send
     assert elector.counters == {"prepare_foreign": 1, "accept_foreign": 1}
     own = replace(prepare, ballot=replace(ballot, node="r2"))
-    assert agreed(elector.on_prepare, PrepareAsked(request=3, asker="r2", prepare=own), 1.0).send, "its own one does"
+    assert agreed(elector.acceptor.on_prepare, PrepareAsked(request=3, asker="r2", prepare=own), 1.0).send, (
+        "its own one does"
+    )

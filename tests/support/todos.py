@@ -18,7 +18,10 @@ def todo_of(call: Callable[..., None], *args: Any) -> ToDo:
 
 
 def agreed(call: Callable[..., None], *args: Any) -> ToDo:
-    """The same of a method of `Agreement`; those who wait for changes that have ended are told, as the node does."""
+    """The same of a method of `Agreement`, or of its acceptor, which ends no change.
+
+    Those who wait for changes that have ended are told, as the node does.
+    """
     todo = todo_of(call, *args)
     agreement: Agreement = call.__self__  # type: ignore[attr-defined] # a bound method
     for ended in todo.ended:

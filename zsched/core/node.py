@@ -105,7 +105,7 @@ class Node(Stages):
         """
         if now >= self._promised or self.beat_at < self._promised or now >= self.rounds.next_deadline():
             return False
-        return self._todo.is_only_sent and not (self.tenure.is_busy or self.agreement.has_parked)
+        return self._todo.is_only_sent and not (self.tenure.is_busy or self.agreement.acceptor.has_parked)
 
     def _only_sent(self) -> tuple[do.Instruction, ...]:
         """The batch of an event that changed nothing here."""
@@ -200,7 +200,7 @@ class Node(Stages):
         if self.tenure.exclusive:
             self.tenure.tend_leases(self.beat_sequence, todo, now)
         # Also where no task is exclusive any more: the question may have come while one was.
-        self.agreement.retry_parked(todo, now)
+        self.agreement.acceptor.retry_parked(todo, now)
         self.tenure.tend_isolation(self.membership, todo, now)
         for executor in self.executors.values():
             if now >= executor.next_deadline():

@@ -44,7 +44,8 @@ REGISTER, LEASE, TENURE = "zsched.core.vote.register", "zsched.core.vote.lease",
 SEALING, WITNESS = "zsched.core.executor.sealing", "zsched.core.vote.witness"
 NAMESAKES = "zsched.core.membership.namesakes"
 BELIEF = "zsched.core.vote.belief"
-AGREEMENT, MEMBERSHIP, NODE = "zsched.core.vote.agreement", "zsched.core.membership.peers", "zsched.core.node"
+AGREEMENT, ACCEPTOR = "zsched.core.vote.agreement", "zsched.core.vote.acceptor"
+MEMBERSHIP, NODE = "zsched.core.membership.peers", "zsched.core.node"
 VOTE, VOTING = "zsched.core.vote.tally", "zsched.core.vote.voting"
 DECISION, ROUNDS = "zsched.core.scheduler.decision", "zsched.core.scheduler.rounds"
 ORDERS, EXPIRY = "zsched.core.handlers.orders", "zsched.core.vote.expiry"
@@ -248,8 +249,8 @@ REGISTER_BUGS = (
     _bug(
         "node without state is an elector",
         AGREEMENT,
-        "self.is_elector = durable is not None and me in fleet.electors",
-        "self.is_elector = me in fleet.electors",
+        "is_elector = durable is not None and me in fleet.electors",
+        "is_elector = me in fleet.electors",
         _AGREEMENT,
     ),
     _bug(
@@ -268,7 +269,7 @@ REGISTER_BUGS = (
     ),
     _bug(
         "ballot in another's name is answered",
-        AGREEMENT,
+        ACCEPTOR,
         "return ballot.node == asker and asker in self._nodes",
         "return True",
         _REGISTER,
@@ -450,7 +451,7 @@ LEASE_BUGS = (
     ),
     _bug(
         "identity round ends the silence",
-        AGREEMENT,
+        ACCEPTOR,
         "if has_accepted and (known is None or value.revision > known.revision):",
         "if has_accepted:",
         (*_LEASE, "tests/unit/core/vote/test_parked_accepts.py"),
@@ -716,8 +717,8 @@ VOTE_BUGS = (
     _bug(
         "an accept waits for a lease although it came with others",
         AGREEMENT,
-        "accept=accept), todo, now, park_s=0)",
-        "accept=accept), todo, now)",
+        "self.acceptor.on_accept(yes, todo, now, park_s=0)",
+        "self.acceptor.on_accept(yes, todo, now)",
         _JOINING,
     ),
     _bug(
@@ -730,8 +731,8 @@ VOTE_BUGS = (
     _bug(
         "each question of a frame counts at the rate",
         AGREEMENT,
-        "prepare=prepare), todo, now, may_ask=may_ask)",
-        "prepare=prepare), todo, now)",
+        "self.acceptor.on_prepare(promise, todo, now, may_ask=may_ask)",
+        "self.acceptor.on_prepare(promise, todo, now)",
         _JOINING,
     ),
     Bug(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from zsched_lab.bugs.core_bugs import AGREEMENT, LEASE, REGISTER, Bug
+from zsched_lab.bugs.core_bugs import ACCEPTOR, AGREEMENT, LEASE, REGISTER, Bug
 
 ROLL, CHANGES = "zsched.core.electorate.roll", "zsched.core.electorate.changes"
 FOUNDING, SETTLING = "zsched.core.electorate.founding", "zsched.core.electorate.settling"
@@ -391,7 +391,7 @@ ELECTOR_BUGS: tuple[Bug, ...] = (
     ),
     _fleet_bug(
         "an elector answers a fleet ballot that is not its asker's",
-        AGREEMENT,
+        ACCEPTOR,
         ("if not self._is_its_own(event.question.ballot, event.asker):", "if False:"),
         has_schedules=False,
     ),

@@ -75,7 +75,7 @@ def is_restless(node: Stages, now: float) -> bool:
     """Whether anything goes on here for which beats must come at full pace, besides what they say themselves."""
     if node.tenure.exclusive or not node.votes.is_idle or node.membership.is_uneasy(now):
         return True
-    is_agreeing = node.agreement.has_parked or node.agreement.next_deadline() < math.inf
+    is_agreeing = node.agreement.acceptor.has_parked or node.agreement.next_deadline() < math.inf
     is_moving = any(executor.next_deadline() < math.inf for executor in node.executors.values())
     return (
         is_agreeing
@@ -182,7 +182,7 @@ def _hear_leases(node: Stages, beat: Beat, todo: ToDo, now: float, *, is_newest:
     node.tenure.hear(beat, node.agreement.accepted(), todo, now, is_newest=is_newest)
     node.agreement.note_asked(beat, now)
     if beat.released:
-        node.agreement.retry_parked(todo, now)
+        node.agreement.acceptor.retry_parked(todo, now)
 
 
 def on_twins(node: Stages, event: ev.LearntReceived, todo: ToDo, now: float) -> None:

@@ -120,11 +120,11 @@ def _is_ours(node: Stages, proposal: Proposal) -> bool:
 
 
 def _on_prepare(node: Stages, event: ev.PrepareAsked, todo: ToDo, now: float) -> None:
-    node.agreement.on_prepare(event, todo, now)
+    node.agreement.acceptor.on_prepare(event, todo, now)
 
 
 def _on_accept(node: Stages, event: ev.AcceptAsked, todo: ToDo, now: float) -> None:
-    node.agreement.on_accept(event, todo, now)
+    node.agreement.acceptor.on_accept(event, todo, now)
 
 
 def _on_answer(node: Stages, event: ev.ElectorAnswered, todo: ToDo, now: float) -> None:

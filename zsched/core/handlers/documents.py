@@ -43,7 +43,7 @@ def count_voters(node: Stages) -> None:
 
 
 def _on_asked(node: Stages, event: ev.FleetAsked, todo: ToDo, now: float) -> None:
-    node.agreement.on_fleet_asked(event, todo, now)
+    node.agreement.acceptor.on_fleet_asked(event, todo, now)
 
 
 def _on_answered(node: Stages, event: ev.FleetAnswered, todo: ToDo, now: float) -> None:

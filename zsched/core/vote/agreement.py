@@ -20,12 +20,11 @@ from zsched.core.electorate.numbers import Numbers
 from zsched.core.electorate.orders import Orders
 from zsched.core.electorate.strangers import Strangers
 from zsched.core.todo import ToDo
-from zsched.core.values.change import Change, Ended, MoveOwner, Retune, RoundOutcome, SetLeased
+from zsched.core.values.change import Change, Ended, MoveOwner, RoundOutcome
 from zsched.core.values.document import Flag
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import (
     CREATION_STEP,
-    SAID_DIGITS,
     TOLD_DIGITS,
     Creation,
     Elector,
@@ -34,57 +33,31 @@ from zsched.core.values.electorate import (
 )
 from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.messages import (
-    Accepted,
-    CommandOutcome,
-    CommandResult,
     FleetQuestion,
     Learnt,
-    Prepare,
-    Promise,
-    Refusal,
     Refused,
-    fleet_answer,
     votes_of,
 )
 from zsched.core.values.model import (
     NO_BALLOT,
     Allocation,
-    Ballot,
     Beat,
     NodeId,
     RegisterState,
     TaskId,
-    Weights,
 )
 from zsched.core.values.struct import replace
-from zsched.core.vote.belief import GENERATION_STEP, MAX_GENERATION, is_fit, is_proven
-from zsched.core.vote.generations import way_out
+from zsched.core.vote.acceptor import Acceptor
+from zsched.core.vote.belief import GENERATION_STEP, MAX_GENERATION, is_proven
+from zsched.core.vote.commands import answer_end, refuse_gone, wanted_retune
+from zsched.core.vote.generations import lost_text, moved_text
 from zsched.core.vote.lease import Leases, hold_s
+from zsched.core.vote.questions import ASK_AT_ONCE_S, ASK_LEARNT_EVERY_S, Questions
 from zsched.core.vote.task_register import TaskRegister
 from zsched.core.vote.witness import Witness, as_seen, as_tuple
 
 SETTLE_AFTER_START_S = 0.3
 """A starting elector learns first what was accepted before (an identity round), once its peers are connected."""
-ASK_LEARNT_EVERY_S = 0.3
-ASK_AT_ONCE_S = 0.05
-"""A peer whose beats, or word of a new value, tell of news is asked at most this often."""
-VOTES_WAIT_S = 1.0
-"""While the electors change, how often they have voted is asked for this much later."""
-READ_EVERY_S = 2.0
-"""A value that one node's word does not prove is read from a majority at most this often."""
-PREPARES_PER_S = 20.0
-PREPARE_BURST = 40.0
-"""Prepares of one peer: honest proposers back off far below this, only a broken one comes near."""
-PARK_SHARE = 0.8
-"""An accept that a lease forbids waits for this part of a ballot's deadline for the release; then it is refused."""
-
-_ENDED = {
-    RoundOutcome.COMMITTED: (CommandOutcome.OK, "committed by a majority of the electors"),
-    RoundOutcome.CONFLICT: (CommandOutcome.CONFLICT, "another change came first; look and try again"),
-    RoundOutcome.UNCHANGED: (CommandOutcome.UNCHANGED, "it is so already"),
-    RoundOutcome.NO_QUORUM: (CommandOutcome.NO_QUORUM, "no majority of the electors answered"),
-    RoundOutcome.UNKNOWN: (CommandOutcome.UNKNOWN, "the electors fell silent; `zsched status` tells"),
-}
 
 
 class Agreement:
@@ -140,7 +113,7 @@ class Agreement:
             seen={} if durable is None else as_seen(durable.seen),
         )
         self.voted = set() if durable is None else set(durable.voted)
-        self.is_elector = durable is not None and me in fleet.electors and not self._disputed and not self._lost
+        is_elector = durable is not None and me in fleet.electors and not self._disputed and not self._lost
         self._problems: dict[str, str] = {}
         if durable is not None and self._lost:
             value = None if durable.fleet_register is None else durable.fleet_register.learnt
@@ -148,7 +121,6 @@ class Agreement:
         if self._disputed:
             self._problems["state"] = f"{self._disputed}; no elector until `zsched init --settle`"
         self.counters: Counter[str] = Counter()
-        self._buckets: dict[NodeId, tuple[float, float]] = {}
         # A state of today's names no creations: its registers are those of its generation.
         held = () if durable is None else durable.registers
         creation = self.generation or 0
@@ -156,7 +128,7 @@ class Agreement:
         agreed = None if durable is None or durable.fleet_register is None else durable.fleet_register.learnt
         self._incarnation, self._rng = incarnation, rng
         self.registers = {
-            task.name: self._register(task, states.get(task.name) or self._blank(task.name, agreed))
+            task.name: self._register(task, states.get(task.name) or self._blank(task.name, agreed), is_elector)
             for task in fleet.tasks
         }
         # A task that left the fleet file may come back: its promises must not be forgotten.
@@ -180,27 +152,27 @@ class Agreement:
         if self.generation is not None:
             may_elect = durable is not None and not self._disputed and not self._lost
             self._numbers.begin(self.generation, self._by_file, self.at_start, now, may_elect=may_elect)
-        self._settle_at = now + SETTLE_AFTER_START_S if self.is_elector else math.inf
-        self._asked_at: dict[tuple[NodeId, bool], float] = {}
-        """{(peer, whether for a newer revision): when}: news of votes must not delay a question about revisions."""
-        self._awaited = 0, -math.inf
-        """(highest fleet revision that a peer was asked for, until when no other peer is asked for it)."""
-        self._said = 0, -math.inf
-        """(newest fleet revision that everybody was told, when)."""
-        self._changing = 0, -math.inf
-        """(highest number that was heard while electors were not settled, since when)."""
-        self._read_at: dict[TaskId, float] = {}
+        self._settle_at = now + SETTLE_AFTER_START_S if is_elector else math.inf
+        self._questions = Questions()
         self.leases = Leases(
             fleet=fleet,
             me=me,
             incarnation=incarnation,
-            standing=self.standing() if self.is_elector else {},
+            standing=self.standing() if is_elector else {},
             now=now,
             granted_s=0.0 if durable is None else durable.lease_s,
         )
         if durable is not None and self._numbers.is_waiting:
             self.leases.terms = terms_of(durable.joins, 0)  # beats tell what this node is to join
-        self._parked: dict[tuple[TaskId, NodeId], tuple[ev.AcceptAsked, float]] = {}
+        self.acceptor = Acceptor(
+            fleet=fleet,
+            registers=self.registers,
+            numbers=self._numbers,
+            witness=self.witness,
+            leases=self.leases,
+            counters=self.counters,
+            is_elector=is_elector,
+        )
         first = self._numbers.value
         self._seats = {} if first is None else {seat.name: seat for seat in first.electors}
         """{name: the seat to which what is remembered of an elector belongs}."""
@@ -210,14 +182,14 @@ class Agreement:
         self._values: dict[TaskId, Allocation] = {}
         self._accepted: dict[TaskId, tuple[NodeId, int]] = {}
 
-    def _register(self, task: TaskSpec, state: RegisterState) -> TaskRegister:
+    def _register(self, task: TaskSpec, state: RegisterState, is_elector: bool) -> TaskRegister:
         """A task's register. Blank electors have agreed on the first value of its creation, or of a generation."""
         return TaskRegister(
             me=self._me,
             incarnation=self._incarnation,
             electors=self._fleet.electors,
             electorate=self._by_file,
-            is_elector=self.is_elector,
+            is_elector=is_elector,
             initial=task.first_value(state.creation * CREATION_STEP),
             state=state,
             disk="" if self._durable is None else self._durable.disk,
@@ -251,7 +223,7 @@ class Agreement:
             register, remembered = kept.pop(task.name, None), away.pop(task.name, None)
             if register is None:
                 state = remembered or self._blank(task.name, self._numbers.changed)
-                register = self._register(task, state)
+                register = self._register(task, state, self.is_elector)
                 self._numbers.count_in(register, now)
                 self._settle_at = now + SETTLE_AFTER_START_S if self.is_elector else math.inf
             first = task.first_value(register.state.creation * CREATION_STEP)
@@ -262,7 +234,7 @@ class Agreement:
             if register.state != RegisterState(task=register.state.task, creation=register.state.creation):
                 away[register.state.task] = register.state
         self._foreign = tuple(away[name] for name in sorted(away))
-        self._parked = {key: known for key, known in self._parked.items() if key[0] in self.registers}
+        self.acceptor.adopt(fleet)
         self._seen = []
         self.leases.adopt(fleet, self.standing() if self.is_elector else {}, now)
         todo.must_persist |= self.must_persist
@@ -279,6 +251,11 @@ class Agreement:
         return self._by_file if value is None else f"fleet/{value.generation_id}"
 
     # --- queries -----------------------------------------------------------------------------------------------------
+
+    @property
+    def is_elector(self) -> bool:
+        """Whether this node's state and the electors in force let it vote."""
+        return self.acceptor.is_elector
 
     @property
     def problems(self) -> dict[str, str]:
@@ -299,7 +276,7 @@ class Agreement:
             return
         self._seen = states
         self._values = {name: register.value for name, register in self.registers.items()}
-        newest = {name: _newest(register) for name, register in self.registers.items()}
+        newest = {name: register.newest for name, register in self.registers.items()}
         self._accepted = {
             name: (value.owner, value.epoch)
             for name, value in newest.items()
@@ -333,7 +310,7 @@ class Agreement:
         for register in self.registers.values():
             if (at := register.next_deadline()) < due:
                 due = at
-        return min(due, *(deadline for _, deadline in self._parked.values())) if self._parked else due
+        return min(due, self.acceptor.next_deadline())
 
     def accepted(self) -> Mapping[TaskId, tuple[NodeId, int]]:
         """{leased task: (owner, epoch)} that this elector echoes: from the newest value that it has accepted or learnt.
@@ -347,7 +324,7 @@ class Agreement:
 
     def standing(self) -> dict[TaskId, Allocation | None]:
         """{task: the newest value here}: an elector that does not know when it granted accepts only this owner."""
-        return {name: _newest(register) for name, register in self.registers.items()}
+        return {name: register.newest for name, register in self.registers.items()}
 
     def to_persist(self, now: float) -> DurableState | None:
         """The state to write now, or ``None`` when this node keeps none."""
@@ -394,17 +371,19 @@ class Agreement:
         is refused, and comes again alone.
         """
         ballots, request, asker = event.ballots, event.request, event.asker
-        may_ask = not (ballots.prepares or ballots.ahead) or self._may_ask(asker, now)
+        may_ask = not (ballots.prepares or ballots.ahead) or self.acceptor.may_ask(asker, now)
         sent, todo.send = todo.send, []
         if ballots.fleet is not None:
             self._hear_fleet(ballots.fleet, asker, todo, now)
         for prepare in ballots.prepares:
-            self.on_prepare(ev.PrepareAsked(request=request, asker=asker, prepare=prepare), todo, now, may_ask=may_ask)
+            promise = ev.PrepareAsked(request=request, asker=asker, prepare=prepare)
+            self.acceptor.on_prepare(promise, todo, now, may_ask=may_ask)
         for accept in ballots.accepts:
-            self.on_accept(ev.AcceptAsked(request=request, asker=asker, accept=accept), todo, now, park_s=0)
+            yes = ev.AcceptAsked(request=request, asker=asker, accept=accept)
+            self.acceptor.on_accept(yes, todo, now, park_s=0)
         if ballots.ahead is not None:
-            question = FleetQuestion(prepare=ballots.ahead)
-            self.on_fleet_asked(ev.FleetAsked(request=request, asker=asker, question=question), todo, now, may_ask)
+            ahead_of = ev.FleetAsked(request=request, asker=asker, question=FleetQuestion(prepare=ballots.ahead))
+            self.acceptor.on_fleet_asked(ahead_of, todo, now, may_ask)
         answers = [one for one in todo.send if isinstance(one, do.AnswerElection) and one.request == request]
         ahead = [one for one in todo.send if isinstance(one, do.AnswerFleet) and one.request == request]
         todo.send = [*sent, *(one for one in todo.send if one not in answers and one not in ahead)]
@@ -422,56 +401,8 @@ class Agreement:
         if self._numbers.has_accepted(value):
             if self._numbers.learn(value, teller, todo, now):
                 self._count_anew(todo)
-        elif self._numbers.is_news(value) and self._is_unasked(value.revision, now):
+        elif self._numbers.is_news(value) and self._questions.is_unasked(value.revision, self.fleet_revision, now):
             self._ask(teller, [], ASK_AT_ONCE_S, todo, now, is_news=True, of_fleet=value.revision)
-
-    def on_prepare(self, event: ev.PrepareAsked, todo: ToDo, now: float, *, may_ask: bool | None = None) -> None:
-        """A proposer asks for a promise: only for its own ballots, at a bounded rate (each promise costs an fsync).
-
-        ``may_ask``: whether the rate allows it, where that is known already.
-        """
-        register = self.registers.get(event.prepare.task)
-        if register is None or not self._is_its_own(event.prepare.ballot, event.asker):
-            self.counters["prepare_foreign"] += 1
-            return
-        if self._numbers.is_foreign(event.prepare):
-            self.counters["prepare_stranger"] += 1
-            return
-        ballot = event.prepare.ballot
-        answer: Promise | Refused
-        turned_away = self._numbers.turned_away(event.prepare, event.asker, todo)
-        if not (self._may_ask(event.asker, now) if may_ask is None else may_ask):
-            self.counters["prepare_rate"] += 1
-            answer = register.refuse(ballot, Refusal.RATE)
-        elif turned_away is not None:
-            answer = turned_away
-        elif self.is_elector and not self.witness.may_vote(now):
-            answer = register.refuse(ballot, Refusal.YOUNG)
-        else:
-            answer = register.on_prepare(event.prepare, todo)
-            self.witness.votes += isinstance(answer, Promise)
-        todo.add(do.AnswerElection(request=event.request, answer=answer))
-
-    def on_fleet_asked(self, event: ev.FleetAsked, todo: ToDo, now: float, may_ask: bool | None = None) -> None:
-        """A proposer asks this elector's fleet register: only for its own ballots, at the rate of all prepares.
-
-        ``may_ask``: whether the rate allows it, where that is known already.
-        """
-        question = event.question.content
-        if not self._is_its_own(event.question.ballot, event.asker):
-            self.counters["fleet_foreign"] += 1
-            return
-        refusal = None
-        is_prepare = isinstance(question, Prepare)
-        if is_prepare and not (self._may_ask(event.asker, now) if may_ask is None else may_ask):
-            self.counters["prepare_rate"] += 1
-            refusal = Refusal.RATE
-        elif self.is_elector and not self.witness.may_vote(now):
-            refusal = Refusal.YOUNG
-        answer = self._numbers.on_question(question, event.asker, todo, now, refusal)
-        if answer is not None:
-            self.witness.votes += not isinstance(answer, Refused)
-            todo.add(do.AnswerFleet(request=event.request, answer=fleet_answer(answer)))
 
     def on_fleet_answer(self, event: ev.FleetAnswered, todo: ToDo, now: float) -> None:
         """An elector answered our question to its fleet register."""
@@ -500,78 +431,6 @@ class Agreement:
     def change_fleet(self, change: FleetChange, todo: ToDo, now: float) -> str:
         """Try to commit a change of the fleet; why it cannot be made, or nothing."""
         return self._numbers.propose(change, todo, now)
-
-    def _may_ask(self, asker: NodeId, now: float) -> bool:
-        """Take one token of the asker's bucket (`PREPARES_PER_S`, at most `PREPARE_BURST` saved); a no costs none."""
-        tokens, at = self._buckets.get(asker, (PREPARE_BURST, now))
-        tokens = min(tokens + (now - at) * PREPARES_PER_S, PREPARE_BURST)
-        may_ask = tokens >= 1.0
-        self._buckets[asker] = (tokens - may_ask, now)
-        return may_ask
-
-    def on_accept(self, event: ev.AcceptAsked, todo: ToDo, now: float, *, park_s: float | None = None) -> None:
-        """A proposer asks this elector to accept a value: only under its own ballots.
-
-        ``park_s``: the longest wait for an owner to leave (seconds); ``None``: by the file.
-        """
-        acceptance = event.accept.acceptance
-        register = self.registers.get(event.accept.task)
-        if register is None or not self._is_its_own(acceptance.ballot, event.asker):
-            self.counters["accept_foreign"] += 1
-            return
-        if self._numbers.is_foreign(event.accept):
-            self.counters["accept_stranger"] += 1
-            return
-        if not is_fit(self._fleet, acceptance.value, register):
-            self.counters["accept_unfit"] += 1
-            refused = register.refuse(acceptance.ballot, Refusal.VALUE)
-        elif (turned_away := self._numbers.turned_away(event.accept, event.asker, todo)) is not None:
-            refused = turned_away
-        elif self.is_elector and not self.witness.may_vote(now):
-            refused = register.refuse(acceptance.ballot, Refusal.YOUNG)
-        else:
-            at_most = PARK_SHARE * self._fleet.timing.ballot_s if park_s is None else park_s
-            self._accept_or_park(event, now + at_most, todo, now)
-            return
-        todo.add(do.AnswerElection(request=event.request, answer=refused))
-
-    def _accept_or_park(self, event: ev.AcceptAsked, deadline: float, todo: ToDo, now: float) -> None:
-        """Accept, refuse, or let the question wait while an exclusive task's owner is asked to leave."""
-        accept = event.accept
-        register = self.registers[accept.task]
-        key = (accept.task, event.asker)
-        older = self._parked.pop(key, None)
-        if older is not None and older[0] != event:
-            todo.add(do.AnswerElection(request=older[0].request, answer=self._leased(older[0])))
-        value = accept.acceptance.value
-        if not register.would_accept(accept) or self.leases.may_accept(accept.task, value.owner, now):
-            known = _newest(register)
-            answer = register.on_accept(accept, todo, now)
-            has_accepted = isinstance(answer, Accepted)
-            if has_accepted and (known is None or value.revision > known.revision):
-                # An identity round's is none: the next owner may still wait.
-                self.leases.on_newer_value(value)
-            self.witness.votes += has_accepted
-            todo.add(do.AnswerElection(request=event.request, answer=answer))
-        elif now >= deadline:
-            todo.add(do.AnswerElection(request=event.request, answer=self._leased(event)))
-        else:
-            self._parked[key] = (event, deadline)
-            todo.must_beat |= older is None  # an owner must hear that it is asked to leave
-
-    def _leased(self, event: ev.AcceptAsked) -> Refused:
-        register = self.registers[event.accept.task]
-        return register.refuse(event.accept.acceptance.ballot, Refusal.LEASE)
-
-    @property
-    def has_parked(self) -> bool:
-        """Whether a question waits for an exclusive task's owner to leave."""
-        return bool(self._parked)
-
-    def retry_parked(self, todo: ToDo, now: float) -> None:
-        """A lease may have been released or run out, or a parked question may have waited long enough."""
-        for event, deadline in tuple(self._parked.values()):
-            self._accept_or_park(event, deadline, todo, now)
 
     def on_answer(self, event: ev.ElectorAnswered, todo: ToDo, now: float) -> None:
         """An elector answered our prepare or accept."""
@@ -654,15 +513,10 @@ class Agreement:
         value, roll = self._numbers.changed, self._numbers.roll
         if value is None or roll is None:
             return
-        for key, (event, _) in tuple(self._parked.items()):
-            if key[0] not in self.registers:
-                del self._parked[key]
-                refused = self._numbers.roll.refused(event.accept) if self._numbers.roll else None
-                if refused is not None:
-                    todo.add(do.AnswerElection(request=event.request, answer=refused))
+        self.acceptor.refuse_gone(todo)
         self.witness.electors = self.electors
         self._forget_seats(value, todo)
-        self.is_elector = roll.is_elector
+        self.acceptor.is_elector = roll.is_elector
         self.leases.count_with(
             self.electors,
             terms=value.terms,
@@ -692,9 +546,6 @@ class Agreement:
         ours = self._numbers.value
         told = learnt.fleet.electorate.seat(self._me) if learnt.fleet is not None else Elector(name=self._me)
         return ours is not None and (ours.electorate.seat(self._me) or Elector(name=self._me)) == told
-
-    def _is_its_own(self, ballot: Ballot, asker: NodeId) -> bool:
-        return ballot.node == asker and asker in self._nodes
 
     def note_asked(self, beat: Beat, now: float) -> None:
         """An elector (maybe this one) asks owners to leave, because another owner's accept waits."""
@@ -727,7 +578,7 @@ class Agreement:
                 self._hear_fleet(learnt.fleet, learnt.node, todo, now)
             newer = [(value.task, value.revision) for value in learnt.values]
             revision = 0 if learnt.fleet is None else learnt.fleet.revision
-            is_news = self._is_unasked(revision, now)
+            is_news = self._questions.is_unasked(revision, self.fleet_revision, now)
             self._ask(learnt.node, newer, ASK_AT_ONCE_S, todo, now, is_news=is_news, of_fleet=revision)
             return
         if learnt.fleet is not None and self._numbers.learn(learnt.fleet, learnt.node, todo, now):
@@ -756,8 +607,7 @@ class Agreement:
     def _read(self, task: TaskId, register: TaskRegister, todo: ToDo, now: float) -> None:
         """Ask a majority for the value in force (an identity round): one peer's word is not enough."""
         self.counters["learnt_unproven"] += 1
-        if now - self._read_at.get(task, -math.inf) >= READ_EVERY_S:
-            self._read_at[task] = now
+        if self._questions.take_read(task, now):
             register.settle(todo, now)
 
     def is_stranger(self, beat: Beat, todo: ToDo, now: float) -> bool:
@@ -854,9 +704,9 @@ class Agreement:
 
     def _complain_of_loss(self, *, is_agreed: bool) -> None:
         """Say that this node is no elector, and until when: by an agreed document another disk is another member."""
-        lost = _lost_text(self._lost, self.newest_generation, is_agreed=is_agreed)
+        lost = lost_text(self._lost, self.newest_generation, is_agreed=is_agreed)
         joins = "" if self._durable is None else self._durable.joins
-        self._problems["state"] = lost if not joins else _moved_text(self._lost, joins)
+        self._problems["state"] = lost if not joins else moved_text(self._lost, joins)
 
     def compare(self, beat: Beat, todo: ToDo, now: float) -> None:
         """A peer's beat may show that it has learnt more than we have, or has voted: then ask it."""
@@ -866,7 +716,7 @@ class Agreement:
             return
         is_news = beat.has_voted and beat.node not in self.voted and beat.node in self.electors
         is_news |= self.witness.must_ask(beat) and not self._may_wait(beat, now)
-        is_news |= self._is_unasked(beat.fleet_revision, now)
+        is_news |= self._questions.is_unasked(beat.fleet_revision, self.fleet_revision, now)
         is_news |= self._is_guest_of(beat.generation) and beat.node in self.electors
         newer = [(task, revision) for task, revision, _ in beat.learnt]
         self._ask(beat.node, newer, ASK_LEARNT_EVERY_S, todo, now, is_news=is_news, of_fleet=beat.fleet_revision)
@@ -874,33 +724,17 @@ class Agreement:
     def _may_wait(self, beat: Beat, now: float) -> bool:
         """Whether a peer is asked later how often it has voted: the electors change just now.
 
-        Each of them votes several times in such a change. It is asked after `VOTES_WAIT_S` at the latest; whom this
-        elector has not asked since it started, at once. So is it once a higher number was heard: a beat is anybody's
-        word, and numbers by turns must not begin the time again.
+        Each of them votes several times in such a change. Whom this elector has not asked since it started is asked at
+        once.
         """
         number = max(beat.number, self.number)
         if (number == self.number and self.unsettled is None) or not self.witness.has_asked(beat.node):
             return False
-        if number > self._changing[0]:
-            self._changing = number, now
-        return number == self._changing[0] and now < self._changing[1] + VOTES_WAIT_S
-
-    def _is_unasked(self, revision: int, now: float) -> bool:
-        """Whether a fleet revision is newer than the learnt one, and no peer was asked for it just now.
-
-        That holds others up once for each revision, and for none that is lower than one asked for before: a beat is
-        anybody's word, and must not keep a node from learning.
-        """
-        asked, until = self._awaited
-        return revision > self.fleet_revision and (revision != asked or now >= until)
+        return self._questions.may_wait(number, now)
 
     def word(self, now: float) -> Learnt | None:
         """What this node has learnt, for everybody; ``None``: it has said so just now."""
-        revision, at = self._said
-        if revision == self.fleet_revision and now < at + ASK_LEARNT_EVERY_S:
-            return None
-        self._said = self.fleet_revision, now
-        return self.learnt()
+        return self.learnt() if self._questions.take_word(self.fleet_revision, now) else None
 
     def _ask(
         self,
@@ -923,12 +757,11 @@ class Agreement:
             is_behind |= register is not None and revision > register.value.revision
         if not is_behind and not is_news:
             return
-        if now - self._asked_at.get((peer, is_behind), -math.inf) < every_s:
-            return
-        self._asked_at[peer, is_behind] = now
-        if of_fleet > max(self.fleet_revision, self._awaited[0]):
-            self._awaited = of_fleet, now + ASK_LEARNT_EVERY_S
-        todo.add(do.AskLearnt(peer=peer, deadline_s=self._fleet.timing.ballot_s))
+        may_ask = self._questions.take(
+            peer, now, every_s=every_s, is_behind=is_behind, revision=of_fleet, learnt=self.fleet_revision
+        )
+        if may_ask:
+            todo.add(do.AskLearnt(peer=peer, deadline_s=self._fleet.timing.ballot_s))
 
     # --- proposers ---------------------------------------------------------------------------------------------------
 
@@ -941,28 +774,9 @@ class Agreement:
 
     def retune(self, event: ev.WeightsCommanded, todo: ToDo, now: float) -> None:
         """An operator changes a task's weights; the answer comes when the change has ended."""
-        command, request = event.command, event.request
-        register = self.registers.get(command.task)
-        if register is None:
-            known = ", ".join(sorted(self.registers))
-            _refuse(request, CommandOutcome.INVALID, f"no task {command.task!r}; tasks: {known}", todo)
-            return
-        try:
-            weights = Weights(cpu=command.cpu, memory=command.memory, network=command.network, gauges=command.gauges)
-        except ValueError as error:
-            _refuse(request, CommandOutcome.INVALID, str(error), todo)
-            return
-        value = register.value
-        if command.base_revision not in (None, value.revision):
-            detail = f"revision is {value.revision}, not {command.base_revision}"
-            _refuse(request, CommandOutcome.CONFLICT, detail, todo)
-        elif weights == value.tuning.weights:
-            _refuse(request, CommandOutcome.UNCHANGED, _ENDED[RoundOutcome.UNCHANGED][1], todo)
-        else:
-            tuning = replace(value.tuning, weights=weights)
-            asked = command.asked
-            change = Retune(base_revision=value.revision, tuning=tuning, request=request, asked=asked)
-            self.propose(command.task, change, todo, now)
+        change = wanted_retune(event, self.registers, todo)
+        if change is not None:
+            self.propose(event.command.task, change, todo, now)
 
     def tick(self, todo: ToDo, now: float) -> None:
         """Time has passed."""
@@ -986,9 +800,8 @@ class Agreement:
         """A change of this node has ended: tell the other nodes, and the operator that waits for it."""
         task, change, outcome = ended.task, ended.change, ended.outcome
         register = self.registers.get(task)
-        if register is None:  # its task has left the fleet
-            if isinstance(change, Retune) and change.request is not None:
-                _refuse(change.request, CommandOutcome.INVALID, f"{task} has left the fleet", todo)
+        if register is None:
+            refuse_gone(ended, todo)
             return
         value = register.value
         if outcome is RoundOutcome.COMMITTED:
@@ -996,10 +809,7 @@ class Agreement:
         if isinstance(change, MoveOwner):
             text = f"move to {change.owner} on revision {change.base_revision}: {outcome}"
             todo.add(do.RecordStory(stage="vote", text=text, task=task, epoch=value.epoch))
-        if not isinstance(change, SetLeased) and change.request is not None:
-            kind, detail = _ENDED[outcome]
-            result = CommandResult(outcome=kind, detail=f"{task}: {detail}", revision=value.revision)
-            todo.add(do.AnswerCommand(request=change.request, result=result))
+        answer_end(ended, value, todo)
 
     def on_persist_failed(self, reason: str) -> None:
         """The disk refused: no elector any more, and nothing is written any more."""
@@ -1008,38 +818,7 @@ class Agreement:
         self._stop_electing()
 
     def _stop_electing(self) -> None:
-        self.is_elector = False
+        self.acceptor.is_elector = False
         self.leases.stop_granting()
         if self._numbers.roll is not None:
             self._numbers.roll.stop_electing()
-
-
-def _refuse(request: int, outcome: CommandOutcome, detail: str, todo: ToDo) -> None:
-    todo.add(do.AnswerCommand(request=request, result=CommandResult(outcome=outcome, detail=detail)))
-
-
-def _newest(register: TaskRegister) -> Allocation | None:
-    """The value of the higher revision among accepted and learnt; the learnt one when they are of the same."""
-    accepted, learnt = register.state.accepted, register.state.learnt
-    if accepted is None:
-        return learnt
-    return accepted.value if learnt is None or accepted.value.revision > learnt.revision else learnt
-
-
-def _moved_text(why: str, joins: str) -> str:
-    """Why a node that was told which generation to join is no elector."""
-    return (
-        f"{why} yet (generation {joins[:SAID_DIGITS]}): no elector until it is added as one, which "
-        "`electorate: auto` does by itself"
-    )
-
-
-def _lost_text(why: str, newest_generation: int, *, is_agreed: bool) -> str:
-    """``is_agreed``: the fleet goes by an agreed document, in which another disk is another member."""
-    until = f"a new generation ({way_out(newest_generation + 1)})"
-    if is_agreed:
-        until = "it is added as one anew, which `electorate: auto` does by itself once its old seat is given up"
-    return (
-        f"{why}: it was brought back from a backup, or its disk has lost what it said was written; no elector until "
-        f"{until}"
-    )

@@ -1,4 +1,4 @@
-"""VOTE, a node's blank state: objections to it, and its values in a new generation.
+"""VOTE, a node's blank state: objections to it, its values in a new generation, what is said of a lost one.
 
 Knows: the content of the state before, the fleet's answers. Does not know: disks, how a node is asked.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from zsched.core.values.durable import DurableState
+from zsched.core.values.electorate import SAID_DIGITS
 from zsched.core.values.fleet import Fleet, electorate_hash
 from zsched.core.values.model import NO_BALLOT, Acceptance, Allocation, NodeId, RegisterState
 from zsched.core.values.snapshot import Snapshot
@@ -155,3 +156,25 @@ def objection(
 def _has_lost_too_many(answer: Snapshot) -> bool:
     quorum = answer.quorum
     return quorum.electors - len(quorum.stateless) < quorum.needed
+
+
+def moved_text(why: str, joins: str) -> str:
+    """Why a node that was told which generation to join is no elector."""
+    return (
+        f"{why} yet (generation {joins[:SAID_DIGITS]}): no elector until it is added as one, which "
+        "`electorate: auto` does by itself"
+    )
+
+
+def lost_text(why: str, newest_generation: int, *, is_agreed: bool) -> str:
+    """Why a node whose state is lost is no elector, and until when.
+
+    ``is_agreed``: the fleet goes by an agreed document, in which another disk is another member.
+    """
+    until = f"a new generation ({way_out(newest_generation + 1)})"
+    if is_agreed:
+        until = "it is added as one anew, which `electorate: auto` does by itself once its old seat is given up"
+    return (
+        f"{why}: it was brought back from a backup, or its disk has lost what it said was written; no elector until "
+        f"{until}"
+    )

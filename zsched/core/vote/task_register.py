@@ -20,6 +20,14 @@ class TaskRegister(Register[Allocation]):
     A change that leaves owner or tuning as they are writes nothing, so a higher epoch always means another owner.
     """
 
+    @property
+    def newest(self) -> Allocation | None:
+        """The value of the higher revision among accepted and learnt; the learnt one when they are of the same."""
+        accepted, learnt = self.state.accepted, self.state.learnt
+        if accepted is None:
+            return learnt
+        return accepted.value if learnt is None or accepted.value.revision > learnt.revision else learnt
+
     def _highest(self, value: Allocation) -> int:
         return max(value.revision, value.epoch)
 

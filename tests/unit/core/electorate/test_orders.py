@@ -106,7 +106,7 @@ def asked(
     agreement: Agreement, question: Prepare | Accept[FleetValue], asker: str = "robot2"
 ) -> tuple[ToDo, FleetAnswer | None]:
     event = ev.FleetAsked(request=1, asker=asker, question=fleet_question(question))
-    todo = agreed(agreement.on_fleet_asked, event, 100.1)
+    todo = agreed(agreement.acceptor.on_fleet_asked, event, 100.1)
     answers = of(todo, do.AnswerFleet)
     return todo, answers[0].answer if answers else None
 

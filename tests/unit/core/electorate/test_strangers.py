@@ -179,12 +179,12 @@ def test_a_question_of_another_generation_gets_no_answer() -> None:
         number=RIGHT.number,
     )
     event = ev.PrepareAsked(request=1, asker="robot3", prepare=question)
-    assert not [one for one in agreed(one.on_prepare, event, 100.1).send if isinstance(one, do.AnswerElection)]
+    assert not [one for one in agreed(one.acceptor.on_prepare, event, 100.1).send if isinstance(one, do.AnswerElection)]
     ours = replace(question, generation_id=LEFT.generation_id)
     for name in ROBOTS[1:]:
         one.witness.on_answer(Learnt(node=name, values=()))
     event = ev.PrepareAsked(request=2, asker="robot3", prepare=ours)
-    assert [one for one in agreed(one.on_prepare, event, 101.0).send if isinstance(one, do.AnswerElection)]
+    assert [one for one in agreed(one.acceptor.on_prepare, event, 101.0).send if isinstance(one, do.AnswerElection)]
 
 
 def test_a_stranger_is_no_peer_and_its_other_frames_do_not_count() -> None:
@@ -293,6 +293,6 @@ def test_two_that_wait_elect_nothing_among_themselves() -> None:
         generation_id=LEFT.generation_id,
         number=1,
     )
-    todo = agreed(one.on_prepare, ev.PrepareAsked(request=1, asker="robot2", prepare=question), 101.0)
+    todo = agreed(one.acceptor.on_prepare, ev.PrepareAsked(request=1, asker="robot2", prepare=question), 101.0)
     (answer,) = [out.answer for out in todo.send if isinstance(out, do.AnswerElection)]
     assert answer.refusal == "not_elector"  # type: ignore[union-attr]

@@ -39,14 +39,9 @@ from zsched.core.values.model import (
     Beat,
     RegisterState,
 )
-from zsched.core.vote.agreement import (
-    ASK_AT_ONCE_S,
-    ASK_LEARNT_EVERY_S,
-    READ_EVERY_S,
-    SETTLE_AFTER_START_S,
-    Agreement,
-)
+from zsched.core.vote.agreement import SETTLE_AFTER_START_S, Agreement
 from zsched.core.vote.belief import GENERATION_STEP, MAX_AHEAD, MAX_GENERATION
+from zsched.core.vote.questions import ASK_AT_ONCE_S, ASK_LEARNT_EVERY_S, READ_EVERY_S
 
 T = TypeVar("T")
 ROBOTS = ("robot1", "robot2", "robot3")
@@ -321,7 +316,7 @@ def test_an_owner_that_is_no_candidate_any_more_can_be_learnt_and_accepted() -> 
         acceptance=Acceptance(ballot=ballot_of(5, "robot2"), value=before),
         electorate="e",
     )
-    agreed(elector.on_accept, ev.AcceptAsked(request=1, asker="robot2", accept=asked), 200.0)
+    agreed(elector.acceptor.on_accept, ev.AcceptAsked(request=1, asker="robot2", accept=asked), 200.0)
     accepted = elector.registers["merge"].state.accepted
     assert accepted is not None
     assert accepted.value == before
@@ -363,7 +358,7 @@ def test_an_absurd_value_is_not_accepted(absurd: Allocation) -> None:
         acceptance=Acceptance(ballot=ballot_of(5, "robot2"), value=absurd),
         electorate="e",
     )
-    effects = agreed(agreement.on_accept, ev.AcceptAsked(request=1, asker="robot2", accept=asked), 100.0)
+    effects = agreed(agreement.acceptor.on_accept, ev.AcceptAsked(request=1, asker="robot2", accept=asked), 100.0)
     (said,) = of(effects, do.AnswerElection)
     assert isinstance(said.answer, Refused)
     assert said.answer.refusal is Refusal.VALUE
@@ -430,7 +425,7 @@ def test_refused_write_ends_the_electorship_and_the_writing() -> None:
     assert agreement.problems == {"state": "disk full; this node is no elector until it is restarted"}
     ballot = ballot_of(node="robot2")
     effects = agreed(
-        agreement.on_prepare,
+        agreement.acceptor.on_prepare,
         ev.PrepareAsked(request=1, asker="robot2", prepare=replace(_prepare(agreement), ballot=ballot)),
         100.0,
     )
@@ -479,7 +474,9 @@ def test_prepares_of_one_peer_are_rate_limited_and_others_are_not() -> None:
     answers = []
     for number in range(60):
         prepare = Prepare(task="merge", ballot=ballot_of(number + 1, "robot2"), electorate="e")
-        effects = agreed(agreement.on_prepare, ev.PrepareAsked(request=number, asker="robot2", prepare=prepare), 100.0)
+        effects = agreed(
+            agreement.acceptor.on_prepare, ev.PrepareAsked(request=number, asker="robot2", prepare=prepare), 100.0
+        )
         answers += [i.answer for i in of(effects, do.AnswerElection)]
     refused = [answer for answer in answers if isinstance(answer, Refused)]
     assert len(answers) == 60
@@ -487,18 +484,18 @@ def test_prepares_of_one_peer_are_rate_limited_and_others_are_not() -> None:
     assert {answer.refusal for answer in refused} == {Refusal.RATE}
     other = Prepare(task="merge", ballot=ballot_of(99, "robot3"), electorate="e")
     (answer,) = of(
-        agreed(agreement.on_prepare, ev.PrepareAsked(request=1, asker="robot3", prepare=other), 100.0),
+        agreed(agreement.acceptor.on_prepare, ev.PrepareAsked(request=1, asker="robot3", prepare=other), 100.0),
         do.AnswerElection,
     )
     assert isinstance(answer.answer, Promise)
     again = Prepare(task="merge", ballot=ballot_of(100, "robot2"), electorate="e")
     (soon,) = of(
-        agreed(agreement.on_prepare, ev.PrepareAsked(request=1, asker="robot2", prepare=again), 100.04),
+        agreed(agreement.acceptor.on_prepare, ev.PrepareAsked(request=1, asker="robot2", prepare=again), 100.04),
         do.AnswerElection,
     )
     assert isinstance(soon.answer, Refused), "one is saved in a twentieth of a second"
     (later,) = of(
-        agreed(agreement.on_prepare, ev.PrepareAsked(request=1, asker="robot2", prepare=again), 101.0),
+        agreed(agreement.acceptor.on_prepare, ev.PrepareAsked(request=1, asker="robot2", prepare=again), 101.0),
         do.AnswerElection,
     )
     assert isinstance(later.answer, Promise)
@@ -513,7 +510,7 @@ def test_a_broken_proposer_costs_an_elector_twenty_promises_a_second_and_an_hone
             asked = ev.PrepareAsked(
                 request=number, asker="robot2", prepare=Prepare(task="merge", ballot=ballot, electorate="e")
             )
-            (said,) = of(agreed(agreement.on_prepare, asked, 100.0 + number / per_s), do.AnswerElection)
+            (said,) = of(agreed(agreement.acceptor.on_prepare, asked, 100.0 + number / per_s), do.AnswerElection)
             count += isinstance(said.answer, Promise)
         assert count in promised, per_s
 
@@ -579,7 +576,7 @@ def test_generations_refuse_each_others_ballots() -> None:
     agreement = make()
     stranger = Prepare(task="merge", ballot=ballot_of(node="robot2"), electorate="e/1")
     (said,) = of(
-        agreed(agreement.on_prepare, ev.PrepareAsked(request=1, asker="robot2", prepare=stranger), 0.0),
+        agreed(agreement.acceptor.on_prepare, ev.PrepareAsked(request=1, asker="robot2", prepare=stranger), 0.0),
         do.AnswerElection,
     )
     assert isinstance(said.answer, Refused)

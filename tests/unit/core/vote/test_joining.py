@@ -35,8 +35,10 @@ from zsched.core.values.messages import (
     votes_of,
 )
 from zsched.core.values.model import Acceptance, RegisterState
-from zsched.core.vote.agreement import ASK_LEARNT_EVERY_S, PREPARE_BURST, VOTES_WAIT_S, Agreement
+from zsched.core.vote.acceptor import PREPARE_BURST
+from zsched.core.vote.agreement import Agreement
 from zsched.core.vote.joining import joined
+from zsched.core.vote.questions import ASK_LEARNT_EVERY_S, VOTES_WAIT_S
 
 ROBOTS = ("robot1", "robot2", "robot3")
 TASKS = ("guard", "merge", "plan")
@@ -91,9 +93,9 @@ def alone(agreement: Agreement, questions: Iterable[Prepare | Accept]) -> list[P
     found: list[Promise | Accepted | Refused] = []
     for one in questions:
         if isinstance(one, Prepare):
-            todo = agreed(agreement.on_prepare, ev.PrepareAsked(request=1, asker="robot2", prepare=one), 100.0)
+            todo = agreed(agreement.acceptor.on_prepare, ev.PrepareAsked(request=1, asker="robot2", prepare=one), 100.0)
         else:
-            todo = agreed(agreement.on_accept, ev.AcceptAsked(request=1, asker="robot2", accept=one), 100.0)
+            todo = agreed(agreement.acceptor.on_accept, ev.AcceptAsked(request=1, asker="robot2", accept=one), 100.0)
         found += [sent.answer for sent in todo.send if isinstance(sent, do.AnswerElection)]
     return found
 
@@ -145,9 +147,9 @@ def test_an_accept_that_would_wait_for_a_lease_is_refused_at_once_and_waits_when
     told = votes(ask(one, question, accept("merge")))
     assert [it.task for it in told.accepted] == ["merge"]
     assert [(it.task, it.refusal) for it in told.refused] == [("guard", Refusal.LEASE)]
-    assert not one.has_parked
+    assert not one.acceptor.has_parked
     assert alone(one, [question]) == []
-    assert one.has_parked
+    assert one.acceptor.has_parked
 
 
 def test_a_frame_counts_as_one_question_at_the_rate() -> None:

@@ -91,7 +91,7 @@ def proposed(agreement: Agreement) -> Prepare:
 def asked(agreement: Agreement, prepare: Prepare, asker: str = "robot2") -> tuple[ToDo, Promise | Accepted | Refused]:
     ballot = replace(prepare.ballot, node=asker, counter=prepare.ballot.counter + 10)
     event = ev.PrepareAsked(request=1, asker=asker, prepare=replace(prepare, ballot=ballot))
-    todo = agreed(agreement.on_prepare, event, 100.1)
+    todo = agreed(agreement.acceptor.on_prepare, event, 100.1)
     return todo, of(todo, do.AnswerElection)[0].answer
 
 
@@ -180,7 +180,7 @@ def test_an_accept_under_a_lower_number_is_refused_too() -> None:
         generation_id=prepare.generation_id,
         number=1,
     )
-    todo = agreed(agreement.on_accept, ev.AcceptAsked(request=3, asker="robot2", accept=accept), 100.1)
+    todo = agreed(agreement.acceptor.on_accept, ev.AcceptAsked(request=3, asker="robot2", accept=accept), 100.1)
     (answer,) = [one.answer for one in of(todo, do.AnswerElection)]
     assert isinstance(answer, Refused)
     assert (answer.refusal, answer.fleet) == (Refusal.NUMBER, WITH_EDGE)

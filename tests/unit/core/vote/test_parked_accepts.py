@@ -21,7 +21,8 @@ from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.messages import Accept, Accepted, Learnt, Refusal, Refused
 from zsched.core.values.model import Acceptance, Allocation, RegisterState
-from zsched.core.vote.agreement import PARK_SHARE, Agreement
+from zsched.core.vote.acceptor import PARK_SHARE
+from zsched.core.vote.agreement import Agreement
 from zsched.core.vote.lease import hold_s
 
 ROBOTS = ("robot1", "robot2", "robot3")
@@ -83,7 +84,7 @@ ASKS_TO_LEAVE = beat_of("robot2", 9, asked_to_leave=(("guard", "robot2", 3),))
 def asks(agreement: Agreement, request: int, counter: int, now: float, asker: str = "robot3") -> ToDo:
     ballot = ballot_of(counter, asker)
     accept = Accept(task="guard", acceptance=Acceptance(ballot=ballot, value=value(4, "robot3")), electorate="e")
-    return agreed(agreement.on_accept, ev.AcceptAsked(request=request, asker=asker, accept=accept), now)
+    return agreed(agreement.acceptor.on_accept, ev.AcceptAsked(request=request, asker=asker, accept=accept), now)
 
 
 def answers(effects: ToDo) -> list[tuple[int, str]]:
@@ -98,20 +99,20 @@ def answers(effects: ToDo) -> list[tuple[int, str]]:
 def test_it_waits_for_the_lease_and_is_refused_when_its_ballot_is_nearly_over() -> None:
     agreement = elector()
     effects = asks(agreement, 1, 5, 100.1)
-    assert (answers(effects), effects.must_beat, agreement.has_parked) == ([], True, True)
-    effects = agreed(agreement.retry_parked, 100.1 + PARKED_S / 2)
-    assert (answers(effects), effects.must_beat, agreement.has_parked) == ([], False, True)
+    assert (answers(effects), effects.must_beat, agreement.acceptor.has_parked) == ([], True, True)
+    effects = agreed(agreement.acceptor.retry_parked, 100.1 + PARKED_S / 2)
+    assert (answers(effects), effects.must_beat, agreement.acceptor.has_parked) == ([], False, True)
     assert agreement.next_deadline() <= 100.1 + PARKED_S
-    assert answers(agreed(agreement.retry_parked, 100.1 + PARKED_S)) == [(1, Refusal.LEASE)]
-    assert not agreement.has_parked
+    assert answers(agreed(agreement.acceptor.retry_parked, 100.1 + PARKED_S)) == [(1, Refusal.LEASE)]
+    assert not agreement.acceptor.has_parked
 
 
 def test_it_is_accepted_as_soon_as_the_lease_is_over() -> None:
     agreement = elector()
     at = 100.0 + HOLD_S
     asks(agreement, 1, 5, at - PARKED_S / 2)
-    effects = agreed(agreement.retry_parked, at)
-    assert (answers(effects), effects.must_persist, agreement.has_parked) == ([(1, "accepted")], True, False)
+    effects = agreed(agreement.acceptor.retry_parked, at)
+    assert (answers(effects), effects.must_persist, agreement.acceptor.has_parked) == ([(1, "accepted")], True, False)
 
 
 @pytest.mark.parametrize(("waited", "expected"), [(0.7, "accepted"), (0.9, Refusal.LEASE)])
@@ -121,8 +122,8 @@ def test_it_waits_for_most_of_its_ballot_s_time_and_the_no_still_comes_before_th
     agreement = elector()
     at = 100.0 + HOLD_S
     asks(agreement, 1, 5, at - waited * FLEET.timing.ballot_s)
-    early = answers(agreed(agreement.retry_parked, at - 0.01))
-    assert early + answers(agreed(agreement.retry_parked, at)) == [(1, expected)]
+    early = answers(agreed(agreement.acceptor.retry_parked, at - 0.01))
+    assert early + answers(agreed(agreement.acceptor.retry_parked, at)) == [(1, expected)]
 
 
 def test_the_asker_s_next_ballot_ends_the_wait_of_the_one_before_and_an_echo_of_it_does_not() -> None:
@@ -132,22 +133,25 @@ def test_the_asker_s_next_ballot_ends_the_wait_of_the_one_before_and_an_echo_of_
     assert (answers(effects), effects.must_beat) == ([], False), "the same question once more"
     effects = asks(agreement, 2, 6, 100.2)
     assert (answers(effects), effects.must_beat) == ([(1, Refusal.LEASE)], False)
-    assert agreement.has_parked
-    assert answers(agreed(agreement.retry_parked, 100.2 + PARKED_S)) == [(2, Refusal.LEASE)]
+    assert agreement.acceptor.has_parked
+    assert answers(agreed(agreement.acceptor.retry_parked, 100.2 + PARKED_S)) == [(2, Refusal.LEASE)]
 
 
 def test_two_askers_wait_beside_each_other() -> None:
     agreement = elector()
     asks(agreement, 1, 5, 100.1)
     assert answers(asks(agreement, 2, 5, 100.1, "robot2")) == []
-    assert sorted(answers(agreed(agreement.retry_parked, 100.1 + PARKED_S))) == [(1, Refusal.LEASE), (2, Refusal.LEASE)]
+    assert sorted(answers(agreed(agreement.acceptor.retry_parked, 100.1 + PARKED_S))) == [
+        (1, Refusal.LEASE),
+        (2, Refusal.LEASE),
+    ]
 
 
 def test_a_question_that_would_be_refused_anyway_does_not_wait() -> None:
     agreement = elector()
     asks(agreement, 1, 5, 100.1)
     effects = agreed(
-        agreement.on_accept,
+        agreement.acceptor.on_accept,
         ev.AcceptAsked(
             request=9,
             asker="robot3",
@@ -168,7 +172,7 @@ def test_a_question_that_waits_is_answered_though_no_task_is_exclusive_any_more(
     ballot = ballot_of(5, "robot3")
     accept = Accept(task="guard", acceptance=Acceptance(ballot=ballot, value=value(4, "robot3")), electorate="e")
     node.handle(ev.AcceptAsked(request=1, asker="robot3", accept=accept), 100.1)
-    assert node.agreement.has_parked
+    assert node.agreement.acceptor.has_parked
     node.tenure.exclusive = ()
     now = 100.1 + PARKED_S
     told = [one for one in node.handle(ev.DeadlineReached(), now) if isinstance(one, do.AnswerElection)]
@@ -203,7 +207,7 @@ def test_an_identity_round_does_not_end_the_silence_towards_an_owner_that_is_ask
     asks(agreement, 1, 5, now)
     acceptance = Acceptance(ballot=ballot_of(6, "robot2"), value=value(3, "robot2"))
     identity = Accept(task="guard", acceptance=acceptance, electorate="e")
-    effects = agreed(agreement.on_accept, ev.AcceptAsked(request=2, asker="robot2", accept=identity), now)
+    effects = agreed(agreement.acceptor.on_accept, ev.AcceptAsked(request=2, asker="robot2", accept=identity), now)
     assert answers(effects) == [(2, "accepted")]
     said = agreement.leases.on_sent(1, now + 0.1)
     assert (said.asked_to_leave, said.echoes) == ((("guard", "robot2", 3),), ())

@@ -1,0 +1,68 @@
+"""VOTE, an operator's change of a task: which change it asks for, and the answer when that has ended.
+
+Knows: commands, outcomes in words. Does not know: rounds (`zsched.core.vote.register`), how an answer travels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from zsched.core import events as ev
+from zsched.core import instructions as do
+from zsched.core.todo import ToDo
+from zsched.core.values.change import Ended, Retune, RoundOutcome, SetLeased
+from zsched.core.values.messages import CommandOutcome, CommandResult
+from zsched.core.values.model import Allocation, TaskId, Weights
+from zsched.core.values.struct import replace
+from zsched.core.vote.task_register import TaskRegister
+
+_ENDED = {
+    RoundOutcome.COMMITTED: (CommandOutcome.OK, "committed by a majority of the electors"),
+    RoundOutcome.CONFLICT: (CommandOutcome.CONFLICT, "another change came first; look and try again"),
+    RoundOutcome.UNCHANGED: (CommandOutcome.UNCHANGED, "it is so already"),
+    RoundOutcome.NO_QUORUM: (CommandOutcome.NO_QUORUM, "no majority of the electors answered"),
+    RoundOutcome.UNKNOWN: (CommandOutcome.UNKNOWN, "the electors fell silent; `zsched status` tells"),
+}
+
+
+def wanted_retune(event: ev.WeightsCommanded, registers: Mapping[TaskId, TaskRegister], todo: ToDo) -> Retune | None:
+    """The change that an operator's new weights mean; ``None``: the answer is given already."""
+    command, request = event.command, event.request
+    register = registers.get(command.task)
+    if register is None:
+        known = ", ".join(sorted(registers))
+        _refuse(request, CommandOutcome.INVALID, f"no task {command.task!r}; tasks: {known}", todo)
+        return None
+    try:
+        weights = Weights(cpu=command.cpu, memory=command.memory, network=command.network, gauges=command.gauges)
+    except ValueError as error:
+        _refuse(request, CommandOutcome.INVALID, str(error), todo)
+        return None
+    value = register.value
+    if command.base_revision not in (None, value.revision):
+        detail = f"revision is {value.revision}, not {command.base_revision}"
+        _refuse(request, CommandOutcome.CONFLICT, detail, todo)
+    elif weights == value.tuning.weights:
+        _refuse(request, CommandOutcome.UNCHANGED, _ENDED[RoundOutcome.UNCHANGED][1], todo)
+    else:
+        tuning = replace(value.tuning, weights=weights)
+        return Retune(base_revision=value.revision, tuning=tuning, request=request, asked=command.asked)
+    return None
+
+
+def refuse_gone(ended: Ended, todo: ToDo) -> None:
+    """A change has ended whose task has left the fleet."""
+    if isinstance(ended.change, Retune) and ended.change.request is not None:
+        _refuse(ended.change.request, CommandOutcome.INVALID, f"{ended.task} has left the fleet", todo)
+
+
+def answer_end(ended: Ended, value: Allocation, todo: ToDo) -> None:
+    """Tell the operator who waits for a change how it has ended; ``value`` is the present one."""
+    if not isinstance(ended.change, SetLeased) and ended.change.request is not None:
+        kind, detail = _ENDED[ended.outcome]
+        result = CommandResult(outcome=kind, detail=f"{ended.task}: {detail}", revision=value.revision)
+        todo.add(do.AnswerCommand(request=ended.change.request, result=result))
+
+
+def _refuse(request: int, outcome: CommandOutcome, detail: str, todo: ToDo) -> None:
+    todo.add(do.AnswerCommand(request=request, result=CommandResult(outcome=outcome, detail=detail)))
