@@ -11,7 +11,7 @@ from zsched.core.scheduler.rounds import Rounds
 from zsched.core.todo import ToDo
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, TaskId
-from zsched.core.vote.votes import Votes
+from zsched.core.vote.voting import Votes
 
 
 class Decider:

@@ -50,7 +50,7 @@ from zsched.core.values.struct import Struct
 from zsched.core.vote.agreement import Agreement
 from zsched.core.vote.expiry import Expiry
 from zsched.core.vote.retuning import Retuning
-from zsched.core.vote.votes import Votes
+from zsched.core.vote.voting import Votes
 
 HISTORY = 32
 """Past values of a task that status can show."""

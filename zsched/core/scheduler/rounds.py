@@ -1,7 +1,7 @@
 """SCHEDULER in motion at one robot, all tasks: gather, judge, hand out proposals.
 
 Knows: the round's course and its deadlines. Does not know: how scores arise (`scoring`), stickiness (`judge`), what
-becomes of a proposal (`zsched.core.vote.votes`), bytes.
+becomes of a proposal (`zsched.core.vote.voting`), bytes.
 
 A robot judges every ``decide_s``, by the others' utilities: it gathers them, unless all is at rest
 (`zsched.core.scheduler.rest`). It gathers at once when an owner is gone or another robot's proposal
