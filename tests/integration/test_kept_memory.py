@@ -12,8 +12,7 @@ from support.sessions import hub_and_neighbour, matches
 from support.waiting import until
 from zsched.hop.acknowledger import Acknowledger
 from zsched.sessions.stalled_links import StalledLinks
-from zsched.worker.debts import Debts
-from zsched.worker.keep import Keeper
+from zsched.worker.keep import Debts, Keeper
 from zsched.worker.outputs import OUTPUT_DEPTH, Output
 
 ANSWERS = 1000

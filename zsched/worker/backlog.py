@@ -26,7 +26,7 @@ from typing import Final, Generic, NamedTuple, Protocol, TypeVar
 import zenoh
 
 from zsched.core.hop.receiver import SourceName
-from zsched.worker.debts import Held
+from zsched.worker.keep import Held
 
 MAX_WITHHELD: Final = 256
 """Samples per key of an input without ``keep_last`` that a predecessor's state may want again."""

@@ -28,9 +28,8 @@ from zsched.core.hop.serial import number_near, serial_of
 from zsched.guard import guarded
 from zsched.hop.acknowledger import Acknowledger
 from zsched.worker.backlog import Done, StandbyInputs
-from zsched.worker.debts import Debts, Held
 from zsched.worker.jobs import JobBook
-from zsched.worker.lanes import KeptLane
+from zsched.worker.keep import Debts, Held, KeptLane
 from zsched.worker.samples import Input, Marker, OpenSource, Received, Waiting
 from zsched.worker.troubles import Troubles
 

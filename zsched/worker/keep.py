@@ -1,7 +1,8 @@
-"""Keeps a worker's answers until the robots' relays have acknowledged them, and sends again what one has missed.
+"""A worker's answers until the robots have them: kept, sent again to the relay that has missed one, owed by an input.
 
-Knows: frames of acknowledgements, how answers are put again. Does not know: epochs, roles, what is in an answer, which
-relay is owed what (`zsched.core.hop.shared`).
+Knows: frames of acknowledgements, how answers are put again, which lock guards what. Does not know: epochs, roles, what
+is in an answer, which relay is owed what (`zsched.core.hop.shared`), which input waits for which answers
+(`zsched.core.hop.held`), how an input is acknowledged (`zsched.hop.acknowledger`).
 
 A link that closes (a freeze, a cut) takes with it what was on it, and a put says nothing about that. So every answer of
 class ``reliable`` is kept, at most ``limit`` of an output and `SHARED_BYTES`, of ``latest`` the newest. A relay that
@@ -12,6 +13,12 @@ never acknowledges; for it nothing is kept longer than that.
 
 Anybody can put under the key of acknowledgements. What is too large to be one, or comes while too many wait, is dropped
 and counted; what is dropped of a relay's is mended by its next one.
+
+An acknowledgement overtakes the answers: on a full link it would call an input done whose answer is lost with the
+machine that holds it. So an input of class ``reliable`` *owes* the answers of class ``reliable`` that its callback has
+put, and counts as processed when all robots for which it waits have them (`KeptLane.settled`). A callback that puts
+nothing owes nothing, and so does one whose answers another thread puts. Where an answer was withheld, since the worker
+was not the owner, its input waits until it has been processed again.
 """
 
 from __future__ import annotations
@@ -19,23 +26,28 @@ from __future__ import annotations
 import logging
 import queue
 import threading
-from typing import Final
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, Final
 
 import zenoh
 from zenoh import CongestionControl, Sample, Session
 
 from zsched.clock import monotonic_s
+from zsched.core.hop.held import Held as HeldOf
+from zsched.core.hop.held import HeldInputs
+from zsched.core.hop.kept import Owed
+from zsched.core.hop.receiver import SourceName
 from zsched.core.hop.serial import serial_of
-from zsched.core.hop.shared import TICK_S, SharedSender
+from zsched.core.hop.shared import MAX_RECEIVERS, TICK_S, SharedSender
 from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks
+from zsched.core.values.struct import Struct, field
 from zsched.errors import WireError
 from zsched.guard import guarded, tolerant
+from zsched.hop.acknowledger import Acknowledger
 from zsched.ipc.pipe import encode_end
 from zsched.sessions.stalled_links import StalledLinks
 from zsched.wire import codec as wire
-from zsched.wire.keyspace import END_CHUNK, parse
-from zsched.worker.debts import Debts
-from zsched.worker.lanes import KeptLane
+from zsched.wire.keyspace import AGAIN_CHUNK, END_CHUNK, parse
 
 MAX_FRAME_BYTES: Final = 1 << 17
 """Of one frame of acknowledgements: ours have at most `zsched.hop.acknowledger.MAX_PER_FRAME`, and take less."""
@@ -45,6 +57,163 @@ BESIDE: Final = " (application)"
 """Behind a robot's name (no name has such characters): its application that has its streams itself."""
 
 _log = logging.getLogger("zsched.worker")
+
+Answer = tuple[Any, Any, Any]
+"""(payload, attachment, encoding)."""
+
+
+class KeptLane(Struct, kw_only=True, eq=False):
+    """One publisher's answers; its lock guards `state`.
+
+    `keep`, `note_end` and `settled` may be called from any thread, the rest is the keeper's.
+    """
+
+    key: str
+    source_id: zenoh.EntityGlobalId
+    wake: threading.Event
+    state: SharedSender
+    lock: threading.Lock = field(default_factory=threading.Lock)
+    ways: dict[str, zenoh.Publisher] = field(default_factory=dict)
+    """{relay: the publisher of what it alone is sent again}; there while that is owed, or a relay is looked for."""
+    is_closed: bool = False
+    """Nothing more is put."""
+
+    def keep(self, answer: Answer, stamp: Any, size: int) -> int:
+        """Keep what is about to be put; answers its number."""
+        with self.lock:
+            number = self.state.note_put(answer, stamp, size, monotonic_s())
+        if not self.wake.is_set():
+            self.wake.set()
+        return number
+
+    def note_end(self, marker: EndMarker) -> None:
+        """The end marker was put behind the last answer."""
+        with self.lock:
+            self.state.note_end(marker, monotonic_s())
+        self.wake.set()
+
+    def settled(self, name: str, now: float, /) -> int:
+        """`SharedSender.settled`."""
+        with self.lock:
+            return self.state.settled(name, now)
+
+    # --- the keeper's thread -----------------------------------------------------------------------------------------
+
+    def hear(self, relay: str, node: str, ack: StreamAck, now: float) -> None:
+        """Take a relay's word."""
+        with self.lock:
+            before = self.state.crowded_out
+            self.state.hear(relay, node, ack, now)
+            is_first = before < self.state.crowded_out == 1
+        if is_first:
+            _log.warning("%s: more than %d relays acknowledge answers: some are strangers", self.key, MAX_RECEIVERS)
+
+    def take_owed(self, session: Session) -> Iterator[tuple[zenoh.Publisher, Owed, EndMarker | None]]:
+        """What single relays are to be put now: (the way to one, what is owed to it, the marker of its skip)."""
+        with self.lock:
+            relays = self.state.owing()
+        for relay in relays:
+            is_reached, now = _matches(self._way(session, relay)), monotonic_s()
+            with self.lock:
+                owed = self.state.take_owed(relay, now, is_reached=is_reached)
+                skip = None if owed.skip is None else self.state.skip_marker(relay, owed.skip, now)
+            yield self.ways[relay], owed, skip
+
+    def look_after(self, session: Session, now: float) -> None:
+        """Note what is late; find out which relays that have said nothing subscribe to the answers."""
+        with self.lock:
+            self.state.look_after(now)
+            in_doubt = self.state.in_doubt(now)
+        for relay in in_doubt:
+            if relay not in self.ways:
+                self._way(session, relay)  # it is known at the next tick whether it matches
+                continue
+            is_there = _matches(self.ways[relay])
+            with self.lock:
+                self.state.decide(relay, now, is_there=is_there)
+
+    def next_deadline(self, now: float) -> float | None:
+        """When to look after it again; ``None``: there is nothing left to do."""
+        with self.lock:
+            return self.state.next_deadline(now)
+
+    def give_up(self) -> None:
+        """Nobody looks after it any more."""
+        with self.lock:
+            self.state.give_up()
+        for relay in tuple(self.ways):
+            self._close_way(relay)
+
+    def close_ways(self) -> None:
+        """Give back the publishers to relays that nothing is owed any more."""
+        if self.ways:
+            with self.lock:
+                unused = [relay for relay in self.ways if not self.state.needs_way(relay)]
+            for relay in unused:
+                self._close_way(relay)
+
+    def _way(self, session: Session, relay: str) -> zenoh.Publisher:
+        way = self.ways.get(relay)
+        if way is None:
+            key = f"{self.key}/{AGAIN_CHUNK}/{relay}"
+            way = self.ways[relay] = session.declare_publisher(key, congestion_control=CongestionControl.BLOCK)
+        return way
+
+    def _close_way(self, relay: str) -> None:
+        self.ways.pop(relay).undeclare()
+
+
+Held = HeldOf[KeptLane]
+
+
+class Debts:
+    """The inputs whose answers are on their way. Its lock is held around lanes' locks, and around nothing else."""
+
+    def __init__(self, acks: Acknowledger) -> None:
+        """``acks`` hears what is processed, in the order of each source."""
+        self._acks = acks
+        self._lock = threading.Lock()
+        self._held = HeldInputs[KeptLane]()
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether an input is held back."""
+        return bool(self._held.lines)
+
+    def processed(
+        self, name: SourceName, number: int, size: int, owed: Mapping[KeptLane, int], *, is_unanswered: bool = False
+    ) -> Held | None:
+        """A callback has returned (dispatch thread); ``owed`` are the answers that it has put.
+
+        ``is_unanswered``: an answer was withheld; what is given back is for `answered`.
+        """
+        with self._lock:
+            held = self._held.hold(name, number, size, owed, is_unanswered=is_unanswered)
+        if held is None:
+            self._acks.processed(name, number, size)
+        _wake(owed)
+        return held
+
+    def answered(self, held: Held, owed: Mapping[KeptLane, int], now: float) -> None:
+        """An input whose answer was withheld has been processed again, or was given up."""
+        with self._lock:
+            held.unanswered -= 1
+            held.owe(owed)
+        _wake(owed)
+        if not owed:
+            self.settle(now)
+
+    def forget(self, name: SourceName) -> None:
+        """Nobody waits for this source's inputs any more."""
+        with self._lock:
+            self._held.forget(name)
+
+    def settle(self, now: float) -> None:
+        """Tell of every input whose answers are where they should be (any thread; the keeper's when it has heard)."""
+        with self._lock:
+            done = self._held.settle(now)
+        for one in done:
+            self._acks.processed(one.name, one.number, one.size)
 
 
 class _Bell(threading.Event):
@@ -196,3 +365,13 @@ def put_end(session: Session, key: str, source_id: zenoh.EntityGlobalId, marker:
         congestion_control=CongestionControl.BLOCK,
         source_info=zenoh.SourceInfo(source_id, serial_of(marker.count)),
     )
+
+
+def _matches(publisher: Any) -> bool:
+    return bool(publisher.matching_status.matching)  # the status itself is always true
+
+
+def _wake(lanes: Iterable[KeptLane]) -> None:
+    for lane in lanes:
+        if not lane.wake.is_set():
+            lane.wake.set()  # the keeper may have been at rest since the answer was put

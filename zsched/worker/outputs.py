@@ -17,8 +17,7 @@ from zsched.core.hop.serial import serial_of
 from zsched.core.relay_protocol import EndMarker
 from zsched.core.values.struct import Struct
 from zsched.sessions.send_queue import SendQueue
-from zsched.worker.keep import Keeper, put_end
-from zsched.worker.lanes import KeptLane
+from zsched.worker.keep import Keeper, KeptLane, put_end
 
 LATEST_DEPTH: Final = 16
 """Values of class ``latest`` that may wait for a receiver that keeps up; behind a stalled one, ``keep_last`` do."""

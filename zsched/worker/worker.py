@@ -46,12 +46,11 @@ from zsched.sessions.config import lease_s
 from zsched.sessions.stalled_links import StalledLinks
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import END_CHUNK, Keyspace
-from zsched.worker.debts import Debts
 from zsched.worker.epochs import CARRY_LOOK_S, CARRY_S, Epochs, lets_out
 from zsched.worker.errands import Errands
 from zsched.worker.inputs import Dispatcher
 from zsched.worker.jobs import Job, JobBook
-from zsched.worker.keep import Keeper
+from zsched.worker.keep import Debts, Keeper
 from zsched.worker.keys import IN_OUTPUTS, filled, untaken
 from zsched.worker.outputs import OUTPUT_DEPTH, Output
 from zsched.worker.roles import RoleWatch

@@ -18,9 +18,9 @@ from zsched.hop.acknowledger import Acknowledger
 from zsched.relay.troubles import PAUSE_S, Troubles, Word
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import Keyspace
-from zsched.worker.debts import Debts
 from zsched.worker.inputs import Dispatcher
 from zsched.worker.jobs import TELL_S, JobBook, JobTimer
+from zsched.worker.keep import Debts
 from zsched.worker.samples import Input, Received
 
 KEYS = Keyspace("test")

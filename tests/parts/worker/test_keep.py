@@ -19,9 +19,7 @@ from zsched.sessions.stalled_links import StalledLinks
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import AGAIN_CHUNK, END_CHUNK, Keyspace
 from zsched.worker import keep as worker_keep
-from zsched.worker.debts import Debts
-from zsched.worker.keep import Keeper
-from zsched.worker.lanes import KeptLane
+from zsched.worker.keep import Debts, Keeper, KeptLane
 
 KEY = "edge1/t/1/out"
 KEYS = Keyspace("t")

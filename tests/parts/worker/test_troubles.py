@@ -20,9 +20,9 @@ from zsched.relay.troubles import Troubles as Heard
 from zsched.relay.troubles import Word
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import Keyspace
-from zsched.worker.debts import Debts
 from zsched.worker.inputs import Dispatcher
 from zsched.worker.jobs import JobBook
+from zsched.worker.keep import Debts
 from zsched.worker.samples import Input, Received
 from zsched.worker.troubles import MAX_KINDS, Troubles
 

@@ -9,8 +9,7 @@ from zsched.core.hop.held import MAX_HELD
 from zsched.core.hop.shared import STALLED_S, SharedSender
 from zsched.core.relay_protocol import StreamAck
 from zsched.hop.acknowledger import Acknowledger
-from zsched.worker.debts import Debts
-from zsched.worker.lanes import KeptLane
+from zsched.worker.keep import Debts, KeptLane
 
 OWN, OTHER = "aa1", "bb2"
 NAME = ("edge1/t/robot1/in", OWN, 7)
