@@ -12,9 +12,9 @@ from functools import partial
 
 from zenoh import Sample, SampleKind, Timestamp
 
+from zsched.core.route.wildcards import Rewriting
 from zsched.core.values.plan import Route, StreamClass
 from zsched.relay.streams.outlet import QUEUE_DEPTH
-from zsched.relay.streams.rewrite import Rewriting
 from zsched.sessions.send_queue import SendQueue
 from zsched.stream.samples import Received
 

@@ -14,7 +14,10 @@ import re
 from collections.abc import Callable
 from typing import Final
 
-from zsched.core.route.keyexpr import ANY_RUN, DOUBLE
+from zsched.core.route.keyexpr import ANY_RUN, DOUBLE, is_wild
+
+KEPT_OWNERS: Final = 4
+"""Newest owners whose keys still find their way."""
 
 Rewriter = Callable[[str], str | None]
 
@@ -66,6 +69,36 @@ def rewriter(from_expr: str, to_expr: str) -> Rewriter:
         return None if match is None else _fill(to_expr, match.groups())
 
     return rewrite
+
+
+class Rewriting:
+    """From the keys of one or several owners to those of one place; for one thread."""
+
+    def __init__(self, from_expr: str, to_expr: str) -> None:
+        """Raises `ValueError`: ``to_expr`` cannot be filled from ``from_expr``."""
+        self.is_wild = is_wild(to_expr)
+        """Whether several keys lead there."""
+        self._to = to_expr
+        self._rewriters: dict[str, Rewriter] = {from_expr: rewriter(from_expr, to_expr)}
+
+    def also_from(self, from_expr: str) -> None:
+        """Take keys of another owner, too: its ``from`` captures what fills the wildcards of ``to``.
+
+        Raises:
+            ValueError: ``to`` cannot be filled from it.
+        """
+        self._rewriters[from_expr] = rewriter(from_expr, self._to)
+        while len(self._rewriters) > KEPT_OWNERS:
+            self._rewriters.pop(next(iter(self._rewriters)))
+
+    def key(self, key: str) -> str | None:
+        """The new key, by the newest owner whose ``from`` the old one matches; ``None``: it fits none."""
+        if not self.is_wild:
+            return self._to
+        for rewrite in reversed(tuple(self._rewriters.values())):
+            if (result := rewrite(key)) is not None:
+                return result
+        return None
 
 
 def _pattern(expr: str) -> re.Pattern[str]:

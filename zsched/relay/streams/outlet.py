@@ -32,15 +32,14 @@ from zsched.clock import monotonic_s
 from zsched.core.hop.kept import NOTHING, Owed
 from zsched.core.hop.sender import KEPT_BYTES, KEPT_BYTES_LATEST, KEPT_SAMPLES
 from zsched.core.relay_protocol import EndMarker, StreamAck
+from zsched.core.route.wildcards import Rewriting
 from zsched.core.values.plan import OnCrash, StreamClass, StreamSettings
 from zsched.relay.streams.acks import WorkerAcks
 from zsched.relay.streams.crowd import Crowd
 from zsched.relay.streams.greetings import Greetings
-from zsched.relay.streams.lanes import Lane
+from zsched.relay.streams.lanes import Lane, declare_publisher, put_marker
 from zsched.relay.streams.proofs import LeftOpen
-from zsched.relay.streams.publishers import declare_publisher, put_marker
 from zsched.relay.streams.receive import undeclare
-from zsched.relay.streams.rewrite import Rewriting
 from zsched.relay.streams.tally import Tally
 from zsched.sessions.send_queue import SendQueue
 
