@@ -20,7 +20,7 @@ from zsched.commands.common import CliError, Json, nearest, say, wants_color
 from zsched.commands.example import APPLICATION
 from zsched.commands.report import render_status
 from zsched.config.load import load_fleet
-from zsched.core.route.templates import routes_for
+from zsched.core.route.route import routes_for
 from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.model import NodeId, NodeKind, TaskId
 from zsched.core.values.plan import Direction

@@ -19,8 +19,7 @@ from zsched.config.drivers import DRIVER_KEYS
 from zsched.config.reader import Fault, Scalar, read_yaml
 from zsched.config.reader import Mapping as Block
 from zsched.config.rows import rows
-from zsched.core.route.route import outputs_of
-from zsched.core.route.templates import named_rules
+from zsched.core.route.route import named_rules, outputs_of
 from zsched.core.values.fleet import (
     Cell,
     Fleet,

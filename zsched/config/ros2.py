@@ -28,7 +28,8 @@ from zsched.core.route.ros2 import (
     ros_key,
     type_fault,
 )
-from zsched.core.route.templates import placeholders, template_fault
+from zsched.core.route.route import placeholders
+from zsched.core.route.templates import template_fault
 from zsched.core.values.model import NodeId
 from zsched.core.values.plan import Direction, RosGraph, StreamClass
 

@@ -25,8 +25,7 @@ from typing import Final
 
 from zsched.core.route import keyexpr
 from zsched.core.route.keytree import KeyTree
-from zsched.core.route.route import NOBODY
-from zsched.core.route.templates import named_rules, widened
+from zsched.core.route.route import NOBODY, named_rules, widened
 from zsched.core.values.fleet import StreamRule, TaskSpec
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.plan import Direction

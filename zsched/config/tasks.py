@@ -14,16 +14,8 @@ from zsched.config.nodes import Cast, select
 from zsched.config.reader import Collector, Place, nearest
 from zsched.config.ros2 import ros2_rules
 from zsched.config.rulecheck import RuleConflict, rule_conflicts
-from zsched.core.route.route import NOBODY
-from zsched.core.route.templates import (
-    PLACEHOLDERS,
-    merges_keys,
-    named_rules,
-    placeholders,
-    rule_fault,
-    shared_key_fault,
-    template_fault,
-)
+from zsched.core.route.route import NOBODY, PLACEHOLDERS, named_rules, placeholders
+from zsched.core.route.templates import merges_keys, rule_fault, shared_key_fault, template_fault
 from zsched.core.scheduler.patience import FIRST_PATIENCE
 from zsched.core.values.fleet import (
     DEFAULT_BONUS,

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator
 from enum import StrEnum
 from typing import Any, Final
 
-from zsched.core.route.templates import widened
+from zsched.core.route.route import widened
 from zsched.core.values.certificates import Role, accepted
 from zsched.core.values.fleet import Fleet, NodeSpec, Security, StreamRule, TaskSpec, runs_worker
 from zsched.core.values.model import NodeKind

@@ -9,7 +9,7 @@ import json
 from typing import Final
 
 from zsched.core.route import keyexpr
-from zsched.core.route.templates import placeholders
+from zsched.core.route.route import placeholders
 from zsched.core.values.model import MAX_REASON
 from zsched.errors import ConfigError
 

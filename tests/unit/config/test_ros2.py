@@ -8,7 +8,7 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from zsched.config.load import CheckResult, check_bytes
-from zsched.core.route.templates import routes_for
+from zsched.core.route.route import routes_for
 from zsched.core.route.wildcards import rewriter
 from zsched.core.values.fleet import Fleet, LocalMode, LocalSide
 from zsched.core.values.plan import Direction, RosGraph, StreamClass

@@ -8,7 +8,7 @@ import pytest
 from support.fleets import tuning_of
 from zsched.config.rulecheck import RuleConflict, rule_conflicts
 from zsched.core.route import keyexpr
-from zsched.core.route.templates import named_rules, routes_for
+from zsched.core.route.route import named_rules, routes_for
 from zsched.core.values.fleet import StreamRule, TaskSpec
 from zsched.core.values.plan import Direction
 

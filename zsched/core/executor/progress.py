@@ -36,7 +36,7 @@ COUNT_S = 1.0
 MARGIN_S = 1.5
 """A complaint may be this much older than the answer that ends it: `COUNT_S` and a profile's way."""
 _INPUTS, _OUTPUTS = "in", "out"
-"""The directions in stream names (`zsched.core.route.templates`)."""
+"""The directions in stream names (`zsched.core.route.route`)."""
 
 
 class _Seen(Struct):

@@ -1,20 +1,91 @@
 """ROUTE: the plan of one task for this robot's relay, and its other duties for the task.
 
-Knows: slots, plans, watches. Does not know: when a handover may go on (`zsched.core.executor.handover`), zenoh,
-processes.
+Knows: how a template becomes a key, routes, slots, plans, watches. Does not know: which templates are allowed
+(`zsched.core.route.templates`), when a handover may go on (`zsched.core.executor.handover`), zenoh, processes.
 """
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
+from typing import Final
+
 from zsched.core.relay_protocol import WorkerWatch
 from zsched.core.route import keyexpr
-from zsched.core.route.templates import fill, routes_for, widened
-from zsched.core.values.fleet import Fleet, Standby, TaskSpec, runs_worker
+from zsched.core.values.fleet import Fleet, Standby, StreamRule, TaskSpec, runs_worker
 from zsched.core.values.model import NodeId, NodeKind
 from zsched.core.values.plan import Direction, ReadyWhen, RosGraph, Route, RoutePhase, RoutePlan, Slot
 
+PLACEHOLDERS: Final = ("robot", "node", "target", "task", "epoch")
+BRACES: Final = re.compile(r"\{([^{}]*)\}")
+
 NOBODY = "Nobody"
 """No node has this name (names have no capitals): only a subscriber to everything takes its samples."""
+
+
+def placeholders(template: str) -> tuple[str, ...]:
+    """The names between braces, in order, known or not.
+
+    >>> placeholders("{target}/map_merge/{robot}/map")
+    ('target', 'robot')
+    """
+    return tuple(BRACES.findall(template))
+
+
+def fill(template: str, **names: str) -> str:
+    """``template`` with every placeholder replaced. Raises `KeyError` for a placeholder without a name.
+
+    >>> fill("{robot}/map", robot="robot1")
+    'robot1/map'
+    """
+    return BRACES.sub(lambda match: names[match.group(1)], template)
+
+
+def widened(template: str, **names: str) -> str:
+    """The key expression of everything that ``template`` may become when the placeholders not in ``names`` vary.
+
+    >>> widened("{target}/map_merge/{epoch}/tf", target="edge1")
+    'edge1/map_merge/*/tf'
+    """
+    chunks = [_widened_chunk(chunk, names) for chunk in template.split("/")]
+    return keyexpr.canonical("/".join(chunks))
+
+
+def _widened_chunk(chunk: str, names: Mapping[str, str]) -> str:
+    open_names = dict.fromkeys(PLACEHOLDERS, keyexpr.ANY_RUN)
+    wide = fill(chunk, **{**open_names, **names})
+    while keyexpr.ANY_RUN * 2 in wide:
+        wide = wide.replace(keyexpr.ANY_RUN * 2, keyexpr.ANY_RUN)
+    return keyexpr.SINGLE if wide == keyexpr.ANY_RUN else wide
+
+
+def routes_for(task: TaskSpec, robot: NodeId, owner: NodeId, epoch: int) -> tuple[Route, ...]:
+    """The streams of ``robot`` towards ``owner`` in ``epoch``, inputs first, in the order of the fleet file.
+
+    Stream names (``<task>/in/<i>``, ``<task>/out/<i>``, ``<task>/srv/<i>``) depend on the rule's place only: counters
+    and kept values that hang on them outlive every move.
+    """
+    names = {"robot": robot, "node": robot, "target": owner, "task": task.name, "epoch": str(epoch)}
+    return tuple(
+        Route(
+            stream=stream,
+            direction=rule.direction,
+            from_expr=fill(rule.from_template, **names),
+            to_expr=fill(rule.to_template, **names),
+            settings=rule.settings,
+            service=rule.service,
+        )
+        for stream, rule in named_rules(task)
+    )
+
+
+def named_rules(task: TaskSpec) -> tuple[tuple[str, StreamRule], ...]:
+    """(stream name, rule) of ``task``: inputs, outputs, services, each counted from 0."""
+    named: list[tuple[str, StreamRule]] = []
+    for direction, word in ((Direction.INPUT, "in"), (Direction.OUTPUT, "out"), (Direction.SERVICE, "srv")):
+        rules = [rule for rule in task.rules if rule.direction is direction]
+        named.extend((f"{task.name}/{word}/{index}", rule) for index, rule in enumerate(rules))
+    return tuple(named)
 
 
 def slot_for(spec: TaskSpec, robot: NodeId, owner: NodeId, epoch: int) -> Slot:

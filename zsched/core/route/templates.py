@@ -1,7 +1,7 @@
-"""Decides which concrete routes a task's rules become for one robot, one owner and one epoch.
+"""Decides which templates a rule of a task may have.
 
-Knows: the placeholders, where each may stand, how a template becomes a key expression. Does not know: YAML, zenoh,
-other tasks (`zsched.config.rulecheck` holds rules against each other).
+Knows: where each placeholder may stand, and why. Does not know: what a template becomes (`zsched.core.route.route`),
+YAML, other tasks (`zsched.config.rulecheck` holds rules against each other).
 
 ====================  =====================================================  =============================
 place                 placeholders                                           must hold
@@ -25,17 +25,15 @@ Wildcards (``*``, ``**``, ``$*``) of ``from`` are captured and fill those of ``t
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from typing import Final
 
 from zsched.core.route import keyexpr
 from zsched.core.route import wildcards as capture
-from zsched.core.values.fleet import StreamRule, TaskSpec
-from zsched.core.values.model import NodeId
-from zsched.core.values.plan import Direction, Route
+from zsched.core.route.route import BRACES, PLACEHOLDERS, fill, placeholders
+from zsched.core.values.fleet import StreamRule
+from zsched.core.values.plan import Direction
 
-PLACEHOLDERS: Final = ("robot", "node", "target", "task", "epoch")
 RESERVED_CHUNK: Final = "@zsched"
 """Root of the control keys and of the in-band end markers; no rule of a user may touch it."""
 
@@ -53,7 +51,6 @@ _NEEDED: Final[Mapping[tuple[Direction, str], tuple[frozenset[str], str]]] = {
         "it lacks {target}: a request goes to whichever node owns the task",
     ),
 }
-_BRACES: Final = re.compile(r"\{([^{}]*)\}")
 _A: Final = {Direction.INPUT: "an input", Direction.OUTPUT: "an output", Direction.SERVICE: "a service"}
 _EVERYWHERE: Final = frozenset({"robot", "node", "task"})
 _ALLOWED: Final[Mapping[tuple[Direction, str], frozenset[str]]] = {
@@ -69,24 +66,6 @@ _WHY_NOT: Final[Mapping[tuple[Direction, str, str], str]] = {
     (Direction.OUTPUT, "to", "target"): "an output keeps its key when the owner changes",
     (Direction.SERVICE, "from", "target"): "a service keeps its key when the owner changes",
 }
-
-
-def placeholders(template: str) -> tuple[str, ...]:
-    """The names between braces, in order, known or not.
-
-    >>> placeholders("{target}/map_merge/{robot}/map")
-    ('target', 'robot')
-    """
-    return tuple(_BRACES.findall(template))
-
-
-def fill(template: str, **names: str) -> str:
-    """``template`` with every placeholder replaced. Raises `KeyError` for a placeholder without a name.
-
-    >>> fill("{robot}/map", robot="robot1")
-    'robot1/map'
-    """
-    return _BRACES.sub(lambda match: names[match.group(1)], template)
 
 
 def template_fault(template: str, direction: Direction, side: str) -> str | None:
@@ -110,53 +89,6 @@ def merges_keys(rule: StreamRule) -> bool:
     return len(capture.wildcards(rule.to_template)) < len(capture.wildcards(rule.from_template))
 
 
-def routes_for(task: TaskSpec, robot: NodeId, owner: NodeId, epoch: int) -> tuple[Route, ...]:
-    """The streams of ``robot`` towards ``owner`` in ``epoch``, inputs first, in the order of the fleet file.
-
-    Stream names (``<task>/in/<i>``, ``<task>/out/<i>``, ``<task>/srv/<i>``) depend on the rule's place only: counters
-    and kept values that hang on them outlive every move.
-    """
-    names = {"robot": robot, "node": robot, "target": owner, "task": task.name, "epoch": str(epoch)}
-    return tuple(
-        Route(
-            stream=stream,
-            direction=rule.direction,
-            from_expr=fill(rule.from_template, **names),
-            to_expr=fill(rule.to_template, **names),
-            settings=rule.settings,
-            service=rule.service,
-        )
-        for stream, rule in named_rules(task)
-    )
-
-
-def named_rules(task: TaskSpec) -> tuple[tuple[str, StreamRule], ...]:
-    """(stream name, rule) of ``task``: inputs, outputs, services, each counted from 0."""
-    named: list[tuple[str, StreamRule]] = []
-    for direction, word in ((Direction.INPUT, "in"), (Direction.OUTPUT, "out"), (Direction.SERVICE, "srv")):
-        rules = [rule for rule in task.rules if rule.direction is direction]
-        named.extend((f"{task.name}/{word}/{index}", rule) for index, rule in enumerate(rules))
-    return tuple(named)
-
-
-def widened(template: str, **names: str) -> str:
-    """The key expression of everything that ``template`` may become when the placeholders not in ``names`` vary.
-
-    >>> widened("{target}/map_merge/{epoch}/tf", target="edge1")
-    'edge1/map_merge/*/tf'
-    """
-    chunks = [_widened_chunk(chunk, names) for chunk in template.split("/")]
-    return keyexpr.canonical("/".join(chunks))
-
-
-def _widened_chunk(chunk: str, names: Mapping[str, str]) -> str:
-    open_names = dict.fromkeys(PLACEHOLDERS, keyexpr.ANY_RUN)
-    wide = fill(chunk, **{**open_names, **names})
-    while keyexpr.ANY_RUN * 2 in wide:
-        wide = wide.replace(keyexpr.ANY_RUN * 2, keyexpr.ANY_RUN)
-    return keyexpr.SINGLE if wide == keyexpr.ANY_RUN else wide
-
-
 def _placeholder_fault(template: str, direction: Direction, side: str) -> str | None:
     allowed = _ALLOWED[direction, side]
     for name in placeholders(template):
@@ -166,7 +98,7 @@ def _placeholder_fault(template: str, direction: Direction, side: str) -> str | 
             continue
         why = _WHY_NOT.get((direction, side, name), f"only the 'from' of an output has {{{name}}}")
         return f"{{{name}}} may not stand in the '{side}' of {_A[direction]}: {why}"
-    if "{" in _BRACES.sub("", template) or "}" in _BRACES.sub("", template):
+    if "{" in BRACES.sub("", template) or "}" in BRACES.sub("", template):
         return "a brace is not closed"
     if template.count("{epoch}") > 1 or ("{epoch}" in template and "{epoch}" not in template.split("/")):
         return "{epoch} must be one whole chunk, once: the gate subscribes to exactly one epoch"

@@ -5,7 +5,8 @@ import pytest
 from support.fleets import tuning_of
 from zsched.config.load import CheckResult, check_bytes
 from zsched.config.rulecheck import rule_conflicts
-from zsched.core.route.templates import routes_for, template_fault
+from zsched.core.route.route import routes_for
+from zsched.core.route.templates import template_fault
 from zsched.core.values.fleet import StreamRule, TaskSpec
 from zsched.core.values.plan import Direction, ServiceSettings
 

@@ -8,17 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from support.fleets import tuning_of
-from zsched.core.route import keyexpr, templates
-from zsched.core.route.templates import (
-    fill,
-    merges_keys,
-    named_rules,
-    routes_for,
-    rule_fault,
-    shared_key_fault,
-    template_fault,
-    widened,
-)
+from zsched.core.route import keyexpr
+from zsched.core.route import route as made
+from zsched.core.route.route import fill, named_rules, routes_for, widened
+from zsched.core.route.templates import merges_keys, rule_fault, shared_key_fault, template_fault
 from zsched.core.values.fleet import StreamRule, TaskSpec
 from zsched.core.values.plan import Direction, StreamClass, StreamSettings
 
@@ -177,4 +170,4 @@ def test_fill_without_a_name_raises() -> None:
 
 
 def test_examples_in_the_module_hold() -> None:
-    assert doctest.testmod(templates).failed == 0
+    assert doctest.testmod(made).failed == 0
