@@ -58,6 +58,14 @@ def guarded(
     return threading.Thread(target=_named, args=(name, begin), name=name, daemon=True)
 
 
+def ends_within(limit_s: float, run: Callable[..., object], *args: Any, name: str) -> bool:
+    """Run what may hang in a thread of its own; whether it has ended in time. If not, it goes on without us."""
+    thread = guarded(run, *args, name=name, is_lasting=False)
+    thread.start()
+    thread.join(limit_s)
+    return not thread.is_alive()
+
+
 def tolerant(callback: Callable[[T], object], kind: str) -> Callable[[T], None]:
     """``callback`` for one of zenoh's threads: what it raises is noted (zenoh would print every one, without limit)."""
 

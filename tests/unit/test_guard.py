@@ -14,7 +14,7 @@ import pytest
 
 import zsched
 from zsched import guard
-from zsched.guard import guarded
+from zsched.guard import ends_within, guarded
 from zsched.log_limit import LIBRARY, MAX_PLACES, LogLimit, PlainLines, limit_library
 from zsched.log_limit import LIMIT as SHARED
 
@@ -273,3 +273,14 @@ def test_a_record_that_passes_two_filters_is_counted_once() -> None:
     for _ in range(5):
         log.info("m")
     assert len(lines.lines) == 2
+
+
+def test_what_hangs_is_not_waited_for_longer_than_its_time() -> None:
+    hanging = threading.Event()
+    try:
+        assert ends_within(5.0, lambda: None, name="short")
+        began_at = time.monotonic()
+        assert not ends_within(0.05, hanging.wait, name="long")
+        assert 0.05 <= time.monotonic() - began_at < 5.0
+    finally:
+        hanging.set()

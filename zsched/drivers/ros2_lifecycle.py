@@ -46,7 +46,8 @@ from zsched.drivers.engine import Ended, Look, drive
 from zsched.drivers.place import Place
 from zsched.errors import ConfigError
 from zsched.exits import EXIT_CONFIG
-from zsched.guard import guarded
+from zsched.guard import ends_within, guarded
+from zsched.sessions.closing import CLOSE_S
 from zsched.wire.keyspace import Keyspace
 from zsched.worker.roles import RoleWatch
 from zsched.worker.start import open_session, relay_endpoint
@@ -60,7 +61,6 @@ SILENT_S: Final = 10.0
 """A node that has answered once, and then does not for this long, has failed."""
 CHANGE_S: Final = {Transition.CONFIGURE: 60.0, Transition.ACTIVATE: 10.0, Transition.DEACTIVATE: 3.0}
 """A node may take this long to change: one that is no owner any more, and stays active, is killed soon."""
-CLOSE_S: Final = 0.6
 DOMAIN: Final = "ROS_DOMAIN_ID"
 
 
@@ -135,9 +135,7 @@ class LifecycleNode:
         self._stop.set()
         self._news.set()
         if self._session is not None:
-            closing = guarded(self._session.close, name="zsched close", is_lasting=False)
-            closing.start()
-            closing.join(CLOSE_S)
+            ends_within(CLOSE_S, self._session.close, name="zsched close")
 
     # --- the thread --------------------------------------------------------------------------------------------------
 

@@ -32,7 +32,7 @@ from zsched.core.relay_protocol import RelayReport, RelayStarted, RelayStop, Tas
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.plan import Role, Route, RoutePlan
 from zsched.errors import WireError
-from zsched.guard import guarded, on_failure
+from zsched.guard import ends_within, guarded, on_failure
 from zsched.heap import give_back
 from zsched.ipc.pipe import COMMANDS, read_frame, wait_readable, write_frame
 from zsched.ipc.protocol import RelayHello, RelayPulse
@@ -46,6 +46,7 @@ from zsched.relay.successors import Successor, Successors
 from zsched.relay.task import TaskRelay
 from zsched.relay.tokens import Tokens
 from zsched.relay.troubles import Troubles
+from zsched.sessions.closing import ALARM_S, CLOSE_S
 from zsched.sessions.config import lease_s
 from zsched.sessions.expulsion import MAX_DATA_SESSIONS, Expulsion, Refusal, members_of
 from zsched.sessions.link_sockets import opened
@@ -67,10 +68,6 @@ ANEW_S: Final = 60.0
 END_S: Final = 3.0
 """The session has this time to close, and its port to be free."""
 RETRY_S: Final = 0.05
-CLOSE_S: Final = 0.6
-"""Closing a session towards a stopped peer can take seconds: we wait at most this long, then the process ends."""
-ALARM_S: Final = 0.9
-"""...and should zenoh hold Python's global lock meanwhile, the kernel ends it."""
 MAX_REPORTS: Final = 4096
 SOURCE: Final = "relay"
 
@@ -257,10 +254,7 @@ class RelayProcess:
             self._expulsion.close()
         if self._introducer is not None:
             self._introducer.close()
-        closing = guarded(self._session.close, name="close", is_lasting=False)
-        closing.start()
-        closing.join(END_S)
-        if closing.is_alive():
+        if not ends_within(END_S, self._session.close, name="close"):
             raise TimeoutError(f"the session before does not close within {END_S:g} s")
 
     def keep(self, tasks: Collection[TaskId]) -> None:
@@ -496,9 +490,7 @@ def run(
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         signal.setitimer(signal.ITIMER_REAL, ALARM_S)
         reporter.flush(0.1)
-        closing = guarded(relay.close, name="close", is_lasting=False)
-        closing.start()
-        closing.join(CLOSE_S)
+        ends_within(CLOSE_S, relay.close, name="close")
     return 0
 
 

@@ -37,11 +37,12 @@ from zsched.core.route.keyexpr import fault, includes, is_wild
 from zsched.core.values.model import MAX_REASON, TaskId
 from zsched.core.values.plan import RoutePhase, RoutePlan
 from zsched.errors import AdapterError
-from zsched.guard import guarded
+from zsched.guard import ends_within, guarded
 from zsched.ipc.protocol import DaemonGone, StreamKeys, StreamsTaken
 from zsched.log_limit import limit_library
 from zsched.relay.streams.acks import Acks
 from zsched.relay.tokens import Tokens
+from zsched.sessions.closing import APPLICATION_CLOSE_S
 from zsched.sessions.config import lease_s
 from zsched.sessions.link_sockets import opened
 from zsched.sessions.problems import why_not_open
@@ -66,8 +67,6 @@ FINISH_S: Final = 2.0
 """What was put is processed within this time of `Streams.close`, or counted as at most lost."""
 LOOK_S: Final = 0.01
 JOIN_S: Final = 0.3
-CLOSE_S: Final = 3.0
-"""Closing a session towards a stopped peer can take seconds; we wait at most this long."""
 
 _log = logging.getLogger("zsched.streams")
 
@@ -229,9 +228,7 @@ class Streams:
         self._thread.join(JOIN_S)
         for task in tasks:
             task.end()
-        closing = guarded(self._session.close, name="zsched close", is_lasting=False)
-        closing.start()
-        closing.join(CLOSE_S)
+        ends_within(APPLICATION_CLOSE_S, self._session.close, name="zsched close")
 
     def __enter__(self) -> Self:
         return self

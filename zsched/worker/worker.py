@@ -38,10 +38,11 @@ from zsched.core.events import WorkerJobs
 from zsched.core.hop.shared import STALLED_S
 from zsched.core.relay_protocol import StreamAcks, WorkerTrouble
 from zsched.core.values.plan import Role, WorkerRole
-from zsched.guard import guarded, tolerant
+from zsched.guard import ends_within, guarded, tolerant
 from zsched.hop.acknowledger import Acknowledger
 from zsched.ipc.pipe import decode_end
 from zsched.log_limit import limit_library
+from zsched.sessions.closing import ALARM_S, CLOSE_S
 from zsched.sessions.config import lease_s
 from zsched.sessions.stalled_links import StalledLinks
 from zsched.wire import codec as wire
@@ -60,10 +61,6 @@ from zsched.worker.snapshot import TIMEOUT_S, Offer, Restorer, StateLink, fetch
 from zsched.worker.start import open_session, relay_endpoint, surroundings
 from zsched.worker.troubles import Troubles
 
-CLOSE_S: Final = 0.6
-"""Closing a session towards a stopped peer can take seconds; we wait for at most this long."""
-ALARM_S: Final = 0.9
-"""...and should zenoh hold Python's global lock meanwhile, the kernel ends a process that was told to stop."""
 FINISH_S: Final = 2.0
 """A worker that was told to stop does what has come, for at most so long, and until a second signal comes."""
 STILL_S: Final = 0.08
@@ -351,10 +348,8 @@ class Worker:
         for output in tuple(self._outputs):
             output.close()
         self._errands.close()
-        closing = guarded(self._close_session, name="zsched close", is_lasting=False)
-        closing.start()
-        closing.join(CLOSE_S)
-        if closing.is_alive() and self._signals:
+        is_closed = ends_within(CLOSE_S, self._close_session, name="zsched close")
+        if not is_closed and self._signals:
             logging.shutdown()
             os._exit(0)  # a stopped peer holds zenoh's close for seconds, and its threads hold the interpreter
         if has_alarm:

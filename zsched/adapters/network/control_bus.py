@@ -59,7 +59,7 @@ from zsched.core.values.snapshot import Snapshot
 from zsched.core.values.struct import replace
 from zsched.core.values.words import NAME
 from zsched.errors import AdapterError, WireError
-from zsched.guard import guarded, tolerant
+from zsched.guard import ends_within, tolerant
 from zsched.sessions.expulsion import Expulsion, Refusal
 from zsched.sessions.link_retries import LinkRetries
 from zsched.sessions.link_sockets import LinkSockets, opened
@@ -280,10 +280,7 @@ class ControlBus:
         if self._expulsion is not None:
             self._expulsion.close()
         kept, self._kept, self._publishers, self._ring = self._kept, [], {}, None
-        closing = guarded(self._close, session, kept, name="zsched-bus-close", is_lasting=False)
-        closing.start()
-        closing.join(CLOSE_S)
-        if closing.is_alive():
+        if not ends_within(CLOSE_S, self._close, session, kept, name="zsched-bus-close"):
             log.warning("close_abandoned why=a peer does not read")
 
     def _close(self, session: zenoh.Session, kept: list[Any]) -> None:

@@ -17,7 +17,7 @@ from zsched.clock import monotonic_s
 from zsched.core.route.ros2 import decode_attachment
 from zsched.core.values.struct import Struct
 from zsched.errors import AdapterError
-from zsched.guard import guarded
+from zsched.guard import ends_within, guarded
 
 DEPTH: Final = 10_000
 """Samples that may wait for the reader; beyond it the oldest go, and `StreamTap.missed` stays honest."""
@@ -98,9 +98,7 @@ class StreamTap:
 
     def close(self) -> None:
         """Close the sessions, within `CLOSE_S`."""
-        closing = guarded(self._close, name="tap close", is_lasting=False)
-        closing.start()
-        closing.join(CLOSE_S)
+        ends_within(CLOSE_S, self._close, name="tap close")
 
     def _close(self) -> None:
         for entity in (*self._subscribers, *self._sessions):
