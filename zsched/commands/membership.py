@@ -43,6 +43,7 @@ from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
 from zsched.files import read_regular
 from zsched.runtime.membership import Places, Written, found, is_joined
 from zsched.runtime.membership import join as join_here
+from zsched.runtime.own_addresses import is_loopback
 from zsched.wire.codec import from_plain
 from zsched.wire.invitation import MAX_BYTES, Invitation, decode_invitation, encode_invitation
 
@@ -91,7 +92,7 @@ class Address(Struct, frozen=True, kw_only=True):
     @property
     def listened_host(self) -> str:
         """At which of the machine's addresses its sessions listen: at all of them, but for a loopback address."""
-        return self.host if _is_loopback(self.host) else "::" if ":" in self.host else "0.0.0.0"  # noqa: S104 - a robot's
+        return self.host if is_loopback(self.host) else "::" if ":" in self.host else "0.0.0.0"  # noqa: S104 - a robot's
 
     def entry(self, protocol: str) -> str:
         """The part of a node's entry in the fleet file that says so."""
@@ -126,13 +127,6 @@ def address_of(text: str) -> Address:
     if _is_of_nobody(host):
         raise CliError(EXIT_USAGE, f"--address: {host} is no address of one machine; {advice}")
     return Address(host=host, port=int(port or CONTROL_PORT))
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def _is_of_nobody(host: str) -> bool:

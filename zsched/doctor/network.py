@@ -21,6 +21,7 @@ from zsched.core.values.fleet import NodeSpec, dial_endpoint
 from zsched.core.values.struct import Struct
 from zsched.doctor.model import Result, Scene, counted, failed, joined, passed, skipped, warned
 from zsched.procfs import names, read_file
+from zsched.runtime.own_addresses import is_loopback
 
 RESOLVE_S: Final = 5.0
 CONNECT_S: Final = 2.0
@@ -95,19 +96,19 @@ def is_not_alone_on_loopback(scene: Scene) -> Result:
     others = addresses(spec for spec in scene.fleet.nodes if spec.name != scene.node)
     if not mine:
         return skipped(f"{scene.node} has no address: it dials the others")
-    if others and all(_is_loopback(address.place[0]) for address in others):
+    if others and all(_leads_here(address.place[0]) for address in others):
         return skipped("all nodes of this fleet are on one machine")
-    local = [address for address in mine if _is_loopback(address.place[0])]
+    local = [address for address in mine if _leads_here(address.place[0])]
     if not local or len(scene.fleet.nodes) == 1:
         return passed(f"others dial {', '.join(address.endpoint for address in mine)}")
     fix = f"give {scene.node} a `host:` that the others reach; see the line of its name in /etc/hosts"
     return failed(*(f"{address}: only this machine reaches that" for address in local), fix=fix)
 
 
-def _is_loopback(host: str) -> bool:
+def _leads_here(host: str) -> bool:
     with contextlib.suppress(OSError, UnicodeError, ValueError):
         found = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)
-        return all(ipaddress.ip_address(str(one[4][0]).partition("%")[0]).is_loopback for one in found)
+        return all(is_loopback(str(one[4][0]).partition("%")[0]) for one in found)
     return False
 
 

@@ -17,6 +17,7 @@ from collections.abc import Iterable, Sequence
 from typing import Final
 
 from zsched.core.values.struct import Struct
+from zsched.runtime.own_addresses import is_loopback
 
 STAY_S: Final = 2.0
 """A new address must have been there for this long: a radio that roams may have none, or two, for a moment."""
@@ -35,17 +36,10 @@ def places_of(hosts: Iterable[str]) -> tuple[str, ...]:
     """
     found: list[str] = []
     for host in hosts:
-        place = numeric(host) or ("" if _is_loopback(host) else ANY_HOST)
+        place = numeric(host) or ("" if host in ("", "localhost") or is_loopback(host) else ANY_HOST)
         if place and place not in found:
             found.append(place)
     return tuple(found[:MOST_HOSTS])
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host.strip("[]")).is_loopback
-    except ValueError:
-        return host in ("", "localhost")
 
 
 def numeric(host: str) -> str:
@@ -58,7 +52,7 @@ def numeric(host: str) -> str:
         ipaddress.ip_address(host.strip("[]"))
     except ValueError:
         return ""
-    return "" if _is_loopback(host) else host
+    return "" if is_loopback(host) else host
 
 
 def gone_from(home: str) -> str:

@@ -16,6 +16,7 @@ from zsched.core.values.snapshot import Exposure
 from zsched.errors import ConfigError
 from zsched.files import read_regular
 from zsched.runtime.access_rules import Side
+from zsched.runtime.own_addresses import is_loopback
 from zsched.runtime.secured import identity_of, secured_text
 from zsched.sessions import config as zenoh_config
 
@@ -92,12 +93,12 @@ def exposure(fleet: Fleet, protocol: str, listens: Iterable[str]) -> Exposure:
     plain = [end for end in listens if _scheme(end) not in ENCRYPTED]
     if protocol != PLAIN and not plain:
         return Exposure.ENCRYPTED
-    return Exposure.LOCAL if all(_is_loopback(end) for end in plain) else Exposure.OPEN
+    return Exposure.LOCAL if all(_is_local(end) for end in plain) else Exposure.OPEN
 
 
-def _is_loopback(endpoint: str) -> bool:
-    host = endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
-    return host in ("localhost", "::1") or host.startswith("127.")
+def _is_local(endpoint: str) -> bool:
+    host = endpoint.partition("/")[2].rpartition(":")[0]
+    return host == "localhost" or is_loopback(host)
 
 
 def plain_text_problem(me: NodeSpec, protocol: str) -> str | None:
