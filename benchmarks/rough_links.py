@@ -25,7 +25,7 @@ from benchmarks.false_deaths import pass_time
 from zsched.clock import monotonic_s
 from zsched.core.values.model import NodeId, PeerState
 from zsched_lab.fleet import netns
-from zsched_lab.fleet.netbed import DATA_PORT, Netbed, Probe
+from zsched_lab.fleet.netbed import OnboardBed, Probe
 from zsched_lab.fleet.testbed import TASK, echo_fleet
 
 CLI = (sys.executable, "-m", "zsched.cli")
@@ -36,14 +36,6 @@ CASES = ("far", "roam")
 LOCAL = "tcp/127.0.0.1:7470"
 
 
-class Bed(Netbed):
-    """Applications are on their robot, and stay linked to its relay whatever its address is."""
-
-    def _data_endpoint(self, node: NodeId) -> str:
-        sides = self.fleet.node(node).local
-        return sides.listen[0] if sides else f"tcp/127.0.0.1:{DATA_PORT}"
-
-
 def fleet(timing: str) -> dict[str, Any]:
     """The fleet file of both cases."""
     tree = echo_fleet(robots=2, edges=2, timing=timing, stream_class="reliable")
@@ -51,7 +43,7 @@ def fleet(timing: str) -> dict[str, Any]:
     return tree
 
 
-def begin(bed: Bed) -> Probe:
+def begin(bed: OnboardBed) -> Probe:
     """Start all, and the application; it gets its answers when this returns."""
     bed.init()
     bed.start()
@@ -62,7 +54,7 @@ def begin(bed: Bed) -> Probe:
     return probe
 
 
-def gap_s(bed: Bed, probe: Probe, since: float) -> float:
+def gap_s(bed: OnboardBed, probe: Probe, since: float) -> float:
     """The longest time without an answer, once answers to what was put later flow again."""
     bed.wait(lambda: probe.first_after(since) is not None and probe.is_flowing(FRESH_S), FLOWS_S, "answers again")
     pass_time(bed, AFTER_S)
@@ -70,23 +62,21 @@ def gap_s(bed: Bed, probe: Probe, since: float) -> float:
     return max((after - before for before, after in itertools.pairwise(came)), default=0.0)
 
 
-def deaths(bed: Bed, since: float, *, but: NodeId = "") -> list[str]:
+def deaths(bed: OnboardBed, since: float, *, but: NodeId = "") -> list[str]:
     """Who was held for gone since then, but for one that really was."""
     changes = (one for one in bed.changes(since=since) if one.after is PeerState.GONE and one.node != but)
     return [f"{one.observer} holds {one.node} for gone: {one.reason}" for one in changes]
 
 
-def tell_numbers(bed: Bed, probe: Probe) -> None:
+def tell_numbers(bed: OnboardBed, probe: Probe) -> None:
     """What came back of what was put, and what the relay's counters say."""
     numbers = [one.number for one in list(probe.received)]
     missing = len(set(range(max(numbers) + 1)) - set(numbers))
-    counts = bed.counts(ROBOT)
-    told = sum(one.lost + one.at_most_lost + sum(count for _, count in one.drops) for one in counts)
     print(f"  of {max(numbers) + 1} numbers: without an answer {missing}, twice {len(numbers) - len(set(numbers))}")
-    print(f"  the relay's counters tell of {told} lost or at most lost")
+    print(f"  the relay's counters tell of {bed.told_lost(ROBOT)} lost or at most lost")
 
 
-def move(bed: Bed, target: NodeId) -> None:
+def move(bed: OnboardBed, target: NodeId) -> None:
     """A planned move, by the verb."""
     here = ("--runtime-dir", str(bed.folder), "--node", ROBOT, "--yes", "--timeout", "60")
     subprocess.run([*CLI, "move", TASK, target, *here], check=True, stdout=subprocess.DEVNULL, timeout=120)
@@ -94,7 +84,7 @@ def move(bed: Bed, target: NodeId) -> None:
 
 def far(n: int, minutes: float, one_way_ms: float) -> None:
     """Nodes far from each other."""
-    with tempfile.TemporaryDirectory() as folder, Bed(Path(folder), fleet("wan")) as bed:
+    with tempfile.TemporaryDirectory() as folder, OnboardBed(Path(folder), fleet("wan")) as bed:
         for name in bed.names:
             bed.network.lengthen(name, one_way_ms / 2000)
         probe = begin(bed)
@@ -128,7 +118,7 @@ def roam(n: int, *, has_local_side: bool) -> None:
     tree = fleet("wifi")
     if has_local_side:
         tree["nodes"][ROBOT]["local"] = {"mode": "peer", "listen": [LOCAL]}
-    with tempfile.TemporaryDirectory() as folder, Bed(Path(folder), tree, hidden=(ROBOT,)) as bed:
+    with tempfile.TemporaryDirectory() as folder, OnboardBed(Path(folder), tree, hidden=(ROBOT,)) as bed:
         probe = begin(bed)
         gaps = []
         for _ in range(n):

@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 
 from zsched.clock import monotonic_s
-from zsched.core.values.model import NodeId
 from zsched_lab.fleet import netns
-from zsched_lab.fleet.netbed import DATA_PORT, Netbed, Probe
+from zsched_lab.fleet.netbed import OnboardBed, Probe
 from zsched_lab.fleet.testbed import TASK, echo_fleet
 
 pytestmark = [pytest.mark.long, pytest.mark.root, pytest.mark.timeout(240)]
@@ -17,25 +16,10 @@ pytestmark = [pytest.mark.long, pytest.mark.root, pytest.mark.timeout(240)]
 ROBOT, LOCAL = "robot1", "tcp/127.0.0.1:7470"
 
 
-class Bed(Netbed):
-    """Applications are on their robot, and stay linked to its relay whatever its address is."""
-
-    __test__ = False
-
-    def _data_endpoint(self, node: NodeId) -> str:
-        sides = self.fleet.node(node).local
-        return sides.listen[0] if sides else f"tcp/127.0.0.1:{DATA_PORT}"
-
-
 def missing(probe: Probe) -> int:
     """Numbers without an answer below the newest that has one."""
     numbers = {one.number for one in probe.received}
     return max(numbers) + 1 - len(numbers)
-
-
-def told(bed: Bed) -> int:
-    """Samples that the robot's relay tells of as lost, or as lost at most."""
-    return sum(one.lost + one.at_most_lost + sum(count for _, count in one.drops) for one in bed.counts(ROBOT))
 
 
 @pytest.mark.parametrize("has_local_side", [True, False], ids=["local side", "data session"])
@@ -50,7 +34,7 @@ def test_a_robot_that_roams_is_served_again_and_its_lost_samples_are_counted(
     tree["tasks"][TASK]["outputs"][0]["handover"] = "all"
     if has_local_side:
         tree["nodes"][ROBOT]["local"] = {"mode": "peer", "listen": [LOCAL]}
-    with Bed(tmp_path, tree, hidden=(ROBOT,)) as bed:
+    with OnboardBed(tmp_path, tree, hidden=(ROBOT,)) as bed:
         bed.init()
         bed.start()
         bed.wait_whole()
@@ -66,7 +50,7 @@ def test_a_robot_that_roams_is_served_again_and_its_lost_samples_are_counted(
         assert bed.status(ROBOT)["incarnation"] > life
         assert (bed.relay_pid(ROBOT) == relay) is has_local_side
         if has_local_side:
-            bed.wait(lambda: missing(probe) <= told(bed), 30, "the counters to tell of what was lost")
+            bed.wait(lambda: missing(probe) <= bed.told_lost(ROBOT), 30, "the counters to tell of what was lost")
             assert len({one.number for one in probe.received}) == len(probe.received), "none came twice"
 
 
@@ -74,7 +58,7 @@ def test_a_node_that_the_others_dial_where_it_is_no_more_says_so_and_no_longer_w
     reason = netns.why_not()
     if reason is not None:
         pytest.skip(f"no network namespaces here: {reason}")
-    with Bed(tmp_path, echo_fleet(robots=2, edges=1)) as bed:
+    with OnboardBed(tmp_path, echo_fleet(robots=2, edges=1)) as bed:
         bed.init()
         bed.start()
         bed.wait_whole()

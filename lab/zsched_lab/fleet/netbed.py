@@ -267,6 +267,10 @@ class Netbed(Testbed):
         endpoints: list[str] = ask(socket_path(self.folder, node), {"verb": "access"}, 3.0)["endpoints"]
         return endpoints[0]
 
+    def told_lost(self, node: NodeId) -> int:
+        """Samples that a robot's relay tells of as lost, or as lost at most."""
+        return sum(one.lost + one.at_most_lost + sum(count for _, count in one.drops) for one in self.counts(node))
+
     def power_off(self, node: NodeId, *, is_seen: bool = False) -> None:
         """The machine is gone at once: nobody sees its sockets close, unless ``is_seen``: only its processes die."""
         if not is_seen:
@@ -323,6 +327,14 @@ class Netbed(Testbed):
             super().__exit__(kind, error, trace)
         finally:
             self.network.close()
+
+
+class OnboardBed(Netbed):
+    """Applications are on their robot, and stay linked to its relay whatever its address is."""
+
+    def _data_endpoint(self, node: NodeId) -> str:
+        sides = self.fleet.node(node).local
+        return sides.listen[0] if sides else f"tcp/127.0.0.1:{DATA_PORT}"
 
 
 def stamped(log: str) -> list[tuple[float, str]]:
