@@ -101,11 +101,16 @@ class Relay:
 
 
 def environment(relay: Relay, folder: Path) -> dict[str, str]:
-    path = folder / "worker.json5"
-    path.write_text(worker_config(connect=(relay.endpoint,)))
+    return environment_on("edge1", folder, worker_config(connect=(relay.endpoint,)))
+
+
+def environment_on(node: str, folder: Path, config: str) -> dict[str, str]:
+    """What a daemon on ``node`` tells its worker of the task, with ``config`` for its session."""
+    path = folder / f"{node}.json5"
+    path.write_text(config)
     return {
         "ZSCHED_FLEET": "test",
-        "ZSCHED_NODE": "edge1",
+        "ZSCHED_NODE": node,
         "ZSCHED_TASK": "t",
         "ZSCHED_INCARNATION": "3",
         "ZSCHED_ZENOH_CONFIG": str(path),

@@ -16,6 +16,7 @@ import pytest
 import zenoh
 
 from support.books import newest_counts
+from support.hand_relay import environment_on
 from support.waiting import free_endpoint, until
 from zsched.adapters.relay.streams import RelayHandle
 from zsched.core.events import ProblemReported, RelayChanged, SlotDrained, SlotFlipped, SlotReady
@@ -68,12 +69,9 @@ class Edge:
         self._hub = zenoh.open(zenoh.Config.from_json5(text))
         self._roles = RoleServer(self._hub, Keyspace("test"), node)
         self.tell(WorkerRole.IDLE)
-        path = folder / f"{node}.json5"
-        path.write_text(
-            worker_config(connect=(endpoint, *dialled), listen=(), shared_memory=False, dials_by_gossip=False)
-        )
-        names = {"FLEET": "test", "NODE": node, "TASK": "t", "INCARNATION": "1", "ZENOH_CONFIG": str(path)}
-        self._worker = Worker.from_env({f"ZSCHED_{name}": value for name, value in names.items()})
+        dials = (endpoint, *dialled)
+        config = worker_config(connect=dials, listen=(), shared_memory=False, dials_by_gossip=False)
+        self._worker = Worker.from_env(environment_on(node, folder, config))
         self._answers = self._worker.publisher("{prefix}/{epoch}/robot1/out", reliable=True)
         self._worker.subscribe("{prefix}/robot1/in", self._echo)
         self._worker.ready()

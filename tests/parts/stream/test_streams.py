@@ -12,7 +12,7 @@ from typing import cast
 import pytest
 import zenoh
 
-from support.hand_relay import Relay
+from support.hand_relay import Relay, environment_on
 from support.waiting import free_endpoint, until
 from zsched.core.events import SlotDrained
 from zsched.core.hop.books import unaccounted
@@ -73,14 +73,9 @@ class Bench:
 
     def __post_init__(self) -> None:
         self.relay = Relay()
-        path = self.folder / "worker.json5"
-        path.write_text(
-            worker_config(
-                connect=(self.relay.endpoint, self.own), listen=(), shared_memory=False, dials_by_gossip=False
-            )
-        )
-        names = {"FLEET": "test", "NODE": "edge1", "TASK": "t", "INCARNATION": "3", "ZENOH_CONFIG": str(path)}
-        self.worker = Worker.from_env({f"ZSCHED_{name}": value for name, value in names.items()})
+        dialled = (self.relay.endpoint, self.own)
+        config = worker_config(connect=dialled, listen=(), shared_memory=False, dials_by_gossip=False)
+        self.worker = Worker.from_env(environment_on("edge1", self.folder, config))
         self._answers = self.worker.publisher("{prefix}/{epoch}/robot1/out", reliable=True)
         self.worker.subscribe("{prefix}/robot1/*/in", self._echo)
         self.worker.ready()
