@@ -59,7 +59,9 @@ from zsched.runtime.access import StreamAccess, joins_at
 from zsched.runtime.access_rules import Side, common_names_of, names_of
 from zsched.runtime.adoption import Adoption
 from zsched.runtime.descriptors import take_descriptors
+from zsched.runtime.desk import Desk
 from zsched.runtime.endpoints import DATA_PORT, Endpoints, claim_port, endpoints_for, free_port, is_here
+from zsched.runtime.inbox import Inbox
 from zsched.runtime.leaving import Leaving
 from zsched.runtime.library import Library
 from zsched.runtime.membership import copied_file
@@ -72,7 +74,7 @@ from zsched.runtime.sampler import Sampler
 from zsched.runtime.sealing import seals_of
 from zsched.runtime.secured import digest_of, require_own
 from zsched.runtime.sessions import SessionsRead
-from zsched.runtime.shell import Desk, Inbox, Shell
+from zsched.runtime.shell import Shell
 from zsched.runtime.strikes import Strikes
 from zsched.screen import fitted
 from zsched.sessions import config as zenoh_config

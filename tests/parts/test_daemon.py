@@ -44,8 +44,8 @@ from zsched.runtime.endpoints import (
     free_port,
     is_here,
 )
+from zsched.runtime.inbox import Inbox
 from zsched.runtime.sampler import Sampler
-from zsched.runtime.shell import Inbox
 from zsched.sessions.config import worker_config
 from zsched.wire.keyspace import Keyspace
 from zsched_lab.fleet.testbed import echo_fleet

@@ -312,7 +312,7 @@ def endpoint_of(text: str) -> str:
 
 def _ask_elsewhere(door: Door, request: Json) -> Json:
     """The answer of a node of a fleet that has no daemon here."""
-    from zsched.runtime.shell import answer_json, command_of  # noqa: PLC0415 - loads zenoh, which no socket needs
+    from zsched.runtime.desk import answer_json, command_of  # noqa: PLC0415 - loads zenoh, which no socket needs
 
     if request["verb"] in ONLY_THERE:
         raise CliError(EXIT_USAGE, f"only the machine of a node tells its {request['verb']}: run this there")

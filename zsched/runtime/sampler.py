@@ -21,7 +21,8 @@ from zsched.core.values.struct import replace
 from zsched.core.vote.clocks import is_bad
 from zsched.guard import guarded
 from zsched.paths import PID_SUFFIX, beside_session
-from zsched.runtime.shell import Inbox, Shell
+from zsched.runtime.inbox import Inbox
+from zsched.runtime.shell import Shell
 
 log = logging.getLogger("zsched.daemon")
 

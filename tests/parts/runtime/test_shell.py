@@ -52,17 +52,10 @@ from zsched.core.values.model import Acceptance, Asked, Tuning, Weights, WorkerS
 from zsched.core.values.plan import STILL_S, Role, RoutePhase, RoutePlan, StreamCount, WorkerRole
 from zsched.errors import AdapterError, WireError
 from zsched.runtime import shell as shell_module
+from zsched.runtime.desk import LOCAL_REQUESTS_FROM, Desk, command_of
+from zsched.runtime.inbox import INBOX_LIMIT, WAITING_LIMIT, Inbox
 from zsched.runtime.library import Library
-from zsched.runtime.shell import (
-    INBOX_LIMIT,
-    LOCAL_REQUESTS_FROM,
-    PROBLEM_TTL_S,
-    WAITING_LIMIT,
-    Desk,
-    Inbox,
-    Shell,
-    command_of,
-)
+from zsched.runtime.shell import PROBLEM_TTL_S, Shell
 from zsched.wire.codec import document_hash
 
 BALLOT = ballot_of()
@@ -520,7 +513,7 @@ def test_desk_answers_several_at_once_each_with_its_own(house: House) -> None:
 
 
 def test_desk_gives_up_on_a_loop_that_does_not_answer(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shell_module, "ANSWER_TIMEOUT_S", 0.05)
+    monkeypatch.setattr("zsched.runtime.desk.ANSWER_TIMEOUT_S", 0.05)
     assert house.desk.answer({"verb": "status"}) == {
         "error": "the decision loop of robot1 did not answer within 0.05 s"
     }

@@ -26,7 +26,7 @@ from zsched.core.values.decision import Decision, Explanation, Figures, Move, Ne
 from zsched.core.values.model import Allocation, PeerState, Reach, ScoreForm, Tuning, Utility, UtilityVector, Weights
 from zsched.core.values.snapshot import VoteStatus
 from zsched.exits import EXIT_FAILED, EXIT_UNREACHABLE, EXIT_USAGE, EXIT_WOULD_CHANGE
-from zsched.runtime.shell import answer_json
+from zsched.runtime.desk import answer_json
 
 ROBOTS = ("robot1", "robot2", "robot3")
 WEIGHTS = Weights(cpu=0.5, memory=0.3, network=0.2)
