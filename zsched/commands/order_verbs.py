@@ -1,6 +1,6 @@
 """The verbs by which an operator gives orders: arguments in, exit code out.
 
-Knows: options. Does not know: how anything is done (`zsched.commands.orders`, imported by the verb that runs).
+Knows: options. Does not know: how anything is done (files of the verbs' names, imported by the verb that runs).
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ def move(
     It does not pin: the fleet may move the task again when it has reason to. Exits with 5 when it has not settled in
     time; it goes on all the same.
     """
-    from zsched.commands.orders import MoveOrder  # noqa: PLC0415 - each verb imports what it needs
-    from zsched.commands.orders import move as give  # noqa: PLC0415 - as above
+    from zsched.commands.move import MoveOrder  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.move import move as give  # noqa: PLC0415 - as above
 
     view = order_view(node, runtime_dir, connect, reason, revision, None, json_=json_, yes=yes, plan=plan)
     order = MoveOrder(task=task, node=to, origin=origin, is_detached=detach, timeout_s=timeout)
@@ -165,7 +165,7 @@ def tune(
 
     A change is agreed like an allocation: it holds for every robot, or for none (exit 4 without a quorum).
     """
-    from zsched.commands.orders import tune as give  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.tune import tune as give  # noqa: PLC0415 - each verb imports what it needs
 
     view = order_view(node, runtime_dir, connect, reason, revision, None, json_=json_, yes=yes, plan=plan)
     raise typer.Exit(give(view, task, pairs or []))
@@ -254,7 +254,7 @@ def maint(
 ) -> None:
     """List every order in force: pauses and pins, with author and reason, and the nodes that stop."""
     from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
-    from zsched.commands.orders import maint as show  # noqa: PLC0415 - as above
+    from zsched.commands.maint import maint as show  # noqa: PLC0415 - as above
 
     raise typer.Exit(show(find_door(runtime_dir, node, connect=connect), is_json=json_))
 
@@ -298,7 +298,7 @@ def _hold(
     is_all: bool = False,
     is_waiting: bool = False,
 ) -> None:
-    from zsched.commands.orders import HoldOrder, hold  # noqa: PLC0415 - as above
+    from zsched.commands.hold import HoldOrder, hold  # noqa: PLC0415 - as above
 
     if tasks and is_all:
         raise CliError(EXIT_USAGE, "--all goes without tasks")

@@ -17,8 +17,9 @@ from zsched.adapters.host.operator_client import Json
 from zsched.cli import app
 from zsched.commands.brief import render_brief
 from zsched.commands.common import CliError
-from zsched.commands.orders import KEYS, tuned, user_name
+from zsched.commands.orders import user_name
 from zsched.commands.report import render_status
+from zsched.commands.tune import KEYS, tuned
 
 TUNING: Json = {
     "weights": {"cpu": 0.5, "memory": 0.5, "network": 0.0},
@@ -160,7 +161,7 @@ def test_a_pause_that_some_node_never_learns_says_which(daemon: Daemon, monkeypa
         return {**told, "tasks": [{**one, "revision": 7} for one in told["tasks"]]} if is_late else told
 
     daemon.answers = answer
-    monkeypatch.setattr("zsched.commands.orders.KNOWN_S", 0.1)
+    monkeypatch.setattr("zsched.commands.hold.KNOWN_S", 0.1)
     result = run("pause", "echo", "--wait", "--yes")
     assert result.exit_code == 5
     assert result.stdout.splitlines()[-1] == "  edge2 has not learnt revision 8 of echo"

@@ -1,0 +1,172 @@
+"""`zsched pause`, `resume`, `pin`, `unpin`: orders that last, and their end.
+
+Knows: how they are shown before and after, when each robot knows them. Does not know: what a task does by them.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+from zsched.clock import monotonic_s
+from zsched.commands.ask import Door, ask_door
+from zsched.commands.common import CliError, Json, print_json, say
+from zsched.commands.orders import (
+    CODES,
+    NOTHING,
+    PAUSE_S,
+    OrderView,
+    Row,
+    begin,
+    check_name,
+    check_said,
+    status_of,
+    tell_results,
+)
+from zsched.commands.page import span
+from zsched.commands.report import told_hold
+from zsched.core.values.struct import Struct
+from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE
+
+TASK_SCHEMA: Final = "zsched.task/1"
+KNOWN_S: Final = 30.0
+"""How long `pause --wait` may take."""
+
+
+class HoldOrder(Struct, frozen=True, kw_only=True):
+    """A pause or a pin, or the end of one: ``hold`` is the verb."""
+
+    hold: str
+    node: str | None = None
+    is_hard: bool = False
+    is_waiting: bool = False
+    """Until every node that is alive knows it."""
+
+
+def hold(view: OrderView, order: HoldOrder, names: Sequence[str], *, is_all: bool) -> int:
+    """Give a lasting order about tasks, or list those that are in force; returns the exit code.
+
+    Raises:
+        CliError: nobody answers, there is no such task, it was not agreed to, or an order was not agreed.
+    """
+    check_said(view)
+    status = status_of(view.door)
+    known = {str(task["name"]): task for task in status["tasks"]}
+    chosen = list(known) if is_all else list(dict.fromkeys(names))
+    for name in chosen:
+        check_name(status, "task", name, list(known))
+    if order.node is not None:
+        check_name(status, "node", order.node, [str(node["name"]) for node in status["nodes"]])
+    if not chosen:
+        return _list_holds(view, order.hold, list(known.values()))
+    if view.revision is not None and len(chosen) > 1:
+        raise CliError(EXIT_USAGE, "--revision goes with one task")
+    rows = [_hold_row(view, order, known[name]) for name in chosen]
+    changing = [row[0] for row in rows if row[2] != row[3]]
+    plans = [
+        {**_held(known[row[0]]), "outcome": "planned" if row[0] in changing else "unchanged", "detail": row[3]}
+        for row in rows
+    ]
+    body = {"schema": TASK_SCHEMA, "tasks": plans}
+    code = begin(view, rows, body, is_change=bool(changing), warning=_warning(order))
+    if code is not None:
+        return code
+    results = {name: _give_hold(view, order, known[name]) for name in changing}
+    after = {str(task["name"]): task for task in status_of(view.door)["tasks"]}
+    lacks = _wait_known(view, results) if order.is_waiting else []
+    late = EXIT_TIMED_OUT if lacks else EXIT_OK
+    if view.is_json:
+        tasks = [{**_held(after[name]), **results.get(name, {"outcome": "unchanged", "detail": ""})} for name in chosen]
+        print_json({"schema": TASK_SCHEMA, "tasks": tasks, "missing": lacks})
+        return max([late, *[CODES.get(str(result["outcome"]), EXIT_FAILED) for result in results.values()]])
+    code = tell_results(results)
+    for lack in lacks:
+        say(f"  {lack}", indent=4)
+    return max(code, late)
+
+
+def _wait_known(view: OrderView, results: Mapping[str, Json]) -> list[str]:
+    """Wait until every node that is alive has learnt what was agreed; what is missing when that takes too long."""
+    revisions = {name: int(one["revision"]) for name, one in results.items() if one["outcome"] == "ok"}
+    began = monotonic_s()
+    while True:
+        lacks = _not_known(view.door, revisions)
+        if not lacks or monotonic_s() - began >= KNOWN_S:
+            return lacks
+        time.sleep(PAUSE_S)
+
+
+def _not_known(door: Door, revisions: Mapping[str, int]) -> list[str]:
+    lacks = []
+    first = status_of(door)
+    for node in [str(one["name"]) for one in first["nodes"] if one["state"] == "alive"]:
+        try:
+            status = first if node == first["node"] else status_of(door.to(node))
+        except CliError as error:
+            lacks.append(f"{node} does not answer: {error}")
+            continue
+        known = {str(task["name"]): int(task["revision"]) for task in status["tasks"]}
+        late = [name for name, revision in revisions.items() if known.get(name, -1) < revision]
+        lacks += [f"{node} has not learnt revision {revisions[name]} of {name}" for name in late]
+    return lacks
+
+
+def _warning(order: HoldOrder) -> str:
+    if order.hold == "pause":
+        return "A dead owner will not be replaced."
+    return "Without that node nobody does the task." if order.is_hard else ""
+
+
+def _give_hold(view: OrderView, order: HoldOrder, task: Json) -> Json:
+    request = {
+        "verb": "hold",
+        "hold": order.hold,
+        "task": task["name"],
+        "target": order.node,
+        "hard": order.is_hard,
+        "for_s": view.for_s,
+        "base_revision": task["revision"] if view.revision is None else view.revision,
+        **view.asked,
+    }
+    return ask_door(view.door, request)
+
+
+def _hold_row(view: OrderView, order: HoldOrder, task: Json) -> Row:
+    kind = "pause" if order.hold in ("pause", "resume") else "pin"
+    before = _told(kind, task.get(kind))
+    if order.hold in ("resume", "unpin"):
+        after = NOTHING
+    else:
+        wanted = {
+            "node": (order.node or task["owner"]) if kind == "pin" else None,
+            "is_hard": order.is_hard,
+            "by": view.asked["by"],
+            "reason": view.reason,
+            "for_s": view.for_s,
+        }
+        after = _told(kind, wanted)
+    return str(task["name"]), kind, before, after
+
+
+def _told(kind: str, order: Json | None) -> str:
+    return NOTHING if order is None else told_hold(kind, order)
+
+
+def _held(task: Json) -> Json:
+    return {key: task.get(key) for key in ("owner", "revision", "pause", "pin")} | {"task": task["name"]}
+
+
+def _list_holds(view: OrderView, verb: str, tasks: Sequence[Json]) -> int:
+    """The orders of one kind that are in force."""
+    verb = {"resume": "pause", "unpin": "pin"}.get(verb, verb)
+    held = [task for task in tasks if task.get(verb) is not None]
+    if view.is_json:
+        print_json({"schema": TASK_SCHEMA, "tasks": [_held(task) for task in held]})
+        return EXIT_OK
+    if not held:
+        say(f"no task is {verb}{'ned' if verb == 'pin' else 'd'}")
+    for task in held:
+        age = span(task[verb]["known_s"])
+        say(f"{task['name']}: {told_hold(verb, task[verb])}, known for {age}")
+    return EXIT_OK

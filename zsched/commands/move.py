@@ -1,0 +1,157 @@
+"""`zsched move`: hands a task over, and watches until its streams have settled.
+
+Knows: what is watched, and for how long. Does not know: how a move is agreed.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+from zsched.clock import monotonic_s
+from zsched.commands.ask import Door, ask_door
+from zsched.commands.common import Json, print_json, say
+from zsched.commands.orders import PAUSE_S, OrderView, begin, check_name, check_said, refused, status_of
+from zsched.commands.page import span
+from zsched.commands.report import millis
+from zsched.commands.wait import Condition, missing
+from zsched.core.values.struct import Struct
+from zsched.exits import EXIT_OK, EXIT_TIMED_OUT
+
+MOVE_SCHEMA: Final = "zsched.move/1"
+GAP_S: Final = 3.0
+"""How long a settled move is watched for the new owner's first answers; the relays count once a second."""
+
+
+class MoveOrder(Struct, frozen=True, kw_only=True):
+    """A handover to a named node."""
+
+    task: str
+    node: str
+    origin: str | None = None
+    is_detached: bool = False
+    timeout_s: float = 30.0
+
+
+def move(view: OrderView, order: MoveOrder) -> int:
+    """Hand a task over and wait until its streams have settled; returns the exit code.
+
+    Raises:
+        CliError: nobody answers, there is no such task or node, or the move is refused.
+    """
+    check_said(view)
+    status = status_of(view.door)
+    known = {str(task["name"]): task for task in status["tasks"]}
+    check_name(status, "task", order.task, list(known))
+    check_name(status, "node", order.node, [str(node["name"]) for node in status["nodes"]])
+    task = known[order.task]
+    request = {
+        "verb": "move",
+        "task": order.task,
+        "target": order.node,
+        "origin": order.origin,
+        "base_revision": task["revision"] if view.revision is None else view.revision,
+        **view.asked,
+    }
+    plan = ask_door(view.door, {**request, "plan": True})
+    if plan["outcome"] not in ("ok", "unchanged"):
+        raise refused(order.task, plan)
+    row = (order.task, "owner", str(task["owner"] or "nobody"), order.node)
+    body: Json = {"schema": MOVE_SCHEMA, "task": order.task, "from": task["owner"], "to": order.node, "epoch": None}
+    body |= {"revision": task["revision"], "settled": False, "switched_s": None, "gap_s": None}
+    body |= {"lost": None, "doubled": None}
+    code = begin(view, [row], {**body, "missing": []}, is_change=plan["outcome"] == "ok")
+    if code is not None:
+        return code
+    before = _counts(_robots(view.door, status), order.task)
+    result = ask_door(view.door, request)
+    if result["outcome"] not in ("ok", "unchanged"):
+        raise refused(order.task, result)
+    watch = not order.is_detached
+    if watch and not view.is_json:
+        say("It is agreed. Ctrl-C ends the watching, not the move.")
+    found, lacks = _watch(view.door, order, int(result["revision"])) if watch else ({}, [])
+    return _tell_move(view, order, str(task["owner"] or ""), result, before, found, lacks)
+
+
+def _watch(door: Door, order: MoveOrder, revision: int) -> tuple[dict[str, Json], list[str]]:
+    """Every robot's status once the move is over, and what is missing when it is not in time."""
+    began, settled_at = monotonic_s(), None
+    while True:
+        first = status_of(door)
+        found = _robots(door, first)
+        now = monotonic_s()
+        task = next(task for task in first["tasks"] if task["name"] == order.task)
+        statuses = {str(first["node"]): first, **found}
+        lacks = missing(Condition(kind="settled", task=order.task), statuses)
+        if task["revision"] < revision:
+            lacks.append(f"{order.task}: {first['node']} has not learnt revision {revision}")
+        settled_at = (settled_at or now) if not lacks else None
+        is_measured = settled_at is not None and (not unmeasured(found, order.task) or now - settled_at >= GAP_S)
+        if is_measured or now - began >= order.timeout_s:
+            return found, lacks
+        time.sleep(PAUSE_S)
+
+
+def unmeasured(statuses: Mapping[str, Json], name: str) -> list[str]:
+    """The robots at which answers flow, and the new owner's first one is not told yet."""
+    found = []
+    for node, status in statuses.items():
+        task = next(one for one in status["tasks"] if one["name"] == name)
+        flows = [stream for stream in task["streams"] if stream.get("gap_s") is not None]
+        if flows and task.get("gap_s") is None:
+            found.append(node)
+    return found
+
+
+def _robots(door: Door, status: Json) -> dict[str, Json]:
+    """The statuses of all robots that are alive."""
+    alive = [str(node["name"]) for node in status["nodes"] if node["kind"] == "robot" and node["state"] == "alive"]
+    return {name: status if name == status["node"] else status_of(door.to(name)) for name in alive}
+
+
+def _counts(statuses: Mapping[str, Json], name: str) -> dict[str, int]:
+    """What hops of the task's streams have lost and doubled so far, over all robots."""
+    streams = [
+        stream
+        for status in statuses.values()
+        for task in status["tasks"]
+        if task["name"] == name
+        for stream in task["streams"]
+    ]
+    return {key: sum(int(stream[key]) for stream in streams) for key in ("lost", "doubled")}
+
+
+def _tell_move(
+    view: OrderView,
+    order: MoveOrder,
+    left: str,
+    result: Json,
+    before: Mapping[str, int],
+    found: Mapping[str, Json],
+    lacks: Sequence[str],
+) -> int:
+    tasks = [task for status in found.values() for task in status["tasks"] if task["name"] == order.task]
+    switched = [task["switched_s"] for task in tasks if task.get("switched_s") is not None]
+    switched_s = max(switched, default=None)
+    gap_s = max([task["gap_s"] for task in tasks if task.get("gap_s") is not None], default=None)
+    after = _counts(found, order.task)
+    more: dict[str, Any] = {key: max(after[key] - before[key], 0) if found else None for key in before}
+    epoch = max([int(task["epoch"]) for task in tasks], default=None)
+    if view.is_json:
+        body = {"schema": MOVE_SCHEMA, "task": order.task, "from": left or None, "to": order.node, "epoch": epoch}
+        body |= {"revision": result["revision"], "settled": bool(found) and not lacks, "switched_s": switched_s}
+        body |= {"gap_s": gap_s}
+        print_json({**body, **more, "missing": list(lacks)})
+    elif not found:
+        say(f"{order.task}: revision {result['revision']} is agreed; `zsched wait --for settled={order.task}`")
+    elif lacks:
+        say(f"{order.task}: not settled after {span(order.timeout_s)}")
+        for lack in lacks:
+            say(f"  {lack}", indent=4)
+    else:
+        took = "" if switched_s is None else f", streams switched in {millis(switched_s)}"
+        took += "" if gap_s is None else f", no answer for at most {millis(gap_s)}"
+        say(f"{order.task}: settled on {order.node}{took}, lost {more['lost']}, doubled {more['doubled']}")
+    return EXIT_TIMED_OUT if lacks else EXIT_OK

@@ -1,0 +1,192 @@
+"""`zsched tune`: the settings of a task that operators may change while it runs.
+
+Knows: their names, how a value is read and shown. Does not know: what a task does by them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from enum import StrEnum
+from typing import Any, Final
+
+from zsched.commands.ask import ask_door
+from zsched.commands.common import CliError, Json, nearest, print_json, say
+from zsched.commands.orders import CODES, OrderView, begin, check_name, check_said, status_of, tell_results
+from zsched.commands.weight_words import NAMES, shares
+from zsched.core.values.fleet import TUNED_LINKS, TUNED_RULES
+from zsched.core.values.model import Aggregate, PairReading, Reach, ScoreForm, Tuning, Weights
+from zsched.core.values.struct import replace
+from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE
+
+TUNING_SCHEMA: Final = "zsched.tuning/1"
+
+
+_NUMBERS: Final = ("bonus", "cool_down_s", "deadline_ms")
+_WORDS: Final[Mapping[str, type[StrEnum]]] = {
+    "aggregate": Aggregate,
+    "score": ScoreForm,
+    "reach": Reach,
+    "pair": PairReading,
+}
+_WHOLE: Final = ("max_moves_per_minute",)
+WEIGHTS: Final = NAMES
+OF_THE_FILE: Final = (*TUNED_RULES, *TUNED_LINKS)
+"""Settings that follow the fleet file, unless an operator has set another value."""
+KEYS: Final = (*WEIGHTS, *_NUMBERS, "aggregate", "score", *OF_THE_FILE)
+
+
+def tuned(before: Json, file: Json, pairs: Sequence[str]) -> dict[str, Any]:
+    """A tuning, as JSON values, after ``key=value`` words; ``key=null`` is the file's value.
+
+    >>> base = {"weights": {"cpu": 0.5, "memory": 0.5, "network": 0.0}, "bonus": 0.1}
+    >>> tuned(base, base, ["bonus=0.2"])["bonus"]
+    0.2
+
+    Raises:
+        CliError: a word is no such pair, or the key or its value is unknown.
+    """
+    after = {**before, "weights": shares(before["weights"])}
+    by_file = shares(file["weights"])
+    seen = set[str]()
+    for pair in pairs:
+        key, equals, text = pair.partition("=")
+        key = key.removeprefix("weights.")
+        if not equals:
+            raise CliError(EXIT_USAGE, f"{pair!r} is no setting; write it like bonus=0.2, or bonus=null")
+        if key not in KEYS:
+            raise CliError(EXIT_USAGE, f"{pair!r}: there is no setting {key!r}{nearest(key, KEYS)}")
+        if key in seen:
+            raise CliError(EXIT_USAGE, f"{pair!r}: {key} is given twice; give it once")
+        seen.add(key)
+        place, source = (after["weights"], by_file) if key in WEIGHTS else (after, file)
+        default = source.get(key, 0.0) if key in WEIGHTS else source.get(key)
+        place[key] = default if text == "null" else _setting(pair, key, text)
+    after["weights"] = shares(after["weights"])
+    return after
+
+
+def _setting(pair: str, key: str, text: str) -> Any:
+    try:
+        return str(_WORDS[key](text)) if key in _WORDS else int(text) if key in _WHOLE else float(text)
+    except ValueError:
+        number = "a whole number" if key in _WHOLE else "a number"
+        kind = f"one of {', '.join(list(_WORDS[key]))}" if key in _WORDS else number
+        raise CliError(EXIT_USAGE, f"{pair!r}: {text!r} is not {kind}") from None
+
+
+def tune(view: OrderView, name: str | None, pairs: Sequence[str]) -> int:
+    """Show tunings, or change one on the whole running fleet; returns the exit code.
+
+    Raises:
+        CliError: nobody answers, there is no such task or setting, or the change was not agreed.
+    """
+    check_said(view)
+    status = status_of(view.door)
+    known = {str(task["name"]): task for task in status["tasks"]}
+    if name is not None:
+        check_name(status, "task", name, list(known))
+    if name is None or not pairs:
+        return _list_tunings(view, [known[name]] if name is not None else list(known.values()))
+    task = known[name]
+    after = tuned(task["tuning"], _file_tuning(task), pairs)
+    tuning = _checked(after, _file_tuning(task))
+    flat_before, flat_after = _flat(task["tuning"]), _flat(after)
+    rows = [
+        (name, key, _figure(key, flat_before.get(key, 0.0)), _figure(key, flat_after.get(key, 0.0)))
+        for key in KEYS
+        if flat_before.get(key, 0.0) != flat_after.get(key, 0.0)
+    ]
+    told = {"task": name, "revision": task["revision"], "tuning": flat_after, "file": _flat(_file_tuning(task))}
+    planned = {**told, "outcome": "planned" if rows else "unchanged", "detail": ""}
+    code = begin(view, rows, {"schema": TUNING_SCHEMA, "tasks": [planned]}, is_change=bool(rows))
+    if code is not None:
+        return code
+    base = task["revision"] if view.revision is None else view.revision
+    request = {"verb": "tune", "task": name, "tuning": tuning, "base_revision": base, **view.asked}
+    result = ask_door(view.door, request)
+    if view.is_json:
+        print_json({"schema": TUNING_SCHEMA, "tasks": [{**told, **result}]})
+        return CODES.get(str(result["outcome"]), EXIT_FAILED)
+    return tell_results({name: result})
+
+
+def _checked(after: Json, file: Json) -> Json:
+    """The tuning as a request carries it: a setting that is the file's is left to the file.
+
+    Raises:
+        CliError: a figure is out of range, or the weights' sum is not 1.
+    """
+    from zsched.wire.codec import as_plain  # noqa: PLC0415 - the other orders need no codec
+
+    try:
+        deadline_ms = after.get("deadline_ms")
+        tuning = Tuning(
+            weights=Weights.of(after["weights"]),
+            bonus=after["bonus"],
+            cool_down_s=after["cool_down_s"],
+            aggregate=Aggregate(after["aggregate"]),
+            score=ScoreForm(after["score"]),
+            deadline_ms=deadline_ms,
+            **_own(after),
+        )
+    except ValueError as error:
+        raise CliError(EXIT_USAGE, f"{error}; nothing was changed") from None
+    nu, rho = tuning.nu_dbm, tuning.rho_dbm
+    if nu is not None and rho is not None and nu >= rho:
+        raise CliError(EXIT_USAGE, f"nu_dbm ({nu:g}) must be below rho_dbm ({rho:g}); nothing was changed")
+    if tuning.deadline_ms is not None and tuning.score is ScoreForm.PAPER:
+        raise CliError(EXIT_USAGE, "the paper's score knows no deadlines: score=service, or deadline_ms=null")
+    kept: dict[str, Any] = {key: None for key in OF_THE_FILE if after.get(key) == file.get(key)}
+    body: Json = as_plain(replace(tuning, **kept))
+    return body
+
+
+def _own(after: Json) -> Json:
+    """The settings of the file that this tuning has; those in words as their enumerations."""
+    given = {key: after.get(key) for key in OF_THE_FILE}
+    return {key: _WORDS[key](value) if key in _WORDS and value is not None else value for key, value in given.items()}
+
+
+def _file_tuning(task: Json) -> Json:
+    """The fleet file's tuning; a daemon of an older program does not tell it."""
+    found: Json = task.get("file_tuning") or task["tuning"]
+    return found
+
+
+def _flat(tuning: Json) -> Json:
+    """Every setting; of the gauges' weights those above 0."""
+    return {**shares(tuning["weights"]), **{key: tuning.get(key) for key in KEYS if key not in WEIGHTS}}
+
+
+def _figure(key: str, value: Any) -> str:
+    if value is None:
+        return {"patience": "learnt"}.get(key, "none")
+    return f"{value:g}" if isinstance(value, float | int) else str(value)
+
+
+def _list_tunings(view: OrderView, tasks: Sequence[Json]) -> int:
+    if view.is_json:
+        found = [
+            {
+                "task": task["name"],
+                "revision": task["revision"],
+                "tuning": _flat(task["tuning"]),
+                "file": _flat(_file_tuning(task)),
+            }
+            for task in tasks
+        ]
+        print_json({"schema": TUNING_SCHEMA, "tasks": found})
+        return EXIT_OK
+    for task in tasks:
+        now, file = _flat(task["tuning"]), _flat(_file_tuning(task))
+        words = [
+            f"{key}={_figure(key, now.get(key, 0.0))}{_differs(key, now.get(key, 0.0), file.get(key, 0.0))}"
+            for key in KEYS
+            if key in now or key in file
+        ]
+        say(f"{task['name']} (revision {task['revision']}): {' '.join(words)}")
+    return EXIT_OK
+
+
+def _differs(key: str, now: Any, file: Any) -> str:
+    return "" if now == file else f" (file: {_figure(key, file)})"
