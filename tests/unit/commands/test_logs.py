@@ -1,0 +1,136 @@
+"""`zsched logs` and `zsched restart`: what a worker has printed, and another one in its place."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from typer.testing import CliRunner, Result
+
+from support.recorded_daemon import Daemon
+from support.schemas import faults
+from zsched.cli import app
+
+CLI = (sys.executable, "-m", "zsched.cli")
+Json = dict[str, Any]
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def printed(*texts: str) -> list[Json]:
+    return [{"number": number, "age_s": 0.5, "text": text} for number, text in enumerate(texts, 1)]
+
+
+def test_logs_shows_the_owner_s_lines_page_after_page(daemon: Daemon) -> None:
+    daemon.lines = printed("one", "two", "three\x1b[2J")
+    result = run("logs", "echo")
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert [re.sub(r"^\d\d:\d\d:\d\d ", "", line) for line in result.stdout.splitlines()] == ["one", "two", "three?[2J"]
+    asked = [request for request in daemon.asked if request["verb"] == "lines"]
+    assert asked == [{"verb": "lines", "task": "echo", "after": after, "node": "edge1"} for after in (0, 2)]
+    assert run("logs", "echo", "--lines", "1").stdout.endswith(" three?[2J\n")
+    assert run("logs", "echo", "--lines", "0").stdout == ""
+    bodies = [json.loads(line) for line in run("logs", "echo", "edge2", "--json").stdout.splitlines()]
+    assert ([faults(body) for body in bodies], {body["node"] for body in bodies}) == ([[], [], []], {"edge2"})
+
+
+def test_logs_of_a_worker_that_has_printed_nothing_says_so(daemon: Daemon) -> None:
+    daemon.lines = []
+    result = run("logs", "echo")
+    told = "the worker of echo on edge1 has printed nothing since the daemon there started\n"
+    assert (result.exit_code, result.stdout, result.stderr) == (0, "", told)
+    assert run("logs", "echo", "--level", "error").stderr == told.replace("nothing", "nothing at error or above")
+
+
+def test_logs_of_a_node_that_starts_no_worker_says_so(daemon: Daemon) -> None:
+    daemon.is_here = False
+    result = run("logs", "echo", "robot2")
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert "robot2 starts no worker of echo" in result.stderr
+
+
+def test_logs_of_a_task_without_an_owner_needs_a_node(daemon: Daemon) -> None:
+    daemon.status["tasks"][0]["owner"] = None
+    result = run("logs", "echo")
+    assert result.exit_code == 1
+    assert "echo has no owner; name a node, there are edge1, edge2" in result.stderr
+    assert run("logs", "ecko").exit_code == run("logs", "echo", "egde1").exit_code == 2
+
+
+def test_logs_followed_prints_what_comes_and_starts_anew_with_another_daemon(folder: Path) -> None:
+    with Daemon(folder) as daemon:
+        daemon.lines = printed("one", "two", "three")
+        command = [*CLI, "logs", "echo", "-f", "--json", "--runtime-dir", str(folder)]
+        with subprocess.Popen(command, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+            assert process.stdout is not None
+            first = [json.loads(process.stdout.readline())["text"] for _ in range(3)]
+            daemon.lines += [{"number": 4, "age_s": 0.0, "text": "four"}]
+            first.append(json.loads(process.stdout.readline())["text"])
+            daemon.lines = printed("anew")
+            first.append(json.loads(process.stdout.readline())["text"])
+            process.send_signal(signal.SIGINT)
+            _, error = process.communicate(timeout=60)
+    assert first == ["one", "two", "three", "four", "anew"]
+    assert (process.returncode, error) == (0, "")
+
+
+def test_logs_of_a_level_keep_a_traceback_whole(daemon: Daemon) -> None:
+    texts = (
+        "it starts",
+        "2026-11-24 INFO ready",
+        "2026-11-24 ERROR no map",
+        "Traceback (most recent call last):",
+        '  File "worker.py", line 3',
+        "[WARN] [camera]: late",
+        "DEBUG done",
+        '{"level": "info", "msg": "error 7 is over"}',
+        "{'severity': 'fatal'}",
+    )
+    daemon.lines = [{"number": number, "age_s": 1.0, "text": text} for number, text in enumerate(texts, 1)]
+
+    def shown(*words: str) -> list[int]:
+        lines = run("logs", "echo", "--json", *words).stdout.splitlines()
+        return [json.loads(line)["number"] for line in lines]
+
+    assert shown() == shown("--level", "debug") == list(range(1, 10))
+    assert shown("--level", "warning") == [1, 3, 4, 5, 6, 9], "a line before the first level is shown"
+    assert shown("--level", "error") == [1, 3, 4, 5, 9]
+    assert shown("--level", "error", "--lines", "2") == [5, 9]
+    refused = run("logs", "echo", "--level", "warn")
+    assert (refused.exit_code, "did you mean warning" in refused.stderr) == (2, True)
+
+
+def test_restart_shows_what_becomes_of_the_worker_and_says_who_wants_it(daemon: Daemon) -> None:
+    daemon.result = {"outcome": "ok", "detail": "its worker is started again, it was ready", "revision": None}
+    result = run("restart", "echo", "edge2", "--yes", "-m", "new code")
+    assert (result.exit_code, result.stderr) == (0, "")
+    heads, row, told = result.stdout.splitlines()
+    assert heads.split() == ["TASK", "WHAT", "NOW", "AFTER"]
+    assert re.split(r"  +", row) == ["echo", "worker on edge2", "ready", "started again"]
+    assert told == "echo on edge2: its worker is started again, it was ready"
+    asked = daemon.asked[-1]
+    assert (asked["verb"], asked["task"], asked["node"], asked["reason"]) == ("restart", "echo", "edge2", "new code")
+    assert asked["by"].endswith("@robot1")
+
+
+def test_restart_of_the_owner_s_worker_says_that_the_task_pauses(daemon: Daemon) -> None:
+    refused = run("restart", "echo")
+    assert (refused.exit_code, [asked["verb"] for asked in daemon.asked]) == (2, ["status"])
+    assert "started again; the task pauses until it is ready" in refused.stdout
+    assert run("restart", "echo", "--yes").exit_code == 0
+    assert daemon.asked[-1]["node"] == "edge1"
+
+
+def test_restart_that_is_refused_exits_with_1(daemon: Daemon) -> None:
+    daemon.result = {"outcome": "invalid", "detail": "its worker does not run", "revision": None}
+    text, as_json = run("restart", "echo", "edge2", "--yes"), run("restart", "echo", "edge2", "--yes", "--json")
+    assert (text.exit_code, as_json.exit_code) == (1, 1)
+    assert "echo on edge2: its worker does not run" in text.stderr
+    assert faults(json.loads(as_json.stdout)) == []
