@@ -1,7 +1,7 @@
 """The numbers by which one node's agreement counts: founded from its file and state, learnt, or changed by itself.
 
 Knows: when a node founds a fleet value, what of it goes to disk and into messages, that a value's document comes before
-the value. Does not know: what an elector answers beyond that (`zsched.core.vote.agreement`), how anything travels, who
+the value. Does not know: what an elector answers beyond that (`zsched.core.vote.acceptor`), how anything travels, who
 wants a change (`zsched.core.electorate.orders`).
 """
 

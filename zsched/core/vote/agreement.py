@@ -1,7 +1,8 @@
 """VOTE, between the registers and the node: one register per task, the durable state they share, the messages.
 
-Knows: which messages a register's step becomes, how an operator's change is made, what goes to disk. Does not know: the
-rules of a round (`zsched.core.vote.register`), the effect of a learnt allocation (the node applies it).
+Knows: which messages a register's step becomes, what is learnt of whom, what goes to disk. Does not know: the rules of
+a round (`zsched.core.vote.register`), what a proposer is answered (`zsched.core.vote.acceptor`), the effect of a learnt
+allocation (the node applies it).
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ to each elector, ten writes there and ten answers, twice. With them goes what an
 the fleet value that brought the number, and the first question of the change that will say that all is settled.
 
 Knows: which instructions may travel together. Does not know: why a register asks (`zsched.core.vote.register`), what an
-elector answers (`zsched.core.vote.agreement`).
+elector answers (`zsched.core.vote.acceptor`).
 """
 
 from __future__ import annotations
