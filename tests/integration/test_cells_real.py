@@ -92,6 +92,16 @@ def test_a_node_of_one_cell_asks_and_commands_the_other_while_its_gateways_die(s
     assert (paused["by"], paused["reason"]) == (f"{getpass.getuser()}@{A}/robot1", "lens")
     assert here.json("status")["tasks"][0]["pause"] is None  # nothing was agreed here
 
+    for node in (f"{B}/robot1", f"{B}/edge2"):  # a robot's log, and an edge's
+        moves = here.json("history", "--node", node)["moves"]
+        assert moves[-1]["to"] == there.bed.owner()
+    merged = here.json("history", "--site")
+    assert [(cell["name"], cell["error"]) for cell in merged["cells"]] == [(A, None), (B, None)]
+    assert {move["cell"] for move in merged["moves"]} == {A, B}
+    ages = [move["age_s"] for move in merged["moves"]]
+    assert ages == sorted(ages, reverse=True)
+    assert here.json("history", "--node", "edge2")["node"] == "edge2"  # and of the own fleet
+
     there.bed.kill("edge1")  # its first gateway
     status = here.json("status", "--node", f"{B}/robot1")
     assert (status["fleet"], status["node"]) == (B, "robot1")
@@ -106,6 +116,10 @@ def test_a_node_of_one_cell_asks_and_commands_the_other_while_its_gateways_die(s
     assert all(f"by {gateway}" in refused.stderr for gateway in here.bed.fleet.cells[0].gateways)
     listed = here.json("site")["cells"]
     assert [(cell["name"], cell["error"] is None) for cell in listed] == [(A, True), (B, False)]
+    done = here.zsched("history", "--site")
+    assert done.returncode == 0, done.stderr
+    assert f"{A}  " in done.stdout
+    assert f"PROBLEMS\n  {B}: cell {B} cannot be asked" in done.stdout
     there.bed.send("edge2", signal.SIGCONT)
 
 
@@ -129,6 +143,8 @@ def test_a_secured_cell_is_asked_with_a_certificate_of_its_own_authority(tmp_pat
         here = Cell(bed=Testbed(desk, own))
         status = here.json("status", "--node", f"{B}/robot1")
         assert (status["fleet"], status["node"]) == (B, "robot1")
+        done = here.zsched("history", "--node", f"{B}/edge1")
+        assert (done.returncode, TASK in done.stdout) == (0, True), done.stderr
         done = here.zsched("pause", TASK, "--node", f"{B}/edge1", "--yes")
         assert done.returncode == 0, done.stderr
         assert bed.task("robot1")["pause"]["by"] == "ana.operator"

@@ -28,6 +28,7 @@ from zsched.core.values.messages import (
     Prepare,
     Promise,
     ReadFleet,
+    ReadHistory,
     ReadLines,
     Refusal,
     Refused,
@@ -423,6 +424,8 @@ class Storm:
             return ev.RestartCommanded(request=self.number(), command=RestartTask(task=self.task()))
         if self.rng.random() < 0.1:
             return ev.LinesAsked(request=self.number(), command=ReadLines(task=self.task()))
+        if self.rng.random() < 0.1:
+            return ev.HistoryAsked(request=self.number(), command=ReadHistory())
         if self.rng.random() < 0.1:
             return ev.FleetReadAsked(request=self.number(), command=ReadFleet())
         if self.rng.random() < 0.1:

@@ -1,4 +1,4 @@
-"""`zsched site`: asks every fleet of the site how it is, each at its own gateways.
+"""`zsched site` and `zsched history --site`: ask every fleet of the site, each at its own gateways.
 
 Knows: which fleets there are, by the fleet file; exit codes. Does not know: sessions (`zsched.commands.ask`).
 """
@@ -7,13 +7,16 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from zsched import paths as places
 from zsched.commands.ask import Door, ask_door, door_here, door_of, fleet_here
-from zsched.commands.common import CliError, Json, print_json
+from zsched.commands.common import CliError, Json, print_json, say
+from zsched.commands.history import SCHEMA as HISTORY
+from zsched.commands.history import Past, lines_of, print_lines
 from zsched.commands.report import degradations
 from zsched.core.values.fleet import Fleet
 from zsched.errors import ConfigError
@@ -23,6 +26,7 @@ from zsched.screen import harmless
 SCHEMA: Final = "zsched.site/1"
 ALIVE: Final = "alive"
 TITLES: Final = ("CELL", "NODES", "TASKS", "ASKED AT")
+T = TypeVar("T")
 
 
 def show_site(runtime_dir: Path | None, node: str | None, *, is_json: bool) -> int:
@@ -31,17 +35,70 @@ def show_site(runtime_dir: Path | None, node: str | None, *, is_json: bool) -> i
     Raises:
         ConfigError: no document is agreed, and the fleet file cannot be used.
     """
-    here = door_here(runtime_dir, node)
-    fleet = fleet_here(here, places.config_path(None, os.environ))
-    doors = [] if here is None else [(fleet.name, here)]
-    doors += [(cell.name, door_of(cell, fleet.name, here)) for cell in fleet.cells]
-    with ThreadPoolExecutor(max(len(doors), 1)) as errands:
-        cells = list(errands.map(lambda one: _told(*one), doors))
+    fleet, cells = _ask_all(runtime_dir, node, _told)
     if is_json:
         print_json({"schema": SCHEMA, "fleet": fleet.name, "cells": cells})
     else:
         _print(fleet, cells)
     return _code(cells)
+
+
+def show_histories(runtime_dir: Path | None, node: str | None, past: Past, *, is_json: bool) -> int:
+    """Print the moves of all cells by their age, the newest last, and who is silent; returns the exit code.
+
+    Each cell's moves are told by one of its nodes, with ages by that node's clock: no two clocks are compared.
+
+    Raises:
+        ConfigError: no document is agreed, and the fleet file cannot be used.
+    """
+    fleet, cells = _ask_all(runtime_dir, node, lambda name, door: _past(name, door, past))
+    silent = [cell for cell in cells if cell["error"] is not None]
+    if is_json:
+        merged = {key: _merged(cells, key) for key in ("moves", "rehearsals", "rollouts")}
+        asked = [{key: cell[key] for key in ("name", "node", "error")} for cell in cells]
+        first = next((cell["node"] for cell in cells if cell["error"] is None), "")
+        print_json({"schema": HISTORY, "node": first, **merged, "cells": asked})
+    else:
+        width = max((len(cell["name"]) for cell in cells), default=0)
+        lines = [line for cell in cells for line in lines_of(cell, f"{cell['name']:<{width}}  ")]
+        print_lines(lines)
+        heard = [cell["name"] for cell in cells if cell["error"] is None]
+        if not lines and heard:
+            say(f"no move{past.words} in {', '.join(heard)}")
+        said = [f"  {cell['name']}: {cell['error']}" for cell in silent]
+        for line in (*(("PROBLEMS", *said) if said else ()), *_alone(fleet)):
+            say(line, indent=4)
+    return EXIT_UNREACHABLE if cells and len(silent) == len(cells) else EXIT_OK
+
+
+def _ask_all(runtime_dir: Path | None, node: str | None, ask: Callable[[str, Door], T]) -> tuple[Fleet, list[T]]:
+    """(this machine's fleet, what ``ask`` makes of each cell), this machine's first; all are asked at once."""
+    here = door_here(runtime_dir, node)
+    fleet = fleet_here(here, places.config_path(None, os.environ))
+    doors = [] if here is None else [(fleet.name, here)]
+    doors += [(cell.name, door_of(cell, fleet.name, here)) for cell in fleet.cells]
+    with ThreadPoolExecutor(max(len(doors), 1)) as errands:
+        return fleet, list(errands.map(lambda one: ask(*one), doors))
+
+
+def _past(name: str, door: Door, past: Past) -> Json:
+    """What a cell's node has in its log; ``error`` where none tells."""
+    body: Json = {"name": name, "node": None, "moves": [], "rehearsals": [], "rollouts": [], "error": None}
+    try:
+        return {**body, **past.read(door)}
+    except (CliError, ConfigError) as error:
+        return {**body, "error": str(error)}
+
+
+def _merged(cells: list[Json], key: str) -> list[Json]:
+    """What all cells tell, each with its cell, the newest last."""
+    found = [{**one, "cell": cell["name"]} for cell in cells for one in cell[key]]
+    return sorted(found, key=lambda one: -one["age_s"])
+
+
+def _alone(fleet: Fleet) -> tuple[str, ...]:
+    """Why no other cell is asked, where none is named."""
+    return () if fleet.cells else (f"fleet {fleet.name} names no other under `site:` (docs/guide/scale.md)",)
 
 
 def _told(name: str, door: Door) -> Json:
@@ -71,8 +128,7 @@ def _print(fleet: Fleet, cells: list[Json]) -> None:
     for cell in cells:
         told = cell["degraded"] if cell["error"] is None else [cell["error"]]
         lines += [f"  {cell['name']}: {text}" for text in told]
-    if not fleet.cells:
-        lines.append(f"fleet {fleet.name} names no other under `site:` (docs/guide/scale.md)")
+    lines += _alone(fleet)
     sys.stdout.write("\n".join(harmless(line) for line in lines) + "\n")
 
 

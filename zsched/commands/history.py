@@ -1,4 +1,4 @@
-"""`zsched history` and `zsched events`: what the daemon on this machine has written into its decision log.
+"""`zsched history` and `zsched events`: what daemons have written into their decision logs.
 
 Knows: pages of a log, ages, text, the schemas ``zsched.history/1`` and ``zsched.event/1``. Does not know: files.
 
@@ -18,7 +18,7 @@ from zsched.commands.common import CliError, Json, nearest, print_json, say, war
 from zsched.commands.page import span
 from zsched.commands.report import millis, printable
 from zsched.core.values.struct import Struct
-from zsched.exits import EXIT_OK, EXIT_UNREACHABLE, EXIT_USAGE
+from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_UNREACHABLE, EXIT_USAGE
 
 SCHEMA = "zsched.history/1"
 FOLLOW_S = 0.5
@@ -94,30 +94,62 @@ def types_of(text: str) -> tuple[str, ...]:
     return words
 
 
+class Past(Struct, frozen=True, kw_only=True):
+    """Which part of a history is asked for."""
+
+    task: str | None = None
+    about: str | None = None
+    """Only moves to this node or away from it."""
+    since_s: float | None = None
+    """None that are older."""
+
+    @property
+    def words(self) -> str:
+        """What is asked for, behind "no move"."""
+        whose = (f" of {self.task}" if self.task else "") + (f" to {self.about} or away from it" if self.about else "")
+        return whose + ("" if self.since_s is None else f" of the last {span(self.since_s)}")
+
+    def read(self, door: Door) -> Json:
+        """What the log of the node at the door tells of it: ``node``, ``moves``, ``rehearsals``, ``rollouts``.
+
+        Raises:
+            CliError: nobody answers, or the log cannot be read.
+        """
+        node, now, entries, _ = read_log(door, is_moves=True)
+        entries = [entry for entry in entries if self.since_s is None or entry["at"] >= now - self.since_s]
+        moves = [move for move in moves_of(entries, now, self.task) if self.about in (None, move["from"], move["to"])]
+        rehearsals = list(rehearsals_of(entries, now, self.task)) if self.about is None else []
+        rollouts = list(rollouts_of(entries, now, self.task)) if self.about is None else []
+        return {"node": node, "moves": moves, "rehearsals": rehearsals, "rollouts": rollouts}
+
+
 def history(
     door: Door, task: str | None, *, is_json: bool, about: str | None = None, since_s: float | None = None
 ) -> int:
-    """Print the moves that the log knows, the newest last; returns the exit code.
-
-    ``about``: only moves to this node or away from it. ``since_s``: none that are older.
-    """
-    node, now, entries, _ = read_log(door, is_moves=True)
-    entries = [entry for entry in entries if since_s is None or entry["at"] >= now - since_s]
-    moves = [move for move in moves_of(entries, now, task) if about in (None, move["from"], move["to"])]
-    rehearsals = list(rehearsals_of(entries, now, task)) if about is None else []
-    rollouts = list(rollouts_of(entries, now, task)) if about is None else []
+    """Print the moves that the log of the node at the door knows, the newest last; returns the exit code."""
+    past = Past(task=task, about=about, since_s=since_s)
+    told = past.read(door)
     if is_json:
-        print_json({"schema": SCHEMA, "node": node, "moves": moves, "rehearsals": rehearsals, "rollouts": rollouts})
+        print_json({"schema": SCHEMA, **told})
         return EXIT_OK
-    if not moves and not rehearsals and not rollouts:
-        whose = (f" of {task}" if task else "") + (f" to {about} or away from it" if about else "")
-        whose += "" if since_s is None else f" of the last {span(since_s)}"
-        say(f"no move{whose} in the log of {node}")
-    lines = [(move["age_s"], _move_line(printable(move))) for move in moves]
-    lines += [(one["age_s"], _told_line(printable(one))) for one in (*rehearsals, *rollouts)]
+    lines = lines_of(told)
+    if not lines:
+        say(f"no move{past.words} in the log of {told['node']}")
+    print_lines(lines)
+    return EXIT_OK
+
+
+def lines_of(told: Json, before: str = "") -> list[tuple[float, str]]:
+    """(age, text behind ``before``) of all that a log has told."""
+    lines = [(move["age_s"], f"{before}{_move_line(printable(move))}") for move in told["moves"]]
+    others = (*told["rehearsals"], *told["rollouts"])
+    return [*lines, *((one["age_s"], f"{before}{_told_line(printable(one))}") for one in others)]
+
+
+def print_lines(lines: Iterable[tuple[float, str]]) -> None:
+    """Print them, the newest last."""
     for _, text in sorted(lines, key=lambda line: -line[0]):
         say(text, indent=AGE_COLUMNS)
-    return EXIT_OK
 
 
 def events(door: Door, view: EventsView) -> int:
@@ -148,16 +180,23 @@ def events(door: Door, view: EventsView) -> int:
 def read_log(door: Door, *, is_moves: bool, cursor: str = "") -> tuple[str, float, list[Json], str]:
     """(node, its wall clock, entries, where they end) from ``cursor`` to the end of the log.
 
+    Another machine tells its moves only.
+
     Raises:
-        CliError: nobody answers, or another machine's log is meant.
+        CliError: nobody answers, the log cannot be read there, or another machine is asked for more than its moves.
     """
-    if door.node is not None:
+    is_far = door.node is not None or bool(door.endpoint)
+    if is_far and not is_moves:
         instead = f"--for node/{door.node} shows what this machine's log tells of it"
         raise CliError(EXIT_USAGE, f"the log of {door.node} lies on its machine: ask there; {instead}")
     found: list[Json] = []
     while True:
-        answer = ask_door(door, {"verb": "log", "moves": is_moves, "cursor": cursor})
+        answer = ask_door(door, {"verb": "history" if is_far else "log", "moves": is_moves, "cursor": cursor})
+        if "entries" not in answer:
+            raise CliError(EXIT_FAILED, str(answer.get("detail", "no history came")))
         found += answer["entries"]
+        if door.cell is not None:
+            door = door.to(str(answer["node"]))  # the cursor is a place in its log only
         cursor = str(answer["cursor"])
         if not answer["more"]:
             return str(answer["node"]), float(answer["now"]), found, cursor

@@ -90,20 +90,33 @@ def history(
         str | None, typer.Option("--for", metavar="node/NAME", help="Only moves to this node or away from it.")
     ] = None,
     since: Annotated[str | None, typer.Option("--since", metavar="AGE", help="Not older: 90s, 10m, 2h, 1d.")] = None,
+    site: Annotated[bool, typer.Option("--site", help="Of every fleet of the site, merged by age.")] = False,
     json_: JsonOption = False,
-    node: HereOption = None,
+    node: AskedOption = None,
     runtime_dir: RuntimeOption = None,
+    connect: ConnectOption = None,
 ) -> None:
-    """Show every change of owner in the decision log: when, from where to where, why, and who voted for it."""
+    """Show every change of owner in a node's decision log: when, from where to where, why, and who voted for it.
+
+    With --site one node of each fleet of the site is asked. A fleet that does not answer is named, and the others are
+    shown; exits with 3 when none answers.
+    """
     from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
-    from zsched.commands.history import duration_s, subject_of  # noqa: PLC0415 - as above
+    from zsched.commands.history import Past, duration_s, subject_of  # noqa: PLC0415 - as above
     from zsched.commands.history import history as show_moves  # noqa: PLC0415 - as above
 
     of_task, of_node = (None, None) if about is None else subject_of(about)
     since_s = None if since is None else duration_s(since)
     if task is not None and of_task not in (None, task):
         raise CliError(EXIT_USAGE, f"{task} and --for {about} are two tasks; name one")
-    door = find_door(runtime_dir, node)
+    if site:
+        from zsched.commands.cells import show_histories  # noqa: PLC0415 - as above
+
+        if connect is not None or (node is not None and "/" in node):
+            raise CliError(EXIT_USAGE, "--site asks every cell; leave out --connect and CELL/NODE")
+        past = Past(task=task or of_task, about=of_node, since_s=since_s)
+        raise typer.Exit(show_histories(runtime_dir, node, past, is_json=json_))
+    door = find_door(runtime_dir, node, connect=connect)
     raise typer.Exit(show_moves(door, task or of_task, about=of_node, since_s=since_s, is_json=json_))
 
 

@@ -24,6 +24,7 @@ from zsched.core.values.messages import (
     Prepare,
     Promise,
     ReadFleet,
+    ReadHistory,
     ReadLines,
     Refused,
     RestartTask,
@@ -458,6 +459,13 @@ class LinesAsked(Struct, frozen=True, kw_only=True):
     command: ReadLines
 
 
+class HistoryAsked(Struct, frozen=True, kw_only=True):
+    """An operator asks what this node's decision log tells of moves."""
+
+    request: int
+    command: ReadHistory
+
+
 class FleetCommanded(Struct, frozen=True, kw_only=True):
     """An operator changes the fleet."""
 
@@ -570,6 +578,7 @@ Event = (
     | RehearsalKept
     | RehearsalsAsked
     | LinesAsked
+    | HistoryAsked
     | FleetCommanded
     | FleetReadAsked
     | FrameDropped
@@ -606,6 +615,8 @@ def commanded(request: int, command: Command, *, is_near: bool = False) -> Event
         return TuneCommanded(request=request, command=command)
     if isinstance(command, ReadLines):
         return LinesAsked(request=request, command=command)
+    if isinstance(command, ReadHistory):
+        return HistoryAsked(request=request, command=command)
     if isinstance(command, ChangeFleet):
         return FleetCommanded(request=request, command=command)
     if isinstance(command, ReadFleet):

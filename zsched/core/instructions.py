@@ -280,6 +280,13 @@ class AnswerLines(Struct, frozen=True, kw_only=True):
     after: int
 
 
+class AnswerHistory(Struct, frozen=True, kw_only=True):
+    """Answer an operator with a page of this node's decision log: its moves behind ``cursor``."""
+
+    request: int
+    cursor: str
+
+
 class TakeCertificate(Struct, frozen=True, kw_only=True):
     """Keep a newer certificate for this node's key (PEM) if it is one, and answer who has sent it."""
 
@@ -443,6 +450,7 @@ Instruction = (
     | AnswerCommand
     | AnswerExplanation
     | AnswerLines
+    | AnswerHistory
     | TakeCertificate
     | StandDown
     | RecordStory

@@ -25,10 +25,12 @@ from zsched.core.values.messages import (
     CommandResult,
     ExplainTask,
     FleetTold,
+    HistoryTold,
     Hold,
     HoldTask,
     MoveTask,
     ReadFleet,
+    ReadHistory,
     ReadLines,
     RestartTask,
     RetryTask,
@@ -219,6 +221,10 @@ def _lines_of(request: dict[str, Any]) -> ReadLines:
     return ReadLines(task=str(request["task"]), after=after)
 
 
+def _history_of(request: dict[str, Any]) -> ReadHistory:
+    return ReadHistory(cursor=str(request.get("cursor") or ""))
+
+
 def _change_of(request: dict[str, Any]) -> ChangeFleet:
     """The whole document, or one elector: exactly one of them is named."""
     base, text = request.get("base_revision"), request.get("text")
@@ -278,6 +284,7 @@ _COMMANDS: dict[str, Callable[[dict[str, Any]], Command]] = {
     "explain": _explain_of,
     "restart": _restart_of,
     "lines": _lines_of,
+    "history": _history_of,
     "certificate": _certificate_of,
     "change": _change_of,
     "fleet": _fleet_of,
@@ -306,6 +313,10 @@ def answer_json(value: object) -> dict[str, Any]:
         lines = [{"number": line.number, "age_s": line.age_s, "text": line.text} for line in value.lines]
         body = {"node": value.node, "task": value.task, "lines": lines}
         return {**body, "newest": value.newest, "is_here": value.is_here}
+    if isinstance(value, HistoryTold):
+        entries = [{**wire.as_plain(line), "task": line.task, "text": line.text} for line in value.lines]
+        told = {"node": value.node, "now": value.now, "entries": entries}
+        return {**told, "cursor": value.cursor, "more": value.has_more}
     if isinstance(value, FleetTold):
         return _fleet_json(value)
     if isinstance(value, RehearsalsTold):

@@ -8,6 +8,7 @@ Knows: which adapter an instruction is for. Does not know: why it was given.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections.abc import Callable, Iterator
 from typing import assert_never
@@ -36,6 +37,7 @@ from zsched.core.values.messages import (
     CommandOutcome,
     CommandResult,
     FleetTold,
+    HistoryTold,
     WorkerLines,
     fleet_question,
 )
@@ -183,6 +185,8 @@ class Shell:
                 self._answer_operator(request, explanation)
             case do.AnswerLines(request=request, task=task, after=after):
                 self._answer_operator(request, self._lines(task, after))
+            case do.AnswerHistory(request=request, cursor=cursor):
+                self._tell_history(request, cursor)
             case do.TakeCertificate(request=request, certificate=certificate):
                 self._answer_operator(request, self.take_certificate(certificate))
             case do.ApplyRoutes(plan=plan):
@@ -229,6 +233,18 @@ class Shell:
             return WorkerLines(node=self._node, task=task, is_here=False)
         lines, newest = kept.behind(after)
         return WorkerLines(node=self._node, task=task, lines=lines, newest=newest)
+
+    def _tell_history(self, request: int, cursor: str) -> None:
+        """Let the log's thread answer: it reads files."""
+
+        def answer(told: HistoryTold | None) -> None:
+            refused = CommandResult(outcome=CommandOutcome.INVALID, detail="its decision log cannot be read")
+            with contextlib.suppress(AdapterError):  # the session has closed: nobody hears it
+                self._answer_operator(request, told or refused)
+
+        if self.log is None or not self.log.ask(cursor, answer):
+            busy = "others read its decision log just now: ask again in a moment"
+            self._answer_operator(request, CommandResult(outcome=CommandOutcome.INVALID, detail=busy))
 
     def _keep(self, request: int, rehearsal: KeepRehearsal) -> None:
         assert self.rehearsals is not None

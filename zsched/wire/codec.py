@@ -65,6 +65,8 @@ KINDS: dict[str, tuple[type, int]] = {
     "read_fleet": (messages.ReadFleet, SMALL),
     "fleet_told": (messages.FleetTold, LARGE),
     "worker_lines": (messages.WorkerLines, LARGE),
+    "read_history": (messages.ReadHistory, SMALL),
+    "history_told": (messages.HistoryTold, LARGE),
     "strike": (rehearsal.Strike, SMALL),
     "keep_rehearsal": (rehearsal.KeepRehearsal, LARGE),
     "read_rehearsals": (rehearsal.ReadRehearsals, SMALL),

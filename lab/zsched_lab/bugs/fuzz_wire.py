@@ -45,6 +45,7 @@ from zsched.core.values.messages import (
     Learnt,
     Prepare,
     Promise,
+    ReadHistory,
     Refused,
     SetWeights,
     Utilities,
@@ -150,6 +151,8 @@ def _dataclass(cls: Any, rng: Random) -> Any:
         values["task"] = values["acceptance"].value.task
     if made is Strike:
         values["step"] = rng.choice(FAULTS)
+    if made is ReadHistory:
+        values["cursor"] = rng.choice(("", "4711:65536"))
     chosen = rng.choice(ONE_OF.get(made, ("",)))
     for other in ONE_OF.get(made, ()):
         if other != chosen:

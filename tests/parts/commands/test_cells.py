@@ -8,12 +8,15 @@ from pathlib import Path
 
 import pytest
 
+from support.doors import answering
+from support.schemas import faults
 from zsched.commands import ask
 from zsched.commands.ask import ask_door, find_door
-from zsched.commands.cells import show_site
-from zsched.commands.common import CliError
+from zsched.commands.cells import show_histories, show_site
+from zsched.commands.common import CliError, Json
+from zsched.commands.history import Past
 from zsched.commands.orders import asker, user_name
-from zsched.exits import EXIT_UNREACHABLE, EXIT_USAGE
+from zsched.exits import EXIT_OK, EXIT_UNREACHABLE, EXIT_USAGE
 from zsched_lab.fleet.loopback import free_endpoint, own_address
 
 
@@ -74,3 +77,40 @@ def test_an_order_tells_the_fleet_and_the_machine_it_comes_from() -> None:
 def test_a_site_of_which_no_cell_answers_exits_with_3(capsys: pytest.CaptureFixture[str]) -> None:
     assert show_site(None, None, is_json=False) == EXIT_UNREACHABLE
     assert "hall-b: cell hall-b cannot be asked" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("gateways")
+def test_a_history_of_which_no_cell_tells_exits_with_3(capsys: pytest.CaptureFixture[str]) -> None:
+    assert show_histories(None, None, Past(), is_json=False) == EXIT_UNREACHABLE
+    assert capsys.readouterr().out.startswith("PROBLEMS\n  hall-b: cell hall-b cannot be asked; by tcp/")
+
+
+def ours(request: Json) -> Json:
+    """The daemon of this machine: one move, and no document."""
+    if request["verb"] == "fleet":
+        return {"node": "robot1", "text": ""}
+    move = {"epoch": 2, "revision": 3, "left": "edge1", "owner": "edge2", "reason": "edge1 is gone"}
+    entry = {"at": 1_790_000_000.0, "life": 7, "task": "echo", "text": "learnt", "move": move}
+    return {"node": "robot1", "now": 1_790_000_060.0, "entries": [entry], "cursor": "1:9", "more": False}
+
+
+@pytest.mark.usefixtures("gateways")
+def test_a_silent_cell_is_named_and_the_history_of_the_others_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with answering(ours, tmp_path, monkeypatch):
+        assert show_histories(None, None, Past(), is_json=False) == EXIT_OK
+        move, title, problem = capsys.readouterr().out.splitlines()
+        assert move.startswith("hall-a   1m00s ago  ")
+        assert move.endswith("echo epoch 2  edge1 -> edge2: edge1 is gone")
+        assert (title, problem.startswith("  hall-b: cell hall-b cannot be asked")) == ("PROBLEMS", True)
+        assert show_histories(None, None, Past(task="other"), is_json=False) == EXIT_OK
+        assert capsys.readouterr().out.startswith("no move of other in hall-a\nPROBLEMS\n")
+        assert show_histories(None, None, Past(), is_json=True) == EXIT_OK
+    told = json.loads(capsys.readouterr().out)
+    assert faults(told) == []
+    assert [(move["cell"], move["to"]) for move in told["moves"]] == [("hall-a", "edge2")]
+    assert [(cell["name"], cell["node"], cell["error"] is None) for cell in told["cells"]] == [
+        ("hall-a", "robot1", True),
+        ("hall-b", None, False),
+    ]

@@ -19,14 +19,16 @@ from support.profiles import profile_of
 from support.proposals import proposal_of
 from support.states import state_of
 from support.waiting import until
+from zsched.adapters.host.decision_log import DecisionLog
 from zsched.adapters.host.state_file import StateFile
 from zsched.adapters.workers.kept_lines import KeptLines
 from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
+from zsched.commands.history import moves_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.electorate.founding import founded
 from zsched.core.relay_protocol import RelayStarted, WorkerSeen
-from zsched.core.values.decision import Explanation
+from zsched.core.values.decision import Explanation, Move
 from zsched.core.values.document import Document, Flag, FlagKind, Text
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import WorkerSpec
@@ -401,7 +403,7 @@ def test_desk_refuses_what_is_no_request(house: House) -> None:
     for request, says in (
         (
             {"verb": "fly"},
-            "unknown verb 'fly'; known: access, certificate, change, explain, fleet, hold, keep, leave, lines, log, ",
+            "unknown verb 'fly'; known: access, certificate, change, explain, fleet, history, hold, keep, leave, ",
         ),
         ({"verb": "move", "task": "merge", "target": "edge1"}, "move: 'by' is missing"),
         ({**order, "verb": "move"}, "move: 'target' is missing"),
@@ -464,6 +466,34 @@ def test_lines_are_asked_of_the_supervisor_and_answered_as_json(house: House) ->
     assert found["lines"][0]["age_s"] >= 0.0
     assert (found["node"], found["task"], found["newest"], found["is_here"]) == ("robot1", "merge", 2, True)
     assert (none["lines"], none["newest"], none["is_here"]) == ([], 0, False)
+
+
+def test_a_history_is_asked_of_the_log_and_answered_as_json(house: House, tmp_path: Path) -> None:
+    answers: list[dict[str, Any]] = []
+
+    def ask(request: dict[str, Any]) -> None:
+        asking = threading.Thread(target=lambda: answers.append(house.desk.answer(request)))
+        asking.start()
+        event = house.inbox.take(60.0)
+        assert isinstance(event, ev.HistoryAsked)
+        house.shell.carry_out((do.AnswerHistory(request=event.request, cursor=event.command.cursor),))
+        asking.join(60.0)
+
+    ask({"verb": "history"})
+    assert answers.pop()["outcome"] == "invalid", "there is no log"
+    house.shell.log = log = DecisionLog(tmp_path, "robot1", 7, lambda _problem: None)
+    move = Move(epoch=2, revision=3, left="edge1", owner="edge2", reason="edge1 is gone", votes=(("r1", "edge2"),))
+    log.put(do.RecordStory(stage="vote", text="learnt", task="merge", epoch=2, move=move))
+    log.put(do.RecordStory(stage="vote", text="no move"))
+    log.start()
+    ask({"verb": "history", "moves": True, "cursor": ""})
+    log.close()
+    told = answers.pop()
+    (entry,) = told["entries"]
+    assert (told["node"], told["more"], entry["task"], entry["text"]) == ("robot1", False, "merge", "learnt")
+    (shown,) = moves_of(told["entries"], told["now"], "merge")
+    assert (shown["from"], shown["to"], shown["votes"]) == ("edge1", "edge2", {"r1": "edge2"})
+    assert house.desk.answer({"verb": "history", "cursor": "1:2:3"})["error"].startswith("history: history.cursor")
 
 
 def test_a_question_for_the_fleet_is_answered_with_the_text_of_its_document(house: House, tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from zsched.commands.history import EventsView, duration_s, events, history, sub
 from zsched.core.instructions import RecordStory
 from zsched.core.scheduler.decision import decide_again, verdict_of
 from zsched.core.values.decision import Decision, Figures, Move, Rules
+from zsched.core.values.fleet import Cell
 from zsched.core.values.model import Allocation, PeerState, Reach, Tuning, Utility, UtilityVector, Weights
 from zsched.exits import EXIT_UNREACHABLE, EXIT_USAGE
 
@@ -53,19 +54,26 @@ class Pages:
     def __init__(self, *entries: dict[str, Any]) -> None:
         self.entries = list(entries)
         self.asked: list[dict[str, Any]] = []
+        self.nodes: list[str | None] = []
         self.is_away = False
 
     def ask(self, door: Door, request: dict[str, Any], timeout_s: float = 5.0) -> dict[str, Any]:
-        assert door.node is None
         assert timeout_s > 0
         self.asked.append(request)
+        self.nodes.append(door.node)
         if self.is_away:
             raise CliError(EXIT_UNREACHABLE, "no daemon")
         first = int(request["cursor"] or 0)
         page = self.entries[first : first + 2]
         wanted = [one for one in page if not request["moves"] or {"move", "took_s", "gap_s", "is_rollout"} & {*one}]
         at = first + len(page)
-        return {"node": "robot1", "now": NOW, "entries": wanted, "cursor": str(at), "more": at < len(self.entries)}
+        return {
+            "node": door.node or "robot1",
+            "now": NOW,
+            "entries": wanted,
+            "cursor": str(at),
+            "more": at < len(self.entries),
+        }
 
 
 @pytest.fixture
@@ -225,11 +233,34 @@ def test_who_follows_goes_on_where_it_was_and_outlasts_a_restart(
     assert captured.err.count("asking again") == 1
 
 
-def test_another_machine_s_log_is_refused(pages: Pages) -> None:
+def test_another_machine_tells_its_moves_and_refuses_its_events(
+    pages: Pages, capsys: pytest.CaptureFixture[str]
+) -> None:
+    there = Door(socket=Path("s"), node="robot2")
     with pytest.raises(CliError, match="lies on its machine: ask there; --for node/robot2") as refused:
+        events(there, view())
+    assert (refused.value.code, pages.asked) == (EXIT_USAGE, [])
+    assert history(there, "merge", is_json=True) == 0
+    assert {request["verb"] for request in pages.asked} == {"history"}
+    assert [move["epoch"] for move in json.loads(capsys.readouterr().out)["moves"]] == [2]
+    assert history(HERE, "merge", is_json=True) == 0
+    assert pages.asked[-1]["verb"] == "log"
+
+
+def test_all_pages_of_a_cell_s_history_are_told_by_the_node_that_told_the_first(pages: Pages) -> None:
+    """A cursor is a place in one node's log; another gateway would begin again with its own."""
+    cell = Cell(name="hall-b", gateways=("tcp/192.0.2.31:7457", "tcp/192.0.2.32:7457"))
+    there = Door(socket=Path(), endpoint=cell.gateways[0], cell=cell)
+    assert history(there, None, is_json=False) == 0
+    assert pages.nodes == [None, *["robot1"] * (len(pages.asked) - 1)]
+    assert len(pages.asked) > 2
+
+
+def test_a_node_that_cannot_read_its_log_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    refused = {"outcome": "invalid", "detail": "its decision log cannot be read", "revision": None}
+    monkeypatch.setattr(verb, "ask_door", lambda *_given: refused)
+    with pytest.raises(CliError, match="its decision log cannot be read"):
         history(Door(socket=Path("s"), node="robot2"), None, is_json=False)
-    assert refused.value.code == EXIT_USAGE
-    assert pages.asked == []
 
 
 @pytest.mark.parametrize("word", ["10", "m", "-5m", "1w", "1.5.2h", "", "\u0663m", f"{'9' * 400}d"])

@@ -34,6 +34,7 @@ from zsched.core.values.messages import (
     Prepare,
     Promise,
     ReadFleet,
+    ReadHistory,
     ReadLines,
     Refusal,
     Refused,
@@ -817,6 +818,14 @@ def test_a_certificate_is_handed_on_whoever_has_sent_it() -> None:
 def test_a_question_for_lines_is_handed_on() -> None:
     batch = make("edge1").handle(ev.LinesAsked(request=7, command=ReadLines(task="merge", after=3)), 100.0)
     assert of(batch, do.AnswerLines) == [do.AnswerLines(request=7, task="merge", after=3)]
+
+
+def test_a_question_for_the_history_is_handed_on_and_names_a_place_in_a_log() -> None:
+    batch = make("edge1").handle(ev.HistoryAsked(request=7, command=ReadHistory(cursor="4711:12")), 100.0)
+    assert of(batch, do.AnswerHistory) == [do.AnswerHistory(request=7, cursor="4711:12")]
+    for bad in ("4711", "a:1", f"1:{'9' * 16}", "1:2 "):
+        with pytest.raises(ValueError, match=r"history\.cursor"):
+            ReadHistory(cursor=bad)
 
 
 def test_a_node_tells_by_which_fleet_value_it_goes() -> None:

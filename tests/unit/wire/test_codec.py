@@ -178,6 +178,8 @@ def dataclass_strategy(cls: type[Any]) -> st.SearchStrategy[Any]:
     parts = {field.name: strategy(hints[field.name], field.name) for field in fields(made)}
     if made is Strike:
         parts["step"] = st.sampled_from(FAULTS)
+    if made is messages.ReadHistory:
+        parts["cursor"] = st.sampled_from(("", "4711:65536"))
     if made not in ONE_OF:
         return st.builds(made, **parts)
     whole = [

@@ -15,23 +15,30 @@ from __future__ import annotations
 import json
 import os
 import queue
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from zsched.clock import wall_s
 from zsched.core.instructions import RecordStory
-from zsched.core.values.decision import Decision, Move
+from zsched.core.values.decision import Decision, HistoryLine, Move
+from zsched.core.values.messages import HistoryTold
 from zsched.core.values.model import NodeId
 from zsched.core.values.struct import Struct
+from zsched.errors import WireError
 from zsched.guard import guarded
-from zsched.wire.codec import as_plain
+from zsched.wire.codec import as_plain, from_plain
 
 SCHEMA = "zsched.event/1"
 NAME, OLD_NAME = "decisions.ndjson", "decisions.1.ndjson"
 FILE_BYTES = 2 * 1024 * 1024
 PAGE_BYTES = 512 * 1024
 """One answer tells of at most this much of a file, so that a question keeps a daemon busy for milliseconds only."""
+TOLD_BYTES = 64 * 1024
+"""A node's history goes to another machine in pieces of about this much of a log, of which a frame takes two."""
+ASKED_LIMIT = 4
+"""Questions of other machines that may wait for the log's thread."""
 QUEUE_LIMIT = 1000
 CLOSE_S = 0.5
 _BODY = b',"decision":'
@@ -65,8 +72,15 @@ class Entry(Struct, frozen=True, kw_only=True):
     """Last, for readers that do without it."""
 
 
+class _Question(Struct, frozen=True, kw_only=True):
+    """Another machine asks for the history."""
+
+    cursor: str
+    answer: Callable[[HistoryTold | None], None]
+
+
 class DecisionLog:
-    """This daemon's log; `put` is the loop's, all else other threads'."""
+    """This daemon's log; `put` and `ask` are the loop's, all else other threads'."""
 
     def __init__(
         self,
@@ -79,7 +93,8 @@ class DecisionLog:
         """``on_problem`` is told why lines are lost, and with ``None`` that none are any more."""
         self._folder, self._node, self._life = folder, node, life
         self._on_problem, self._file_bytes = on_problem, file_bytes
-        self._queue: queue.SimpleQueue[tuple[float, RecordStory] | None] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[tuple[float, RecordStory] | _Question | None] = queue.SimpleQueue()
+        self._askers = threading.BoundedSemaphore(ASKED_LIMIT)
         self._lost = self._crowded_out = 0
         self._is_failing = False
         self._is_whole = False
@@ -97,6 +112,16 @@ class DecisionLog:
         else:
             self._queue.put((wall_s(), story))
 
+    def ask(self, cursor: str, answer: Callable[[HistoryTold | None], None]) -> bool:
+        """Have a page of the history told to ``answer`` by the log's thread; false: too many wait for that already.
+
+        ``answer`` gets ``None`` where the log cannot be read.
+        """
+        if not self._askers.acquire(blocking=False):
+            return False
+        self._queue.put(_Question(cursor=cursor, answer=answer))
+        return True
+
     def close(self) -> None:
         """Write what has been put, for at most `CLOSE_S`."""
         self._queue.put(None)
@@ -107,10 +132,21 @@ class DecisionLog:
 
     def _run(self) -> None:
         while (item := self._queue.get()) is not None:
+            if isinstance(item, _Question):
+                self._tell(item)
+                continue
             at, story = item
             crowded_out, self._crowded_out = self._crowded_out, 0
             self._lost += crowded_out
             self._write(at, story)
+
+    def _tell(self, question: _Question) -> None:
+        try:
+            told = self.history(question.cursor)
+        except OSError:
+            told = None
+        self._askers.release()
+        question.answer(told)
 
     def _write(self, at: float, story: RecordStory) -> None:
         try:
@@ -189,6 +225,32 @@ class DecisionLog:
         wanted = [line for line in map(without_figures, lines) if not is_moves or _is_of_move(line)]
         entries = [entry for line in wanted if (entry := _parsed(line)) is not None]
         return {"node": self._node, "now": wall_s(), "entries": entries, "cursor": cursor, "more": has_more}
+
+    def history(self, cursor: str) -> HistoryTold:
+        """What the log tells of moves behind ``cursor``, as much as one frame takes.
+
+        Raises:
+            OSError: it cannot be read.
+        """
+        told: list[HistoryLine] = []
+        taken = looked = 0
+        has_more = True
+        while has_more and taken < TOLD_BYTES and looked < PAGE_BYTES:
+            lines, cursor, has_more = read_page(self._folder, cursor, TOLD_BYTES)
+            for line in map(without_figures, lines):
+                if _is_of_move(line) and (one := _history_line(line)) is not None:
+                    taken += len(line)
+                    told.append(one)
+            looked += TOLD_BYTES
+        return HistoryTold(node=self._node, now=wall_s(), lines=tuple(told), cursor=cursor, has_more=has_more)
+
+
+def _history_line(line: bytes) -> HistoryLine | None:
+    """A line as it travels; ``None`` for one that is torn, or that this version does not read."""
+    try:
+        return from_plain(_parsed(line), HistoryLine)
+    except WireError:
+        return None
 
 
 def is_torn(line: bytes) -> bool:

@@ -40,12 +40,14 @@ from zsched.core.values.messages import (
     FleetAnswer,
     FleetQuestion,
     FleetTold,
+    HistoryTold,
     HoldTask,
     Learnt,
     MoveTask,
     Prepare,
     Promise,
     ReadFleet,
+    ReadHistory,
     ReadLines,
     Refused,
     TuneTask,
@@ -77,7 +79,7 @@ RING = 1024
 MAX_LIVES = 1024
 """At most this many nodes' incarnations and sessions are remembered: commands to them are sealed for the former."""
 
-Answer = Snapshot | CommandResult | Explanation | WorkerLines | FleetTold | RehearsalsTold
+Answer = Snapshot | CommandResult | Explanation | WorkerLines | HistoryTold | FleetTold | RehearsalsTold
 Post = Callable[[ev.Event], None]
 log = logging.getLogger("zsched.bus")
 
@@ -111,6 +113,8 @@ def answer_classes(command: Command | None) -> tuple[type[Answer], ...]:
         return (FleetTold,)
     if isinstance(command, ReadRehearsals):
         return (RehearsalsTold, CommandResult)
+    if isinstance(command, ReadHistory):
+        return (HistoryTold, CommandResult)
     return (WorkerLines,) if isinstance(command, ReadLines) else (CommandResult, Explanation)
 
 
@@ -420,7 +424,7 @@ class ControlBus:
             return ev.StatusAsked(request=self._questions.keep(query, keys.status(node, asker)))
         if kind == "command":
             command: Any = wire.decode(payload, *COMMANDS)
-            if not isinstance(command, ExplainTask | ReadLines | ReadFleet | ReadRehearsals):
+            if not isinstance(command, ExplainTask | ReadLines | ReadHistory | ReadFleet | ReadRehearsals):
                 log.info("command=%s from=%s", type(command).__name__, asker)
                 if holder is not None:
                     command = signed_by(holder, command)

@@ -101,6 +101,10 @@ def _on_lines(_node: Stages, event: ev.LinesAsked, todo: ToDo, _now: float) -> N
     todo.add(do.AnswerLines(request=event.request, task=event.command.task, after=event.command.after))
 
 
+def _on_history(_node: Stages, event: ev.HistoryAsked, todo: ToDo, _now: float) -> None:
+    todo.add(do.AnswerHistory(request=event.request, cursor=event.command.cursor))
+
+
 def _on_certificate(_node: Stages, event: ev.CertificateSent, todo: ToDo, _now: float) -> None:
     todo.add(do.TakeCertificate(request=event.request, certificate=event.command.certificate))
 
@@ -135,6 +139,7 @@ HANDLERS: Final[Mapping[type[Any], Handler]] = {
     ev.ExplanationAsked: _on_explanation,
     ev.RestartCommanded: _on_restart,
     ev.LinesAsked: _on_lines,
+    ev.HistoryAsked: _on_history,
     ev.CertificateSent: _on_certificate,
     ev.FrameDropped: _on_dropped,
     ev.Commanded: _on_commanded,

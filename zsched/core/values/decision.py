@@ -135,6 +135,23 @@ class Move(Struct, frozen=True, kw_only=True):
     """No owner has changed: it is the first that the node learns of the task since its start. ``left`` is ``None``."""
 
 
+class HistoryLine(Struct, frozen=True, kw_only=True):
+    """One line of a decision log that the history of tasks is made from."""
+
+    at: float
+    """Seconds since the Unix epoch, by the wall clock of the node that has written it."""
+    life: int
+    """The daemon's incarnation."""
+    task: TaskId = ""
+    epoch: int = 0
+    text: str = ""
+    move: Move | None = None
+    took_s: float | None = None
+    gap_s: float | None = None
+    rehearsal: str = ""
+    is_rollout: bool = False
+
+
 class Explanation(Struct, frozen=True, kw_only=True):
     """A node's answer about the last judgement of one task."""
 

@@ -5,10 +5,12 @@ Knows: the fields of each message and their ranges. Does not know: keys, bytes, 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from enum import StrEnum
 from typing import Final, Generic, get_args
 
+from zsched.core.values.decision import HistoryLine
 from zsched.core.values.document import Document, Text
 from zsched.core.values.electorate import FleetValue, check_id
 from zsched.core.values.model import (
@@ -30,6 +32,8 @@ from zsched.core.values.rehearsal import KeepRehearsal, ReadRehearsals, Strike
 from zsched.core.values.struct import Struct, replace
 from zsched.core.values.words import Readings, check_range
 
+_CURSOR: Final = re.compile(r"([0-9]{1,20}:[0-9]{1,15})?")
+"""A file of the log and an offset in it (`zsched.adapters.host.decision_log`)."""
 MAX_CERTIFICATE: Final = 4096
 """Characters of a certificate that is sent to a node; those of `zsched pki` have 900."""
 
@@ -386,6 +390,17 @@ class ReadLines(Struct, frozen=True, kw_only=True):
         check_counter("lines.after", self.after)
 
 
+class ReadHistory(Struct, frozen=True, kw_only=True):
+    """Operator's question to one node: what its decision log tells of moves, rehearsals and rollouts."""
+
+    cursor: str = ""
+    """Where the page before ended; empty: begin with the oldest line."""
+
+    def __post_init__(self) -> None:
+        if _CURSOR.fullmatch(self.cursor) is None:
+            raise ValueError(f"history.cursor: {self.cursor!r:.80} is no place in a log")
+
+
 class ChangeFleet(Struct, frozen=True, kw_only=True):
     """Operator command to one node: commit one change of the fleet. Exactly one of the three changes is given.
 
@@ -489,6 +504,7 @@ Command = (
     | RestartTask
     | TakeCertificate
     | ReadLines
+    | ReadHistory
     | MoveTask
     | HoldTask
     | TuneTask
@@ -539,6 +555,21 @@ class WorkerLines(Struct, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         check_name("worker_lines.node", self.node)
         check_name("worker_lines.task", self.task)
+
+
+class HistoryTold(Struct, frozen=True, kw_only=True):
+    """The answer to `ReadHistory`: a page of the log, the oldest line first."""
+
+    node: NodeId
+    now: float
+    """Its wall clock: ages are made of it and of the lines' times, which are by the same clock."""
+    lines: tuple[HistoryLine, ...] = ()
+    cursor: str = ""
+    """Where the page ends."""
+    has_more: bool = False
+
+    def __post_init__(self) -> None:
+        check_name("history_told.node", self.node)
 
 
 class CommandOutcome(StrEnum):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import queue
 import resource
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,8 +14,10 @@ import pytest
 
 from zsched.adapters.host.decision_log import NAME, OLD_NAME, QUEUE_LIMIT, SCHEMA, DecisionLog, read_page
 from zsched.core.instructions import RecordStory
-from zsched.core.values.decision import Decision, Figures, Move, Rules, Verdict
+from zsched.core.values.decision import Decision, Figures, HistoryLine, Move, Rules, Verdict
+from zsched.core.values.messages import HistoryTold
 from zsched.core.values.model import Allocation, Reach, Tuning, Weights
+from zsched.wire.codec import LARGE, decode, encode
 
 MOVE = Move(epoch=2, revision=2, left="edge1", owner="edge2", reason="edge1 is gone", votes=(("robot1", "edge2"),))
 VALUE = Allocation(
@@ -202,3 +206,41 @@ def test_a_line_longer_than_a_page_is_read_whole(tmp_path: Path, size: int) -> N
     Kept(tmp_path).write(story("x" * 400))
     page, _, _ = read_page(tmp_path, "", most_bytes=size)
     assert json.loads(page[0])["text"] == "x" * 400
+
+
+def test_another_machine_is_told_the_moves_by_the_log_s_thread_page_by_page(tmp_path: Path) -> None:
+    log = DecisionLog(tmp_path, "robot1", 7, lambda _problem: None)
+    log.start()
+    for number in range(1200):
+        log.put(story("stay edge1: nobody better", decision=DECISION))
+        log.put(story(f"learnt {number} " + "x" * 200, move=MOVE))
+        while log._queue.qsize() > 500:
+            time.sleep(0.001)
+    told: queue.SimpleQueue[HistoryTold | None] = queue.SimpleQueue()
+    found: list[HistoryLine] = []
+    cursor, pages = "", 0
+    while True:
+        assert log.ask(cursor, told.put)
+        page = told.get(timeout=10.0)
+        assert page is not None
+        assert len(encode(page)) < LARGE
+        assert decode(encode(page), HistoryTold) == page
+        found += page.lines
+        cursor, pages = page.cursor, pages + 1
+        if not page.has_more:
+            break
+    log.close()
+    assert [line.text.split()[1] for line in found] == [str(number) for number in range(1200)]
+    assert found[0].move == MOVE
+    assert pages > 3
+
+
+def test_only_some_questions_wait_at_a_time_and_a_log_that_cannot_be_read_is_no_history(tmp_path: Path) -> None:
+    log = DecisionLog(tmp_path, "robot1", 7, lambda _problem: None)
+    told: list[HistoryTold | None] = []
+    assert [log.ask("", told.append) for _ in range(6)] == [True, True, True, True, False, False]
+    (tmp_path / NAME).mkdir()
+    log.start()
+    log.close()
+    assert told == [None] * 4
+    assert log.ask("", told.append), "who was answered waits no more"

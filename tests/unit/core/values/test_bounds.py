@@ -15,6 +15,7 @@ from support.profiles import load_of, profile_of
 from support.proposals import proposal_of
 from zsched.core.events import (
     FleetReadAsked,
+    HistoryAsked,
     LinesAsked,
     RehearsalKept,
     RehearsalsAsked,
@@ -32,10 +33,12 @@ from zsched.core.values.fleet import Demand
 from zsched.core.values.messages import (
     Accepted,
     FleetTold,
+    HistoryTold,
     Learnt,
     Prepare,
     Promise,
     ReadFleet,
+    ReadHistory,
     ReadLines,
     Refusal,
     Refused,
@@ -162,6 +165,7 @@ NAMES = [
     (WorkerLines(node="edge1", task="merge"), "node", "worker_lines"),
     (WorkerLines(node="edge1", task="merge"), "task", "worker_lines"),
     (FleetTold(node="edge1", value=None, fleet_file=""), "node", "fleet_told"),
+    (HistoryTold(node="edge1", now=1.0), "node", "history_told"),
 ]
 RATIO = (0.0, 1.0)
 RANGES = [
@@ -250,6 +254,7 @@ def test_each_command_is_its_own_event() -> None:
     assert commanded(8, RetryTask(task="merge")) == RetryCommanded(request=8, command=RetryTask(task="merge"))
     assert commanded(9, RestartTask(task="merge")) == RestartCommanded(request=9, command=RestartTask(task="merge"))
     assert commanded(9, ReadLines(task="merge")) == LinesAsked(request=9, command=ReadLines(task="merge"))
+    assert commanded(9, ReadHistory()) == HistoryAsked(request=9, command=ReadHistory())
     strike = Strike(task="merge", step=Step.DAEMON, asked=Asked(by="ada@robot1"))
     assert commanded(9, strike) == StrikeCommanded(request=9, command=strike)
     assert commanded(9, strike, is_near=True) == StrikeCommanded(request=9, command=strike, is_near=True)

@@ -280,6 +280,23 @@ SAMPLES: dict[str, object] = {
         lines=(messages.WorkerLine(number=13, age_s=1.5, text="merged 3 maps"),),
         newest=14,
     ),
+    "read_history": messages.ReadHistory(cursor="4711:65536"),
+    "history_told": messages.HistoryTold(
+        node="edge1",
+        now=1_790_000_100.5,
+        lines=(
+            decision.HistoryLine(
+                at=1_790_000_000.25,
+                life=3,
+                task="map_merge",
+                epoch=4,
+                text="learnt edge1",
+                move=decision.Move(epoch=4, revision=7, left="edge2", owner="edge1", reason="edge2 is gone"),
+            ),
+        ),
+        cursor="4711:70000",
+        has_more=True,
+    ),
     "strike": rehearsal.Strike(task="map_merge", step=rehearsal.Step.LINK, asked=_ASKED, cut_s=5.0, is_plan=True),
     "keep_rehearsal": rehearsal.KeepRehearsal(
         task="map_merge", name="20261124-002423", body=document.Text("{}"), told="2 steps", asked=_ASKED
