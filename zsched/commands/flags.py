@@ -54,6 +54,8 @@ class DrainOrder(Struct, frozen=True, kw_only=True):
     """``LEAVE``: they give up their seats among the electors, too."""
     more_rows: tuple[Row, ...] = ()
     """What else follows, in the table of what changes."""
+    is_shown: bool = False
+    """The operator has seen the table, and has agreed."""
 
 
 class _Watch(Struct):
@@ -91,7 +93,7 @@ def drain(view: OrderView, order: DrainOrder) -> int:
     owned = [row[0] for row in rows if row[1] == "owner"]
     plan = _body("planned", nodes=nodes, revision=held.revision, tasks=owned, reason=danger)
     is_change = after != held.flags
-    if is_change or view.is_plan:
+    if (is_change or view.is_plan) and not order.is_shown:
         code = begin(view, [*rows, *order.more_rows], plan, is_change=is_change, titles=TITLES, is_line=True)
         if code is not None:
             return code
@@ -105,6 +107,17 @@ def drain(view: OrderView, order: DrainOrder) -> int:
         return EXIT_OK
     watching = _Watch(view=view, began=monotonic_s(), owners=_owned(status, nodes), before=before, kind=order.kind)
     return _watch(watching, nodes, revision, order.deadline_s)
+
+
+def check_drain(view: OrderView, order: DrainOrder) -> None:
+    """Refuse what `drain` would refuse, before anything is done.
+
+    Raises:
+        CliError: as of `drain`.
+    """
+    status, held = _status(view.door), _held(view)
+    after = _with(view, held, order.kind, _chosen(status, order))
+    _check_dangers(view, order.accepted, status, held.flags, after)
 
 
 def undrain(view: OrderView, nodes: Sequence[str]) -> int:

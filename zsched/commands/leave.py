@@ -60,9 +60,11 @@ class LeaveOrder(Struct, frozen=True, kw_only=True):
     is_plan: bool = False
     is_yes: bool = False
     is_json: bool = False
+    verb: str = "zsched leave"
+    """The command as it is to be given again."""
 
 
-class _Way(Struct, frozen=True, kw_only=True):
+class Way(Struct, frozen=True, kw_only=True):
     """One node on its way out."""
 
     order: LeaveOrder
@@ -73,6 +75,7 @@ class _Way(Struct, frozen=True, kw_only=True):
 
     @property
     def door(self) -> Door:
+        """To its daemon."""
         return self.view.door
 
     def tell(self, text: str) -> None:
@@ -88,7 +91,7 @@ class _Way(Struct, frozen=True, kw_only=True):
         """
         passed_s = monotonic_s() - self.began
         if passed_s >= self.order.deadline_s:
-            again = f"give `zsched leave` again to go on, or take it back: zsched undrain {self.me}"
+            again = f"give `{self.order.verb}` again to go on, or take it back: zsched undrain {self.me}"
             raise CliError(EXIT_TIMED_OUT, f"{self.me} has not left after {span(passed_s)}: {lacks}; {again}")
 
 
@@ -107,7 +110,7 @@ def leave(order: LeaveOrder) -> int:
     fleet, me = whose(order.places.state)
     files = belongings(order.places, is_purged=order.is_purged)
     try:
-        door = _own_door(order, me)
+        door = own_door(order, me)
         status = ask_door(door, {"verb": "status"})
     except CliError as error:
         if error.code != EXIT_UNREACHABLE:
@@ -118,15 +121,20 @@ def leave(order: LeaveOrder) -> int:
         other = f"{status['node']} of fleet {status['fleet']}"
         raise CliError(EXIT_USAGE, f"the daemon here is {other}, and {order.places.state} is {me}'s; give --state-dir")
     view = OrderView(door=door, is_json=order.is_json, is_yes=order.is_yes, is_plan=order.is_plan, reason=order.reason)
-    way = _Way(order=order, view=view, me=me, began=monotonic_s(), files=files)
+    way = Way(order=order, view=view, me=me, began=monotonic_s(), files=files)
     code = _take_leave(way, status)
     if code != EXIT_OK:
         return code
-    _stop(way, fleet)
+    stop_daemon(way, fleet, f"{me} has left {fleet}")
     return _end(order, fleet, me, files)
 
 
-def _own_door(order: LeaveOrder, me: str) -> Door:
+def own_door(order: LeaveOrder, me: str) -> Door:
+    """To the daemon of this machine.
+
+    Raises:
+        CliError: it does not run (3).
+    """
     door = find_door(order.runtime_dir, me)
     if door.node is not None:
         raise CliError(EXIT_UNREACHABLE, f"no daemon of {me} runs on this machine")
@@ -148,11 +156,11 @@ def _accept(order: LeaveOrder, name: str, means: str) -> None:
 # --- while the daemon runs -------------------------------------------------------------------------------------------
 
 
-def _take_leave(way: _Way, status: Json) -> int:
+def _take_leave(way: Way, status: Json) -> int:
     """Have the fleet agree, step by step; the exit code."""
     order, me = way.order, way.me
     held = _newest(way, status)
-    members = _members(held, status)
+    members = members_of(held, status)
     danger = _danger(way, status, held, members)
     if danger is not None:
         _accept(order, *danger)
@@ -160,10 +168,10 @@ def _take_leave(way: _Way, status: Json) -> int:
         way.tell(f"{me} is no node of {held.fleet} since revision {held.revision}")
     if danger is not None or me not in members:
         return _planned(way, held.fleet) if order.is_plan else EXIT_OK
-    _without_me(document_text(held), me)  # its faults come before anything is done
+    without(document_text(held), me)  # its faults come before anything is done
     rows: tuple[Row, ...] = ((me, "member", held.fleet, "-"),)
     if any(name == me for name, _ in held.electors):
-        rows = (*rows, (me, "elector", ", ".join(name for name, _ in held.electors), _others(held, me)))
+        rows = (*rows, (me, "elector", ", ".join(name for name, _ in held.electors), others_of(held, me)))
     drained = DrainOrder(
         nodes=(me,),
         kind=LEAVE,
@@ -176,21 +184,22 @@ def _take_leave(way: _Way, status: Json) -> int:
         return _planned(way, held.fleet)
     if order.is_plan or code != EXIT_OK:
         return EXIT_WOULD_CHANGE if order.is_plan and code == EXIT_OK else code
-    _give_up_the_seat(way)
+    give_up_the_seat(way)
     _go_out(way)
     return EXIT_OK
 
 
-def _planned(way: _Way, fleet: str) -> int:
+def _planned(way: Way, fleet: str) -> int:
     _told(way.order, fleet, way.me, way.files, "planned", f"{way.me} would leave {fleet}")
     return EXIT_WOULD_CHANGE
 
 
-def _others(held: InForce, me: str) -> str:
+def others_of(held: InForce, me: str) -> str:
+    """The electors without this node, in words."""
     return ", ".join(name for name, _ in held.electors if name != me) or "another node"
 
 
-def _newest(way: _Way, status: Json) -> InForce:
+def _newest(way: Way, status: Json) -> InForce:
     """The newest document that some node of the fleet has: this one may have been taken out of it."""
     held = in_force(way.door)
     if held.text:
@@ -205,7 +214,7 @@ def _newest(way: _Way, status: Json) -> InForce:
     return held
 
 
-def _members(held: InForce, status: Json) -> tuple[str, ...]:
+def members_of(held: InForce, status: Json) -> tuple[str, ...]:
     """The nodes of the document, or of the file by which each machine goes."""
     if not held.document:
         return tuple(str(node["name"]) for node in status["nodes"])
@@ -216,7 +225,7 @@ def _members(held: InForce, status: Json) -> tuple[str, ...]:
     return tuple(node.name for node in fleet.nodes)
 
 
-def _danger(way: _Way, status: Json, held: InForce, members: tuple[str, ...]) -> tuple[str, str] | None:
+def _danger(way: Way, status: Json, held: InForce, members: tuple[str, ...]) -> tuple[str, str] | None:
     """(name, what it means) of what keeps the fleet from agreeing; ``None``: it can."""
     me, quorum = way.me, status["quorum"]
     if members == (me,):
@@ -232,7 +241,7 @@ def _danger(way: _Way, status: Json, held: InForce, members: tuple[str, ...]) ->
     return None
 
 
-def _without_me(text: str, me: str) -> str:
+def without(text: str, me: str) -> str:
     """The document without this node.
 
     Raises:
@@ -245,7 +254,7 @@ def _without_me(text: str, me: str) -> str:
     return shorter
 
 
-def _give_up_the_seat(way: _Way) -> None:
+def give_up_the_seat(way: Way) -> None:
     """Wait until this node knows that the electors have settled without it (rule of `may_go`).
 
     By itself an elector that leaves is removed; one that the operator has named is removed by this command.
@@ -266,7 +275,7 @@ def _give_up_the_seat(way: _Way) -> None:
         time.sleep(PAUSE_S)
 
 
-def _ask_for_the_seat(way: _Way, held: InForce) -> str:
+def _ask_for_the_seat(way: Way, held: InForce) -> str:
     """Why the seat is not given up yet."""
     if not held.is_settled:
         return f"number {held.number} is being settled"
@@ -279,7 +288,7 @@ def _ask_for_the_seat(way: _Way, held: InForce) -> str:
     return "it is removed"
 
 
-def _go_out(way: _Way) -> None:
+def _go_out(way: Way) -> None:
     """Have this node taken out of the document, and wait until the others know.
 
     One of them proposes it: this node would not store a document that does not name it.
@@ -289,7 +298,7 @@ def _go_out(way: _Way) -> None:
         try:
             held = in_force(way.door.to(others[count % len(others)]) if others else way.door)
             flags = [flag for flag in held.flags if flag["subject"] != way.me]
-            text = {"text": _without_me(document_text(held), way.me), "flags": flags, "rollouts": list(held.rollouts)}
+            text = {"text": without(document_text(held), way.me), "flags": flags, "rollouts": list(held.rollouts)}
             answer = change(way.door.to(held.node), {**text, "base_revision": held.revision, "reason": _reason(way)})
         except CliError as error:
             way.check_time(str(error))
@@ -301,7 +310,7 @@ def _go_out(way: _Way) -> None:
     _wait_until_known(way, revision)
 
 
-def _alive(way: _Way) -> list[str]:
+def _alive(way: Way) -> list[str]:
     """The other nodes that are alive, electors first."""
     status = ask_door(way.door, {"verb": "status"})
     electors = status["quorum"]["names"]
@@ -309,7 +318,7 @@ def _alive(way: _Way) -> list[str]:
     return sorted(names, key=lambda name: name not in electors)
 
 
-def _wait_until_known(way: _Way, revision: int) -> None:
+def _wait_until_known(way: Way, revision: int) -> None:
     """Wait until the others have that document; a node that does not in time learns it from them."""
     until = monotonic_s() + LEARN_S
     waiting = _alive(way)
@@ -329,7 +338,7 @@ def _knows(answer: Json | CliError, revision: int) -> bool:
     return int(answer["revision"]) >= revision and bool(answer["text"])
 
 
-def _reason(way: _Way) -> str:
+def _reason(way: Way) -> str:
     asked = way.view.asked
     return f"leave, by {asked['by']}" + (f": {way.order.reason}" if way.order.reason else "")
 
@@ -337,8 +346,8 @@ def _reason(way: _Way) -> str:
 # --- the end ---------------------------------------------------------------------------------------------------------
 
 
-def _stop(way: _Way, fleet: str) -> None:
-    """End the daemon, and wait until it has given its state folder back.
+def stop_daemon(way: Way, fleet: str, done: str) -> None:
+    """End the daemon, and wait until it has given its state folder back; ``done``: what has been done so far.
 
     Raises:
         CliError: it does not end.
@@ -350,8 +359,8 @@ def _stop(way: _Way, fleet: str) -> None:
             check_ended(fleet, way.me, way.order.places)
         except AdapterError as error:
             if monotonic_s() > until:
-                told = f"{way.me} has left {fleet}, and its daemon does not end: {error}"
-                raise CliError(EXIT_TIMED_OUT, f"{told}; stop it, then give `zsched leave` again") from error
+                told = f"{done}, and its daemon does not end: {error}"
+                raise CliError(EXIT_TIMED_OUT, f"{told}; stop it, then give `{way.order.verb}` again") from error
             time.sleep(PAUSE_S)
         else:
             way.tell(f"{way.me}: the daemon has ended")

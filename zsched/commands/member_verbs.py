@@ -7,13 +7,14 @@ the verb that runs).
 from __future__ import annotations
 
 import os
+import shlex
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from zsched.commands.common import Verb
+from zsched.commands.common import CliError, Verb
 from zsched.commands.fleet_verbs import (
     AcceptOption,
     PlanOption,
@@ -194,7 +195,6 @@ def join(
     Nothing of another fleet is touched: it is refused. Start the daemon then; it votes as soon as it hears the others.
     """
     from zsched.commands import membership  # noqa: PLC0415 - each verb imports what it needs
-    from zsched.commands.common import CliError  # noqa: PLC0415 - as above
     from zsched.exits import EXIT_USAGE  # noqa: PLC0415 - as above
 
     if (file is None) == (request is None):
@@ -210,6 +210,10 @@ def join(
 
 
 def leave(
+    to: Annotated[
+        str | None,
+        typer.Option("--to", metavar="CELL", help="Join this cell of the site; or the file of an invitation into one."),
+    ] = None,
     purge: Annotated[
         bool,
         typer.Option("--purge", help="Delete this machine's files of the fleet, its key too; else they are renamed."),
@@ -230,11 +234,17 @@ def leave(
 
     Nothing of the others' streams is interrupted. Exits with 5 at the deadline: the leave stays in force, and the same
     command goes on with it; `zsched undrain` takes it back. Another machine is taken out by `zsched node forget`.
+
+    With --to the machine becomes a node of another fleet of the site, and is ready there in the end. Its own fleet
+    names it until then: where the other one does not take it, it goes back.
     """
     from zsched.commands.history import duration_s  # noqa: PLC0415 - each verb imports what it needs
     from zsched.commands.leave import LeaveOrder  # noqa: PLC0415 - as above
     from zsched.commands.leave import leave as go  # noqa: PLC0415 - as above
+    from zsched.exits import EXIT_USAGE  # noqa: PLC0415 - as above
 
+    if to is not None and purge:
+        raise CliError(EXIT_USAGE, "--purge does not go with --to: until it is over, the files are the way back")
     order = LeaveOrder(
         places=_places(config, state_dir),
         runtime_dir=runtime_dir,
@@ -245,5 +255,10 @@ def leave(
         is_plan=plan,
         is_yes=yes,
         is_json=json_,
+        verb="zsched leave" if to is None else shlex.join(("zsched", "leave", "--to", to)),
     )
+    if to is not None:
+        from zsched.commands.change_cell import change_cells  # noqa: PLC0415 - as above
+
+        raise typer.Exit(change_cells(order, to))
     raise typer.Exit(go(order))

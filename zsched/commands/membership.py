@@ -221,7 +221,9 @@ def create(view: CreateView) -> int:
         outcome=outcome,
         said=f"would be written; {said}" if view.is_plan else said,
         files=files if papers is None else (*files, *papers.files),
-        next=() if view.is_plan else (*_start(view.node, view.places), more, *([papers.advice] if papers else [])),
+        next=()
+        if view.is_plan
+        else (*how_to_start(view.node, view.places), more, *([papers.advice] if papers else [])),
     )
     told.tell(is_json=view.is_json)
     return EXIT_WOULD_CHANGE if view.is_plan else EXIT_OK
@@ -244,7 +246,7 @@ def _first_text(view: CreateView, address: Address) -> str:
     )
 
 
-def _start(node: NodeId, where: Places) -> tuple[str, ...]:
+def how_to_start(node: NodeId, where: Places) -> tuple[str, ...]:
     """How its daemon is started."""
     by_default = places.SYSTEM_CONFIG, Path("/var/lib/zsched")
     is_named = node == places.node_name(None, {})
@@ -284,7 +286,7 @@ def invite(door: Door, view: ApplyView, guest: Guest, file: Path | None) -> int:
     if file is None and sys.stdout.isatty() and not view.is_plan:
         raise CliError(EXIT_USAGE, f"the invitation is a file: zsched invite {guest.name} > {guest.name}.invite")
     held = in_force(door)
-    fleet = _fleet_of(document_text(held))
+    fleet = fleet_of(document_text(held))
     check_request(fleet, guest.request, guest.authority)
     secret = b"" if view.is_plan else key_to_papers(fleet, guest.authority)
     if fleet.security is None and guest.address is not None:
@@ -297,7 +299,7 @@ def invite(door: Door, view: ApplyView, guest: Guest, file: Path | None) -> int:
         if code != EXIT_OK:
             return code
     if not view.is_plan:
-        _write(_invitation(door, guest, secret), guest, file)
+        _write(invitation_for(door, guest, secret), guest, file)
     return EXIT_OK
 
 
@@ -311,7 +313,12 @@ def _check_invited_again(door: Door, guest: Guest) -> None:
         raise CliError(EXIT_FAILED, f"{guest.name} is in the document already; {advice}")
 
 
-def _fleet_of(text: str) -> Fleet:
+def fleet_of(text: str) -> Fleet:
+    """The fleet of a document in force.
+
+    Raises:
+        CliError: it has faults for this version.
+    """
     fleet = check_bytes(text.encode(), DOCUMENT).fleet
     if fleet is None:
         advice = "update zsched here; `zsched fleet export` shows the document"
@@ -322,8 +329,8 @@ def _fleet_of(text: str) -> Fleet:
 def _with_guest(held: InForce, guest: Guest, address: Address | None) -> str:
     """The document with the node, as the last one to dial, and among the candidates."""
     text = document_text(held)
-    fleet = _fleet_of(text)
-    entry = _entry_of(guest.name, guest.kind, address, _protocol(fleet))
+    fleet = fleet_of(text)
+    entry = _entry_of(guest.name, guest.kind, address, protocol_of(fleet))
     text = add_entries(text, "nodes", f"nodes:\n{entry}", f"the name {guest.name}")
     if address is not None:
         known = fleet.seeds if is_list(text, ("seeds",)) else ()
@@ -344,7 +351,7 @@ def _can_be_dialled(node: NodeSpec) -> bool:
     return all(endpoint and dial_endpoint(endpoint, node.host) for endpoint in ends)
 
 
-def _protocol(fleet: Fleet) -> str:
+def protocol_of(fleet: Fleet) -> str:
     """With which the others listen."""
     if fleet.security is not None:
         return SECURED
@@ -358,13 +365,13 @@ def _with_candidate(text: str, fleet: Fleet, task: str, guest: Guest) -> str:
         raise CliError(EXIT_USAGE, f"--candidate-for: fleet {fleet.name} has no task {task!r}{nearest(task, names)}")
     if is_list(text, ("tasks", task, "candidates")):
         return add_names(text, ("tasks", task, "candidates"), [guest.name])
-    if guest.name not in _fleet_of(text).task(task).candidates:
+    if guest.name not in fleet_of(text).task(task).candidates:
         advice = "invite it without that, and change them with `zsched edit`"
         raise CliError(EXIT_FAILED, f"the candidates of {task} are a selection that {guest.name} is not in; {advice}")
     return text
 
 
-def _invitation(door: Door, guest: Guest, secret: bytes) -> Invitation:
+def invitation_for(door: Door, guest: Guest, secret: bytes) -> Invitation:
     """What the node at the door goes by now, with a certificate for the new one."""
     told = ask_door(door, {"verb": "fleet"})
     try:
@@ -373,7 +380,7 @@ def _invitation(door: Door, guest: Guest, secret: bytes) -> Invitation:
         document = from_plain(parts, Document)
     except (KeyError, WireError) as error:
         raise CliError(EXIT_FAILED, f"{told['node']} does not tell its fleet value: update zsched there") from error
-    fleet = _fleet_of(document.text)
+    fleet = fleet_of(document.text)
     addresses = [dial_endpoint(node.listen_control, node.host) for node in fleet.nodes if node.name != guest.name]
     papers = papers_for(fleet, guest.name, guest.authority, guest.request, secret)
     return Invitation(
@@ -429,7 +436,7 @@ def join(file: str, where: Places, *, is_plan: bool, is_json: bool) -> int:
         AdapterError: the machine has files of another fleet or node, or a file cannot be written.
         ConfigError: the document cannot be used here.
     """
-    invitation = _read(file)
+    invitation = read_invitation(file)
     fleet, node = invitation.fleet, invitation.node
     if is_joined(invitation, where):
         said = f"{where.state}: this machine is {node} of fleet {fleet} already: nothing to do"
@@ -438,7 +445,7 @@ def join(file: str, where: Places, *, is_plan: bool, is_json: bool) -> int:
     read, files = join_here(invitation, where, is_plan=is_plan)
     would = "would become" if is_plan else "is"
     said = f"{fleet}: this machine {would} {node} (generation {invitation.value.generation_id[:8]})"
-    follow = () if is_plan else (*_lacking(read, invitation), *_start(node, where), *_look(invitation))
+    follow = () if is_plan else (*_lacking(read, invitation), *how_to_start(node, where), *_look(invitation))
     outcome = "planned" if is_plan else "joined"
     Told(fleet=fleet, node=node, outcome=outcome, said=said, files=files, next=follow).tell(is_json=is_json)
     return EXIT_WOULD_CHANGE if is_plan else EXIT_OK
@@ -461,7 +468,12 @@ def request(name: str, where: Places, out: Path | None, *, is_json: bool) -> int
     return EXIT_OK
 
 
-def _read(file: str) -> Invitation:
+def read_invitation(file: str) -> Invitation:
+    """The invitation in a file; ``-``: stdin.
+
+    Raises:
+        CliError: it cannot be read, or is none.
+    """
     try:
         data = sys.stdin.buffer.read(MAX_BYTES + 1) if file == "-" else read_regular(Path(file), MAX_BYTES)
     except OSError as error:

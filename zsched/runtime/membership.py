@@ -54,6 +54,8 @@ LEFT: Final = ".left"
 """Behind the names of files of a fleet that this machine has left."""
 COPY_NAME: Final = "copied"
 """In the state folder: the hash of the fleet file that was written as a copy of the document."""
+NEXT_CELL: Final = "next-cell"
+"""In the state folder, while the machine changes cells: private keys are in it, and only its owner may read it."""
 PUBLIC_MODE, PRIVATE_MODE, FOLDER_MODE = 0o644, 0o600, 0o755
 _WHAT: Final = {
     CERTIFICATE: "the certificate",
@@ -318,8 +320,12 @@ def check_ended(fleet: str, node: NodeId, places: Places) -> None:
         pass
 
 
-def put_away(fleet: str, node: NodeId, places: Places, *, is_purged: bool) -> tuple[Written, ...]:
+def put_away(
+    fleet: str, node: NodeId, places: Places, *, is_purged: bool, comes_back: bool = False
+) -> tuple[Written, ...]:
     """Rename this machine's files of its fleet, or delete them; then it can found or join one. Its daemon has ended.
+
+    ``comes_back``: they may be wanted again (`bring_back`), so nothing is deleted.
 
     Raises:
         AdapterError: a daemon runs by them, they are another node's, or one cannot be renamed or deleted.
@@ -328,8 +334,34 @@ def put_away(fleet: str, node: NodeId, places: Places, *, is_purged: bool) -> tu
         file.check_owner()
         there = tuple(_belongings(places, is_purged=is_purged))
         for one in there:
-            _put_one_away(one.path, is_deleted=is_purged or one.path.name == COPY_NAME)
+            _put_one_away(one.path, is_deleted=is_purged or (one.path.name == COPY_NAME and not comes_back))
     return tuple(Written(path=one.path, what=_fate(one, is_purged=is_purged)) for one in there)
+
+
+def bring_back(fleet: str, node: NodeId, places: Places, *, is_secured: bool) -> None:
+    """Delete this machine's files of ``fleet``, and give those that were put away for it their names again.
+
+    Its daemon has ended. The state goes first and comes last, so that a machine is never two nodes.
+    ``is_secured``: there were certificates among them.
+
+    Raises:
+        AdapterError: a daemon runs by them, they are another node's, or one cannot be renamed or deleted.
+    """
+    with StateFile(places.state, fleet=fleet, node=node) as file:
+        file.check_owner()
+        for one in reversed(tuple(_belongings(places, is_purged=False))):
+            _put_one_away(one.path, is_deleted=True)
+        names = [places.config, *(places.state / name for name in (COPY_NAME, FOLDER_NAME))]
+        folders = (places.config.parent / PKI_FOLDER, places.state / PKI_FOLDER)
+        names += [folder / name for folder in folders for name in _WHAT if is_secured]
+        for path in (*names, places.state / STATE_NAME):
+            old = path.with_name(f"{path.name}{LEFT}")
+            try:
+                if os.path.lexists(old):
+                    old.rename(path)
+                    sync_folder(path.parent)
+            except OSError as error:
+                raise AdapterError(f"cannot rename {old}: {error.strerror}; {_advice(error, old)}") from error
 
 
 def _belongings(places: Places, *, is_purged: bool) -> Iterator[Written]:
@@ -340,7 +372,8 @@ def _belongings(places: Places, *, is_purged: bool) -> Iterator[Written]:
     for folder in (_pki_folder(places.config), places.state / PKI_FOLDER):
         for name, what in _WHAT.items():
             yield from _there(folder / name, what, is_purged=is_purged)
-    more = (decision_log.OLD_NAME, decision_log.NAME, rehearsals.FOLDER_NAME, core_speed.NAME) if is_purged else ()
+    logs = (decision_log.OLD_NAME, decision_log.NAME)
+    more = (*logs, rehearsals.FOLDER_NAME, core_speed.NAME, NEXT_CELL) if is_purged else ()
     for name in (*more, COPY_NAME, FOLDER_NAME, STATE_NAME):
         yield from _there(places.state / name, _KEPT.get(name, "the node's records"), is_purged=is_purged)
 

@@ -531,6 +531,6 @@ def test_a_file_on_stdout_with_a_key_is_for_its_owner_only(
         monkeypatch.setattr("sys.stdout", out)
         from zsched.commands.ask import find_door
 
-        membership._write(membership._invitation(find_door(None, None), guest, b""), guest, None)
+        membership._write(membership.invitation_for(find_door(None, None), guest, b""), guest, None)
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
     assert decode_invitation(file.read_bytes()).papers is not None

@@ -1,0 +1,197 @@
+"""What a machine keeps while it changes cells: the next one's invitation, and how the former one is still asked.
+
+Knows: the folder, its files, in which order they are written. Does not know: when a machine changes cells
+(`zsched.commands.change_cell`), what becomes of the files of its node (`zsched.runtime.membership`).
+
+The folder is there from before the former cell is asked to let the machine go until it is no node of it any more.
+"""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Final
+
+from zsched.adapters.host.state_file import MAX_STATE_BYTES, STATE_NAME, replace_synced, sync_folder
+from zsched.config.load import check_bytes
+from zsched.config.reader import MAX_FILE_BYTES
+from zsched.config.schema import PKI_FOLDER
+from zsched.core.electorate.pilot import may_go
+from zsched.core.values.fleet import Fleet
+from zsched.core.values.model import NodeId
+from zsched.core.values.struct import Struct
+from zsched.errors import AdapterError, WireError
+from zsched.files import read_regular
+from zsched.runtime.membership import NEXT_CELL, Places, Written, bring_back, is_joined, join, put_away, whose
+from zsched.runtime.secured import CERTIFICATE, KEY, TRUSTED, files_of
+from zsched.wire.codec import decode_state
+from zsched.wire.invitation import MAX_BYTES, Invitation, decode_invitation, encode_invitation
+
+INVITATION: Final = "invitation"
+FILE: Final = "fleet.yaml"
+FORMER, NEXT = "former", "next"
+PRIVATE_FOLDER: Final = 0o700
+
+
+class Change(Struct, frozen=True, kw_only=True):
+    """A change of cells that is under way on this machine."""
+
+    invitation: Invitation
+    former: str
+    """The fleet from which the machine comes."""
+    former_is_secured: bool
+    former_file: Path
+    """Its fleet file, beside the certificate with which it is asked."""
+    next_file: Path
+    """The same of the next one."""
+
+
+def begin(state: Path, fleet: Fleet, text: str, invitation: Invitation) -> Change:
+    """Write what a change needs; the invitation is written last, so a folder without one says nothing.
+
+    Args:
+        state: this machine's state folder.
+        fleet: the fleet that the machine leaves.
+        text: its document.
+        invitation: into the next one.
+
+    Raises:
+        AdapterError: a file cannot be read or written, or the certificates are elsewhere than beside the fleet file.
+    """
+    folder = state / NEXT_CELL
+    try:
+        shutil.rmtree(folder, ignore_errors=True)
+        for name in (FORMER, NEXT):
+            (folder / name / PKI_FOLDER).mkdir(parents=True, mode=PRIVATE_FOLDER)
+        folder.chmod(PRIVATE_FOLDER)
+        _write(folder / FORMER / FILE, text.encode())
+        _write(folder / NEXT / FILE, invitation.document.text.encode())
+        if fleet.security is not None:
+            files = files_of(fleet.security)
+            for name, path in ((CERTIFICATE, files.certificate), (KEY, files.key), (TRUSTED, files.trusted)):
+                _write(folder / FORMER / PKI_FOLDER / name, read_regular(path, MAX_FILE_BYTES))
+        papers = invitation.papers
+        if papers is not None:
+            for name, pem in ((CERTIFICATE, papers.certificate), (KEY, papers.key), (TRUSTED, papers.trusted)):
+                _write(folder / NEXT / PKI_FOLDER / name, pem.encode())
+        for name in (FORMER, NEXT):
+            _check_folder(folder / name / FILE)
+        _write(folder / INVITATION, encode_invitation(invitation).encode())
+    except OSError as error:
+        raise AdapterError(f"{error.filename or folder}: {error.strerror}; run this as root") from error
+    return _change(folder, invitation)
+
+
+def under_way(state: Path) -> Change | None:
+    """The change that was begun on this machine and is not over; ``None``: there is none.
+
+    Raises:
+        AdapterError: its files cannot be read.
+    """
+    folder = state / NEXT_CELL
+    try:
+        return _change(folder, decode_invitation(read_regular(folder / INVITATION, MAX_BYTES)))
+    except FileNotFoundError:
+        return None
+    except (OSError, WireError) as error:
+        raise AdapterError(f"{folder / INVITATION}: {error}; run this as root, or delete {folder}") from error
+
+
+def go_over(change: Change, places: Places) -> tuple[Written, ...]:
+    """Put the files of the former cell away, and write those of the next one; the daemon has ended.
+
+    Whatever part of it was done before is left as it is.
+
+    Raises:
+        AdapterError: a daemon runs by them, or a file cannot be renamed or written.
+        ConfigError: the document cannot be used here.
+    """
+    has_state = (places.state / STATE_NAME).exists()
+    if whose(places.state)[0] == change.former if has_state else _is_file_of(change.former, places.config):
+        put_away(change.former, change.invitation.node, places, is_purged=False, comes_back=True)
+    if is_joined(change.invitation, places):
+        return ()
+    return join(change.invitation, places, is_plan=False)[1]
+
+
+def has_seat(state: Path, fleet: str, node: NodeId) -> bool:
+    """Whether this machine's state is that fleet's, and does not tell that its electors have settled without it.
+
+    Raises:
+        AdapterError: it cannot be read.
+    """
+    try:
+        kept = decode_state(read_regular(state / STATE_NAME, MAX_STATE_BYTES))
+    except FileNotFoundError:
+        return False
+    except (OSError, WireError) as error:
+        raise AdapterError(f"{state / STATE_NAME}: {error}; run this as root") from error
+    value = None if kept.fleet_register is None else kept.fleet_register.learnt
+    return kept.fleet == fleet and (value is None or not may_go(value, node))
+
+
+def go_back(change: Change, places: Places) -> None:
+    """Undo `go_over`; the daemon has ended.
+
+    Raises:
+        AdapterError: a daemon runs by the files, or one cannot be renamed.
+    """
+    if (places.state / STATE_NAME).exists() and whose(places.state)[0] == change.former:
+        return
+    bring_back(change.invitation.fleet, change.invitation.node, places, is_secured=change.former_is_secured)
+
+
+def _is_file_of(fleet: str, path: Path) -> bool:
+    """Whether the fleet file here is that fleet's: a way back was broken off."""
+    try:
+        held = check_bytes(read_regular(path, MAX_FILE_BYTES), str(path)).fleet
+    except OSError:
+        return False
+    return held is not None and held.name == fleet
+
+
+def end(state: Path) -> None:
+    """The change is over: delete what was kept for it, the invitation first.
+
+    Raises:
+        AdapterError: it cannot be deleted.
+    """
+    folder = state / NEXT_CELL
+    try:
+        (folder / INVITATION).unlink(missing_ok=True)
+        if folder.exists():
+            shutil.rmtree(folder)
+            sync_folder(state)
+    except OSError as error:
+        raise AdapterError(f"cannot delete {folder}: {error.strerror}; it holds private keys") from error
+
+
+def _change(folder: Path, invitation: Invitation) -> Change:
+    former = folder / FORMER / FILE
+    fleet = check_bytes(read_regular(former, MAX_FILE_BYTES), str(former)).fleet
+    if fleet is None:
+        raise AdapterError(f"{former} has faults for this version of zsched; delete {folder}")
+    return Change(
+        invitation=invitation,
+        former=fleet.name,
+        former_is_secured=fleet.security is not None,
+        former_file=former,
+        next_file=folder / NEXT / FILE,
+    )
+
+
+def _check_folder(path: Path) -> None:
+    """Refuse a document whose certificates are elsewhere than beside the fleet file: each cell has its own.
+
+    Raises:
+        AdapterError: they are.
+    """
+    fleet = check_bytes(read_regular(path, MAX_FILE_BYTES), str(path)).fleet
+    if fleet is not None and fleet.security is not None and Path(fleet.security.folder) != path.parent / PKI_FOLDER:
+        advice = "leave that out of the document, or change cells by `zsched leave` and `zsched join`"
+        raise AdapterError(f"fleet {fleet.name} says `security: {{folder: {fleet.security.folder}}}`; {advice}")
+
+
+def _write(path: Path, content: bytes) -> None:
+    """Whole; the folder keeps others out."""
+    replace_synced(path, path.with_name(f"{path.name}.new"), content)
