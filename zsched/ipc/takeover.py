@@ -97,6 +97,8 @@ class Door:
         self._socket = folder / f"{node}.relay"
         self._next = folder / f"{node}.relay.next"
         self._lock = folder / f"{node}{_LOCK}"
+        self.books = folder / f"{node}.relay.books"
+        """What this node's relays have counted (`zsched.relay.books`)."""
 
     def note(self) -> Note | None:
         """The note about the relay that runs, ``None`` when none does."""
@@ -193,9 +195,24 @@ class Door:
 
     def remove(self) -> None:
         """Remove the files, once the relay is gone."""
-        for path in (self._socket, self._next, self._words, self._lock):
+        for path in (self._socket, self._next, self._words, *books_files(self.books), self._lock):
             with contextlib.suppress(OSError):
                 path.unlink(missing_ok=True)
+
+
+def taken_file(books: Path) -> Path:
+    """Beside a relay's books: how many samples each input has taken."""
+    return books.with_suffix(".taken")
+
+
+def fresh_file(path: Path) -> Path:
+    """What takes the place of a file once it is whole."""
+    return path.with_name(f"{path.name}.next")
+
+
+def books_files(books: Path) -> tuple[Path, ...]:
+    """All files that may stand there for a relay's books."""
+    return tuple(one for made in (books, taken_file(books)) for one in (made, fresh_file(made)))
 
 
 def relays_in(folder: Path) -> tuple[int, ...]:

@@ -5,6 +5,7 @@ Knows: the command line, signals, the parent's death. Does not know: streams.
 ``python -m zsched.relay --fleet F --node N [--threads T] [--parent PID] [--local]``; the first frame on stdin is
 the zenoh session as JSON (with ``--local`` the second one is that of the host's own side). Logs go to stderr.
 With ``--streams PATH --streams-listen ENDPOINT`` an application of this node may have its streams itself.
+With ``--books PATH`` its counters go on from those of the relay before.
 With ``--door FD --orphan S`` it outlives its daemon for S seconds and obeys the next one that comes through the door;
 without, it dies with its parent.
 """
@@ -65,6 +66,7 @@ def main() -> None:
             orphan_s=arguments.orphan,
             streams=Path(arguments.streams) if arguments.streams else None,
             streams_listen=arguments.streams_listen,
+            books=Path(arguments.books) if arguments.books else None,
         )
     except SystemExit:
         code = 0
@@ -90,6 +92,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--session", default="", help="a digest over what the data session is opened with")
     parser.add_argument("--streams", default="", help="the socket for an application that has its streams itself")
     parser.add_argument("--streams-listen", default="", help="the endpoint at which workers dial that application")
+    parser.add_argument("--books", default="", help="the file in which a relay finds what those before have counted")
     parser.add_argument("--log-level", default="WARNING")
     return parser.parse_args()
 

@@ -157,6 +157,11 @@ class Application:
                 return
         self._report(word)
 
+    def settled(self, counts: tuple[StreamCount, ...]) -> tuple[StreamCount, ...]:
+        """Our own counters with those of applications that have gone."""
+        with self._lock:
+            return self._shares.settled(counts)
+
     def added(self, counts: tuple[StreamCount, ...]) -> tuple[StreamCount, ...]:
         """Our own counters with the application's."""
         with self._lock:

@@ -25,7 +25,7 @@ from typing import Final
 
 import zenoh
 
-from zsched.clock import awake_s
+from zsched.clock import awake_s, monotonic_s
 from zsched.core.events import FrameDropped, ProblemReported, RoleEnded, StreamsCounted
 from zsched.core.membership.relink import Introductions
 from zsched.core.relay_protocol import RelayReport, RelayStarted, RelayStop, TaskEnded, WorkerSeen, WorkerWatch
@@ -37,6 +37,7 @@ from zsched.heap import give_back
 from zsched.ipc.pipe import COMMANDS, read_frame, wait_readable, write_frame
 from zsched.ipc.protocol import RelayHello, RelayPulse
 from zsched.relay.application import Application
+from zsched.relay.books import Books
 from zsched.relay.graph import GraphMirror
 from zsched.relay.local_side import LocalSide
 from zsched.relay.matching import Matching
@@ -68,6 +69,10 @@ ANEW_S: Final = 60.0
 END_S: Final = 3.0
 """The session has this time to close, and its port to be free."""
 RETRY_S: Final = 0.05
+FINISH_S: Final = 0.3
+"""A relay that ends lets what is under way arrive, and closes its streams, within this time..."""
+FINISH_SPARE_S: Final = 0.1
+"""...of which this much is left for the closing."""
 MAX_REPORTS: Final = 4096
 SOURCE: Final = "relay"
 
@@ -161,8 +166,13 @@ class RelayProcess:
         link_lease_s: float = DEFAULT_LEASE_S,
         members: frozenset[str] | None = None,
         application: Application | None = None,
+        books: Books | None = None,
     ) -> None:
-        """``link_lease_s``: zenoh's, on the session's links. ``members``: the common names that it lets in, if any."""
+        """``link_lease_s``: zenoh's, on the session's links. ``members``: the common names that it lets in, if any.
+
+        ``books``: with what relays before this one have counted.
+        """
+        self._books = books or Books(None)
         self._application = application or Application(fleet, node, None, "", reporter.report)
         self._session, self._fleet = session, fleet
         self._counting, self._refused = threading.Lock(), Counter[Refusal]()
@@ -198,6 +208,13 @@ class RelayProcess:
         if self._introducer is not None:
             self._introducer.close()
         self._session.close()
+
+    def finish(self) -> None:
+        """Take nothing more, let what is under way arrive for a moment, and write down what became of all samples."""
+        until = monotonic_s() + FINISH_S
+        for is_done in [task.finish(until - FINISH_SPARE_S) for task in tuple(self._tasks.values())]:
+            is_done.wait(max(0.0, until - monotonic_s()))
+        self._tell_counts(is_last=True)
 
     def reopen(self, config: str) -> None:
         """Open the data session anew, by another configuration; the host's own side, and what comes there, stays.
@@ -261,6 +278,7 @@ class RelayProcess:
         """End what is carried for other tasks: they have left the fleet."""
         with self._lock:
             known = {*self._tasks, *self._waiting, *self._standbys, *self._unowned}
+            self._books.keep(frozenset(tasks))
         for name in sorted(known - set(tasks)):
             self._end(name)
 
@@ -347,6 +365,7 @@ class RelayProcess:
                 table.pop(name, None)
             if self._graph is not None:
                 self._graph.set_routes(_standbys_of(name), ())
+            self._books.forget(name)
             task = self._tasks.pop(name, None)
         if task is not None:
             task.end()
@@ -372,6 +391,7 @@ class RelayProcess:
                 self._application.report,
                 graph,
                 self._local,
+                self._books.cell,
             )
             self._tasks[name] = task
         return task
@@ -400,12 +420,17 @@ class RelayProcess:
         while True:
             due = max(due + COUNT_S, awake_s())  # none is made up for
             pause.wait(due - awake_s())
-            counts = tuple(count for task in tuple(self._tasks.values()) for count in task.counts())
-            self._reporter.report(StreamsCounted(counts=self._application.added(counts)))
+            self._tell_counts()
             self._tell_refused()
             is_missing = any(task.misses_its_worker for task in tuple(self._tasks.values()))
             if introductions.is_due(awake_s(), is_missing=is_missing) and self._introducer is not None:
                 self._introducer.introduce()
+
+    def _tell_counts(self, *, is_last: bool = False) -> None:
+        own = tuple(count for task in tuple(self._tasks.values()) for count in task.counts())
+        counts = self._books.added(own)
+        self._books.write(own, self._application.settled(own), is_last=is_last)
+        self._reporter.report(StreamsCounted(counts=self._application.added(counts)))
 
 
 def _standbys_of(task: TaskId) -> str:
@@ -439,9 +464,11 @@ def run(
     orphan_s: float = 0.0,
     streams: Path | None = None,
     streams_listen: str = "",
+    books: Path | None = None,
 ) -> int:
     """Serve until told to stop; the exit code: 0 stopped, 1 the session could not be opened.
 
+    ``books`` is where the counters of this node's relays stand.
     ``streams`` is the socket for an application that has its streams itself, which listens at ``streams_listen``.
     ``door`` is a listening socket: through it the daemon's successor comes, within ``orphan_s`` of the daemon's end.
     """
@@ -470,6 +497,7 @@ def run(
         lease_s(config),
         members_of(config),
         application,
+        Books(books),  # the relay before has gone: it had our port
     )
     application.open(config)
     give_back()
@@ -488,7 +516,11 @@ def run(
             relay.begin_again()
     finally:
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
-        signal.setitimer(signal.ITIMER_REAL, ALARM_S)
+        signal.setitimer(signal.ITIMER_REAL, FINISH_S + ALARM_S)
+        try:
+            relay.finish()
+        except Exception:  # noqa: BLE001 - it ends all the same
+            _log.exception("the last counts are missing")
         reporter.flush(0.1)
         ends_within(CLOSE_S, relay.close, name="close")
     return 0

@@ -10,6 +10,7 @@ import logging
 import queue
 import threading
 from collections.abc import Callable
+from time import sleep
 from typing import Final
 
 import zenoh
@@ -17,6 +18,7 @@ from zenoh import Session, Timestamp
 
 from zsched.clock import monotonic_s
 from zsched.core.events import ProblemReported, SlotDrained, SlotFlipped, SlotReady
+from zsched.core.hop.books import added, closed, together
 from zsched.core.relay_protocol import RelayReport, SlotLost
 from zsched.core.values.model import TaskId
 from zsched.core.values.plan import (
@@ -121,7 +123,14 @@ class _Unowned(Struct, frozen=True):
     routes: tuple[Route, ...]
 
 
-_Item = RoutePlan | _Orphaned | _Unowned | _Leave | _Rejoin | _Ended | None
+class _Finish(Struct, frozen=True, eq=False):
+    """In the queue of plans: this relay is about to end, its successor goes on with its counters."""
+
+    is_done: threading.Event
+    until: float
+
+
+_Item = RoutePlan | _Finish | _Orphaned | _Unowned | _Leave | _Rejoin | _Ended | None
 
 
 class TaskRelay:
@@ -137,8 +146,13 @@ class TaskRelay:
         report: Callable[[RelayReport], None],
         graph: GraphMirror,
         local: Session | None = None,
+        cells: Callable[[str], memoryview | None] = lambda _stream: None,
     ) -> None:
-        """``session`` is the fleet's, ``local`` the one of the host's own side, if it has one."""
+        """``session`` is the fleet's, ``local`` the one of the host's own side, if it has one.
+
+        ``cells``: where an input counts what it takes, beside its own counters (`zsched.relay.books`).
+        """
+        self._cells = cells
         self._session = session
         self._local = local
         self._graph = graph
@@ -152,6 +166,10 @@ class TaskRelay:
         self._slots: dict[int, _OpenSlot] = {}
         self._inputs: dict[str, InputStream] = {}
         self._outputs: dict[str, OutputStream] = {}
+        self._closed: dict[str, StreamCount] = {}
+        """What streams have counted that were closed, and may come again by the same name..."""
+        self._changing = threading.Lock()
+        """...which a reader of counters sees in one of both places."""
         self._services = Services(session, local)
         self._stamps = Stamps()
         self._times = AnswerTimes()
@@ -197,6 +215,15 @@ class TaskRelay:
         """Carry on by another data session; ``own_ids`` are those of all sessions of this process."""
         self._queue.put(_Rejoin(session, own_ids))
 
+    def finish(self, until: float) -> threading.Event:
+        """This relay is about to end: take nothing more, let what is under way arrive until then, and close all.
+
+        The event is set when the counters are the last ones.
+        """
+        is_done = threading.Event()
+        self._queue.put(_Finish(is_done, until))
+        return is_done
+
     def end(self) -> None:
         """The task left the fleet file: close everything, and end."""
         self._queue.put(_Ended())
@@ -209,9 +236,10 @@ class TaskRelay:
 
     def counts(self) -> tuple[StreamCount, ...]:
         """The counters of every stream, by name."""
-        streams: list[InputStream | OutputStream] = [*self._inputs.values(), *self._outputs.values()]
-        counts = [*(stream.count() for stream in streams), *self._services.counts()]
-        return tuple(sorted(counts, key=lambda count: count.stream))
+        with self._changing:
+            streams: list[InputStream | OutputStream] = [*self._inputs.values(), *self._outputs.values()]
+            counts = added(tuple(stream.count() for stream in streams), self._closed)
+        return tuple(sorted((*counts, *self._services.counts()), key=lambda count: count.stream))
 
     # --- the thread --------------------------------------------------------------------------------------------------
 
@@ -224,6 +252,9 @@ class TaskRelay:
             try:
                 if isinstance(plan, _Ended):
                     self._close_all()
+                    return
+                if isinstance(plan, _Finish):
+                    self._finish(plan)
                     return
                 if isinstance(plan, _Orphaned):
                     self._pause()
@@ -350,6 +381,21 @@ class TaskRelay:
         self._services.keep(set())
         self._graph.set_routes(self._task, ())
 
+    def _finish(self, finish: _Finish) -> None:
+        """The streams stay in the table: whoever asks now hears their last counts."""
+        try:
+            for source in self._inputs.values():
+                source.stop()
+            while any(source.under_way() for source in self._inputs.values()) and monotonic_s() < finish.until:
+                for source in self._inputs.values():
+                    source.look_after()
+                sleep(BUSY_S)
+            streams: list[InputStream | OutputStream] = [*self._inputs.values(), *self._outputs.values()]
+            for stream in streams:
+                stream.close()
+        finally:
+            finish.is_done.set()
+
     def _listen(self, routes: tuple[Route, ...]) -> None:
         for route in routes:
             if route.stream in self._inputs:
@@ -360,7 +406,10 @@ class TaskRelay:
                 self._problem(f"{route.stream}: {route.from_expr}: {error}")
 
     def _take_input(self, route: Route) -> InputStream:
-        return InputStream(self._session, route, self._own_ids, self._local, self._times)
+        cell = self._cells(route.stream)
+        if cell is not None and route.stream not in self._closed:
+            cell[0] = 0  # of a task by this name that has left the fleet
+        return InputStream(self._session, route, self._own_ids, self._local, self._times, cell=cell)
 
     def _take_output(self, route: Route) -> OutputStream:
         return OutputStream(self._session, route, self._own_ids, self.wake, self._local, self._times)
@@ -461,15 +510,13 @@ class TaskRelay:
         if route.direction is Direction.INPUT:
             source = self._inputs.get(route.stream)
             if source is None or (source.route.from_expr, source.route.settings) != (route.from_expr, route.settings):
-                if source is not None:
-                    source.close()
+                self._end_input(route.stream)
                 source = self._inputs[route.stream] = self._take_input(route)
             source.open(epoch, route, acks, self._stamps if _replays(slot) else None)
             return
         sink = self._outputs.get(route.stream)
         if sink is None or (sink.route.to_expr, sink.route.settings) != (route.to_expr, route.settings):
-            if sink is not None:
-                sink.close()
+            self._end_output(route.stream)
             sink = self._outputs[route.stream] = self._take_output(route)
         sink.know(route.from_expr, notes_stamps=_replays(slot))
         sink.open(epoch, route, acks, is_from_start=is_from_start)
@@ -505,11 +552,29 @@ class TaskRelay:
             return
         for stream in tuple(self._inputs):
             if stream not in names:
-                self._inputs.pop(stream).close()
+                self._end_input(stream)
         for stream in tuple(self._outputs):
             if stream not in names:
-                self._outputs.pop(stream).close()
+                self._end_output(stream)
         self._services.keep(names)
+
+    def _end_input(self, stream: str) -> None:
+        source = self._inputs.get(stream)
+        if source is not None:
+            source.close()
+            with self._changing:
+                self._keep_counts(self._inputs.pop(stream).count())
+
+    def _end_output(self, stream: str) -> None:
+        sink = self._outputs.get(stream)
+        if sink is not None:
+            sink.close()
+            with self._changing:
+                self._keep_counts(self._outputs.pop(stream).count())
+
+    def _keep_counts(self, count: StreamCount) -> None:
+        before = self._closed.get(count.stream)
+        self._closed[count.stream] = closed(count) if before is None else together(before, closed(count))
 
     # --- readiness and warm-up ---------------------------------------------------------------------------------------
 

@@ -161,7 +161,7 @@ class RelayHandle:
                 tasks=bequest.tasks,
             )
             self._command += ["--orphan", str(bequest.orphan_s), "--digest", digest, "--session", session]
-            self._command += ["--incarnation", str(bequest.incarnation)]
+            self._command += ["--incarnation", str(bequest.incarnation), "--books", str(bequest.door.books)]
         self._lock = threading.Lock()
         self._newest: dict[_Key, _Told] = {}
         self._outbox = _Outbox()

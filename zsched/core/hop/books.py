@@ -11,11 +11,23 @@ died, or it waits for the first owner (class ``latest``)::
 The last is what went to workers that acknowledge nothing; towards `zsched.worker` it is 0.
 
 What is missing on the right was lost silently; what is too much was counted twice. Both are bugs of ours.
+
+The books outlive who keeps them. What a relay (or an application) that has gone had counted is added to what the next
+one counts; what it had in hand is at most lost, and so is what it had taken since its last count.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Final
+
 from zsched.core.values.plan import StreamCount
+from zsched.core.values.struct import replace
+
+_SUMS: Final = (
+    *("messages", "bytes", "lost", "doubled", "reordered", "replayed"),
+    *("at_most_lost", "repeated", "unsent", "unconfirmed"),
+)
 
 
 def unaccounted(count: StreamCount) -> int | None:
@@ -32,3 +44,52 @@ def unaccounted(count: StreamCount) -> int | None:
 def given_up(count: StreamCount) -> int:
     """Samples that the counters of an input or an output call lost, perhaps lost, or dropped."""
     return count.lost + count.at_most_lost + sum(number for _, number in count.drops)
+
+
+def closed(count: StreamCount, untold: int = 0) -> StreamCount:
+    """What stays of the counters of somebody who has gone; ``untold`` samples it had taken since it told them.
+
+    What was in flight may be done or not, and so may the untold ones; nothing is in flight any more, and nothing moves.
+    """
+    in_hand = (count.in_flight or 0) + (0 if count.in_flight is None else untold)
+    return replace(
+        count,
+        messages=count.messages + untold,
+        at_most_lost=count.at_most_lost + in_hand,
+        in_flight=None if count.in_flight is None else 0,
+        last_seen_s=None,
+        answer_s=None,
+        gap_s=None,
+        move_gap_s=None,
+        move_epoch=0,
+    )
+
+
+def together(first: StreamCount, other: StreamCount) -> StreamCount:
+    """The counters of both; times are those of the one that has them, the first before the other."""
+    drops = dict(first.drops)
+    for reason, count in other.drops:
+        drops[reason] = drops.get(reason, 0) + count
+    return replace(
+        first,
+        **{name: getattr(first, name) + getattr(other, name) for name in _SUMS},
+        drops=tuple(sorted(drops.items())),
+        acknowledged=_both(first.acknowledged, other.acknowledged),
+        in_flight=_both(first.in_flight, other.in_flight),
+        last_seen_s=min((s for s in (first.last_seen_s, other.last_seen_s) if s is not None), default=None),
+        answer_s=other.answer_s if first.answer_s is None else first.answer_s,
+        gap_s=other.gap_s if first.gap_s is None else first.gap_s,
+        move_gap_s=other.move_gap_s if first.move_gap_s is None else first.move_gap_s,
+        move_epoch=max(first.move_epoch, other.move_epoch),
+    )
+
+
+def added(counts: tuple[StreamCount, ...], more: Mapping[str, StreamCount]) -> tuple[StreamCount, ...]:
+    """Counters with those of others, by stream; of a stream that has gone nobody is told."""
+    if not more:
+        return counts
+    return tuple(together(count, more[count.stream]) if count.stream in more else count for count in counts)
+
+
+def _both(first: int | None, other: int | None) -> int | None:
+    return None if first is None and other is None else (first or 0) + (other or 0)

@@ -13,16 +13,12 @@ from __future__ import annotations
 from typing import Final
 
 from zsched.core.events import SlotDrained
+from zsched.core.hop.books import added, closed, together
 from zsched.core.relay_protocol import SlotLost, WorkerWatch
 from zsched.core.route.keyexpr import includes
 from zsched.core.values.model import TaskId
 from zsched.core.values.plan import Direction, Route, RoutePlan, Slot, StreamCount
 from zsched.core.values.struct import Struct, field, replace
-
-_SUMS: Final = (
-    *("messages", "bytes", "lost", "doubled", "reordered", "replayed"),
-    *("at_most_lost", "repeated", "unsent", "unconfirmed"),
-)
 
 MAX_PARTS: Final = 8
 
@@ -163,10 +159,8 @@ class Shares(Struct, eq=False):
                 words.append(SlotLost(task=task, epoch=slot.epoch, owner=slot.owner, samples=lost))
         words += self.held.values()
         for stream, count in self.counted.items():
-            gone = replace(count, in_flight=None, at_most_lost=count.at_most_lost + (count.in_flight or 0))
-            if count.in_flight is not None:
-                gone = replace(gone, in_flight=0)
-            self.past[stream] = _sum(self.past[stream], gone) if stream in self.past else gone
+            gone = closed(count)
+            self.past[stream] = together(self.past[stream], gone) if stream in self.past else gone
         self.keys = ()
         self.told, self.parts, self.drained, self.held, self.counted = set(), {}, set(), {}, {}
         return tuple(words)
@@ -182,40 +176,14 @@ class Shares(Struct, eq=False):
             if count.stream in own:
                 self.counted[count.stream] = count
 
+    def settled(self, counts: tuple[StreamCount, ...]) -> tuple[StreamCount, ...]:
+        """The relay's counters with those of applications that have gone; the one that is there keeps its own."""
+        return added(counts, self.past)
+
     def added(self, counts: tuple[StreamCount, ...]) -> tuple[StreamCount, ...]:
         """The relay's counters with those of applications."""
-        if not self.past and not self.counted:
-            return counts
-        found = {count.stream: count for count in counts}
-        for more in (self.past, self.counted):
-            for stream, count in more.items():
-                if stream in found:  # of a stream that has gone nobody is told, as of the relay's own
-                    found[stream] = _sum(found[stream], count)
-        return tuple(found.values())
+        return added(self.settled(counts), self.counted)
 
 
 def _slots(plan: RoutePlan) -> tuple[Slot, ...]:
     return tuple(slot for slot in (*plan.predecessors, plan.current) if slot is not None)
-
-
-def _sum(first: StreamCount, other: StreamCount) -> StreamCount:
-    """The counters of both; times are those of the one that has them, the first before the other."""
-    drops = dict(first.drops)
-    for reason, count in other.drops:
-        drops[reason] = drops.get(reason, 0) + count
-    return replace(
-        first,
-        **{name: getattr(first, name) + getattr(other, name) for name in _SUMS},
-        drops=tuple(sorted(drops.items())),
-        acknowledged=_both(first.acknowledged, other.acknowledged),
-        in_flight=_both(first.in_flight, other.in_flight),
-        last_seen_s=min((s for s in (first.last_seen_s, other.last_seen_s) if s is not None), default=None),
-        answer_s=other.answer_s if first.answer_s is None else first.answer_s,
-        gap_s=other.gap_s if first.gap_s is None else first.gap_s,
-        move_gap_s=other.move_gap_s if first.move_gap_s is None else first.move_gap_s,
-        move_epoch=max(first.move_epoch, other.move_epoch),
-    )
-
-
-def _both(first: int | None, other: int | None) -> int | None:
-    return None if first is None and other is None else (first or 0) + (other or 0)

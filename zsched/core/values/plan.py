@@ -179,7 +179,7 @@ STILL_S = 2.0
 
 
 class StreamCount(Struct, frozen=True, kw_only=True):
-    """Counters of one stream since the relay started."""
+    """Counters of one stream, over all relays of this node since its service started."""
 
     stream: str
     messages: int = 0

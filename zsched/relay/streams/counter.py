@@ -11,10 +11,12 @@ from zsched.relay.streams.tally import Tally
 
 
 class StreamCounter:
-    """Counters of one stream since the relay started."""
+    """Counters of one stream since it was opened."""
 
-    def __init__(self, stream: str) -> None:
+    def __init__(self, stream: str, cell: memoryview | None = None) -> None:
+        """``cell``: one number that outlives this process, of all samples that came in."""
         self.stream = stream
+        self._cell = cell
         self._messages = 0
         self._bytes = 0
         self._drops: dict[str, int] = {}
@@ -36,6 +38,8 @@ class StreamCounter:
     def seen(self, size: int) -> None:
         """A sample of ``size`` bytes came in."""
         self._messages += 1
+        if self._cell is not None:
+            self._cell[0] += 1
         self._bytes += size
         self._last_seen = monotonic_s()
 

@@ -84,16 +84,17 @@ class InputStream:
         times: AnswerTimes | None = None,
         *,
         is_ours: bool = False,
+        cell: memoryview | None = None,
     ) -> None:
         """Subscribe on ``local``, the host's own side, if there is one; ``session`` is the fleet's.
 
-        ``is_ours``: nothing is subscribed to, samples come by `give`.
+        ``is_ours``: nothing is subscribed to, samples come by `give`. ``cell``: see `StreamCounter`.
         """
         self.route = route
         self._times = times
         self._session = session
         self._lock = threading.Lock()
-        self._counter = StreamCounter(route.stream)
+        self._counter = StreamCounter(route.stream, cell)
         self._slots: dict[int, _InputSlot] = {}
         self._active: _InputSlot | None = None
         self._mirror: _InputSlot | None = None
@@ -130,7 +131,7 @@ class InputStream:
         self._giving = threading.Lock()
         self._in_hand: Outlet | None = None
         """Where the sample that is given goes, if its put is left to the giver (`_giving` and our lock guard it)."""
-        self._receiver = None if is_ours else self._subscribe(side)
+        self._receiver: Receiver | None = None if is_ours else self._subscribe(side)
 
     def _subscribe(self, side: Session) -> Receiver:
         return Receiver(
@@ -298,10 +299,15 @@ class InputStream:
             self._closed.add(said)
             return left
 
+    def stop(self) -> None:
+        """Unsubscribe."""
+        receiver, self._receiver = self._receiver, None
+        if receiver is not None:
+            receiver.close()
+
     def close(self) -> None:
         """Unsubscribe and close every slot."""
-        if self._receiver is not None:
-            self._receiver.close()
+        self.stop()
         with self._lock:
             self._counter.dropped("closed", len(self._paused))
             self._paused.clear()

@@ -285,6 +285,8 @@ class Outlet:
             self._undeclare()
             return self.counted()
         left = self._queue.close(self._leave)
+        if self._crowd is not None:
+            return Tally(waiting=left)
         with self._lock:
             said = self._sum()
             in_hand = max(0, said.waiting - left)  # nobody will hear whether it still goes out

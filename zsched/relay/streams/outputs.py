@@ -35,6 +35,7 @@ from zsched.relay.streams.outlet import Outlet
 from zsched.relay.streams.pace import Pace
 from zsched.relay.streams.receive import Receiver, undeclare
 from zsched.relay.streams.slots import Feed, KeyState, OutputSlot
+from zsched.relay.streams.tally import Tally
 from zsched.wire.keyspace import AGAIN_CHUNK, END_CHUNK
 
 HOLD_SAMPLES: Final = 10_000
@@ -303,13 +304,21 @@ class OutputStream:
         return None
 
     def close(self) -> None:
-        """Close every slot and give the publisher back."""
+        """Close every slot and give the publisher back; what has come and not gone out is counted."""
+        with self._lock:
+            held = sum(len(slot.held) for slot in self._slots.values() if slot.is_flipped)
+            self._counter.dropped("closed", held)
+            for slot in self._slots.values():
+                slot.held.clear()
         for epoch in sorted(self._slots, reverse=True):
             self.close_slot(epoch)
         for ends in self._ends.values():
             undeclare(ends)
         self._ends.clear()
-        self._outlet.undeclare()
+        said = self._outlet.undeclare()
+        if isinstance(said, Tally):
+            with self._lock:
+                self._counter.dropped("closed", said.waiting)
         if self._acks is not None:
             self._acks.close()
 
