@@ -88,6 +88,8 @@ class AdoptDocument(Struct, frozen=True, kw_only=True):
     tasks: tuple[tuple[TaskId, bool], ...]
     """(task, whether it is exclusive) of every task of the document."""
     lease_s: float
+    file_lease_s: float = 0.0
+    """Of the fleet file before: leases of that length may still run."""
     reason: str = "the fleet's file is agreed"
 
     def fault(self, read: FleetValue) -> str:
@@ -105,7 +107,7 @@ class AdoptDocument(Struct, frozen=True, kw_only=True):
             document=self.document,
             tasks=tasks,
             lease_s=self.lease_s,
-            guard_lease_s=self.lease_s,
+            guard_lease_s=max(self.lease_s, self.file_lease_s),
         )
 
 
@@ -175,6 +177,8 @@ class Settle(Struct, frozen=True, kw_only=True):
     base_revision: int
     number: int
     """Under which the electors were asked: of any other number nothing is known."""
+    has_waited: bool = False
+    """A guard time has passed. Without an exclusive task nobody waits: leases of one that has gone may still run."""
     reason: str = "the electors are settled"
 
     def fault(self, read: FleetValue) -> str:
@@ -185,7 +189,8 @@ class Settle(Struct, frozen=True, kw_only=True):
         """The value, settled."""
         if self.fault(read):
             return read
-        return replace(read, revision=read.revision + 1, settled=True, guard_lease_s=read.lease_s)
+        longest = read.lease_s if self.has_waited else read.guard_lease_s
+        return replace(read, revision=read.revision + 1, settled=True, guard_lease_s=longest)
 
 
 FleetChange = AdoptDocument | AddElector | RemoveElector | SetLease | SetDocument | SetAway | Settle

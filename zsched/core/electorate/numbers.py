@@ -168,6 +168,11 @@ class Numbers:
         return None if fleet is None or value is None else in_force(fleet, value)
 
     @property
+    def file_lease_s(self) -> float:
+        """The length of leases by which this node goes; by its file, until a document is agreed."""
+        return self._fleet.timing.lease_s
+
+    @property
     def electors(self) -> tuple[NodeId, ...]:
         """With whom this node counts."""
         return self._fleet.electors if self.roll is None else self.roll.value.electorate.names

@@ -74,7 +74,13 @@ class Orders:
         command, value = self._storing.pop(event.request, None), self._numbers.value
         if command is None or value is None or command.base_revision is None:
             return
-        change = document_change(value, event.document, event.fleet, base_revision=command.base_revision)
+        change = document_change(
+            value,
+            event.document,
+            event.fleet,
+            base_revision=command.base_revision,
+            file_lease_s=self._numbers.file_lease_s,
+        )
         self._propose(event.request, _explained(change, command), todo, now)
 
     def on_refused(self, event: ev.DocumentRefused, todo: ToDo) -> None:
@@ -134,7 +140,12 @@ def _explained(change: FleetChange, command: ChangeFleet) -> FleetChange:
 
 
 def document_change(
-    value: FleetValue, document: str, fleet: Fleet, *, base_revision: int | None = None
+    value: FleetValue,
+    document: str,
+    fleet: Fleet,
+    *,
+    base_revision: int | None = None,
+    file_lease_s: float = 0.0,
 ) -> AdoptDocument | SetDocument:
     """The change by which a fleet goes by a document: the first one, or another one.
 
@@ -143,13 +154,14 @@ def document_change(
         document: the document's hash.
         fleet: what it says.
         base_revision: of the value that the operator saw; ``None``: this one.
+        file_lease_s: the length of leases in the fleet file by which nodes have gone so far.
     """
     base = value.revision if base_revision is None else base_revision
     tasks = tuple((task.name, task.exclusive) for task in fleet.tasks)
     lease_s = fleet.timing.lease_s
     if value.document:
         return SetDocument(base_revision=base, document=document, tasks=tasks, lease_s=lease_s)
-    return AdoptDocument(base_revision=base, document=document, tasks=tasks, lease_s=lease_s)
+    return AdoptDocument(base_revision=base, document=document, tasks=tasks, lease_s=lease_s, file_lease_s=file_lease_s)
 
 
 def _committed(value: FleetValue) -> str:

@@ -69,7 +69,8 @@ class Settling:
         if now < self._say_at:
             return None
         self._say_at = now + self._pause_s
-        return Settle(base_revision=value.revision, number=value.number)
+        has_waited = now >= self._whole_at + hold_s(value.guard_lease_s)
+        return Settle(base_revision=value.revision, number=value.number, has_waited=has_waited)
 
 
 def _guard_s(value: FleetValue) -> float:

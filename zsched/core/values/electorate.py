@@ -138,7 +138,8 @@ class FleetValue(Struct, frozen=True, kw_only=True, dict=True):
     """A majority of these electors holds what was chosen before them, and no lease by the number before is left."""
     lease_s: float
     guard_lease_s: float
-    """The longest lease that may still run: of this number or, until it is settled, of the number before."""
+    """The longest lease that may still run: of this number or, until somebody has waited a guard time, of one before.
+    Who settles waits only where a task is exclusive; else it stays, for a task that comes back as an exclusive one."""
     creations: int = 0
     """How many tasks were ever created in this fleet: the next one's number is one more."""
     tasks: tuple[Creation, ...] = ()

@@ -161,7 +161,7 @@ class Agreement:
             incarnation=incarnation,
             standing=self.standing() if is_elector else {},
             now=now,
-            granted_s=0.0 if durable is None else durable.lease_s,
+            granted_s=0.0 if durable is None else max(durable.lease_s, self._guard_lease_s),
         )
         if durable is not None and self._numbers.is_waiting:
             self.leases.terms = terms_of(durable.joins, 0)  # beats tell what this node is to join
@@ -524,7 +524,14 @@ class Agreement:
             number=value.number,
             lease_s=value.lease_s,
             standing=self.standing() if self.is_elector else {},
+            guard_lease_s=value.guard_lease_s,
         )
+
+    @property
+    def _guard_lease_s(self) -> float:
+        """The longest lease that may still run, by the learnt fleet value."""
+        value = self._numbers.changed
+        return 0.0 if value is None else value.guard_lease_s
 
     def _forget_seats(self, value: FleetValue, todo: ToDo) -> None:
         """What is remembered of an elector belongs to its seat; so does the loss of this node's own state."""

@@ -320,6 +320,8 @@ class Leases:
     terms: str = field(init=False)
     number: int = 0
     """Of the fleet value by which this node counts; 0: of its file."""
+    guard_lease_s: float = 0.0
+    """The longest lease that may still run, by that value: of a task that comes, its name may have one."""
     electors: tuple[NodeId, ...] = field(init=False)
     lease_s: float = field(init=False)
     is_in_doubt: bool = False
@@ -386,6 +388,7 @@ class Leases:
         number: int,
         lease_s: float,
         standing: Mapping[TaskId, Allocation | None],
+        guard_lease_s: float = 0.0,
     ) -> None:
         """A newer fleet value is learnt: grant and count by its number. Grants and leases of before run to their end.
 
@@ -395,7 +398,9 @@ class Leases:
             number: of that value.
             lease_s: of that value.
             standing: {task: its newest value here}; empty when this node is no elector.
+            guard_lease_s: the longest lease that may still run, by that value; it changes within a number, too.
         """
+        self.guard_lease_s = guard_lease_s
         if (terms, number) == (self.terms, self.number):
             return
         self.terms, self.number, self.electors, self.lease_s = terms, number, electors, lease_s
@@ -417,12 +422,14 @@ class Leases:
         Args:
             fleet: the fleet file.
             standing: as at the start, by the tasks of ``fleet``.
-            now: monotonic seconds. What an earlier time here may have granted of a task that comes is over in a lease.
+            now: monotonic seconds. What an earlier time here may have granted of a task that comes is over in a lease,
+                the longest that may still run. By today's length two owners could meet: a lease is granted, made
+                shorter for the fleet, and its task removed and created again, all before that lease has ended.
         """
         self.fleet, self.standing, self._grants = fleet, standing, bool(standing)
         leased = {task.name for task in fleet.tasks if task.exclusive}
         leased |= {task for task, value in standing.items() if value is not None and value.leased}
-        until = math.inf if self.is_in_doubt else now + hold_s(max(self.lease_s, self.granted_s))
+        until = math.inf if self.is_in_doubt else now + hold_s(max(self.lease_s, self.granted_s, self.guard_lease_s))
         for task in [task for task in self._granters if task not in leased or task not in standing]:
             del self._granters[task]
         for task, value in standing.items():

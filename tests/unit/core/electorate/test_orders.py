@@ -16,7 +16,7 @@ from zsched.core.electorate.changes import AdoptDocument
 from zsched.core.electorate.documents import RECENT
 from zsched.core.electorate.founding import founded
 from zsched.core.electorate.numbers import in_force
-from zsched.core.electorate.orders import MAX_OPEN
+from zsched.core.electorate.orders import MAX_OPEN, document_change
 from zsched.core.todo import ToDo
 from zsched.core.values.change import RoundOutcome
 from zsched.core.values.document import Document, Flag, FlagKind, Text
@@ -400,3 +400,9 @@ def test_a_state_s_document_brings_its_flags() -> None:
     agreement = make(ADOPTED, {"0d": FLEET}, {"0d": STAYS})
     assert agreement.flags == STAYS
     assert make().flags == ()
+
+
+def test_the_first_document_knows_the_leases_of_the_files_before() -> None:
+    """They may be longer, and still run when the document's electors and tasks change."""
+    adopted = document_change(FIRST, "0d", FLEET, file_lease_s=9.0).apply(FIRST)
+    assert (adopted.lease_s, adopted.guard_lease_s) == (FLEET.timing.lease_s, 9.0)

@@ -393,6 +393,25 @@ def test_lease_shortened_is_another_number_and_the_guard_goes_by_the_longer(befo
     assert hold_s(2.0) < 2.3
 
 
+def test_without_an_exclusive_task_nobody_waits_and_the_longer_lease_stays_known() -> None:
+    """The task that had it may come back, before its owner's lease has ended."""
+    world = Machines("abc", electors=2, lease_s=2.0)
+    assert world.change(world.machine("a"), SetLease(base_revision=1, lease_s=0.5)) == ""
+    world.run(for_s=0.4)
+    value = value_of(world.machine("a"))
+    assert (value.settled, value.lease_s, value.guard_lease_s) == (True, 0.5, 2.0)
+    add(world, "a", "c", for_s=0.4)
+    assert value_of(world.machine("a")).guard_lease_s == 2.0, "nor does the next change"
+
+
+def test_a_task_that_becomes_exclusive_as_all_is_settled_does_not_forget_longer_leases() -> None:
+    """Who settles has not waited, for it knew of no such task; its word is put on top of the newer document."""
+    unsettled = replace(VALUE, number=4, settled=False, lease_s=0.5)
+    assert unsettled.is_exclusive
+    assert Settle(base_revision=7, number=4).apply(unsettled).guard_lease_s == 2.0
+    assert Settle(base_revision=7, number=4, has_waited=True).apply(unsettled).guard_lease_s == 0.5
+
+
 def test_a_document_that_changes_meanwhile_does_not_keep_electors_unsettled() -> None:
     world = Machines("abc", electors=2, tasks=(("t1", True),), lease_s=1.0)
     add(world, "a", "c", for_s=0.1)

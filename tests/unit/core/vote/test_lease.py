@@ -272,3 +272,41 @@ def test_what_was_given_is_worth_a_beat_when_it_has_run_out_and_nothing_only_now
     assert [run_out(6, 11.0), run_out(7, 11.0), run_out(8, 11.0 + HURRY_S / 2)] == [True, True, False]
     assert run_out(9, 11.0 + 1.5 * HURRY_S)
     assert not run_out(10, 11.0 + 2 * HURRY_S)
+
+
+LONG_S = 3.0
+"""The length of leases before it was made shorter: `L`."""
+LONG = replace(FLEET, timing=replace(FLEET.timing, lease_s=LONG_S))
+WITHOUT = replace(FLEET, tasks=(replace(GUARD, name="other", exclusive=False),))
+R2_HOLDS_UNTIL = 10.0 + LONG_S
+"""r2 sent beat 5 at 10 s, and two of three electors have echoed it: its worker may work until then."""
+
+
+def granting() -> Leases:
+    """An elector that has echoed beat 5 of r2 at 10 s, under long leases."""
+    one = Leases(fleet=LONG, me="r1", incarnation=1, standing={"guard": value()}, now=0.0)
+    sent = replace(beat(), lease_terms=lease_terms(LONG))
+    assert one.on_beat(sent, ACCEPTED, 10.0)
+    return one
+
+
+def test_what_was_granted_before_three_changes_within_a_lease_still_excludes_others() -> None:
+    """The lease is made shorter, its task removed and created again: r3 is not accepted while r2 may be at work."""
+    one = granting()
+    one.count_with(NAMES, terms="t/2", number=2, lease_s=L, standing={"guard": None}, guard_lease_s=LONG_S)
+    one.adopt(WITHOUT, {"other": None}, 10.2)
+    one.adopt(FLEET, {"guard": None, "other": None}, 10.4)
+    assert not one.may_accept("guard", "r3", R2_HOLDS_UNTIL - 0.01)
+    assert one.may_accept("guard", "r3", 10.4 + hold_s(LONG_S))
+
+
+def test_an_elector_that_never_knew_of_long_leases_waits_for_them_too() -> None:
+    """The electors may be others by then: all of them go by what the fleet value says may still run."""
+    one = Leases(fleet=WITHOUT, me="r1", incarnation=1, standing={"other": None}, now=0.0)
+    one.count_with(NAMES, terms="t/4", number=4, lease_s=L, standing={"other": None}, guard_lease_s=LONG_S)
+    one.adopt(FLEET, {"guard": None, "other": None}, 10.4)
+    assert not one.may_accept("guard", "r3", R2_HOLDS_UNTIL - 0.01)
+    one.count_with(NAMES, terms="t/4", number=4, lease_s=L, standing={"guard": None}, guard_lease_s=L)
+    one.adopt(WITHOUT, {"other": None}, 20.0)
+    one.adopt(FLEET, {"guard": None, "other": None}, 20.0)
+    assert one.may_accept("guard", "r3", 20.0 + HOLD_S), "a guard time was waited for meanwhile"
