@@ -97,6 +97,28 @@ def test_a_node_starts_by_its_document_and_shows_that_its_file_differs() -> None
     assert "fleet/file" not in play.sim.node("robot2").problems
 
 
+@pytest.mark.parametrize("kept", [0, 1], ids=["all files are gone", "an older folder"])
+def test_a_node_whose_document_is_gone_starts_with_what_it_knows_and_fetches_it(kept: int) -> None:
+    """Its file lists a task that the fleet has not any more, and lacks one that it has."""
+    play = Play()
+    play.adopt()
+    more = tuple(replace(FLEET.tasks[0], name=name, exclusive=False) for name in ("other", "third"))
+    play.sim.machines["robot1"].fleet = replace(FLEET, tasks=(*FLEET.tasks, more[0]))
+    agreed = replace(FLEET, tasks=(*FLEET.tasks, more[1]))
+    assert play.told("robot2", ChangeFleet(document=play.document(agreed))).outcome is CommandOutcome.OK
+    assert play.sim.run_until(lambda: play.sim.node("robot1").fleet.tasks == agreed.tasks, 20)
+    play.settle(20)
+    play.sim.crash("robot1")
+    assert play.sim.machines["robot1"].disk.lose_documents(kept)
+    play.sim.start("robot1")
+    robot = play.sim.node("robot1")
+    assert [task.name for task in robot.fleet.tasks] == [TASK]
+    assert "is not on this disk" in robot.agreement.problems["fleet/document"]
+    assert play.sim.run_until(lambda: play.sim.node("robot1").fleet.tasks == agreed.tasks, 5)
+    assert "fleet/document" not in play.sim.node("robot1").agreement.problems
+    play.settle(20)
+
+
 def test_a_document_that_is_not_valid_here_is_shown_and_the_node_goes_on_by_its_last_one() -> None:
     play = Play()
     play.adopt()

@@ -13,6 +13,7 @@ from random import Random
 from types import MappingProxyType
 from typing import Any
 
+from zsched.core.electorate.numbers import known_at_start
 from zsched.core.events import SlotReady
 from zsched.core.executor.handover import Executor
 from zsched.core.executor.progress import HangWatch
@@ -102,6 +103,7 @@ class Stages:
         stored: Mapping[str, Fleet] = MappingProxyType({}),
         flags: Mapping[str, tuple[Flag, ...]] = MappingProxyType({}),
     ) -> None:
+        fleet = known_at_start(fleet, durable, stored)
         self.fleet, self.me, self.version = fleet, me, version
         self.kind = fleet.node(me).kind
         self.incarnation = incarnation

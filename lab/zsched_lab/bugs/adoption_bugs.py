@@ -53,7 +53,7 @@ ADOPTION_BUGS: tuple[Bug, ...] = (
     _bug(
         "a task that becomes exclusive is granted at once",
         LEASE,
-        "until = math.inf if self.is_in_doubt else now + hold_s(max(self.lease_s, self.granted_s))",
+        "until = math.inf if self.is_in_doubt else now + hold_s(max(self.lease_s, self.granted_s, self.guard_lease_s))",
         "until = math.inf if self.is_in_doubt else now",
         _FLEET,
     ),

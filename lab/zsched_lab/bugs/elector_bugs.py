@@ -67,6 +67,31 @@ ELECTOR_BUGS: tuple[Bug, ...] = (
         ),
         has_schedules=False,
     ),
+    Bug(
+        name="who settles without waiting forgets the longer lease",
+        module=CHANGES,
+        changes=(("longest = read.lease_s if self.has_waited else read.guard_lease_s", "longest = read.lease_s"),),
+        tests=("tests/unit/core/electorate/test_rules.py",),
+        has_schedules=False,
+    ),
+    Bug(
+        name="a task that comes back waits for today's lease alone",
+        module=LEASE,
+        changes=(("max(self.lease_s, self.granted_s, self.guard_lease_s))", "max(self.lease_s, self.granted_s))"),),
+        tests=("tests/unit/core/vote/test_lease.py",),
+        has_schedules=False,
+    ),
+    Bug(
+        name="a document that is gone at a start is not asked for",
+        module="zsched.core.electorate.numbers",
+        changes=(
+            (
+                "        if not self.documents.holds(self.roll.value):\n            self._want(",
+                "        if not self.roll.value.document:\n            self._want(",
+            ),
+        ),
+        has_changing_fleets=True,
+    ),
     _bug(
         "a task that comes back has its old register",
         CHANGES,

@@ -13,6 +13,9 @@ INPUTS, SHARED = "zsched.worker.inputs", "zsched.core.hop.shared"
 KEPT, HELD, SLOTS = "zsched.core.hop.kept", "zsched.core.hop.held", "zsched.relay.streams.slots"
 GREETINGS, SENDER, OUTLET = "zsched.relay.streams.greetings", "zsched.core.hop.sender", "zsched.relay.streams.outlet"
 
+BOOKS = "zsched.relay.books"
+
+_BOOKS = ("tests/unit/relay/test_books.py",)
 _GREETINGS = ("tests/parts/relay/streams/test_greetings.py",)
 _RECEIVE = ("tests/parts/relay/streams/test_receive.py",)
 _ACKS = ("tests/unit/hop/test_acknowledger.py",)
@@ -503,6 +506,27 @@ STREAM_BUGS = (
         "if not owed and not is_unanswered and line is None:",
         "if not owed and not is_unanswered:",
         ("tests/unit/worker/test_debts.py",),
+    ),
+    _bug(
+        "what a relay had in its hand goes with it",
+        "zsched.core.hop.books",
+        "        at_most_lost=count.at_most_lost + in_hand,\n",
+        "",
+        _BOOKS,
+    ),
+    _bug(
+        "what a killed relay took since its last count is in no counter",
+        BOOKS,
+        "closed(count, untold.get(stream, 0))",
+        "closed(count)",
+        _BOOKS,
+    ),
+    _bug(
+        "the cells of another life are counted once more",
+        BOOKS,
+        "            if life == found.life  # else no cells had been made yet\n",
+        "",
+        _BOOKS,
     ),
     _bug(
         "a beginning that no relay gets is in no counter",

@@ -32,6 +32,8 @@ STORE_S = (0.005, 0.05, 0.4)
 class World(Protocol):
     """What documents need of the simulator."""
 
+    machines: dict[str, Machine]
+
     def later(self, seconds: float, action: Callable[..., None], *arguments: Any) -> None:
         """Do something after a while."""
 
@@ -100,7 +102,8 @@ class Documents:
         assert held.learnt is not None
         for value in (held.learnt, None if held.accepted is None else held.accepted.value):
             if value is not None and value.document:
-                assert value.document in machine.disk.documents, f"{machine.key} has no document of {value}"
+                stored = value.document in machine.disk.documents or value.document in machine.disk.lost
+                assert stored, f"{machine.key} has no document of {value}"
         self.judge.on_disk(machine.name, state.disk, held, state.registers)
 
     def at_start(self, machine: Machine, state: DurableState | None) -> tuple[Fleet, dict[str, Fleet], FlagsOf]:
@@ -157,6 +160,11 @@ class Documents:
     def _keep(machine: Machine, documents: Iterable[str]) -> None:
         recent = machine.disk.documents[-8:]
         machine.disk.documents[:] = [one for one in machine.disk.documents if one in documents or one in recent]
+
+    def has_elsewhere(self, machine: Machine, document: str) -> bool:
+        """Whether another machine that runs has a document on its disk."""
+        others = [one for one in self._sim.machines.values() if one is not machine and one.node is not None]
+        return any(document in other.disk.documents for other in others)
 
     def content(self, machine: Machine, document: str) -> Document | None:
         """What a machine answers to a question for a document."""

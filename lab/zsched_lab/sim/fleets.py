@@ -44,6 +44,8 @@ STEPS = ("change", "change", "change", "kill", "kill", "power", "cut", "pause", 
 FLAGGED = 0.5
 """So often a step of the faults is followed by an operator's order about nodes."""
 FLAG_S = (None, None, 3.0, 10.0)
+FORGETS = 0.15
+"""So often a step of the faults is followed by a machine that begins its next life without documents that it had."""
 COMING = 0.35
 """So often a step of the faults is followed by one of machines that come and go (`zsched_lab.sim.members`)."""
 HALVES = 0.1
@@ -79,11 +81,13 @@ class Schedule:
     _number: int = 0
     _says_flags: Random = field(init=False)
     _comes: Random = field(init=False)
+    _forgets: Random = field(init=False)
 
     def __post_init__(self) -> None:
         self.rng = Random(f"fleets {self.seed}")
         self._says_flags = Random(f"flags {self.seed}")
         self._comes = Random(f"members {self.seed}")
+        self._forgets = Random(f"forgotten {self.seed}")
         self.fleet = fleet_of(self.rng)
         if self._comes.random() < AUTO:
             self.fleet = replace(self.fleet, is_auto=True, replace_s=2.0, away_s=6.0)
@@ -113,6 +117,8 @@ class Schedule:
             getattr(self, f"_{rng.choice(STEPS)}")()
             if self._says_flags.random() < FLAGGED:
                 self._flag()
+            if self._forgets.random() < FORGETS:
+                self._forget()
             if self._comes.random() < COMING:
                 self.members.step()
             self.members.go_on()
@@ -273,6 +279,34 @@ class Schedule:
         self.sim.later(1.0, self.members.start, name)
         self.lost += seat is not None
         self.done["disk lost"] += 1
+
+    def _forget(self) -> None:
+        """Files are deleted, or their folder is an older one: the next life finds some documents, or none.
+
+        The state beside them stays. What no other machine has would be lost for good, as by a worn-out disk.
+        """
+        rng = self._forgets
+        name = rng.choice(self.members.names())
+        machine = self.sim.machines[name]
+        documents = machine.disk.documents
+        kept = rng.choice((0, len(documents) // 2, max(0, len(documents) - 1)))
+        if not documents[kept:] or not all(
+            self.sim.documents.has_elsewhere(machine, one) for one in documents[kept:] if one in self._named(name)
+        ):
+            return
+        self.sim.crash(name, is_power_lost=rng.random() < 0.5)
+        machine.disk.lose_documents(kept)
+        self.sim.later(rng.choice((0.05, 0.5, 3.0, 12.0)), self.members.start, name)
+        self.done["documents lost"] += 1
+
+    def _named(self, name: NodeId) -> set[str]:
+        """The documents that a machine's state names."""
+        state = self.sim.disk(name)
+        register = None if state is None else state.fleet_register
+        if register is None:
+            return set()
+        values = (register.learnt, None if register.accepted is None else register.accepted.value)
+        return {value.document for value in values if value is not None and value.document}
 
     # --- the end -----------------------------------------------------------------------------------------------------
 

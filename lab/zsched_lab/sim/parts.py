@@ -62,6 +62,8 @@ class Disk:
     """Full or read-only: it refuses every write."""
     documents: list[str] = field(default_factory=list)
     """Hashes of the fleet's documents that are stored beside the state, the newest last."""
+    lost: set[str] = field(default_factory=set)
+    """Those of them that were there, and have gone by themselves: the state may name them all the same."""
     past: deque[bytes] = field(default_factory=lambda: deque(maxlen=PAST_KEPT))
     """What the file held before: what a backup may bring back."""
     _unsynced: DurableState | None = None
@@ -127,11 +129,19 @@ class Disk:
         self.state = self.read()
         self._index()
 
+    def lose_documents(self, kept: int) -> tuple[str, ...]:
+        """Of the documents only the oldest are there any more, the state beside them stays; answers what has gone."""
+        gone = tuple(self.documents[kept:])
+        del self.documents[kept:]
+        self.lost |= set(gone)
+        return gone
+
     def wipe(self) -> None:
         """The disk is new."""
         self.state = self.content = self._unsynced = self._in_cache = None
         self.past.clear()
         self.documents.clear()
+        self.lost.clear()
         self._index()
 
     def _index(self) -> None:

@@ -423,3 +423,17 @@ class Numbers:
 def in_force(fleet: Fleet, value: FleetValue) -> Fleet:
     """What a node goes by: a document, with the electors and the length of leases that are agreed."""
     return replace(fleet, electors=value.electorate.names, timing=replace(fleet.timing, lease_s=value.lease_s))
+
+
+def known_at_start(fleet: Fleet, durable: DurableState | None, stored: Mapping[str, Fleet]) -> Fleet:
+    """What a node goes by at its start: ``fleet``, or less, while the document that its state names is not on its disk.
+
+    Of its fleet file it has the tasks then whose registers are the agreed ones. Of any other task it knows nothing yet.
+    """
+    register = None if durable is None else durable.fleet_register
+    value = None if register is None else register.learnt
+    if durable is None or value is None or not value.document or value.document in stored:
+        return fleet
+    agreed = {(one.task, one.number) for one in value.tasks}
+    held = {one.task for one in durable.registers if (one.task, one.creation) in agreed}
+    return replace(fleet, tasks=tuple(task for task in fleet.tasks if task.name in held))
