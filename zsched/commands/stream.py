@@ -69,7 +69,7 @@ def show_list(view: StreamView, key: str | None) -> int:
 def rates(before: Json, after: Json, elapsed_s: float) -> list[Json]:
     """The streams of the later status, each with ``hz`` and ``bytes_per_s`` since the earlier one.
 
-    The relay counts once a second, so a window of a second is right by one count; a relay that restarted meanwhile
+    The relay counts once a second, so a window of a second is right by one count; a service that restarted meanwhile
     starts from 0, and its rates are ``None``.
     """
     old = {stream["stream"]: stream for task in before["tasks"] for stream in task["streams"]}

@@ -35,7 +35,7 @@ class StreamRates:
         before, self._totals = self._totals, {}
         for count in counts:
             totals = before.get(count.stream, deque())
-            if totals and count.messages < totals[-1].messages:  # another relay, which counts from 0
+            if totals and count.messages < totals[-1].messages:  # another service, which counts from 0
                 totals.clear()
             totals.append(_Total(at=now, messages=count.messages, size=count.bytes))
             while len(totals) > 2 and now - totals[1].at >= WINDOW_S:

@@ -288,6 +288,9 @@ class InputStream:
                 held, self._held, self._held_bytes = self._held, [], 0
                 self._next = self._waits_for = None
                 self._owe([LeftOpen(*one) for one in held])
+            if slot.said is not None:  # between two data sessions: it has been settled
+                self._closed.add(slot.said)
+                return 0
             if self._replays and slot.is_counted:
                 return self._leave(slot, has_answer)
             said = slot.outlet.undeclare()

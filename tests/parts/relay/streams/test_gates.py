@@ -538,3 +538,18 @@ def test_a_forged_number_does_not_end_an_output(bench: Bench) -> None:
     assert heard == [0, 1, 2, 10**6, 5, 6, 7]
     assert out.count().lost == 2
     got.undeclare()
+
+
+def test_answers_that_wait_when_an_output_ends_are_counted(bench: Bench) -> None:
+    """The next owner's wait for the end of the one before, with `HandoverRule.ALL`."""
+    stream = bench.output(way_out(1, HandoverRule.ALL))
+    for epoch in (1, 2):
+        stream.know(way_out(epoch, HandoverRule.ALL).from_expr)
+        stream.open(epoch, way_out(epoch, HandoverRule.ALL))
+        stream.flip(epoch)
+    publisher = bench.publisher("edge2/t/2/out")
+    for _ in range(3):
+        publisher.put(b"x")
+    until(lambda: stream.count().messages == 3, "all of them")
+    stream.close()
+    assert drops(stream) == {"closed": 3}

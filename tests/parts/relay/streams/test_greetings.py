@@ -11,11 +11,13 @@ import zenoh
 
 from support.sessions import hub_and_neighbour
 from support.waiting import until
+from zsched.core.hop.books import unaccounted
 from zsched.core.relay_protocol import EndMarker, StreamAck, StreamAcks
-from zsched.core.values.plan import OnCrash, StreamClass, StreamSettings
+from zsched.core.values.plan import Direction, OnCrash, Route, StreamClass, StreamSettings
 from zsched.ipc.pipe import decode_end
 from zsched.relay.streams import greetings
 from zsched.relay.streams.acks import Acks
+from zsched.relay.streams.inputs import InputStream
 from zsched.relay.streams.outlet import Outlet
 from zsched.relay.streams.proofs import LeftOpen
 from zsched.wire import codec as wire
@@ -419,3 +421,28 @@ def test_a_worker_of_class_latest_is_told_its_epoch_before_any_value(bench: Benc
     until(lambda: late.got, "a value")
     assert late.starts == [EndMarker(epoch=0, count=0, slot=8)]
     wild.undeclare()
+
+
+@pytest.mark.parametrize("on_crash", list(OnCrash))
+def test_what_ends_between_two_data_sessions_is_counted_once(bench: Bench, on_crash: OnCrash) -> None:
+    """Its slot has been settled when the session before ended."""
+    settings = StreamSettings(stream_class=StreamClass.RELIABLE, depth=100, on_crash=on_crash)
+    route = Route(
+        stream="t/in/0", direction=Direction.INPUT, from_expr="robot1/in", to_expr="edge1/in", settings=settings
+    )
+    receiver = Receiver(bench.other, bench.relay, "edge1/in")
+    stream = InputStream(bench.relay, route, frozenset(), is_ours=True)
+    stream.open(1, route, bench.acks)
+    stream.flip(1)
+    sample = bench.sample()
+    for _ in range(5):
+        stream.give(sample)
+    receiver.greeted()
+    receiver.ack(0)
+    until(lambda: stream.look_after() or receiver.got == [0, 1, 2, 3, 4], "all of them")  # type: ignore[func-returns-value]
+    stream.hold()
+    stream.leave()
+    stream.close()
+    count = stream.count()
+    assert unaccounted(count) == 0
+    assert (count.in_flight or 0) + count.at_most_lost == 5
