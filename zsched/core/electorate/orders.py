@@ -99,6 +99,8 @@ class Orders:
         ending, value = self._ending, self._numbers.value
         if ending is None or value is None or ending != (value.revision, event.flags):
             return
+        if event.fleet != self._numbers.documents.fleet(value.document):
+            return  # another document without these flags, which was fetched meanwhile
         self._ending = None
         change = document_change(value, event.document, event.fleet)
         self._numbers.propose(replace(change, reason="the time of a drain or of its like is over"), todo, now)

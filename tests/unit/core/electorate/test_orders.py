@@ -391,6 +391,16 @@ def test_the_document_without_a_flag_whose_time_is_over_is_written_then_proposed
     assert of(agreed(agreement.on_stored, event, 100.3), do.AnswerCommand) == []
 
 
+def test_a_document_that_is_fetched_is_not_taken_for_the_one_without_those_flags() -> None:
+    """It may be an older one, by which machines that have joined since would be thrown out again."""
+    agreement = make(ADOPTED, {"0d": FLEET})
+    agreement.orders.end_flags((), ToDo())
+    older = ev.DocumentStored(document="0e", fleet=SAID)
+    assert of(agreed(agreement.on_stored, older, 100.1), do.AskElectors) == []
+    wanted = ev.DocumentStored(document="0f", fleet=FLEET)
+    assert len(of(agreed(agreement.on_stored, wanted, 100.2), do.AskElectors)) == 1, "that one is still waited for"
+
+
 def test_without_an_agreed_document_there_is_no_flag_to_end() -> None:
     make().orders.end_flags((), todo := ToDo())
     assert todo.send == []
