@@ -75,6 +75,13 @@ ELECTOR_BUGS: tuple[Bug, ...] = (
         has_schedules=False,
     ),
     Bug(
+        name="settled while a task is leased that is not exclusive any more",
+        module=SETTLING,
+        changes=(("(hold_s(value.guard_lease_s) if is_leased else _guard_s(value))", "_guard_s(value)"),),
+        tests=("tests/unit/core/electorate/test_rules.py",),
+        has_schedules=False,
+    ),
+    Bug(
         name="a task that comes back waits for today's lease alone",
         module=LEASE,
         changes=(("max(self.lease_s, self.granted_s, self.guard_lease_s))", "max(self.lease_s, self.granted_s))"),),

@@ -6,8 +6,8 @@ know: how a round goes (`zsched.core.vote.register`), whether somebody else sett
 1. An identity round of every task's register under the new number. It writes what it reads: from then on a majority of
    the new electors holds it, and no majority of the old ones can choose anything any more. A blank register needs no
    write.
-2. When a task is exclusive: the guard time on this node's clock, by the longer lease of both numbers. What electors
-   granted under the number before has then ended, also to an owner that never hears of the change.
+2. When a task is exclusive, or leased: the guard time on this node's clock, by the longer lease of both numbers. What
+   electors granted under the number before has then ended, also to an owner that never hears of the change.
 3. The value says that it is settled, for exactly this number. A change of the document that came first is no reason to
    begin again. A settler that restarts does begin again.
 """
@@ -65,7 +65,9 @@ class Settling:
             return None
         if self._whole_at is None:
             self._whole_at = now
-            self._say_at = now + _guard_s(value)
+            # Leased is what has a lease: a task may be exclusive no more by the document, and leased for a while yet.
+            is_leased = any(register.value.leased for register in registers)
+            self._say_at = now + (hold_s(value.guard_lease_s) if is_leased else _guard_s(value))
         if now < self._say_at:
             return None
         self._say_at = now + self._pause_s

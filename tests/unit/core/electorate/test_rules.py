@@ -16,6 +16,7 @@ from zsched.core.todo import ToDo
 from zsched.core.values.change import RoundOutcome
 from zsched.core.values.electorate import Creation, Elector, FleetValue
 from zsched.core.values.messages import Prepare, Promise, Refusal, Refused
+from zsched.core.values.model import Allocation
 from zsched.core.vote.lease import hold_s
 from zsched_lab.sim.chosen import ChosenError
 from zsched_lab.sim.electors import Ask, AskRoll, Machine, Machines, Message, Say, SayRoll
@@ -391,6 +392,21 @@ def test_lease_shortened_is_another_number_and_the_guard_goes_by_the_longer(befo
     value = value_of(world.machine("a"))
     assert (value.settled, value.guard_lease_s) == (True, after_s)
     assert hold_s(2.0) < 2.3
+
+
+class Leased(Machines):
+    """Their tasks have been exclusive, and are leased until their owner's file says otherwise."""
+
+    def first_value(self, creation: Creation) -> Allocation:
+        return replace(super().first_value(creation), leased=True)
+
+
+def test_a_task_that_is_leased_is_waited_for_though_the_document_calls_it_exclusive_no_more() -> None:
+    world = Leased("abc", electors=2, lease_s=2.0)
+    add(world, "a", "c", for_s=1.9)
+    assert not value_of(world.machine("a")).settled
+    world.run(for_s=0.4)
+    assert value_of(world.machine("a")).settled
 
 
 def test_without_an_exclusive_task_nobody_waits_and_the_longer_lease_stays_known() -> None:
