@@ -69,7 +69,7 @@ ANEW_S: Final = 60.0
 END_S: Final = 3.0
 """The session has this time to close, and its port to be free."""
 RETRY_S: Final = 0.05
-FINISH_S: Final = 0.3
+FINISH_S: Final = 0.4
 """A relay that ends lets what is under way arrive, and closes its streams, within this time..."""
 FINISH_SPARE_S: Final = 0.1
 """...of which this much is left for the closing."""

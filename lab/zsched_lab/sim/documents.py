@@ -161,10 +161,10 @@ class Documents:
         recent = machine.disk.documents[-8:]
         machine.disk.documents[:] = [one for one in machine.disk.documents if one in documents or one in recent]
 
-    def has_elsewhere(self, machine: Machine, document: str) -> bool:
-        """Whether another machine that runs has a document on its disk."""
-        others = [one for one in self._sim.machines.values() if one is not machine and one.node is not None]
-        return any(document in other.disk.documents for other in others)
+    def is_on_one_of(self, names: Iterable[NodeId], document: str) -> bool:
+        """Whether one of these machines has a document on its disk, and runs."""
+        others = [self._sim.machines[name] for name in names]
+        return any(document in other.disk.documents for other in others if other.node is not None)
 
     def content(self, machine: Machine, document: str) -> Document | None:
         """What a machine answers to a question for a document."""

@@ -290,9 +290,9 @@ class Schedule:
         machine = self.sim.machines[name]
         documents = machine.disk.documents
         kept = rng.choice((0, len(documents) // 2, max(0, len(documents) - 1)))
-        if not documents[kept:] or not all(
-            self.sim.documents.has_elsewhere(machine, one) for one in documents[kept:] if one in self._named(name)
-        ):
+        others = [one for one in self.members.names() if one != name]
+        wanted = [one for one in documents[kept:] if one in self._named(name)]
+        if not documents[kept:] or not all(self.sim.documents.is_on_one_of(others, one) for one in wanted):
             return
         self.sim.crash(name, is_power_lost=rng.random() < 0.5)
         machine.disk.lose_documents(kept)
@@ -315,6 +315,7 @@ class Schedule:
         sim.documents.unfit.clear()
         sim.heal()
         self.members.calm()
+        self._give_again()
         for machine in tuple(sim.machines.values()):
             sim.unpause(machine, machine.life)
             if machine.node is not None and machine.node.agreement.problems.get("fleet/document"):
@@ -324,6 +325,16 @@ class Schedule:
             sim.run(STAND_DOWN_S)
             self.members.settle_disputes()
             self.members.start_all()
+
+    def _give_again(self) -> None:
+        """What a state names, and no disk has any more, is brought back by the operator."""
+        names = self.members.names()
+        for name in names:
+            for document in sorted(self._named(name)):
+                if all(document not in self.sim.machines[other].disk.documents for other in names):
+                    self.sim.crash(name)
+                    self.sim.machines[name].disk.documents.append(document)
+                    self.done["document given again"] += 1
 
     def _newest(self) -> FleetValue | None:
         return self.members.newest()
@@ -345,6 +356,10 @@ class Schedule:
             return f"revision {newest.revision} is chosen, and no node has learnt it yet"
         if not first.settled:
             return f"number {first.number} is not settled"
+        nodes = {name: self.sim.node(name) for name in self.sim.running()}
+        lacking = sorted(name for name, node in nodes.items() if first.document and node.agreement.document is None)
+        if lacking:
+            return f"{', '.join(lacking)}: the agreed document is missing"
         said = self.sim.documents.says.get(first.document, self.fleet)
         why = unsettled(said, self.sim.machines, self.sim.work.working, self.sim.now)
         return why or self._ill_flagged(said)

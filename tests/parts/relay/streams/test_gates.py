@@ -546,7 +546,7 @@ def test_answers_that_wait_when_an_output_ends_are_counted(bench: Bench) -> None
     for epoch in (1, 2):
         stream.know(way_out(epoch, HandoverRule.ALL).from_expr)
         stream.open(epoch, way_out(epoch, HandoverRule.ALL))
-        stream.flip(epoch)
+        stream.flip(epoch, drops_held=False)
     publisher = bench.publisher("edge2/t/2/out")
     for _ in range(3):
         publisher.put(b"x")
