@@ -46,6 +46,10 @@ FLAGGED = 0.5
 FLAG_S = (None, None, 3.0, 10.0)
 FORGETS = 0.15
 """So often a step of the faults is followed by a machine that begins its next life without documents that it had."""
+FORGETS_LAST = 0.5
+"""So often it happens once more at rest, where no later change brings another document."""
+FETCHED_S = 8.0
+DOWN_S = (0.05, 0.5, 3.0, 12.0)
 COMING = 0.35
 """So often a step of the faults is followed by one of machines that come and go (`zsched_lab.sim.members`)."""
 HALVES = 0.1
@@ -135,6 +139,11 @@ class Schedule:
         if not sim.run_until(lambda: not self._timed() and self._is_at_rest(), REST_S):
             raise ScheduleError(f"not at rest without the flags whose time is over, {self._timed()}: {self._why()}")
         self._change_once_more()
+        if self._forgets.random() < FORGETS_LAST:
+            self._forget()
+            sim.run(max(DOWN_S) + FETCHED_S)
+            if lacking := self._lacking(first := self._newest()):
+                raise ScheduleError(f"{lacking} of {first}, {FETCHED_S:g} s after it was lost, and nothing has changed")
 
     def _comes_to_rest(self) -> bool:
         """Whether the fleet comes to rest; where no majority is left, one survivor is recovered first.
@@ -296,7 +305,7 @@ class Schedule:
             return
         self.sim.crash(name, is_power_lost=rng.random() < 0.5)
         machine.disk.lose_documents(kept)
-        self.sim.later(rng.choice((0.05, 0.5, 3.0, 12.0)), self.members.start, name)
+        self.sim.later(rng.choice(DOWN_S), self.members.start, name)
         self.done["documents lost"] += 1
 
     def _named(self, name: NodeId) -> set[str]:
@@ -356,13 +365,17 @@ class Schedule:
             return f"revision {newest.revision} is chosen, and no node has learnt it yet"
         if not first.settled:
             return f"number {first.number} is not settled"
-        nodes = {name: self.sim.node(name) for name in self.sim.running()}
-        lacking = sorted(name for name, node in nodes.items() if first.document and node.agreement.document is None)
-        if lacking:
-            return f"{', '.join(lacking)}: the agreed document is missing"
+        if lacking := self._lacking(first):
+            return lacking
         said = self.sim.documents.says.get(first.document, self.fleet)
         why = unsettled(said, self.sim.machines, self.sim.work.working, self.sim.now)
         return why or self._ill_flagged(said)
+
+    def _lacking(self, value: FleetValue | None) -> str:
+        """Who has no document of a fleet value that has one."""
+        nodes = {name: self.sim.node(name) for name in self.sim.running()}
+        names = sorted(name for name, node in nodes.items() if node.agreement.document is None)
+        return f"{', '.join(names)} without the document" if names and value is not None and value.document else ""
 
     def _ill_flagged(self, said: Fleet) -> str:
         """A node that goes by other flags than the document's, or a drained one that has not handed over."""
