@@ -300,22 +300,13 @@ class Schedule:
         documents = machine.disk.documents
         kept = rng.choice((0, len(documents) // 2, max(0, len(documents) - 1)))
         others = [one for one in self.members.names() if one != name]
-        wanted = [one for one in documents[kept:] if one in self._named(name)]
+        wanted = [one for one in documents[kept:] if one in machine.disk.named()]
         if not documents[kept:] or not all(self.sim.documents.is_on_one_of(others, one) for one in wanted):
             return
         self.sim.crash(name, is_power_lost=rng.random() < 0.5)
         machine.disk.lose_documents(kept)
         self.sim.later(rng.choice(DOWN_S), self.members.start, name)
         self.done["documents lost"] += 1
-
-    def _named(self, name: NodeId) -> set[str]:
-        """The documents that a machine's state names."""
-        state = self.sim.disk(name)
-        register = None if state is None else state.fleet_register
-        if register is None:
-            return set()
-        values = (register.learnt, None if register.accepted is None else register.accepted.value)
-        return {value.document for value in values if value is not None and value.document}
 
     # --- the end -----------------------------------------------------------------------------------------------------
 
@@ -339,7 +330,7 @@ class Schedule:
         """What a state names, and no disk has any more, is brought back by the operator."""
         names = self.members.names()
         for name in names:
-            for document in sorted(self._named(name)):
+            for document in sorted(self.sim.machines[name].disk.named()):
                 if all(document not in self.sim.machines[other].disk.documents for other in names):
                     self.sim.crash(name)
                     self.sim.machines[name].disk.documents.append(document)

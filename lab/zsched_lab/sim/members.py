@@ -99,11 +99,15 @@ class Members:
         return newest is not None and all(self._has_majority(value) for value in values)
 
     def _has_majority(self, value: FleetValue, without: NodeId = "") -> bool:
+        return self._fit(value, without) >= majority(len(value.electors))
+
+    def _fit(self, value: FleetValue, without: NodeId) -> int:
+        """How many of the electors can answer, one left out."""
         fit = 0
         for seat in value.electors:
             state = self.sim.disk(seat.name) if seat.name in self.names() and seat.name != without else None
             fit += state is not None and seat.is_held_by(seat.name, state.disk) and not (state.lost or state.disputed)
-        return fit >= majority(len(value.electors))
+        return fit
 
     def _learnt(self, name: NodeId) -> FleetValue | None:
         state = self.sim.disk(name)
@@ -361,7 +365,11 @@ class Members:
             made = Flag(kind=FlagKind.LEAVE, subject=name, revision=value.revision + 1)
             self._write(value, fleet, (*(one for one in flags if one.subject != name), made), door)
         elif value.electorate.seat(name) is not None:
-            if value.settled and not (self._pilot_can(value, fleet) if is_dead else fleet.is_auto):
+            if (
+                value.settled
+                and self._can_do_without(value, name)
+                and not (self._pilot_can(value, fleet) if is_dead else fleet.is_auto)
+            ):
                 self.tell(ChangeFleet(remove_elector=name), door)
         elif is_dead or self._has_learnt_that(machine):
             nodes = tuple(node for node in fleet.nodes if node.name != name)
@@ -375,6 +383,10 @@ class Members:
                 tuple(one for one in flags if one.subject != name),
                 door,
             )
+
+    def _can_do_without(self, value: FleetValue, name: NodeId) -> bool:
+        """Whether the other electors can agree without it; an operator who is told of a lost state waits."""
+        return self._fit(value, name) >= majority(max(1, len(value.electors) - 1))
 
     @staticmethod
     def _pilot_can(value: FleetValue, fleet: Fleet) -> bool:

@@ -113,7 +113,16 @@ class Disk:
             self.past.pop()
         self.state = self.read()
         self._index()
+        self.lost |= self.named() - set(self.documents)
         return True
+
+    def named(self) -> set[str]:
+        """The documents that the state names."""
+        register = None if self.state is None else self.state.fleet_register
+        if register is None:
+            return set()
+        values = (register.learnt, None if register.accepted is None else register.accepted.value)
+        return {value.document for value in values if value is not None and value.document}
 
     def damage(self, rng: Random) -> None:
         """The card is worn out: the file is cut short, or one of its bits is another one."""
