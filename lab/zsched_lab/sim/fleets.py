@@ -327,13 +327,17 @@ class Schedule:
             self.members.start_all()
 
     def _give_again(self) -> None:
-        """What a state names, and no disk has any more, is brought back by the operator."""
-        names = self.members.names()
-        for name in names:
-            for document in sorted(self.sim.machines[name].disk.named()):
-                if all(document not in self.sim.machines[other].disk.documents for other in names):
+        """What a state names, and nobody has whom that node asks, is brought back by the operator.
+
+        It asks the electors and the nodes of its fleet file; of others, which have joined since, it does not know.
+        """
+        for name in self.members.names():
+            machine = self.sim.machines[name]
+            asked = {name, *(node.name for node in machine.fleet.nodes)} & set(self.members.names())
+            for document in sorted(machine.disk.named()):
+                if all(document not in self.sim.machines[one].disk.documents for one in asked):
                     self.sim.crash(name)
-                    self.sim.machines[name].disk.documents.append(document)
+                    machine.disk.documents.append(document)
                     self.done["document given again"] += 1
 
     def _newest(self) -> FleetValue | None:

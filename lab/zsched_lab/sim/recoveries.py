@@ -68,6 +68,10 @@ class Recoveries(Members):
                 for dead in sorted(self.dead)
                 if dead in self.sim.machines and (state := self.sim.disk(dead)) is not None and self.rng.random() < 0.5
             ]
+            for lost in sorted(machine.disk.named() - set(machine.disk.documents)):
+                if any(lost in self.sim.machines[other].disk.documents for other in self.names()):
+                    machine.disk.documents.append(lost)  # the operator copies the file
+                    self.done["document brought"] += 1
             documents = {one: self.sim.documents.says[one] for one in machine.disk.documents}
             file_hash = wire.document_hash(self.sim.documents.write(machine.fleet))
             found = Found(
