@@ -99,6 +99,8 @@ class Chosen:
         if held is None or held.ballot == NO_BALLOT:
             return
         key = name, held.ballot
+        if key not in self._numbers and (("", *name[1:]), held.ballot) in self._numbers:
+            return  # asked for while the fleet file was in force, written just after the document: nobody judges those
         holders = self._held.setdefault(key, set())
         if (machine, disk) in holders:
             return
