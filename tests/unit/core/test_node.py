@@ -952,3 +952,16 @@ def test_links_that_begin_and_cease_to_hold_beats_up_are_in_the_story() -> None:
         "links hold no beats up any more: a peer is suspect after 1.2 s of silence",
     ]
     assert node.counters["links_lossy"] == 1
+
+
+@pytest.mark.parametrize("life", [4, 3], ids=["begins again", "beats again after silence"])
+def test_a_peer_that_comes_hears_of_this_machine_soon(life: int) -> None:
+    node, now, sent = started("edge2"), 100.0, [100.0]
+    while now < 101.6:
+        now = node.next_deadline()
+        sent += [now for _ in of(node.handle(ev.DeadlineReached(), now), do.PublishProfile)]
+        node.handle(ev.ProfileSampled(device=SAMPLE), now)
+    came = max(sent) + 0.05
+    node.handle(ev.BeatReceived(beat=beat("edge1", 2, incarnation=life)), came)
+    soon = [came + 0.1 * step for step in range(1, 4)]
+    assert [at for at in soon for _ in of(node.handle(ev.DeadlineReached(), at), do.PublishProfile)]

@@ -241,6 +241,7 @@ def on_transition(node: Stages, change: Transition, todo: ToDo, now: float) -> N
     todo.must_beat = True  # tell the others at once: they wait for a second observer
     if change.after is PeerState.ALIVE:
         node.probation.on_back(change.node, now)
+        node.profiler.owe(now)
         if change.before in (PeerState.SUSPECT, PeerState.GONE):
             node.hangs.on_back(change.node, now)
     if change.after is PeerState.GONE:

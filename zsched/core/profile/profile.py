@@ -200,6 +200,10 @@ class Profiler:
             jobs=self._jobs[load.task].value if load.task in self._jobs else None,
         )
 
+    def owe(self, now: float) -> None:
+        """Somebody has come who knows nothing of this machine: the next profile is due within one beat."""
+        self._sent_at = min(self._sent_at, now + self._timing.beat_s - self._timing.publish_s)
+
     def publishable(
         self,
         states: dict[TaskId, WorkerState],

@@ -282,6 +282,20 @@ def test_a_profile_that_is_nearly_due_goes_with_a_beat() -> None:
     assert profiler.publishable(READY, is_draining=False, now=almost, beats_now=True) is not None
 
 
+def test_who_comes_hears_of_this_machine_within_a_beat_however_many_come() -> None:
+    profiler = make_profiler()
+    profiler.absorb(device(), (), now=0.0)
+    taken(profiler, 0.0)
+    sent = 0
+    for tick in range(1, 11):
+        now = tick * TIMING.beat_s / 10
+        profiler.owe(now)
+        sent += profiler.publishable(READY, is_draining=False, now=now) is not None
+    assert sent == 0, "they share one"
+    assert profiler.publishable(READY, is_draining=False, now=1.11 * TIMING.beat_s) is not None
+    assert profiler.publishable(READY, is_draining=False, now=1.2 * TIMING.beat_s) is None
+
+
 RAW = replace(TIMING, smoothing_s=0.0)
 
 
