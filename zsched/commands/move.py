@@ -22,6 +22,8 @@ from zsched.exits import EXIT_OK, EXIT_TIMED_OUT
 MOVE_SCHEMA: Final = "zsched.move/1"
 GAP_S: Final = 3.0
 """How long a settled move is watched for the new owner's first answers; the relays count once a second."""
+KNOWN_S: Final = 3.0
+"""How long a daemon that has just begun may take to hear a living node's profile; nodes publish once a second."""
 
 
 class MoveOrder(Struct, frozen=True, kw_only=True):
@@ -41,7 +43,7 @@ def move(view: OrderView, order: MoveOrder) -> int:
         CliError: nobody answers, there is no such task or node, or the move is refused.
     """
     check_said(view)
-    status = status_of(view.door)
+    status = _once_it_is_known(view.door, order.node)
     known = {str(task["name"]): task for task in status["tasks"]}
     check_name(status, "task", order.task, list(known))
     check_name(status, "node", order.node, [str(node["name"]) for node in status["nodes"]])
@@ -73,6 +75,18 @@ def move(view: OrderView, order: MoveOrder) -> int:
         say("It is agreed. Ctrl-C ends the watching, not the move.")
     found, lacks = _watch(view.door, order, int(result["revision"])) if watch else ({}, [])
     return _tell_move(view, order, str(task["owner"] or ""), result, before, found, lacks)
+
+
+def _once_it_is_known(door: Door, target: str) -> Json:
+    """The status, as soon as it has a profile of the target, if that node lives; after `KNOWN_S` as it is."""
+    began = monotonic_s()
+    while True:
+        status = status_of(door)
+        node = next((node for node in status["nodes"] if node["name"] == target), None)
+        is_awaited = node is not None and node["state"] == "alive" and node["cpu_cores"] is None
+        if not is_awaited or monotonic_s() - began >= KNOWN_S:
+            return status
+        time.sleep(PAUSE_S)
 
 
 def _watch(door: Door, order: MoveOrder, revision: int) -> tuple[dict[str, Json], list[str]]:

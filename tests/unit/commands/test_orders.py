@@ -200,6 +200,27 @@ def test_a_move_waits_until_the_streams_have_settled_and_tells_what_was_measured
     assert (faults(body), body["settled"], body["lost"]) == ([], False, None)
 
 
+def test_a_move_waits_for_the_profile_of_a_node_that_lives(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
+    looks = []
+
+    def answer(request: Json) -> Json:
+        told = Daemon.answer(daemon, request)
+        if request["verb"] == "status":
+            looks.append(request)
+            told["nodes"][1]["cpu_cores"] = None if len(looks) < 3 else 2.0
+        elif len(looks) < 3:
+            told |= {"outcome": "invalid", "detail": "echo: edge2 cannot have it: no fresh profile"}
+        return told
+
+    daemon.answers = answer
+    assert run("move", "echo", "edge2", "--plan").exit_code == 10
+    looks.clear()
+    monkeypatch.setattr("zsched.commands.move.KNOWN_S", 0.0)
+    result = run("move", "echo", "edge2", "--yes")
+    assert (result.exit_code, len(looks)) == (1, 1)
+    assert "no fresh profile" in result.stderr
+
+
 def test_a_move_that_does_not_settle_in_time_exits_with_5(daemon: Daemon) -> None:
     daemon.status["tasks"][0]["phase"] = "preparing"
     result = run("move", "echo", "edge2", "--timeout", "0", "--yes")
