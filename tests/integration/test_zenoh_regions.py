@@ -10,10 +10,10 @@ import time
 
 import pytest
 
-from support.regions import GATEWAYS, ROBOTS, Site, kept_inside
+from support.regions import GATEWAYS, ROBOTS, Site, in_some_trial, kept_inside
 from support.waiting import until
 
-pytestmark = pytest.mark.timeout(90)
+pytestmark = pytest.mark.timeout(240)
 ALL = sorted((*ROBOTS, *GATEWAYS))
 MODES = ("peer", "router")
 CARRIES, RESTS = "ga2", "ga1"
@@ -33,6 +33,7 @@ def doubled(numbers: list[int]) -> int:
 
 
 @pytest.mark.parametrize("mode", MODES)
+@in_some_trial
 def test_with_two_gateways_a_sample_crosses_once_and_one_gateway_hears_its_own_region_twice(mode: str) -> None:
     with Site(mode=mode) as site:
         heard = site.put("a1")
@@ -47,6 +48,7 @@ def test_with_two_gateways_a_sample_crosses_once_and_one_gateway_hears_its_own_r
 
 
 @pytest.mark.parametrize("mode", MODES)
+@in_some_trial
 def test_when_the_gateway_that_rests_is_killed_nothing_is_lost(mode: str) -> None:
     with Site(mode=mode) as site:
         site.stream("a1", 400)
@@ -58,6 +60,7 @@ def test_when_the_gateway_that_rests_is_killed_nothing_is_lost(mode: str) -> Non
 
 
 @pytest.mark.parametrize("mode", MODES)
+@in_some_trial
 def test_when_the_gateway_that_carries_is_killed_the_region_is_cut_off_for_good(mode: str) -> None:
     with Site(mode=mode) as site:
         site.stream("a1", 600)
@@ -73,6 +76,7 @@ def test_when_the_gateway_that_carries_is_killed_the_region_is_cut_off_for_good(
 
 
 @pytest.mark.parametrize("mode", MODES)
+@in_some_trial
 def test_while_the_gateway_that_carries_is_frozen_nothing_crosses(mode: str) -> None:
     with Site(mode=mode, lease_ms=LEASE_MS) as site:
         site.stream("a1", 800)
@@ -86,6 +90,7 @@ def test_while_the_gateway_that_carries_is_frozen_nothing_crosses(mode: str) -> 
         assert lost(site.heard()["b1"], 800) >= 300
 
 
+@in_some_trial
 def test_a_robots_own_token_goes_where_it_is_watched_in_its_own_region() -> None:
     with Site() as site:
         assert sorted(name for _, name in site.token_changes("a1")) == ALL
@@ -95,6 +100,7 @@ def test_a_robots_own_token_goes_where_it_is_watched_in_its_own_region() -> None
         assert site.sessions["a1"].is_up
 
 
+@in_some_trial
 def test_a_gateway_that_comes_back_carries_again() -> None:
     with Site() as site:
         site.sessions[CARRIES].kill()
@@ -105,6 +111,7 @@ def test_a_gateway_that_comes_back_carries_again() -> None:
         assert {name: heard[name] for name in ("a2", "b1", "b2")} == {"a2": 10, "b1": 10, "b2": 10}
 
 
+@in_some_trial
 def test_when_both_gateways_are_gone_the_peers_of_a_region_still_have_one_another() -> None:
     with Site() as site:
         for name in (CARRIES, RESTS):
@@ -116,6 +123,7 @@ def test_when_both_gateways_are_gone_the_peers_of_a_region_still_have_one_anothe
         assert site.answers("a2") == ["a1", "a2"]
 
 
+@in_some_trial
 def test_clients_of_two_routers_hear_one_another_once_and_go_to_the_other_when_theirs_is_killed() -> None:
     with Site(mode="router", robots="client") as site:
         heard = site.put("a1")
@@ -134,6 +142,7 @@ def test_clients_of_two_routers_hear_one_another_once_and_go_to_the_other_when_t
         site.wait_answers("b1", ROBOTS)
 
 
+@in_some_trial
 def test_a_client_of_a_frozen_router_has_nobody_until_the_router_goes_on() -> None:
     with Site(mode="router", robots="client", lease_ms=LEASE_MS) as site:
         site.stream("a1", 800)
@@ -147,6 +156,7 @@ def test_a_client_of_a_frozen_router_has_nobody_until_the_router_goes_on() -> No
         assert all(lost(heard[name], 800) >= 400 for name in ("a2", "b1", "b2"))
 
 
+@in_some_trial
 def test_clients_of_two_routers_that_are_both_gone_have_nobody() -> None:
     with Site(mode="router", robots="client") as site:
         for name in (CARRIES, RESTS):
@@ -156,6 +166,7 @@ def test_clients_of_two_routers_that_are_both_gone_have_nobody() -> None:
 
 
 @pytest.mark.parametrize("mode", MODES)
+@in_some_trial
 def test_access_rules_of_the_gateways_keep_keys_inside_a_region(mode: str) -> None:
     with Site(mode=mode, more=kept_inside("x/**", "t/**")) as site:
         heard = site.put("a1")
@@ -167,6 +178,7 @@ def test_access_rules_of_the_gateways_keep_keys_inside_a_region(mode: str) -> No
         assert set(site.answers("a1")) == set(ALL)  # nothing was said about these
 
 
+@in_some_trial
 def test_a_gateways_namespace_keeps_nothing_inside() -> None:
     with Site(more={"namespace": "cell"}, crossing=ROBOTS) as site:
         heard = site.put("a1")
