@@ -21,6 +21,8 @@ from zsched.errors import AdapterError
 from zsched_lab.fleet.netbed import stop_group
 from zsched_lab.fleet.netns import Network
 
+LOG_LINES = 15
+"""Of each daemon, where a verb has failed."""
 FIRST_PORT, LAST_PORT, BLOCK = 21_000, 31_800, 40
 
 
@@ -70,8 +72,17 @@ class Hall:
         """
         done = self.run(node, *words)
         if done.returncode != 0:
-            raise AssertionError(f"zsched {' '.join(words)} on {node}: {done.stdout}{done.stderr}")
+            told = f"zsched {' '.join(words)} on {node}: {done.stdout}{done.stderr}"
+            raise AssertionError("\n".join((told, *(self._said(one) for one in self._daemons))))
         return done.stdout
+
+    def _said(self, node: str) -> str:
+        """What a node with a daemon says of the fleet, and the end of its log."""
+        status = self.status(node)
+        tasks = [(one["name"], one["owner"], one["revision"], one["phase"]) for one in status.get("tasks", ())]
+        workers = [(one["name"], one["state"], one["workers"]) for one in status.get("nodes", ())]
+        log = "\n".join(self.log(node).splitlines()[-LOG_LINES:])
+        return f"{node}: {tasks}, {workers}, {status.get('quorum')}, {self.problems(node)}\n{log}"
 
     def run(self, node: str, *words: str) -> subprocess.CompletedProcess[str]:
         """A verb on a node's machine, whatever comes of it."""
