@@ -88,7 +88,7 @@ def _program(scene: Scene, program: Path, *, hides_homes: bool) -> Iterator[Resu
             needed += [Path(word) for word in task.worker.command if word.startswith("/")]
     for path in needed:
         if hidden := _home_of(path):
-            fix = "install to /opt, Python too (docs/guide/service.md), or ProtectHome=no in a drop-in"
+            fix = "install to /opt, Python too (docs/guide/install.md), or ProtectHome=no in a drop-in"
             yield failed(f"{path} is or leads to {hidden}, which the service cannot see (ProtectHome)", fix=fix)
 
 
