@@ -73,25 +73,30 @@ def test_every_sample_that_comes_is_carried_or_gives_way_to_newer_ones(
         beside.undeclare()
 
 
+@pytest.mark.parametrize(("most_of_zenohs", "count"), [(8, 200), (16, 1000)], ids=["a queue of its own", "zenoh's"])
 @pytest.mark.parametrize("stream_class", [StreamClass.LATEST, StreamClass.RELIABLE])
 def test_a_full_queue_makes_the_link_wait_and_drops_nothing(
-    stream_class: StreamClass, monkeypatch: pytest.MonkeyPatch
+    stream_class: StreamClass, most_of_zenohs: int, count: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A ring of zenoh's would drop the oldest here, in no counter."""
-    monkeypatch.setattr(receive, "QUEUE_DEPTH", 16)
+    monkeypatch.setattr(receive, "QUEUE_DEPTH", most_of_zenohs)
     reached: list[zenoh.Sample] = []
     with hub_and_neighbour() as (relay, outside):
         held = Held(relay, stream_class)
-        publisher = publisher_of(outside)
-        publisher.put("0")
-        until(lambda: held.carried == [0], "the first is in hand")
-        beside = relay.declare_subscriber(KEY, reached.append)  # declared later, so it is handed each one later
-        for number in range(1, COUNT):
-            publisher.put(str(number))
-        until(lambda: len(reached) >= 16, "the queue is full")
-        held.may_go_on.set()
-        until(lambda: held.carried[-1] == COUNT - 1, "the newest")
-        assert held.carried == list(range(COUNT))
+        try:
+            publisher = publisher_of(outside)
+            publisher.put("0")
+            until(lambda: held.carried == [0], "the first is in hand")
+            beside = relay.declare_subscriber(KEY, reached.append)  # declared later, so it is handed each one later
+            for number in range(1, count):
+                publisher.put(str(number))
+            until(lambda: len(reached) >= 16, "the queue is full")
+            with pytest.raises(AssertionError):
+                until(lambda: len(reached) == count - 1, "the link does not wait", 0.5)
+        finally:
+            held.may_go_on.set()
+        until(lambda: held.carried[-1] == count - 1, "the newest")
+        assert held.carried == list(range(count))
         assert not held.gone
         held.close()
         beside.undeclare()
