@@ -141,12 +141,16 @@ PILOT_BUGS: tuple[Bug, ...] = (
         "zsched.core.node",
         ("        documents.count_voters(self)\n", ""),
     ),
-    _node_bug(
-        "rounds go by the electors of the file",
-        "zsched.core.handlers.documents",
-        (
-            "node.rounds.count_with(voters, node.agreement.electors)",
-            "node.rounds.count_with(voters, node.rounds.electors)",
+    Bug(
+        name="rounds go by the electors of the file",
+        module="zsched.core.handlers.documents",
+        changes=(
+            (
+                "node.rounds.count_with(voters, node.agreement.electors)",
+                "node.rounds.count_with(voters, node.rounds.electors)",
+            ),
         ),
+        tests=("tests/unit/core/electorate/test_strangers.py",),
+        has_schedules=False,
     ),
 )

@@ -25,7 +25,7 @@ RECOVERY_BUGS: tuple[Bug, ...] = (
     _bug(
         "a recovered elector does not wait for leases of before",
         RECOVERY,
-        ("            lease_s=value.guard_lease_s,\n", "            lease_s=0.0,\n"),
+        ("            granted_s=granted_s,\n", "            granted_s=0.0,\n"),
     ),
     _bug(
         "a recovered generation takes its id from its parent",

@@ -661,6 +661,9 @@ def test_a_name_that_comes_behind_the_first_value_counts_for_it_too(
     if not waits_s:
         until(lambda: relay.outputs == [("edge1/t/1/robot1/out", b"a")], "a result that nobody takes any more")
         relay.outputs.clear()
+    else:
+        with pytest.raises(AssertionError):
+            until(lambda: relay.outputs, "it has not waited for its name", 0.3)
     relay.mark(EndMarker(epoch=0, count=0, slot=3))
     until(lambda: newest.worker._dispatcher._slots, "the marker")
     if not waits_s:

@@ -412,6 +412,12 @@ def test_a_state_s_document_brings_its_flags() -> None:
     assert make().flags == ()
 
 
+def test_a_document_that_is_fetched_brings_its_flags() -> None:
+    agreement = make(ADOPTED)
+    agreed(agreement.on_stored, ev.DocumentStored(document="0d", fleet=FLEET, flags=STAYS), 100.1)
+    assert agreement.flags == STAYS
+
+
 def test_the_first_document_knows_the_leases_of_the_files_before() -> None:
     """They may be longer, and still run when the document's electors and tasks change."""
     adopted = document_change(FIRST, "0d", FLEET, file_lease_s=9.0).apply(FIRST)

@@ -21,7 +21,7 @@ from zsched.core.status import build_snapshot
 from zsched.core.todo import ToDo
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import FleetValue
-from zsched.core.values.fleet import TaskSpec
+from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.messages import Learnt, Prepare
 from zsched.core.values.model import Allocation, Ballot, Beat, Grant, PeerState, Proposal, RegisterState
 from zsched.core.vote.agreement import Agreement
@@ -60,7 +60,13 @@ def state_of(me: str, value: FleetValue | None) -> DurableState:
     )
 
 
-def node(value: FleetValue | None = LEFT, me: str = "robot1", state: DurableState | None = None) -> Node:
+def node(
+    value: FleetValue | None = LEFT,
+    me: str = "robot1",
+    state: DurableState | None = None,
+    *,
+    stored: dict[str, Fleet] | None = None,
+) -> Node:
     return Node(
         fleet=FLEET,
         me=me,
@@ -69,7 +75,7 @@ def node(value: FleetValue | None = LEFT, me: str = "robot1", state: DurableStat
         electorate="e",
         rng=Random(1),
         now=100.0,
-        stored={"0d": FLEET},
+        stored={"0d": FLEET} if stored is None else stored,
     )
 
 
@@ -229,6 +235,12 @@ def test_a_grant_needs_the_same_generation_as_well_as_the_same_number() -> None:
     one, later = agreement(), 200.0  # what was granted before its start is over
     assert granted(one, RIGHT, later) == ()
     assert [grant.owner for grant in granted(one, LEFT, later)] == ["robot3"]
+
+
+def test_without_its_document_a_robot_counts_the_electors_that_are_agreed() -> None:
+    one = node(stored={})
+    one.start(100.0)
+    assert one.rounds.electors == LEFT.electorate.names != one.fleet.electors
 
 
 def test_recover_at_once_grants_nothing_while_a_lease_of_before_may_last() -> None:
