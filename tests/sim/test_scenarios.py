@@ -1,6 +1,7 @@
 """The classic faults as scenario files with full transcripts: `tests/sim/scenarios/*.txt`.
 
-A line that begins with ``> `` is a command; what follows it, up to the next one, is all that the fleet said meanwhile.
+A line that begins with ``> `` is a command; what follows it, up to the next one, is all that the fleet said meanwhile;
+how nodes meet is one line, "all alive".
 ``ZSCHED_REGENERATE=1 pytest tests/sim/test_scenarios.py`` writes the transcripts anew: read the difference.
 
 Commands: ``fleet robots=3 edges=2 [exclusive] [seed=N]``, ``start [NODE...]``, ``settle [SECONDS]``, ``run SECONDS``,
@@ -28,6 +29,7 @@ from zsched_lab.sim.simulator import CORES, Simulator
 FOLDER = Path(__file__).parent / "scenarios"
 FILES = sorted(FOLDER.glob("*.txt"))
 TASK = "merge"
+MET = " unknown -> alive: beats"
 
 
 def fleet(words: list[str]) -> Fleet:
@@ -79,7 +81,16 @@ class Scene:
         self.owner = self.sim.agreed(TASK) or self.owner if self.sim.running() else self.owner
         before = len(self.sim.stories)
         said = self.verbs[verb]([self.owner if word == "owner" else word for word in words]) or []
-        return [*self.sim.stories[before:], *said]
+        return [*self.met(self.sim.stories[before:]), *said]
+
+    def met(self, stories: list[str]) -> list[str]:
+        """The stories; where all that run have come to see one another, one line for all that say so."""
+        running = self.sim.running()
+        at = [number for number, story in enumerate(stories) if story.endswith(MET)]
+        if not at or any(self.sim.sees(one, other) != "alive" for one, other in itertools.permutations(running, 2)):
+            return stories
+        last = f"{stories[at[-1]].split(' membership ')[0].rpartition(' ')[0]} all alive"
+        return [last if number == at[-1] else story for number, story in enumerate(stories) if number not in at[:-1]]
 
     def fleet(self, words: list[str]) -> None:
         seed = next((int(word.partition("=")[2]) for word in words if word.startswith("seed=")), 1)
