@@ -10,6 +10,7 @@ import pytest
 import zenoh
 
 from support.waiting import until
+from zsched.exits import EXIT_LEFT
 from zsched.sessions.config import client_config
 from zsched_lab.fleet.hall import Hall, block_of_ports
 
@@ -62,3 +63,25 @@ def test_two_machines_are_a_secured_fleet_by_four_commands_and_nobody_restarts_a
 
     checks = json.loads(hall.zsched("robot1", "pki", "show", "--json"))["certificates"]
     assert [(one["name"], one["state"]) for one in checks] == [("robot1", "valid"), ("robot2", "valid")]
+
+
+def test_a_machine_whose_invitation_was_lost_and_that_leaves_later_comes_in_by_the_next_one(hall: Hall) -> None:
+    port = block_of_ports(20)
+    hall.zsched("robot1", "fleet", "create", "hall", "--address", f"127.0.0.1:{port}")
+    hall.start("robot1")
+    until(lambda: hall.alive("robot1") == {"robot1"}, "the first daemon")
+    address = ("--address", f"127.0.0.1:{port + 10}")
+    invited = ("invite", "robot2", "--yes")
+    file = hall.folder / "robot2.invite"
+    file.write_text(hall.zsched("robot1", *invited, *address))
+    for more in ((), address):
+        file.write_text(hall.zsched("robot1", *invited, *more))
+        hall.zsched("robot2", "join", str(file))
+        hall.start("robot2")
+        for node in ("robot1", "robot2"):
+            until(lambda node=node: hall.alive(node) == {"robot1", "robot2"}, f"both at {node}")  # type: ignore[misc]
+        if more != address:
+            hall.zsched("robot2", "leave", "--yes")
+            assert hall.ended("robot2", 20) == EXIT_LEFT
+            until(lambda: hall.alive("robot1") == {"robot1"}, "robot1 alone")
+    assert "revoked: [robot2, robot2.k2]" in hall.zsched("robot1", "fleet", "export")

@@ -147,7 +147,7 @@ def invite(
 
     In a secured fleet the file holds the machine's certificate, and its key unless --csr is given, where this machine
     has the authority.
-    For a node that was never there it is written once more.
+    For a node that was never there it is written once more, with another key: the former one is revoked.
     """
     from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
     from zsched.commands.membership import Guest  # noqa: PLC0415 - as above

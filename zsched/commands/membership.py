@@ -27,6 +27,7 @@ from zsched.commands.papers import (
     ask_for_certificate,
     check_request,
     key_to_papers,
+    keys_to_revoke,
     papers_for,
     refuse_open_network,
 )
@@ -50,6 +51,8 @@ from zsched.wire.invitation import MAX_BYTES, Invitation, decode_invitation, enc
 SCHEMA: Final = "zsched.member/1"
 PRIVATE: Final = 0o600
 SECURED: Final = "tls"
+REVOKED: Final = ("security", "revoked")
+"""Where a document lists keys that are not let in."""
 LOCAL_PORT_AFTER: Final = 3
 """The port of a host's applications comes after those of its two sessions and of `zsched web`."""
 MAX_PORT: Final = 65_535
@@ -291,13 +294,17 @@ def invite(door: Door, view: ApplyView, guest: Guest, file: Path | None) -> int:
     secret = b"" if view.is_plan else key_to_papers(fleet, guest.authority)
     if fleet.security is None and guest.address is not None:
         refuse_open_network((address_of(guest.address).host,), view.accepted)
+    former = keys_to_revoke(fleet, guest.name, guest.authority, guest.request)
+    code = EXIT_OK
     if any(node.name == guest.name for node in fleet.nodes):
         _check_invited_again(door, guest)
+        if fleet.security is not None and not set(former) <= set(fleet.security.revoked):
+            code = apply(door, view, lambda held: _without_keys(document_text(held), former), DOCUMENT)
     else:
         address = None if guest.address is None else address_of(guest.address)
-        code = apply(door, view, lambda held: _with_guest(held, guest, address), DOCUMENT)
-        if code != EXIT_OK:
-            return code
+        code = apply(door, view, lambda held: _without_keys(_with_guest(held, guest, address), former), DOCUMENT)
+    if code != EXIT_OK:
+        return code
     if not view.is_plan:
         _write(invitation_for(door, guest, secret), guest, file)
     return EXIT_OK
@@ -338,6 +345,17 @@ def _with_guest(held: InForce, guest: Guest, address: Address | None) -> str:
     for task in dict.fromkeys(guest.tasks):
         text = _with_candidate(text, fleet, task, guest)
     return text
+
+
+def _without_keys(text: str, labels: Sequence[str]) -> str:
+    """The document with these keys among those that are not let in."""
+    security = fleet_of(text).security if labels else None
+    new = [label for label in labels if security is not None and label not in security.revoked]
+    if not new:
+        return text
+    if is_list(text, REVOKED):
+        return add_names(text, REVOKED, new)
+    return add_entries(text, REVOKED[0], f"{REVOKED[0]}: {{{REVOKED[1]}: [{', '.join(new)}]}}\n")
 
 
 def dial_order(fleet: Fleet) -> tuple[NodeId, ...]:

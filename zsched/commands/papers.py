@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 from zsched import paths as places
 from zsched.commands.apply import DANGERS, OPEN_NETWORK
 from zsched.commands.common import CliError, nearest, warn
-from zsched.commands.pki import begin_for, holds_authority, issue_for, passphrase_for
+from zsched.commands.pki import begin_for, former_keys, holds_authority, issue_for, passphrase_for, supersede
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId
 from zsched.core.values.words import NAME
@@ -105,6 +105,20 @@ def key_to_papers(fleet: Fleet, authority: Path | None) -> bytes:
     return b"" if fleet.security is None else passphrase_for(fleet, authority) or b""
 
 
+def keys_to_revoke(fleet: Fleet, node: NodeId, authority: Path | None, request: Path | None) -> tuple[str, ...]:
+    """The labels of keys that a machine has had, with which it is not let in any more once it is invited again.
+
+    An invitation may be lost, and a machine that has left keeps its key. Empty without certificates, and where the
+    authority is not on this machine.
+
+    Raises:
+        AdapterError: a file cannot be used.
+    """
+    if fleet.security is None:
+        return ()
+    return former_keys(fleet, node, authority, b"" if request is None else read_request(request))
+
+
 def papers_for(
     fleet: Fleet, node: NodeId, authority: Path | None, request: Path | None, secret: bytes
 ) -> Papers | None:
@@ -117,6 +131,7 @@ def papers_for(
     """
     if fleet.security is None:
         return None
+    supersede(fleet, keys_to_revoke(fleet, node, authority, request), authority)
     issued = issue_for(fleet, node, authority, secret, b"" if request is None else read_request(request))
     if issued is None:
         advice = f"where it is: zsched pki issue {node}; bring its files to the machine before it starts"

@@ -10,7 +10,7 @@ import contextlib
 import getpass
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -147,6 +147,38 @@ def passphrase_for(fleet: Fleet, given: Path | None) -> bytes | None:
         secret = _passphrase(authority)
         authority.check(secret)
     return secret
+
+
+def former_keys(fleet: Fleet, node: str, given: Path | None, request: bytes = b"") -> tuple[str, ...]:
+    """The labels of all keys that a node has had, less the one that ``request`` is for.
+
+    Raises:
+        AdapterError: the authority or the request cannot be used.
+    """
+    folder = holds_authority(fleet.name, given)
+    if folder is None:
+        return ()
+    from zsched.pki.authority import opened  # noqa: PLC0415 - imports cryptography
+
+    with opened(folder, fleet.name) as authority:
+        own = [one for one in authority.record.entries if (one.holder.name, one.holder.role) == (node, Role.NODE)]
+        return tuple(one.label for one in own if not authority.asks_for(one, request))
+
+
+def supersede(fleet: Fleet, labels: Sequence[str], given: Path | None) -> None:
+    """Revoke keys that others take the place of.
+
+    Raises:
+        AdapterError: the authority cannot be used.
+    """
+    folder = holds_authority(fleet.name, given)
+    if folder is None or not labels:
+        return
+    from zsched.pki.authority import opened  # noqa: PLC0415 - imports cryptography
+
+    with opened(folder, fleet.name) as authority:
+        for label in labels:
+            authority.revoke(label, _now())
 
 
 def issue_for(fleet: Fleet, node: str, given: Path | None, secret: bytes, request: bytes = b"") -> Issued | None:

@@ -142,10 +142,14 @@ class Authority:
     ) -> Issued:
         """A first certificate for a key: a new key, or that of ``request`` (a certificate request, PEM).
 
+        A request for the key that the holder has already is answered again.
+
         Raises:
-            AdapterError: the holder has a key that is not revoked, the request is not usable, or a file is not.
+            AdapterError: the holder has another key that is not revoked, the request is not usable, or a file is not.
         """
         before, at = self.record.newest(name, role), _seconds(now)
+        if before is not None and self.asks_for(before, request):
+            return self._certify(before.holder, self._requested(request), tuple(hosts), passphrase, now)
         if before is not None and before.revoked is None and before.until > at:
             raise AdapterError(
                 f"{before.label} has a certificate until {day(before.until)}; `zsched pki renew {before.label}` keeps "
@@ -177,6 +181,16 @@ class Authority:
             raise AdapterError(f"the key of {label} is revoked; `zsched pki issue {entry.holder.name}` makes another")
         public = self._requested(request) if request else self._key_in(entry.certificate)
         return self._certify(entry.holder, public, entry.hosts if hosts is None else tuple(hosts), passphrase, now)
+
+    def asks_for(self, entry: Entry, request: bytes) -> bool:
+        """Whether a request is for a key that has a certificate already, and is not revoked.
+
+        Raises:
+            AdapterError: the request is not usable.
+        """
+        return (
+            bool(request) and entry.revoked is None and x509.fingerprint(self._requested(request)) == entry.fingerprint
+        )
 
     def revoke(self, label: str, now: datetime) -> Entry:
         """Mark a key as revoked: it is never certified again. The fleet file says which names are let in.

@@ -22,6 +22,7 @@ from zsched.commands.membership import Address, address_of, dial_order, own_addr
 from zsched.config.load import check_bytes, load_fleet
 from zsched.core.values.document import Document, Rollout, Text
 from zsched.core.values.electorate import Elector, FleetValue
+from zsched.errors import ConfigError
 from zsched.runtime.secured import require_own
 from zsched.wire.codec import as_plain, document_hash, from_plain
 from zsched.wire.invitation import decode_invitation
@@ -423,9 +424,50 @@ def test_in_a_secured_fleet_the_certificate_and_its_key_come_along(node: Node, t
     fleet = load_fleet(folder / "fleet.yaml")
     assert fleet.security is not None
     require_own(fleet, fleet.security, "robot2")
+    node.states["robot2"] = "alive"
     again = run("invite", "robot2")
     assert again.exit_code == 1
-    assert "is a node of the fleet" in again.stderr or "has a certificate until" in again.stderr
+    assert "is a node of the fleet" in again.stderr
+
+
+@pytest.mark.parametrize("has_left", [False, True], ids=["the invitation was lost", "the machine has left"])
+def test_a_machine_that_is_invited_again_gets_another_key_and_the_former_one_is_worth_nothing(
+    node: Node, tmp_path: Path, *, has_left: bool
+) -> None:
+    secured(tmp_path, node)
+    alone, words = node.text, ("invite", "robot2", "--yes", "-o")
+    assert run(*words, tmp_path / "1.invite", "--address", "192.0.2.12").exit_code == 0
+    for number in (2, 3):
+        file, folder = tmp_path / f"{number}.invite", tmp_path / f"robot2-{number}"
+        node.text = alone if has_left else node.text
+        where = ("--address", "192.0.2.12") if has_left else ()
+        plan = run("invite", "robot2", "--plan", *where)
+        assert (plan.exit_code, "security.revoked" in plan.stderr) == (10, True), plan.stderr
+        assert run(*words, file, *where).exit_code == 0
+        assert run("join", file, *here(folder)).exit_code == 0
+        fleet = load_fleet(folder / "fleet.yaml")
+        assert fleet.security is not None
+        assert fleet.security.revoked == ("robot2", "robot2.k2")[: number - 1]
+        require_own(fleet, fleet.security, "robot2")
+        lost = tmp_path / f"stranger-{number}"
+        assert run("join", tmp_path / f"{number - 1}.invite", *here(lost)).exit_code == 0
+        for name in ("certificate.pem", "key.pem"):
+            (folder / "pki" / name).write_bytes((lost / "pki" / name).read_bytes())
+        with pytest.raises(ConfigError, match="does not let in"):
+            require_own(fleet, fleet.security, "robot2")
+
+
+def test_a_request_for_the_same_key_is_answered_again(node: Node, tmp_path: Path) -> None:
+    secured(tmp_path, node)
+    folder, csr, file = tmp_path / "robot2", tmp_path / "robot2.csr", tmp_path / "robot2.invite"
+    assert run("join", "--request", "robot2", "-o", csr, *here(folder)).exit_code == 0
+    assert run("invite", "robot2", "--address", "192.0.2.12", "--csr", csr, "--yes", "-o", file).exit_code == 0
+    assert run("invite", "robot2", "--csr", csr, "-o", file).exit_code == 0, "the document stays as it is"
+    assert run("join", file, *here(folder)).exit_code == 0
+    fleet = load_fleet(folder / "fleet.yaml")
+    assert fleet.security is not None
+    assert fleet.security.revoked == ()
+    require_own(fleet, fleet.security, "robot2")
 
 
 def test_a_key_that_the_machine_made_stays_there(node: Node, tmp_path: Path) -> None:
