@@ -83,6 +83,13 @@ class Step:
     keys: str = ""
     after_s: float = 2.0
     env: dict[str, str] = field(default_factory=dict)
+    into: str = ""
+    """A file in its node's folder, which takes what is printed (``> into``)."""
+
+    @property
+    def line(self) -> str:
+        """What one types."""
+        return f"zsched {self.words}{f' > {self.into}' if self.into else ''}"
 
     @property
     def verb(self) -> str:
@@ -192,6 +199,8 @@ def played(hall: Hall, step: Step, size: tuple[int, int]) -> Seen:
         env |= {"ZSCHED_NODE": step.node, "ZSCHED_AUTHORITY": str(hall.folder / "stick"), "TERM": "xterm-256color"}
         for name in ("COLUMNS", "LINES", "NO_COLOR"):
             env.pop(name, None)
+        if step.into:
+            os.dup2(os.open(step.into, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), 1)
         time.sleep(0.1)  # its terminal is given its size meanwhile
         os.execve(sys.executable, [sys.executable, "-m", "zsched.cli", *shlex.split(step.words)], env)  # noqa: S606
     fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, 0, 0))
@@ -263,13 +272,13 @@ def application(hall: Hall) -> Iterator[None]:
             yield
 
 
-def write_cast(file: Path, seen: Sequence[Seen], size: tuple[int, int], folder: Path) -> None:
+def write_cast(file: Path, seen: Sequence[Seen], size: tuple[int, int], folder: Path, title: str) -> None:
     """An asciicast of all steps, one after another; what took long is shortened."""
     rows, columns = size
-    lines: list[Any] = [{"version": 2, "width": columns, "height": rows, "title": "every verb of zsched, six machines"}]
+    lines: list[Any] = [{"version": 2, "width": columns, "height": rows, "title": title}]
     now = 0.0
     for one in seen:
-        lines.append([round(now, 2), "o", f"\x1b[1m{one.step.node}$ zsched {one.step.words}\x1b[0m\r\n"])
+        lines.append([round(now, 2), "o", f"\x1b[1m{one.step.node}$ {one.step.line}\x1b[0m\r\n"])
         before = 0.0
         for at, text in one.events:
             now += min(at - before, SHOWN_PAUSE_S)
@@ -334,7 +343,7 @@ def main() -> None:
                 seen.append(played(hall, step, size))
                 print(f"{seen[-1].seconds:5.1f} s  {seen[-1].code}  {step.node}$ zsched {step.words}", flush=True)
     if options.cast:
-        write_cast(options.cast, seen, size, Path(name))
+        write_cast(options.cast, seen, size, Path(name), "every verb of zsched, six machines")
     if options.page:
         write_page(options.page, seen, Path(name))
     if options.screens:
