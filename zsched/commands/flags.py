@@ -101,7 +101,10 @@ def drain(view: OrderView, order: DrainOrder) -> int:
     before = {name: _counts(found, name) for name in _owned(status, nodes)}
     revision = _commit(view, held, after, f"{order.kind} {', '.join(nodes)}")
     what = "It is agreed" if is_change else "It is so already"
-    watch = "" if order.is_detached else f". Ctrl-C ends the watching, not the {order.kind}"
+    watch = ". Ctrl-C ends the watching, not the drain"
+    if order.kind == LEAVE:  # this command does the rest, once the node is empty
+        watch = f". After Ctrl-C the same command goes on, and `zsched undrain {' '.join(nodes)}` takes it back"
+    watch = "" if order.is_detached else watch
     tell(view, "agreed", f"{what}{watch}.", after_s=0.0, nodes=nodes, revision=revision)
     if order.is_detached:
         return EXIT_OK

@@ -189,6 +189,7 @@ def test_it_hands_over_gives_its_seat_up_goes_out_of_the_document_and_ends(hall:
     assert hall.flags == []
     assert left(hall.folder) == RENAMED
     said = done.stdout
+    assert "the same command goes on, and `zsched undrain robot3` takes it back" in " ".join(said.split())
     order = ["merge: robot3 -> robot1", "robot3: empty, and gets nothing new\n", "still: it waits for a spare"]
     order += ["electors: robot1, robot2", "revision 9 is agreed, and robot3 is no node of it", "the daemon has ended"]
     places = [said.index(one) for one in (*order, "robot3 has left hall", "it comes back by `zsched invite robot3`")]
