@@ -41,21 +41,19 @@ from zsched.core.values.messages import (
     FleetQuestion,
     FleetTold,
     HistoryTold,
-    HoldTask,
     Learnt,
-    MoveTask,
+    Ordered,
     Prepare,
     Promise,
     ReadFleet,
     ReadHistory,
     ReadLines,
     Refused,
-    TuneTask,
     Utilities,
     Votes,
     WorkerLines,
 )
-from zsched.core.values.model import Beat, NodeId, Profile, Proposal
+from zsched.core.values.model import Asked, Beat, NodeId, Profile, Proposal
 from zsched.core.values.rehearsal import ReadRehearsals, RehearsalsTold
 from zsched.core.values.snapshot import Snapshot
 from zsched.core.values.struct import replace
@@ -120,9 +118,11 @@ def answer_classes(command: Command | None) -> tuple[type[Answer], ...]:
 
 def signed_by(holder: Holder, command: Command) -> Command:
     """A command that tells who has ordered it, with the name of the certificate instead of what the tool says."""
-    if holder.role is Role.NODE or not isinstance(command, MoveTask | HoldTask | TuneTask):
+    if holder.role is Role.NODE or not isinstance(command, Ordered):
         return command
-    return replace(command, asked=replace(command.asked, by=holder.label))
+    said = command.asked  # an older tool says nothing
+    asked = Asked(by=holder.label) if said is None else replace(said, by=holder.label)
+    return replace(command, asked=asked)
 
 
 def task_of(command: Command) -> str:

@@ -512,6 +512,8 @@ Command = (
     | ReadFleet
 )
 COMMANDS: tuple[type, ...] = get_args(Command)
+Ordered = SetWeights | Strike | KeepRehearsal | RetryTask | RestartTask | MoveTask | HoldTask | TuneTask
+"""Commands that carry who gives them (``asked``)."""
 
 
 class FleetTold(Struct, frozen=True, kw_only=True):

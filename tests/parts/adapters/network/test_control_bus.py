@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 import pytest
 import zenoh
@@ -14,6 +14,7 @@ import zenoh
 from support.allocations import allocation_of
 from support.ballots import ballot_of
 from support.beats import beat_of
+from support.fleets import tuning_of
 from support.profiles import profile_of
 from support.proposals import proposal_of
 from support.waiting import free_endpoint, until
@@ -22,24 +23,34 @@ from zsched.adapters.network.control_bus import RING, ControlBus, signed_by
 from zsched.adapters.network.open_questions import Questions
 from zsched.core import events as ev
 from zsched.core.values.certificates import Holder, Role
+from zsched.core.values.document import Text
 from zsched.core.values.fleet import Timing
 from zsched.core.values.messages import (
+    COMMANDS,
     Accept,
     Accepted,
     Ballots,
     CommandOutcome,
     CommandResult,
+    ExplainTask,
+    Hold,
+    HoldTask,
     Learnt,
     MoveTask,
+    Ordered,
     Prepare,
     Promise,
     Refusal,
     Refused,
+    RestartTask,
+    RetryTask,
     SetWeights,
+    TuneTask,
     Utilities,
     Votes,
 )
 from zsched.core.values.model import Acceptance, Asked
+from zsched.core.values.rehearsal import KeepRehearsal, Step, Strike
 from zsched.core.values.snapshot import QuorumStatus, Snapshot
 from zsched.errors import AdapterError
 from zsched.sessions.config import control_config
@@ -133,14 +144,37 @@ def stranger(trio: tuple[Peer, Peer, Peer]) -> Iterator[zenoh.Session]:
         session.close()
 
 
-def test_an_operator_s_order_has_the_name_of_its_certificate_whatever_the_tool_says() -> None:
-    move = MoveTask(task="merge", node="edge1", asked=Asked(by="root@robot1", reason="why"))
+BOB = Asked(by="bob@robot1", reason="why")
+ORDERS: tuple[Ordered, ...] = (
+    MoveTask(task="merge", node="edge1", asked=BOB),
+    HoldTask(task="merge", hold=Hold.PAUSE, asked=BOB),
+    TuneTask(task="merge", tuning=tuning_of(), base_revision=3, asked=BOB),
+    SetWeights(task="merge", cpu=1.0, memory=0.0, network=0.0, asked=BOB),
+    RetryTask(task="merge", asked=BOB),
+    RestartTask(task="merge", asked=BOB),
+    Strike(step=Step.WORKER, task="merge", asked=BOB),
+    KeepRehearsal(task="merge", name="one", body=Text("{}"), told="", asked=BOB),
+)
+
+
+@pytest.mark.parametrize("order", ORDERS, ids=lambda order: type(order).__name__)
+def test_an_operator_s_order_has_the_name_of_its_certificate_whatever_the_tool_says(order: Ordered) -> None:
     ana, robot = Holder(name="ana", role=Role.OPERATOR), Holder(name="robot1")
-    signed = signed_by(ana, move)
-    assert isinstance(signed, MoveTask)
+    signed = signed_by(ana, order)
+    assert isinstance(signed, type(order))
     assert signed.asked == Asked(by="ana.operator", reason="why")
-    assert signed_by(robot, move) == move, "the user of a node's machine, as that node tells it"
-    assert signed_by(ana, COMMAND) == COMMAND
+    assert signed_by(robot, order) == order, "the user of a node's machine, as that node tells it"
+
+
+def test_an_operator_whose_tool_says_nothing_is_named_too_and_questions_have_no_name() -> None:
+    ana = Holder(name="ana", role=Role.OPERATOR)
+    assert set(get_args(Ordered)) == {type(order) for order in ORDERS}
+    assert set(get_args(Ordered)) == {one for one in COMMANDS if "asked" in one.__annotations__}
+    signed = signed_by(ana, RetryTask(task="merge"))
+    assert isinstance(signed, RetryTask)
+    assert signed.asked == Asked(by="ana.operator")
+    question = ExplainTask(task="merge")
+    assert signed_by(ana, question) == question
 
 
 # --- puts ------------------------------------------------------------------------------------------------------------
