@@ -138,7 +138,9 @@ def _problems(node: Stages, quorum: QuorumStatus, now: float) -> tuple[str, ...]
     voters = node.agreement.voters
     silent = [name for name in voters if node.membership.state(name) is not PeerState.ALIVE]
     needed = majority(len(voters))
-    if quorum.ok and len(voters) - len(silent) < needed:
+    if quorum.ok and not voters:
+        problems.append("nobody votes: the fleet has no robot, so no task gets an owner; `zsched invite` brings one")
+    elif quorum.ok and len(voters) - len(silent) < needed:
         problems.append(
             f"no planned moves: {len(voters) - len(silent)} of {len(voters)} robots can vote, {needed} needed; "
             f"not {', '.join(silent)}. An owner that is gone, drains or fails is still replaced"

@@ -438,6 +438,24 @@ def test_robots_that_cannot_make_a_majority_are_a_problem_while_electors_can() -
     assert build_snapshot(node, 100.0).problems == ()
 
 
+def test_a_fleet_without_robots_says_that_nobody_votes() -> None:
+    edges = fleet_of(*FLEET.tasks, of=EDGES, electors=EDGES[:1])
+    hashed = electorate_hash(edges)
+    node = Node(
+        fleet=edges,
+        me="edge1",
+        durable=state_of("edge1", electorate=hashed),
+        incarnation=7,
+        electorate=hashed,
+        rng=Random(1),
+        now=100.0,
+        version="1.2.3",
+    )
+    assert build_snapshot(node, 100.0).problems == (
+        "nobody votes: the fleet has no robot, so no task gets an owner; `zsched invite` brings one",
+    )
+
+
 def test_a_worker_that_failed_or_is_missed_is_told_with_its_reason() -> None:
     node = make()
     for name in EDGES:
