@@ -69,6 +69,8 @@ from zsched.runtime.membership import belongings, whose
 from zsched.runtime.next_cell import Change
 from zsched.wire.invitation import Invitation
 
+INVITE: Final = ".invite"
+"""The end of an invitation's name, as the advice writes it."""
 PAUSE_S: Final = 0.2
 TRIES: Final = 10
 REACH_S: Final = 60.0
@@ -205,6 +207,8 @@ def _found(way: Way, fleet: str, word: str, going: Change | None) -> _Next:
         return _Next(fleet=word, invitation=going.invitation, is_invited=True)
     if cell is None:
         if not Path(word).exists():
+            if "/" in word or word.endswith(INVITE):
+                raise CliError(EXIT_USAGE, f"--to: there is no file {word}; give the invitation's path")
             known = [one.name for one in here.cells]
             hint = nearest(word, known) if known else f"; fleet {fleet} names no cell under `site:`"
             raise CliError(EXIT_USAGE, f"--to: {word!r} is no cell of the site, and no invitation{hint}")
@@ -234,7 +238,7 @@ def _found(way: Way, fleet: str, word: str, going: Change | None) -> _Next:
 
 
 def _invite(fleet: str, me: NodeId) -> str:
-    file = f"{me}.invite"
+    file = f"{me}{INVITE}"
     return f"where {fleet}'s authority is: zsched invite {me} > {file}; then here: sudo zsched leave --to {file}"
 
 
@@ -330,7 +334,7 @@ def _text_with(way: Way, held: InForce) -> str:
         text = add_names(text, ("seeds",), [*(name for name in dial_order(fleet) if name not in known), way.me])
     result = check_bytes(text.encode(), f"the document of {held.fleet} with {way.me}")
     if result.fleet is None:
-        advice = f"invite it by hand there, and give the invitation: zsched leave --to {way.me}.invite"
+        advice = f"invite it by hand there, and give the invitation: zsched leave --to {way.me}{INVITE}"
         raise ConfigError(f"nothing was changed: {result.report()}\n{advice}")
     return text
 

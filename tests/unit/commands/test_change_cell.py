@@ -446,6 +446,8 @@ def test_a_way_back_that_was_broken_off_between_two_files_goes_on(
     ("words", "code", "told"),
     [
         (("--to", "hall-x"), 2, "'hall-x' is no cell of the site, and no invitation"),
+        (("--to", "/nowhere/robot3"), 2, "--to: there is no file /nowhere/robot3; give the invitation's path"),
+        (("--to", "robot3.invite"), 2, "--to: there is no file robot3.invite"),
         (("--to", "hall-b", "--purge"), 2, "--purge does not go with --to"),
         (("--to", "hall-b", "--accept", "nothing"), 2, "there is no danger 'nothing'"),
     ],
