@@ -161,7 +161,7 @@ def is_joined(invitation: Invitation, places: Places) -> bool:
         AdapterError: it has a state of another node, fleet or generation.
     """
     file = StateFile(places.state, fleet=invitation.fleet, node=invitation.node)
-    file.check_owner()
+    file.check_owner("or take this machine out of its fleet first (`zsched leave`)")
     loaded = file.load()
     if loaded.is_missing:
         return False

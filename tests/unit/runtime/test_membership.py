@@ -136,13 +136,14 @@ def test_another_text_of_the_same_fleet_is_kept_beside(second: Places, invitatio
 def test_a_state_of_another_node_fleet_or_generation_is_left_as_it_is(
     first: Places, second: Places, invitation: Invitation
 ) -> None:
-    with pytest.raises(AdapterError, match="belongs to the node 'robot1'"):
+    instead = r"own with --state-dir, or take this machine out of its fleet first \(`zsched leave`\)$"
+    with pytest.raises(AdapterError, match=f"belongs to the node 'robot1'.*{instead}"):
         is_joined(invitation, first)
     other = replace(invitation, value=replace(invitation.value, generation_id="cd" * 16))
     join(other, second, is_plan=False)
     with pytest.raises(AdapterError, match="of another generation"):
         is_joined(invitation, second)
-    with pytest.raises(AdapterError, match="belongs to the fleet"):
+    with pytest.raises(AdapterError, match=f"belongs to the fleet.*{instead}"):
         is_joined(replace(invitation, value=replace(invitation.value, fleet="yard")), second)
 
 

@@ -106,8 +106,11 @@ class StateFile:
     ) -> None:
         self.release()
 
-    def check_owner(self) -> None:
+    def check_owner(self, instead: str = "") -> None:
         """Look whose folder it is; it is left as it is.
+
+        Args:
+            instead: what else to do, where no option of the command names another node or fleet file.
 
         Raises:
             AdapterError: another node's or fleet's.
@@ -115,8 +118,8 @@ class StateFile:
         state = self._read().state
         if state is None or (state.fleet, state.node) == (self._fleet, self._node):
             return
-        whose = f"or say with --node {state.node} that this machine is {state.node}"
-        if state.fleet != self._fleet:
+        whose = instead or f"or say with --node {state.node} that this machine is {state.node}"
+        if not instead and state.fleet != self._fleet:
             whose = "or name that fleet's file with --config"
         raise AdapterError(
             f"{self.path} {self._foreign(state)}, and is left as it is; "
