@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TextIO
 
+from zsched import paths as places
 from zsched.commands.ask import Door
 from zsched.commands.common import CliError, Json, check_reason, nearest, print_json, say, says_yes, warn
 from zsched.commands.document import (
@@ -179,7 +180,9 @@ def make_plan(door: Door, held: InForce, text: str, file: str, view: ApplyView |
             worker can wait.
         ConfigError: it has faults.
     """
-    result = check_bytes(text.encode(), file)
+    config = places.config_path(None, os.environ)
+    folder = config.absolute().parent if config.exists() else None  # where the nodes read it
+    result = check_bytes(text.encode(), file, folder)
     if result.fleet is None:
         raise ConfigError(result.report())
     fleet = result.fleet
@@ -195,7 +198,7 @@ def make_plan(door: Door, held: InForce, text: str, file: str, view: ApplyView |
             raise CliError(EXIT_FAILED, f"--pause-after: {held.fleet} has no document yet; agree its file first")
         return _first(door, held, text, fleet, warnings)
     warnings = render_all(file, warnings_in_force(text, result.warnings), "warning")
-    old = check_bytes(document_text(held).encode(), file).fleet
+    old = check_bytes(document_text(held).encode(), file, folder).fleet
     if old is None:
         advice = "update zsched here; `zsched fleet export` shows the document"
         raise CliError(EXIT_FAILED, f"the document in force has faults for this version of zsched; {advice}")

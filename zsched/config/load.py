@@ -103,14 +103,14 @@ def _unread_hint(file: Path, error: OSError | ValueError) -> str:
     return "give the path of a fleet file"
 
 
-def check_bytes(data: bytes, file: str = "fleet.yaml") -> CheckResult:
-    """As `check_file` for ``data``; file names in it are relative to the folder of ``file``."""
+def check_bytes(data: bytes, file: str = "fleet.yaml", folder: Path | None = None) -> CheckResult:
+    """As `check_file` for ``data``; file names in it are relative to ``folder``, else to the folder of ``file``."""
     root, out = read_yaml(data)
     fleet = None
     if root is not None:
         section = FLEET.read(root, out)
         if section is not None:
-            fleet = _fleet(section, Path(file).absolute().parent, len(data), out)
+            fleet = _fleet(section, folder or Path(file).absolute().parent, len(data), out)
     is_good = fleet is not None and out.count == 0
     return CheckResult(file=file, fleet=fleet if is_good else None, faults=out.faults, warnings=out.warnings)
 

@@ -128,6 +128,24 @@ def changed(tmp_path: Path, old: str, new: str) -> Path:
 # --- apply -----------------------------------------------------------------------------------------------------------
 
 
+def test_files_that_the_document_names_are_looked_for_beside_the_fleet_file(
+    node: Node, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither in the folder from which the verb is called, nor in that of the new text."""
+    (tmp_path / "etc").mkdir()
+    monkeypatch.setenv("ZSCHED_CONFIG", str(tmp_path / "etc" / "fleet.yaml"))
+    node.text += "site:\n  yard: {gateways: [tcp/192.0.2.31:7457, tcp/192.0.2.32:7457], file: yard.yaml}\n"
+    for name, text in (("fleet.yaml", node.text), ("yard.yaml", "fleet: yard")):
+        (tmp_path / "etc" / name).write_text(text)
+    file = tmp_path / "new.yaml"
+    file.write_text(node.text.replace("cpu: 0.5, memory: 0.5", "cpu: 0.6, memory: 0.4"))
+    for words in (("apply", file), ("invite", "robot3")):
+        result = run(*words, "--plan")
+        assert (result.exit_code, "is not on this machine" in result.stderr) == (10, False), result.stderr
+    (tmp_path / "etc" / "yard.yaml").unlink()
+    assert f"{tmp_path / 'etc' / 'yard.yaml'} is not on this machine" in run("apply", file, "--plan").stderr
+
+
 def test_a_plan_shows_before_and_after_in_the_files_words_and_changes_nothing(node: Node, tmp_path: Path) -> None:
     file = changed(tmp_path, "cpu: 0.5, memory: 0.5", "cpu: 0.6, memory: 0.4")
     result = run("apply", file, "--plan")
