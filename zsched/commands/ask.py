@@ -403,7 +403,7 @@ def _visit(endpoint: str, cell: Cell | None) -> _Visit:
     """With the certificates that the fleet file of this machine or of the cell names, where the endpoint is secured.
 
     Raises:
-        CliError: there is no such fleet file (78).
+        CliError: there is no such fleet file, or it is another fleet's (78).
         ConfigError: it has faults, or there is no certificate.
     """
     name = places.node_name(None, os.environ)
@@ -428,6 +428,9 @@ def _visit(endpoint: str, cell: Cell | None) -> _Visit:
             f"{advice}",
         )
     fleet = load_fleet(file)
+    if cell is not None and fleet.name != cell.name:
+        advice = f"put a copy of {cell.name}'s there (docs/guide/scale.md)"
+        raise CliError(EXIT_CONFIG, f"{file} is the file of fleet {fleet.name}, and not of {cell.name}; {advice}")
     text = session_text(fleet, Side.VISIT)
     if fleet.security is None:
         return _Visit(text=text, asker=asker, fleet=any_fleet)

@@ -12,8 +12,9 @@ import pytest
 from zsched import paths as places
 from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.commands import ask
-from zsched.commands.ask import AGAIN_S, Door, ask_door, find_door
+from zsched.commands.ask import AGAIN_S, Door, ask_door, door_of, find_door
 from zsched.commands.common import CliError
+from zsched.core.values.fleet import Cell
 from zsched.exits import EXIT_CONFIG, EXIT_UNREACHABLE
 from zsched.paths import again_path, socket_path
 
@@ -54,6 +55,15 @@ def test_a_secured_endpoint_without_a_fleet_file_here_says_which_file_is_meant(
     monkeypatch.setenv("ZSCHED_CONFIG", str(tmp_path / "fleet.yaml"))
     with pytest.raises(CliError, match=r"lets in who has its certificate, and .*fleet\.yaml, which names it") as caught:
         ask_door(find_door(None, None, ENV, connect="tls/127.0.0.1:1"), {"verb": "status"})
+    assert caught.value.code == EXIT_CONFIG
+
+
+def test_a_cell_with_the_file_of_another_fleet_says_whose_it_is(tmp_path: Path) -> None:
+    file = tmp_path / "hall-b.yaml"
+    file.write_text("fleet: hall-c\nnodes: {robot1: {kind: robot}}\ntasks: {}\n")
+    cell = Cell(name="hall-b", gateways=("tls/127.0.0.1:1", "tls/127.0.0.1:2"), file=str(file))
+    with pytest.raises(CliError, match=f"^{file} is the file of fleet hall-c, and not of hall-b; put a copy") as caught:
+        ask_door(door_of(cell, "hall-a", None), {"verb": "status"})
     assert caught.value.code == EXIT_CONFIG
 
 
