@@ -110,6 +110,13 @@ PILOT_BUGS: tuple[Bug, ...] = (
             "return bool(self._durable is None and self._lost and",
         ),
     ),
+    _bug(
+        "who was never heard is counted on",
+        (
+            "if peer is not None and now - peer.at < course.silence_s and _answers(seat, peer.word):",
+            "if peer is None or now - peer.at < course.silence_s:",
+        ),
+    ),
     _bug("electors that the operator has named are replaced", ("if not course.is_auto:", "if not course.members:")),
     _bug("the electors become an even number", ("return count - 1 + count % 2", "return count")),
     _bug("one elector's view sends a robot away", ("if count >= needed or (name", "if count or (name")),

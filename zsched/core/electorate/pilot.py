@@ -14,7 +14,7 @@ Knows: what this node has heard in beats, what other electors think, the fleet v
   disk of its newest beat.
 * Two electors are no better than three of which one is gone: so the third goes only when a spare is there. Two never
   become one but by a leave, for a majority of two is both. The last one stays.
-* A leaver is removed once those that are alive without it are a majority of the electors that stay: else whoever is
+* A leaver is removed once those that are heard without it are a majority of the electors that stay: else whoever is
   gone is replaced first. A single elector that leaves takes a second one, if one is fit, and goes then.
 * A leaver stays until it has learnt a settled value without it (`may_go`).
 * The aim is an odd number, at most `TARGET`, of robots and edges alike, of those the steadiest.
@@ -254,18 +254,17 @@ class Pilot:
 
     def _electors_heard(self, value: FleetValue, course: Course, now: float) -> list[tuple[NodeId, Word]]:
         """The newest words of the other electors that are alive and count as this node does."""
-        found = []
+        words = ((name, self._peers[name].word) for name in self._alive(value, course, now) if name != self.me)
+        return [(name, word) for name, word in words if word.is_current]
+
+    def _alive(self, value: FleetValue, course: Course, now: float) -> list[NodeId]:
+        """The electors that this node hears, itself included; who was never heard is not, however new its seat is."""
+        heard = []
         for seat in value.electors:
             peer = self._peers.get(seat.name)
             if peer is not None and now - peer.at < course.silence_s and _answers(seat, peer.word):
-                found += [(seat.name, peer.word)] if peer.word.is_current else []
-        return found
-
-    def _alive(self, value: FleetValue, course: Course, now: float) -> list[NodeId]:
-        """The electors that this node hears, itself included."""
-        own = value.electorate.seat(self.me)
-        heard = [seat.name for seat in value.electors if seat != own and now - self._seats[seat] < course.silence_s]
-        return sorted([*heard, self.me])
+                heard.append(seat.name)
+        return sorted({*heard, self.me})
 
     def _rank(self, value: FleetValue, course: Course, now: float) -> int:
         """This node's turn among the electors that it hears; they take turns by the value's revision."""

@@ -246,6 +246,15 @@ def test_a_leaver_waits_where_too_few_would_be_left_and_who_is_gone_is_replaced_
     assert ear.wish == "-b", "the one that stays is a majority of one"
 
 
+def test_whom_a_pilot_that_has_just_started_never_heard_is_not_counted_on() -> None:
+    """It may be dead: without the leaver the fleet would have no majority any more."""
+    ear = Ear(value("abc"), replace(COURSE, leaving=("b",)))
+    ear.hear("b", 1.0)
+    assert (ear.gone(), ear.wish) == ((), "b leaves when 2 of the other electors are alive")
+    ear.hear("bc", 1.0)
+    assert ear.wish == "-b"
+
+
 def test_a_single_elector_that_leaves_hands_its_seat_to_one_that_is_fit() -> None:
     ear = Ear(value("a"))
     ear.hear("x", STEADY * T + 1.0)
