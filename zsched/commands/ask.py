@@ -21,7 +21,7 @@ from zsched.clock import wall_s
 from zsched.commands.common import CliError, Json, nearest
 from zsched.core.values.struct import Struct, replace
 from zsched.core.values.words import NAME
-from zsched.errors import AdapterError
+from zsched.errors import AdapterError, WireError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_TIMED_OUT, EXIT_UNREACHABLE, EXIT_USAGE
 
 if TYPE_CHECKING:
@@ -148,7 +148,7 @@ def door_here(runtime_dir: Path | None, node: str | None, env: Mapping[str, str]
 
 
 def fleet_here(door: Door | None, config: Path) -> Fleet:
-    """The fleet by which this machine goes: the document in force, by the daemon here; else its fleet file.
+    """The fleet by which this machine goes: the document by the daemon here, else the stored one, else the fleet file.
 
     Once a document is agreed the file may be a copy of an older one.
 
@@ -165,9 +165,27 @@ def fleet_here(door: Door | None, config: Path) -> Fleet:
         with contextlib.suppress(CliError):
             text = ask_door(door, {"verb": "fleet"}).get("text")
             known = check_bytes(text.encode(), str(config)).fleet if text else None
-            if known is not None:
-                return known
-    return load_fleet(config)
+            return load_fleet(config) if known is None else known
+    by_file = load_fleet(config)
+    text = _kept_document(by_file.name)
+    return (check_bytes(text.encode(), str(config)).fleet if text else None) or by_file
+
+
+def _kept_document(fleet: str) -> str:
+    """The text of the last document in this machine's state folder; empty: none of that fleet, or none to be read."""
+    from zsched.adapters.host.document_store import DocumentStore  # noqa: PLC0415 - only where no daemon answers
+    from zsched.adapters.host.state_file import MAX_STATE_BYTES, STATE_NAME  # noqa: PLC0415 - as above
+    from zsched.files import read_regular  # noqa: PLC0415 - as above
+    from zsched.wire.codec import decode_state  # noqa: PLC0415 - as above
+
+    folder = places.state_folder(None, os.environ)
+    try:
+        state = decode_state(read_regular(folder / STATE_NAME, MAX_STATE_BYTES))
+    except (OSError, WireError):
+        return ""
+    value = None if state.fleet != fleet or state.fleet_register is None else state.fleet_register.learnt
+    content = None if value is None else DocumentStore(folder).load(value.document)
+    return "" if content is None else content.text
 
 
 def door_of(cell: Cell, fleet: str, here: Door | None, node: str | None = None) -> Door:

@@ -72,11 +72,18 @@ def show_histories(runtime_dir: Path | None, node: str | None, past: Past, *, is
 
 
 def _ask_all(runtime_dir: Path | None, node: str | None, ask: Callable[[str, Door], T]) -> tuple[Fleet, list[T]]:
-    """(this machine's fleet, what ``ask`` makes of each cell), this machine's first; all are asked at once."""
+    """(this machine's fleet, what ``ask`` makes of each cell), this machine's first; all are asked at once.
+
+    Raises:
+        CliError: no daemon runs here, and no other cell is known.
+    """
     here = door_here(runtime_dir, node)
     fleet = fleet_here(here, places.config_path(None, os.environ))
     doors = [] if here is None else [(fleet.name, here)]
     doors += [(cell.name, door_of(cell, fleet.name, here)) for cell in fleet.cells]
+    if not doors:
+        told = f"no daemon answers on this machine, and what it has of fleet {fleet.name} names no other under `site:`"
+        raise CliError(EXIT_UNREACHABLE, f"{told}; start it with `zsched up`, or ask where a daemon runs")
     with ThreadPoolExecutor(max(len(doors), 1)) as errands:
         return fleet, list(errands.map(lambda one: ask(*one), doors))
 
