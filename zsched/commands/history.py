@@ -15,6 +15,7 @@ from typing import Final
 
 from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, nearest, print_json, say, warn
+from zsched.commands.orders import check_name, status_of
 from zsched.commands.page import span
 from zsched.commands.report import millis, printable
 from zsched.core.values.struct import Struct
@@ -129,6 +130,8 @@ def history(
     """Print the moves that the log of the node at the door knows, the newest last; returns the exit code."""
     past = Past(task=task, about=about, since_s=since_s)
     told = past.read(door)
+    if not any(told[key] for key in ("moves", "rehearsals", "rollouts")):
+        _check_names(door, past)
     if is_json:
         print_json({"schema": SCHEMA, **told})
         return EXIT_OK
@@ -137,6 +140,20 @@ def history(
         say(f"no move{past.words} in the log of {told['node']}")
     print_lines(lines)
     return EXIT_OK
+
+
+def _check_names(door: Door, past: Past) -> None:
+    """Refuse a task or a node of which nothing is told, and which the fleet has not (2); one that is gone has a past.
+
+    Raises:
+        CliError: there is none of that name, or nobody answers.
+    """
+    if past.task is None and past.about is None:
+        return
+    status = status_of(door)
+    for kind, name in (("task", past.task), ("node", past.about)):
+        if name is not None:
+            check_name(status, kind, name, [str(one["name"]) for one in status[f"{kind}s"]])
 
 
 def lines_of(told: Json, before: str = "") -> list[tuple[float, str]]:

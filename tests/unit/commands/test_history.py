@@ -26,6 +26,11 @@ from zsched.exits import EXIT_UNREACHABLE, EXIT_USAGE
 
 NOW = 1_790_000_000.0
 HERE = Door(socket=Path("s"))
+STATUS = {
+    "fleet": "hall",
+    "tasks": [{"name": "merge"}, {"name": "nothing"}, {"name": "other"}],
+    "nodes": [{"name": "edge1"}, {"name": "edge3"}, {"name": "robot1"}],
+}
 MOVE = {
     "epoch": 2,
     "revision": 3,
@@ -88,6 +93,7 @@ def pages(monkeypatch: pytest.MonkeyPatch) -> Pages:
         entry("learnt \x1b[2J", 60.0, task="other", move={**MOVE, "left": None, "votes": []}),
     )
     monkeypatch.setattr(verb, "ask_door", made.ask)
+    monkeypatch.setattr(verb, "status_of", lambda _door: STATUS)
     monkeypatch.setattr("zsched.commands.history.time.sleep", lambda _s: None)
     return made
 
@@ -286,6 +292,17 @@ def test_moves_of_one_node_are_those_that_came_to_it_or_left_it(capsys: pytest.C
     assert [move["task"] for move in json.loads(capsys.readouterr().out)["moves"]] == ["merge", "other"]
     assert history(HERE, "merge", about="edge3", is_json=False) == 0
     assert capsys.readouterr().out == "no move of merge to edge3 or away from it in the log of robot1\n"
+
+
+@pytest.mark.usefixtures("pages")
+def test_a_name_that_neither_the_log_nor_the_fleet_has_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(CliError, match=r"^fleet hall has no task 'merg'; did you mean merge") as refused:
+        history(HERE, "merg", is_json=False)
+    assert refused.value.code == EXIT_USAGE
+    with pytest.raises(CliError, match=r"^fleet hall has no node 'nosuch'; there are edge1,") as refused:
+        history(HERE, None, about="nosuch", is_json=True)
+    assert (refused.value.code, capsys.readouterr().out) == (EXIT_USAGE, "")
+    assert history(HERE, None, about="edge2", is_json=False) == 0, "a node that is gone has a past"
 
 
 def test_events_of_one_node_name_it_as_a_whole_word(pages: Pages, capsys: pytest.CaptureFixture[str]) -> None:
