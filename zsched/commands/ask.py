@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from zsched.adapters.network.seals import Seals
     from zsched.core.values.fleet import Cell, Fleet
     from zsched.core.values.messages import Command
+    from zsched.core.values.model import NodeId
 
 PLAIN, TLS = "tcp/", "tls/"
 SECURE_PAGE = "docs/guide/secure.md"
@@ -361,13 +362,14 @@ def _ask_cell(cell: Cell, node: str | None, command: Command | None) -> Answer:
     A command goes to the gateway by which the node has just told its status, once: a second one might do it twice.
 
     Raises:
+        CliError: the cell has no such node (2).
         AdapterError: no gateway finds it, or the command was not answered.
     """
     failures = []
     for gateway in sorted(cell.gateways, key=lambda one: one != _answered.get(cell.name)):
         try:
             client = _client(gateway, cell)
-            status = client.ask(node, None)
+            status = _status_in(cell, client, node)
         except AdapterError as error:
             failures.append(f"by {gateway}: {str(error).removeprefix(gateway).strip()}")
             continue
@@ -375,6 +377,19 @@ def _ask_cell(cell: Cell, node: str | None, command: Command | None) -> Answer:
         return status if command is None else client.ask(node, command)
     whom = f"{cell.name}/{node}" if node is not None else f"cell {cell.name}"
     raise AdapterError(f"{whom} cannot be asked; {'; '.join(failures)}")
+
+
+def _status_in(cell: Cell, client: FleetClient, node: NodeId | None) -> Answer:
+    """The status of a node of a cell; of one that is silent the gateway says whether the cell has it."""
+    try:
+        return client.ask(node, None)
+    except AdapterError:
+        names: list[NodeId] = []
+        with contextlib.suppress(AdapterError):
+            names = [one.name for one in client.status().nodes]
+        if node is None or not names or node in names:
+            raise
+        raise CliError(EXIT_USAGE, f"fleet {cell.name} has no node {node!r}{nearest(node, names)}") from None
 
 
 _answered: dict[str, str] = {}

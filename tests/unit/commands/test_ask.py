@@ -6,6 +6,7 @@ import os
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -15,7 +16,8 @@ from zsched.commands import ask
 from zsched.commands.ask import AGAIN_S, Door, ask_door, door_of, find_door
 from zsched.commands.common import CliError
 from zsched.core.values.fleet import Cell
-from zsched.exits import EXIT_CONFIG, EXIT_UNREACHABLE
+from zsched.errors import AdapterError
+from zsched.exits import EXIT_CONFIG, EXIT_UNREACHABLE, EXIT_USAGE
 from zsched.paths import again_path, socket_path
 
 ENV = {"ZSCHED_NODE": "robot1"}
@@ -65,6 +67,26 @@ def test_a_cell_with_the_file_of_another_fleet_says_whose_it_is(tmp_path: Path) 
     with pytest.raises(CliError, match=f"^{file} is the file of fleet hall-c, and not of hall-b; put a copy") as caught:
         ask_door(door_of(cell, "hall-a", None), {"verb": "status"})
     assert caught.value.code == EXIT_CONFIG
+
+
+def test_a_name_that_a_cell_has_not_is_refused_with_those_it_has(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Gateway:
+        """It passes questions on, and nobody answers them."""
+
+        def ask(self, node: str, _command: object) -> None:
+            raise AdapterError(f"{node} did not answer within 3 s")
+
+        def status(self) -> object:
+            return SimpleNamespace(nodes=[SimpleNamespace(name="edge1"), SimpleNamespace(name="robot1")])
+
+    monkeypatch.setattr(ask, "_client", lambda _gateway, _cell: Gateway())
+    cell = Cell(name="hall-b", gateways=("tcp/127.0.0.1:1", "tcp/127.0.0.1:2"))
+    with pytest.raises(CliError, match=r"^fleet hall-b has no node 'nosuch'; there are edge1, robot1$") as caught:
+        ask_door(door_of(cell, "hall-a", None, "nosuch"), {"verb": "status"})
+    assert caught.value.code == EXIT_USAGE
+    with pytest.raises(CliError, match=r"^hall-b/edge1 cannot be asked; by tcp/127.0.0.1:1: edge1 did not") as caught:
+        ask_door(door_of(cell, "hall-a", None, "edge1"), {"verb": "status"})
+    assert caught.value.code == EXIT_UNREACHABLE
 
 
 def test_nobody_at_a_plain_endpoint_may_be_a_secured_fleet(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -68,8 +68,7 @@ class FleetClient:
         """
         life = 0
         if command is not None and (node is None or self._seals is not None):
-            status = self.ask(node, None)  # a command is signed for one life of the node that takes it
-            assert isinstance(status, Snapshot)
+            status = self.status(node)  # a command is signed for one life of the node that takes it
             node, life = status.node, status.incarnation
         end = monotonic_s() + ANSWER_S
         while monotonic_s() < end:
@@ -79,6 +78,12 @@ class FleetClient:
             time.sleep(PAUSE_S)
         who = node or f"the node at {self._endpoint}"
         raise AdapterError(f"{who} did not answer within {ANSWER_S:g} s; is that a node's control endpoint?")
+
+    def status(self, node: NodeId | None = None) -> Snapshot:
+        """As `ask`, the status."""
+        status = self.ask(node, None)
+        assert isinstance(status, Snapshot)
+        return status
 
     def _ask_once(self, node: NodeId | None, command: Command | None, life: int) -> Answer | None:
         keys, whom = self._keys, node or "*"
