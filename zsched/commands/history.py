@@ -15,7 +15,6 @@ from typing import Final
 
 from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, nearest, print_json, say, warn
-from zsched.commands.orders import check_name, status_of
 from zsched.commands.page import span
 from zsched.commands.report import millis, printable
 from zsched.core.values.struct import Struct
@@ -148,6 +147,8 @@ def _check_names(door: Door, past: Past) -> None:
     Raises:
         CliError: there is none of that name, or nobody answers.
     """
+    from zsched.commands.orders import check_name, status_of  # noqa: PLC0415 - loads the values, which showing needs not
+
     if past.task is None and past.about is None:
         return
     status = status_of(door)
