@@ -374,9 +374,30 @@ def _ask_cell(cell: Cell, node: str | None, command: Command | None) -> Answer:
             failures.append(f"by {gateway}: {str(error).removeprefix(gateway).strip()}")
             continue
         _answered[cell.name] = gateway
-        return status if command is None else client.ask(node, command)
+        if command is None:
+            return status
+        if node is not None and not gateway.startswith(PLAIN):
+            client = _gateway_of(cell, node)
+        return client.ask(node, command)
     whom = f"{cell.name}/{node}" if node is not None else f"cell {cell.name}"
     raise AdapterError(f"{whom} cannot be asked; {'; '.join(failures)}")
+
+
+def _gateway_of(cell: Cell, node: NodeId) -> FleetClient:
+    """The session to the gateway that a node of a secured cell is: no other one passes a command on.
+
+    Raises:
+        CliError: it is no gateway, or nobody answers at its endpoint.
+    """
+    found: dict[NodeId, FleetClient] = {}
+    for gateway in cell.gateways:
+        with contextlib.suppress(AdapterError):
+            client = _client(gateway, cell)
+            found[client.status().node] = client
+        if node in found:
+            return found[node]
+    said = f"{node} is none of the gateways of {cell.name} that answer ({', '.join(found) or 'there is none'})"
+    raise CliError(EXIT_FAILED, f"{said}, and in a secured fleet a node passes on no command from elsewhere; ask one")
 
 
 def _status_in(cell: Cell, client: FleetClient, node: NodeId | None) -> Answer:

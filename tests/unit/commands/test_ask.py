@@ -16,8 +16,9 @@ from zsched.commands import ask
 from zsched.commands.ask import AGAIN_S, Door, ask_door, door_of, find_door
 from zsched.commands.common import CliError
 from zsched.core.values.fleet import Cell
+from zsched.core.values.messages import CommandOutcome, CommandResult
 from zsched.errors import AdapterError
-from zsched.exits import EXIT_CONFIG, EXIT_UNREACHABLE, EXIT_USAGE
+from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_UNREACHABLE, EXIT_USAGE
 from zsched.paths import again_path, socket_path
 
 ENV = {"ZSCHED_NODE": "robot1"}
@@ -111,3 +112,38 @@ def test_where_systemd_has_the_unit_it_says_how_systemd_starts_it(
     (tmp_path / "mine").mkdir()
     with pytest.raises(CliError, match="start one with `zsched up`"):
         find_door(tmp_path / "mine", None, ENV)
+
+
+def test_in_a_secured_cell_a_command_goes_to_the_gateway_that_it_names(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    asked: list[tuple[str, str]] = []
+
+    class Gateway:
+        def __init__(self, name: str) -> None:
+            self.name = name
+
+        def ask(self, node: str | None, command: object) -> object:
+            if command is None:
+                return self.status()
+            asked.append((self.name, str(node)))
+            return CommandResult(outcome=CommandOutcome.OK, detail="")
+
+        def status(self) -> object:
+            if self.name == "edge2":
+                raise AdapterError("it is gone")
+            return SimpleNamespace(node=self.name, nodes=[SimpleNamespace(name=name) for name in ("edge1", "robot1")])
+
+    names = {"tls/127.0.0.1:1": "edge1", "tls/127.0.0.1:2": "edge2", "tls/127.0.0.1:3": "robot1"}
+    monkeypatch.setattr(ask, "_client", lambda gateway, _cell: Gateway(names[gateway]))
+    monkeypatch.setattr(ask, "_visit", lambda *_given: SimpleNamespace(is_guest=False))
+    cell = Cell(name="hall-b", gateways=tuple(names), file=str(tmp_path / "none"))
+    order = {"verb": "retry", "task": "merge", "by": "ada@robot9"}
+    assert ask_door(door_of(cell, "hall-a", None, "robot1"), order)["outcome"] == "ok"
+    assert ask_door(door_of(cell, "hall-a", None, "edge1"), order)["outcome"] == "ok"
+    assert asked == [("robot1", "robot1"), ("edge1", "edge1")]
+    with pytest.raises(
+        CliError, match=r"^robot2 is none of the gateways of hall-b that answer \(edge1, robot1\)"
+    ) as none:
+        ask_door(door_of(cell, "hall-a", None, "robot2"), order)
+    assert none.value.code == EXIT_FAILED
