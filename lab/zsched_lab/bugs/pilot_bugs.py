@@ -48,7 +48,10 @@ PILOT_BUGS: tuple[Bug, ...] = (
         ("            self._listens_since = now\n", "            pass\n"),
     ),
     _bug("an opinion of long ago counts", ("now - peer.at < course.silence_s and _answers", "_answers")),
-    _bug("an opinion under another number counts", ("if peer.word.is_current else []", "")),
+    _bug(
+        "an opinion under another number counts",
+        (" for name, word in words if word.is_current]", " for name, word in words]"),
+    ),
     _bug("an elector is added without room", ("if count > 1 and len(alive) < majority(count + 1):", "if not alive:")),
     _bug(
         "a single elector stays alone",
