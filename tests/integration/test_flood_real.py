@@ -8,7 +8,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from support.authorities import install, make_authority
+from support.authorities import secured
 from zsched.core.values.messages import Prepare
 from zsched.core.values.model import Ballot, Beat, Proposal
 from zsched.runtime.access_rules import Side
@@ -37,13 +37,7 @@ def attacker(bed: Testbed) -> str:
 
 
 def test_ten_thousand_frames_of_each_kind_change_nothing(tmp_path: Path) -> None:
-    tree = echo_fleet(robots=3, edges=1)
-    for node in tree["nodes"].values():
-        node["listen"] = {kind: end.replace("tcp/", "tls/") for kind, end in node["listen"].items()}
-    tree["security"] = {}
-    authority = make_authority(tmp_path / "authority", tree["fleet"])
-    for name in tree["nodes"]:
-        install(authority, tmp_path / "pki" / name, name)
+    tree = secured(echo_fleet(robots=3, edges=1), tmp_path)
     beat = wire.encode(Beat(node=IDLE, incarnation=1, sequence=1, loop_lag_s=0.0))
     proposal = wire.encode(Proposal(voter=IDLE, task=TASK, base_revision=1, candidate="edge1", aggregate=0.5))
     prepare = Prepare(task=TASK, ballot=Ballot(counter=10**6, node=IDLE, incarnation=1), electorate="e")

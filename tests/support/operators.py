@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import threading
+from pathlib import Path
 
 import zenoh
 
@@ -17,9 +18,10 @@ PERIOD_S = 0.01
 class Operator:
     """The command line of one machine."""
 
-    def __init__(self, bed: Testbed) -> None:
+    def __init__(self, bed: Testbed, runtime: Path | None = None) -> None:
+        """``runtime``: a folder with the operator sockets of that machine alone."""
         kept = {name: value for name, value in os.environ.items() if not name.startswith("ZSCHED_")}
-        self._env = {**kept, "ZSCHED_RUNTIME_DIR": str(bed.folder), "ZSCHED_NODE": "robot1"}
+        self._env = {**kept, "ZSCHED_RUNTIME_DIR": str(runtime or bed.folder), "ZSCHED_NODE": "robot1"}
 
     def zsched(self, *words: object) -> subprocess.CompletedProcess[bytes]:
         """One verb, to its end."""
