@@ -97,6 +97,7 @@ ELECTOR_BUGS: tuple[Bug, ...] = (
                 "        if not self.roll.value.document:\n            self._want(",
             ),
         ),
+        tests=("tests/unit/core/electorate/test_orders.py",),
         has_changing_fleets=True,
     ),
     _bug(
