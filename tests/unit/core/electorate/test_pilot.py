@@ -295,6 +295,25 @@ def test_a_candidate_was_heard_without_a_break_for_several_silences() -> None:
     assert ear.wish == "4 electors, 4 alive, 0 to spare", "and begins again"
 
 
+def test_who_leaves_is_no_candidate_until_its_flag_is_taken_back() -> None:
+    ear = Ear(value("abcd"), replace(COURSE, leaving=("x",)))
+    ear.hear("bcdx", STEADY * T + 1.0)
+    assert ear.wish == "4 electors, 4 alive, 0 to spare"
+    ear.hear("bcdxy", STEADY * T + 1.0)
+    assert ear.wish == f"+y/{disk_of('y')}", "x was heard for longer"
+    ear.course = COURSE
+    assert ear.wish == f"+x/{disk_of('x')}"
+
+
+def test_who_leaves_is_no_spare_for_one_of_three_that_is_gone() -> None:
+    ear = Ear(value("abc"), replace(COURSE, leaving=("x",)))
+    ear.hear("bcx", T)
+    ear.hear("bx", STEADY * T, gone=("c",))
+    assert ear.wish.endswith("two electors are no better than three")
+    ear.course = COURSE
+    assert ear.wish == "-c"
+
+
 @pytest.mark.parametrize("word", [{"is_current": False}, {"disk": ""}])
 def test_a_candidate_shows_the_present_number_and_a_disk(word: dict[str, object]) -> None:
     ear = Ear(value("abcd"))

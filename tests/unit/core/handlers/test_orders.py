@@ -227,6 +227,17 @@ def test_a_pin_is_to_the_owner_or_to_a_candidate_and_a_move_elsewhere_is_refused
     assert Lone(owner=None, paused=True).hold(Hold.PIN).detail == "it has no owner: name the node to pin it to"
 
 
+def test_a_lasting_order_and_its_end_leave_owner_and_epoch() -> None:
+    """Another epoch would be another ownership: leases and workers would begin anew."""
+    lone = Lone()
+    for revision, hold in enumerate((Hold.PIN, Hold.PAUSE, Hold.UNPIN, Hold.RESUME), start=6):
+        assert lone.hold(hold).outcome is CommandOutcome.OK
+        assert (lone.value().revision, lone.value().owner, lone.value().epoch) == (revision, "edge1", 3)
+    assert lone.hold(Hold.PAUSE, for_s=60.0).outcome is CommandOutcome.OK
+    lone.wait(70.0)
+    assert (lone.value().paused, lone.value().owner, lone.value().epoch) == (False, "edge1", 3), "nor when time ends it"
+
+
 def test_a_tuning_is_agreed_for_the_revision_that_it_was_made_of() -> None:
     lone, wanted = Lone(), tuning_of(bonus=0.3)
     command = TuneTask(task="merge", tuning=wanted, base_revision=5, asked=ADA)
