@@ -33,7 +33,7 @@ def _numbers_bug(name: str, module: str, *changes: tuple[str, str], also: Bug | 
 
 
 def _fleet_bug(name: str, module: str, *changes: tuple[str, str], has_schedules: bool = True) -> Bug:
-    tests = ("tests/sim/test_fleet_changes.py", "tests/unit/core/electorate/test_orders.py")
+    tests = ("tests/unit/core/electorate/test_orders.py", "tests/sim/test_fleet_changes.py")
     return Bug(
         name=name, module=module, changes=changes, tests=tests, has_schedules=has_schedules, has_changing_fleets=True
     )

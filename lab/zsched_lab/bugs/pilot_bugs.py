@@ -11,7 +11,7 @@ from zsched_lab.bugs.core_bugs import AGREEMENT, Bug
 
 PILOT: Final = "zsched.core.electorate.pilot"
 HELM: Final = "zsched.core.electorate.helm"
-_TESTS: Final = ("tests/sim/test_pilot.py", "tests/unit/core/electorate/test_pilot.py")
+_TESTS: Final = ("tests/unit/core/electorate/test_pilot.py", "tests/sim/test_pilot.py")
 
 
 def _node_bug(name: str, module: str, *changes: tuple[str, str]) -> Bug:
