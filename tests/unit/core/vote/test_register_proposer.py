@@ -85,20 +85,25 @@ def test_move_raises_epoch_and_revision_retune_only_the_revision() -> None:
     assert Retune(base_revision=1, tuning=tuning).apply(moved) == replace(moved, revision=2, tuning=tuning)
 
 
-def test_newer_among_accepted_means_the_higher_ballot_never_the_higher_revision() -> None:
+@pytest.mark.parametrize(("newer", "older"), [(1, 5), (5, 1)], ids=["lower revision", "higher revision"])
+@pytest.mark.parametrize("first", ["r2", "r3"])
+def test_newer_among_accepted_means_the_higher_ballot_whatever_the_revisions(
+    newer: int, older: int, first: str
+) -> None:
     proposer = make("r1")
     asked = did(proposer.settle, 0.0).prepare
     assert asked is not None
-    accepted = {
-        "r2": Acceptance(ballot=ballot(9), value=allocation(1)),
-        "r3": Acceptance(ballot=ballot(2), value=allocation(5)),
+    held_by = {
+        "r2": Acceptance(ballot=ballot(9), value=allocation(newer)),
+        "r3": Acceptance(ballot=ballot(2), value=allocation(older)),
     }
+    accepted = dict(sorted(held_by.items(), reverse=first == "r3"))
     step = last(
         did(proposer.on_answer, Promise(elector=name, task="merge", ballot=asked.ballot, accepted=held), 0.0)
         for name, held in accepted.items()
     )
     assert step.accept is not None
-    assert step.accept.acceptance == Acceptance(ballot=asked.ballot, value=allocation(1))
+    assert step.accept.acceptance == Acceptance(ballot=asked.ballot, value=allocation(newer))
 
 
 def test_unlearnt_value_is_settled_first_and_our_outdated_change_ends_as_conflict() -> None:
