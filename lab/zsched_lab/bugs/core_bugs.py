@@ -121,14 +121,14 @@ REGISTER_BUGS = (
         REGISTER,
         "        todo.must_persist = True\n        return Promise(",
         "        return Promise(",
-        _SCHEDULES,
+        _REGISTER + _SCHEDULES,
     ),
     _bug(
         "acceptance not persisted",
         REGISTER,
         "        todo.must_persist = True\n        return Accepted(",
         "        return Accepted(",
-        _SCHEDULES,
+        _REGISTER + _SCHEDULES,
     ),
     _bug(
         "promise with >=",
@@ -149,7 +149,7 @@ REGISTER_BUGS = (
         REGISTER,
         "newest = max(accepted, key=lambda held: (held.ballot, self._prevails(held.value)), default=None)",
         "newest = None",
-        _SCHEDULES,
+        _REGISTER + _SCHEDULES,
     ),
     _bug(
         "newest by revision instead of ballot",
@@ -493,7 +493,7 @@ MEMBERSHIP_BUGS = (
         BEATS,
         "    if beat.has_lost_state:\n",
         "    if beat.twins:\n",
-        ("tests/sim/test_status_words.py", "tests/sim/test_restored_state.py"),
+        ("tests/unit/core/test_status.py", "tests/sim/test_status_words.py", "tests/sim/test_restored_state.py"),
         seed=9000013,
     ),
     _bug(
