@@ -95,6 +95,7 @@ class World:
         if self.faulty() and self.rng.random() < self.crash_rate:
             return self.crash(host)
         if answer is not None:
+            self.check_on_disk(host, answer[1])
             self.send(answer[0], answer[1], host.name)
         for message in (step.prepare, step.accept):
             for elector in self.electors if message is not None else ():
@@ -120,6 +121,11 @@ class World:
             self.check_learnt(state.learnt)
 
     # --- invariants --------------------------------------------------------------------------------------------
+
+    def check_on_disk(self, host: Host, answer: Message) -> None:
+        """A promise is on disk before it leaves; two values hardly ever come of one that a crash forgets."""
+        if isinstance(answer, Promise) and host.disk.promised < answer.ballot:
+            raise ViolationError(f"{host.name} promises {answer.ballot} with {host.disk.promised} on its disk")
 
     def check_learnt(self, value: Allocation) -> None:
         if self.chosen.setdefault(value.revision, value) != value:
@@ -299,6 +305,13 @@ def test_register_unlearnt_majority_after_power_loss_is_learnt_without_a_new_pro
 # --- test the test: planted bugs must be found ------------------------------------------------------------------
 
 
+class ForgetsPromises(TaskRegister):
+    """Answers before the promise is on disk."""
+
+    def on_prepare(self, prepare: Prepare, _todo: ToDo) -> Promise | Refused:
+        return super().on_prepare(prepare, ToDo())
+
+
 class ForgetsAcceptances(TaskRegister):
     """Answers before the acceptance is on disk."""
 
@@ -330,7 +343,10 @@ class TellsNobody(TaskRegister):
         return float("inf")
 
 
-@pytest.mark.parametrize("mutant", [ForgetsAcceptances, PromisesBackwards, IgnoresWhatItReads, TellsNobody])
+MUTANTS = (ForgetsPromises, ForgetsAcceptances, PromisesBackwards, IgnoresWhatItReads, TellsNobody)
+
+
+@pytest.mark.parametrize("mutant", MUTANTS)
 def test_harness_finds_a_planted_bug(mutant: type[TaskRegister]) -> None:
     with pytest.raises(ViolationError):
         play_all(range(50), mutant)
