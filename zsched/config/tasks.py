@@ -373,6 +373,10 @@ def _check_settings(section: Section, direction: Direction, out: Collector) -> N
     if section.get("class") is StreamClass.LATEST and section.get("handover") is HandoverRule.ALL:
         message = "class latest keeps only the newest, handover all loses nothing"
         out.warn(section.where("handover"), message, "class: reliable")
+    is_reliable_output = direction is Direction.OUTPUT and section.get("class") is StreamClass.RELIABLE
+    if is_reliable_output and "handover" not in section.values and section.is_whole:
+        message = "class reliable, and at a move the old owner's last answers are dropped (handover: latest)"
+        out.warn(section.where("class"), message, "handover: all; or handover: latest, if that is meant")
 
 
 def _placeholder_hint(template: str) -> str:

@@ -690,6 +690,16 @@ def test_relay_loop_names_every_rule_with_its_place() -> None:
     assert loop.hint == "rules: map_merge/in/0 at 17:42"
 
 
+def test_a_reliable_output_that_says_nothing_of_the_handover_is_warned_of() -> None:
+    def warned(more: str) -> list[str]:
+        result = check(GOOD.replace("class: latest}]", f"class: reliable{more}}}]"))
+        assert result.fleet is not None
+        return [fault.hint for fault in result.warnings if "last answers are dropped" in fault.message]
+
+    assert warned("") == ["handover: all; or handover: latest, if that is meant"]
+    assert warned(", handover: all") == warned(", handover: latest") == []
+
+
 def test_worker_cycle_is_a_warning_with_both_rules() -> None:
     result = check(swapped('"{robot}/global_map"', '"{robot}/map"'))
     assert result.fleet is not None

@@ -42,6 +42,8 @@ HOLD_SAMPLES: Final = 10_000
 HOLD_BYTES: Final = 64 << 20
 MAX_STAMPS: Final = 8192
 UNNUMBERED: Final = -1
+LATE_S: Final = 1.0
+"""For so long what still comes of a slot that was cut is counted."""
 HEARD_SLOTS: Final = 4
 """Closed slots of which is known how far they came: an owner may be left and come back in one epoch (isolation)."""
 
@@ -111,6 +113,8 @@ class OutputStream:
         self._acks: Acknowledger | None = None
         self._fence = Fence()
         self._heard: OrderedDict[tuple[int, str], dict[SourceName, int]] = OrderedDict()  # {(epoch, from): numbers}
+        self._late: list[tuple[float, Feed]] = []
+        """(until when, what feeds a slot that was cut)."""
         self._notes_stamps = False
         self._stamps: OrderedDict[Timestamp, None] = OrderedDict()
         self._is_paused = False
@@ -127,6 +131,7 @@ class OutputStream:
         Raises:
             zenoh.ZError: ``from`` is no key expression.
         """
+        self._end_late(route.from_expr)
         has_epoch = str(epoch) in route.from_expr.split("/")
         slot = OutputSlot(epoch=epoch, expr=route.from_expr)
         stream_class = route.settings.stream_class
@@ -170,6 +175,7 @@ class OutputStream:
 
     def leave(self) -> None:
         """Unsubscribe from every owner; slots, and how far they came, stay for `rejoin`."""
+        self._end_late()
         for slot in tuple(self._slots.values()):
             if slot.feed is not None:
                 slot.feed.close()
@@ -262,7 +268,7 @@ class OutputStream:
         """True when everything of the slot has come (end markers), it was cut, or it is not there."""
         with self._lock:
             slot = self._slots.get(epoch)
-            if slot is None or (self._carrier is not None and self._carrier.epoch > epoch):
+            if slot is None or self._is_cut(slot):
                 return True
             now = monotonic_s()
             heirs = [other for other in self._slots.values() if other.expr == slot.expr and other.feed is None]
@@ -271,13 +277,17 @@ class OutputStream:
             return bool(slot.keys) and all(key.is_ended(now, slot.answers) for key in slot.keys.values())
 
     def close_slot(self, epoch: int) -> None:
-        """Unsubscribe from a slot; if it carried the stream, the flipped one takes over with what it held."""
+        """Unsubscribe from a slot; if it carried the stream, the flipped one takes over with what it held.
+
+        What is on its way from one that was cut is counted before its subscription ends.
+        """
         with self._lock:
             slot = self._slots.pop(epoch, None)
             if slot is None:
                 return
             slot.is_closed = True
             feed = self._hand_on(slot)
+            is_cut = self._is_cut(slot)
             if slot is self._carrier:  # of any other nothing more was wanted
                 self._counter.lost += slot.missing() if feed is not None else 0
                 self._carrier = None
@@ -286,7 +296,19 @@ class OutputStream:
                 self._heard[slot.epoch, slot.expr] = slot.answers.close()
                 while len(self._heard) > HEARD_SLOTS:
                     self._heard.popitem(last=False)
-        if feed is not None:
+        if feed is not None and is_cut:
+            self._late.append((monotonic_s() + LATE_S, feed))
+        elif feed is not None:
+            feed.close()
+
+    def _is_cut(self, slot: OutputSlot) -> bool:
+        return self._carrier is not None and slot.epoch < self._carrier.epoch
+
+    def _end_late(self, from_expr: str | None = None) -> None:
+        """End what still listens to slots that were cut: to ``from_expr``, to all (``None``)."""
+        ended = [one for one in self._late if from_expr is None or one[1].slot.expr == from_expr]
+        self._late = [one for one in self._late if one not in ended]
+        for _, feed in ended:
             feed.close()
 
     def _hand_on(self, slot: OutputSlot) -> Feed | None:
@@ -312,6 +334,7 @@ class OutputStream:
                 slot.held.clear()
         for epoch in sorted(self._slots, reverse=True):
             self.close_slot(epoch)
+        self._end_late()
         for ends in self._ends.values():
             undeclare(ends)
         self._ends.clear()
@@ -325,6 +348,8 @@ class OutputStream:
     def look_after(self) -> None:
         """Let through what waits for answers that never come, or for a highest rate; call it now and then."""
         self._outlet.look_after()
+        while self._late and self._late[0][0] <= monotonic_s():
+            self._late.pop(0)[1].close()
         with self._lock:
             for slot in tuple(self._slots.values()):
                 for (name, zid, eid), sample in slot.answers.overdue() if slot.answers is not None else ():
@@ -350,9 +375,9 @@ class OutputStream:
                 self._counter.seen(len(sample.payload))
                 self._counter.dropped("loop")
                 return
-            if slot.is_closed:  # our thread waited for the lock; a count of it would begin again, from 0
+            if slot.is_closed:  # a count of it would begin again, from 0
                 self._counter.seen(len(sample.payload))
-                self._counter.dropped("stale_epoch")
+                self._counter.dropped("cut" if self._is_cut(slot) else "stale_epoch")
                 return
             name = str(sample.key_expr)
             key = slot.keys.get(name) or slot.key(name)
@@ -413,7 +438,7 @@ class OutputStream:
             self._hold(slot, sample)
         elif slot is self._carrier:
             self._forward(sample, size)
-        elif self._carrier is not None and slot.epoch < self._carrier.epoch:
+        elif self._is_cut(slot):
             self._counter.dropped("cut")
         elif slot.is_flipped and self.route.settings.handover is HandoverRule.LATEST:
             self._take_over(slot)

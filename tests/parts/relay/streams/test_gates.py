@@ -392,6 +392,28 @@ def test_the_first_sample_of_the_new_owner_cuts(bench: Bench) -> None:
     assert move.stream.has_ended(1)
 
 
+def test_what_a_cut_owner_had_on_its_way_is_counted_once_its_slot_is_closed(bench: Bench) -> None:
+    """A slot that is cut closes at once; what came then was in no counter. The owner that comes back is heard once."""
+    move = Handover(bench, HandoverRule.LATEST)
+    move.stream.flip(2, drops_held=False)
+    move.put(move.new, "new 1")
+    move.stream.close_slot(1)
+    move.put(move.old, "old 1")
+    assert drops(move.stream) == {"cut": 1}
+    move.stream.open(1, way_out(1, HandoverRule.LATEST))
+    until(lambda: getattr(move.old.matching_status, "matching", False), "the slot again")
+    move.put(move.old, "old 2")
+    assert drops(move.stream) == {"cut": 2}
+    move.stream.close_slot(1)
+
+    def is_left() -> bool:
+        move.stream.look_after()
+        return not getattr(move.old.matching_status, "matching", True)
+
+    until(is_left, "the end of the subscription")
+    assert move.is_through("new 1")
+
+
 def test_with_all_the_new_owner_waits_for_the_old_ones_last(bench: Bench) -> None:
     move = Handover(bench, HandoverRule.ALL)
     move.put(move.old, "old 1")
