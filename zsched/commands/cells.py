@@ -16,7 +16,7 @@ from zsched import paths as places
 from zsched.commands.ask import Door, ask_door, door_here, door_of, fleet_here
 from zsched.commands.common import CliError, Json, print_json, say
 from zsched.commands.history import SCHEMA as HISTORY
-from zsched.commands.history import Past, lines_of, print_lines
+from zsched.commands.history import TOLD, Past, lines_of, print_lines
 from zsched.commands.report import degradations
 from zsched.core.values.fleet import Fleet
 from zsched.errors import ConfigError
@@ -54,7 +54,7 @@ def show_histories(runtime_dir: Path | None, node: str | None, past: Past, *, is
     fleet, cells = _ask_all(runtime_dir, node, lambda name, door: _past(name, door, past))
     silent = [cell for cell in cells if cell["error"] is not None]
     if is_json:
-        merged = {key: _merged(cells, key) for key in ("moves", "rehearsals", "rollouts")}
+        merged = {key: _merged(cells, key) for key in TOLD}
         asked = [{key: cell[key] for key in ("name", "node", "error")} for cell in cells]
         first = next((cell["node"] for cell in cells if cell["error"] is None), "")
         print_json({"schema": HISTORY, "node": first, **merged, "cells": asked})
@@ -64,7 +64,7 @@ def show_histories(runtime_dir: Path | None, node: str | None, past: Past, *, is
         print_lines(lines)
         heard = [cell["name"] for cell in cells if cell["error"] is None]
         if not lines and heard:
-            say(f"no move{past.words} in {', '.join(heard)}")
+            say(f"no move and no order{past.words} in {', '.join(heard)}")
         said = [f"  {cell['name']}: {cell['error']}" for cell in silent]
         for line in (*(("PROBLEMS", *said) if said else ()), *_alone(fleet)):
             say(line, indent=4)
@@ -90,7 +90,7 @@ def _ask_all(runtime_dir: Path | None, node: str | None, ask: Callable[[str, Doo
 
 def _past(name: str, door: Door, past: Past) -> Json:
     """What a cell's node has in its log; ``error`` where none tells."""
-    body: Json = {"name": name, "node": None, "moves": [], "rehearsals": [], "rollouts": [], "error": None}
+    body: Json = {"name": name, "node": None, **{key: [] for key in TOLD}, "error": None}
     try:
         return {**body, **past.read(door)}
     except (CliError, ConfigError) as error:

@@ -28,6 +28,8 @@ MOVE: Final = "move"
 STAGES: Final = ("scheduler", "vote", "executor", "route", "membership", "log")
 """As a line names what has told it (`zsched.core.instructions.RecordStory`)."""
 TYPES: Final = (MOVE, *STAGES)
+TOLD: Final = ("moves", "rehearsals", "rollouts", "changes")
+"""What a history has, beside whose log it is."""
 _DURATION = re.compile(r"([0-9]{1,12}(?:\.[0-9]{1,9})?)(s|m|h|d)")
 _UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 
@@ -105,12 +107,12 @@ class Past(Struct, frozen=True, kw_only=True):
 
     @property
     def words(self) -> str:
-        """What is asked for, behind "no move"."""
+        """What is asked for, behind "no move and no order"."""
         whose = (f" of {self.task}" if self.task else "") + (f" to {self.about} or away from it" if self.about else "")
         return whose + ("" if self.since_s is None else f" of the last {span(self.since_s)}")
 
     def read(self, door: Door) -> Json:
-        """What the log of the node at the door tells of it: ``node``, ``moves``, ``rehearsals``, ``rollouts``.
+        """What the log of the node at the door tells of it: ``node``, and each of `TOLD`.
 
         Raises:
             CliError: nobody answers, or the log cannot be read.
@@ -120,7 +122,9 @@ class Past(Struct, frozen=True, kw_only=True):
         moves = [move for move in moves_of(entries, now, self.task) if self.about in (None, move["from"], move["to"])]
         rehearsals = list(rehearsals_of(entries, now, self.task)) if self.about is None else []
         rollouts = list(rollouts_of(entries, now, self.task)) if self.about is None else []
-        return {"node": node, "moves": moves, "rehearsals": rehearsals, "rollouts": rollouts}
+        others = [entry for entry in entries if self.about is None or names(entry, self.about)]
+        changes = list(changes_of(others, now, self.task))
+        return {"node": node, "moves": moves, "rehearsals": rehearsals, "rollouts": rollouts, "changes": changes}
 
 
 def history(
@@ -129,14 +133,14 @@ def history(
     """Print the moves that the log of the node at the door knows, the newest last; returns the exit code."""
     past = Past(task=task, about=about, since_s=since_s)
     told = past.read(door)
-    if not any(told[key] for key in ("moves", "rehearsals", "rollouts")):
+    if not any(told[key] for key in TOLD):
         _check_names(door, past)
     if is_json:
         print_json({"schema": SCHEMA, **told})
         return EXIT_OK
     lines = lines_of(told)
     if not lines:
-        say(f"no move{past.words} in the log of {told['node']}")
+        say(f"no move and no order{past.words} in the log of {told['node']}")
     print_lines(lines)
     return EXIT_OK
 
@@ -160,7 +164,7 @@ def _check_names(door: Door, past: Past) -> None:
 def lines_of(told: Json, before: str = "") -> list[tuple[float, str]]:
     """(age, text behind ``before``) of all that a log has told."""
     lines = [(move["age_s"], f"{before}{_move_line(printable(move))}") for move in told["moves"]]
-    others = (*told["rehearsals"], *told["rollouts"])
+    others = (*told["rehearsals"], *told["rollouts"], *told["changes"])
     return [*lines, *((one["age_s"], f"{before}{_told_line(printable(one))}") for one in others)]
 
 
@@ -251,6 +255,7 @@ def moves_of(entries: Iterable[Json], now: float, task: str | None) -> Iterator[
             "votes": dict(move.get("votes", ())),
             "switched_s": took.get((entry["task"], move["epoch"], entry["life"])),
             "gap_s": gaps.get((entry["task"], move["epoch"])),
+            "by": entry.get("by") or None,
         }
 
 
@@ -285,8 +290,20 @@ def rollouts_of(entries: Iterable[Json], now: float, task: str | None) -> Iterat
             yield {"at": wall_text(entry["at"]), "age_s": max(now - entry["at"], 0.0), **told}
 
 
+def changes_of(entries: Iterable[Json], now: float, task: str | None) -> Iterator[Json]:
+    """What operators have changed beside moves and rehearsals, among a log's entries."""
+    for entry in entries:
+        if not entry.get("by") or "move" in entry or entry.get("rehearsal"):
+            continue
+        about = entry.get("task") or None
+        if task in (None, about):
+            told = {"task": about, "by": entry["by"], "text": entry["text"]}
+            yield {"at": wall_text(entry["at"]), "age_s": max(now - entry["at"], 0.0), **told}
+
+
 def _told_line(one: Json) -> str:
-    return f"{span(one['age_s']):>6} ago  {one['at']}  {one['task']} {one['text']}"
+    about = f"{one['task']} " if one["task"] else ""
+    return f"{span(one['age_s']):>6} ago  {one['at']}  {about}{one['text']}"
 
 
 def _move_line(move: Json) -> str:

@@ -85,9 +85,12 @@ def explain(
 
 
 def history(
-    task: Annotated[str | None, typer.Argument(metavar="[TASK]", help="Only its moves.")] = None,
+    task: Annotated[str | None, typer.Argument(metavar="[TASK]", help="Only what was done to it.")] = None,
     about: Annotated[
-        str | None, typer.Option("--for", metavar="node/NAME", help="Only moves to this node or away from it.")
+        str | None,
+        typer.Option(
+            "--for", metavar="node/NAME", help="Only moves to this node or away from it, and orders that name it."
+        ),
     ] = None,
     since: Annotated[str | None, typer.Option("--since", metavar="AGE", help="Not older: 90s, 10m, 2h, 1d.")] = None,
     site: Annotated[bool, typer.Option("--site", help="Of every fleet of the site, merged by age.")] = False,
@@ -97,6 +100,8 @@ def history(
     connect: ConnectOption = None,
 ) -> None:
     """Show every change of owner in a node's decision log: when, from where to where, why, and who voted for it.
+
+    It also tells what operators have changed, with their names.
 
     With --site one node of each fleet of the site is asked. A fleet that does not answer is named, and the others are
     shown; exits with 3 when none answers.

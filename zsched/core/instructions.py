@@ -321,6 +321,8 @@ class RecordStory(Struct, frozen=True, kw_only=True):
     """With it, an operator has rehearsed; this is the rehearsal's name."""
     is_rollout: bool = False
     """It tells of a changed worker that waits for an operator's look, or waits no more."""
+    by: str = ""
+    """With it, an operator has changed something; this is who."""
 
 
 # --- of the fleet register -------------------------------------------------------------------------------------------

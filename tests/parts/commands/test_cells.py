@@ -105,7 +105,7 @@ def test_a_silent_cell_is_named_and_the_history_of_the_others_is_told(
         assert move.endswith("echo epoch 2  edge1 -> edge2: edge1 is gone")
         assert (title, problem.startswith("  hall-b: cell hall-b cannot be asked")) == ("PROBLEMS", True)
         assert show_histories(None, None, Past(task="other"), is_json=False) == EXIT_OK
-        assert capsys.readouterr().out.startswith("no move of other in hall-a\nPROBLEMS\n")
+        assert capsys.readouterr().out.startswith("no move and no order of other in hall-a\nPROBLEMS\n")
         assert show_histories(None, None, Past(), is_json=True) == EXIT_OK
     told = json.loads(capsys.readouterr().out)
     assert faults(told) == []

@@ -70,7 +70,9 @@ class Pages:
             raise CliError(EXIT_UNREACHABLE, "no daemon")
         first = int(request["cursor"] or 0)
         page = self.entries[first : first + 2]
-        wanted = [one for one in page if not request["moves"] or {"move", "took_s", "gap_s", "is_rollout"} & {*one}]
+        wanted = [
+            one for one in page if not request["moves"] or {"move", "took_s", "gap_s", "is_rollout", "by"} & {*one}
+        ]
         at = first + len(page)
         return {
             "node": door.node or "robot1",
@@ -166,7 +168,32 @@ def test_a_changed_worker_that_waits_for_a_look_is_part_of_the_history(
     body = json.loads(capsys.readouterr().out)
     assert (faults(body), [one["task"] for one in body["rollouts"]]) == ([], ["merge"])
     assert history(HERE, "other", is_json=False) == 0
-    assert capsys.readouterr().out == "no move of other in the log of robot1\n"
+    assert capsys.readouterr().out == "no move and no order of other in the log of robot1\n"
+
+
+def test_what_operators_have_changed_is_part_of_the_history_with_their_names(
+    pages: Pages, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drain = "ana.operator (new fan): drain edge1, on revision 4: committed"
+    pages.entries = [
+        entry(drain, 50.0, task="", by="ana.operator"),
+        entry("learnt revision 3: paused by ada@robot1", 40.0, by="ada@robot1"),
+        entry("learnt revision 4", 30.0, move=MOVE, by="ada@robot1"),
+        entry("rehearsed", 20.0, rehearsal="one", by="ada@robot1"),
+    ]
+    assert history(HERE, None, is_json=False) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == f"   50s ago  2026-09-21T14:12:30.000Z  {drain}"
+    assert lines[1].endswith("  merge learnt revision 3: paused by ada@robot1")
+    assert len(lines) == 4, "each line once"
+    assert history(HERE, None, is_json=True) == 0
+    body = json.loads(capsys.readouterr().out)
+    assert faults(body) == []
+    assert [(one["task"], one["by"]) for one in body["changes"]] == [(None, "ana.operator"), ("merge", "ada@robot1")]
+    assert [one["by"] for one in body["moves"]] == ["ada@robot1"]
+    for given, told in (({"task": "merge"}, ["merge"]), ({"task": None, "about": "edge1"}, [None])):
+        assert history(HERE, is_json=True, **given) == 0
+        assert [one["task"] for one in json.loads(capsys.readouterr().out)["changes"]] == told
 
 
 @pytest.mark.usefixtures("pages")
@@ -191,13 +218,15 @@ def test_moves_of_one_task_as_json(capsys: pytest.CaptureFixture[str]) -> None:
                 "votes": {"robot1": "edge2", "robot2": "edge2", "robot3": "edge1"},
                 "switched_s": 0.086,
                 "gap_s": 0.3,
+                "by": None,
             }
         ],
         "rehearsals": [],
         "rollouts": [],
+        "changes": [],
     }
     assert history(HERE, "nothing", is_json=False) == 0
-    assert capsys.readouterr().out == "no move of nothing in the log of robot1\n"
+    assert capsys.readouterr().out == "no move and no order of nothing in the log of robot1\n"
 
 
 @pytest.mark.usefixtures("pages")
@@ -291,7 +320,7 @@ def test_moves_of_one_node_are_those_that_came_to_it_or_left_it(capsys: pytest.C
     assert history(HERE, None, about="edge2", is_json=True) == 0
     assert [move["task"] for move in json.loads(capsys.readouterr().out)["moves"]] == ["merge", "other"]
     assert history(HERE, "merge", about="edge3", is_json=False) == 0
-    assert capsys.readouterr().out == "no move of merge to edge3 or away from it in the log of robot1\n"
+    assert capsys.readouterr().out == "no move and no order of merge to edge3 or away from it in the log of robot1\n"
 
 
 @pytest.mark.usefixtures("pages")
@@ -421,7 +450,7 @@ def test_moves_of_the_last_time_only(capsys: pytest.CaptureFixture[str]) -> None
     assert history(HERE, None, is_json=False, since_s=95.0) == 0
     assert "edge1 -> edge2" in capsys.readouterr().out
     assert history(HERE, "merge", is_json=False, since_s=60.0) == 0
-    assert capsys.readouterr().out == "no move of merge of the last 1m00s in the log of robot1\n"
+    assert capsys.readouterr().out == "no move and no order of merge of the last 1m00s in the log of robot1\n"
 
 
 def test_events_of_some_types_only(pages: Pages, capsys: pytest.CaptureFixture[str]) -> None:

@@ -68,6 +68,7 @@ class Entry(Struct, frozen=True, kw_only=True):
     gap_s: float | None = None
     rehearsal: str = ""
     is_rollout: bool = False
+    by: str = ""
     decision: Decision | None = None
     """Last, for readers that do without it."""
 
@@ -181,6 +182,7 @@ class DecisionLog:
             gap_s=story.gap_s,
             rehearsal=story.rehearsal,
             is_rollout=story.is_rollout,
+            by=story.by,
             decision=story.decision,
         )
         return json.dumps(as_plain(entry), separators=(",", ":")).encode() + b"\n"
@@ -281,7 +283,7 @@ def _parsed(line: bytes) -> Json | None:
 
 
 def _is_of_move(line: bytes) -> bool:
-    marks = (b',"move":', b',"took_s":', b',"gap_s":', b',"rehearsal":', b',"is_rollout":')
+    marks = (b',"move":', b',"took_s":', b',"gap_s":', b',"rehearsal":', b',"is_rollout":', b',"by":')
     return any(mark in line for mark in marks)
 
 

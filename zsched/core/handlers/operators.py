@@ -48,7 +48,8 @@ def _on_retry(node: Stages, event: ev.RetryCommanded, todo: ToDo, now: float) ->
 def _record(node: Stages, task: TaskId, asked: Asked | None, what: str, todo: ToDo) -> None:
     """Tell the history who has ordered it, and why."""
     who = "an operator" if asked is None else told_by(asked)
-    todo.add(do.RecordStory(stage="executor", text=f"{who} {what}", task=task, epoch=node.executors[task].epoch))
+    epoch, by = node.executors[task].epoch, "" if asked is None else asked.by
+    todo.add(do.RecordStory(stage="executor", text=f"{who} {what}", task=task, epoch=epoch, by=by))
 
 
 def _may_work(node: Stages, task: TaskId, whose: NodeId) -> bool:

@@ -43,7 +43,7 @@ def _on_strike(node: Stages, event: ev.StrikeCommanded, todo: ToDo, now: float) 
     if not strike.is_plan:
         text = f"{told_by(strike.asked)} rehearses: {_DONE[strike.step].format(task=strike.task, cut_s=strike.cut_s)}"
         epoch = node.registers[strike.task].value.epoch
-        todo.add(do.RecordStory(stage="executor", text=text, task=strike.task, epoch=epoch))
+        todo.add(do.RecordStory(stage="executor", text=text, task=strike.task, epoch=epoch, by=strike.asked.by))
     if strike.step in _ENDS:
         todo.add(do.StrikeDaemon(request=event.request, strike=strike, fleet=node.fleet))
         return

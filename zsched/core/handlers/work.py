@@ -48,7 +48,8 @@ def carry_out(node: Stages, value: Allocation, reason: str, todo: ToDo, now: flo
     node.rounds.on_learnt(task, is_new_epoch=is_new_epoch, now=now)
     text = f"learnt revision {value.revision}: owner {value.owner}, weights {_told(value.tuning.weights)}"
     text += "" if value.asked is None and not is_known else f", {reason}"
-    todo.add(do.RecordStory(stage="vote", text=text, task=task, epoch=value.epoch, move=move))
+    by = "" if value.asked is None or is_known else value.asked.by
+    todo.add(do.RecordStory(stage="vote", text=text, task=task, epoch=value.epoch, move=move, by=by))
     executor.execute(value, todo, now)
     node.tenure.hold(value, node.beat_sequence + 1)
     for old in executor.predecessors:

@@ -150,6 +150,8 @@ class HistoryLine(Struct, frozen=True, kw_only=True):
     gap_s: float | None = None
     rehearsal: str = ""
     is_rollout: bool = False
+    by: str = ""
+    """The operator who has changed something."""
 
 
 class Explanation(Struct, frozen=True, kw_only=True):

@@ -179,6 +179,7 @@ def test_operators_get_no_figures_and_moves_alone_where_they_ask_for_them(tmp_pa
         story('text with ,"move": in it'),
         story("moved", move=MOVE),
         story("x", took_s=0.25),
+        story("paused", by="ana.operator"),
     )
     with (tmp_path / NAME).open("ab") as file:
         file.write(b'{"torn":\n')
@@ -188,11 +189,13 @@ def test_operators_get_no_figures_and_moves_alone_where_they_ask_for_them(tmp_pa
         'text with ,"move": in it',
         "moved",
         "x",
+        "paused",
         "end",
     ]
     assert not any("decision" in entry for entry in everything["entries"])
     moves = kept.log.answer({"verb": "log", "moves": True, "cursor": 5})
-    assert [entry["text"] for entry in moves["entries"]] == ["moved", "x"]
+    assert [entry["text"] for entry in moves["entries"]] == ["moved", "x", "paused"]
+    assert [line.by for line in kept.log.history("").lines] == ["", "", "ana.operator"]
     assert kept.log.answer({"cursor": everything["cursor"]})["entries"] == []
     assert kept.log.answer({"cursor": "1:nonsense"})["entries"] == everything["entries"]
 

@@ -20,7 +20,16 @@ from zsched.core.status import build_snapshot
 from zsched.core.values.change import MoveOwner
 from zsched.core.values.document import Flag, FlagKind
 from zsched.core.values.fleet import TaskSpec, WorkerSpec, electorate_hash
-from zsched.core.values.messages import CommandOutcome, CommandResult, Hold, HoldTask, Learnt, MoveTask, TuneTask
+from zsched.core.values.messages import (
+    CommandOutcome,
+    CommandResult,
+    Hold,
+    HoldTask,
+    Learnt,
+    MoveTask,
+    RetryTask,
+    TuneTask,
+)
 from zsched.core.values.model import Acceptance, Allocation, Asked, DeviceSample, RegisterState, WorkerState
 from zsched.core.values.snapshot import FlagStatus
 
@@ -251,6 +260,23 @@ def test_a_tuning_is_agreed_for_the_revision_that_it_was_made_of() -> None:
     assert (refused.outcome, refused.detail) == (CommandOutcome.INVALID, "nu_dbm (-30) must be below rho_dbm (-40)")
     unknown = TuneTask(task="mergee", tuning=wanted, base_revision=6, asked=ADA)
     assert lone.ask(ev.TuneCommanded(request=42, command=unknown)).outcome is CommandOutcome.INVALID
+
+
+# --- in the history --------------------------------------------------------------------------------------------------
+
+
+def test_every_node_writes_down_who_has_ordered_what_it_learns() -> None:
+    lone = Lone()
+    lone.tell(ev.HoldCommanded(request=42, command=HoldTask(task="merge", hold=Hold.PAUSE, asked=ADA)))
+    assert [one.by for one in lone.done if isinstance(one, do.RecordStory) and one.by] == ["ada@robot1"]
+    lone.done.clear()
+    tuned = TuneTask(task="merge", tuning=replace(TUNING, bonus=0.4), base_revision=6, asked=ADA)
+    lone.tell(ev.TuneCommanded(request=42, command=tuned))
+    (story,) = [one for one in lone.done if isinstance(one, do.RecordStory) and one.by]
+    assert story.text.endswith("retuned by ada@robot1 (new battery)")
+    lone.done.clear()
+    lone.tell(ev.RetryCommanded(request=42, command=RetryTask(task="merge", asked=ADA)))
+    assert [one.by for one in lone.done if isinstance(one, do.RecordStory) and one.by] == ["ada@robot1"]
 
 
 # --- flags -----------------------------------------------------------------------------------------------------------
