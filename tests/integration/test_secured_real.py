@@ -17,6 +17,8 @@ import zenoh
 
 from support.authorities import install, make_authority
 from zsched.adapters.host.operator_client import ask
+from zsched.commands.ask import Door, ask_door, close_sessions
+from zsched.commands.orders import user_name
 from zsched.config.load import load_fleet
 from zsched.core.values.certificates import Role
 from zsched.core.values.messages import Accept, Prepare, Promise
@@ -100,6 +102,73 @@ def test_an_operator_commands_from_elsewhere_and_a_guest_only_looks(bed: Testbed
         60,
         "the command in the decision log, with the operator's name",
     )
+
+
+def flags_at(bed: Testbed, node: str) -> dict[tuple[str, str], str]:
+    """{(node, kind): in whose name} of the flags that a node knows."""
+    nodes = bed.status(node)["nodes"]
+    return {(one["name"], flag["kind"]): flag["by"] for one in nodes for flag in one.get("flags", ())}
+
+
+def test_the_document_and_its_flags_are_changed_in_the_name_of_the_certificate(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Testbed(tmp_path, secured(tmp_path)) as bed:
+        bed.init()
+        bed.start()
+        bed.wait_settled(90)
+        endpoint = bed.fleet.node("robot1").listen_control
+        elsewhere = ["--yes", "--connect", endpoint]
+        for words in (
+            ["apply", str(tmp_path / "ana" / "fleet.yaml"), "-m", "the first"],
+            ["drain", "edge1", "--detach", "-m", "new fan"],
+            ["pause", TASK],
+        ):
+            done = zsched(bed, "ana", *words, *elsewhere)
+            assert done.returncode == 0, (words, done.stderr)
+        assert zsched(bed, "robot1", "eligible", "robot2", "off", "--yes").returncode == 0
+        user = f"{user_name()}@robot1"
+        drained, closed = ("edge1", "drain"), ("robot2", "ineligible")
+        bed.wait(
+            lambda: flags_at(bed, "robot2") == {drained: "ana.operator", closed: user},
+            60,
+            "both flags at the other robot, each in the name of who gave it",
+        )
+
+        # a program of hers that says another name, and gives another's flag her reason
+        monkeypatch.setenv("ZSCHED_CONFIG", str(tmp_path / "ana" / "fleet.yaml"))
+        door = Door(socket=Path(), endpoint=endpoint)
+        told = ask_door(door, {"verb": "fleet"})
+        flags = [{**flag, "by": "bob@robot1", "reason": "a lie"} for flag in told["flags"]]
+        request = {"verb": "change", "text": told["text"], "flags": flags, "reason": "nothing, by bob@robot1"}
+        answer = ask_door(door, {**request, "by": "bob@robot1", "base_revision": told["revision"]})
+        close_sessions()
+        assert answer["outcome"] == "ok", answer
+        wanted = {drained: "ana.operator", closed: "ana.operator"}
+        bed.wait(lambda: flags_at(bed, "robot2") == wanted, 60, "no flag in another's name")
+        listed = zsched(bed, "robot2", "maint").stdout
+        assert listed.count("ana.operator") == 3, listed
+        assert "bob@robot1" not in listed
+
+        def told_by() -> list[tuple[str, str]]:
+            said = json.loads(zsched(bed, "robot1", "history", "--json").stdout)["changes"]
+            return [(one["by"], one["text"].partition(", on revision")[0]) for one in said if one["task"] is None]
+
+        bed.wait(
+            lambda: (
+                told_by()
+                == [
+                    ("ana.operator", "ana.operator (the first): apply"),
+                    ("ana.operator", "ana.operator (new fan): drain edge1"),
+                    (user, f"{user}: eligible off robot2"),
+                    ("ana.operator", "ana.operator: nothing, by bob@robot1"),
+                ]
+            ),
+            60,
+            f"every change with its name: {told_by()}",
+        )
+        history = zsched(bed, "robot2", "history", TASK).stdout
+        assert "paused by ana.operator" in history, "each node tells who gave an order about a task"
 
 
 def refusals(bed: Testbed, node: str) -> dict[str, int]:

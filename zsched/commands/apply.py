@@ -6,10 +6,8 @@ of the file (`zsched.config.difference`), how a change is agreed.
 
 from __future__ import annotations
 
-import getpass
 import os
 import shlex
-import socket
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -26,6 +24,7 @@ from zsched.commands.document import (
     change,
     document_text,
     in_force,
+    ordered,
     status_of,
     wait_until_settled,
 )
@@ -377,9 +376,10 @@ def _agreed(door: Door, step: Json, held: InForce, view: ApplyView) -> int:
         CliError: it is refused; somebody else was first, or the fleet does not come to rest.
     """
     base = held.revision
+    by = ordered(shlex.join(view.words[:1]), {"by": asker(door), "reason": view.reason})
     for left in reversed(range(TRIES)):
         try:
-            answer = change(door, {**step, "base_revision": base, "reason": _reason(view)})
+            answer = change(door, {**step, "base_revision": base, **by})
         except ConflictError:
             now = in_force(door)
             is_same = (now.document, now.flags, now.rollouts) == (held.document, held.flags, held.rollouts)
@@ -390,15 +390,6 @@ def _agreed(door: Door, step: Json, held: InForce, view: ApplyView) -> int:
         else:
             return int(answer["revision"])
     raise AssertionError
-
-
-def _reason(view: ApplyView) -> str:
-    """Why, and who gives the command on which machine: for the journal."""
-    try:
-        who = getpass.getuser()
-    except (KeyError, OSError):  # this user has no name
-        who = f"uid {os.getuid()}"
-    return f"{view.reason or shlex.join(view.words[:1])}, by {who}@{socket.gethostname()}"
 
 
 def _check_same(held: InForce, document: str) -> None:

@@ -450,6 +450,8 @@ class _Visit(Struct, frozen=True, kw_only=True):
     fleet: str
     seals: Seals | None = None
     is_guest: bool = False
+    operator: str = ""
+    """What an operator's certificate calls its holder; empty: it is of another role, or there is none."""
 
 
 @cache
@@ -489,8 +491,19 @@ def _visit(endpoint: str, cell: Cell | None) -> _Visit:
     if fleet.security is None:
         return _Visit(text=text, asker=asker, fleet=any_fleet)
     holder = identity_of(fleet, fleet.security).holder
-    is_guest = holder.role is Role.GUEST
-    return _Visit(text=text, asker=holder.name, fleet=fleet.name, seals=seals_of(fleet), is_guest=is_guest)
+    return _Visit(
+        text=text,
+        asker=holder.name,
+        fleet=fleet.name,
+        seals=seals_of(fleet),
+        is_guest=holder.role is Role.GUEST,
+        operator=holder.label if holder.role is Role.OPERATOR else "",
+    )
+
+
+def operator_at(door: Door) -> str:
+    """The name by which the nodes at the door know who asks, by an operator's certificate; empty: by no such one."""
+    return _visit(door.endpoint, door.cell).operator if door.endpoint else ""
 
 
 def _unanswered(door: Door, error: AdapterError) -> CliError:

@@ -28,6 +28,7 @@ from zsched.commands.document import (
     change,
     document_text,
     in_force,
+    ordered,
     status_of,
     wait_until_settled,
 )
@@ -346,7 +347,7 @@ def _invited(way: Way, there: _Next, going: Change | None) -> Change:
         assert there.door is not None
         assert there.held is not None
         if not there.is_invited:
-            asked = {"base_revision": there.held.revision, "reason": _reason(way)}
+            asked = {"base_revision": there.held.revision, **_ordered(way)}
             kept = {"flags": list(there.held.flags), "rollouts": list(there.held.rollouts)}
             answer = change(there.door, {"text": _text_with(way, there.held), **kept, **asked})
             wait_until_settled(there.door, int(answer["revision"]))
@@ -510,7 +511,7 @@ def _not_forgotten(way: Way, going: Change) -> str:
         return ""
     flags = [flag for flag in held.flags if flag["subject"] != way.me]
     what = {"text": without(text, way.me), "flags": flags, "rollouts": list(held.rollouts)}
-    answer = change(door, {**what, "base_revision": held.revision, "reason": _reason(way)})
+    answer = change(door, {**what, "base_revision": held.revision, **_ordered(way)})
     way.tell(f"{going.former}: revision {answer['revision']} is agreed, and {way.me} is no node of it")
     return ""
 
@@ -529,9 +530,8 @@ def _has_forgotten(way: Way, going: Change) -> bool:
     return False
 
 
-def _reason(way: Way) -> str:
-    asked = way.view.asked
-    return f"{way.me} changes cells, by {asked['by']}" + (f": {way.order.reason}" if way.order.reason else "")
+def _ordered(way: Way) -> Json:
+    return ordered(f"{way.me} changes cells", {**way.view.asked, "reason": way.order.reason})
 
 
 def _go_back(way: Way, going: Change, why: str) -> int:

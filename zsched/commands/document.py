@@ -123,6 +123,11 @@ def _ask(door: Door, request: Json, name: str) -> Json | CliError:
         return error
 
 
+def ordered(what: str, asked: Json) -> Json:
+    """What a change is for, who orders it, and why, as `change` takes it."""
+    return {"reason": what, "by": asked["by"], "why": asked["reason"]}
+
+
 def change(door: Door, what: Json) -> Json:
     """Propose a change of the fleet, and return what became of it.
 

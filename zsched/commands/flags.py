@@ -15,7 +15,7 @@ from typing import Any, Final
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, nearest, print_json, say
-from zsched.commands.document import InForce, change, document_text, in_force
+from zsched.commands.document import InForce, change, document_text, in_force, ordered
 from zsched.commands.orders import OrderView, Row, begin, check_said
 from zsched.commands.page import span
 from zsched.commands.report import millis, told_flag
@@ -325,10 +325,8 @@ def _commit(view: OrderView, held: InForce, flags: Sequence[Json], what: str) ->
     """
     if tuple(flags) == held.flags:
         return held.revision
-    asked = view.asked
-    reason = f"{what}, by {asked['by']}" + (f": {asked['reason']}" if asked["reason"] else "")
-    text = {"text": held.text, "flags": list(flags), "rollouts": list(held.rollouts), "reason": reason}
-    answer = change(view.door, {**text, "base_revision": held.revision})
+    text = {"text": held.text, "flags": list(flags), "rollouts": list(held.rollouts)}
+    answer = change(view.door, {**text, "base_revision": held.revision, **ordered(what, view.asked)})
     return int(answer["revision"])
 
 
@@ -345,7 +343,7 @@ def drain_quietly(view: OrderView, node: str) -> int:
 
 
 def lift_quietly(view: OrderView, since: int) -> tuple[str, ...]:
-    """End the drains with this view's author and reason, and nobody else's; their nodes.
+    """End the drains with this view's reason, which no other drain has; their nodes.
 
     Raises:
         CliError: nobody answers, the node asked does not know revision ``since`` yet, or the end is not agreed.
@@ -353,16 +351,16 @@ def lift_quietly(view: OrderView, since: int) -> tuple[str, ...]:
     held = in_force(view.door)
     if held.revision < since:
         raise CliError(EXIT_FAILED, f"{held.node} has not learnt revision {since} yet")
-    ours = tuple(str(flag["subject"]) for flag in held.flags if is_given_by(view.asked, flag))
+    ours = tuple(str(flag["subject"]) for flag in held.flags if is_given_for(view.reason, flag))
     if ours:
-        left = [flag for flag in held.flags if not is_given_by(view.asked, flag)]
+        left = [flag for flag in held.flags if not is_given_for(view.reason, flag)]
         _commit(view, held, left, f"undrain {', '.join(ours)}")
     return ours
 
 
-def is_given_by(asked: Json, flag: Json) -> bool:
-    """Whether a flag is a drain by this operator for this reason."""
-    return flag["kind"] == DRAIN and (flag["by"], flag["reason"]) == (asked["by"], asked["reason"])
+def is_given_for(reason: str, flag: Json) -> bool:
+    """Whether a flag is a drain for this reason; who gave it, each node that takes a command may call another name."""
+    return bool(flag["kind"] == DRAIN and flag["reason"] == reason)
 
 
 # --- watching --------------------------------------------------------------------------------------------------------

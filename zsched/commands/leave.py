@@ -18,7 +18,7 @@ from zsched import paths
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door, find_door
 from zsched.commands.common import CliError, Json, check_reason, nearest, say, warn
-from zsched.commands.document import QUESTION, InForce, ask_all, change, document_text, in_force
+from zsched.commands.document import QUESTION, InForce, ask_all, change, document_text, in_force, ordered
 from zsched.commands.entries import DOCUMENT, HERE
 from zsched.commands.flags import LEAVE, NO_OTHER, DrainOrder, drain
 from zsched.commands.membership import Told
@@ -282,7 +282,7 @@ def _ask_for_the_seat(way: Way, held: InForce) -> str:
     if not held.text or not names_electors(held.text):
         return str(ask_door(way.door, {"verb": "status"})["quorum"].get("pilot") or "the electors are about to change")
     try:
-        change(way.door, {"remove_elector": way.me, "base_revision": held.revision, "reason": _reason(way)})
+        change(way.door, {"remove_elector": way.me, "base_revision": held.revision, **_ordered(way)})
     except CliError as error:
         return str(error)
     return "it is removed"
@@ -299,7 +299,7 @@ def _go_out(way: Way) -> None:
             held = in_force(way.door.to(others[count % len(others)]) if others else way.door)
             flags = [flag for flag in held.flags if flag["subject"] != way.me]
             text = {"text": without(document_text(held), way.me), "flags": flags, "rollouts": list(held.rollouts)}
-            answer = change(way.door.to(held.node), {**text, "base_revision": held.revision, "reason": _reason(way)})
+            answer = change(way.door.to(held.node), {**text, "base_revision": held.revision, **_ordered(way)})
         except CliError as error:
             way.check_time(str(error))
             time.sleep(PAUSE_S)
@@ -338,9 +338,8 @@ def _knows(answer: Json | CliError, revision: int) -> bool:
     return int(answer["revision"]) >= revision and bool(answer["text"])
 
 
-def _reason(way: Way) -> str:
-    asked = way.view.asked
-    return f"leave, by {asked['by']}" + (f": {way.order.reason}" if way.order.reason else "")
+def _ordered(way: Way) -> Json:
+    return ordered("leave", {**way.view.asked, "reason": way.order.reason})
 
 
 # --- the end ---------------------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from zsched.commands.ask import Door, ask_door
+from zsched.commands.ask import Door, ask_door, operator_at
 from zsched.commands.common import CliError, Json, check_reason, nearest, print_json, say, says_yes
 from zsched.commands.page import span
 from zsched.core.values.model import MAX_FOR_S
@@ -61,7 +61,12 @@ class OrderView(Struct, frozen=True, kw_only=True):
 
 
 def asker(door: Door) -> str:
-    """user@node of the person that runs this program, as orders carry it; in another cell user@fleet/node."""
+    """Who runs this program, as orders carry it: the name in an operator's certificate, or else user@node.
+
+    In another cell it is user@fleet/node.
+    """
+    if operator := operator_at(door):
+        return operator  # nodes would write it in place of any other name
     place = door.asked_from or door.socket.stem or socket.gethostname()  # no daemon of this machine is asked
     return f"{user_name()}@{place}"[:MAX_ASKER]
 

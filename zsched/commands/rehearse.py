@@ -22,8 +22,8 @@ from zsched.clock import monotonic_s, wall_s
 from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, nearest, print_json, say, warn
 from zsched.commands.document import IN_FORCE_S, document_text, in_force
-from zsched.commands.flags import drain_quietly, is_given_by, lift_quietly
-from zsched.commands.orders import OrderView, Row, begin, user_name
+from zsched.commands.flags import drain_quietly, is_given_for, lift_quietly
+from zsched.commands.orders import OrderView, Row, asker, begin
 from zsched.commands.page import counted
 from zsched.commands.rehearse_report import SCHEMA, as_json, table
 from zsched.commands.wait import Condition, missing
@@ -289,9 +289,8 @@ class Stage:
             raise CliError(EXIT_USAGE, text)
         self.at = wall_s()
         self.name = time.strftime("%Y%m%d-%H%M%S", time.gmtime(self.at)) + f"-{os.getpid() % 1000:03d}"
-        who = view.door.socket.stem or os.uname().nodename
         reason = f"rehearsal {self.name}" + (f": {view.reason}" if view.reason else "")
-        self.asked: Json = {"by": f"{user_name()}@{who}", "reason": reason}
+        self.asked: Json = {"by": asker(view.door), "reason": reason}
         told = ask_door(view.door, {"verb": "rehearsals", "task": order.task})
         if "outcome" in told:
             raise CliError(EXIT_FAILED, str(told["detail"]))
@@ -364,9 +363,8 @@ class Stage:
 
     def _drained(self, status: Json) -> list[str]:
         """The nodes with a drain of this rehearsal, as one node knows them."""
-        asked = self._drains.asked
-        nodes = status["nodes"]
-        return [str(node["name"]) for node in nodes if any(is_given_by(asked, flag) for flag in node.get("flags", ()))]
+        nodes, why = status["nodes"], self._drains.reason
+        return [str(node["name"]) for node in nodes if any(is_given_for(why, flag) for flag in node.get("flags", ()))]
 
     def _lacks(self, statuses: Mapping[str, Json], first: Json) -> list[str]:
         """What is missing at full strength, by what was there at the beginning."""

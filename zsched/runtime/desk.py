@@ -244,6 +244,7 @@ def _change_of(request: dict[str, Any]) -> ChangeFleet:
         remove_elector=str(request.get("remove_elector") or ""),
         base_revision=base,
         reason=str(request.get("reason") or "")[:MAX_REASON],
+        asked=_asked_of({"by": request["by"], "reason": request.get("why")}) if "by" in request else None,
     )
 
 

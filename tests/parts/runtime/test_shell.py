@@ -36,6 +36,7 @@ from zsched.core.values.messages import (
     Accept,
     Accepted,
     Ballots,
+    ChangeFleet,
     CommandOutcome,
     CommandResult,
     FleetTold,
@@ -385,6 +386,9 @@ def test_an_order_becomes_the_event_that_says_all_of_it() -> None:
     tuned = command_of({**order, "verb": "tune", "tuning": TUNING})
     wanted = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0), bonus=0.3)
     assert tuned == TuneTask(task="merge", tuning=wanted, base_revision=3, asked=asked)
+    drained = command_of({"verb": "change", "text": "x", "reason": "drain", "by": "ada@robot1", "why": "lens"})
+    assert drained == ChangeFleet(document=Document(text=Text("x")), reason="drain", asked=asked)
+    assert command_of({"verb": "change", "text": "x"}) == ChangeFleet(document=Document(text=Text("x")))
     kinds = [type(ev.commanded(1, command)) for command in (move, pin, tuned)]
     assert kinds == [ev.MoveCommanded, ev.HoldCommanded, ev.TuneCommanded]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import socket
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -210,8 +209,8 @@ def test_off_a_terminal_the_command_with_yes_is_printed_and_that_command_works(n
     assert (done.exit_code, done.stdout.splitlines()[-1]) == (0, "hall: revision 8 is agreed")
     (change,) = node.changes
     assert (change["base_revision"], change["flags"]) == (7, FLAGS)
-    assert change["reason"].startswith("less swapping, by ")
-    assert change["reason"].endswith(f"@{socket.gethostname()}")
+    assert (change["reason"], change["why"]) == ("apply", "less swapping")
+    assert change["by"].endswith("@robot1")
     assert node.text == file.read_text()
 
 

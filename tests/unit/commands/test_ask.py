@@ -15,6 +15,7 @@ from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.commands import ask
 from zsched.commands.ask import AGAIN_S, Door, ask_door, door_of, find_door
 from zsched.commands.common import CliError
+from zsched.commands.orders import asker, user_name
 from zsched.core.values.fleet import Cell
 from zsched.core.values.messages import CommandOutcome, CommandResult
 from zsched.errors import AdapterError
@@ -147,3 +148,13 @@ def test_in_a_secured_cell_a_command_goes_to_the_gateway_that_it_names(
     ) as none:
         ask_door(door_of(cell, "hall-a", None, "robot2"), order)
     assert none.value.code == EXIT_FAILED
+
+
+def test_an_order_by_an_operator_s_certificate_has_its_name_and_any_other_that_of_the_user(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    names = {"tls/robot1:1": "ana.operator", "tls/robot1:2": ""}
+    monkeypatch.setattr(ask, "_visit", lambda endpoint, _cell: SimpleNamespace(operator=names[endpoint]))
+    assert asker(Door(socket=Path(), endpoint="tls/robot1:1")) == "ana.operator"
+    assert asker(Door(socket=Path(), endpoint="tls/robot1:2")).startswith(f"{user_name()}@")
+    assert asker(Door(socket=Path("run/robot1.sock"))) == f"{user_name()}@robot1"

@@ -132,8 +132,8 @@ def test_several_nodes_are_flagged_by_one_change_that_keeps_the_other_flags(daem
         ("edge2", "drain", 5),
         ("robot1", "ineligible", 2),
     ]
-    assert change["reason"].startswith("drain edge2, edge1, by ")
-    assert change["reason"].endswith("@robot1: hall")
+    assert (change["reason"], change["why"]) == ("drain edge2, edge1", "hall")
+    assert change["by"].endswith("@robot1")
 
 
 def test_a_task_without_a_candidate_is_a_danger_that_is_accepted_by_name(daemon: Daemon) -> None:

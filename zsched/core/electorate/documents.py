@@ -15,7 +15,7 @@ from types import MappingProxyType
 
 from zsched.core import instructions as do
 from zsched.core.todo import ToDo
-from zsched.core.values.document import Flag
+from zsched.core.values.document import Flag, Rollout
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId
@@ -64,6 +64,11 @@ class Documents:
     def flags(self, document: str) -> tuple[Flag, ...]:
         """What operators have said of nodes, by a stored document; nothing if it is not stored here."""
         return self._flags.get(document, ())
+
+    def rollouts(self, document: str) -> tuple[Rollout, ...]:
+        """The changed workers that wait for a look, by a stored document; nothing if it is not stored here."""
+        fleet = self._fleets.get(document)
+        return () if fleet is None else tuple(task.rollout for task in fleet.tasks if task.rollout is not None)
 
     def next_deadline(self) -> float:
         """When `tick` has something to do."""

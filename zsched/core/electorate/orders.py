@@ -4,6 +4,9 @@ Knows: which change of a fleet value each command is, in which words it ends. Do
 (`zsched.core.electorate.numbers`), how a document is stored.
 
 A command ends when its change is chosen, or cannot be. The electors of the new number are settled after that.
+
+What a document says in an operator's name (its flags and rollouts) travels inside the document, so a program could put
+any name there. The node that takes the command writes the name of who gives it beside all that is new or changed.
 """
 
 from __future__ import annotations
@@ -14,14 +17,18 @@ from zsched.core.electorate.changes import AddElector, AdoptDocument, FleetChang
 from zsched.core.electorate.numbers import Numbers
 from zsched.core.todo import ToDo
 from zsched.core.values.change import Rewrite, RoundOutcome
-from zsched.core.values.document import Flag
+from zsched.core.values.document import Document, Flag, in_the_name_of
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import ChangeFleet, CommandOutcome, CommandResult
+from zsched.core.values.model import as_reason, told_by
 from zsched.core.values.struct import replace
 
 MAX_OPEN = 16
 """Operators' commands that may wait for their documents; of more the oldest ends, and its operator is answered so."""
+
+MAX_STORY = 500
+"""Characters of a line of the journal: a text on the wire has at most 512."""
 
 _ENDED = {
     RoundOutcome.CONFLICT: (CommandOutcome.CONFLICT, "another change came first; look and try again"),
@@ -38,7 +45,7 @@ class Orders:
         self._numbers = numbers
         self._storing: dict[int, ChangeFleet] = {}
         """{request: its command} while the document is checked and written."""
-        self._running: list[tuple[FleetChange, int]] = []
+        self._running: list[tuple[FleetChange, int, ChangeFleet]] = []
         self._ending: tuple[int, tuple[Flag, ...]] | None = None
         """(revision, the flags that stay) while the document is written without those whose time is over."""
 
@@ -53,18 +60,26 @@ class Orders:
             detail = f"the fleet is at revision {value.revision}, not {command.base_revision}; look and try again"
             self._answer(request, CommandOutcome.CONFLICT, detail, todo)
         elif command.document is not None:
+            content = self._named(command.document, command, value)
             self._storing[request] = replace(command, base_revision=value.revision)
             for old in tuple(self._storing)[:-MAX_OPEN]:
                 del self._storing[old]
                 detail = f"{MAX_OPEN} newer changes wait here for their documents; nothing is changed, try again"
                 self._answer(old, CommandOutcome.CONFLICT, detail, todo)
-            todo.add(do.StoreDocument(request=request, content=command.document))
+            todo.add(do.StoreDocument(request=request, content=content))
         elif command.add_elector:
             change = AddElector(base_revision=value.revision, name=command.add_elector, disk=command.disk)
-            self._propose(request, _explained(change, command), todo, now)
+            self._propose(request, change, command, todo, now)
         else:
             gone = RemoveElector(base_revision=value.revision, name=command.remove_elector)
-            self._propose(request, _explained(gone, command), todo, now)
+            self._propose(request, gone, command, todo, now)
+
+    def _named(self, content: Document, command: ChangeFleet, value: FleetValue) -> Document:
+        """The document of a command, in which its operator's name stands beside what it changes."""
+        if command.asked is None:
+            return content
+        documents, present = self._numbers.documents, value.document
+        return in_the_name_of(command.asked.by, content, documents.flags(present), documents.rollouts(present))
 
     def on_stored(self, event: ev.DocumentStored, todo: ToDo, now: float) -> None:
         """The document of a command is on disk, or one without the flags whose time is over: propose it."""
@@ -81,7 +96,7 @@ class Orders:
             base_revision=command.base_revision,
             file_lease_s=self._numbers.file_lease_s,
         )
-        self._propose(event.request, _explained(change, command), todo, now)
+        self._propose(event.request, change, command, todo, now)
 
     def on_refused(self, event: ev.DocumentRefused, todo: ToDo) -> None:
         """The document of a command is not valid here, or the disk refused it."""
@@ -105,20 +120,22 @@ class Orders:
         change = document_change(value, event.document, event.fleet)
         self._numbers.propose(replace(change, reason="the time of a drain or of its like is over"), todo, now)
 
-    def _propose(self, request: int, change: FleetChange, todo: ToDo, now: float) -> None:
+    def _propose(self, request: int, change: FleetChange, command: ChangeFleet, todo: ToDo, now: float) -> None:
+        change = replace(change, reason=command.reason) if command.reason else change
         fault = self._numbers.propose(change, todo, now)
         if fault:
             self._answer(request, CommandOutcome.INVALID, fault, todo)
         else:
-            self._running.append((change, request))
+            self._running.append((change, request, command))
 
     def on_ended(self, change: Rewrite[FleetValue], outcome: RoundOutcome, todo: ToDo) -> None:
         """A change of the fleet has ended; if a command asked for it, its operator hears so."""
-        request = next((number for one, number in self._running if one is change), None)
+        request, command = next(
+            ((number, order) for one, number, order in self._running if one is change), (None, None)
+        )
         self._running = [one for one in self._running if one[0] is not change]
         value = self._numbers.value
-        text = f"{change.reason}, on revision {change.base_revision}: {outcome}"
-        todo.add(do.RecordStory(stage="vote", text=text))
+        todo.add(_story(change, outcome, command))
         if request is None or value is None:
             return
         if outcome is RoundOutcome.COMMITTED:
@@ -136,9 +153,15 @@ class Orders:
         todo.add(do.AnswerCommand(request=request, result=result))
 
 
-def _explained(change: FleetChange, command: ChangeFleet) -> FleetChange:
-    """The change with its operator's reason, if there is one."""
-    return replace(change, reason=command.reason) if command.reason else change
+def _story(change: Rewrite[FleetValue], outcome: RoundOutcome, command: ChangeFleet | None) -> do.RecordStory:
+    """What became of a change, with the name of the operator who has given the command, if one has."""
+    asked = None if command is None else command.asked
+    end = f", on revision {change.base_revision}: {outcome}"
+    if asked is None:
+        return do.RecordStory(stage="vote", text=f"{change.reason}{end}")
+    text = as_reason(f"{told_by(asked)}: {change.reason}", MAX_STORY - len(end))
+    is_done = outcome in (RoundOutcome.COMMITTED, RoundOutcome.UNKNOWN)
+    return do.RecordStory(stage="vote", text=f"{text}{end}", by=asked.by if is_done else "")
 
 
 def document_change(

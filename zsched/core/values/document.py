@@ -6,11 +6,12 @@ Knows: the fields of a document and their sizes. Does not know: what the text me
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from enum import StrEnum
 from typing import NewType
 
 from zsched.core.values.model import MAX_REASON, NodeId, TaskId, check_counter, check_name
-from zsched.core.values.struct import Struct
+from zsched.core.values.struct import Struct, replace
 from zsched.core.values.words import check_range
 
 Text = NewType("Text", str)
@@ -42,7 +43,7 @@ class Flag(Struct, frozen=True, kw_only=True):
     """The node."""
     reason: str = ""
     by: str = ""
-    """The operator, as the program that set the flag names the person."""
+    """The operator: the name in the certificate, or else the person that the program names."""
     for_s: float | None = None
     """How long it lasts, in seconds; ``None``: until it is taken back."""
     revision: int = 0
@@ -69,7 +70,7 @@ class Rollout(Struct, frozen=True, kw_only=True):
     """...and environment."""
     reason: str = ""
     by: str = ""
-    """The operator, as the program that began it names the person."""
+    """The operator: the name in the certificate, or else the person that the program names."""
     revision: int = 0
     """Of the fleet value that brought it."""
 
@@ -103,3 +104,13 @@ class Document(Struct, frozen=True, kw_only=True):
         tasks = [one.task for one in self.rollouts]
         if len(tasks) > MAX_ROLLOUTS or len(set(tasks)) < len(tasks):
             raise ValueError(f"document.rollouts: more than {MAX_ROLLOUTS}, or two of one task")
+
+
+def in_the_name_of(by: str, content: Document, flags: Iterable[Flag], rollouts: Iterable[Rollout]) -> Document:
+    """The document, in which all that ``flags`` and ``rollouts``, those so far, do not have is said by ``by``."""
+    known, waiting = frozenset(flags), frozenset(rollouts)
+    return replace(
+        content,
+        flags=tuple(flag if flag in known else replace(flag, by=by) for flag in content.flags),
+        rollouts=tuple(one if one in waiting else replace(one, by=by) for one in content.rollouts),
+    )

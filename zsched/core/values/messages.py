@@ -416,7 +416,9 @@ class ChangeFleet(Struct, frozen=True, kw_only=True):
     base_revision: int | None = None
     """The fleet value's revision that the operator saw; ``None``: whatever is current at this node."""
     reason: str = ""
-    """Why, in the operator's words; it stands in the journal."""
+    """What for, as the operator's program says it; it stands in the journal."""
+    asked: Asked | None = None
+    """``None``: by an older program."""
 
     def __post_init__(self) -> None:
         for name in filter(None, (self.add_elector, self.remove_elector)):
@@ -512,7 +514,7 @@ Command = (
     | ReadFleet
 )
 COMMANDS: tuple[type, ...] = get_args(Command)
-Ordered = SetWeights | Strike | KeepRehearsal | RetryTask | RestartTask | MoveTask | HoldTask | TuneTask
+Ordered = SetWeights | Strike | KeepRehearsal | RetryTask | RestartTask | MoveTask | HoldTask | TuneTask | ChangeFleet
 """Commands that carry who gives them (``asked``)."""
 
 

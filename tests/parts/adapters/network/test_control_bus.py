@@ -30,6 +30,7 @@ from zsched.core.values.messages import (
     Accept,
     Accepted,
     Ballots,
+    ChangeFleet,
     CommandOutcome,
     CommandResult,
     ExplainTask,
@@ -154,6 +155,7 @@ ORDERS: tuple[Ordered, ...] = (
     RestartTask(task="merge", asked=BOB),
     Strike(step=Step.WORKER, task="merge", asked=BOB),
     KeepRehearsal(task="merge", name="one", body=Text("{}"), told="", asked=BOB),
+    ChangeFleet(remove_elector="a", asked=BOB),
 )
 
 

@@ -16,10 +16,10 @@ from zsched.core.electorate.changes import AdoptDocument
 from zsched.core.electorate.documents import RECENT
 from zsched.core.electorate.founding import founded
 from zsched.core.electorate.numbers import in_force
-from zsched.core.electorate.orders import MAX_OPEN, document_change
+from zsched.core.electorate.orders import MAX_OPEN, MAX_STORY, document_change
 from zsched.core.todo import ToDo
 from zsched.core.values.change import RoundOutcome
-from zsched.core.values.document import Document, Flag, FlagKind, Text
+from zsched.core.values.document import Document, Flag, FlagKind, Rollout, Text
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet, TaskSpec
@@ -35,7 +35,8 @@ from zsched.core.values.messages import (
     Refused,
     fleet_question,
 )
-from zsched.core.values.model import Acceptance, Ballot, RegisterState
+from zsched.core.values.model import Acceptance, Asked, Ballot, RegisterState
+from zsched.core.values.words import MAX_ASKED, MAX_ASKER
 from zsched.core.vote.agreement import Agreement
 
 T = TypeVar("T")
@@ -348,7 +349,7 @@ def test_each_end_of_a_change_has_its_answer() -> None:
     for outcome, kind in words.items():
         agreement = make(ADOPTED, {"0d": FLEET})
         commanded(agreement, ChangeFleet(remove_elector="robot2"))
-        ((change, _),) = agreement.orders._running
+        ((change, *_),) = agreement.orders._running
         todo = ToDo()
         agreement.orders.on_ended(change, outcome, todo)
         assert told(todo)[0] is kind
@@ -371,6 +372,76 @@ def test_a_refusal_s_fleet_value_waits_for_its_document() -> None:
     todo = agreed(agreement.on_fleet_answer, ev.FleetAnswered(answer=FleetAnswer(refused=refused)), 100.1)
     assert [one.document for one in of(todo, do.FetchDocument)] == ["0e"]
     assert agreement.fleet_value == ADOPTED
+
+
+# --- in whose name ---------------------------------------------------------------------------------------------------
+
+ANA = Asked(by="ana.operator", reason="new fan")
+BOB = "bob@robot1"
+"""Whom the program names, and who has not given the command."""
+DRAINED = Flag(kind=FlagKind.DRAIN, subject="robot3", by="eve@robot2", reason="a wheel", revision=2)
+WAITS = Rollout(task="merge", first=("robot1",), command=(Text("old"),), by="eve@robot2", revision=2)
+
+
+def names_in(content: Document, *, asked: Asked | None = ANA) -> tuple[list[str], list[str]]:
+    """Whose names stand in the document that is written for a command: of its flags, and of its rollouts."""
+    fleet = replace(FLEET, tasks=(replace(TASK, rollout=WAITS),))
+    agreement = make(ADOPTED, {"0d": fleet}, {"0d": (DRAINED,)})
+    (store,) = of(commanded(agreement, ChangeFleet(document=content, asked=asked)), do.StoreDocument)
+    assert replace(store.content, flags=(), rollouts=()) == replace(content, flags=(), rollouts=())
+    return [flag.by for flag in store.content.flags], [one.by for one in store.content.rollouts]
+
+
+def test_who_gives_a_command_is_named_by_what_is_new_or_changed_and_by_nothing_else() -> None:
+    new = Flag(kind=FlagKind.INELIGIBLE, subject="robot2", by=BOB, revision=3)
+    text = Text("fleet: new")
+    assert names_in(Document(text=text, flags=(DRAINED, new), rollouts=(WAITS,))) == (
+        ["eve@robot2", "ana.operator"],
+        ["eve@robot2"],
+    )
+    changed = replace(DRAINED, reason="another wheel")
+    wave = replace(WAITS, first=("robot2",))
+    assert names_in(Document(text=text, flags=(changed,), rollouts=(wave,))) == (["ana.operator"], ["ana.operator"])
+    for renamed in (replace(DRAINED, by=BOB), replace(DRAINED, by="")):
+        assert names_in(Document(text=text, flags=(renamed,))) == (["ana.operator"], []), "no flag gets another's name"
+
+
+def test_a_command_of_an_older_program_without_a_name_stays_as_it_is() -> None:
+    new = Flag(kind=FlagKind.DRAIN, subject="robot2", by=BOB, revision=3)
+    assert names_in(Document(text=Text("fleet: new"), flags=(new,)), asked=None) == ([BOB], [])
+
+
+def test_flags_of_a_first_document_are_in_the_name_of_who_brings_it() -> None:
+    content = Document(text=Text("fleet: hall"), flags=(DRAINED,))
+    (store,) = of(commanded(make(FIRST), ChangeFleet(document=content, asked=ANA)), do.StoreDocument)
+    assert [flag.by for flag in store.content.flags] == ["ana.operator"]
+
+
+def ended(outcome: RoundOutcome, asked: Asked | None = ANA, reason: str = "drain robot2") -> do.RecordStory:
+    """What the journal tells of a change that has ended."""
+    agreement = make(ADOPTED, {"0d": FLEET})
+    commanded(agreement, ChangeFleet(remove_elector="robot2", reason=reason, asked=asked))
+    ((change, *_),) = agreement.orders._running
+    agreement.orders.on_ended(change, outcome, todo := ToDo())
+    (story,) = of(todo, do.RecordStory)
+    return story
+
+
+def test_the_journal_tells_who_has_changed_the_fleet() -> None:
+    done = ended(RoundOutcome.COMMITTED)
+    told_first = "ana.operator (new fan): drain robot2, on revision 2: committed"
+    assert (done.text, done.by) == (told_first, "ana.operator")
+    assert ended(RoundOutcome.UNKNOWN).by == "ana.operator", "it may have been agreed"
+    assert ended(RoundOutcome.CONFLICT).by == "", "nothing was changed"
+    nameless = ended(RoundOutcome.COMMITTED, None)
+    assert (nameless.text, nameless.by) == ("drain robot2, on revision 2: committed", "")
+
+
+def test_a_line_of_the_journal_fits_the_wire_however_long_its_words_are() -> None:
+    longest = Asked(by="a" * MAX_ASKER, reason="b" * MAX_ASKED)
+    text = ended(RoundOutcome.COMMITTED, longest, "c" * 400).text
+    assert len(text) <= MAX_STORY
+    assert text.endswith("…, on revision 2: committed")
 
 
 # --- flags whose time is over ----------------------------------------------------------------------------------------
