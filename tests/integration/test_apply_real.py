@@ -72,7 +72,7 @@ def test_a_task_comes_and_goes_by_the_document_while_a_stream_runs(tmp_path: Pat
             return bool(back)
 
         bed.wait(answers, 60, "an answer of the task that came")
-        assert "(more work): apply, on revision " in operator.done("history")
+        assert f"(more work): task add {fragment}, on revision " in operator.done("history")
 
         # who saw the fleet before that is refused
         late = operator.zsched("apply", file, "--yes", "--accept", "remove-task", "--revision", first)

@@ -158,7 +158,7 @@ def test_the_document_and_its_flags_are_changed_in_the_name_of_the_certificate(
             lambda: (
                 told_by()
                 == [
-                    ("ana.operator", "ana.operator (the first): apply"),
+                    ("ana.operator", f"ana.operator (the first): apply {tmp_path / 'ana' / 'fleet.yaml'}"),
                     ("ana.operator", "ana.operator (new fan): drain edge1"),
                     (user, f"{user}: eligible off robot2"),
                     ("ana.operator", "ana.operator: nothing, by bob@robot1"),

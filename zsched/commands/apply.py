@@ -376,7 +376,7 @@ def _agreed(door: Door, step: Json, held: InForce, view: ApplyView) -> int:
         CliError: it is refused; somebody else was first, or the fleet does not come to rest.
     """
     base = held.revision
-    by = ordered(shlex.join(view.words[:1]), {"by": asker(door), "reason": view.reason})
+    by = ordered(shlex.join(view.words), {"by": asker(door), "reason": view.reason})
     for left in reversed(range(TRIES)):
         try:
             answer = change(door, {**step, "base_revision": base, **by})

@@ -209,7 +209,7 @@ def test_off_a_terminal_the_command_with_yes_is_printed_and_that_command_works(n
     assert (done.exit_code, done.stdout.splitlines()[-1]) == (0, "hall: revision 8 is agreed")
     (change,) = node.changes
     assert (change["base_revision"], change["flags"]) == (7, FLAGS)
-    assert (change["reason"], change["why"]) == ("apply", "less swapping")
+    assert (change["reason"], change["why"]) == (f"apply {file}", "less swapping")
     assert change["by"].endswith("@robot1")
     assert node.text == file.read_text()
 

@@ -284,7 +284,8 @@ def test_an_invited_node_is_agreed_last_in_who_dials_whom_and_its_file_says_all(
     assert fleet.task("merge").candidates == ("robot1", "robot2", "robot3")
     assert fleet.node("robot2").listen_data == "tcp/0.0.0.0:7458"
     assert node.text.startswith(TEXT.partition("tasks:")[0]), "every other character stays"
-    assert (node.changes[0]["reason"], node.changes[0]["why"]) == ("invite", "more hands")
+    assert node.changes[0]["reason"] == "invite robot2 --address 192.0.2.12 --candidate-for merge"
+    assert node.changes[0]["why"] == "more hands"
     assert "nodes.robot2" in result.stderr
     assert "next, on that machine: sudo zsched join robot2.invite" in result.stderr
     more = run("invite", "robot4", "--address", "192.0.2.14", "--kind", "edge", "--candidate-for", "count", "--yes")
