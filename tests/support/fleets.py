@@ -20,9 +20,9 @@ def tuning_of(cpu: float = 0.5, memory: float = 0.5, network: float = 0.0, **opt
     return Tuning(weights=Weights(cpu=cpu, memory=memory, network=network), **options)
 
 
-def nodes_of(names: Iterable[str]) -> tuple[NodeSpec, ...]:
-    """Nodes of these names, in their order."""
-    return tuple(NodeSpec(name=name, kind=NodeKind.ROBOT if name.startswith("r") else NodeKind.EDGE) for name in names)
+def node_of(name: str, **options: Any) -> NodeSpec:
+    """A node."""
+    return NodeSpec(name=name, **{"kind": NodeKind.ROBOT if name.startswith("r") else NodeKind.EDGE, **options})
 
 
 def task_of(name: str = "merge", candidates: tuple[str, ...] = EDGES, **options: Any) -> TaskSpec:
@@ -30,15 +30,22 @@ def task_of(name: str = "merge", candidates: tuple[str, ...] = EDGES, **options:
     return TaskSpec(name=name, candidates=candidates, **{"tuning": tuning_of(), **options})
 
 
-def fleet_of(*tasks: TaskSpec, of: Iterable[str] = (*EDGES, *ROBOTS), electors: Iterable[str] | None = None) -> Fleet:
+def fleet_of(
+    *tasks: TaskSpec,
+    of: Iterable[str | NodeSpec] = (*EDGES, *ROBOTS),
+    electors: Iterable[str] | None = None,
+    **options: Any,
+) -> Fleet:
     """A fleet of these tasks.
 
     Args:
         tasks: none: `task_of()`.
-        of: names of its nodes.
+        of: its nodes; a name stands for a plain one.
         electors: none given: the robots.
+        options: other fields; ``tasks=()`` for a fleet without a task.
     """
-    known = nodes_of(of)
-    robots = tuple(node.name for node in known if node.kind is NodeKind.ROBOT)
+    nodes = tuple(node_of(one) if isinstance(one, str) else one for one in of)
+    robots = tuple(node.name for node in nodes if node.kind is NodeKind.ROBOT)
     chosen = robots if electors is None else tuple(electors)
-    return Fleet(name="test", timing=Timing(), nodes=known, tasks=tasks or (task_of(),), electors=chosen)
+    usual = {"name": "test", "timing": Timing(), "tasks": tasks or (task_of(),)}
+    return Fleet(nodes=nodes, electors=chosen, **{**usual, **options})

@@ -13,6 +13,9 @@ from typing import Any
 
 import pytest
 
+from support.allocations import allocation_of
+from support.decisions import figures_of
+from support.fleets import task_of, tuning_of
 from support.schemas import faults
 from zsched.adapters.host.decision_log import NAME, DecisionLog
 from zsched.commands import explain as verb
@@ -22,15 +25,16 @@ from zsched.commands.explain import SCHEMA, ExplainView, explain, formula_of
 from zsched.core.instructions import RecordStory
 from zsched.core.scheduler.decision import decide_again, verdict_of
 from zsched.core.scheduler.utility import total_utility
-from zsched.core.values.decision import Decision, Explanation, Figures, Move, Need, Rules
-from zsched.core.values.model import Allocation, PeerState, Reach, ScoreForm, Tuning, Utility, UtilityVector, Weights
+from zsched.core.values.decision import Decision, Explanation, Move, Need
+from zsched.core.values.fleet import WorkerSpec
+from zsched.core.values.model import ScoreForm, Utility, UtilityVector, Weights
 from zsched.core.values.snapshot import VoteStatus
 from zsched.exits import EXIT_FAILED, EXIT_UNREACHABLE, EXIT_USAGE, EXIT_WOULD_CHANGE
 from zsched.runtime.desk import answer_json
 
 ROBOTS = ("robot1", "robot2", "robot3")
-WEIGHTS = Weights(cpu=0.5, memory=0.3, network=0.2)
-VALUE = Allocation(task="merge", revision=4, epoch=3, owner="edge1", tuning=Tuning(weights=WEIGHTS, bonus=0.05))
+TUNING = tuning_of(cpu=0.5, memory=0.3, network=0.2, bonus=0.05)
+VALUE = allocation_of(4, epoch=3, tuning=TUNING)
 TERMS = {"edge1": (0.75, 0.5, 0.5), "edge2": (0.5, 0.5, 0.25)}
 
 
@@ -40,38 +44,16 @@ def decision() -> Decision:
         for name, (cpu, memory, net) in TERMS.items()
     )
     refused = (("edge3", "worker failed: \x1b[31mno model"),)
-    figures = Figures(
-        task="merge",
-        now=1000.0,
-        rules=Rules(
-            candidates=("edge1", "edge2", "edge3"),
-            reach=Reach.MAJORITY,
-            memory_floor_ratio=0.05,
-            max_moves_per_minute=6,
-            patience=0.15,
-            learns_patience=False,
-            start_deadline_s=20.0,
-            has_command=True,
-        ),
-        allocation=VALUE,
-        voters=ROBOTS,
-        present=ROBOTS,
-        vectors=tuple(
-            UtilityVector(
-                voter=robot,
-                task="merge",
-                revision=4,
-                utilities=column,
-                refused=refused,
-                penalties=(("edge2", 0.03),),
-            )
-            for robot in ROBOTS[:2]
-        ),
-        electors=ROBOTS,
-        electors_heard=ROBOTS,
-        settled_for_s=60.0,
-        owner_state=PeerState.ALIVE,
+    vectors = tuple(
+        UtilityVector(
+            voter=robot, task="merge", revision=4, utilities=column, refused=refused, penalties=(("edge2", 0.03),)
+        )
+        for robot in ROBOTS[:2]
     )
+    spec = task_of(
+        candidates=("edge1", "edge2", "edge3"), patience=0.15, tuning=TUNING, worker=WorkerSpec(command=("merge",))
+    )
+    figures = figures_of(spec, *ROBOTS, vectors=vectors)
     needs = (Need(candidate="edge1", cpu_cores=0.4, memory_mb=250.0),)
     return Decision(figures=figures, verdict=verdict_of(decide_again(figures).judgement), needs=needs)
 

@@ -10,6 +10,8 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from support.decisions import figures_of
+from support.fleets import task_of, tuning_of
 from support.schemas import faults
 from zsched.adapters.host.decision_log import NAME, DecisionLog
 from zsched.cli import app
@@ -19,9 +21,9 @@ from zsched.commands.common import CliError
 from zsched.commands.history import EventsView, duration_s, events, history, subject_of, types_of
 from zsched.core.instructions import RecordStory
 from zsched.core.scheduler.decision import decide_again, verdict_of
-from zsched.core.values.decision import Decision, Figures, Move, Rules
-from zsched.core.values.fleet import Cell
-from zsched.core.values.model import Allocation, PeerState, Reach, Tuning, Utility, UtilityVector, Weights
+from zsched.core.values.decision import Decision, Move
+from zsched.core.values.fleet import Cell, WorkerSpec
+from zsched.core.values.model import Utility, UtilityVector
 from zsched.exits import EXIT_UNREACHABLE, EXIT_USAGE
 
 NOW = 1_790_000_000.0
@@ -351,30 +353,15 @@ def test_events_of_one_node_name_it_as_a_whole_word(pages: Pages, capsys: pytest
 
 
 def decision(value: float) -> Decision:
-    weights = Weights(cpu=1.0, memory=0.0, network=0.0)
     column = tuple(Utility(candidate=name, value=one, cpu=one) for name, one in (("edge1", 0.1), ("edge2", value)))
-    figures = Figures(
-        task="merge",
-        now=12.345678901234567,
-        rules=Rules(
-            candidates=("edge1", "edge2"),
-            reach=Reach.MAJORITY,
-            memory_floor_ratio=0.05,
-            max_moves_per_minute=6,
-            patience=0.15,
-            learns_patience=True,
-            start_deadline_s=20.0,
-            has_command=True,
-        ),
-        allocation=Allocation(task="merge", revision=4, epoch=3, owner="edge1", tuning=Tuning(weights=weights)),
-        voters=("robot1",),
-        present=("robot1",),
-        vectors=(UtilityVector(voter="robot1", task="merge", revision=4, utilities=column),),
-        electors=("robot1",),
-        electors_heard=("robot1",),
-        settled_for_s=60.0,
-        owner_state=PeerState.ALIVE,
+    spec = task_of(
+        tuning=tuning_of(cpu=1.0, memory=0.0),
+        patience=0.15,
+        learns_patience=True,
+        worker=WorkerSpec(command=("merge",)),
     )
+    vector = UtilityVector(voter="robot1", task="merge", revision=4, utilities=column)
+    figures = figures_of(spec, "robot1", now=12.345678901234567, vectors=(vector,))
     return Decision(figures=figures, verdict=verdict_of(decide_again(figures).judgement))
 
 

@@ -12,40 +12,17 @@ from pathlib import Path
 
 import pytest
 
+from support.decisions import figures_of
+from support.fleets import task_of
 from zsched.adapters.host.decision_log import NAME, OLD_NAME, QUEUE_LIMIT, SCHEMA, DecisionLog, read_page
 from zsched.core.instructions import RecordStory
-from zsched.core.values.decision import Decision, Figures, HistoryLine, Move, Rules, Verdict
+from zsched.core.values.decision import Decision, HistoryLine, Move, Verdict
 from zsched.core.values.messages import HistoryTold
-from zsched.core.values.model import Allocation, Reach, Tuning, Weights
 from zsched.wire.codec import LARGE, decode, encode
 
 MOVE = Move(epoch=2, revision=2, left="edge1", owner="edge2", reason="edge1 is gone", votes=(("robot1", "edge2"),))
-VALUE = Allocation(
-    task="merge", revision=1, epoch=1, owner="edge1", tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
-)
-RULES = Rules(
-    candidates=("edge1",),
-    reach=Reach.MAJORITY,
-    memory_floor_ratio=0.05,
-    max_moves_per_minute=6,
-    patience=0.15,
-    learns_patience=False,
-    start_deadline_s=20.0,
-    has_command=True,
-)
 DECISION = Decision(
-    figures=Figures(
-        task="merge",
-        now=5.0,
-        rules=RULES,
-        allocation=VALUE,
-        voters=("robot1",),
-        present=("robot1",),
-        vectors=(),
-        electors=("robot1",),
-        electors_heard=("robot1",),
-        settled_for_s=1.0,
-    ),
+    figures=figures_of(task_of(), "robot1"),
     verdict=Verdict(outcome="none", candidate=None, aggregate=0.0, reason="utilities of 0 robots, 1 needed"),
 )
 

@@ -8,16 +8,15 @@ from dataclasses import replace
 
 import pytest
 
-from support.fleets import tuning_of
+from support.allocations import allocation_of
+from support.decisions import figures_of
+from support.fleets import task_of, tuning_of
 from zsched.core.scheduler.decision import decide_again, verdict_of
 from zsched.core.scheduler.explain import Explained, explained, judged_again, owner_cpu_below, utility_of, without
 from zsched.core.scheduler.scoring import pick
-from zsched.core.values.decision import DampingMemory, Decision, Figures, Need, Rules
+from zsched.core.values.decision import DampingMemory, Decision, Need
 from zsched.core.values.model import (
     Aggregate,
-    Allocation,
-    PeerState,
-    Reach,
     ScoreForm,
     Tuning,
     Utility,
@@ -50,30 +49,12 @@ def decision_of(tuning: Tuning = TUNING, *, owner: str | None = "edge1", **chang
             value = value_of((cpu, memory, network), tuning)
             column.append(Utility(candidate=name, value=value, cpu=cpu, memory=memory, network=network))
         vectors.append(UtilityVector(voter=robot, task="merge", revision=4, utilities=tuple(column)))
-    figures = Figures(
-        task="merge",
-        now=1000.0,
-        rules=Rules(
-            candidates=EDGES,
-            reach=Reach.MAJORITY,
-            memory_floor_ratio=0.05,
-            max_moves_per_minute=6,
-            patience=0.15,
-            learns_patience=False,
-            start_deadline_s=20.0,
-            has_command=False,
-        ),
-        allocation=Allocation(task="merge", revision=4, epoch=3, owner=owner, tuning=tuning),
-        voters=ROBOTS,
-        present=ROBOTS,
-        vectors=tuple(vectors),
-        electors=ROBOTS,
-        electors_heard=ROBOTS,
-        settled_for_s=60.0,
-        owner_state=PeerState.ALIVE,
-        damping=DampingMemory(points=(("edge3", 1.0, 990.0),)),
-    )
-    figures = replace(figures, **changes)  # type: ignore[arg-type]
+    given = {
+        "allocation": allocation_of(4, owner, 3, tuning=tuning),
+        "vectors": tuple(vectors),
+        "damping": DampingMemory(points=(("edge3", 1.0, 990.0),)),
+    }
+    figures = figures_of(task_of(candidates=EDGES, patience=0.15), *ROBOTS, **{**given, **changes})
     needs = (Need(candidate="edge1", cpu_cores=0.4, memory_mb=250.0),)
     return Decision(figures=figures, verdict=verdict_of(decide_again(figures).judgement), needs=needs)
 

@@ -8,20 +8,21 @@ from dataclasses import replace
 from hypothesis import given
 from hypothesis import strategies as st
 
-from support.fleets import tuning_of
+from support.allocations import allocation_of
+from support.decisions import figures_of
+from support.fleets import task_of
 from support.proposals import vector_of
 from zsched.core.scheduler.damping import Damping
-from zsched.core.scheduler.decision import decide, rules_of
+from zsched.core.scheduler.decision import decide
 from zsched.core.scheduler.flags import AGAIN_S, SPREAD_S, NodeFlags, told_flag
 from zsched.core.scheduler.judge import Judge, Outcome
 from zsched.core.values.decision import Figures
 from zsched.core.values.document import Flag, FlagKind
-from zsched.core.values.fleet import TaskSpec
-from zsched.core.values.model import Allocation, Asked, NodeId, PeerState, Pin
+from zsched.core.values.model import Asked, NodeId, PeerState, Pin
 
 ROBOTS = ("robot1", "robot2", "robot3")
 NODES = ("edge1", "edge2", "edge3")
-SPEC = TaskSpec(name="merge", candidates=NODES, tuning=tuning_of(), patience=0.1)
+SPEC = task_of(candidates=NODES, patience=0.1)
 
 
 def drain(node: NodeId = "edge1", for_s: float | None = None, revision: int = 3) -> Flag:
@@ -104,27 +105,20 @@ def figures(draw: st.DrawFn) -> Figures:
     owner = draw(st.sampled_from((None, *NODES)))
     pin = draw(st.sampled_from((None, *NODES)))
     is_hard, is_paused = draw(st.booleans()), draw(st.integers(0, 4)) == 0
-    allocation = Allocation(
-        task="merge",
-        revision=5,
-        epoch=5,
-        owner=owner,
-        tuning=tuning_of(),
+    allocation = allocation_of(
+        5,
+        owner,
         pin=None if pin is None else Pin(node=pin, asked=Asked(by="ada"), revision=5, is_hard=is_hard),
         pinned=pin is not None,
         paused=is_paused,
     )
     state = draw(st.sampled_from((PeerState.ALIVE, PeerState.ALIVE, PeerState.GONE)))
-    return Figures(
-        task="merge",
+    return figures_of(
+        SPEC,
+        *ROBOTS,
         now=draw(st.sampled_from((0.0, 50.0))),
-        rules=rules_of(SPEC),
         allocation=allocation,
-        voters=ROBOTS,
-        present=ROBOTS,
         vectors=tuple(vector_of(robot, worth, revision=5) for robot in ROBOTS),
-        electors=ROBOTS,
-        electors_heard=ROBOTS,
         settled_for_s=draw(st.sampled_from((0.0, 100.0))),
         owner_state=PeerState.GONE if owner is None else state,
         is_called=draw(st.booleans()),
