@@ -9,8 +9,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from support.authorities import secured
+from support.ballots import ballot_of
+from support.beats import beat_of
+from support.proposals import proposal_of
 from zsched.core.values.messages import Prepare
-from zsched.core.values.model import Ballot, Beat, Proposal
 from zsched.runtime.access_rules import Side
 from zsched.runtime.tls import session_text
 from zsched.sessions.config import control_config
@@ -38,9 +40,9 @@ def attacker(bed: Testbed) -> str:
 
 def test_ten_thousand_frames_of_each_kind_change_nothing(tmp_path: Path) -> None:
     tree = secured(echo_fleet(robots=3, edges=1), tmp_path)
-    beat = wire.encode(Beat(node=IDLE, incarnation=1, sequence=1, loop_lag_s=0.0))
-    proposal = wire.encode(Proposal(voter=IDLE, task=TASK, base_revision=1, candidate="edge1", aggregate=0.5))
-    prepare = Prepare(task=TASK, ballot=Ballot(counter=10**6, node=IDLE, incarnation=1), electorate="e")
+    beat = wire.encode(beat_of(IDLE))
+    proposal = wire.encode(proposal_of(IDLE, task=TASK, base_revision=1))
+    prepare = Prepare(task=TASK, ballot=ballot_of(10**6, IDLE), electorate="e")
     floods = (
         ("frames", KEYS.beat(IDLE), beat, COUNT),
         ("frames", KEYS.proposal(IDLE), proposal, COUNT),

@@ -16,9 +16,12 @@ from typing import Any
 import pytest
 import zenoh
 
+from support.allocations import allocation_of
+from support.beats import beat_of
+from support.profiles import profile_of
 from zsched.core.relay_protocol import EndMarker, StreamAck, StreamAcks
 from zsched.core.values.messages import Learnt
-from zsched.core.values.model import Allocation, Beat, NodeId, Profile
+from zsched.core.values.model import NodeId
 from zsched.core.values.plan import Role, WorkerRole
 from zsched.ipc.pipe import encode_end
 from zsched.wire import codec as wire
@@ -156,7 +159,7 @@ def test_one_put_on_the_control_network_ends_nothing(
     reaches(stranger.control, KEYS.allocation("robot1"))
     tuning = bed.fleet.tasks[0].tuning
     for number in (2**52 - 1, epoch + 1):
-        absurd = Allocation(task=TASK, revision=number, epoch=number, owner="nobody", tuning=tuning)
+        absurd = allocation_of(number, "nobody", task=TASK, tuning=tuning)
         put(KEYS.allocation("robot1"), wire.encode(Learnt(node="robot1", values=(absurd,))))
     ours = life(bed, "edge1")
     for incarnation, sequence in ((ours, 10**9), (ours, FAR), (2**52, 1)):
@@ -197,22 +200,11 @@ def test_beats_in_its_name_do_not_stop_a_daemon_that_starts(bed: Testbed, strang
 
 
 def _beat(node: NodeId, incarnation: int, sequence: int) -> bytes:
-    return wire.encode(Beat(node=node, incarnation=incarnation, sequence=sequence, loop_lag_s=0.0))
+    return wire.encode(beat_of(node, sequence, incarnation=incarnation))
 
 
 def _profile(node: NodeId, incarnation: int, sequence: int) -> bytes:
-    return wire.encode(
-        Profile(
-            node=node,
-            incarnation=incarnation,
-            sequence=sequence,
-            cpu_cores=1.0,
-            cpu_used_cores=0.0,
-            memory_mb=1.0,
-            memory_used_mb=0.0,
-            draining=True,
-        )
-    )
+    return wire.encode(profile_of(node, incarnation=incarnation, sequence=sequence, draining=True))
 
 
 # --- the data network ------------------------------------------------------------------------------------------------

@@ -13,11 +13,12 @@ from typing import Any
 
 import pytest
 
-from support.fleets import tuning_of
+from support.fleets import task_of, tuning_of
+from support.profiles import profile_of
 from support.waiting import between
 from zsched.core.gateway.demand import Demands
-from zsched.core.values.fleet import Demand, TaskSpec
-from zsched.core.values.model import Jobs, Profile, WorkerLoad, WorkerState
+from zsched.core.values.fleet import Demand
+from zsched.core.values.model import Jobs, WorkerLoad, WorkerState
 from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 
 pytestmark = pytest.mark.long
@@ -77,12 +78,7 @@ def shown(bed: Testbed) -> dict[str, Any]:
 
 def needed(bed: Testbed, for_s: float) -> tuple[float, float, float]:
     """(cores that it needs by the core's rule, cores that it uses, seconds a job), means over a while."""
-    spec = TaskSpec(
-        name=TASK,
-        candidates=("edge1",),
-        tuning=tuning_of(cpu=1.0, memory=0.0),
-        demand=Demand(),
-    )
+    spec = task_of(TASK, ("edge1",), tuning=tuning_of(cpu=1.0, memory=0.0), demand=Demand())
     found = []
     until = time.monotonic() + for_s
     while time.monotonic() < until:
@@ -92,14 +88,9 @@ def needed(bed: Testbed, for_s: float) -> tuple[float, float, float]:
         jobs = None if load["jobs"] is None else Jobs(**load["jobs"])
         if jobs is None or load["cpu_cores"] is None:
             continue
-        profile = Profile(
-            node="edge1",
-            incarnation=1,
-            sequence=1,
-            cpu_cores=node["cpu_cores"],
-            cpu_used_cores=node["cpu_used_cores"],
-            memory_mb=node["memory_mb"],
-            memory_used_mb=node["memory_used_mb"],
+        machine = {name: node[name] for name in ("cpu_cores", "cpu_used_cores", "memory_mb", "memory_used_mb")}
+        profile = profile_of(
+            **machine,
             workers=(WorkerLoad(**{**load, "state": WorkerState(load["state"]), "jobs": jobs}),),
         )
         demands = Demands()

@@ -8,6 +8,7 @@ import math
 import pytest
 
 from support.fleets import fleet_of, task_of, tuning_of
+from support.profiles import SAMPLE
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.profile.profile import Profiler
 from zsched.core.values.fleet import Timing
@@ -44,12 +45,11 @@ def test_a_profiler_on_every_edge_measures_beta_mu_and_lambda() -> None:
 def test_the_network_profiler_measures_each_link_for_itself() -> None:
     """Sec. III-D: the RSSI from each edge device or nearby router respective to each individual robot."""
     profiler = Profiler("robot1", 1, TIMING)
-    device = DeviceSample(cpu_cores=4.0, cpu_used_cores=1.0, memory_mb=4000.0, memory_used_mb=1000.0)
     links = tuple(
         LinkSample(source=LinkSource.NL80211, peer=peer, rssi_dbm=rssi)
         for peer, rssi in ((None, -60.0), ("edge1", -50.0), ("edge2", -70.0))
     )
-    profiler.absorb(device, links, 0.0)
+    profiler.absorb(SAMPLE, links, 0.0)
 
     seen = {link.peer: link.rssi_dbm for link in published(profiler, 0.0).links}
     assert seen == {None: -60.0, "edge1": -50.0, "edge2": -70.0}

@@ -37,7 +37,7 @@ SPEC = TaskSpec(
 ROBOTS = ("robot1", "robot2", "robot3")
 LONG = Timing(profile_ttl_s=60.0)
 """One set of edge data lasts for a test."""
-FLEET = replace(fleet_of(SPEC, of=(*SPEC.candidates, *ROBOTS)), timing=LONG)
+FLEET = fleet_of(SPEC, of=(*SPEC.candidates, *ROBOTS), timing=LONG)
 ALIVE = {node.name: PeerState.ALIVE for node in FLEET.nodes}
 SETTLED_S = 1000.0
 

@@ -20,6 +20,7 @@ from typing import Any
 import pytest
 import zenoh
 
+from support.fleets import fleet_of, node_of
 from support.sessions import matches
 from support.waiting import until
 from zsched import daemon
@@ -27,7 +28,7 @@ from zsched.adapters.host.operator_client import ask
 from zsched.adapters.host.state_file import StateFile
 from zsched.clock import ClockWatch, Drift
 from zsched.core import events as ev
-from zsched.core.values.fleet import Fleet, NodeSpec, Timing
+from zsched.core.values.fleet import Fleet, NodeSpec
 from zsched.core.values.model import DeviceSample, NodeKind
 from zsched.core.vote.clocks import is_bad
 from zsched.errors import AdapterError
@@ -57,11 +58,11 @@ Json = dict[str, Any]
 
 
 def spec(name: str, *, host: str = "", control: str = "", data: str = "") -> NodeSpec:
-    return NodeSpec(name=name, kind=NodeKind.EDGE, host=host, listen_control=control, listen_data=data)
+    return node_of(name, kind=NodeKind.EDGE, host=host, listen_control=control, listen_data=data)
 
 
 def fleet(*nodes: NodeSpec, seeds: tuple[str, ...] = ()) -> Fleet:
-    return Fleet(name="f", timing=Timing(), nodes=nodes, tasks=(), electors=(), seeds=seeds)
+    return fleet_of(of=nodes, tasks=(), seeds=seeds)
 
 
 def endpoints(me: NodeSpec, *others: NodeSpec, seeds: tuple[str, ...] = ()) -> Endpoints:

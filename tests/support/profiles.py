@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from zsched.core.values.model import NodeId, Profile, TaskId, WorkerLoad, WorkerState
+from zsched.core.values.model import DeviceSample, NodeId, Profile, TaskId, WorkerLoad, WorkerState
 
 USUAL: dict[str, Any] = {
     "incarnation": 1,
@@ -14,6 +14,8 @@ USUAL: dict[str, Any] = {
     "memory_mb": 4000.0,
     "memory_used_mb": 1000.0,
 }
+SAMPLE = DeviceSample(cpu_cores=4.0, cpu_used_cores=1.0, memory_mb=4000.0, memory_used_mb=1000.0)
+"""What such a node measures of itself."""
 
 
 def profile_of(node: NodeId = "edge1", **options: Any) -> Profile:

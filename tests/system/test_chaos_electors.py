@@ -18,9 +18,9 @@ from pathlib import Path
 import msgpack
 import pytest
 
+from support.beats import beat_of
 from zsched.adapters.host.operator_client import ask
 from zsched.core.membership.identity import TOLD_YOUNG_S
-from zsched.core.values.model import Beat
 from zsched.paths import socket_path
 from zsched.runtime.init import init_state
 from zsched.sessions import config as zenoh_config
@@ -147,14 +147,7 @@ def test_second_fleet_on_the_same_network_stays_apart(bed: Bed) -> None:
 
 
 def test_frames_of_another_wire_version_are_counted_and_nothing_else(bed: Bed) -> None:
-    beat = Beat(
-        node="robot2",
-        incarnation=2**40,
-        sequence=10**6,
-        loop_lag_s=0.0,
-        learnt=((TASK, 10**6, 10**6),),
-        suspects=("robot1",),
-    )
+    beat = beat_of("robot2", 10**6, incarnation=2**40, learnt=((TASK, 10**6, 10**6),), suspects=("robot1",))
     version, *rest = msgpack.unpackb(wire.encode(beat))
     frame = msgpack.packb([version + 1, *rest])
     epoch = bed.task("robot1")["epoch"]

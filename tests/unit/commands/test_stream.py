@@ -10,13 +10,13 @@ import pytest
 import zenoh
 from typer.testing import CliRunner
 
+from support.fleets import fleet_of, node_of
 from support.schemas import faults
 from zsched.adapters.network.stream_tap import Tapped
 from zsched.cli import app
 from zsched.commands.common import CliError
 from zsched.commands.stream import KeyStats, StreamView, _print_rates, _print_sample, keys_for, rates
-from zsched.core.values.fleet import Fleet, LocalSide, NodeSpec, Timing
-from zsched.core.values.model import NodeKind
+from zsched.core.values.fleet import LocalSide
 from zsched.runtime.access import StreamAccess
 
 
@@ -112,12 +112,14 @@ def test_one_message_has_no_gap() -> None:
 
 # --- the way to the data ---------------------------------------------------------------------------------------------
 
-NODES = (
-    NodeSpec(name="edge1", kind=NodeKind.EDGE, host="192.0.2.11", listen_data="tcp/0.0.0.0:7458"),
-    NodeSpec(name="robot1", kind=NodeKind.ROBOT, local=LocalSide(connect=("tcp/127.0.0.1:7447",))),
-    NodeSpec(name="robot2", kind=NodeKind.ROBOT),
+FLEET = fleet_of(
+    of=(
+        node_of("edge1", host="192.0.2.11", listen_data="tcp/0.0.0.0:7458"),
+        node_of("robot1", local=LocalSide(connect=("tcp/127.0.0.1:7447",))),
+        "robot2",
+    ),
+    tasks=(),
 )
-FLEET = Fleet(name="f", timing=Timing(), nodes=NODES, tasks=(), electors=("robot1", "robot2"))
 
 
 def access(me: str) -> StreamAccess:

@@ -16,6 +16,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from support.allocations import allocation_of
+from support.fleets import fleet_of
 from support.profiles import load_of
 from support.proposals import proposal_of
 from zsched.core.events import WorkerJobs
@@ -29,8 +30,6 @@ from zsched.core.values.fleet import (
     DEFAULT_COOL_DOWN_S,
     PAPER_PATIENCE,
     Demand,
-    Fleet,
-    NodeSpec,
     TaskSpec,
     Timing,
     WorkerSpec,
@@ -39,7 +38,6 @@ from zsched.core.values.model import (
     DeviceSample,
     LinkSample,
     LinkSource,
-    NodeKind,
     PeerState,
     ScoreForm,
     Tuning,
@@ -166,11 +164,7 @@ class Loop:
             learns_patience=self.learns,
             worker=WorkerSpec(command=("worker",)),
         )
-        nodes = [NodeSpec(name=name, kind=NodeKind.EDGE) for name in names]
-        nodes += [NodeSpec(name=name, kind=NodeKind.ROBOT) for name in self.robots]
-        fleet = Fleet(
-            name="loop", timing=self.timing, nodes=tuple(nodes), tasks=(self.spec,), electors=tuple(self.robots)
-        )
+        fleet = fleet_of(self.spec, of=(*names, *self.robots), timing=self.timing)
         self.allocation = allocation_of(owner=names[0], tuning=self.spec.tuning)
         self.gateways = {robot: Gateway(fleet) for robot in self.robots}
         self.judges = {robot: Judge(spec=self.spec) for robot in self.robots}

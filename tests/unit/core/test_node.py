@@ -13,7 +13,7 @@ from support.allocations import allocation_of
 from support.ballots import ballot_of
 from support.beats import beat_of
 from support.fleets import fleet_of, tuning_of
-from support.profiles import load_of, profile_of
+from support.profiles import SAMPLE, load_of, profile_of
 from support.proposals import proposal_of, vector_of
 from support.states import state_of
 from zsched.core import events as ev
@@ -48,7 +48,6 @@ from zsched.core.values.model import (
     Allocation,
     Ballot,
     Beat,
-    DeviceSample,
     Echo,
     PeerState,
     RegisterState,
@@ -66,7 +65,6 @@ FLEET = fleet_of(
     electors=ROBOTS,
 )
 ELECTORATE = electorate_hash(FLEET)
-SAMPLE = DeviceSample(cpu_cores=4.0, cpu_used_cores=1.0, memory_mb=4000.0, memory_used_mb=1000.0)
 
 
 def durable(me: str, *registers: RegisterState) -> DurableState:

@@ -6,24 +6,19 @@ from dataclasses import replace
 
 import pytest
 
-from support.fleets import fleet_of, task_of
+from support.fleets import fleet_of, node_of, task_of
 from zsched.core.values.fleet import Fleet, NodeSpec, Security, SharedMemory
 from zsched.core.values.model import NodeKind
 from zsched.runtime.restarts import moved, opens_anew, restarts
 
 
-def addressed(name: str, kind: NodeKind = NodeKind.EDGE, host: str = "") -> NodeSpec:
+def addressed(name: str, host: str = "") -> NodeSpec:
     at = host or f"10.0.0.{sum(map(ord, name)) % 200}"
-    return NodeSpec(name=name, kind=kind, host=at, listen_control="tcp/0.0.0.0:7457", listen_data="tcp/0.0.0.0:7458")
+    return node_of(name, host=at, listen_control="tcp/0.0.0.0:7457", listen_data="tcp/0.0.0.0:7458")
 
 
-NODES = (
-    addressed("edge1"),
-    addressed("edge2"),
-    addressed("robot1", NodeKind.ROBOT),
-    addressed("robot2", NodeKind.ROBOT),
-)
-OLD = replace(fleet_of(task_of("merge"), electors=("robot1", "robot2")), nodes=NODES, seeds=("edge1", "edge2"))
+NODES = tuple(map(addressed, ("edge1", "edge2", "robot1", "robot2")))
+OLD = fleet_of(of=NODES, seeds=("edge1", "edge2"))
 
 
 def with_node(node: NodeSpec, seeds: tuple[str, ...] = ("edge1", "edge2")) -> Fleet:

@@ -10,15 +10,13 @@ import pytest
 import zenoh
 
 from support.authorities import install, make_authority
+from support.fleets import fleet_of
 from zsched.core.values.certificates import Holder, Role
-from zsched.core.values.fleet import Fleet, NodeSpec, Security, Timing
-from zsched.core.values.model import NodeKind
+from zsched.core.values.fleet import Fleet, Security
 from zsched.errors import ConfigError
 from zsched.runtime.access_rules import Side
 from zsched.runtime.secured import digest_of, files_of, identity_of, require_own, secured_text
 from zsched.runtime.tls import asker_in, protocol_of, session_text
-
-NODES = tuple(NodeSpec(name=name, kind=NodeKind.ROBOT) for name in ("robot1", "robot2"))
 
 
 @pytest.fixture
@@ -29,8 +27,7 @@ def pki(tmp_path: Path) -> Path:
 
 def fleet(folder: Path, *revoked: str) -> tuple[Fleet, Security]:
     security = Security(folder=str(folder), revoked=revoked)
-    plain = Fleet(name="yard", timing=Timing(), nodes=NODES, tasks=(), electors=("robot1",))
-    return replace(plain, security=security), security
+    return fleet_of(name="yard", of=("robot1", "robot2"), tasks=(), security=security), security
 
 
 def test_the_text_has_tls_both_ways_and_denies_what_no_rule_allows(pki: Path) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from support.fleets import fleet_of
+from support.fleets import fleet_of, node_of
 from zsched.core.values.fleet import Fleet
 from zsched.runtime.strikes import RESTARTED_BY, cut_rules, ports_of, unit_of, why_no_cut, why_no_restart
 
@@ -73,14 +73,13 @@ def test_the_unit_is_the_innermost_service(tmp_path: Path) -> None:
 
 def apart() -> Fleet:
     """Two machines, by addresses that are set aside for documents."""
-    fleet = fleet_of(of=("edge1", "robot1"), electors=("robot1",))
-    nodes = [
-        replace(
-            node, host=f"192.0.2.{number}", listen_control="tcp/0.0.0.0:7457", listen_data=f"tls/[::]:{7458 + number}#a"
-        )
-        for number, node in enumerate(fleet.nodes)
-    ]
-    return replace(fleet, nodes=tuple(nodes))
+    listen = "tcp/0.0.0.0:7457"
+    return fleet_of(
+        of=[
+            node_of(name, host=f"192.0.2.{number}", listen_control=listen, listen_data=f"tls/[::]:{7458 + number}#a")
+            for number, name in enumerate(("edge1", "robot1"))
+        ]
+    )
 
 
 def test_a_cut_drops_what_comes_from_or_goes_to_a_port_of_the_fleet_for_a_while() -> None:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from zsched.core.values.fleet import Fleet, NodeSpec, Security, Timing
-from zsched.core.values.model import NodeKind
+from support.fleets import fleet_of, node_of
+from zsched.core.values.fleet import Fleet, Security
 from zsched.core.values.snapshot import Exposure
 from zsched.errors import ConfigError
 from zsched.runtime.tls import exposure, operator_json5, plain_text_problem, protocol_of
@@ -19,8 +19,7 @@ PLAIN, TLS = "tcp/0.0.0.0:7457", "tls/0.0.0.0:7457"
 
 
 def fleet(control: str = "") -> Fleet:
-    node = NodeSpec(name="robot1", kind=NodeKind.ROBOT, listen_control=control)
-    return Fleet(name="f", timing=Timing(), nodes=(node,), tasks=(), electors=(), seeds=(), zenoh_config=FILE)
+    return fleet_of(of=(node_of("robot1", listen_control=control),), tasks=(), zenoh_config=FILE)
 
 
 @pytest.mark.parametrize(

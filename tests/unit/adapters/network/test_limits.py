@@ -7,10 +7,10 @@ import threading
 
 import zenoh
 
+from support.fleets import fleet_of
 from zsched.adapters.network.limits import BURST_S, Buckets, Drops, Limit, in_turn_hz, limit_for
 from zsched.config.timing import PROFILES
-from zsched.core.values.fleet import Fleet, NodeSpec, Timing
-from zsched.core.values.model import NodeKind
+from zsched.core.values.fleet import Timing
 from zsched.sessions.config import control_config
 
 LIMIT = Limit(hz=10, burst=20)
@@ -63,8 +63,7 @@ def test_every_profile_leaves_room_for_a_vote_about_every_task_at_once() -> None
 
 
 def test_each_node_s_periodic_frames_are_thinned_far_above_their_rate() -> None:
-    nodes = tuple(NodeSpec(name=name, kind=NodeKind.ROBOT) for name in ("robot1", "robot2"))
-    fleet = Fleet(name="yard", timing=Timing(), nodes=nodes, tasks=(), electors=("robot1",))
+    fleet = fleet_of(name="yard", of=("robot1", "robot2"), tasks=())
     rates = in_turn_hz(fleet)
     assert set(rates) == {
         f"@zsched/yard/{kind}/{name}/in/turn" for kind in ("beat", "profile") for name in ("robot1", "robot2")

@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 
 from support.authorities import install, make_authority
+from support.fleets import fleet_of
 from zsched.adapters.network import seals as module
 from zsched.adapters.network.seals import KEPT_CERTIFICATES, Seals, nonce
 from zsched.core.values.certificates import Role
-from zsched.core.values.fleet import Fleet, NodeSpec, Security, Signatures, Timing
-from zsched.core.values.model import NodeKind
+from zsched.core.values.fleet import Fleet, Security, Signatures
 from zsched.errors import ConfigError, WireError
 from zsched.runtime.sealing import seals_of
 from zsched.wire.keyspace import Keyspace
@@ -33,11 +33,10 @@ Make = Callable[..., Seals]
 
 
 def fleet(folder: Path, signatures: Signatures = Signatures.REQUIRED, revoked: tuple[str, ...] = ()) -> Fleet:
-    nodes = tuple(NodeSpec(name=name, kind=NodeKind.ROBOT) for name in ("robot1", "robot2"))
     security = Security(
         folder=str(folder), operators=("ana",), guests=("screen",), signatures=signatures, revoked=revoked
     )
-    return Fleet(name="yard", timing=Timing(), nodes=nodes, tasks=(), electors=("robot1",), security=security)
+    return fleet_of(name="yard", of=("robot1", "robot2"), tasks=(), security=security)
 
 
 @pytest.fixture(scope="module")

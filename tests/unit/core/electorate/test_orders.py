@@ -8,7 +8,8 @@ from typing import TypeVar
 
 import pytest
 
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of
+from support.states import state_of
 from support.todos import agreed
 from zsched.core import events as ev
 from zsched.core import instructions as do
@@ -20,9 +21,8 @@ from zsched.core.electorate.orders import MAX_OPEN, MAX_STORY, document_change
 from zsched.core.todo import ToDo
 from zsched.core.values.change import RoundOutcome
 from zsched.core.values.document import Document, Flag, FlagKind, Rollout, Text
-from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import FleetValue
-from zsched.core.values.fleet import Fleet, TaskSpec
+from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import (
     Accept,
     ChangeFleet,
@@ -42,7 +42,7 @@ from zsched.core.vote.agreement import Agreement
 T = TypeVar("T")
 NAMES = ("edge1", "robot1", "robot2", "robot3")
 ROBOTS = NAMES[1:]
-TASK = TaskSpec(name="merge", candidates=NAMES, tuning=tuning_of(), exclusive=True)
+TASK = task_of(candidates=NAMES, exclusive=True)
 FLEET = fleet_of(TASK, of=NAMES, electors=ROBOTS)
 SAID = replace(FLEET, relay_orphan_s=5.0)
 FIRST = founded(FLEET.name, 0, ROBOTS)
@@ -56,16 +56,8 @@ def make(
     stored: dict[str, Fleet] | None = None,
     flags: dict[str, tuple[Flag, ...]] | None = None,
 ) -> Agreement:
-    state = DurableState(
-        fleet=FLEET.name,
-        node="robot1",
-        incarnation=7,
-        generation=0,
-        hardware="h",
-        electorate="e",
-        disk="d1",
-        fleet_register=None if value is None else RegisterState(task=FLEET.name, learnt=value),
-    )
+    held = None if value is None else RegisterState(task=FLEET.name, learnt=value)
+    state = state_of("robot1", hardware="h", disk="d1", fleet_register=held)
     agreement = Agreement(
         fleet=FLEET,
         me="robot1",

@@ -7,7 +7,9 @@ from dataclasses import replace
 
 import pytest
 
-from support.fleets import fleet_of, tuning_of
+from support import states
+from support.allocations import allocation_of
+from support.fleets import fleet_of, task_of
 from zsched.core.electorate.changes import AdoptDocument, RemoveElector, SetLease
 from zsched.core.electorate.founding import founded, newest_fleet
 from zsched.core.electorate.recovery import (
@@ -24,14 +26,14 @@ from zsched.core.electorate.recovery import (
 )
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import CREATION_STEP, FleetValue
-from zsched.core.values.fleet import Fleet, TaskSpec
+from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import Acceptance, Allocation, Ballot, RegisterState
 from zsched.core.values.snapshot import SCHEMA, QuorumStatus, Snapshot
 from zsched.wire.codec import decode_state, encode_state
 
 NAMES = ("edge1", "robot1", "robot2", "robot3")
 ROBOTS = NAMES[1:]
-TASK = TaskSpec(name="merge", candidates=NAMES, tuning=tuning_of(), exclusive=True)
+TASK = task_of(candidates=NAMES, exclusive=True)
 FLEET = fleet_of(TASK, of=NAMES, electors=ROBOTS)
 FIRST = founded(FLEET.name, 0, ROBOTS)
 ADOPTED = replace(
@@ -42,7 +44,7 @@ BALLOT = Ballot(counter=9, incarnation=1, node="robot2")
 
 def allocation(revision: int, owner: str, creation: int = 0) -> Allocation:
     start = creation * CREATION_STEP + revision
-    return Allocation(task="merge", revision=start, epoch=start, owner=owner, tuning=TASK.tuning, leased=True)
+    return allocation_of(start, owner, leased=True)
 
 
 def state_of(
@@ -54,14 +56,11 @@ def state_of(
     lease_s: float = 0.0,
 ) -> DurableState:
     held = None if accepted is None else Acceptance(ballot=BALLOT, value=accepted)
-    return DurableState(
-        fleet=FLEET.name,
-        node=node,
+    return states.state_of(
+        node,
+        RegisterState(task="merge", learnt=learnt, accepted=held),
         incarnation=5,
-        generation=0,
         hardware="h",
-        electorate="e",
-        registers=(RegisterState(task="merge", learnt=learnt, accepted=held),),
         lease_s=lease_s,
         disk=f"d{node[-1]}",
         fleet_register=None if value is None else RegisterState(task=FLEET.name, learnt=value),

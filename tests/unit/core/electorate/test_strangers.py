@@ -7,7 +7,10 @@ from random import Random
 
 import pytest
 
-from support.fleets import fleet_of, tuning_of
+from support import states
+from support.allocations import allocation_of
+from support.beats import beat_of
+from support.fleets import fleet_of, task_of
 from support.todos import agreed
 from zsched.core import events as ev
 from zsched.core import instructions as do
@@ -21,14 +24,14 @@ from zsched.core.status import build_snapshot
 from zsched.core.todo import ToDo
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import FleetValue
-from zsched.core.values.fleet import Fleet, TaskSpec
+from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import Learnt, Prepare
 from zsched.core.values.model import Allocation, Ballot, Beat, Grant, PeerState, Proposal, RegisterState
 from zsched.core.vote.agreement import Agreement
 
 NAMES = ("edge1", "robot1", "robot2", "robot3")
 ROBOTS = NAMES[1:]
-TASK = TaskSpec(name="merge", candidates=NAMES, tuning=tuning_of(), exclusive=True)
+TASK = task_of(candidates=NAMES, exclusive=True)
 FLEET = fleet_of(TASK, of=NAMES, electors=ROBOTS)
 FIRST = founded(FLEET.name, 0, ROBOTS)
 AGREED = replace(
@@ -36,28 +39,12 @@ AGREED = replace(
 )
 LEFT = recovered(AGREED, "robot1", disk="d1", generation_id="aa" * 16, states=())[0]
 RIGHT = recovered(AGREED, "robot3", disk="d3", generation_id="bb" * 16, states=())[0]
-ALLOCATION = Allocation(
-    task="merge",
-    revision=LEFT.tasks[0].start + 3,
-    epoch=LEFT.tasks[0].start + 3,
-    owner="robot3",
-    tuning=TASK.tuning,
-    leased=True,
-)
+ALLOCATION = allocation_of(LEFT.tasks[0].start + 3, "robot3", leased=True)
 
 
 def state_of(me: str, value: FleetValue | None) -> DurableState:
     held = None if value is None else RegisterState(task=FLEET.name, learnt=value)
-    return DurableState(
-        fleet=FLEET.name,
-        node=me,
-        incarnation=7,
-        generation=0,
-        hardware="h",
-        electorate="e",
-        disk=f"d{me[-1]}",
-        fleet_register=held,
-    )
+    return states.state_of(me, hardware="h", disk=f"d{me[-1]}", fleet_register=held)
 
 
 def node(
@@ -85,11 +72,9 @@ def agreement(value: FleetValue | None = LEFT, me: str = "robot1", state: Durabl
 
 def beat(value: FleetValue | None, sender: str = "robot3", sequence: int = 1) -> Beat:
     """What a node that counts by a value beats; ``None``: by its file."""
-    return Beat(
-        node=sender,
-        incarnation=1,
-        sequence=sequence,
-        loop_lag_s=0.0,
+    return beat_of(
+        sender,
+        sequence,
         lease_terms="0123456789abcdef" if value is None else value.terms,
         number=0 if value is None else value.number,
         fleet_revision=0 if value is None else value.revision,

@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import replace
 from random import Random
+from typing import Any
 
 import pytest
 
+from support.allocations import allocation_of
 from support.ballots import ballot_of
 from support.beats import beat_of
-from support.fleets import fleet_of, tuning_of
-from support.profiles import load_of, profile_of
+from support.fleets import fleet_of, task_of, tuning_of
+from support.profiles import SAMPLE, load_of, profile_of
 from support.states import state_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
@@ -19,7 +21,7 @@ from zsched.core.node import Node
 from zsched.core.status import build_snapshot
 from zsched.core.values.change import MoveOwner
 from zsched.core.values.document import Flag, FlagKind
-from zsched.core.values.fleet import TaskSpec, WorkerSpec, electorate_hash
+from zsched.core.values.fleet import WorkerSpec, electorate_hash
 from zsched.core.values.messages import (
     CommandOutcome,
     CommandResult,
@@ -30,26 +32,21 @@ from zsched.core.values.messages import (
     RetryTask,
     TuneTask,
 )
-from zsched.core.values.model import Acceptance, Allocation, Asked, DeviceSample, RegisterState, WorkerState
+from zsched.core.values.model import Acceptance, Allocation, Asked, RegisterState, WorkerState
 from zsched.core.values.snapshot import FlagStatus
 
 ADA = Asked(by="ada@robot1", reason="new battery")
 EDGES = ("edge1", "edge2", "edge3")
 TUNING = tuning_of()
-FLEET = fleet_of(
-    TaskSpec(name="merge", candidates=EDGES, tuning=TUNING, worker=WorkerSpec(command=("merge",))),
-    of=(*EDGES, "robot1"),
-    electors=("robot1",),
-)
-SAMPLE = DeviceSample(cpu_cores=4.0, cpu_used_cores=1.0, memory_mb=4000.0, memory_used_mb=1000.0)
+FLEET = fleet_of(task_of("merge", EDGES, worker=WorkerSpec(command=("merge",))), of=(*EDGES, "robot1"))
 
 
 class Lone:
     """A node whose questions to the electors come back to itself at once."""
 
-    def __init__(self, owner: str | None = "edge1", **holds: object) -> None:
+    def __init__(self, owner: str | None = "edge1", **holds: Any) -> None:
         self.now = 100.0
-        learnt = Allocation(task="merge", revision=5, epoch=3, owner=owner, tuning=TUNING, **holds)  # type: ignore[arg-type]
+        learnt = allocation_of(5, owner, 3, **holds)
         electorate = electorate_hash(FLEET)
         held = Acceptance(ballot=ballot_of(1), value=learnt)
         register = RegisterState(task="merge", promised=held.ballot, accepted=held, learnt=learnt)

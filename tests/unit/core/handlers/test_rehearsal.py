@@ -8,22 +8,21 @@ from typing import Any
 
 import pytest
 
+from support.allocations import allocation_of
 from support.ballots import ballot_of
 from support.beats import beat_of
-from support.fleets import fleet_of, tuning_of
-from support.profiles import load_of, profile_of
+from support.fleets import fleet_of, task_of
+from support.profiles import SAMPLE, load_of, profile_of
 from support.states import state_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.node import Node
 from zsched.core.values.document import Flag, FlagKind, Text
-from zsched.core.values.fleet import Fleet, Security, TaskSpec, WorkerSpec, electorate_hash
+from zsched.core.values.fleet import Fleet, Security, WorkerSpec, electorate_hash
 from zsched.core.values.messages import CommandOutcome, CommandResult
 from zsched.core.values.model import (
     Acceptance,
-    Allocation,
     Asked,
-    DeviceSample,
     Pause,
     PeerState,
     Pin,
@@ -34,14 +33,11 @@ from zsched.core.values.rehearsal import KeepRehearsal, ReadRehearsals, Step, St
 
 ADA = Asked(by="ada@robot1", reason="rehearsal 1")
 PEERS = ("edge1", "edge2", "robot2")
-TASK = TaskSpec(
-    name="merge",
+TASK = task_of(
     candidates=("edge1", "edge2", "robot1"),
-    tuning=tuning_of(),
     worker=WorkerSpec(command=("merge",), failure_window_s=60.0),
 )
 FLEET = fleet_of(TASK, of=(*PEERS, "robot1"), electors=("edge1", "robot1", "robot2"))
-SAMPLE = DeviceSample(cpu_cores=4.0, cpu_used_cores=1.0, memory_mb=4000.0, memory_used_mb=1000.0)
 
 
 class Owner:
@@ -56,8 +52,7 @@ class Owner:
         **value: Any,
     ) -> None:
         self.now = 100.0
-        given = {"owner": "robot1", **value}
-        learnt = Allocation(task="merge", revision=5, epoch=3, tuning=tuning_of(), **given)
+        learnt = allocation_of(5, epoch=3, **{"owner": "robot1", **value})
         held = Acceptance(ballot=ballot_of(1), value=learnt)
         register = RegisterState(task="merge", promised=held.ballot, accepted=held, learnt=learnt)
         electorate = electorate_hash(fleet)

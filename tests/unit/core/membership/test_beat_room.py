@@ -7,14 +7,15 @@ from dataclasses import replace
 import pytest
 
 from support.beats import beat_of
+from support.fleets import fleet_of, node_of, task_of
 from zsched.config.load import check_bytes
 from zsched.core.membership.beat_room import FRAME_BYTES, MAX_BEAT_BYTES, BeatRoom, beat_bytes, most_bytes
-from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.values.model import MAX_COUNTER, Beat, Grant, NodeKind, Tuning, Weights
+from zsched.core.values.fleet import Fleet, WorkerSpec
+from zsched.core.values.model import MAX_COUNTER, Beat, Grant
 from zsched.wire import codec as wire
 from zsched_lab.sim.simulator import Simulator
 
-LONG = "n" * 60
+LONG = "r" * 60
 ROBOTS = tuple(f"{LONG}{number:03}" for number in range(3))
 
 
@@ -116,7 +117,7 @@ def beats_of(big: Fleet) -> Beat:
 
 def test_the_most_that_a_fleet_s_beats_take_is_reckoned_from_its_names() -> None:
     big = fleet(3, 20)
-    nodes = (*big.nodes, NodeSpec(name="r2", kind=NodeKind.ROBOT))
+    nodes = (*big.nodes, node_of("r2"))
     plain = replace(big.tasks[0], name="plain", exclusive=False)
     mixed = replace(big, nodes=nodes, tasks=(*big.tasks, plain))
     for one in (big, mixed, replace(big, tasks=())):
@@ -172,23 +173,9 @@ def test_a_part_that_has_no_room_is_the_next_beat_s_first() -> None:
 
 
 def fleet(tasks: int, length: int) -> Fleet:
-    tuning = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
-    return Fleet(
-        name="sim",
-        timing=Timing(),
-        nodes=tuple(NodeSpec(name=robot, kind=NodeKind.ROBOT) for robot in ROBOTS),
-        tasks=tuple(
-            TaskSpec(
-                name=name(number, length),
-                candidates=ROBOTS,
-                tuning=tuning,
-                worker=WorkerSpec(command=("true",)),
-                exclusive=True,
-            )
-            for number in range(tasks)
-        ),
-        electors=ROBOTS,
-    )
+    worker = WorkerSpec(command=("true",))
+    named = (name(number, length) for number in range(tasks))
+    return fleet_of(*(task_of(one, ROBOTS, worker=worker, exclusive=True) for one in named), of=ROBOTS)
 
 
 def test_electors_of_more_exclusive_tasks_than_a_beat_has_room_for_stay_alive_and_all_tasks_work() -> None:

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from support.profiles import load_of
+from support.profiles import SAMPLE, load_of
 from zsched.core.events import WorkerJobs
 from zsched.core.profile.means import STALE_S, Ewma
 from zsched.core.profile.profile import (
@@ -379,7 +379,7 @@ def test_sent_at_once_when_a_link_falls_silent_or_is_taken_away() -> None:
 def test_a_sampler_that_died_leaves_nothing_measured() -> None:
     """Its last figures must not stand for ever."""
     profiler = Profiler("edge1", 1, Timing())
-    profiler.absorb(DeviceSample(cpu_cores=4.0, cpu_used_cores=1.0, memory_mb=4000.0, memory_used_mb=1000.0), (), 0.0)
+    profiler.absorb(SAMPLE, (), 0.0)
     first = profiler.publishable({}, is_draining=False, now=0.0)
     later = profiler.publishable({}, is_draining=False, now=STALE_S + 0.1)
     assert first is not None

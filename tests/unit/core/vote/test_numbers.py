@@ -11,7 +11,10 @@ from typing import TypeVar
 
 import pytest
 
-from support.fleets import fleet_of, tuning_of
+from support.allocations import allocation_of
+from support.beats import beat_of
+from support.fleets import fleet_of, task_of
+from support.states import state_of
 from support.todos import agreed
 from zsched.core import events as ev
 from zsched.core import instructions as do
@@ -19,11 +22,10 @@ from zsched.core.electorate.changes import AddElector, AdoptDocument, RemoveElec
 from zsched.core.electorate.founding import founded
 from zsched.core.todo import ToDo
 from zsched.core.values.change import MoveOwner
-from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import FleetValue
-from zsched.core.values.fleet import Fleet, TaskSpec
+from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import Accept, Accepted, Learnt, Prepare, Promise, Refusal, Refused
-from zsched.core.values.model import NO_BALLOT, Acceptance, Allocation, Ballot, Beat, Grant, RegisterState
+from zsched.core.values.model import NO_BALLOT, Acceptance, Ballot, Beat, Grant, RegisterState
 from zsched.core.vote.agreement import Agreement
 from zsched.core.vote.belief import GENERATION_STEP
 from zsched.core.vote.lease import Leases, hold_s
@@ -32,7 +34,7 @@ from zsched.wire.codec import decode_state, encode_state
 T = TypeVar("T")
 NAMES = ("edge1", "robot1", "robot2", "robot3")
 ROBOTS = NAMES[1:]
-TASK = TaskSpec(name="merge", candidates=NAMES, tuning=tuning_of(), exclusive=True)
+TASK = task_of(candidates=NAMES, exclusive=True)
 FLEET = fleet_of(TASK, of=NAMES, electors=ROBOTS)
 GENERATION = 2
 FIRST = founded(FLEET.name, GENERATION, ROBOTS)
@@ -50,17 +52,7 @@ def make(
     stored: Mapping[str, Fleet] = MappingProxyType({"0d": FLEET}),
 ) -> Agreement:
     held = None if fleet_value is None else RegisterState(task=FLEET.name, learnt=fleet_value)
-    state = DurableState(
-        fleet=FLEET.name,
-        node=me,
-        incarnation=7,
-        generation=GENERATION,
-        hardware="h",
-        electorate="e",
-        disk="d1",
-        fleet_register=held,
-        registers=registers,
-    )
+    state = state_of(me, *registers, generation=GENERATION, hardware="h", disk="d1", fleet_register=held)
     agreement = Agreement(
         fleet=FLEET,
         me=me,
@@ -144,7 +136,7 @@ def test_the_first_document_keeps_the_registers_and_raises_the_number() -> None:
     assert again.apply(ADOPTED) == ADOPTED
     before = make()
     start = GENERATION * GENERATION_STEP
-    learnt = Allocation(task="merge", revision=start + 3, epoch=start + 2, owner="edge1", tuning=TASK.tuning)
+    learnt = allocation_of(start + 3, epoch=start + 2)
     before.registers["merge"].learn(learnt, ToDo(), 100.0)
     register = before.registers["merge"]
     told = Learnt(node="robot2", values=(), generation=GENERATION, fleet=ADOPTED)
@@ -219,15 +211,7 @@ def test_a_refusal_brings_the_newer_number_and_the_round_goes_on_under_it() -> N
 
 def test_a_peer_s_beat_with_a_newer_fleet_value_leads_to_a_question_and_its_answer_is_followed() -> None:
     agreement = make()
-    beat = Beat(
-        node="robot2",
-        incarnation=1,
-        sequence=1,
-        loop_lag_s=0.0,
-        generation=GENERATION,
-        number=3,
-        fleet_revision=WITHOUT_ROBOT1.revision,
-    )
+    beat = beat_of("robot2", generation=GENERATION, number=3, fleet_revision=WITHOUT_ROBOT1.revision)
     todo = ToDo()
     agreement.compare(beat, todo, 100.1)
     assert [one.peer for one in of(todo, do.AskLearnt)] == ["robot2"]
@@ -312,7 +296,7 @@ def test_an_elector_without_its_document_remembers_the_tasks_that_its_file_lacks
 
 # --- leases over numbers ---------------------------------------------------------------------------------------------
 
-HELD = Allocation(task="merge", revision=7, epoch=3, owner="robot2", tuning=TASK.tuning, leased=True)
+HELD = allocation_of(7, "robot2", 3, leased=True)
 L = FLEET.timing.lease_s
 
 
@@ -326,16 +310,7 @@ def renumbered(one: Leases, number: int = 2, lease_s: float = L, electors: tuple
 
 
 def beat(number: int, node: str = "robot2", sequence: int = 5, **parts: tuple[Grant, ...]) -> Beat:
-    return Beat(
-        node=node,
-        incarnation=1,
-        sequence=sequence,
-        loop_lag_s=0.0,
-        learnt=(("merge", 7, 3),),
-        lease_terms=f"t/{number}",
-        number=number,
-        **parts,  # type: ignore[arg-type]
-    )
+    return beat_of(node, sequence, learnt=(("merge", 7, 3),), lease_terms=f"t/{number}", number=number, **parts)
 
 
 OWNERS = {"merge": ("robot2", 3)}
