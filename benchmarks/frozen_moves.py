@@ -31,11 +31,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from benchmarks.common import machine
-from benchmarks.rig import ROBOT, TASK, Load, Rig, Traffic, routes, told_of, until
+from benchmarks.rig import Load, Rig, Traffic, routes, told_of
 from zsched.core.events import SlotFlipped, SlotReady, StreamsCounted
 from zsched.core.hop.books import unaccounted
 from zsched.core.relay_protocol import RelayStarted
 from zsched.core.values.plan import RoutePhase, Slot, StreamClass, StreamCount, WorkerRole
+from zsched_lab.fleet.relays import ROBOT, TASK
+from zsched_lab.fleet.waiting import until
 
 EDGES = ("edge1", "edge2", "edge3")
 FREEZES_S = (0.0, 0.9, 4.0)
@@ -103,7 +105,7 @@ def _round(rig: Rig, random_: random.Random, hz: float, until_s: float, sums: Su
     slow = ("--delay-ms", str(2000 / load[0].hz)) if is_overload else ()
     for edge in EDGES:
         rig.start_worker(edge, *slow)
-    traffic = Traffic(rig.app(), load[0])
+    traffic = Traffic(rig.application(), load[0])
     now = routes("edge1", 1, load, StreamClass.RELIABLE)
     rig.move(now)
     until(lambda: traffic.is_connected, "the application sees the relay")
@@ -122,7 +124,7 @@ def _round(rig: Rig, random_: random.Random, hz: float, until_s: float, sums: Su
         now = new
         sums.moves[freeze_s] += 1
     traffic.stop()
-    if sum(isinstance(report, RelayStarted) for _, report in rig.heard[ROBOT]) > 1:
+    if rig.reports[ROBOT].count(RelayStarted) > 1:
         sums.void += 1
         print(f"{time.strftime('%H:%M:%S')} the robot's relay was replaced, and its counters with it: void", flush=True)
         return
@@ -132,7 +134,7 @@ def _round(rig: Rig, random_: random.Random, hz: float, until_s: float, sums: Su
 def _move(rig: Rig, new: Slot, old: Slot, freeze_s: float) -> None:
     """The executor's table; the new owner's worker stands still from *ready* on."""
     rig.plan(RoutePhase.PREPARE, new, old)
-    until(lambda: rig.find(SlotReady, epoch=new.epoch, is_ready=True), f"epoch {new.epoch} ready", 120.0)
+    rig.wait(SlotReady, 120.0, epoch=new.epoch, is_ready=True)
     worker = rig.workers[new.owner]
     if freeze_s:
         worker.send_signal(signal.SIGSTOP)
@@ -140,7 +142,7 @@ def _move(rig: Rig, new: Slot, old: Slot, freeze_s: float) -> None:
     rig.role(new.owner, WorkerRole.ACTIVE, new.epoch)
     rig.role(old.owner, WorkerRole.DRAINING, old.epoch)
     rig.plan(RoutePhase.FLIP, new, old)
-    until(lambda: rig.find(SlotFlipped, epoch=new.epoch), f"epoch {new.epoch} flipped", 30.0)
+    rig.wait(SlotFlipped, 30.0, epoch=new.epoch)
     rig.wait_drained(max(DRAIN_S, freeze_s), old)
     time.sleep(freeze_s)  # at most; it is awake before the next move
     rig.plan(RoutePhase.CLOSE, new)
@@ -149,9 +151,9 @@ def _move(rig: Rig, new: Slot, old: Slot, freeze_s: float) -> None:
 
 def _flip(rig: Rig, new: Slot, *olds: Slot) -> None:
     rig.plan(RoutePhase.PREPARE, new, *olds)
-    until(lambda: rig.find(SlotReady, epoch=new.epoch, is_ready=True), f"epoch {new.epoch} ready", 120.0)
+    rig.wait(SlotReady, 120.0, epoch=new.epoch, is_ready=True)
     rig.plan(RoutePhase.FLIP, new, *olds)
-    until(lambda: rig.find(SlotFlipped, epoch=new.epoch), f"epoch {new.epoch} flipped", 30.0)
+    rig.wait(SlotFlipped, 30.0, epoch=new.epoch)
 
 
 def _there_and_back(rig: Rig, new: Slot, old: Slot, again: Slot) -> Slot:
@@ -200,7 +202,9 @@ def _judge(rig: Rig, traffic: Traffic, sums: Sums, *, is_overload: bool) -> None
 
 
 def _unaccounted(rig: Rig) -> list[tuple[float, StreamCount, int]]:
-    counts = [(at, one) for at, said in rig.heard[ROBOT] if isinstance(said, StreamsCounted) for one in said.counts]
+    counts = [
+        (at, one) for at, said in rig.reports[ROBOT].items if isinstance(said, StreamsCounted) for one in said.counts
+    ]
     return [(at, one, missing) for at, one in counts if (missing := unaccounted(one))]
 
 

@@ -20,8 +20,10 @@ from pathlib import Path
 from typing import TextIO
 
 from benchmarks.common import line, machine
-from benchmarks.rig import ROBOT, TASK, Load, Rig, Traffic, routes, until
+from benchmarks.rig import Load, Rig, Traffic, routes
 from zsched.core.values.plan import RoutePhase, RoutePlan, StreamClass
+from zsched_lab.fleet.relays import ROBOT, TASK
+from zsched_lab.fleet.waiting import until
 
 SMALL = Load(name="small", hz=1000, size=100)
 LARGE = Load(name="large", hz=50, size=1 << 20)
@@ -97,11 +99,11 @@ def _run(rig: Rig, options: argparse.Namespace) -> int:
     )
     for edge in ("edge1", "edge2"):
         rig.start_worker(edge, *arguments)
-    session = rig.app()
+    session = rig.application()
     traffics = [Traffic(session, load) for load in loads]
     recorded = [0]
     if options.recorder:
-        recorder = rig.app()
+        recorder = rig.application()
         recorder.declare_subscriber("**", lambda _: recorded.__setitem__(0, recorded[0] + 1))
     now = routes("edge1", 1, loads, stream_class, is_mirrored=options.mirror)
     rig.move(now)

@@ -20,7 +20,6 @@ from typing import Any, cast
 
 import zenoh
 
-from benchmarks.rig import until
 from zsched.core.values.plan import Direction, HandoverRule, Route, StreamClass, StreamSettings
 from zsched.relay.streams.acks import Acks
 from zsched.relay.streams.inputs import InputStream
@@ -30,6 +29,7 @@ from zsched.relay.streams.receive import undeclare
 from zsched.sessions.config import data_config, worker_config
 from zsched.wire.keyspace import Keyspace
 from zsched_lab.fleet.loopback import free_endpoint
+from zsched_lab.fleet.waiting import until
 
 KEY = "robot1/in"
 OWNER = "edge1/t/1/out"

@@ -26,7 +26,6 @@ from typing import NamedTuple
 import psutil
 
 from benchmarks.common import machine, percentile
-from benchmarks.rig import FLEET, until
 from zsched.adapters.relay.streams import RelayHandle
 from zsched.core.events import RelayChanged, SlotFlipped, SlotReady
 from zsched.core.relay_protocol import HandleReport
@@ -44,6 +43,8 @@ from zsched.core.values.plan import (
 )
 from zsched.sessions.config import data_config, worker_config
 from zsched_lab.fleet.loopback import free_endpoint
+from zsched_lab.fleet.relays import FLEET
+from zsched_lab.fleet.waiting import until
 
 WAYS = ("direct", "stream", "relay")
 PACE_HZ = {1024: 500, 65536: 250, 1 << 20: 50}

@@ -20,11 +20,11 @@ import zenoh
 
 from benchmarks.common import at_pace, machine
 from benchmarks.record import Record, progress, table
-from benchmarks.rig import until
 from zsched.core.values.plan import Direction, Route, ServiceSettings, StreamSettings
 from zsched.relay.services.service import ServiceStream
 from zsched.sessions.config import data_config, worker_config
 from zsched_lab.fleet.loopback import free_endpoints
+from zsched_lab.fleet.waiting import until
 
 ASKED, OWNERS = "robot1/ask", "edge1/echo/robot1/ask"
 TIME_S: Final = 2.0

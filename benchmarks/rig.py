@@ -5,57 +5,36 @@ Knows: relay handles, workers' processes, an application's session. Does not kno
 
 from __future__ import annotations
 
-import os
-import signal
-import subprocess
-import sys
 import threading
 import time
 from bisect import bisect_left
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import psutil
 import zenoh
 
-from zsched.adapters.relay.streams import RelayHandle
-from zsched.core.events import RelayChanged, SlotDrained, SlotFlipped, SlotReady, StreamsCounted
+from zsched.core.events import SlotDrained, StreamsCounted
 from zsched.core.hop.books import given_up, unaccounted
-from zsched.core.relay_protocol import HandleReport, SlotLost, WorkerSeen
+from zsched.core.relay_protocol import SlotLost
 from zsched.core.values.plan import (
     Direction,
     HandoverRule,
     ReadyWhen,
-    Role,
     Route,
     RoutePhase,
-    RoutePlan,
     Slot,
     StreamClass,
     StreamCount,
     StreamSettings,
     WorkerRole,
 )
-from zsched.sessions.config import data_config, worker_config
-from zsched_lab.fleet.loopback import free_endpoint
+from zsched_lab.fleet.relays import ROBOT, TASK, Relays
+from zsched_lab.fleet.waiting import until
 
-FLEET, ROBOT, TASK = "bench", "robot1", "echo"
 NUMBER_BYTES = 10
-
-
-def until(condition: Callable[[], Any], what: str, deadline_s: float = 10.0) -> Any:
-    """The condition's first true value; `AssertionError` when there is none in time."""
-    end = time.monotonic() + deadline_s
-    while time.monotonic() < end:
-        value = condition()
-        if value:
-            return value
-        time.sleep(0.002)
-    raise AssertionError(f"not within {deadline_s} s: {what}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,94 +84,16 @@ def routes(
 
 
 @dataclass
-class Rig:
-    """One robot's relay and the relays and workers of some edges, on loopback."""
+class Rig(Relays):
+    """One robot's relay and the relays and workers of some edges; one side dials every link, as in a fleet."""
 
-    folder: Path
-    edges: tuple[str, ...] = ("edge1", "edge2")
-    relays: dict[str, RelayHandle] = field(default_factory=dict)
-    workers: dict[str, subprocess.Popen[bytes]] = field(default_factory=dict)
-    heard: dict[str, list[tuple[float, HandleReport]]] = field(default_factory=dict)
-    incarnation: int = 0
-    sessions: list[zenoh.Session] = field(default_factory=list)
-
-    def __enter__(self) -> Self:
-        nodes = (ROBOT, *self.edges)
-        self.endpoints = {node: free_endpoint() for node in nodes}
-        for node in nodes:
-            heard: list[tuple[float, HandleReport]] = []
-            self.heard[node] = heard
-            connect = () if node == ROBOT else (self.endpoint(ROBOT),)
-            # one side dials every link, as `zsched.runtime.endpoints` has it
-            text = data_config(
-                listen=(self.endpoint(node),), connect=connect, shared_memory=False, dials_by_gossip=False
-            )
-            on_report = _listener(heard)
-            self.relays[node] = RelayHandle(fleet=FLEET, node=node, zenoh_config=text, on_report=on_report)
-            self.relays[node].start()
-        until(lambda: all(self.find(RelayChanged, node, is_running=True) for node in nodes), "the relays run", 60.0)
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        for session in self.sessions:
-            session.close()
-        for worker in self.workers.values():
-            worker.send_signal(signal.SIGCONT)
-            worker.kill()
-            worker.wait(5)
-        for relay in self.relays.values():
-            relay.stop(2.0)
-
-    def endpoint(self, node: str) -> str:
-        """The data endpoint of a node's relay."""
-        return self.endpoints[node]
-
-    def app(self) -> zenoh.Session:
-        """An application's session beside the robot."""
-        text = worker_config(connect=(self.endpoint(ROBOT),), shared_memory=False)
-        self.sessions.append(zenoh.open(zenoh.Config.from_json5(text)))
-        return self.sessions[-1]
-
-    def find(self, kind: type, node: str = ROBOT, **fields: Any) -> HandleReport | None:
-        """The newest report of a kind with these fields."""
-        for _, report in reversed(self.heard[node][-400:]):
-            if isinstance(report, kind) and all(getattr(report, name) == value for name, value in fields.items()):
-                return report
-        return None
-
-    def start_worker(self, node: str, *options: str) -> None:
-        """Start an echo worker and wait for its token."""
-        self.incarnation += 1
-        path = self.folder / f"{node}.json5"
-        connect = tuple(dict.fromkeys((self.endpoint(node), self.endpoint(ROBOT))))  # as `zsched.runtime.endpoints`
-        path.write_text(worker_config(connect=connect, listen=(), shared_memory=False, dials_by_gossip=False))
-        env = os.environ | {
-            "ZSCHED_FLEET": FLEET,
-            "ZSCHED_NODE": node,
-            "ZSCHED_TASK": TASK,
-            "ZSCHED_INCARNATION": str(self.incarnation),
-            "ZSCHED_ZENOH_CONFIG": str(path),
-        }
-        self.workers[node] = subprocess.Popen([sys.executable, "-m", "zsched.tasks.echo", *options], env=env)
-        number = str(self.incarnation)
-        until(lambda: self.find(WorkerSeen, incarnation=number, is_present=True), f"the worker of {node}", 60.0)
-
-    def role(self, node: str, role: WorkerRole, epoch: int = 0) -> None:
-        """Tell a node's worker its role."""
-        self.relays[node].set_role(Role(task=TASK, role=role, epoch=epoch))
+    dials_by_gossip: bool = False
 
     def move(self, new: Slot, old: Slot | None = None, *, is_crash: bool = False, drain_s: float = 2.0) -> float:
         """The executor's table; answers the seconds from the first plan to the flip."""
-        self.role(new.owner, WorkerRole.ACTIVE, new.epoch)
-        if old is not None and not is_crash and old.owner != new.owner:
-            self.role(old.owner, WorkerRole.DRAINING, old.epoch)
         began = time.monotonic()
-        self.plan(RoutePhase.PREPARE, new, old)
-        until(lambda: self.find(SlotReady, epoch=new.epoch, is_ready=True), f"epoch {new.epoch} ready")
-        self.plan(RoutePhase.FLIP, new, old)
-        until(lambda: self.find(SlotFlipped, epoch=new.epoch), f"epoch {new.epoch} flipped")
+        self.prepare(new, old, is_crash=is_crash)
+        self.flip(new, old)
         took = time.monotonic() - began
         if old is not None and not is_crash:
             self.wait_drained(drain_s, old)
@@ -207,15 +108,10 @@ class Rig:
         while time.monotonic() < end and not all(self.find(SlotDrained, epoch=old.epoch) for old in olds):
             time.sleep(0.002)
 
-    def plan(self, phase: RoutePhase, current: Slot, *predecessors: Slot | None) -> None:
-        """Give the robot's relay a plan."""
-        olds = tuple(slot for slot in predecessors if slot is not None)
-        self.relays[ROBOT].apply(RoutePlan(task=TASK, phase=phase, current=current, predecessors=olds))
-
     def counts(self) -> dict[str, StreamCount]:
         """The newest counters of the robot's streams, at most a second old."""
-        since = time.monotonic()
-        until(lambda: any(at > since and isinstance(r, StreamsCounted) for at, r in self.heard[ROBOT][-50:]), "counts")
+        since, told = time.monotonic(), self.reports[ROBOT]
+        until(lambda: any(at > since and isinstance(r, StreamsCounted) for at, r in told.items[-50:]), "counts")
         report = self.find(StreamsCounted)
         assert isinstance(report, StreamsCounted)
         return {count.stream: count for count in report.counts}
@@ -245,7 +141,7 @@ class Rig:
 
     def left_behind(self) -> list[int]:
         """What closed slots reported as "at most so many lost"."""
-        return [report.samples for _, report in self.heard[ROBOT] if isinstance(report, SlotLost)]
+        return [report.samples for _, report in self.reports[ROBOT].items if isinstance(report, SlotLost)]
 
     def memory(self) -> dict[str, tuple[float, int, int]]:
         """{process: (private MB, descriptors, threads)} of the robot's relay and the workers."""
@@ -256,15 +152,6 @@ class Rig:
 def told_of(counts: Mapping[str, StreamCount], index: int) -> int:
     """How many samples of a slot's load the counters of the robot's relay give up: on the way there and back."""
     return given_up(counts[f"{TASK}/in/{index}"]) + given_up(counts[f"{TASK}/out/{index}"])
-
-
-def _listener(heard: list[tuple[float, HandleReport]]) -> Callable[[HandleReport], None]:
-    def hear(report: HandleReport) -> None:
-        heard.append((time.monotonic(), report))
-        if len(heard) > 20_000:
-            del heard[:10_000]
-
-    return hear
 
 
 def _footprint(pid: int) -> tuple[float, int, int]:

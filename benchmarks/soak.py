@@ -21,8 +21,10 @@ from pathlib import Path
 
 from benchmarks.bystander import Bystander
 from benchmarks.common import machine
-from benchmarks.rig import ROBOT, Load, Rig, Traffic, routes, until
+from benchmarks.rig import Load, Rig, Traffic, routes
 from zsched.core.values.plan import StreamClass
+from zsched_lab.fleet.relays import ROBOT
+from zsched_lab.fleet.waiting import until
 
 EDGES = ("edge1", "edge2", "edge3")
 
@@ -54,7 +56,7 @@ def _run(rig: Rig, random_: random.Random, seconds: float, *, has_faults: bool) 
     )
     for edge in EDGES:
         rig.start_worker(edge)
-    session = rig.app()
+    session = rig.application()
     traffics = [Traffic(session, load) for load in loads]
     now = routes("edge1", 1, loads, StreamClass.RELIABLE)
     rig.move(now)

@@ -26,7 +26,6 @@ import psutil
 import zenoh
 
 from benchmarks.common import machine, percentile
-from benchmarks.rig import FLEET, until
 from zsched.adapters.relay.streams import RelayHandle
 from zsched.core.events import RelayChanged, SlotFlipped, SlotReady
 from zsched.core.relay_protocol import HandleReport
@@ -43,6 +42,8 @@ from zsched.core.values.plan import (
 )
 from zsched.sessions.config import data_config, worker_config
 from zsched_lab.fleet.loopback import free_endpoint
+from zsched_lab.fleet.relays import FLEET
+from zsched_lab.fleet.waiting import until
 
 HOPS = ("direct", "router", "naive", "best_effort", "reliable")
 PACE_HZ = {64: 500, 1024: 500, 65536: 250, 1 << 20: 50, 4 << 20: 20}

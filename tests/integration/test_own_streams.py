@@ -102,13 +102,9 @@ class Own:
 
 @contextmanager
 def own_rig(folder: Path) -> Iterator[OwnRig]:
-    made = OwnRig(folder=folder, dialled=(free_endpoint(),))
-    try:
-        made.start()
+    with OwnRig(folder, dialled=(free_endpoint(),)) as made:
         yield made
         made.assert_nothing_is_unaccounted()
-    finally:
-        made.stop()
 
 
 def counted(rig: OwnRig, messages: int) -> StreamCount:

@@ -67,13 +67,9 @@ class Booked(Rig):
 
 @pytest.fixture
 def rig(tmp_path: Path) -> Iterator[Booked]:
-    made = Booked(folder=tmp_path)
-    try:
-        made.start()
+    with Booked(tmp_path) as made:
         yield made
         made.assert_nothing_is_unaccounted()
-    finally:
-        made.stop()
 
 
 @pytest.fixture
@@ -115,7 +111,7 @@ def test_what_a_relay_had_when_it_was_killed_is_at_most_lost(
 ) -> None:
     """Its worker stands still meanwhile, so that much is in its hand; and it takes more before its next count."""
     thread = app.flow(400, 50)
-    worker = rig.workers[0]
+    worker = rig.workers["edge1"]
     worker.send_signal(signal.SIGSTOP)
     until(lambda: (rig.input.in_flight or 0) > 100, "a count with samples in flight")
     pid, told = pid_of(rig), rig.input
@@ -135,7 +131,7 @@ def test_what_came_since_the_last_count_is_counted_after_a_kill(rig: Booked, app
     for _ in range(50):
         app.put()
     until(lambda: rig.input.acknowledged == 50, "all are done")
-    rig.workers[0].send_signal(signal.SIGSTOP)
+    rig.workers["edge1"].send_signal(signal.SIGSTOP)
     pid = pid_of(rig)
     counted = rig.reports[ROBOT].count(RelayChanged)
     until(lambda: rig.input.messages == 50 and rig.input.last_seen_s, "a count")
@@ -146,7 +142,7 @@ def test_what_came_since_the_last_count_is_counted_after_a_kill(rig: Booked, app
     until(lambda: rig.reports[ROBOT].count(RelayChanged) == counted + 2, "the relay runs again")
     until(lambda: rig.input.messages >= 170, "the next one counts on")
     assert (rig.input.messages, rig.input.at_most_lost) == (170, 120)
-    rig.workers[0].send_signal(signal.SIGCONT)
+    rig.workers["edge1"].send_signal(signal.SIGCONT)
 
 
 def cell_of(folder: Path) -> int:
@@ -174,13 +170,13 @@ def test_a_relay_that_is_replaced_in_order_leaves_exact_books(rig: Booked, app: 
 def test_a_relay_that_is_replaced_says_what_it_could_not_hand_over(rig: Booked, app: Application) -> None:
     """Its worker hangs: what it was sent is at most lost, what still waited is dropped, and said to be."""
     thread = app.flow(400, 50)
-    rig.workers[0].send_signal(signal.SIGSTOP)
+    rig.workers["edge1"].send_signal(signal.SIGSTOP)
     until(lambda: (rig.input.in_flight or 0) > 100, "a count with samples in flight")
     pid, told = pid_of(rig), rig.input
     rig.next_daemon("another fleet file")
     rig.relays[ROBOT].apply(carried(SLOT))
     until(lambda: rig.relays[ROBOT].pid not in (None, pid), "another relay")
-    rig.workers[0].send_signal(signal.SIGCONT)
+    rig.workers["edge1"].send_signal(signal.SIGCONT)
     rig.came_back(app, pid)
     app.halt(thread)
     assert given_up(settle(rig, app)) >= (told.in_flight or 0)

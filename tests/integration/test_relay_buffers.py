@@ -41,7 +41,7 @@ def test_large_samples_there_and_back_get_large_buffers_on_both_sides(rig: Rig, 
     back: list[int] = []
     kept = rig.app.declare_subscriber(f"{ROBOT}/out", lambda sample: back.append(len(sample.payload)))
     until(lambda: matches(publisher), "the relay takes it")
-    pids = {"relay": rig.relays[ROBOT].pid, "worker": rig.workers[0].pid}
+    pids = {"relay": rig.relays[ROBOT].pid, "worker": rig.workers["edge1"].pid}
     assert largest(pids["relay"] or 0) == 2 * SMALL, "which the kernel doubles"
 
     def are_large() -> bool:

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
-import zenoh
 
 from support.relay_rig import FLEET, ROBOT, TASK, Application, Reports, Rig, slot
 from support.waiting import free_endpoint, until
@@ -56,8 +55,8 @@ class Host(Rig):
         nobody = tuple(f"tcp/127.0.0.1:{9 + number}" for number in range(self.daemons))
         return data_config(listen=(self.endpoint(ROBOT),), connect=nobody, timing=self.timing, shared_memory=False)
 
-    def application(self) -> zenoh.Session:
-        return zenoh.open(zenoh.Config.from_json5(client_config(connect=(self.side,), connect_s=20.0)))
+    def application_config(self) -> str:
+        return client_config(connect=(self.side,), connect_s=20.0)
 
     def begin_anew(self, plan: Slot) -> None:
         """Another daemon, whose data session is configured otherwise, takes the relay over and plans as before."""

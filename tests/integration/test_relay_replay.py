@@ -153,8 +153,8 @@ def test_a_timestamp_that_several_samples_have_proves_none_of_them_done(rig: Rig
 
 def test_what_has_one_of_its_two_answers_is_done_again(rig: Rig) -> None:
     script = Path(__file__).with_name("double_echo.py")
-    worker = rig.start_worker("edge1", "2", script=script)
-    rig.start_worker("edge2", script=script)
+    worker = rig.start_worker("edge1", "2", program=(str(script),))
+    rig.start_worker("edge2", program=(str(script),))
     back: list[bytes] = []
     answers = rig.app.declare_subscriber(f"{ROBOT}/out", lambda sample: back.append(sample.payload.to_bytes()))
     first, second = replaying(1, "edge1"), replaying(2, "edge2")

@@ -2,40 +2,33 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import zenoh
 
 from support.sessions import matches
-from support.waiting import free_endpoint, until
-from zsched.adapters.relay.streams import RelayHandle
-from zsched.core.events import RelayChanged, SlotDrained, SlotFlipped, SlotReady, StreamsCounted
-from zsched.core.relay_protocol import HandleReport, WorkerSeen
+from support.waiting import until
+from zsched.core.events import SlotDrained, SlotReady, StreamsCounted
 from zsched.core.values.plan import (
     Direction,
     ReadyWhen,
-    Role,
     Route,
     RoutePhase,
-    RoutePlan,
     ServiceSettings,
     Slot,
     StreamSettings,
-    WorkerRole,
 )
-from zsched.sessions.config import data_config, worker_config
+from zsched.sessions.config import worker_config
+from zsched_lab.fleet.relays import ROBOT, Relays
 
-FLEET, ROBOT, TASK = "test", "robot1", "jobs"
+TASK = "jobs"
 SERVICE = f"{ROBOT}/job"
 DEADLINE_S = 90.0
 
@@ -93,80 +86,29 @@ class Asked:
 
 
 @dataclass
-class Rig:
+class Rig(Relays):
     """Three nodes' relays on loopback, workers with a service, an application beside the robot."""
 
-    folder: Path
-    endpoints: dict[str, str] = field(default_factory=lambda: {n: free_endpoint() for n in (ROBOT, "edge1", "edge2")})
-    relays: dict[str, RelayHandle] = field(default_factory=dict)
-    reports: dict[str, list[HandleReport]] = field(default_factory=dict)
-    workers: dict[str, subprocess.Popen[bytes]] = field(default_factory=dict)
-    incarnation: int = 0
+    task: str = TASK
 
     def start(self) -> None:
         (self.folder / "worker.py").write_text(WORKER)
-        seed = self.endpoint(ROBOT)
-        for node in self.endpoints:
-            self.reports[node] = []
-            connect = () if node == ROBOT else (seed,)
-            text = data_config(listen=(self.endpoint(node),), connect=connect, shared_memory=False)
-            relay = RelayHandle(fleet=FLEET, node=node, zenoh_config=text, on_report=self.reports[node].append)
-            self.relays[node] = relay
-            relay.start()
-        until(lambda: all(self.find(RelayChanged, node, is_running=True) for node in self.endpoints), "the relays run")
-        self.app = zenoh.open(zenoh.Config.from_json5(worker_config(connect=(seed,), shared_memory=False)))
+        super().start()
+        self.app = self.application()
 
-    def endpoint(self, node: str) -> str:
-        return self.endpoints[node]
+    def serve(self, node: str) -> subprocess.Popen[bytes]:
+        """Start a worker with the service."""
+        return self.start_worker(node, str(self.folder / f"{node}.log"), program=(str(self.folder / "worker.py"),))
 
-    def find(self, kind: type, node: str = ROBOT, **fields: Any) -> HandleReport | None:
-        for report in tuple(self.reports[node]):
-            if isinstance(report, kind) and all(getattr(report, name) == value for name, value in fields.items()):
-                return report
-        return None
-
-    def start_worker(self, node: str) -> subprocess.Popen[bytes]:
-        self.incarnation += 1
-        path = self.folder / f"{node}.json5"
-        connect = tuple(dict.fromkeys((self.endpoint(node), self.endpoint(ROBOT))))  # as `zsched.runtime.endpoints`
-        path.write_text(worker_config(connect=connect, shared_memory=False))
-        env = os.environ | {
-            "ZSCHED_FLEET": FLEET,
-            "ZSCHED_NODE": node,
-            "ZSCHED_TASK": TASK,
-            "ZSCHED_INCARNATION": str(self.incarnation),
-            "ZSCHED_ZENOH_CONFIG": str(path),
-        }
-        command = [sys.executable, str(self.folder / "worker.py"), str(self.folder / f"{node}.log")]
-        self.workers[node] = subprocess.Popen(command, env=env)
-        seen: dict[str, Any] = {"node": node, "task": TASK, "incarnation": str(self.incarnation), "is_present": True}
-        until(lambda: self.find(WorkerSeen, **seen), f"worker of {node}")
-        return self.workers[node]
+    def open(self, new: Slot, old: Slot | None = None) -> None:
+        """The executor's table up to the flip; the old slot still drains."""
+        self.prepare(new, old)
+        self.flip(new, old)
 
     def done_by(self, node: str) -> list[str]:
         """The requests that the node's workers have begun, in order."""
         path = self.folder / f"{node}.log"
         return path.read_text().splitlines() if path.exists() else []
-
-    def plan(self, phase: RoutePhase, current: Slot | None, predecessor: Slot | None = None) -> None:
-        self.relays[ROBOT].apply(
-            RoutePlan(
-                task=TASK, phase=phase, current=current, predecessors=() if predecessor is None else (predecessor,)
-            )
-        )
-
-    def wait(self, kind: type, **fields: Any) -> None:
-        until(lambda: self.find(kind, **fields), f"{kind.__name__} {fields}")
-
-    def flip(self, new: Slot, old: Slot | None = None) -> None:
-        """The executor's table up to the flip; the old slot still drains."""
-        self.relays[new.owner].set_role(Role(task=TASK, role=WorkerRole.ACTIVE, epoch=new.epoch))
-        if old is not None:
-            self.relays[old.owner].set_role(Role(task=TASK, role=WorkerRole.DRAINING, epoch=old.epoch))
-        self.plan(RoutePhase.PREPARE, new, old)
-        self.wait(SlotReady, epoch=new.epoch, is_ready=True)
-        self.plan(RoutePhase.FLIP, new, old)
-        self.wait(SlotFlipped, epoch=new.epoch)
 
     def ask(self, text: str, key: str = SERVICE, timeout_s: float = DEADLINE_S) -> Asked:
         """Send a request in a thread of its own."""
@@ -197,28 +139,14 @@ class Rig:
         return asked
 
     def drops(self) -> dict[str, int]:
-        reports = [report for report in self.reports[ROBOT] if isinstance(report, StreamsCounted)]
+        reports = [report for report in self.reports[ROBOT].told() if isinstance(report, StreamsCounted)]
         return dict(reports[-1].counts[0].drops) if reports and reports[-1].counts else {}
-
-    def stop(self) -> None:
-        if hasattr(self, "app"):
-            self.app.close()
-        for worker in self.workers.values():
-            worker.send_signal(signal.SIGCONT)
-            worker.kill()
-            worker.wait(60)
-        for relay in self.relays.values():
-            relay.stop(2.0)
 
 
 @pytest.fixture
 def rig(tmp_path: Path) -> Iterator[Rig]:
-    made = Rig(folder=tmp_path)
-    try:
-        made.start()
+    with Rig(tmp_path) as made:
         yield made
-    finally:
-        made.stop()
 
 
 ONCE = ServiceSettings(timeout_s=40.0, max_pending=8)
@@ -229,10 +157,10 @@ SOON_S = 30.0
 
 def begin(rig: Rig, settings: ServiceSettings) -> Slot:
     """edge1 owns the task; edge2 stands by."""
-    rig.start_worker("edge1")
-    rig.start_worker("edge2")
+    rig.serve("edge1")
+    rig.serve("edge2")
     first = slot(1, "edge1", settings)
-    rig.flip(first)
+    rig.open(first)
     rig.plan(RoutePhase.CLOSE, first)
     querier = rig.app.declare_querier(SERVICE)
     until(lambda: matches(querier), "the application sees the relay's offer: else a request has no answer at all")
@@ -263,7 +191,7 @@ def test_requests_in_a_stream_of_moves_are_each_done_once(rig: Rig) -> None:
     for epoch, owner in enumerate(["edge2", "edge1", "edge2", "edge1"], start=2):
         batch = [rig.ask(f"{epoch}-{number}") for number in range(3)]  # under way while the task moves
         new = slot(epoch, owner, ONCE)
-        rig.flip(new, now)
+        rig.open(new, now)
         rig.wait(SlotDrained, epoch=now.epoch)
         rig.plan(RoutePhase.CLOSE, new)
         now = new
@@ -280,7 +208,7 @@ def test_the_old_owner_answers_what_it_has_in_hand_within_its_drain_time(rig: Ri
     asked = rig.ask("sleep 3")
     until(lambda: rig.done_by("edge1"), "the old owner has begun")
     second = slot(2, "edge2", ONCE)
-    rig.flip(second, first)
+    rig.open(second, first)
     assert rig.find(SlotDrained, epoch=1) is None, "drained with a request in hand"
     assert rig.ask("new").wait().answers == [f"edge2/{TASK} did new with a=1;b=2"]
     rig.wait(SlotDrained, epoch=1)
@@ -293,7 +221,7 @@ def test_what_the_old_owner_has_not_answered_by_then_is_an_error_and_not_done_ag
     asked = rig.ask("sleep 10")
     until(lambda: rig.done_by("edge1"), "the old owner has begun")
     second = slot(2, "edge2", ONCE)
-    rig.flip(second, first)
+    rig.open(second, first)
     rig.plan(RoutePhase.CLOSE, second)
     asked.wait()
     assert asked.took_s < SOON_S
@@ -308,7 +236,7 @@ def test_with_retry_the_new_owner_is_asked_instead(rig: Rig) -> None:
     asked = rig.ask("sleep 4")
     until(lambda: rig.done_by("edge1"), "the old owner has begun")
     second = slot(2, "edge2", RETRY)
-    rig.flip(second, first)
+    rig.open(second, first)
     rig.plan(RoutePhase.CLOSE, second)
     assert asked.wait().answers == [f"edge2/{TASK} did sleep 4 with a=1;b=2"]
     assert asked.errors == []
@@ -332,7 +260,7 @@ def test_a_request_that_nobody_has_taken_waits_for_the_next_owner(rig: Rig) -> N
     rig.workers["edge1"].wait(60)
     rig.wait(SlotReady, epoch=1, is_ready=False)
     asked = rig.ask("hello")
-    rig.flip(slot(2, "edge2", ONCE), first)
+    rig.open(slot(2, "edge2", ONCE), first)
     assert asked.wait().answers == [f"edge2/{TASK} did hello with a=1;b=2"]
 
 
@@ -354,7 +282,7 @@ def test_a_request_that_no_end_of_a_link_ends_is_an_error_soon(rig: Rig) -> None
     with zenoh.open(zenoh.Config.from_json5(config)) as owner:
         queryable = owner.declare_queryable(f"edge1/{TASK}/{ROBOT}/job", held.append)
         foreign = slot(1, "edge1", ONCE, ReadyWhen.MATCHING)
-        rig.flip(foreign)
+        rig.open(foreign)
         rig.plan(RoutePhase.CLOSE, foreign)
         asked = rig.ask("hello")
         until(lambda: held, "the owner has the request")
@@ -380,7 +308,7 @@ def test_a_frozen_owner_with_retry_costs_the_move_only(rig: Rig) -> None:
     rig.workers["edge1"].send_signal(signal.SIGSTOP)
     asked = rig.ask("hello")
     second = slot(2, "edge2", RETRY)
-    rig.flip(second, first)
+    rig.open(second, first)
     rig.plan(RoutePhase.CLOSE, second)
     asked.wait()
     assert asked.answers == [f"edge2/{TASK} did hello with a=1;b=2"]

@@ -1,51 +1,42 @@
 """Three nodes' real relays, real echo workers and an application: what the tests of streams are made of.
 
-Knows: the executor's steps of a handover. Does not know: what a test breaks.
+Knows: the streams of the echo, the books at the end. Does not know: what a test breaks.
 """
 
 from __future__ import annotations
 
-import os
 import queue
-import signal
-import subprocess
-import sys
 import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import zenoh
 
 from support.books import newest_counts, wait_for_balance
-from support.waiting import free_endpoint, until
-from zsched.adapters.relay.streams import RelayHandle
-from zsched.core.events import RelayChanged, SlotDrained, SlotFlipped, SlotReady
-from zsched.core.relay_protocol import HandleReport, WorkerSeen
+from support.waiting import until
+from zsched.core.events import SlotDrained
 from zsched.core.values.fleet import Timing
 from zsched.core.values.plan import (
     Direction,
     HandoverRule,
     OnCrash,
     ReadyWhen,
-    Role,
     Route,
     RoutePhase,
-    RoutePlan,
     Slot,
     StreamClass,
     StreamCount,
     StreamSettings,
-    WorkerRole,
 )
-from zsched.sessions.config import DEFAULT_TIMING, data_config, worker_config
+from zsched.sessions.config import DEFAULT_TIMING
+from zsched_lab.fleet.relays import FLEET, ROBOT, TASK, Relays, Reports
 
-Kind = TypeVar("Kind")
-FLEET, ROBOT, TASK = "test", "robot1", "echo"
+__all__ = ["BESIDE", "FLEET", "ROBOT", "TASK", "Application", "Reports", "Rig", "relay_rig", "slot"]
 
 
 def slot(
@@ -79,114 +70,19 @@ def slot(
 
 
 @dataclass
-class Reports:
-    """What one relay said, in order."""
-
-    items: list[tuple[float, HandleReport]] = field(default_factory=list)
-
-    def add(self, report: HandleReport) -> None:
-        self.items.append((time.monotonic(), report))
-
-    def told(self) -> tuple[HandleReport, ...]:
-        return tuple(report for _, report in tuple(self.items))
-
-    def find(self, kind: type[Kind], **fields: Any) -> Kind | None:
-        for _, report in tuple(self.items):
-            if isinstance(report, kind) and all(getattr(report, name) == value for name, value in fields.items()):
-                return report
-        return None
-
-    def count(self, kind: type) -> int:
-        return sum(isinstance(report, kind) for _, report in tuple(self.items))
-
-
-@dataclass
-class Rig:
-    """Three nodes' relays on loopback, echo workers, one application session beside the robot."""
-
-    folder: Path
-    timing: Timing = DEFAULT_TIMING
-    endpoints: dict[str, str] = field(default_factory=lambda: {n: free_endpoint() for n in (ROBOT, "edge1", "edge2")})
-    relays: dict[str, RelayHandle] = field(default_factory=dict)
-    reports: dict[str, Reports] = field(default_factory=dict)
-    workers: list[subprocess.Popen[bytes]] = field(default_factory=list)
-    incarnation: int = 0
-    dialled: tuple[str, ...] = ()
-    """What workers dial beside."""
+class Rig(Relays):
+    """Three nodes' relays, echo workers, one application session beside the robot."""
 
     def start(self) -> None:
-        seed = self.endpoint(ROBOT)
-        for node in self.endpoints:
-            self.reports[node] = Reports()
-            connect = () if node == ROBOT else (seed,)
-            # no shared memory: a stalled target must fill its socket
-            text = data_config(listen=(self.endpoint(node),), connect=connect, timing=self.timing, shared_memory=False)
-            self.relays[node] = self.handle(node, text)
-            self.relays[node].start()
-        until(lambda: all(r.find(RelayChanged, is_running=True) for r in self.reports.values()), "the relays run")
+        super().start()
         self.app = self.application()
 
-    def handle(self, node: str, text: str) -> RelayHandle:
-        """The daemon's hold on a node's relay, whose data session opens by ``text``."""
-        return RelayHandle(fleet=FLEET, node=node, zenoh_config=text, on_report=self.reports[node].add)
-
-    def application(self) -> zenoh.Session:
-        """The session of the robot's application."""
-        text = worker_config(connect=(self.endpoint(ROBOT),), shared_memory=False)
-        return zenoh.open(zenoh.Config.from_json5(text))
-
-    def endpoint(self, node: str) -> str:
-        return self.endpoints[node]
-
-    def start_worker(
-        self, node: str, *options: str, task: str = TASK, operator_json5: str = "", script: Path | None = None
-    ) -> subprocess.Popen[bytes]:
-        """The echo worker, or the one that a ``script`` is."""
-        self.incarnation += 1
-        path = self.folder / f"{task}-{node}.json5"
-        # its own relay first, then the robot's, as `zsched.runtime.endpoints` has it: what is dialled is dialled again
-        connect = tuple(dict.fromkeys((self.endpoint(node), self.endpoint(ROBOT), *self.dialled)))
-        text = worker_config(connect=connect, timing=self.timing, shared_memory=False, operator_json5=operator_json5)
-        path.write_text(text)
-        env = os.environ | {
-            "ZSCHED_FLEET": FLEET,
-            "ZSCHED_NODE": node,
-            "ZSCHED_TASK": task,
-            "ZSCHED_INCARNATION": str(self.incarnation),
-            "ZSCHED_ZENOH_CONFIG": str(path),
-        }
-        program = ("-m", "zsched.tasks.echo") if script is None else (str(script),)
-        command = [sys.executable, *program, *options]
-        worker = subprocess.Popen(command, env=env)
-        self.workers.append(worker)
-        seen = {"node": node, "task": task, "incarnation": str(self.incarnation), "is_present": True}
-        until(lambda: self.reports[ROBOT].find(WorkerSeen, **seen), f"{task}'s worker on {node}")
-        return worker
-
-    def role(self, node: str, role: WorkerRole, epoch: int = 0, task: str = TASK) -> None:
-        self.relays[node].set_role(Role(task=task, role=role, epoch=epoch))
-
-    def plan(self, phase: RoutePhase, current: Slot | None, *predecessors: Slot | None, task: str = TASK) -> None:
-        olds = tuple(slot for slot in predecessors if slot is not None)
-        self.relays[ROBOT].apply(RoutePlan(task=task, phase=phase, current=current, predecessors=olds))
-
-    def wait(self, kind: type[Kind], **fields: Any) -> Kind:
-        report: Kind = until(lambda: self.reports[ROBOT].find(kind, **fields), f"{kind.__name__} {fields}")
-        return report
-
-    def move(self, new: Slot, old: Slot | None = None, *, drains: bool = True, task: str = TASK) -> float:
+    def move(self, new: Slot, old: Slot | None = None, *, drains: bool = True, task: str = "") -> float:
         """The executor's table, step by step; answers how long the flip took."""
-        self.role(new.owner, WorkerRole.ACTIVE, new.epoch, task)
-        if old is not None:
-            self.role(old.owner, WorkerRole.DRAINING, old.epoch, task)
-        self.plan(RoutePhase.PREPARE, new, old, task=task)
-        self.wait(SlotReady, task=task, epoch=new.epoch, is_ready=True)
-        started = time.monotonic()
-        self.plan(RoutePhase.FLIP, new, old, task=task)
-        self.wait(SlotFlipped, task=task, epoch=new.epoch)
-        took = time.monotonic() - started
+        self.prepare(new, old, task)
+        took = self.flip(new, old, task)
         if old is not None and drains:
-            self.wait(SlotDrained, task=task, epoch=old.epoch)
+            self.wait(SlotDrained, task=task or self.task, epoch=old.epoch)
         self.plan(RoutePhase.CLOSE, new, task=task)
         return took
 
@@ -209,27 +105,13 @@ class Rig:
             result.update(dict(count.drops))
         return result
 
-    def stop(self) -> None:
-        if hasattr(self, "app"):
-            self.app.close()
-        for worker in self.workers:
-            worker.send_signal(signal.SIGCONT)
-            worker.kill()
-            worker.wait(30)
-        for relay in self.relays.values():
-            relay.stop(2.0)
-
 
 @contextmanager
 def relay_rig(folder: Path, timing: Timing = DEFAULT_TIMING) -> Iterator[Rig]:
     """A rig that runs; everything of it is ended afterwards."""
-    made = Rig(folder=folder, timing=timing)
-    try:
-        made.start()
+    with Rig(folder, timing=timing) as made:
         yield made
         made.assert_nothing_is_unaccounted()
-    finally:
-        made.stop()
 
 
 BESIDE = Route(

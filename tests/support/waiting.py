@@ -1,32 +1,11 @@
-"""Waits for conditions. Knows: deadlines. Does not know: what is waited for.
-
-A deadline costs nothing when the condition comes true, so it is generous: the machine may be busy with other things.
-"""
+"""Waits for conditions, and bounds of measured times. Knows: deadlines. Does not know: what is waited for."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
-from typing import Any
-
 from zsched_lab.fleet.loopback import free_endpoint
+from zsched_lab.fleet.waiting import DEADLINE_S, POLL_S, until
 
 __all__ = ["DEADLINE_S", "POLL_S", "TooSlowError", "between", "free_endpoint", "until", "within"]
-
-DEADLINE_S = 60.0
-POLL_S = 0.003
-
-
-def until(condition: Callable[[], Any], what: str, deadline_s: float = DEADLINE_S) -> Any:
-    """The condition's first true value; `AssertionError` with ``what`` when there is none in time."""
-    end = time.monotonic() + deadline_s
-    while True:
-        value = condition()
-        if value:
-            return value
-        if time.monotonic() > end:
-            raise AssertionError(f"not within {deadline_s:g} s: {what}")
-        time.sleep(POLL_S)
 
 
 class TooSlowError(AssertionError):

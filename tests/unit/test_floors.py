@@ -293,7 +293,7 @@ def test_program_never_loads_what_is_heavy(program: str) -> None:
 
 def test_unit_tests_open_no_session() -> None:
     """Such tests belong to `tests/parts/`: what others do on the machine can delay them."""
-    real = re.compile(r"zenoh\.open\(|from support\.(?:sessions|relay_rig|ros_host) ")
+    real = re.compile(r"zenoh\.open\(|from (?:support\.(?:sessions|relay_rig|ros_host)|zsched_lab\.fleet\.relays) ")
     tests = sorted((ROOT / "tests" / "unit").rglob("test_*.py"))
     assert not [
         str(path.relative_to(ROOT)) for path in tests if path.name != "test_floors.py" and real.search(path.read_text())
