@@ -1,12 +1,13 @@
-"""What the benchmarks share: percentiles, result lines, a quiet-machine warning, a robot's application."""
+"""What the benchmarks share: percentiles, result lines, a quiet-machine warning, processes, a robot's application."""
 
 from __future__ import annotations
 
 import os
 import statistics
+import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
 import psutil
@@ -41,6 +42,34 @@ def machine() -> str:
 def mean(values: Sequence[float]) -> float:
     """Arithmetic mean."""
     return statistics.fmean(values)
+
+
+def median_us(runs: Iterable[Sequence[float]], share: float) -> float:
+    """The median of several runs' quantiles of delays in s, in microseconds; 0: nothing came."""
+    values = [percentile(delays, share) for delays in runs if delays]
+    return statistics.median(values) * 1e6 if values else 0.0
+
+
+def cpu_s(pid: int | None) -> float:
+    """The CPU seconds of a process so far; of none: 0."""
+    if not pid:
+        return 0.0
+    times = psutil.Process(pid).cpu_times()
+    return float(times.user + times.system)
+
+
+def read(process: subprocess.Popen[str]) -> str:
+    """The next line that a process prints."""
+    assert process.stdout is not None
+    return process.stdout.readline().strip()
+
+
+def ask(process: subprocess.Popen[str], word: str) -> str:
+    """What a process prints when it is told a word."""
+    assert process.stdin is not None
+    process.stdin.write(word + "\n")
+    process.stdin.flush()
+    return read(process)
 
 
 @contextmanager

@@ -24,7 +24,7 @@ from typing import Any
 
 import psutil
 
-from benchmarks.common import at_pace, machine
+from benchmarks.common import at_pace, cpu_s, machine
 from zsched.sessions.config import client_config
 from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
@@ -113,10 +113,10 @@ def _row(size: int, stream_class: str, setting: str, options: argparse.Namespace
             process.stdout.readline()
             worker = _worker_of(bed.pid("edge1"))
             relay = bed.relay_pid("robot1")
-            before = [_cpu_s(pid) for pid in (relay, worker)]
+            before = [cpu_s(pid) for pid in (relay, worker)]
             with at_pace(1.5, lambda: _freeze((relay, worker, process.pid)) if options.freeze else None):
                 sent, back, took_s, shared, wrong = json.loads(process.stdout.readline())
-            used = [after - since for after, since in zip((_cpu_s(relay), _cpu_s(worker)), before, strict=True)]
+            used = [after - since for after, since in zip((cpu_s(relay), cpu_s(worker)), before, strict=True)]
         relay_us, worker_us = (part / max(1, back) * 1e6 for part in used)
         drops: dict[str, Any] = {stream["stream"]: stream["drops"] for stream in bed.task("robot1")["streams"]}
         rates = f"{sent / options.seconds:>9.0f} {back / max(took_s, 1e-9):>8.0f} {sent - back:>9} {wrong:>6}"
@@ -137,13 +137,6 @@ def _freeze(pids: tuple[int | None, ...]) -> None:
         os.kill(pid, signal.SIGSTOP)
         time.sleep(random.uniform(0.05, 0.6))
         os.kill(pid, signal.SIGCONT)
-
-
-def _cpu_s(pid: int | None) -> float:
-    if pid is None:
-        return 0.0
-    times = psutil.Process(pid).cpu_times()
-    return float(times.user + times.system)
 
 
 if __name__ == "__main__":

@@ -23,9 +23,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
-import psutil
-
-from benchmarks.common import machine, percentile
+from benchmarks.common import ask, cpu_s, machine, median_us, read
 from zsched.adapters.relay.streams import RelayHandle
 from zsched.core.events import RelayChanged, SlotFlipped, SlotReady
 from zsched.core.relay_protocol import HandleReport
@@ -159,16 +157,16 @@ class Bench:
         command = [sys.executable, "-c", PUBLISHER, *arguments]
         publisher = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         try:
-            _read(publisher)
-            _ask(self._worker, "reset")
+            read(publisher)
+            ask(self._worker, "reset")
             pids = [publisher.pid, self._relays["robot1"].pid or 0]
-            before = sum(map(_cpu_s, pids))
-            sent = int(_ask(publisher, "go"))
-            got, span, delays = json.loads(_ask(self._worker, "report"))
-            cpu_s = sum(map(_cpu_s, pids)) - before
+            before = sum(map(cpu_s, pids))
+            sent = int(ask(publisher, "go"))
+            got, span, delays = json.loads(ask(self._worker, "report"))
+            used_s = sum(map(cpu_s, pids)) - before
         finally:
             _end(publisher)
-        return Result(sent, got, (got - 1) / span if span else 0.0, tuple(delays[5:]), cpu_s)
+        return Result(sent, got, (got - 1) / span if span else 0.0, tuple(delays[5:]), used_s)
 
     def _has(self, kind: type) -> bool:
         return any(isinstance(report, kind) for report in self._heard)
@@ -181,7 +179,7 @@ class Bench:
         env = os.environ | {f"ZSCHED_{name}": value for name, value in names.items()}
         command = [sys.executable, "-c", RECEIVER]
         worker = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=env)
-        _read(worker)
+        read(worker)
         return worker
 
     def _route(self, stream_class: str) -> None:
@@ -194,28 +192,9 @@ class Bench:
             until(partial(self._has, report), phase.value)
 
 
-def _read(process: subprocess.Popen[str]) -> str:
-    assert process.stdout is not None
-    return process.stdout.readline().strip()
-
-
-def _ask(process: subprocess.Popen[str], word: str) -> str:
-    assert process.stdin is not None
-    process.stdin.write(word + "\n")
-    process.stdin.flush()
-    return _read(process)
-
-
 def _end(process: subprocess.Popen[str]) -> None:
     process.kill()
     process.communicate()
-
-
-def _cpu_s(pid: int) -> float:
-    if not pid:
-        return 0.0
-    times = psutil.Process(pid).cpu_times()
-    return float(times.user + times.system)
 
 
 def main() -> None:
@@ -244,7 +223,10 @@ def _rows(bench: Bench, size: int, stream_class: str, options: argparse.Namespac
             fast[way].append(bench.run(way, size, 0.0, options.seconds))
             time.sleep(0.2)
     rate = {way: statistics.median(result.hz for result in results) for way, results in fast.items()}
-    p50, p99 = ({way: _median_of(results, share) for way, results in paced.items()} for share in (0.5, 0.99))
+    p50, p99 = (
+        {way: median_us((one.delays for one in results), share) for way, results in paced.items()}
+        for share in (0.5, 0.99)
+    )
     for way in WAYS:
         cpu = statistics.median(result.cpu_s / max(1, result.got) for result in fast[way]) * 1e6
         came = sum(result.got for result in fast[way]) / max(1, sum(result.sent for result in fast[way]))
@@ -254,11 +236,6 @@ def _rows(bench: Bench, size: int, stream_class: str, options: argparse.Namespac
             f"{p50[way]:>8.0f} {p99[way]:>8.0f} {p50[way] - p50['direct']:>10.0f} {cpu:>12.1f} {came:>7.1%} {count:>5}",
             flush=True,
         )
-
-
-def _median_of(results: list[Result], share: float) -> float:
-    values = [percentile(result.delays, share) for result in results if result.delays]
-    return statistics.median(values) * 1e6 if values else 0.0
 
 
 if __name__ == "__main__":

@@ -22,10 +22,9 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import psutil
 import zenoh
 
-from benchmarks.common import machine, percentile
+from benchmarks.common import ask, cpu_s, machine, median_us, read
 from zsched.adapters.relay.streams import RelayHandle
 from zsched.core.events import RelayChanged, SlotFlipped, SlotReady
 from zsched.core.relay_protocol import HandleReport
@@ -143,12 +142,12 @@ class Bench:
         self._flip()
         publisher = self._start(PUBLISHER, "pub", IN, str(size), str(hz), str(seconds))
         time.sleep(0.6)
-        before = _cpu_s(hop)
-        sent = int(_ask(publisher, "go"))
-        got, span, delays = json.loads(_ask(subscriber, "report"))
-        cpu_s = _cpu_s(hop) - before
+        before = cpu_s(hop)
+        sent = int(ask(publisher, "go"))
+        got, span, delays = json.loads(ask(subscriber, "report"))
+        used_s = cpu_s(hop) - before
         return Result(
-            sent=sent, got=got, hz=(got - 1) / span if span else 0.0, delays=tuple(delays[5:]), hop_cpu_s=cpu_s
+            sent=sent, got=got, hz=(got - 1) / span if span else 0.0, delays=tuple(delays[5:]), hop_cpu_s=used_s
         )
 
     def close(self) -> None:
@@ -193,7 +192,7 @@ class Bench:
         command = [sys.executable, "-c", program, str(path), *arguments]
         process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         self._processes.append(process)
-        _read(process)
+        read(process)
         return process
 
     def _config(self, *, is_hub: bool) -> str:
@@ -206,25 +205,6 @@ class Bench:
         if self._hop == "router":
             config.insert_json5("mode", json.dumps("router"))
         return str(config)
-
-
-def _read(process: subprocess.Popen[str]) -> str:
-    assert process.stdout is not None
-    return process.stdout.readline().strip()
-
-
-def _ask(process: subprocess.Popen[str], word: str) -> str:
-    assert process.stdin is not None
-    process.stdin.write(word + "\n")
-    process.stdin.flush()
-    return _read(process)
-
-
-def _cpu_s(pid: int | None) -> float:
-    if pid is None:
-        return 0.0
-    times = psutil.Process(pid).cpu_times()
-    return float(times.user + times.system)
 
 
 def _measure(folder: Path, hop: str, size: int, hz: float, options: argparse.Namespace) -> Result:
@@ -259,7 +239,10 @@ def _row(folder: Path, size: int, options: argparse.Namespace) -> None:
             fast[hop].append(_measure(folder, hop, size, 0.0, options))
             paced[hop].append(_measure(folder, hop, size, PACE_HZ.get(size, 100), options))
     rate = {hop: statistics.median(result.hz for result in results) for hop, results in fast.items()}
-    p50 = {hop: _median_of(results, 0.5) for hop, results in paced.items()}
+    p50, p99 = (
+        {hop: median_us((one.delays for one in results), share) for hop, results in paced.items()}
+        for share in (0.5, 0.99)
+    )
     for hop in options.hops:
         results = fast[hop]
         cpu = statistics.median(result.hop_cpu_s / max(1, result.got) for result in results) * 1e6
@@ -268,14 +251,9 @@ def _row(folder: Path, size: int, options: argparse.Namespace) -> None:
         added = p50[hop] - p50.get("direct", 0.0)
         print(
             f"{size:>8}  {hop:<11} {rate[hop]:>8.0f} {rate[hop] * size / 1e6:>9.0f} {ratio:>9.2f} {p50[hop]:>10.0f} "
-            f"{_median_of(paced[hop], 0.99):>8.0f} {added:>10.0f} {cpu:>14.1f} {share:>13.1%}",
+            f"{p99[hop]:>8.0f} {added:>10.0f} {cpu:>14.1f} {share:>13.1%}",
             flush=True,
         )
-
-
-def _median_of(results: list[Result], share: float) -> float:
-    values = [percentile(result.delays, share) for result in results if result.delays]
-    return statistics.median(values) * 1e6 if values else 0.0
 
 
 if __name__ == "__main__":
