@@ -74,116 +74,55 @@ class Claim:
 OTHER_DYNAMIC = ("dyna_cpu", "dyna_both")
 
 
-def _each(says: str, metric: str, schemes: tuple[str, ...], theirs: tuple[str, ...], target: float) -> Iterator[Claim]:
+def _claimed(
+    says: str,
+    metric: str,
+    *,
+    mine: tuple[str, ...] = PAPER_SCHEMES,
+    theirs: tuple[str, ...] = FIXED_SCHEMES,
+    target: float = 0.0,
+) -> Claim:
+    """A claim of the paper."""
+    return Claim(source="paper", says=says, metric=metric, mine=mine, theirs=theirs, target=target)
+
+
+def _each(says: str, metric: str, *, target: float = 0.0) -> Iterator[Claim]:
     """A claim that the paper makes of every one of its variants."""
-    for scheme in schemes:
-        yield Claim(
-            source="paper", says=f"{says}: {scheme}", metric=metric, mine=(scheme,), theirs=theirs, target=target
-        )
+    for scheme in PAPER_SCHEMES:
+        yield _claimed(f"{says}: {scheme}", metric, mine=(scheme,), target=target)
+
+
+def _wanted(says: str, metric: str, target: float) -> Claim:
+    """A goal of ours."""
+    return Claim(
+        source="goal", says=f"zsched: {says}", metric=metric, mine=("zsched",), theirs=FIXED_SCHEMES, target=target
+    )
 
 
 CLAIMS = (
-    Claim(
-        source="paper",
-        says="throughput +40 % over fixed",
-        metric="throughput_mb_s",
-        mine=PAPER_SCHEMES,
-        theirs=FIXED_SCHEMES,
-        target=0.40,
-    ),
-    Claim(
-        source="paper",
-        says="task latency -28 % against fixed, the variants' mean",
-        metric="task_latency_s",
-        mine=PAPER_SCHEMES,
-        theirs=FIXED_SCHEMES,
-        target=-0.28,
-    ),
-    *_each("task latency -28 % against fixed", "task_latency_s", PAPER_SCHEMES, FIXED_SCHEMES, target=-0.28),
-    Claim(
-        source="paper",
-        says="better map frequency than fixed",
-        metric="map_hz",
-        mine=PAPER_SCHEMES,
-        theirs=FIXED_SCHEMES,
-        target=0.0,
-    ),
-    Claim(
-        source="paper",
-        says="map frequency: dyna_mem +20 % over the other variants",
-        metric="map_hz",
+    _claimed("throughput +40 % over fixed", "throughput_mb_s", target=0.40),
+    _claimed("task latency -28 % against fixed, the variants' mean", "task_latency_s", target=-0.28),
+    *_each("task latency -28 % against fixed", "task_latency_s", target=-0.28),
+    _claimed("better map frequency than fixed", "map_hz"),
+    _claimed(
+        "map frequency: dyna_mem +20 % over the other variants",
+        "map_hz",
         mine=("dyna_mem",),
         theirs=OTHER_DYNAMIC,
         target=0.20,
     ),
-    Claim(
-        source="paper",
-        says="map frequency: dyna_mem over fixed",
-        metric="map_hz",
-        mine=("dyna_mem",),
-        theirs=FIXED_SCHEMES,
-        target=0.0,
-    ),
-    *_each("better map accuracy than fixed", "ssim_rebased", PAPER_SCHEMES, FIXED_SCHEMES, target=0.0),
+    _claimed("map frequency: dyna_mem over fixed", "map_hz", mine=("dyna_mem",)),
+    *_each("better map accuracy than fixed", "ssim_rebased"),
     *(
-        Claim(
-            source="paper",
-            says=f"best map accuracy: dyna_both over {other}",
-            metric="ssim_rebased",
-            mine=("dyna_both",),
-            theirs=(other,),
-            target=0.0,
-        )
+        _claimed(f"best map accuracy: dyna_both over {other}", "ssim_rebased", mine=("dyna_both",), theirs=(other,))
         for other in ("dyna_cpu", "dyna_mem")
     ),
-    Claim(
-        source="paper",
-        says="peaks of CPU are spread more evenly than under fixed",
-        metric="cpu_peak_spread",
-        mine=PAPER_SCHEMES,
-        theirs=FIXED_SCHEMES,
-        target=0.0,
-    ),
-    Claim(
-        source="paper",
-        says="CPU is spread more evenly than under fixed",
-        metric="cpu_mean_spread",
-        mine=PAPER_SCHEMES,
-        theirs=FIXED_SCHEMES,
-        target=0.0,
-    ),
-    Claim(
-        source="paper",
-        says="memory is balanced better than under fixed",
-        metric="memory_mean_spread",
-        mine=PAPER_SCHEMES,
-        theirs=FIXED_SCHEMES,
-        target=0.0,
-    ),
-    Claim(
-        source="goal",
-        says="zsched: throughput at least +40 % over fixed",
-        metric="throughput_mb_s",
-        mine=("zsched",),
-        theirs=FIXED_SCHEMES,
-        target=0.40,
-    ),
-    Claim(
-        source="goal",
-        says="zsched: task latency at most -28 % against fixed",
-        metric="task_latency_s",
-        mine=("zsched",),
-        theirs=FIXED_SCHEMES,
-        target=-0.28,
-    ),
-    Claim(
-        source="goal",
-        says="zsched: map frequency at least +20 % over fixed",
-        metric="map_hz",
-        mine=("zsched",),
-        theirs=FIXED_SCHEMES,
-        target=0.20,
-    ),
+    _claimed("peaks of CPU are spread more evenly than under fixed", "cpu_peak_spread"),
+    _claimed("CPU is spread more evenly than under fixed", "cpu_mean_spread"),
+    _claimed("memory is balanced better than under fixed", "memory_mean_spread"),
+    _wanted("throughput at least +40 % over fixed", "throughput_mb_s", target=0.40),
+    _wanted("task latency at most -28 % against fixed", "task_latency_s", target=-0.28),
+    _wanted("map frequency at least +20 % over fixed", "map_hz", target=0.20),
 )
 LESS_IS_BETTER = frozenset(
     {
