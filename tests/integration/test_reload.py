@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import json
 import signal
-import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from copy import deepcopy
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
-import zenoh
-
+from support.operators import Stream
 from support.sessions import matches
 from zsched.core.executor.renewing import SAME_FILE_S
 from zsched.core.hop.books import unaccounted
@@ -22,42 +21,22 @@ Tree = dict[str, Any]
 PERIOD_S = 0.005
 
 
-class Stream:
-    """An application that puts numbers into a reliable input and keeps what comes back."""
+@contextmanager
+def stream_of(bed: Testbed) -> Iterator[Stream]:
+    """An application beside robot1, whose stream has begun."""
+    stream = Stream(bed.app("robot1"), PERIOD_S)
+    bed.wait(lambda: matches(stream.publisher), 60, "the relay subscribes")
+    stream.start()
+    try:
+        yield stream
+    finally:
+        stream.end()
 
-    def __init__(self, session: zenoh.Session) -> None:
-        self.back: list[int] = []
-        self.sent = 0
-        self._kept = session.declare_subscriber(
-            "robot1/out", lambda sample: self.back.append(int(sample.payload.to_bytes()))
-        )
-        self.publisher = session.declare_publisher("robot1/in", congestion_control=zenoh.CongestionControl.BLOCK)
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.end()
-
-    def start(self) -> None:
-        self._thread.start()
-
-    def _run(self) -> None:
-        while not self._ended.wait(PERIOD_S):
-            self.publisher.put(str(self.sent).encode())
-            self.sent += 1
-
-    def end(self) -> None:
-        self._ended.set()
-        if self._thread.is_alive():
-            self._thread.join()
-
-    def flows(self) -> Callable[[], bool]:
-        """Whether 50 more samples have come back since now."""
-        wanted = len(self.back) + 50
-        return lambda: len(self.back) >= wanted
+def flows(stream: Stream) -> Callable[[], bool]:
+    """Whether 50 more samples have come back since now."""
+    wanted = len(stream.back) + 50
+    return lambda: len(stream.back) >= wanted
 
 
 def reload(bed: Testbed, tree: Tree) -> None:
@@ -87,10 +66,8 @@ def test_tasks_weights_and_commands_change_while_a_reliable_stream_runs(tmp_path
         bed.init()
         bed.start()
         bed.wait_settled()
-        with Stream(bed.app("robot1")) as stream:
-            bed.wait(lambda: matches(stream.publisher), 60, "the relay subscribes")
-            stream.start()
-            bed.wait(stream.flows(), 60, "the stream through the first owner")
+        with stream_of(bed) as stream:
+            bed.wait(flows(stream), 60, "the stream through the first owner")
             relay = bed.relay_pid("robot1")
 
             # a task comes, and the weights of the one that runs change
@@ -115,13 +92,13 @@ def test_tasks_weights_and_commands_change_while_a_reliable_stream_runs(tmp_path
             reload(bed, tree)
             bed.wait(lambda: [len(one) for one in worker_lives(bed).values()] == [2, 2, 0], 90, "each worker runs anew")
             assert bed.owner("robot1") != owner, "the owner has given the task away before its worker ended"
-            bed.wait(stream.flows(), 60, "the stream through the next owner")
+            bed.wait(flows(stream), 60, "the stream through the next owner")
 
             # the task that came goes again
             del tree["tasks"]["second"]
             reload(bed, tree)
             bed.wait(lambda: len(bed.status("robot1")["tasks"]) == 1, 60, "the task is gone")
-            bed.wait(stream.flows(), 60, "the stream runs on")
+            bed.wait(flows(stream), 60, "the stream runs on")
             stream.end()
 
             def is_settled() -> bool:
