@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from support.allocations import allocation_of
-from support.fleets import fleet_of
+from support.fleets import fleet_of, task_of
 from support.profiles import load_of, profile_of
 from support.proposals import proposal_of, vector_of
 from support.robots import Decider
@@ -16,7 +16,7 @@ from zsched.core.gateway.gateway import Gateway
 from zsched.core.instructions import AskUtilities, Instruction, PublishProposal
 from zsched.core.scheduler.judge import Judge, Outcome
 from zsched.core.scheduler.scoring import compare, pick, score
-from zsched.core.values.fleet import TaskSpec, Timing, WorkerSpec
+from zsched.core.values.fleet import Timing, WorkerSpec
 from zsched.core.values.messages import Utilities
 from zsched.core.values.model import (
     Allocation,
@@ -31,9 +31,7 @@ from zsched.core.values.model import (
 
 BOTH = Weights(cpu=0.5, memory=0.5, network=0.0)
 TUNING = Tuning(weights=BOTH)
-SPEC = TaskSpec(
-    name="merge", candidates=("edge1", "edge2", "edge3"), tuning=TUNING, worker=WorkerSpec(command=("merge",))
-)
+SPEC = task_of(candidates=("edge1", "edge2", "edge3"), tuning=TUNING, worker=WorkerSpec(command=("merge",)))
 ROBOTS = ("robot1", "robot2", "robot3")
 LONG = Timing(profile_ttl_s=60.0)
 """One set of edge data lasts for a test."""

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from support.allocations import allocation_of
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of, tuning_of
 from support.proposals import proposal_of
 from support.robots import Decider
 from support.todos import done
@@ -16,7 +16,7 @@ from zsched.core.gateway.gateway import Gateway
 from zsched.core.instructions import ApplyRoutes, AskUtilities, Instruction, PublishProposal, StartWorker, StopWorker
 from zsched.core.profile.profile import Profiler
 from zsched.core.values.change import MoveOwner, Retune
-from zsched.core.values.fleet import StreamRule, TaskSpec, WorkerSpec
+from zsched.core.values.fleet import StreamRule, WorkerSpec
 from zsched.core.values.model import (
     Allocation,
     DeviceSample,
@@ -31,8 +31,7 @@ from zsched.core.vote.tally import Tally, VoteOutcome, tally
 
 ROBOTS = ("robot1", "robot2", "robot3")
 TUNING = tuning_of(cpu=0.0, memory=0.0, network=1.0)
-SPEC = TaskSpec(
-    name="merge",
+SPEC = task_of(
     candidates=("edge1", "edge2", "edge3"),
     tuning=TUNING,
     worker=WorkerSpec(command=("merge",)),

@@ -8,11 +8,11 @@ from __future__ import annotations
 import pytest
 
 from support.allocations import allocation_of
-from support.fleets import tuning_of
+from support.fleets import task_of, tuning_of
 from support.proposals import vector_of
 from zsched.core.scheduler.scoring import Standing, compare, pick
 from zsched.core.scheduler.utility import cpu_utility, memory_utility, network_utility, predicted_use, total_utility
-from zsched.core.values.fleet import LinkLimits, TaskSpec
+from zsched.core.values.fleet import LinkLimits
 from zsched.core.values.model import Aggregate, Reach, Tuning, Weights
 
 ALL = frozenset({"cpu", "memory", "network"})
@@ -117,11 +117,7 @@ def test_eq4_a_metric_absent_for_one_candidate_only_is_not_guessed() -> None:
 
 # --- Eq. 5-6: the scheduling problem -------------------------------------------------------------------------------
 
-SPEC = TaskSpec(
-    name="merge",
-    candidates=("edge1", "edge2", "edge3"),
-    tuning=tuning_of(cpu=1.0, memory=0.0),
-)
+SPEC = task_of(candidates=("edge1", "edge2", "edge3"), tuning=tuning_of(cpu=1.0, memory=0.0))
 
 
 def joint(rows: dict[str, dict[str, float]], aggregate: Aggregate = Aggregate.MEAN) -> Standing:

@@ -9,9 +9,9 @@ import pytest
 
 from support.allocations import allocation_of
 from support.beats import beat_of
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of, tuning_of
 from zsched.core.events import ClockCompared
-from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec
+from zsched.core.values.fleet import Fleet, WorkerSpec
 from zsched.core.values.model import Beat, Grant, WorkerState
 from zsched.core.values.plan import WorkerRole
 from zsched.core.vote.clocks import DOUBT_S, JUMP_S, ClockDoubt
@@ -21,9 +21,8 @@ from zsched_lab.sim.simulator import Simulator
 
 SLEW = ClockCompared(error_ratio=0.083, since_s=0.2)
 WELL = ClockCompared(error_ratio=1e-5, since_s=0.2)
-TASK = TaskSpec(
-    name="guard",
-    candidates=("edge1", "edge2"),
+TASK = task_of(
+    "guard",
     tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0),
     patience=0.1,
     worker=WorkerSpec(command=("true",)),

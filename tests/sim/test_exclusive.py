@@ -10,9 +10,9 @@ from random import Random
 import pytest
 
 from support.beats import beat_of
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of, tuning_of
 from zsched.core.events import BeatReceived
-from zsched.core.values.fleet import Fleet, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.fleet import Fleet, Timing, WorkerSpec
 from zsched.core.values.model import NodeId
 from zsched.core.values.plan import WorkerRole
 from zsched.core.vote.lease import hold_s
@@ -25,9 +25,9 @@ TIMING = Timing()
 def fleet(*, exclusive: bool = True, robots_only: bool = False) -> Fleet:
     robots = ("robot1", "robot2", "robot3")
     edges = () if robots_only else ("edge1", "edge2", "edge3")
-    task = TaskSpec(
-        name=TASK,
-        candidates=edges or robots,
+    task = task_of(
+        TASK,
+        edges or robots,
         tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0),
         patience=0.1,
         worker=WorkerSpec(command=("true",)),

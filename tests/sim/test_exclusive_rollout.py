@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import pytest
 
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of, tuning_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.values.durable import DurableState
-from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec
+from zsched.core.values.fleet import Fleet, WorkerSpec
 from zsched.core.values.model import NodeId
 from zsched.core.values.plan import WorkerRole
 from zsched_lab.sim.parts import Machine
@@ -19,9 +19,9 @@ from zsched_lab.sim.simulator import CORES, Simulator
 TASK, LOOK_S = "merge", 0.01
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2", "edge3")
 OLD = fleet_of(
-    TaskSpec(
-        name=TASK,
-        candidates=EDGES,
+    task_of(
+        TASK,
+        EDGES,
         tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0),
         patience=0.1,
         worker=WorkerSpec(command=("true",)),

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of, tuning_of
 from zsched.core.status import build_snapshot
-from zsched.core.values.fleet import TaskSpec, WorkerSpec
+from zsched.core.values.fleet import WorkerSpec
 from zsched.core.values.plan import ReadyWhen
 from zsched_lab.sim.simulator import Simulator
 from zsched_lab.sim.swarm import plan
@@ -14,8 +14,7 @@ DEADLINE_S = 3.0
 
 
 def fleet() -> Simulator:
-    task = TaskSpec(
-        name="merge",
+    task = task_of(
         candidates=EDGES,
         tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0),
         patience=0.0,

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import pytest
 
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of, tuning_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec
+from zsched.core.values.fleet import Fleet, WorkerSpec
 from zsched.core.values.model import NodeId
 from zsched.core.vote.belief import GENERATION_STEP, MAX_GENERATION
 from zsched_lab.sim.simulator import Simulator
@@ -17,12 +17,7 @@ from zsched_lab.sim.simulator import Simulator
 TASK = "merge"
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2", "edge3")
 BY_EDGES = fleet_of(
-    TaskSpec(
-        name=TASK,
-        candidates=EDGES,
-        tuning=tuning_of(cpu=1.0, memory=0.0),
-        worker=WorkerSpec(command=("true",)),
-    ),
+    task_of(TASK, EDGES, tuning=tuning_of(cpu=1.0, memory=0.0), worker=WorkerSpec(command=("true",))),
     of=(*EDGES, *ROBOTS),
     electors=EDGES,
 )

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of
 from zsched.core.status import build_snapshot
-from zsched.core.values.fleet import Fleet, OnIsolation, TaskSpec, WorkerSpec
+from zsched.core.values.fleet import Fleet, OnIsolation, WorkerSpec
 from zsched.core.values.plan import WorkerRole
 from zsched_lab.sim.simulator import Simulator
 
@@ -16,13 +16,7 @@ EDGES = ("edge1", "edge2")
 
 
 def fleet(on_isolation: OnIsolation) -> Fleet:
-    task = TaskSpec(
-        name=TASK,
-        candidates=EDGES,
-        tuning=tuning_of(),
-        worker=WorkerSpec(command=("true",)),
-        on_isolation=on_isolation,
-    )
+    task = task_of(TASK, EDGES, worker=WorkerSpec(command=("true",)), on_isolation=on_isolation)
     return fleet_of(task, of=sorted(EDGES + ROBOTS))
 
 

@@ -9,13 +9,13 @@ import pytest
 
 from support.allocations import allocation_of
 from support.beats import beat_of
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of, tuning_of
 from support.todos import done, todo_of
 from zsched.core import instructions as do
 from zsched.core.executor.handover import Executor
 from zsched.core.executor.tenure import Tenure
 from zsched.core.instructions import SetRole
-from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec, lease_terms
+from zsched.core.values.fleet import Fleet, WorkerSpec, lease_terms
 from zsched.core.values.model import Beat, Grant
 from zsched.core.values.plan import WorkerRole
 from zsched.core.vote.lease import RHO, SENT_KEPT, Granter, Holder, Leases, hold_s
@@ -239,12 +239,8 @@ def test_what_was_given_back_holds_no_lease_any_more() -> None:
     assert owner.lease_until() == -math.inf
 
 
-GUARD = TaskSpec(
-    name="guard",
-    candidates=ELECTORS,
-    tuning=tuning_of(cpu=1.0, memory=0.0),
-    worker=WorkerSpec(command=("true",)),
-    exclusive=True,
+GUARD = task_of(
+    "guard", ELECTORS, tuning=tuning_of(cpu=1.0, memory=0.0), worker=WorkerSpec(command=("true",)), exclusive=True
 )
 FLEET = fleet_of(GUARD, of=ELECTORS, electors=ELECTORS)
 

@@ -4,19 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of, tuning_of
 from zsched.core.handlers.work import _move_of
-from zsched.core.values.fleet import TaskSpec, WorkerSpec
+from zsched.core.values.fleet import WorkerSpec
 from zsched.core.vote.register import FROM_A_PEER
 from zsched_lab.sim.simulator import Simulator
 
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
-SPEC = TaskSpec(
-    name="merge",
-    candidates=EDGES,
-    tuning=tuning_of(cpu=1.0, memory=0.0),
-    worker=WorkerSpec(command=("worker",)),
-)
+SPEC = task_of(candidates=EDGES, tuning=tuning_of(cpu=1.0, memory=0.0), worker=WorkerSpec(command=("worker",)))
 
 
 def test_a_robot_that_did_not_commit_a_move_tells_why_it_was_made() -> None:

@@ -7,13 +7,13 @@ from random import Random
 
 import pytest
 
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of, tuning_of
 from zsched.core import events as ev
 from zsched.core.electorate.recovery import NEW_DISK, Sides, rejoined
 from zsched.core.status import build_snapshot
 from zsched.core.values.document import Flag, FlagKind
 from zsched.core.values.electorate import FleetValue
-from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec
+from zsched.core.values.fleet import Fleet, WorkerSpec
 from zsched.core.values.messages import ChangeFleet
 from zsched.core.values.model import NodeId
 from zsched_lab.sim.simulator import Simulator
@@ -24,9 +24,9 @@ REPLACE_S, AWAY_S = 2.0, 5.0
 
 
 def fleet(electors: tuple[NodeId, ...], robots: tuple[NodeId, ...] = ROBOTS) -> Fleet:
-    task = TaskSpec(
-        name=TASK,
-        candidates=(*EDGES, *robots),
+    task = task_of(
+        TASK,
+        (*EDGES, *robots),
         tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0),
         worker=WorkerSpec(command=("true",)),
         exclusive=True,

@@ -9,13 +9,13 @@ import pytest
 
 from support.allocations import allocation_of
 from support.ballots import ballot_of
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of, tuning_of
 from support.registers import Step, did
 from support.states import state_of
 from support.todos import agreed
 from zsched.core.events import AcceptAsked, PrepareAsked
 from zsched.core.values.change import MoveOwner
-from zsched.core.values.fleet import TaskSpec, WorkerSpec, electorate_hash
+from zsched.core.values.fleet import WorkerSpec, electorate_hash
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise
 from zsched.core.values.model import (
     Acceptance,
@@ -108,7 +108,7 @@ def test_newer_among_accepted_values_is_the_higher_ballot_not_the_higher_revisio
 
 @pytest.mark.parametrize(("node", "asker"), [("r3", "r2"), ("ghost", "ghost"), ("r2x", "r2")])
 def test_a_ballot_that_is_not_its_asker_s_or_a_stranger_s_gets_no_answer(node: str, asker: str) -> None:
-    spec = TaskSpec(name="merge", candidates=ELECTORS, tuning=INITIAL.tuning, worker=WorkerSpec(command=("true",)))
+    spec = task_of(candidates=ELECTORS, tuning=INITIAL.tuning, worker=WorkerSpec(command=("true",)))
     fleet = fleet_of(spec, of=ELECTORS, electors=ELECTORS)
     electorate = electorate_hash(fleet)
     state = state_of("r1", incarnation=1, electorate=electorate)

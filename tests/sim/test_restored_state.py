@@ -7,11 +7,11 @@ from dataclasses import replace
 import pytest
 
 from support.beats import beat_of
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of, tuning_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.values.durable import DurableState
-from zsched.core.values.fleet import TaskSpec, WorkerSpec
+from zsched.core.values.fleet import WorkerSpec
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import NodeId
 from zsched.core.vote.witness import ASK_ALL_S, Witness
@@ -20,9 +20,9 @@ from zsched_lab.sim.simulator import CORES, Simulator
 TASK = "merge"
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
 FLEET = fleet_of(
-    TaskSpec(
-        name=TASK,
-        candidates=EDGES,
+    task_of(
+        TASK,
+        EDGES,
         tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0),
         patience=0.05,
         worker=WorkerSpec(command=("true",)),

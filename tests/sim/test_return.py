@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of, tuning_of
 from zsched.core.scheduler.probation import LEASE_MARGIN_S
-from zsched.core.values.fleet import TaskSpec, Timing, WorkerSpec
+from zsched.core.values.fleet import Timing, WorkerSpec
 from zsched.core.values.model import PeerState
 from zsched_lab.sim.simulator import CORES, Simulator
 
@@ -14,8 +14,7 @@ TIMING = Timing()
 
 def settled_on_edge1() -> Simulator:
     """A fleet at rest whose task would go to edge1 whenever it may."""
-    task = TaskSpec(
-        name="merge",
+    task = task_of(
         candidates=EDGES,
         tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0),
         patience=0.0,

@@ -20,9 +20,9 @@ from random import Random
 
 import pytest
 
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of, tuning_of
 from zsched.core import events as ev
-from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec
+from zsched.core.values.fleet import Fleet, WorkerSpec
 from zsched.core.values.messages import SetWeights
 from zsched_lab.sim.simulator import CORES, Simulator
 
@@ -36,9 +36,9 @@ def fleet(words: list[str]) -> Fleet:
     options = dict(word.split("=") for word in words if "=" in word)
     robots = tuple(f"robot{i}" for i in range(1, int(options.get("robots", 3)) + 1))
     edges = tuple(f"edge{i}" for i in range(1, int(options.get("edges", 2)) + 1))
-    task = TaskSpec(
-        name=TASK,
-        candidates=edges,
+    task = task_of(
+        TASK,
+        edges,
         tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0),
         patience=0.1,
         worker=WorkerSpec(command=("work",)),

@@ -8,8 +8,8 @@ from random import Random
 
 import pytest
 
-from support.fleets import fleet_of, tuning_of
-from zsched.core.values.fleet import PAPER_PATIENCE, Fleet, TaskSpec, Timing, WorkerSpec
+from support.fleets import fleet_of, task_of, tuning_of
+from zsched.core.values.fleet import PAPER_PATIENCE, Fleet, Timing, WorkerSpec
 from zsched.core.values.model import NodeId, PeerState
 from zsched_lab.sim.simulator import CORES, Simulator
 
@@ -18,9 +18,9 @@ TASK = "merge"
 
 def fleet(robots: int = 3, edges: int = 3, *, patience: float = PAPER_PATIENCE, cool_down: float = 10.0) -> Fleet:
     names = [f"robot{i}" for i in range(1, robots + 1)] + [f"edge{i}" for i in range(1, edges + 1)]
-    task = TaskSpec(
-        name=TASK,
-        candidates=tuple(f"edge{i}" for i in range(1, edges + 1)),
+    task = task_of(
+        TASK,
+        tuple(f"edge{i}" for i in range(1, edges + 1)),
         tuning=tuning_of(cool_down_s=cool_down),
         patience=patience,
         worker=WorkerSpec(command=("true",)),

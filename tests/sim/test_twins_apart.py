@@ -4,20 +4,15 @@ from __future__ import annotations
 
 from functools import partial
 
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of
 from zsched.core.status import build_snapshot
-from zsched.core.values.fleet import TaskSpec, WorkerSpec
+from zsched.core.values.fleet import WorkerSpec
 from zsched_lab.sim.parts import Machine
 from zsched_lab.sim.simulator import Simulator
 
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
 FLEET = fleet_of(
-    TaskSpec(
-        name="merge",
-        candidates=EDGES,
-        tuning=tuning_of(),
-        worker=WorkerSpec(command=("true",)),
-    ),
+    task_of(candidates=EDGES, worker=WorkerSpec(command=("true",))),
     of=sorted(EDGES + ROBOTS),
     electors=ROBOTS,
 )

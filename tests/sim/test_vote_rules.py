@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 
 from support.allocations import allocation_of
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of, tuning_of
 from support.proposals import proposal_of
 from support.robots import Decider
 from zsched.core import events as ev
 from zsched.core.gateway.gateway import Gateway
-from zsched.core.values.fleet import TaskSpec, WorkerSpec
+from zsched.core.values.fleet import WorkerSpec
 from zsched.core.values.model import PeerState, Proposal, Reach
 from zsched.core.vote.tally import VoteOutcome, tally
 from zsched_lab.sim.simulator import Simulator
@@ -56,8 +56,7 @@ def test_only_a_robot_that_voted_for_the_winner_commits_it(mine: str, commits: i
 def reaching_all(robots: int) -> Simulator:
     """Robots and three edges at rest; the task's owner must be reached by every robot."""
     voters, edges = tuple(f"robot{i}" for i in range(1, robots + 1)), ("edge1", "edge2", "edge3")
-    task = TaskSpec(
-        name="merge",
+    task = task_of(
         candidates=edges,
         tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0),
         patience=0.0,

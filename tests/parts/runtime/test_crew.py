@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of, tuning_of
 from support.waiting import until
 from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
 from zsched.core import events as ev
 from zsched.core.relay_protocol import WorkerMatched, WorkerSeen, WorkerTrouble
-from zsched.core.values.fleet import TaskSpec, WorkerSpec
+from zsched.core.values.fleet import WorkerSpec
 from zsched.core.values.model import MAX_REASON, WorkerState
 from zsched.core.values.plan import ReadyWhen
 from zsched.core.values.words import WAS_READY, told_of_worker
@@ -33,7 +33,7 @@ SPECS = {
     "token": WorkerSpec(command=SLEEPER, start_deadline_s=4.0, stop_grace_s=0.1),
 }
 FLEET = fleet_of(
-    *((TaskSpec(name=name, candidates=("edge1",), tuning=TUNING, worker=one) for name, one in SPECS.items())),
+    *((task_of(name, ("edge1",), tuning=TUNING, worker=one) for name, one in SPECS.items())),
     of=("edge1",),
     electors=("edge1",),
 )

@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from support.fleets import tuning_of
+from support.fleets import task_of, tuning_of
 from zsched.config.rulecheck import RuleConflict, rule_conflicts
 from zsched.core.route import keyexpr
 from zsched.core.route.route import named_rules, routes_for
@@ -23,9 +23,9 @@ def task(
     candidates: tuple[str, ...] = EDGES,
 ) -> TaskSpec:
     pairs = [(Direction.INPUT, pair) for pair in inputs] + [(Direction.OUTPUT, pair) for pair in outputs]
-    return TaskSpec(
-        name=name,
-        candidates=candidates,
+    return task_of(
+        name,
+        candidates,
         tuning=tuning_of(cpu=1.0, memory=0.0),
         rules=tuple(StreamRule(direction=way, from_template=one, to_template=two) for way, (one, two) in pairs),
     )

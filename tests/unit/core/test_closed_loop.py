@@ -16,7 +16,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from support.allocations import allocation_of
-from support.fleets import fleet_of
+from support.fleets import fleet_of, task_of
 from support.profiles import load_of
 from support.proposals import proposal_of
 from zsched.core.events import WorkerJobs
@@ -30,7 +30,6 @@ from zsched.core.values.fleet import (
     DEFAULT_COOL_DOWN_S,
     PAPER_PATIENCE,
     Demand,
-    TaskSpec,
     Timing,
     WorkerSpec,
 )
@@ -155,8 +154,7 @@ class Loop:
 
     def __post_init__(self) -> None:
         names = tuple(machine.name for machine in self.machines)
-        self.spec = TaskSpec(
-            name="merge",
+        self.spec = task_of(
             candidates=names,
             tuning=replace(self.tuning, weights=self.weights),
             demand=Demand(),

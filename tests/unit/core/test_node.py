@@ -12,7 +12,7 @@ import pytest
 from support.allocations import allocation_of
 from support.ballots import ballot_of
 from support.beats import beat_of
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of, tuning_of
 from support.profiles import SAMPLE, load_of, profile_of
 from support.proposals import proposal_of, vector_of
 from support.states import state_of
@@ -26,7 +26,7 @@ from zsched.core.status import build_snapshot
 from zsched.core.values.document import Text
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import CREATION_STEP
-from zsched.core.values.fleet import StreamRule, TaskSpec, WorkerSpec, electorate_hash
+from zsched.core.values.fleet import StreamRule, WorkerSpec, electorate_hash
 from zsched.core.values.messages import (
     Accept,
     CommandOutcome,
@@ -60,7 +60,7 @@ ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
 TUNING = tuning_of()
 RULE = StreamRule(direction=Direction.INPUT, from_template="{robot}/map", to_template="{target}/merge/{robot}/map")
 FLEET = fleet_of(
-    TaskSpec(name="merge", candidates=EDGES, tuning=TUNING, worker=WorkerSpec(command=("merge",)), rules=(RULE,)),
+    task_of(candidates=EDGES, worker=WorkerSpec(command=("merge",)), rules=(RULE,)),
     of=sorted((*ROBOTS, *EDGES)),
     electors=ROBOTS,
 )

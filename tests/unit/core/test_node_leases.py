@@ -9,12 +9,12 @@ import pytest
 
 from support.allocations import allocation_of
 from support.beats import beat_of
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of
 from support.states import state_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.node import Node
-from zsched.core.values.fleet import TaskSpec, WorkerSpec, lease_terms
+from zsched.core.values.fleet import WorkerSpec, lease_terms
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import (
     Allocation,
@@ -24,11 +24,8 @@ from zsched.core.values.model import (
 )
 
 ROBOTS = ("robot1", "robot2", "robot3")
-TUNING = tuning_of()
 WORKER = WorkerSpec(command=("true",))
-FLEET = fleet_of(
-    TaskSpec(name="guard", candidates=ROBOTS, tuning=TUNING, worker=WORKER, exclusive=True), of=ROBOTS, electors=ROBOTS
-)
+FLEET = fleet_of(task_of("guard", ROBOTS, worker=WORKER, exclusive=True), of=ROBOTS, electors=ROBOTS)
 
 
 def value(revision: int, owner: str = "robot1") -> Allocation:

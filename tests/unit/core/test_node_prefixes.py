@@ -14,14 +14,14 @@ import pytest
 
 from support.allocations import allocation_of
 from support.ballots import ballot_of
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of, tuning_of
 from support.states import state_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.executor.handover import Phase
 from zsched.core.node import Node
 from zsched.core.values.durable import DurableState
-from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec, electorate_hash
+from zsched.core.values.fleet import Fleet, WorkerSpec, electorate_hash
 from zsched.core.values.messages import Accept, Accepted, Learnt, Promise
 from zsched.core.values.model import NO_BALLOT, Acceptance, NodeId, RegisterState, TaskId
 from zsched.core.values.plan import WorkerRole
@@ -36,9 +36,9 @@ SLICES = range(4)
 
 def fleet(*, exclusive: bool = False) -> Fleet:
     tuning = tuning_of(cool_down_s=0.0)
-    task = TaskSpec(
-        name=TASK,
-        candidates=EDGES,
+    task = task_of(
+        TASK,
+        EDGES,
         tuning=tuning,
         patience=0.05,
         worker=WorkerSpec(command=("true",)),

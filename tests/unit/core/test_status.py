@@ -11,7 +11,7 @@ import pytest
 
 from support.allocations import allocation_of
 from support.beats import beat_of
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of, tuning_of
 from support.profiles import load_of, profile_of
 from support.proposals import proposal_of
 from support.states import state_of
@@ -23,7 +23,7 @@ from zsched.core.node import Node
 from zsched.core.report import snapshot_json
 from zsched.core.scheduler.patience import FIRST_PATIENCE
 from zsched.core.status import build_explanation, build_snapshot, status_line
-from zsched.core.values.fleet import TaskSpec, WorkerSpec, electorate_hash, lease_terms
+from zsched.core.values.fleet import WorkerSpec, electorate_hash, lease_terms
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import DeviceSample, Echo, Jobs, LinkSample, LinkSource, ScoreForm, WorkerState
 from zsched.core.values.plan import StreamCount
@@ -35,10 +35,7 @@ from zsched_lab.sim.simulator import Simulator
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
 TUNING = tuning_of()
 FLEET = fleet_of(
-    *(
-        TaskSpec(name=name, candidates=EDGES, tuning=TUNING, worker=WorkerSpec(command=("work",)))
-        for name in ("merge", "merge2")
-    ),
+    *(task_of(name, EDGES, worker=WorkerSpec(command=("work",))) for name in ("merge", "merge2")),
     of=sorted((*ROBOTS, *EDGES)),
     electors=ROBOTS,
 )

@@ -10,7 +10,7 @@ from typing import TypeVar
 import pytest
 
 from support.allocations import allocation_of
-from support.fleets import tuning_of
+from support.fleets import task_of
 from support.todos import done
 from zsched.core.executor.handover import LEAVES_S, MAX_OLD, ROLE_DRAIN_MARGIN_S, Executor, Phase
 from zsched.core.instructions import ApplyRoutes, Instruction, RecordStory, SetRole, StartWorker, StopWorker
@@ -19,11 +19,8 @@ from zsched.core.values.model import Allocation
 from zsched.core.values.plan import Direction, RoutePlan, WorkerRole
 
 T = TypeVar("T")
-TUNING = tuning_of()
-SPEC = TaskSpec(
-    name="merge",
+SPEC = task_of(
     candidates=("edge1", "edge2", "edge3"),
-    tuning=TUNING,
     drain_s=2.0,
     worker=WorkerSpec(command=("merge",), start_deadline_s=20.0),
     rules=(

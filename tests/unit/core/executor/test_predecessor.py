@@ -1,24 +1,16 @@
 """Who is asked for the state of an epoch: the owner of the one before, while it is there."""
 
 from support.allocations import allocation_of
-from support.fleets import tuning_of
+from support.fleets import task_of
 from support.todos import done
 from zsched.core.executor.handover import Executor
 from zsched.core.instructions import Instruction, SetRole
-from zsched.core.values.fleet import TaskSpec, WorkerSpec
+from zsched.core.values.fleet import WorkerSpec
 from zsched.core.values.plan import Role, WorkerRole
-
-TUNING = tuning_of()
 
 
 def edge(*, exclusive: bool = False) -> Executor:
-    spec = TaskSpec(
-        name="merge",
-        candidates=("edge1", "edge2"),
-        tuning=TUNING,
-        exclusive=exclusive,
-        worker=WorkerSpec(command=("merge",)),
-    )
+    spec = task_of(exclusive=exclusive, worker=WorkerSpec(command=("merge",)))
     return Executor(spec=spec, me="edge1", has_streams=False)
 
 

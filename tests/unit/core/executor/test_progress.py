@@ -9,7 +9,7 @@ import pytest
 
 from support.allocations import allocation_of
 from support.beats import beat_of
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of, tuning_of
 from support.profiles import profile_of
 from support.states import state_of
 from support.todos import todo_of
@@ -33,8 +33,7 @@ ROBOTS = ("robot1", "robot2")
 DEADLINE_S = 4.0
 INPUT = StreamRule(direction=Direction.INPUT, from_template="{robot}/in", to_template="{target}/merge/{robot}/in")
 OUTPUT = StreamRule(direction=Direction.OUTPUT, from_template="{target}/merge/out", to_template="{robot}/out")
-SPEC = TaskSpec(
-    name="merge",
+SPEC = task_of(
     candidates=("edge1",),
     tuning=tuning_of(cpu=1.0, memory=0.0),
     worker=WorkerSpec(command=("merge",), output_deadline_s=DEADLINE_S),

@@ -8,7 +8,7 @@ import pytest
 
 from support.allocations import allocation_of
 from support.beats import beat_of
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of, tuning_of
 from support.todos import done
 from zsched.core.executor.handover import Executor
 from zsched.core.executor.sealing import ASK_EVERY_S, Sealing
@@ -19,7 +19,7 @@ from zsched.core.values.model import Allocation, Beat
 
 NAMES = ("e1", "e2", "e3")
 TUNING = tuning_of(cpu=1.0, memory=0.0)
-OPEN = TaskSpec(name="guard", candidates=NAMES[:2], tuning=TUNING, worker=WorkerSpec(command=("true",)))
+OPEN = task_of("guard", NAMES[:2], tuning=TUNING, worker=WorkerSpec(command=("true",)))
 EXCLUSIVE = replace(OPEN, exclusive=True)
 YOUNG_S = 5.0
 

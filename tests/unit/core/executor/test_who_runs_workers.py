@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from support.fleets import tuning_of
+from support.fleets import task_of, tuning_of
 from support.todos import done
 from zsched.core.executor.handover import Executor
 from zsched.core.instructions import StartWorker
-from zsched.core.values.fleet import OnIsolation, TaskSpec, WorkerSpec
+from zsched.core.values.fleet import OnIsolation, WorkerSpec
 
 
 @pytest.mark.parametrize(
@@ -24,8 +24,7 @@ from zsched.core.values.fleet import OnIsolation, TaskSpec, WorkerSpec
 def test_candidates_and_robots_that_work_alone_start_a_warm_worker(
     me: str, is_robot: bool, isolation: OnIsolation, runs: bool
 ) -> None:
-    spec = TaskSpec(
-        name="merge",
+    spec = task_of(
         candidates=("edge1",),
         tuning=tuning_of(cpu=1.0, memory=0.0),
         worker=WorkerSpec(command=("work",)),

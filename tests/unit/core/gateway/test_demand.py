@@ -8,18 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from support.fleets import tuning_of
+from support.fleets import task_of
 from support.profiles import load_of, profile_of
 from zsched.core.gateway.demand import QUEUE_RATIO, SETTLE_S, SHORT_RATIO, STARVED_CPU_RATIO, UNSURE, Demands, is_short
-from zsched.core.values.fleet import Demand, TaskSpec
+from zsched.core.values.fleet import Demand
 from zsched.core.values.model import Jobs, Profile, WorkerLoad, WorkerState
 
-TASK = TaskSpec(
-    name="merge",
-    candidates=("edge1", "edge2"),
-    tuning=tuning_of(),
-    demand=Demand(cpu_cores=0.4, memory_mb=250.0),
-)
+TASK = task_of(demand=Demand(cpu_cores=0.4, memory_mb=250.0))
 EVERY_S = 2 * SETTLE_S
 
 

@@ -4,18 +4,13 @@ import math
 
 import pytest
 
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of
 from support.profiles import load_of, profile_of
 from zsched.core.gateway.gateway import EdgeData, Gateway
-from zsched.core.values.fleet import Demand, TaskSpec
+from zsched.core.values.fleet import Demand
 from zsched.core.values.model import Profile, WorkerState
 
-TASK = TaskSpec(
-    name="merge",
-    candidates=("edge1", "edge2"),
-    tuning=tuning_of(),
-    demand=Demand(cpu_cores=0.4, memory_mb=250.0),
-)
+TASK = task_of(demand=Demand(cpu_cores=0.4, memory_mb=250.0))
 FLEET = fleet_of(TASK, of=("edge1", "edge2", "robot1"), electors=("robot1",))
 TTL_S = FLEET.timing.profile_ttl_s
 

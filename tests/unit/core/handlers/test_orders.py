@@ -37,7 +37,6 @@ from zsched.core.values.snapshot import FlagStatus
 
 ADA = Asked(by="ada@robot1", reason="new battery")
 EDGES = ("edge1", "edge2", "edge3")
-TUNING = tuning_of()
 FLEET = fleet_of(task_of("merge", EDGES, worker=WorkerSpec(command=("merge",))), of=(*EDGES, "robot1"))
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of
 from zsched.config.timing import PROFILES
 from zsched.core.rehearsal.promises import promises
 from zsched.core.values.fleet import Fleet, Standby, StreamRule, TaskSpec, WorkerSpec
@@ -26,13 +26,7 @@ RULES = (
     rule(Direction.OUTPUT, StreamClass.RELIABLE, handover=HandoverRule.ALL),
     rule(Direction.OUTPUT, StreamClass.RELIABLE),
 )
-TASK = TaskSpec(
-    name="merge",
-    candidates=("edge1", "edge2"),
-    tuning=tuning_of(),
-    worker=WorkerSpec(command=("merge",), start_deadline_s=20.0),
-    rules=RULES,
-)
+TASK = task_of(worker=WorkerSpec(command=("merge",), start_deadline_s=20.0), rules=RULES)
 FLEET = fleet_of(TASK, of=("edge1", "edge2", "robot1", "robot2", "robot3"), electors=("robot1",))
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of
 from zsched.core.relay_protocol import WorkerWatch
 from zsched.core.route.route import plan_for, slot_for, watch_for
 from zsched.core.values.fleet import Fleet, Standby, StreamRule, TaskSpec, WorkerSpec
@@ -21,10 +21,7 @@ from zsched.core.values.plan import (
 )
 
 SETTINGS = StreamSettings(stream_class=StreamClass.RELIABLE, depth=7, handover=HandoverRule.ALL)
-SPEC = TaskSpec(
-    name="merge",
-    candidates=("edge1", "edge2"),
-    tuning=tuning_of(),
+SPEC = task_of(
     worker=WorkerSpec(ready_when=ReadyWhen.MATCHING),
     rules=(
         StreamRule(

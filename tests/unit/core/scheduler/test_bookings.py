@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from support.allocations import allocation_of
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of
 from support.profiles import load_of, profile_of
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.scoring import score
@@ -19,15 +19,8 @@ from zsched.core.values.model import (
     WorkerState,
 )
 
-TUNING = tuning_of()
 TASKS = tuple(
-    TaskSpec(
-        name=name,
-        candidates=("edge1",),
-        tuning=TUNING,
-        worker=WorkerSpec(command=("work",)),
-        demand=Demand(cpu_cores=0.5, memory_mb=200.0),
-    )
+    task_of(name, ("edge1",), worker=WorkerSpec(command=("work",)), demand=Demand(cpu_cores=0.5, memory_mb=200.0))
     for name in ("map", "plan", "watch")
 )
 MAP, PLAN, WATCH = TASKS

@@ -6,18 +6,14 @@ from dataclasses import replace
 import pytest
 
 from support.allocations import allocation_of
-from support.fleets import tuning_of
+from support.fleets import task_of, tuning_of
 from support.proposals import vector_of
 from zsched.core.scheduler.scoring import Standing, compare, pick, rounded
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.model import Aggregate, Reach, Utility, UtilityVector
 from zsched.core.values.quorum import majority
 
-SPEC = TaskSpec(
-    name="merge",
-    candidates=("edge1", "edge2", "edge3"),
-    tuning=tuning_of(cpu=1.0, memory=0.0),
-)
+SPEC = task_of(candidates=("edge1", "edge2", "edge3"), tuning=tuning_of(cpu=1.0, memory=0.0))
 GONE = -1.0
 """In `vote`: this robot does not reach the candidate."""
 

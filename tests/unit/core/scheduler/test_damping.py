@@ -8,19 +8,12 @@ from typing import Any
 import pytest
 
 from support.allocations import allocation_of
-from support.fleets import tuning_of
+from support.fleets import task_of, tuning_of
 from zsched.core.scheduler.damping import EARLY_FAILURE_S, MAX_PENALTY, STEP, WINDOW_S, Damping
 from zsched.core.scheduler.judge import Judge, Outcome
 from zsched.core.scheduler.scoring import Standing
-from zsched.core.values.fleet import TaskSpec
 
-SPEC = TaskSpec(
-    name="merge",
-    candidates=("edge1", "edge2"),
-    tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0),
-    patience=0.0,
-    max_moves_per_minute=2,
-)
+SPEC = task_of(tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0), patience=0.0, max_moves_per_minute=2)
 OWNED = allocation_of(tuning=SPEC.tuning)
 
 

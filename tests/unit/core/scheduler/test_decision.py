@@ -12,10 +12,10 @@ from random import Random
 
 import pytest
 
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of, tuning_of
 from zsched.core.scheduler.decision import decide_again, verdict_of
 from zsched.core.values.decision import Decision
-from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec
+from zsched.core.values.fleet import Fleet, WorkerSpec
 from zsched.core.values.model import NodeId, TaskId, WorkerState
 from zsched.errors import InvariantError
 from zsched.wire.codec import as_plain, from_plain
@@ -27,9 +27,9 @@ ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2", "edge3")
 
 def fleet(learns: bool = True, tasks: int = 1) -> Fleet:
     specs = [
-        TaskSpec(
-            name=f"task{number}",
-            candidates=EDGES,
+        task_of(
+            f"task{number}",
+            EDGES,
             tuning=tuning_of(cpu=0.6, memory=0.4, cool_down_s=1.0),
             patience=0.1,
             learns_patience=learns,

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from support.allocations import allocation_of
-from support.fleets import tuning_of
+from support.fleets import task_of, tuning_of
 from support.profiles import load_of, profile_of
 from support.proposals import vector_of
 from zsched.core.scheduler.damping import Damping
@@ -34,12 +34,8 @@ from zsched.core.values.model import (
 )
 
 TUNING = tuning_of(cpu=1.0, memory=0.0, bonus=0.10, cool_down_s=10.0)
-SPEC = TaskSpec(
-    name="merge",
-    candidates=("edge1", "edge2", "edge3"),
-    tuning=TUNING,
-    patience=0.1,
-    worker=WorkerSpec(command=("worker",)),
+SPEC = task_of(
+    candidates=("edge1", "edge2", "edge3"), tuning=TUNING, patience=0.1, worker=WorkerSpec(command=("worker",))
 )
 """A lead of 0.05 over the bonus, as in `BETTER`, uses the patience up in 2 s."""
 LONG = 1000.0
@@ -402,7 +398,7 @@ def reason(
 
 
 DEADLINE_S = SPEC.worker.start_deadline_s
-FOREIGN = TaskSpec(name="merge", candidates=SPEC.candidates, tuning=TUNING)
+FOREIGN = task_of(candidates=SPEC.candidates, tuning=TUNING)
 
 
 def test_a_healthy_owner_is_not_left_however_busy() -> None:
@@ -442,7 +438,7 @@ def test_a_draining_owner_or_one_whose_worker_failed_is_left() -> None:
 
 
 def test_an_owner_that_is_no_candidate_any_more_is_left() -> None:
-    fewer = TaskSpec(name="merge", candidates=("edge2", "edge3"), tuning=TUNING)
+    fewer = task_of(candidates=("edge2", "edge3"), tuning=TUNING)
 
     assert reason(profile(), spec=fewer) == "edge1 is no candidate any more"
 

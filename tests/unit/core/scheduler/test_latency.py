@@ -9,12 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from support.allocations import allocation_of
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of, tuning_of
 from support.profiles import load_of, profile_of
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.scoring import score
 from zsched.core.scheduler.utility import on_time, service_utility
-from zsched.core.values.fleet import Demand, TaskSpec, WorkerSpec
+from zsched.core.values.fleet import Demand, WorkerSpec
 from zsched.core.values.model import (
     Jobs,
     PeerState,
@@ -36,7 +36,7 @@ def worth(
     away_s: tuple[float | None, float | None] = (0.0, 0.0),
 ) -> tuple[float, float]:
     """What the owner edge1 and the candidate edge2 are worth, behind the owner's settling."""
-    spec = TaskSpec(name="merge", candidates=EDGES, tuning=tuning, worker=WorkerSpec(command=("x",)), demand=Demand())
+    spec = task_of(candidates=EDGES, tuning=tuning, worker=WorkerSpec(command=("x",)), demand=Demand())
     gateway = Gateway(fleet_of(spec, of=(*EDGES, "robot1")))
     for sequence, now in ((1, 0.0), (2, 10.0)):
         for name, speed, cores in zip(EDGES, speeds, used, strict=True):

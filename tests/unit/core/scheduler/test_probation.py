@@ -7,7 +7,7 @@ from random import Random
 
 import pytest
 
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of, tuning_of
 from zsched.core.handlers.beats import on_transition
 from zsched.core.membership.peers import Transition
 from zsched.core.node import Node
@@ -17,12 +17,7 @@ from zsched.core.values.fleet import Standby, TaskSpec, WorkerSpec
 from zsched.core.values.model import PeerState
 from zsched.core.values.plan import ReadyWhen
 
-TASK = TaskSpec(
-    name="merge",
-    candidates=("edge1", "edge2"),
-    tuning=tuning_of(cpu=1.0, memory=0.0),
-    worker=WorkerSpec(command=("true",)),
-)
+TASK = task_of(tuning=tuning_of(cpu=1.0, memory=0.0), worker=WorkerSpec(command=("true",)))
 FLEET = fleet_of(TASK, of=TASK.candidates, electors=("edge1",))
 GONE_AT, BACK_AT = 100.0, 105.0
 STOOD_S = FLEET.timing.zenoh_lease_s + LEASE_MARGIN_S

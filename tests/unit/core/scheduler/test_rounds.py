@@ -9,7 +9,7 @@ from typing import TypeVar
 import pytest
 
 from support.allocations import allocation_of
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of, tuning_of
 from support.profiles import load_of, profile_of
 from support.proposals import proposal_of, vector_of
 from support.robots import Decider
@@ -17,7 +17,7 @@ from zsched.core.gateway.gateway import Gateway
 from zsched.core.instructions import AskUtilities, Instruction, PublishProposal
 from zsched.core.scheduler.judge import Outcome
 from zsched.core.scheduler.rounds import TaskRound
-from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec
+from zsched.core.values.fleet import Fleet, WorkerSpec
 from zsched.core.values.messages import Utilities
 from zsched.core.values.model import (
     Allocation,
@@ -32,7 +32,7 @@ ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
 TUNING = tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0)
 PATIENCE = 1.0
 FLEET = fleet_of(
-    TaskSpec(name="merge", candidates=EDGES, tuning=TUNING, patience=PATIENCE, worker=WorkerSpec(command=("merge",))),
+    task_of(candidates=EDGES, tuning=TUNING, patience=PATIENCE, worker=WorkerSpec(command=("merge",))),
     of=sorted((*ROBOTS, *EDGES)),
     electors=ROBOTS,
 )

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from support.allocations import allocation_of
-from support.fleets import fleet_of
+from support.fleets import fleet_of, task_of
 from support.profiles import load_of, profile_of
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts, compare, score
@@ -30,11 +30,8 @@ from zsched.core.values.model import (
 CPU = Weights(cpu=1.0, memory=0.0, network=0.0)
 HALVES = Weights(cpu=0.5, memory=0.0, network=0.5)
 WIRED = (Link(source=LinkSource.WIRED),)
-SPEC = TaskSpec(
-    name="merge",
-    candidates=("edge1", "edge2", "edge3"),
-    tuning=Tuning(weights=CPU),
-    worker=WorkerSpec(command=("worker",)),
+SPEC = task_of(
+    candidates=("edge1", "edge2", "edge3"), tuning=Tuning(weights=CPU), worker=WorkerSpec(command=("worker",))
 )
 
 

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import pytest
 
 from support.allocations import allocation_of
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of
 from support.profiles import load_of, profile_of
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.scoring import book, score
 from zsched.core.scheduler.turns import in_turn, who_moves_first
-from zsched.core.values.fleet import Demand, TaskSpec
+from zsched.core.values.fleet import Demand
 from zsched.core.values.model import (
     Allocation,
     PeerState,
@@ -78,9 +78,8 @@ def test_a_move_keeps_its_turn_for_a_second_try_and_loses_it_then_or_when_it_has
 
 # --- bookings --------------------------------------------------------------------------------------------------------
 
-TUNING = tuning_of()
 DEMAND = Demand(cpu_cores=1.0, memory_mb=800.0)
-A, B = (TaskSpec(name=name, candidates=("edge1", "edge2"), tuning=TUNING, demand=DEMAND) for name in ("a", "b"))
+A, B = (task_of(name, demand=DEMAND) for name in ("a", "b"))
 FLEET = fleet_of(A, B, of=("edge1", "edge2"), electors=("robot1",))
 ALIVE = dict.fromkeys(("edge1", "edge2"), PeerState.ALIVE)
 

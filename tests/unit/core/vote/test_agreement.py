@@ -11,7 +11,7 @@ import pytest
 from support.allocations import allocation_of
 from support.ballots import ballot_of
 from support.beats import beat_of
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of
 from support.states import state_of
 from support.todos import agreed
 from zsched.core import events as ev
@@ -19,7 +19,6 @@ from zsched.core import instructions as do
 from zsched.core.electorate.founding import founded
 from zsched.core.todo import ToDo
 from zsched.core.values.change import MoveOwner
-from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.messages import (
     Accept,
     Accepted,
@@ -45,9 +44,8 @@ from zsched.core.vote.questions import ASK_AT_ONCE_S, ASK_LEARNT_EVERY_S, READ_E
 
 T = TypeVar("T")
 ROBOTS = ("robot1", "robot2", "robot3")
-TUNING = tuning_of()
 FLEET = fleet_of(
-    *(TaskSpec(name=name, candidates=("edge1", "robot2"), tuning=TUNING) for name in ("merge", "plan")),
+    *(task_of(name, ("edge1", "robot2")) for name in ("merge", "plan")),
     of=("edge1", *ROBOTS),
     electors=ROBOTS,
 )

@@ -9,16 +9,14 @@ import pytest
 
 from support.allocations import allocation_of
 from support.ballots import ballot_of
-from support.fleets import fleet_of, tuning_of
-from zsched.core.values.fleet import TaskSpec
+from support.fleets import fleet_of, task_of
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import Acceptance, Allocation, RegisterState
 from zsched.core.vote.belief import GENERATION_STEP, MAX_AHEAD, MAX_GENERATION, is_fit, is_proven
 from zsched.core.vote.register import MAX_REVISION
 from zsched.core.vote.task_register import TaskRegister
 
-TUNING = tuning_of()
-TASK = TaskSpec(name="merge", candidates=("edge1", "robot2"), tuning=TUNING)
+TASK = task_of(candidates=("edge1", "robot2"))
 NAMES = ("edge1", "robot1", "robot2")
 FLEET = fleet_of(TASK, of=NAMES, electors=("robot1", "robot2"))
 STRAY = MAX_AHEAD * 3

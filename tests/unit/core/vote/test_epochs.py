@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from support.fleets import fleet_of
+from support.fleets import fleet_of, task_of
 from support.proposals import proposal_of
 from support.registers import (
     BLANK,
@@ -22,7 +22,6 @@ from support.registers import (
     promise_all,
 )
 from zsched.core.values.change import Change, MoveOwner, Retune, RoundOutcome
-from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.model import PeerState
 from zsched.core.vote.tally import VoteOutcome
 from zsched.core.vote.task_register import TaskRegister
@@ -32,7 +31,7 @@ TODAY = allocation(3)
 STAY = MoveOwner(base_revision=3, owner="e1", reason="test")
 SAME = Retune(base_revision=3, tuning=TUNING)
 ROBOTS = ("r1", "r2", "r3")
-FLEET = fleet_of(TaskSpec(name="merge", candidates=("e1", "e2"), tuning=TUNING), of=ROBOTS, electors=ROBOTS)
+FLEET = fleet_of(task_of(candidates=("e1", "e2"), tuning=TUNING), of=ROBOTS, electors=ROBOTS)
 
 
 def agreed_on_today() -> list[TaskRegister]:

@@ -5,16 +5,14 @@ from __future__ import annotations
 import pytest
 
 from support.allocations import allocation_of
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of, tuning_of
 from zsched.core.scheduler.judge import INITIAL_SETTLE_S, Judge, Outcome
 from zsched.core.scheduler.scoring import Standing
-from zsched.core.values.fleet import TaskSpec, WorkerSpec
+from zsched.core.values.fleet import WorkerSpec
 from zsched_lab.sim.simulator import Simulator
 
 TUNING = tuning_of(cpu=1.0, memory=0.0)
-SPEC = TaskSpec(
-    name="merge", candidates=("edge1", "edge2", "edge3"), tuning=TUNING, worker=WorkerSpec(command=("worker",))
-)
+SPEC = task_of(candidates=("edge1", "edge2", "edge3"), tuning=TUNING, worker=WorkerSpec(command=("worker",)))
 NOBODY = allocation_of(0, None, tuning=TUNING)
 SOME = Standing(aggregates={"edge1": 0.5, "edge2": 0.6}, vetoed={}, vectors=(), voters_heard=3)
 

@@ -6,16 +6,14 @@ import pytest
 
 from support.allocations import allocation_of
 from support.ballots import ballot_of
-from support.fleets import fleet_of, tuning_of
-from zsched.core.values.fleet import TaskSpec
+from support.fleets import fleet_of, task_of
 from zsched.core.values.model import NO_BALLOT, Acceptance, Allocation, RegisterState
 from zsched.core.vote.belief import GENERATION_STEP
 from zsched.core.vote.generations import first_registers
 
-TUNING = tuning_of()
 FLEET = fleet_of(
-    TaskSpec(name="guard", candidates=("robot1",), tuning=TUNING, exclusive=True),
-    TaskSpec(name="merge", candidates=("robot1",), tuning=TUNING),
+    task_of("guard", ("robot1",), exclusive=True),
+    task_of(candidates=("robot1",)),
     of=("robot1",),
     electors=("robot1",),
 )

@@ -11,7 +11,7 @@ import pytest
 from support.allocations import allocation_of
 from support.ballots import ballot_of
 from support.beats import beat_of
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of
 from support.states import state_of
 from support.todos import agreed
 from zsched.core import events as ev
@@ -20,7 +20,6 @@ from zsched.core.electorate.changes import AddElector, AdoptDocument
 from zsched.core.electorate.founding import founded
 from zsched.core.todo import ToDo
 from zsched.core.values.electorate import Elector, FleetValue
-from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.messages import (
     MOST_BALLOTS,
     Accept,
@@ -43,7 +42,7 @@ from zsched.core.vote.questions import ASK_LEARNT_EVERY_S, VOTES_WAIT_S
 ROBOTS = ("robot1", "robot2", "robot3")
 TASKS = ("guard", "merge", "plan")
 FLEET = fleet_of(
-    *(TaskSpec(name=name, candidates=ROBOTS, tuning=tuning_of(), exclusive=name == "guard") for name in TASKS),
+    *(task_of(name, ROBOTS, exclusive=name == "guard") for name in TASKS),
     of=ROBOTS,
     electors=ROBOTS,
 )

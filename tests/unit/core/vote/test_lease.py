@@ -9,14 +9,14 @@ import pytest
 
 from support.allocations import allocation_of
 from support.beats import beat_of
-from support.fleets import fleet_of, tuning_of
-from zsched.core.values.fleet import Fleet, TaskSpec, lease_terms
+from support.fleets import fleet_of, task_of, tuning_of
+from zsched.core.values.fleet import Fleet, lease_terms
 from zsched.core.values.model import Allocation, Beat, Grant
 from zsched.core.vote.lease import HURRY_S, RHO, Granter, Leases, hold_s
 
 NAMES = ("r1", "r2", "r3")
 TUNING = tuning_of(cpu=1.0, memory=0.0)
-GUARD = TaskSpec(name="guard", candidates=NAMES, tuning=TUNING, exclusive=True)
+GUARD = task_of("guard", NAMES, tuning=TUNING, exclusive=True)
 FLEET = fleet_of(GUARD, of=NAMES, electors=NAMES)
 OPEN = replace(FLEET, tasks=(replace(GUARD, exclusive=False),))
 L, HOLD_S = FLEET.timing.lease_s, hold_s(FLEET.timing.lease_s)

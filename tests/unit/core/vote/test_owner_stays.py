@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 from support.allocations import allocation_of
-from support.fleets import tuning_of
+from support.fleets import task_of, tuning_of
 from support.todos import done
 from zsched.core.executor.handover import Executor
 from zsched.core.instructions import ApplyRoutes, SetRole, StartWorker
-from zsched.core.values.fleet import OnIsolation, TaskSpec, WorkerSpec
+from zsched.core.values.fleet import OnIsolation, WorkerSpec
 from zsched.core.values.plan import Role, WorkerRole
 
 TUNING = tuning_of(cpu=1.0, memory=0.0)
-SPEC = TaskSpec(name="guard", candidates=("edge1", "edge2"), tuning=TUNING, worker=WorkerSpec(command=("work",)))
+SPEC = task_of("guard", tuning=TUNING, worker=WorkerSpec(command=("work",)))
 FIRST = allocation_of(task="guard", tuning=TUNING)
 
 

@@ -9,7 +9,7 @@ import pytest
 from support.allocations import allocation_of
 from support.ballots import ballot_of
 from support.beats import beat_of
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of
 from support.states import state_of
 from support.todos import agreed
 from zsched.core import events as ev
@@ -18,7 +18,6 @@ from zsched.core.node import Node
 from zsched.core.todo import ToDo
 from zsched.core.values.change import MoveOwner
 from zsched.core.values.durable import DurableState
-from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.messages import Accept, Accepted, Learnt, Refusal, Refused
 from zsched.core.values.model import Acceptance, Allocation, RegisterState
 from zsched.core.vote.acceptor import PARK_SHARE
@@ -26,8 +25,7 @@ from zsched.core.vote.agreement import Agreement
 from zsched.core.vote.lease import hold_s
 
 ROBOTS = ("robot1", "robot2", "robot3")
-TUNING = tuning_of()
-FLEET = fleet_of(TaskSpec(name="guard", candidates=ROBOTS, tuning=TUNING, exclusive=True), of=ROBOTS, electors=ROBOTS)
+FLEET = fleet_of(task_of("guard", ROBOTS, exclusive=True), of=ROBOTS, electors=ROBOTS)
 HOLD_S = hold_s(FLEET.timing.lease_s)
 PARKED_S = PARK_SHARE * FLEET.timing.ballot_s
 

@@ -7,9 +7,8 @@ import math
 import pytest
 
 from support.allocations import allocation_of
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of, tuning_of
 from support.proposals import proposal_of
-from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.model import PeerState, Proposal
 from zsched.core.vote.tally import VoteOutcome
 from zsched.core.vote.voting import Voting, vote_time
@@ -17,7 +16,7 @@ from zsched.core.vote.voting import Voting, vote_time
 ROBOTS = ("robot1", "robot2", "robot3")
 ALL = dict.fromkeys(ROBOTS, PeerState.ALIVE)
 TUNING = tuning_of(cpu=1.0, memory=0.0)
-FLEET = fleet_of(TaskSpec(name="merge", candidates=("edge1", "edge2"), tuning=TUNING), of=ROBOTS, electors=ROBOTS)
+FLEET = fleet_of(task_of(tuning=TUNING), of=ROBOTS, electors=ROBOTS)
 VALUE = allocation_of(5, tuning=TUNING)
 VOTE_S = vote_time(FLEET.timing)
 

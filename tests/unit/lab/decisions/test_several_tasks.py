@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import pytest
 
-from support.fleets import fleet_of
-from zsched.core.values.fleet import Demand, Fleet, TaskSpec, WorkerSpec
+from support.fleets import fleet_of, task_of
+from zsched.core.values.fleet import Demand, Fleet, WorkerSpec
 from zsched.core.values.model import NodeId, Tuning
 from zsched_lab.decisions.world import EVEN
 from zsched_lab.sim.simulator import CORES, MEMORY_MB, Simulator
@@ -21,9 +21,9 @@ Load = Callable[[NodeId, float], tuple[float, float]]
 def fleet(tasks: int, edges: int) -> Fleet:
     names = tuple(f"edge{index}" for index in range(1, edges + 1))
     specs = tuple(
-        TaskSpec(
-            name=f"task{index}",
-            candidates=names,
+        task_of(
+            f"task{index}",
+            names,
             tuning=Tuning(weights=EVEN, cool_down_s=5.0),
             demand=Demand(cpu_cores=0.25 * CORES, memory_mb=0.25 * MEMORY_MB),
             worker=WorkerSpec(command=("work",)),

@@ -6,17 +6,16 @@ from pathlib import Path
 import pytest
 
 from support.allocations import allocation_of
-from support.fleets import tuning_of
+from support.fleets import task_of, tuning_of
 from zsched.core.scheduler import rounds
 from zsched.core.scheduler.damping import Damping
 from zsched.core.scheduler.judge import Judge, Judgement, Outcome
 from zsched.core.scheduler.scoring import Standing
-from zsched.core.values.fleet import TaskSpec
 from zsched_lab.paper.ruled_daemon import install
 from zsched_lab.paper.rules import EVERY_S, RANDOM_PERIOD_S, JudgeMaker, Rule, RuleName, RulePlan, read_plan
 
 TUNING = tuning_of(bonus=0.0, cool_down_s=0.0)
-SPEC = TaskSpec(name="merge", candidates=("e1", "e2", "e3"), tuning=TUNING, patience=0.0)
+SPEC = task_of(candidates=("e1", "e2", "e3"), tuning=TUNING, patience=0.0)
 OWNED = allocation_of(owner="e1", tuning=TUNING)
 VALUES = {"e1": 0.50, "e2": 0.52, "e3": 0.30}
 

@@ -9,27 +9,20 @@ import pytest
 
 from support.allocations import allocation_of
 from support.beats import beat_of
-from support.fleets import fleet_of, tuning_of
+from support.fleets import fleet_of, task_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.membership.pace import FULL_S
-from zsched.core.values.fleet import StreamRule, TaskSpec, WorkerSpec
+from zsched.core.values.fleet import StreamRule, WorkerSpec
 from zsched.core.values.messages import Accepted, Promise
 from zsched.core.values.model import Acceptance, Allocation, Ballot, NodeId, PeerState
 from zsched.core.values.plan import Direction, Role, StreamCount, WorkerRole
 from zsched.errors import InvariantError
 from zsched_lab.sim.simulator import RESTART_S, TOKEN_DELAY_S, Simulator
 
-TUNING = tuning_of()
 RULE = StreamRule(direction=Direction.INPUT, from_template="{robot}/map", to_template="{target}/merge/{robot}/map")
 FLEET = fleet_of(
-    TaskSpec(
-        name="merge",
-        candidates=("edge1", "edge2"),
-        tuning=TUNING,
-        worker=WorkerSpec(command=("true",)),
-        rules=(RULE,),
-    ),
+    task_of(worker=WorkerSpec(command=("true",)), rules=(RULE,)),
     of=("edge1", "edge2", "robot1", "robot2", "robot3"),
     electors=("robot1", "robot2", "robot3"),
 )
