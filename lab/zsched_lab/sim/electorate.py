@@ -10,11 +10,8 @@ task's owner can be moved.
 
 from __future__ import annotations
 
-import argparse
 import sys
-import time
 from collections import Counter
-from dataclasses import dataclass, field
 from random import Random
 from typing import Final
 
@@ -24,19 +21,12 @@ from zsched.core.values.electorate import FleetValue
 from zsched.core.values.quorum import majority
 from zsched_lab.sim.chosen import ChosenError
 from zsched_lab.sim.electors import Machine, Machines
+from zsched_lab.sim.seeds import Played, play_seeds
 
 NAMES: Final = tuple("abcdefgh")
 TASKS: Final = ("t1", "t2", "t3", "t4")
 CALM_S: Final = 12.0
 LOOKS: Final = 4
-
-
-@dataclass(slots=True)
-class Played:
-    """What came of one schedule."""
-
-    violation: str = ""
-    counts: Counter[str] = field(default_factory=Counter)
 
 
 class Swarm:
@@ -261,21 +251,7 @@ def play(seed: int) -> Played:
 
 def main(arguments: list[str] | None = None) -> int:
     """The command."""
-    parser = argparse.ArgumentParser(prog="python -m zsched_lab.sim.electorate", description=__doc__.partition("\n")[0])
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--runs", type=int, default=1000)
-    options = parser.parse_args(arguments)
-    total: Counter[str] = Counter()
-    found, began = 0, time.process_time()
-    for seed in range(options.seed, options.seed + options.runs):
-        played = play(seed)
-        total += played.counts
-        if played.violation:
-            found += 1
-            print(f"seed {seed}: {played.violation}")
-    print(", ".join(f"{name} {count}" for name, count in sorted(total.items())))
-    print(f"{options.runs} schedules in {time.process_time() - began:.0f} s, {found} violations")
-    return 1 if found else 0
+    return play_seeds("zsched_lab.sim.electorate", __doc__, play, arguments, runs=1000)
 
 
 if __name__ == "__main__":

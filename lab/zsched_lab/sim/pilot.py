@@ -10,12 +10,9 @@ electors as it can, all of them alive, and move its tasks.
 
 from __future__ import annotations
 
-import argparse
 import sys
-import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from random import Random
 from typing import Final
 
@@ -27,6 +24,7 @@ from zsched.core.values.quorum import majority
 from zsched_lab.sim.chosen import ChosenError
 from zsched_lab.sim.electors import Machine
 from zsched_lab.sim.piloted import SILENCE_S, Piloted
+from zsched_lab.sim.seeds import Played, play_seeds
 
 ROBOTS: Final = ("r1", "r2", "r3", "r4")
 EDGES: Final = ("e1", "e2", "e3", "e4")
@@ -34,14 +32,6 @@ FAULTS_S: Final = (10.0, 20.0, 40.0)
 CALM_S: Final = 40.0
 LOOK_S: Final = 0.5
 TRIES: Final = 12
-
-
-@dataclass(slots=True)
-class Played:
-    """What came of one schedule."""
-
-    violation: str = ""
-    counts: Counter[str] = field(default_factory=Counter)
 
 
 class Schedule:
@@ -252,21 +242,7 @@ def play(seed: int) -> Played:
 
 def main(arguments: list[str] | None = None) -> int:
     """The command."""
-    parser = argparse.ArgumentParser(prog="python -m zsched_lab.sim.pilot", description=__doc__.partition("\n")[0])
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--runs", type=int, default=200)
-    options = parser.parse_args(arguments)
-    total: Counter[str] = Counter()
-    found, began = 0, time.process_time()
-    for seed in range(options.seed, options.seed + options.runs):
-        played = play(seed)
-        total += played.counts
-        if played.violation:
-            found += 1
-            print(f"seed {seed}: {played.violation}", flush=True)
-    print(", ".join(f"{name} {count}" for name, count in sorted(total.items())))
-    print(f"{options.runs} schedules in {time.process_time() - began:.0f} s, {found} violations")
-    return 1 if found else 0
+    return play_seeds("zsched_lab.sim.pilot", __doc__, play, arguments, runs=200)
 
 
 if __name__ == "__main__":
