@@ -266,7 +266,7 @@ def test_every_node_writes_down_who_has_ordered_what_it_learns() -> None:
     lone.tell(ev.HoldCommanded(request=42, command=HoldTask(task="merge", hold=Hold.PAUSE, asked=ADA)))
     assert [one.by for one in lone.done if isinstance(one, do.RecordStory) and one.by] == ["ada@robot1"]
     lone.done.clear()
-    tuned = TuneTask(task="merge", tuning=replace(TUNING, bonus=0.4), base_revision=6, asked=ADA)
+    tuned = TuneTask(task="merge", tuning=tuning_of(bonus=0.4), base_revision=6, asked=ADA)
     lone.tell(ev.TuneCommanded(request=42, command=tuned))
     (story,) = [one for one in lone.done if isinstance(one, do.RecordStory) and one.by]
     assert story.text.endswith("retuned by ada@robot1 (new battery)")
