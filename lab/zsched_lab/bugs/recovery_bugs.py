@@ -45,7 +45,13 @@ RECOVERY_BUGS: tuple[Bug, ...] = (
     _bug(
         "a majority that can agree is recovered",
         RECOVERY,
-        ("    if len(able) >= needed:\n", "    if len(able) > len(names):\n"),
+        ("    if any(len(names) < majority(count) for names, count in able):\n", "    if able:\n"),
+        test=f"{_UNIT}test_recovery.py",
+    ),
+    _bug(
+        "electors that were only accepted are a majority that can agree",
+        RECOVERY,
+        ("for value in (learnt, before)]", "for value in (before,)]"),
         test=f"{_UNIT}test_recovery.py",
     ),
     _bug(

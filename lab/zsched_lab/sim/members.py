@@ -263,8 +263,10 @@ class Members:
         for node in fleet.nodes:
             if node.name not in self.sim.machines and node.name not in self.dead:
                 self._bring(node.name, fleet)
+        named = {node.name for node in fleet.nodes}
+        self._invited = [one for one in self._invited if one not in named or one not in self.sim.machines]
         for name in self._invited:
-            if self._is_due(name) and all(node.name != name for node in fleet.nodes):
+            if self._is_due(name) and name not in named:
                 self._add(name, value, fleet, flags)
         for name in (*self._leaving, *sorted(self.dead)):
             if name in self.sim.machines and self._is_due(name):

@@ -50,7 +50,15 @@ class Recoveries(Members):
         others = [name for name in self.names() if name != survivor]
         self._check_strangers([survivor], [name for name in others if self._generation(name) != self.generation_id])
         self._bring_over(others)
+        self._invite_again()
         return True
+
+    def _invite_again(self) -> None:
+        """What the survivor did not know is lost: also that a machine was written into the document."""
+        held = self.said()
+        named = set() if held is None else {node.name for node in held[1].nodes}
+        gone = (*named, *self._invited, *self._leaving)
+        self._invited += [] if held is None else [one for one in self.names() if one not in gone]
 
     def _generation(self, name: NodeId) -> str:
         state = self.sim.disk(name)

@@ -142,9 +142,11 @@ def consider(found: Found) -> Recovery | str:
         return mixed
     held = [state.fleet_register for state in found.states if state.fleet_register is not None]
     first = found.states[0]
-    before = newest_fleet(held) or founded(first.fleet, first.generation, found.fleet.electors)
+    first_value = founded(first.fleet, first.generation, found.fleet.electors)
+    before = newest_fleet(held) or first_value
+    learnt = newest_fleet(replace(one, accepted=None) for one in held) or first_value
     ours = [answer for answer in found.answers if _is_of(answer, before, first.generation)]
-    against = _why_not(found, before, ours)
+    against = _why_not(found, learnt, before, ours)
     if against:
         return against
     agreed, by_file = _agreed(found, before)
@@ -178,8 +180,11 @@ def _is_of(answer: Snapshot, before: FleetValue, generation: int) -> bool:
     return told == before.generation_id if told else answer.quorum.generation == generation
 
 
-def _why_not(found: Found, before: FleetValue, ours: Sequence[Snapshot]) -> str:
-    """Why the fleet needs no recovery, or not this one; empty: it may need it."""
+def _why_not(found: Found, learnt: FleetValue, before: FleetValue, ours: Sequence[Snapshot]) -> str:
+    """Why the fleet needs no recovery, or not this one; empty: it may need it.
+
+    A change that was only accepted (``before``) takes a majority of the electors from which it was asked (``learnt``).
+    """
     newer = [answer for answer in ours if answer.fleet_revision > before.revision]
     if newer:
         told = max(newer, key=lambda answer: answer.fleet_revision)
@@ -187,19 +192,24 @@ def _why_not(found: Found, before: FleetValue, ours: Sequence[Snapshot]) -> str:
             f"{told.node} knows revision {told.fleet_revision} of the fleet, and the states given here only "
             f"{before.revision}: start zsched here, it learns that; or recover on {told.node}"
         )
-    names = before.electorate.names
+    able = [(_able(found, value, ours), len(value.electors)) for value in (learnt, before)]
+    if any(len(names) < majority(count) for names, count in able):
+        return ""
+    names, count = able[-1]
+    return (
+        f"{', '.join(names)} can agree, {majority(count)} of {count} electors are needed: nothing is lost; "
+        "start zsched here, and see `zsched status`"
+    )
+
+
+def _able(found: Found, value: FleetValue, ours: Sequence[Snapshot]) -> list[NodeId]:
+    """The electors of a value that can answer, sorted."""
+    names, own = value.electorate.names, found.own
     able = {answer.node for answer in ours if answer.node in names and answer.quorum.this_node == "elector"}
-    seat = before.electorate.seat(found.me)
-    own = found.own
+    seat = value.electorate.seat(found.me)
     if seat is not None and own is not None and not own.lost and seat.is_held_by(found.me, own.disk):
         able.add(found.me)
-    needed = majority(len(names))
-    if len(able) >= needed:
-        return (
-            f"{', '.join(sorted(able))} can agree, {needed} of {len(names)} electors are needed: nothing is lost; "
-            "start zsched here, and see `zsched status`"
-        )
-    return ""
+    return sorted(able)
 
 
 def _agreed(found: Found, before: FleetValue) -> tuple[Agreed | str | None, tuple[tuple[Danger, str], ...]]:

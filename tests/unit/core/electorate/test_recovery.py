@@ -25,7 +25,7 @@ from zsched.core.electorate.recovery import (
     sides_of,
 )
 from zsched.core.values.durable import DurableState
-from zsched.core.values.electorate import CREATION_STEP, FleetValue
+from zsched.core.values.electorate import CREATION_STEP, Elector, FleetValue
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import Acceptance, Allocation, Ballot, RegisterState
 from zsched.core.values.snapshot import SCHEMA, QuorumStatus, Snapshot
@@ -153,6 +153,22 @@ def test_what_speaks_against_it_is_said(it: Found, why: str) -> None:
 @pytest.mark.parametrize("role", ["lost_state", "no_elector"])
 def test_an_elector_that_cannot_answer_proposers_is_none(role: str) -> None:
     planned(found(own=state_of("robot1"), answers=(answer_of("robot2", role=role),)))
+
+
+def test_a_change_of_electors_that_was_only_accepted_is_none_yet() -> None:
+    """robot3 is lost for good, and its removal was accepted by both others of four, which are no majority.
+
+    By the three that would be left nothing was lost: nobody could agree any more, and `recover` said "start zsched".
+    """
+    four = replace(ADOPTED, electors=(Elector(name="edge1", disk="d1", joining=2), *FIRST.electors))
+    three = RemoveElector(base_revision=four.revision, name="robot3").apply(four)
+    own = replace(
+        state_of("robot1", four),
+        fleet_register=RegisterState(task=FLEET.name, learnt=four, accepted=Acceptance(ballot=BALLOT, value=three)),
+    )
+    it = found(own=own, answers=(answer_of("robot2", four), answer_of("edge1", four, role="follower")))
+    assert planned(it).before == three, "it may have been chosen all the same"
+    assert "can agree" in str(consider(found(own=own, answers=(answer_of("robot2", four), answer_of("edge1", four)))))
 
 
 def test_a_state_that_is_lost_is_no_elector() -> None:
