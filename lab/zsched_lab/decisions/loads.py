@@ -48,6 +48,35 @@ class Scatter:
     uniform: float | None = None
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Spikes:
+    """Spikes of CPU readings on a machine of which a share up to ``below`` is in use."""
+
+    below: float
+    every_s: float
+    height: tuple[float, ...]
+    """Quantiles at even distances, as shares of the machine; between them as likely everywhere."""
+    length_s: tuple[float, ...]
+
+    def drawn(self, steps: int, dt_s: float, rng: np.random.Generator) -> Array:
+        """What they add to each of ``steps`` readings."""
+        out = np.zeros(steps)
+        for begin in np.flatnonzero(rng.random(steps) < dt_s / self.every_s).tolist():
+            height, length_s = (
+                float(np.interp(rng.random(), np.linspace(0.0, 1.0, len(one)), one))
+                for one in (self.height, self.length_s)
+            )
+            out[begin : begin + max(1, round(length_s / dt_s))] = height
+        return out
+
+
+SPIKES = (
+    Spikes(below=0.25, every_s=18.4, height=(0.26, 0.29, 0.32, 0.37, 0.54), length_s=(0.2, 0.2, 0.2, 0.2, 0.6)),
+    Spikes(below=0.75, every_s=3.6, height=(0.25, 0.27, 0.32, 0.36, 0.47), length_s=(0.2, 0.2, 0.2, 0.6, 1.6)),
+)
+"""As `zsched_lab.decisions.spikes` measured them on the demo's edges; it found none on a machine that is fuller."""
+
+
 def loads(steps: int, dt_s: float, plan: LoadPlan, rng: np.random.Generator) -> tuple[Array, Array]:
     """One machine's true use of CPU and memory by others than the task, as shares of the machine, [steps] each."""
     cpu = np.full(steps, rng.uniform(*plan.idle_cpu))
