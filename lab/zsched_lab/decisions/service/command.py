@@ -54,6 +54,10 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--tasks", type=_numbers, default=(1.0, 3.0), help="numbers of tasks (default 1,3)")
     when = "when the tasks' jobs come; each has results of its own (default steady)"
     parser.add_argument("--activity", type=Activity, choices=list(Activity), default=Activity.STEADY, help=when)
+    same = "machines are equal and nobody loads them; has results of its own"
+    parser.add_argument("--equal", action="store_true", help=same)
+    spiky = "readings have the spikes that were measured on the demo's edges; has results of its own"
+    parser.add_argument("--spikes", action="store_true", help=spiky)
     parser.add_argument("--prices", type=_numbers, default=study.PRICES_S, help="of a move, s (default 0.05,0.3,1)")
     also = "one more rule: zsched's under other settings (of Tuning, of TaskSpec, smoothing_s)"
     parser.add_argument("--rule", type=_described, action="append", default=[], metavar="NAME:KEY=VALUE,...", help=also)
@@ -63,6 +67,8 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     given = parser.parse_args(argv)
     if wrong := [count for count in given.tasks if count not in SIZES]:
         parser.error(f"no histories of {wrong[0]:g} tasks; there are {', '.join(map(str, SIZES))}")
+    if given.equal:
+        given.loads, given.prices = (0.0,), given.prices[:1]
     return given
 
 
@@ -72,7 +78,8 @@ def play(given: argparse.Namespace, results: Path) -> None:
         sys.exit(f"{results} is there already: give --resume to go on from it, or another --out")
     known = before.read(results)
     only = set(filter(None, given.only.split(";")))
-    rules = (*study.YARDSTICKS, *(one.name for one in cast.players()), *given.rule)
+    yardsticks = () if given.equal else study.YARDSTICKS
+    rules = (*yardsticks, *(one.name for one in cast.players()), *given.rule)
     rules = tuple(rule for rule in rules if not only or rule.partition(":")[0] in only)
     made_as = {str(row["rule"]): str(row["as"]) for row in known}
     for rule in rules:
@@ -82,7 +89,18 @@ def play(given: argparse.Namespace, results: Path) -> None:
     if any(row["asked_hours"] != given.hours for row in known):
         sys.exit(f"{results} holds histories of another length: give the same --hours, or another --out")
     tasks = [int(count) for count in given.tasks]
-    made = study.cases(given.seeds, given.hours, given.loads, tasks, given.prices, rules, known, given.activity)
+    made = study.cases(
+        given.seeds,
+        given.hours,
+        given.loads,
+        tasks,
+        given.prices,
+        rules,
+        known,
+        given.activity,
+        is_equal=given.equal,
+        has_spikes=given.spikes,
+    )
     began_at = time.monotonic()
     for index, (case, rows) in enumerate(study.play_all(made, given.jobs), 1):
         with results.open("a", encoding="utf-8") as file:
@@ -101,14 +119,17 @@ def main(argv: Sequence[str]) -> None:
     given.out.mkdir(parents=True, exist_ok=True)
     kind = "train" if given.seeds[0] in study.TRAIN else "test"
     name = f"service-{kind}" if given.activity is Activity.STEADY else f"service-{kind}-{given.activity}"
+    name += "-equal" * given.equal + "-spikes" * given.spikes
     results = given.out / f"{name}.ndjson"
     if given.hours > 0:
         play(given, results)
     rows = before.read(results)
     if not rows:
         sys.exit(f"{results} holds no results")
-    text = f"# Judged by service, {kind}ing seeds, {given.activity} tasks\n\n{tables.report(rows)}"
+    shown = tables.equal(rows) if given.equal else tables.report(rows)
+    text = f"# Judged by service, {kind}ing seeds, {given.activity} tasks{', spikes' * given.spikes}\n\n{shown}"
     print(text)
     (given.out / f"{name}.md").write_text(text, encoding="utf-8")
-    picture.draw(rows, given.out / f"{name}.png")
-    print(f"written: {name}.md and {name}.png in {given.out}")
+    if not given.equal:
+        picture.draw(rows, given.out / f"{name}.png")
+    print(f"written: {name}.* in {given.out}")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final
@@ -17,7 +18,7 @@ import numpy.typing as npt
 
 from zsched.core.values.fleet import Demand, Fleet, TaskSpec, Timing
 from zsched.core.values.model import Tuning
-from zsched_lab.decisions.loads import LONG, Array, Scatter, correlated
+from zsched_lab.decisions.loads import LONG, Array, Scatter, Spikes, correlated
 from zsched_lab.decisions.service.machines import Machine, Shared, Work, alone_s, share
 from zsched_lab.decisions.world import DT_S, EVEN, MEMORY_MB, build_fleet
 
@@ -41,7 +42,7 @@ IDLE_SHARE: Final = 0.02
 BURSTS_S: Final = ((5.0, 60.0), (5.0, 60.0))
 """How long a bursty task has all of its jobs, and then none; drawn so that halves and doubles are as likely."""
 MEASURED: Final = Scatter(spike_hz=0.0)
-"""As `zsched_lab.decisions.scatter` measured it; nobody has recorded spikes of readings."""
+"""As `zsched_lab.decisions.scatter` measured it; spikes are apart (`zsched_lab.decisions.loads.SPIKES`)."""
 Placement = tuple[int, ...]
 """The machine of every task."""
 
@@ -83,6 +84,8 @@ class History:
     memory_error: Array
     running_error: Array
     """[T, C]: what a count of the threads that want to run adds to the cores that are wanted."""
+    spikes: tuple[tuple[float, Array], ...]
+    """By use: up to which share of the machine, and [T, C]: what spikes add to a reading, as shares of it."""
     size: float
     """The largest task, as a share of the median machine."""
 
@@ -140,6 +143,8 @@ def build(
     tasks: int = 1,
     scatter: Scatter = MEASURED,
     activity: Activity = Activity.STEADY,
+    is_equal: bool = False,
+    spikes: Sequence[Spikes] = (),
 ) -> History:
     """A history; machines and tasks are the same for every length of load, and machines and loads for every activity.
 
@@ -150,17 +155,24 @@ def build(
         tasks: how many tasks, 1 or 3.
         scatter: of the readings.
         activity: when the tasks' jobs come.
+        is_equal: all machines are as the first one, with its background.
+        spikes: of the readings, by the machine's use.
     """
     rng = np.random.default_rng((seed, tasks))
     machines = tuple(
         Machine(cores=float(rng.choice(CORES)), speed=_between(SPEEDS, rng), memory_mb=MEMORY_MB)
         for _ in range(EDGES[tasks])
     )
+    if is_equal:
+        machines = machines[:1] * len(machines)
     median = float(np.median([machine.cores * machine.speed for machine in machines]))
     sizes = [_between(SIZES[tasks], rng) for _ in range(tasks)]
     works = tuple(_work(f"task{index}", size * median, machines, rng) for index, size in enumerate(sizes, 1))
     idle = [(float(rng.uniform(*LONG.idle_cpu)), float(rng.uniform(*LONG.idle_memory))) for _ in machines]
-    rng = np.random.default_rng((seed, tasks, round(load_s * 10)))
+    if is_equal:
+        idle = idle[:1] * len(idle)
+    seeds, edges = (seed, tasks, round(load_s * 10)), range(len(machines))
+    rng = np.random.default_rng(seeds)
     steps = round(hours * 3600 / DT_S)
     busy, held, begins = _loads(steps, load_s, machines, rng)
     comes = _comes(steps, tasks, activity, np.random.default_rng((seed, tasks, *activity.encode())))
@@ -188,6 +200,15 @@ def build(
         memory_error=np.stack(errors[1], axis=1),
         running_error=np.stack(
             [_counted(steps, idle[index][0] * machine.cores, rng) for index, machine in enumerate(machines)], axis=1
+        ),
+        spikes=tuple(
+            (
+                kind.below,
+                np.stack(
+                    [kind.drawn(steps, DT_S, np.random.default_rng((*seeds, index, which))) for which in edges], 1
+                ),
+            )
+            for index, kind in enumerate(spikes)
         ),
         size=max(sizes),
     )

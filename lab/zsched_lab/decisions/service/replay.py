@@ -80,6 +80,7 @@ class Scene:
         self._errors = tuple(
             error.tolist() for error in (history.cpu_error, history.memory_error, history.running_error)
         )
+        self._spikes = [(below, values.tolist()) for below, values in history.spikes]
         self._shown = [
             [
                 tuple(
@@ -111,7 +112,9 @@ class Scene:
         """What the device profiler reads: never more than there is."""
         machine, stretch = self._history.machines[column], self._stretch[index]
         cores_wanted, memory_wanted, cores, memory, _ = self._shown[column][mask_of(self._placed, column)]
-        used = cores_wanted[stretch] + self._errors[0][index][column] * machine.cores
+        spike = self._spike(cores_wanted[stretch] / machine.cores, index, column)
+        used = cores_wanted[stretch] + (self._errors[0][index][column] + spike) * machine.cores
+        runs = self._errors[2][index][column] + spike * machine.cores
         used_mb = memory_wanted[stretch] + self._errors[1][index][column] * machine.memory_mb
         workers = []
         for task, name in enumerate(self.values):
@@ -134,8 +137,12 @@ class Scene:
             memory_used_mb=min(max(used_mb, 0.0), machine.memory_mb),
             workers=tuple(workers),
             speed=machine.speed,
-            runnable=max(cores_wanted[stretch] + self._errors[2][index][column], 0.0) if self._is_told else None,
+            runnable=max(cores_wanted[stretch] + runs, 0.0) if self._is_told else None,
         )
+
+    def _spike(self, share: float, index: int, column: int) -> float:
+        """What spikes add to a reading of a machine of which ``share`` is wanted."""
+        return next((values[index][column] for below, values in self._spikes if share < below), 0.0)
 
     def _tell_jobs(self, profiler: Profiler, column: int, index: int, now: float) -> None:
         """What the workers here say of their jobs, as `zsched.worker` does."""

@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass
 from statistics import fmean
 from typing import Any, Final
 
+from zsched_lab.decisions.loads import SPIKES
 from zsched_lab.decisions.service.cast import described, players
 from zsched_lab.decisions.service.history import Activity, build
 from zsched_lab.decisions.service.judge import Figures, fixed, judge, oracle
@@ -39,6 +40,8 @@ class Case:
     tasks: int
     prices_s: tuple[float, ...]
     activity: Activity = Activity.STEADY
+    is_equal: bool = False
+    has_spikes: bool = False
     rules: tuple[str, ...]
     """Names of `players` or of `YARDSTICKS`, or descriptions (`described`)."""
 
@@ -52,6 +55,9 @@ def cases(
     rules: Sequence[str],
     known: Sequence[Row],
     activity: Activity = Activity.STEADY,
+    *,
+    is_equal: bool = False,
+    has_spikes: bool = False,
 ) -> list[Case]:
     """Every history with the rules and prices that ``known`` holds no results of; those without any are left out."""
     done = {(row["tasks"], row["load_s"], row["seed"], row["asked_hours"], row["price_s"], row["as"]) for row in known}
@@ -70,6 +76,8 @@ def cases(
                 prices_s=left,
                 rules=tuple(names),
                 activity=activity,
+                is_equal=is_equal,
+                has_spikes=has_spikes,
             )
             for left, names in missing.items()
             if left
@@ -79,7 +87,15 @@ def cases(
 
 def play(case: Case) -> list[Row]:
     """One row per rule and price."""
-    history = build(seed=case.seed, hours=case.hours, load_s=case.load_s, tasks=case.tasks, activity=case.activity)
+    history = build(
+        seed=case.seed,
+        hours=case.hours,
+        load_s=case.load_s,
+        tasks=case.tasks,
+        activity=case.activity,
+        is_equal=case.is_equal,
+        spikes=SPIKES if case.has_spikes else (),
+    )
     common = {"tasks": case.tasks, "load_s": case.load_s, "seed": case.seed, "asked_hours": case.hours}
     found = {one.name: one for one in players()}
     every: dict[float, list[Figures]] = {}

@@ -19,6 +19,10 @@ OURS: Final = "service"
 ORDER: Final = ("oracle", *(player.name for player in players()), *YARDSTICKS[1:])
 CLASSES: Final = ((0.0, 0.3), (0.3, 0.6), (0.6, 9.0))
 """Sizes of tasks, as shares of the median machine."""
+MOST_OF_ORACLE: Final = 1.3
+"""Goal: so many times the oracle's lost service at most."""
+MOST_WASTED: Final = 0.1
+"""Goal: so much of the moves is wasted at most."""
 
 
 def where(rows: Iterable[Row], **wanted: object) -> list[Row]:
@@ -56,6 +60,14 @@ def percent(rows: Sequence[Row], field: str) -> str:
     """Mean and 1.96 standard errors over the seeds; what one seed gives for several loads is one value."""
     mean, spread = mean_and_spread([100.0 * value for value in by_seed(rows, field).values()])
     return f"{mean:.2f} ± {spread:.2f}"
+
+
+def _percent(rows: Sequence[Row], field: str) -> float:
+    return 100.0 * statistics.fmean(float(row[field]) for row in rows)
+
+
+def _verdict(is_met: object) -> str:
+    return "met" if is_met else "missed"
 
 
 def _title(load_s: float) -> str:
@@ -166,6 +178,87 @@ def sizes(rows: Sequence[Row], title: str) -> str:
     return _table(f"{title}: lost service by size of the largest task, %", head, lines)
 
 
+def lengths(rows: Sequence[Row], title: str) -> str:
+    """Everything that is judged by, for every length of load."""
+    lines = []
+    for load_s in filter(None, loads_of(rows)):
+        for name in names(rows):
+            if not (mine := where(rows, rule=name, load_s=load_s)):
+                continue
+            lines.append(
+                (
+                    _title(load_s),
+                    name,
+                    f"{_percent(mine, 'lost'):.2f}",
+                    "" if name == OURS else beside(mine, where(rows, rule=OURS, load_s=load_s)),
+                    f"{_percent(mine, 'missed'):.2f}",
+                    f"{rate(mine, 'moves'):.1f}",
+                    f"{rate(mine, 'wasted'):.1f}",
+                )
+            )
+    head = ("loads of", "rule", "lost %", f"beside {OURS}, points", "missed %", "moves / h", "wasted / h")
+    return _table(f"{title}: by length of load", head, lines)
+
+
+def goals(rows: Sequence[Row], title: str) -> str:
+    """For every length of load: does today's rule lose less than each other one, and is it near the oracle?"""
+    lines = []
+    for load_s in filter(None, loads_of(rows)):
+        loaded = where(rows, load_s=load_s)
+        ours, oracle = where(loaded, rule=OURS), where(loaded, rule=YARDSTICKS[0])
+        others = {name: where(loaded, rule=name) for name in names(loaded) if name not in (OURS, *YARDSTICKS)}
+        if not (ours and oracle and others):
+            continue
+        least = min(others, key=lambda name: _percent(others[name], "lost"))
+        own, floor = _percent(ours, "lost"), _percent(oracle, "lost")
+        moved, wasted = rate(ours, "moves"), rate(ours, "wasted")
+        share = wasted / moved if moved else 0.0
+        lines.append(
+            (
+                _title(load_s),
+                f"{own:.2f}",
+                f"{least}, {beside(others[least], ours)}",
+                _verdict(own < _percent(others[least], "lost")),
+                f"{own / floor:.2f}, {_verdict(own <= MOST_OF_ORACLE * floor)}" if floor > 0.0 else "-",
+                f"{100.0 * share:.0f} %, {_verdict(share <= MOST_WASTED)}",
+            )
+        )
+    head = (
+        "loads of",
+        f"{OURS}, lost %",
+        "next rule, points above it",
+        "below every rule",
+        f"of the oracle's (goal {MOST_OF_ORACLE:g})",
+        f"wasted of its moves (goal {100.0 * MOST_WASTED:.0f} %)",
+    )
+    return _table(f"{title}: goals by length of load", head, lines)
+
+
+def equal(rows: Sequence[Row]) -> str:
+    """Moves between equal machines without load."""
+    parts = []
+    for tasks in sorted({int(row["tasks"]) for row in rows}):
+        mine = where(rows, tasks=tasks)
+        lines = []
+        for name in names(mine):
+            every = where(mine, rule=name)
+            lines.append(
+                (
+                    name,
+                    f"{sum(float(row['hours']) for row in every):.1f}",
+                    f"{rate(every, 'moves'):.2f}",
+                    f"{sum(int(row['moves']) > 0 for row in every)} of {len(every)}",
+                    f"{max(int(row['moves']) / float(row['hours']) for row in every):.1f}",
+                    ", ".join(f"{size:.2f}" for size in sorted(float(row["size"]) for row in every if row["moves"]))
+                    or "-",
+                )
+            )
+        head = ("rule", "hours", "moves / h", "seeds with moves", "most of one seed, moves / h", "sizes that moved")
+        what = "one task" if tasks == 1 else f"{tasks} tasks"
+        parts.append(_table(f"{what}: equal machines, no loads", head, lines))
+    return "\n".join(parts)
+
+
 def report(rows: Sequence[Row]) -> str:
     """All tables."""
     parts = []
@@ -183,5 +276,11 @@ def report(rows: Sequence[Row]) -> str:
         middle_s = prices_s[len(prices_s) // 2]
         priced = where(mine, price_s=middle_s)
         title = f"{what}, {middle_s:g} s a move"
-        parts += [moves(priced, title), reactions(priced, title), sizes(priced, title)]
+        parts += [
+            lengths(priced, title),
+            goals(priced, title),
+            moves(priced, title),
+            reactions(priced, title),
+            sizes(priced, title),
+        ]
     return "\n".join(parts)

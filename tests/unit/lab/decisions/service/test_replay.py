@@ -6,6 +6,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from zsched.core.scheduler import scoring
@@ -14,6 +15,7 @@ from zsched.core.values.fleet import DEFAULT_BONUS, DEFAULT_COOL_DOWN_S, TaskSpe
 from zsched.core.values.model import ScoreForm, Utility, UtilityVector, Weights
 from zsched_lab.decisions import __main__ as package
 from zsched_lab.decisions import entries
+from zsched_lab.decisions.loads import Spikes
 from zsched_lab.decisions.rules import CoreRule, TimedJudge
 from zsched_lab.decisions.service import cast, command, picture, study, tables
 from zsched_lab.decisions.service import replay as closed
@@ -216,3 +218,74 @@ def test_the_package_s_command_knows_it(monkeypatch: pytest.MonkeyPatch, tmp_pat
     monkeypatch.setattr(sys, "argv", ["decisions", "service", "--hours", "0", "--out", str(tmp_path)])
     with pytest.raises(SystemExit, match="holds no results"):
         package.main()
+
+
+def moved(seed: int, rule: str, tasks: int = 1, hours: float = 0.1) -> tuple[History, int]:
+    history = build(seed=seed, hours=hours, load_s=0.0, tasks=tasks, is_equal=True)
+    return history, sum(len(mine) - 1 for mine in replay(history, cast.described(rule), seed))
+
+
+@pytest.mark.parametrize("seed", [1, 2, 5])
+def test_a_task_that_fits_stays_on_one_of_several_equal_machines(seed: int) -> None:
+    history, moves = moved(seed, "service")
+    assert len(set(history.machines)) == 1
+    assert len(history.machines) == 3
+    assert history.size < 0.7, "with the background it fits"
+    assert history.cpu_error.std() > 0.05, "the readings scatter"
+    assert moves == 0
+
+
+def test_without_what_holds_a_task_noise_moves_it_between_equal_machines() -> None:
+    _, moves = moved(1, "loose:bonus=0,patience=0,cool_down_s=0", hours=0.03)
+    assert moves > 5
+
+
+def test_three_tasks_stay_on_equal_machines() -> None:
+    assert moved(1, "service", tasks=3, hours=0.05)[1] == 0
+
+
+def row(rule: str, seed: int, **more: float) -> study.Row:
+    given = {"lost": 0.03, "missed": 0.04, "outputs_hz": 1.0, "slow": 0.0, "moves": 4, "wasted": 1, "felt": 0}
+    common = {"tasks": 1, "load_s": 5.0, "price_s": 0.3, "hours": 0.5, "size": 0.4, "reactions_s": []}
+    return {**common, **given, "rule": rule, "as": rule, "seed": seed, **more}
+
+
+def cells(text: str, first: str) -> list[str]:
+    return [cell.strip() for cell in next(one for one in text.splitlines() if one.startswith(first)).split("|")[1:-1]]
+
+
+def test_every_length_of_load_has_every_rule_s_figures_and_its_goals() -> None:
+    rows = [
+        row(rule, seed, lost=lost + 0.01 * (seed - 101), load_s=load_s)
+        for load_s, figures in ((5.0, {"oracle": 0.02, "service": 0.03, "argmax": 0.05, "paper": 0.04}),
+                                (60.0, {"oracle": 0.02, "service": 0.025, "argmax": 0.022, "paper": 0.03}))
+        for rule, lost in figures.items()
+        for seed in (100, 101, 102)
+    ]  # fmt: skip
+    text = tables.lengths(rows, "x")
+    assert cells(text, "| 5 s | argmax") == ["5 s", "argmax", "5.00", "+2.00 ± 0.00", "4.00", "8.0", "2.0"]
+    assert cells(text, "| 60 s | service") == ["60 s", "service", "2.50", "", "4.00", "8.0", "2.0"]
+    goals = tables.goals(rows, "x")
+    assert cells(goals, "| 5 s") == ["5 s", "3.00", "paper, +1.00 ± 0.00", "met", "1.50, missed", "25 %, missed"]
+    assert cells(goals, "| 60 s") == ["60 s", "2.50", "argmax, -0.30 ± 0.00", "missed", "1.25, met", "25 %, missed"]
+
+
+def test_moves_between_equal_machines_are_told_by_the_hour_and_by_seed() -> None:
+    rows = [row("service", 100, moves=0), row("service", 101, moves=3, size=1.15)]
+    assert cells(tables.equal(rows), "| service") == ["service", "1.0", "3.00", "1 of 2", "6.0", "1.15"]
+    assert cells(tables.equal(rows[:1]), "| service")[-1] == "-"
+
+
+def test_a_reading_has_the_spikes_of_its_machine_s_use() -> None:
+    kinds = (
+        Spikes(below=0.5, every_s=2.0, height=(0.3, 0.5), length_s=(0.2, 0.4)),
+        Spikes(below=0.9, every_s=1.0, height=(0.2, 0.2), length_s=(0.2, 0.2)),
+    )
+    plain, spiky = (build(seed=3, hours=HOURS, load_s=0.0, spikes=one) for one in ((), kinds))
+    assert np.array_equal(plain.cpu_error, spiky.cpu_error), "all else is the same"
+    one, other = scene(plain, 1.0, None), scene(spiky, 1.0, None)
+    step = int(np.flatnonzero(spiky.spikes[0][1][:, 0])[0])
+    read = [made._device(0, step) for made in (one, other)]
+    more = spiky.spikes[0][1][step, 0] * spiky.machines[0].cores
+    assert read[1].cpu_used_cores - read[0].cpu_used_cores == pytest.approx(more)  # type: ignore[operator]
+    assert other._spike(0.95, step, 0) == 0.0, "a loaded machine has none"
