@@ -66,6 +66,13 @@ def _percent(rows: Sequence[Row], field: str) -> float:
     return 100.0 * statistics.fmean(float(row[field]) for row in rows)
 
 
+def _lower(mine: Sequence[Row], other: Sequence[Row]) -> str:
+    """On how many of the seeds that both have one rule loses less than another."""
+    own, theirs = by_seed(mine, "lost"), by_seed(other, "lost")
+    both = own.keys() & theirs.keys()
+    return f"{sum(own[seed] < theirs[seed] for seed in both)} of {len(both)}"
+
+
 def _verdict(is_met: object) -> str:
     return "met" if is_met else "missed"
 
@@ -180,24 +187,14 @@ def sizes(rows: Sequence[Row], title: str) -> str:
 
 def lengths(rows: Sequence[Row], title: str) -> str:
     """Everything that is judged by, for every length of load."""
-    lines = []
-    for load_s in filter(None, loads_of(rows)):
-        for name in names(rows):
-            if not (mine := where(rows, rule=name, load_s=load_s)):
-                continue
-            lines.append(
-                (
-                    _title(load_s),
-                    name,
-                    f"{_percent(mine, 'lost'):.2f}",
-                    "" if name == OURS else beside(mine, where(rows, rule=OURS, load_s=load_s)),
-                    f"{_percent(mine, 'missed'):.2f}",
-                    f"{rate(mine, 'moves'):.1f}",
-                    f"{rate(mine, 'wasted'):.1f}",
-                )
-            )
-    head = ("loads of", "rule", "lost %", f"beside {OURS}, points", "missed %", "moves / h", "wasted / h")
-    return _table(f"{title}: by length of load", head, lines)
+
+    def cell(mine: list[Row]) -> str:
+        if not mine:
+            return "-"
+        shares = f"{_percent(mine, 'lost'):.2f}, {_percent(mine, 'missed'):.2f}"
+        return f"{shares}, {rate(mine, 'moves'):.0f}, {rate(mine, 'wasted'):.0f}"
+
+    return _by_load([row for row in rows if row["load_s"]], f"{title}: lost %, missed %, moves / h, wasted / h", cell)
 
 
 def goals(rows: Sequence[Row], title: str) -> str:
@@ -217,7 +214,7 @@ def goals(rows: Sequence[Row], title: str) -> str:
             (
                 _title(load_s),
                 f"{own:.2f}",
-                f"{least}, {beside(others[least], ours)}",
+                f"{least}, {beside(others[least], ours)}, {_lower(ours, others[least])}",
                 _verdict(own < _percent(others[least], "lost")),
                 f"{own / floor:.2f}, {_verdict(own <= MOST_OF_ORACLE * floor)}" if floor > 0.0 else "-",
                 f"{100.0 * share:.0f} %, {_verdict(share <= MOST_WASTED)}",
@@ -226,7 +223,7 @@ def goals(rows: Sequence[Row], title: str) -> str:
     head = (
         "loads of",
         f"{OURS}, lost %",
-        "next rule, points above it",
+        "next rule, points above it, seeds",
         "below every rule",
         f"of the oracle's (goal {MOST_OF_ORACLE:g})",
         f"wasted of its moves (goal {100.0 * MOST_WASTED:.0f} %)",
