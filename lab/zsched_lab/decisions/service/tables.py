@@ -232,25 +232,33 @@ def goals(rows: Sequence[Row], title: str) -> str:
 
 
 def equal(rows: Sequence[Row]) -> str:
-    """Moves between equal machines without load."""
+    """Moves between equal machines without load; a task that is larger than a machine starves on each."""
     parts = []
     for tasks in sorted({int(row["tasks"]) for row in rows}):
         mine = where(rows, tasks=tasks)
         lines = []
         for name in names(mine):
-            every = where(mine, rule=name)
-            lines.append(
-                (
-                    name,
-                    f"{sum(float(row['hours']) for row in every):.1f}",
-                    f"{rate(every, 'moves'):.2f}",
-                    f"{sum(int(row['moves']) > 0 for row in every)} of {len(every)}",
-                    f"{max(int(row['moves']) / float(row['hours']) for row in every):.1f}",
-                    ", ".join(f"{size:.2f}" for size in sorted(float(row["size"]) for row in every if row["moves"]))
-                    or "-",
-                )
-            )
-        head = ("rule", "hours", "moves / h", "seeds with moves", "most of one seed, moves / h", "sizes that moved")
+            for fits in (True, False):
+                every = [row for row in where(mine, rule=name) if (float(row["size"]) <= 1.0) == fits]
+                if every:
+                    lines.append(
+                        (
+                            name,
+                            "up to 1" if fits else "over 1",
+                            f"{sum(float(row['hours']) for row in every):.1f}",
+                            f"{rate(every, 'moves'):.2f}",
+                            f"{sum(int(row['moves']) > 0 for row in every)} of {len(every)}",
+                            f"{max(int(row['moves']) / float(row['hours']) for row in every):.1f}",
+                        )
+                    )
+        head = (
+            "rule",
+            "largest task, in machines",
+            "hours",
+            "moves / h",
+            "seeds with moves",
+            "most of one seed, moves / h",
+        )
         what = "one task" if tasks == 1 else f"{tasks} tasks"
         parts.append(_table(f"{what}: equal machines, no loads", head, lines))
     return "\n".join(parts)
