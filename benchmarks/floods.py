@@ -4,12 +4,14 @@
 an edge on one machine. Who floods has the certificate of a third robot, which is in the fleet file and does not run,
 or a certificate for nobody in the file; its own session goes by no rules. A flood that is not over after 30 s is
 ended then. Each flood goes to all three daemons. Memory is what a daemon has more of 2 s after the flood, in
-proportional shares (PSS). CPU is a daemon's, of one core, while the flood lasts.
+proportional shares (PSS). CPU is a daemon's, of one core, while the flood lasts. Floods of the data network go to the
+relays, and to the worker that takes the samples; a stream of robot1 runs beside them.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import select
 import subprocess
@@ -25,6 +27,7 @@ from pathlib import Path
 import psutil
 
 from benchmarks.common import machine
+from zsched.core.relay_protocol import StreamAck, StreamAcks
 from zsched.core.values.certificates import Role
 from zsched.core.values.messages import Prepare
 from zsched.core.values.model import Ballot, Beat, Proposal
@@ -33,18 +36,21 @@ from zsched.pki.files import PRIVATE, PUBLIC, make_folder, write_whole
 from zsched.runtime.access_rules import Side
 from zsched.runtime.secured import CERTIFICATE, KEY, TRUSTED
 from zsched.runtime.tls import session_text
-from zsched.sessions.config import control_config
+from zsched.sessions.config import control_config, data_config
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import Keyspace
 from zsched_lab.fleet.floods import connections
+from zsched_lab.fleet.loopback import free_endpoint
+from zsched_lab.fleet.openings import Stream
 from zsched_lab.fleet.testbed import TASK, Json, Testbed, echo_fleet
 
 IDLE, STRANGER = "robot3", "mallory"
 KEYS = Keyspace("testbed")
 LONGEST_S = 30.0
+STREAM_HZ = 100.0
 
 
-def secured(folder: Path, signatures: str = "required", **options: int) -> Json:
+def secured(folder: Path, signatures: str = "required", **options: int | str) -> Json:
     """The echo fleet with certificates for every node."""
     tree = echo_fleet(**options)  # type: ignore[arg-type]
     for node in tree["nodes"].values():
@@ -63,22 +69,36 @@ def secured(folder: Path, signatures: str = "required", **options: int) -> Json:
     return tree
 
 
-def attacker_config(bed: Testbed, name: str) -> str:
-    """The control session of a member that goes by no rules."""
+def with_local_side(tree: Json) -> Json:
+    """The fleet with a local side on robot1, as `zsched fleet create` gives one to each robot."""
+    tree["nodes"]["robot1"]["local"] = {"mode": "peer", "listen": [free_endpoint().partition("#")[0]]}
+    return tree
+
+
+def attacker_config(bed: Testbed, name: str, side: Side = Side.CONTROL) -> str:
+    """A session of a member that goes by no rules, to all daemons or to all relays."""
     assert bed.fleet.security is not None
     security = replace(bed.fleet.security, folder=str(bed.folder / "pki" / name))
-    text = session_text(replace(bed.fleet, security=security), Side.CONTROL)
-    ends = tuple(bed.fleet.node(node).listen_control for node in bed.running())
-    config = json.loads(control_config(listen=(), connect=ends, operator_json5=text))
+    text = session_text(replace(bed.fleet, security=security), side)
+    nodes = [bed.fleet.node(node) for node in bed.running()]
+    if side is Side.CONTROL:
+        ends = tuple(node.listen_control for node in nodes)
+        config = json.loads(control_config(listen=(), connect=ends, operator_json5=text))
+    else:
+        ends = tuple(node.listen_data for node in nodes)
+        listen = (bed.fleet.node(name).listen_data,)  # workers dial it there
+        config = json.loads(data_config(listen=listen, connect=ends, shared_memory=False, operator_json5=text))
     config.pop("access_control")
     config.pop("downsampling", None)
     return json.dumps(config)
 
 
 @contextmanager
-def flood(bed: Testbed, kind: str, key: str, payload: bytes, count: int, holder: str = IDLE) -> Iterator[str]:
+def flood(
+    bed: Testbed, kind: str, key: str, payload: bytes, count: int, holder: str = IDLE, side: Side = Side.CONTROL
+) -> Iterator[str]:
     """One attacker's process; what it says when it has sent everything."""
-    command = [sys.executable, "-m", "zsched_lab.fleet.floods", kind, "--config", attacker_config(bed, holder)]
+    command = [sys.executable, "-m", "zsched_lab.fleet.floods", kind, "--config", attacker_config(bed, holder, side)]
     command += ["--key", key, "--payload", payload.hex(), "--count", str(count)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
@@ -127,6 +147,41 @@ def attack(bed: Testbed, name: str, run: Callable[[], str]) -> None:
     )
 
 
+def relay_used(bed: Testbed) -> tuple[float, float]:
+    """(MiB of the largest relay, seconds of a core that all relays have used)."""
+    relays = [psutil.Process(pid) for node in bed.running() if (pid := bed.relay_pid(node)) is not None]
+    times = [relay.cpu_times() for relay in relays]
+    memory = max(float(relay.memory_full_info().pss) / 2**20 for relay in relays)
+    return memory, float(sum(one.user + one.system for one in times))
+
+
+def attack_data(bed: Testbed, name: str, run: Callable[[], str]) -> None:
+    """One line about one flood of the data network, beside a stream of robot1 of `STREAM_HZ`."""
+    local = bed.fleet.node("robot1").local
+    assert local is not None
+    stream = Stream(local.listen[0], "robot1", STREAM_HZ)
+    stream.start()
+    try:
+        bed.wait(lambda: len(stream.answers) > STREAM_HZ, 60.0, "the stream")
+        (memory, cpu), died, first, start = relay_used(bed), deaths(bed), stream.sent, time.monotonic()
+        told = run()
+        lasted, last = time.monotonic() - start, stream.sent
+        used = relay_used(bed)[1] - cpu
+        time.sleep(5.0)  # what was on its way comes, and so does what was late
+        more = relay_used(bed)[0] - memory
+    finally:
+        stream.close()
+    came = dict(stream.answers)
+    times = sorted(at for number, at in stream.answers if number >= first - 1)
+    pause = max((after - before for before, after in itertools.pairwise(times)), default=0.0)
+    print(
+        f"{name:<22} {told:<24} false deaths {deaths(bed) - died}, memory at most {more:+.1f} MiB a relay, relays' CPU "
+        f"{100 * used / lasted:.0f} % of a core for {lasted:.1f} s; stream: sent {last - first}, without an answer "
+        f"{sum(number not in came for number in range(first, last))}, longest pause {1000 * pause:.0f} ms",
+        flush=True,
+    )
+
+
 def rest() -> str:
     """No flood."""
     time.sleep(3.0)
@@ -154,7 +209,9 @@ def main() -> None:
     }
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        with Testbed(folder, secured(folder, robots=3, edges=1)) as bed:
+        tree = with_local_side(secured(folder, robots=3, edges=1, stream_class="reliable"))
+        tree["tasks"][TASK]["outputs"][0]["handover"] = "all"
+        with Testbed(folder, tree) as bed:
             bed.init()
             bed.start("robot1", "robot2", "edge1")
             bed.wait_settled()
@@ -181,6 +238,21 @@ def main() -> None:
                         return told
 
                 attack(bed, what, show)
+            acks = StreamAcks(acks=tuple(StreamAck(eid=eid, first=0, arrived=9, processed=9) for eid in range(4)))
+            for what, key, payload in (
+                ("acknowledgements", KEYS.ack(IDLE, TASK, 1, "*"), wire.encode(acks)),
+                ("samples of a stream", f"edge1/echo/{IDLE}/in", b"x" * 64),
+            ):
+                if given.only not in what:
+                    continue
+
+                def pour(key: str = key, payload: bytes = payload) -> str:
+                    with flood(bed, "frames", key, payload, given.count, side=Side.DATA) as told:
+                        return told
+
+                attack_data(bed, what, pour)
+            if given.only in "no flood of data":
+                attack_data(bed, "no flood of data", rest)
             ends = bed.fleet.node("robot1").listen_control
 
             def connect() -> str:

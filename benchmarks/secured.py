@@ -1,7 +1,7 @@
-"""What certificates, access rules and signatures cost: a secured fleet beside the same one in plain text, in one run.
+"""What certificates, access rules and signatures cost: a secured fleet, one without signatures, one in plain text.
 
-``python -m benchmarks.secured [--rounds 3] [--hops 200] [--takeovers 1] [--idle 10]``. Two fleets of two robots and two
-edges on one machine, `reliable` streams; the one that is not measured stands still (SIGSTOP). The round trip is that of
+``python -m benchmarks.secured [--rounds 3] [--hops 200] [--takeovers 1] [--idle 10]``. Fleets of two robots and two
+edges on one machine, `reliable` streams; those that are not measured stand still (SIGSTOP). The round trip is that of
 an application on robot1's local side: relay, owner's worker, relay. A commit is `zsched weights`, until the answer. A
 takeover: the owner is killed, until the first answer to a message that was sent afterwards. CPU is a robot's daemon and
 relay, of one core. At the end robot1 of the secured fleet gets a renewed certificate, and begins anew while a 100 Hz
@@ -28,20 +28,20 @@ import psutil
 import zenoh
 
 from benchmarks.common import machine, percentile
-from benchmarks.floods import secured
+from benchmarks.floods import secured, with_local_side
 from zsched import paths as places
 from zsched.adapters.host.operator_client import ask
 from zsched.errors import AdapterError
 from zsched.pki.authority import opened
 from zsched.sessions.config import client_config
-from zsched_lab.fleet.loopback import free_endpoint
-from zsched_lab.fleet.testbed import TASK, Json, Testbed, TestbedError, echo_fleet
+from zsched_lab.fleet.testbed import TASK, Testbed, TestbedError, echo_fleet
 
 ROBOT, KIB, MIB = "robot1", 1 << 10, 1 << 20
 OPTIONS: dict[str, Any] = {"robots": 2, "edges": 2, "stream_class": "reliable"}
 DIGITS = 12
 REST_S = 3.0
-PLAIN, SECURED = "plain", "secured"
+PLAIN, UNSIGNED, SECURED = "plain", "unsigned", "secured"
+"""``unsigned``: certificates and access rules, with ``signatures: off``."""
 
 
 @dataclass(slots=True)
@@ -100,12 +100,6 @@ class Application:
     def close(self) -> None:
         """End the session."""
         self._session.close()
-
-
-def with_local_side(tree: Json) -> Json:
-    """The fleet with a local side on robot1, as `zsched fleet create` gives one to each robot."""
-    tree["nodes"][ROBOT]["local"] = {"mode": "peer", "listen": [free_endpoint().partition("#")[0]]}
-    return tree
 
 
 def pids(bed: Testbed) -> Iterator[int]:
@@ -209,7 +203,7 @@ def begin_anew(bed: Testbed) -> str:
 
 
 def row(name: str, pick: Callable[[Figures], list[float]], fleets: dict[str, Figures], unit: str) -> None:
-    """One line: both fleets beside each other."""
+    """One line: the fleets beside each other."""
     texts = []
     for kind, figures in fleets.items():
         values = pick(figures)
@@ -231,13 +225,14 @@ def main() -> None:
     parser.add_argument("--idle", type=float, default=10.0)
     given = parser.parse_args()
     print(machine())
-    fleets = {PLAIN: Figures(), SECURED: Figures()}
+    fleets = {PLAIN: Figures(), UNSIGNED: Figures(), SECURED: Figures()}
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
         beds: dict[str, Testbed] = {}
         for kind in fleets:
             folder = Path(name, kind)
             folder.mkdir()
-            tree = secured(folder, **OPTIONS) if kind == SECURED else echo_fleet(**OPTIONS)
+            signatures = "off" if kind == UNSIGNED else "required"
+            tree = echo_fleet(**OPTIONS) if kind == PLAIN else secured(folder, signatures, **OPTIONS)
             beds[kind] = stack.enter_context(Testbed(folder, with_local_side(tree)))
             beds[kind].init()
         for _ in range(given.rounds):
