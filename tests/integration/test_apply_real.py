@@ -91,3 +91,41 @@ def test_a_task_comes_and_goes_by_the_document_while_a_stream_runs(tmp_path: Pat
         bed.wait(lambda: len(stream.back) >= stream.sent, 60, "every sample is answered")
         assert stream.back == list(range(stream.sent))
         sub.undeclare()
+
+
+def test_up_with_another_file_founds_nothing_where_a_fleet_is(tmp_path: Path) -> None:
+    """A file that was edited by hand is compared and named; by one of another fleet the state counts for nothing."""
+    tree = echo_fleet(robots=1, edges=1)
+    with Testbed(tmp_path, tree) as bed:
+        bed.init()
+        bed.start()
+        bed.wait_settled()
+        file = tmp_path / "agreed.yaml"
+        file.write_text(as_written(tree))
+        operator = Operator(bed)
+        operator.done("apply", file, "--yes")
+        revision = bed.status("robot1")["fleet_revision"]
+        bed.stop()
+
+        edited = json.loads(json.dumps(tree))
+        edited["tasks"]["second"] = {**tree["tasks"][TASK], "inputs": [], "outputs": []}
+        bed.file.write_text(json.dumps(edited))
+        bed.start()
+        bed.wait_settled()
+        bed.wait(lambda: "zsched apply" in str(bed.status("robot1")["problems"]), 60, "the difference is named")
+        status = bed.status("robot1")
+        assert (list(tasks_of(bed, "robot1")), status["fleet_revision"]) == ([TASK], revision)
+        assert operator.done("fleet", "export") == file.read_text()
+
+        bed.stop("edge1")
+        state = (tmp_path / "edge1" / "state").read_bytes()
+        bed.file.write_text(json.dumps({**edited, "fleet": "elsewhere"}))
+        bed.start("edge1")
+        bed.wait(lambda: bed.status("edge1")["fleet"] == "elsewhere", 60, "it goes by that file")
+        assert "belongs to the fleet 'testbed', not 'elsewhere'" in bed.log("edge1")
+        assert (tmp_path / "edge1" / "state").read_bytes() == state, "it is kept for its own fleet"
+        assert bed.status("robot1")["fleet_revision"] == revision
+        peers = {"robot1": "alive", "edge1": "gone"}
+        bed.wait(
+            lambda: {one["name"]: one["state"] for one in bed.status("robot1")["nodes"]} == peers, 60, "it is gone"
+        )
