@@ -43,6 +43,8 @@ from zsched.wire.keyspace import Keyspace
 from zsched_lab.fleet.loopback import free_endpoint
 from zsched_lab.fleet.testbed import TASK, Json, Testbed, echo_fleet
 
+pytestmark = pytest.mark.long
+
 KEYS = Keyspace("testbed")
 TIMES = 20
 """So often each frame is said again."""

@@ -60,6 +60,7 @@ from zsched.wire import codec as wire
 from zsched.wire.keyspace import Keyspace
 from zsched.wire.seal import Act
 
+pytestmark = pytest.mark.long
 NODES = ("edge1", "edge2", "robot1", "robot2", "robot3")
 ROBOTS = NODES[2:]
 FLEET = fleet_of(task_of(candidates=("edge1", "edge2"), tuning=tuning_of()), of=NODES)
