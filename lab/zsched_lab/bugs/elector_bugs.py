@@ -42,6 +42,12 @@ def _fleet_bug(name: str, module: str, *changes: tuple[str, str], has_schedules:
 NUMBERS, DOCUMENTS = "zsched.core.electorate.numbers", "zsched.core.electorate.documents"
 
 ELECTOR_BUGS: tuple[Bug, ...] = (
+    _fleet_bug(
+        "documents of changes that are under way go",
+        NUMBERS,
+        ("named = (*state, *self.roll.proposed)", "named = state"),
+        has_schedules=False,
+    ),
     _bug(
         "two electors change at once",
         CHANGES,

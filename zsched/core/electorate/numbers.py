@@ -350,10 +350,11 @@ class Numbers:
             self._fleet = todo.in_force = fleet
 
     def _keep(self, todo: ToDo) -> None:
-        """The state's documents, and the one before: older ones may go."""
+        """The state's documents, the one before, and those of our own changes: others may go."""
         if self.roll is not None:
             accepted = self.roll.state.accepted
-            named = (self.roll.value.document, self._before, "" if accepted is None else accepted.value.document)
+            state = (self.roll.value.document, self._before, "" if accepted is None else accepted.value.document)
+            named = (*state, *self.roll.proposed)
             self.documents.keep(tuple(dict.fromkeys(filter(None, named))), todo)
 
     # --- proposer ----------------------------------------------------------------------------------------------------
@@ -389,6 +390,7 @@ class Numbers:
         fault = self.fault(change)
         if not fault and self.roll is not None:
             self.roll.propose(change, todo, now)
+            self._keep(todo)
             self._carry(todo)
         return fault
 

@@ -19,7 +19,7 @@ from collections.abc import Callable
 from enum import StrEnum
 from random import Random
 
-from zsched.core.electorate.changes import FleetChange
+from zsched.core.electorate.changes import AdoptDocument, FleetChange, SetDocument
 from zsched.core.electorate.fleet_register import FleetRegister
 from zsched.core.electorate.settling import Settling
 from zsched.core.instructions import AskFleet, TellFleet
@@ -142,6 +142,11 @@ class Roll:
     def lacking(self) -> FleetValue | None:
         """A value that a round has read, and whose document is not stored here; the round waits for it."""
         return self._register.lacking
+
+    @property
+    def proposed(self) -> tuple[str, ...]:
+        """The documents of the changes that are under way here or wait."""
+        return tuple(one.document for one in self._register.wanted if isinstance(one, AdoptDocument | SetDocument))
 
     def next_deadline(self) -> float:
         """When `tick` may have something to do."""

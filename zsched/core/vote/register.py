@@ -356,6 +356,12 @@ class Register(ABC, Generic[V]):
         if now >= self._lease_over_at:
             self._lease_over_at = at_most
 
+    @property
+    def wanted(self) -> tuple[Rewrite[V], ...]:
+        """The changes that are under way here or wait, in their order."""
+        running = None if self._round is None else self._round.change
+        return tuple(self._queue) if running is None else (running, *self._queue)
+
     def propose(self, change: Rewrite[V], todo: ToDo, now: float) -> None:
         """Try to commit a change; its end appears in `ToDo.ended`, of this or a later call."""
         self._queue.append(change)

@@ -115,6 +115,20 @@ def told(todo: ToDo) -> tuple[CommandOutcome, str]:
     return answer.result.outcome, answer.result.detail
 
 
+def test_documents_of_changes_that_are_under_way_stay_however_many_others_come() -> None:
+    """The first of many was chosen after its document had gone here: the node went by a fleet that it did not know."""
+    agreement = make(ADOPTED, {"0d": FLEET})
+    documents = [f"a{number}" for number in range(RECENT + 3)]
+    kept: tuple[str, ...] = ()
+    for request, document in enumerate(documents):
+        commanded(agreement, ChangeFleet(document=Document(text=Text(document))), request)
+        todo = agreed(agreement.on_stored, ev.DocumentStored(document=document, fleet=SAID, request=request), 100.2)
+        for one in of(todo, do.KeepDocuments):
+            kept = one.documents
+    assert {"0d", *documents} <= set(kept)
+    assert agreement.fleet_value == ADOPTED, "all of them wait"
+
+
 def test_of_more_commands_than_can_wait_the_oldest_ends_with_an_answer_and_changes_nothing() -> None:
     agreement = make(FIRST)
     for request in range(MAX_OPEN):
