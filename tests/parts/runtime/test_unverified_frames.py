@@ -314,7 +314,10 @@ def test_a_command_for_another_life_or_said_once_more_leaves_nothing_on_disk(
     ana, key, frame = of(pki, "ana"), KEYS.command("robot1", "ana"), wire.encode(WEIGHTS)
     first = ana.seal(Act.QUESTION, key, frame, life=LIFE)
     send(session, Act.QUESTION, key, frame, first)
-    until(lambda: b"SetWeights came, signed by ana.operator" in machine.files()["decisions.ndjson"][1], "the command")
+    said = b"SetWeights came, signed by ana.operator"
+    until(lambda: said in machine.files().get("decisions.ndjson", (0, b""))[1], "the command")
+    register = machine.node.registers["merge"]
+    until(lambda: register.state.promised.counter > 0 and not register.is_busy, "its end: nobody answers its ballots")
     before = machine.at_rest()
     for seal in (first, ana.seal(Act.QUESTION, key, frame, life=LIFE - 1)):
         send(session, Act.QUESTION, key, frame, seal)

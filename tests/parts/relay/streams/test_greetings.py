@@ -418,7 +418,7 @@ def test_a_worker_of_class_latest_is_told_its_epoch_before_any_value(bench: Benc
     sample = bench.sample("robot1/b")
     wild.send(sample)
     wild.send(sample)
-    until(lambda: late.got, "a value")
+    until(lambda: late.got and late.starts, "a value and its marker")  # each subscriber has a thread of its own
     assert late.starts == [EndMarker(epoch=0, count=0, slot=8)]
     wild.undeclare()
 
