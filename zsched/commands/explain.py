@@ -16,7 +16,7 @@ from datetime import UTC, datetime
 
 from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, print_json, warn
-from zsched.commands.history import age_s_of, is_known, is_move, wall_text, where_of
+from zsched.commands.history import age_s_of, is_known, is_move, wall_text, when_of, where_of
 from zsched.commands.page import Cell, Page, memory, span
 from zsched.commands.report import printable
 from zsched.commands.weight_words import shares
@@ -174,9 +174,8 @@ def _past(door: Door, task: str, point: Point) -> tuple[Json, Json]:
 def _move(entry: Json, now: float) -> Json:
     move = entry["move"]
     where = {"epoch": move["epoch"], "revision": move["revision"], "from": move["left"], "to": move["owner"]}
-    when = {"at": wall_text(entry["at"]), "age_s": max(now - entry["at"], 0.0)}
     why = {"is_known": is_known(move), "reason": move["reason"]}
-    return {**when, **where, **why, "votes": dict(move.get("votes", ()))}
+    return {**when_of(entry, now), **where, **why, "votes": dict(move.get("votes", ()))}
 
 
 def _search(door: Door, task: str, point: Point) -> tuple[str, float, Json | None, Json | None]:

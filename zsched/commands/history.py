@@ -243,8 +243,7 @@ def moves_of(entries: Iterable[Json], now: float, task: str | None) -> Iterator[
         if move["owner"] is None:
             continue  # an older daemon's line: nobody has had the task yet
         yield {
-            "at": wall_text(entry["at"]),
-            "age_s": max(now - entry["at"], 0.0),
+            **when_of(entry, now),
             "task": entry["task"],
             "epoch": move["epoch"],
             "revision": move["revision"],
@@ -257,6 +256,11 @@ def moves_of(entries: Iterable[Json], now: float, task: str | None) -> Iterator[
             "gap_s": gaps.get((entry["task"], move["epoch"])),
             "by": entry.get("by") or None,
         }
+
+
+def when_of(entry: Json, now: float) -> Json:
+    """When a line of a log was written, by the wall clock there, and how long ago."""
+    return {"at": wall_text(entry["at"]), "age_s": max(now - entry["at"], 0.0)}
 
 
 def is_known(move: Json) -> bool:
@@ -277,9 +281,8 @@ def rehearsals_of(entries: Iterable[Json], now: float, task: str | None) -> Iter
     """The rehearsals among a log's entries."""
     for entry in entries:
         if entry.get("rehearsal") and task in (None, entry["task"]):
-            age_s = max(now - entry["at"], 0.0)
             told = {"task": entry["task"], "rehearsal": entry["rehearsal"], "text": entry["text"]}
-            yield {"at": wall_text(entry["at"]), "age_s": age_s, **told}
+            yield {**when_of(entry, now), **told}
 
 
 def rollouts_of(entries: Iterable[Json], now: float, task: str | None) -> Iterator[Json]:
@@ -287,7 +290,7 @@ def rollouts_of(entries: Iterable[Json], now: float, task: str | None) -> Iterat
     for entry in entries:
         if entry.get("is_rollout") and task in (None, entry["task"]):
             told = {"task": entry["task"], "text": entry["text"]}
-            yield {"at": wall_text(entry["at"]), "age_s": max(now - entry["at"], 0.0), **told}
+            yield {**when_of(entry, now), **told}
 
 
 def changes_of(entries: Iterable[Json], now: float, task: str | None) -> Iterator[Json]:
@@ -298,7 +301,7 @@ def changes_of(entries: Iterable[Json], now: float, task: str | None) -> Iterato
         about = entry.get("task") or None
         if task in (None, about):
             told = {"task": about, "by": entry["by"], "text": entry["text"]}
-            yield {"at": wall_text(entry["at"]), "age_s": max(now - entry["at"], 0.0), **told}
+            yield {**when_of(entry, now), **told}
 
 
 def _told_line(one: Json) -> str:
