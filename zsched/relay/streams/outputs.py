@@ -43,7 +43,7 @@ HOLD_BYTES: Final = 64 << 20
 MAX_STAMPS: Final = 8192
 UNNUMBERED: Final = -1
 LATE_S: Final = 1.0
-"""For so long what still comes of a slot that was cut is counted."""
+"""Samples that still come of a slot that was cut are counted for so long."""
 HEARD_SLOTS: Final = 4
 """Closed slots of which is known how far they came: an owner may be left and come back in one epoch (isolation)."""
 
