@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
 import select
 import subprocess
 import sys
@@ -20,28 +19,21 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 
 import psutil
 
-from benchmarks.common import machine
+from benchmarks.common import cpu_s, machine
 from zsched.core.relay_protocol import StreamAck, StreamAcks
-from zsched.core.values.certificates import Role
 from zsched.core.values.messages import Prepare
 from zsched.core.values.model import Ballot, Beat, Proposal
-from zsched.pki.authority import create
-from zsched.pki.files import PRIVATE, PUBLIC, make_folder, write_whole
 from zsched.runtime.access_rules import Side
-from zsched.runtime.secured import CERTIFICATE, KEY, TRUSTED
-from zsched.runtime.tls import session_text
-from zsched.sessions.config import control_config, data_config
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import Keyspace
 from zsched_lab.fleet.floods import connections
 from zsched_lab.fleet.loopback import free_endpoint
 from zsched_lab.fleet.openings import Stream
+from zsched_lab.fleet.secured import secured, without_rules
 from zsched_lab.fleet.testbed import TASK, Json, Testbed, echo_fleet
 
 IDLE, STRANGER = "robot3", "mallory"
@@ -50,23 +42,10 @@ LONGEST_S = 30.0
 STREAM_HZ = 100.0
 
 
-def secured(folder: Path, signatures: str = "required", **options: int | str) -> Json:
-    """The echo fleet with certificates for every node."""
+def certified(folder: Path, signatures: str = "required", **options: int | str) -> Json:
+    """The echo fleet with certificates for every node, and for a stranger."""
     tree = echo_fleet(**options)  # type: ignore[arg-type]
-    for node in tree["nodes"].values():
-        node["listen"] = {kind: end.replace("tcp/", "tls/") for kind, end in node["listen"].items()}
-    tree["security"] = {"signatures": signatures}
-    authority = create(folder / "authority", tree["fleet"], b"", datetime.now(UTC))
-    for name in (*tree["nodes"], STRANGER):
-        issued = authority.issue(name, Role.NODE, [], b"", b"", datetime.now(UTC))
-        make_folder(folder / "pki" / name)
-        for file, content, mode in (
-            (CERTIFICATE, issued.certificate, PUBLIC),
-            (KEY, issued.key, PRIVATE),
-            (TRUSTED, issued.trusted, PUBLIC),
-        ):
-            write_whole(folder / "pki" / name / file, content, mode)
-    return tree
+    return secured(tree, folder, security={"signatures": signatures}, strangers=(STRANGER,))
 
 
 def with_local_side(tree: Json) -> Json:
@@ -75,30 +54,14 @@ def with_local_side(tree: Json) -> Json:
     return tree
 
 
-def attacker_config(bed: Testbed, name: str, side: Side = Side.CONTROL) -> str:
-    """A session of a member that goes by no rules, to all daemons or to all relays."""
-    assert bed.fleet.security is not None
-    security = replace(bed.fleet.security, folder=str(bed.folder / "pki" / name))
-    text = session_text(replace(bed.fleet, security=security), side)
-    nodes = [bed.fleet.node(node) for node in bed.running()]
-    if side is Side.CONTROL:
-        ends = tuple(node.listen_control for node in nodes)
-        config = json.loads(control_config(listen=(), connect=ends, operator_json5=text))
-    else:
-        ends = tuple(node.listen_data for node in nodes)
-        listen = (bed.fleet.node(name).listen_data,)  # workers dial it there
-        config = json.loads(data_config(listen=listen, connect=ends, shared_memory=False, operator_json5=text))
-    config.pop("access_control")
-    config.pop("downsampling", None)
-    return json.dumps(config)
-
-
 @contextmanager
 def flood(
     bed: Testbed, kind: str, key: str, payload: bytes, count: int, holder: str = IDLE, side: Side = Side.CONTROL
 ) -> Iterator[str]:
     """One attacker's process; what it says when it has sent everything."""
-    command = [sys.executable, "-m", "zsched_lab.fleet.floods", kind, "--config", attacker_config(bed, holder, side)]
+    listen = () if side is Side.CONTROL else (bed.fleet.node(holder).listen_data,)  # workers dial it there
+    config = without_rules(bed, holder, side, listen=listen)
+    command = [sys.executable, "-m", "zsched_lab.fleet.floods", kind, "--config", config]
     command += ["--key", key, "--payload", payload.hex(), "--count", str(count)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
@@ -112,13 +75,17 @@ def flood(
 
 def memory_mb(bed: Testbed) -> dict[str, float]:
     """{node: its daemon's proportional share}."""
-    return {node: float(psutil.Process(bed.pid(node)).memory_full_info().pss) / 2**20 for node in bed.running()}
+    return {node: pss_mb(bed.pid(node)) for node in bed.running()}
 
 
-def cpu_s(bed: Testbed) -> float:
+def pss_mb(pid: int) -> float:
+    """The proportional share of a process, in MiB."""
+    return float(psutil.Process(pid).memory_full_info().pss) / 2**20
+
+
+def daemons_cpu_s(bed: Testbed) -> float:
     """Seconds of a core that the daemons have used."""
-    times = [psutil.Process(bed.pid(node)).cpu_times() for node in bed.running()]
-    return float(sum(one.user + one.system for one in times))
+    return sum(cpu_s(bed.pid(node)) for node in bed.running())
 
 
 def deaths(bed: Testbed) -> int:
@@ -130,10 +97,10 @@ def deaths(bed: Testbed) -> int:
 def attack(bed: Testbed, name: str, run: Callable[[], str]) -> None:
     """One line about one flood."""
     task = bed.task("robot1")
-    before, used, died, start = memory_mb(bed), cpu_s(bed), deaths(bed), time.monotonic()
+    before, used, died, start = memory_mb(bed), daemons_cpu_s(bed), deaths(bed), time.monotonic()
     told = run()
     lasted = time.monotonic() - start
-    used = cpu_s(bed) - used
+    used = daemons_cpu_s(bed) - used
     time.sleep(2.0)
     after = memory_mb(bed)
     more = max(after[node] - before[node] for node in after)
@@ -149,10 +116,8 @@ def attack(bed: Testbed, name: str, run: Callable[[], str]) -> None:
 
 def relay_used(bed: Testbed) -> tuple[float, float]:
     """(MiB of the largest relay, seconds of a core that all relays have used)."""
-    relays = [psutil.Process(pid) for node in bed.running() if (pid := bed.relay_pid(node)) is not None]
-    times = [relay.cpu_times() for relay in relays]
-    memory = max(float(relay.memory_full_info().pss) / 2**20 for relay in relays)
-    return memory, float(sum(one.user + one.system for one in times))
+    relays = [pid for node in bed.running() if (pid := bed.relay_pid(node)) is not None]
+    return max(map(pss_mb, relays)), sum(map(cpu_s, relays))
 
 
 def attack_data(bed: Testbed, name: str, run: Callable[[], str]) -> None:
@@ -209,7 +174,7 @@ def main() -> None:
     }
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        tree = with_local_side(secured(folder, robots=3, edges=1, stream_class="reliable"))
+        tree = with_local_side(certified(folder, robots=3, edges=1, stream_class="reliable"))
         tree["tasks"][TASK]["outputs"][0]["handover"] = "all"
         with Testbed(folder, tree) as bed:
             bed.init()

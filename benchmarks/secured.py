@@ -27,8 +27,8 @@ from typing import Any
 import psutil
 import zenoh
 
-from benchmarks.common import machine, percentile
-from benchmarks.floods import secured, with_local_side
+from benchmarks.common import cpu_s, machine, percentile
+from benchmarks.floods import certified, with_local_side
 from zsched import paths as places
 from zsched.adapters.host.operator_client import ask
 from zsched.errors import AdapterError
@@ -126,10 +126,9 @@ def alone(others: list[Testbed]) -> Iterator[None]:
                 os.kill(pid, signal.SIGCONT)
 
 
-def cpu_s(bed: Testbed) -> float:
+def robots_cpu_s(bed: Testbed) -> float:
     """CPU seconds of robot1's daemon and relay so far."""
-    processes = [psutil.Process(pid) for pid in (bed.pid(ROBOT), bed.relay_pid(ROBOT)) if pid is not None]
-    return sum(sum(process.cpu_times()[:2]) for process in processes)
+    return cpu_s(bed.pid(ROBOT)) + cpu_s(bed.relay_pid(ROBOT))
 
 
 def measure(bed: Testbed, figures: Figures, given: argparse.Namespace) -> None:
@@ -150,9 +149,9 @@ def measure(bed: Testbed, figures: Figures, given: argparse.Namespace) -> None:
         app.close()
     bed.wait_whole()
     time.sleep(2.0)
-    before = cpu_s(bed)
+    before = robots_cpu_s(bed)
     time.sleep(given.idle)
-    figures.cpu.append(100 * (cpu_s(bed) - before) / given.idle)
+    figures.cpu.append(100 * (robots_cpu_s(bed) - before) / given.idle)
 
 
 def takeover(bed: Testbed, app: Application) -> float:
@@ -232,7 +231,7 @@ def main() -> None:
             folder = Path(name, kind)
             folder.mkdir()
             signatures = "off" if kind == UNSIGNED else "required"
-            tree = echo_fleet(**OPTIONS) if kind == PLAIN else secured(folder, signatures, **OPTIONS)
+            tree = echo_fleet(**OPTIONS) if kind == PLAIN else certified(folder, signatures, **OPTIONS)
             beds[kind] = stack.enter_context(Testbed(folder, with_local_side(tree)))
             beds[kind].init()
         for _ in range(given.rounds):

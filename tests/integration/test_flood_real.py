@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 from support.authorities import secured
@@ -14,28 +12,15 @@ from support.beats import beat_of
 from support.proposals import proposal_of
 from zsched.core.values.messages import Prepare
 from zsched.runtime.access_rules import Side
-from zsched.runtime.tls import session_text
-from zsched.sessions.config import control_config
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import Keyspace
+from zsched_lab.fleet.secured import without_rules
 from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 
 IDLE = "robot3"
 """In the file, and not started: who floods has its certificate."""
 COUNT = 10_000
 KEYS = Keyspace("testbed")
-
-
-def attacker(bed: Testbed) -> str:
-    """The control session of a member that goes by no rules of its own."""
-    assert bed.fleet.security is not None
-    security = replace(bed.fleet.security, folder=str(bed.folder / "pki" / IDLE))
-    text = session_text(replace(bed.fleet, security=security), Side.CONTROL)
-    ends = tuple(bed.fleet.node(node).listen_control for node in bed.running())
-    config = json.loads(control_config(listen=(), connect=ends, operator_json5=text))
-    for rules in ("access_control", "downsampling"):
-        config.pop(rules, None)
-    return json.dumps(config)
 
 
 def test_ten_thousand_frames_of_each_kind_change_nothing(tmp_path: Path) -> None:
@@ -54,7 +39,7 @@ def test_ten_thousand_frames_of_each_kind_change_nothing(tmp_path: Path) -> None
         bed.start("robot1", "robot2", "edge1")
         bed.wait_settled()
         before = {key: bed.task("robot1")[key] for key in ("owner", "epoch", "revision")}
-        config = attacker(bed)
+        config = without_rules(bed, IDLE, Side.CONTROL)
         for kind, key, payload, count in floods:
             command = [sys.executable, "-m", "zsched_lab.fleet.floods", kind, "--config", config, "--key", key]
             command += ["--payload", payload.hex(), "--count", str(count)]

@@ -9,11 +9,10 @@ what is said again is of former epochs, too.
 from __future__ import annotations
 
 import contextlib
-import json
 import threading
 from collections import Counter, defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import pytest
@@ -36,11 +35,10 @@ from zsched.core.values.messages import (
     Refused,
 )
 from zsched.runtime.access_rules import Side
-from zsched.runtime.tls import session_text
-from zsched.sessions.config import control_config, data_config
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import Keyspace
 from zsched_lab.fleet.loopback import free_endpoint
+from zsched_lab.fleet.secured import without_rules
 from zsched_lab.fleet.testbed import TASK, Json, Testbed, echo_fleet
 
 pytestmark = pytest.mark.long
@@ -111,21 +109,10 @@ class Middle:
         self._keep(session, "**", "@zsched/testbed/**", "**/@zsched/**")
 
     def _link(self, holder: str, side: Side, *to: str) -> zenoh.Session:
-        """A session with the certificate of ``holder``, without rules; workers dial one of the data network."""
-        assert self.bed.fleet.security is not None
-        security = replace(self.bed.fleet.security, folder=str(self.bed.folder / "pki" / holder))
-        text = session_text(replace(self.bed.fleet, security=security), side)
-        nodes = [self.bed.fleet.node(node) for node in to]
-        if side is Side.CONTROL:
-            ends = tuple(node.listen_control for node in nodes)
-            tree = json.loads(control_config(listen=(), connect=ends, operator_json5=text))
-        else:
-            ends = tuple(node.listen_data for node in nodes)
-            listen = (free_endpoint().partition("#")[0].replace("tcp/", "tls/"),)
-            tree = json.loads(data_config(listen=listen, connect=ends, shared_memory=False, operator_json5=text))
-        for rules in ("access_control", "downsampling"):
-            tree.pop(rules, None)
-        return self.stack.enter_context(zenoh.open(zenoh.Config.from_json5(json.dumps(tree))))
+        """A session with the certificate of ``holder``; workers dial one of the data network."""
+        listen = () if side is Side.CONTROL else (free_endpoint().partition("#")[0].replace("tcp/", "tls/"),)
+        text = without_rules(self.bed, holder, side, to=to, listen=listen)
+        return self.stack.enter_context(zenoh.open(zenoh.Config.from_json5(text)))
 
     def _keep(self, session: zenoh.Session, *keys: str) -> None:
         for key in keys:

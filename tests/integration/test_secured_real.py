@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from support.authorities import install, make_authority
+from support.authorities import install, secured
 from zsched.adapters.host.operator_client import ask
 from zsched.commands.ask import Door, ask_door, close_sessions
 from zsched.commands.orders import user_name
@@ -26,32 +26,29 @@ from zsched.core.values.model import Ballot
 from zsched.pki.authority import opened
 from zsched.runtime.access_rules import Side
 from zsched.runtime.tls import session_text
-from zsched.sessions.config import client_config, control_config
+from zsched.sessions.config import client_config
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import Keyspace
+from zsched_lab.fleet.secured import without_rules
 from zsched_lab.fleet.testbed import TASK, Json, Testbed, echo_fleet
 
 
-def secured(folder: Path) -> Json:
+def with_people(folder: Path) -> Json:
     """Two robots, and two edges of which one gives no address; an operator and a guest have a folder of their own."""
     tree = echo_fleet(robots=2, edges=2, stream_class="reliable")
-    for node in tree["nodes"].values():
-        node["listen"] = {kind: end.replace("tcp/", "tls/") for kind, end in node["listen"].items()}
+    secured(tree, folder, security={"operators": ["ana"], "guests": ["screen"]})
     del tree["nodes"]["edge2"]["host"], tree["nodes"]["edge2"]["listen"]
-    tree["security"] = {"operators": ["ana"], "guests": ["screen"]}
-    authority = make_authority(folder / "authority", tree["fleet"])
-    for name in tree["nodes"]:
-        install(authority, folder / "pki" / name, name)
-    for name, role in (("ana", Role.OPERATOR), ("screen", Role.GUEST)):
-        install(authority, folder / name / "pki", name, role)
-        (folder / name / "fleet.yaml").write_text(json.dumps(tree))
+    with opened(folder / "authority", tree["fleet"]) as authority:
+        for name, role in (("ana", Role.OPERATOR), ("screen", Role.GUEST)):
+            install(authority, folder / name / "pki", name, role)
+            (folder / name / "fleet.yaml").write_text(json.dumps(tree))
     return tree
 
 
 @pytest.fixture(scope="module")
 def bed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Testbed]:
     folder = tmp_path_factory.mktemp("secured")
-    with Testbed(folder, secured(folder)) as testbed:
+    with Testbed(folder, with_people(folder)) as testbed:
         testbed.init()
         testbed.start()
         testbed.wait_settled(90)
@@ -113,7 +110,7 @@ def flags_at(bed: Testbed, node: str) -> dict[tuple[str, str], str]:
 def test_the_document_and_its_flags_are_changed_in_the_name_of_the_certificate(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with Testbed(tmp_path, secured(tmp_path)) as bed:
+    with Testbed(tmp_path, with_people(tmp_path)) as bed:
         bed.init()
         bed.start()
         bed.wait_settled(90)
@@ -181,15 +178,10 @@ def refusals(bed: Testbed, node: str) -> dict[str, int]:
 def test_who_has_a_member_s_link_and_not_its_key_says_nothing_where_it_counts(bed: Testbed) -> None:
     """A router or a client in between: TLS lets it in as robot2, and it repeats and changes what robot2 has said."""
     assert all(refusals(bed, node) == {} for node in ("robot1", "robot2", "edge1")), "members refuse each other"
-    ends = tuple(bed.fleet.node(name).listen_control for name in ("robot1", "robot2"))
-    assert bed.fleet.security is not None
-    security = replace(bed.fleet.security, folder=str(bed.folder / "pki" / "robot2"))
-    text = session_text(replace(bed.fleet, security=security), Side.CONTROL)
-    config = json.loads(control_config(listen=(), connect=ends, operator_json5=text))
-    del config["access_control"]
+    config = without_rules(bed, "robot2", Side.CONTROL, to=("robot1", "robot2"))
     keys, before = Keyspace(bed.fleet.name), bed.task("robot1")
     said: list[zenoh.Sample] = []
-    with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as session:
+    with zenoh.open(zenoh.Config.from_json5(config)) as session:
         # what it repeats itself has no seal, and is not to be repeated
         session.declare_subscriber(keys.allocation("robot2"), said.append, allowed_origin=zenoh.Locality.REMOTE)
         session.declare_queryable(
