@@ -68,7 +68,7 @@ from zsched.runtime.membership import copied_file
 from zsched.runtime.memory import shared_memory_objection
 from zsched.runtime.recipes import Recipes
 from zsched.runtime.reload import Reload
-from zsched.runtime.reopening import Moved, Reopening, turns
+from zsched.runtime.reopening import Moved, Reopening, first_wait_s, turns
 from zsched.runtime.roaming import Roaming, addresses_towards, gone_from, numeric, places_of
 from zsched.runtime.sampler import Sampler
 from zsched.runtime.sealing import seals_of
@@ -577,7 +577,7 @@ class Daemon:
             if self._lets_in_others or left or self._has_another_certificate(node):
                 candidates = [task.candidates for task in node.fleet.tasks]
                 order = turns((*alive, node.me), electors, node.tenure.voters, candidates)
-                self._reopening.want(order, lives, now)
+                self._reopening.want(order, lives, now, first_s=first_wait_s(node.fleet.timing))
             elif not self._has_roamed:
                 self._reopening.forget()
         if self._has_roamed:
