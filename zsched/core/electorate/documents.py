@@ -25,7 +25,7 @@ FETCH_EVERY_S = 3.0
 RECENT = 3
 """Documents stored last that a node knows beside those that its state names."""
 MAX_WANTED = 4
-"""A peer's word must not fill the memory: of more wanted documents the oldest are forgotten."""
+"""A peer's word must not fill the memory: of more wanted or refused documents the oldest are forgotten."""
 
 
 class Documents:
@@ -51,7 +51,7 @@ class Documents:
         self._told: tuple[str, ...] = tuple(sorted(stored))
         """What the disk was told to keep: every document that is known here, or one that comes back is not on it."""
         self.refused: dict[str, str] = {}
-        """{hash: why it is not valid here}."""
+        """{hash: why it is not valid here}, the newest last."""
 
     def holds(self, value: FleetValue) -> bool:
         """Whether the document of a fleet value is stored here; a value without one needs none."""
@@ -112,7 +112,10 @@ class Documents:
     def on_refused(self, document: str, reason: str) -> None:
         """A document that a peer sent is not valid here: it is not asked for again."""
         self._forget(document)
-        self.refused = {document: reason}
+        self.refused.pop(document, None)
+        self.refused[document] = reason
+        for old in tuple(self.refused)[:-MAX_WANTED]:
+            del self.refused[old]
 
     def keep(self, documents: tuple[str, ...], todo: ToDo) -> None:
         """The node's state names these from now on; of the others those that were stored last stay."""

@@ -1,0 +1,45 @@
+"""Which documents a node asks for, and which it asks for no more."""
+
+from __future__ import annotations
+
+from zsched.core import instructions as do
+from zsched.core.electorate.documents import MAX_WANTED, Documents
+from zsched.core.todo import ToDo
+from zsched.core.values.electorate import Elector, FleetValue
+from zsched.core.values.struct import replace
+
+VALUE = FleetValue(
+    fleet="f",
+    generation_id="ab",
+    revision=1,
+    number=1,
+    electors=(Elector(name="robot1", disk="0", joining=1),),
+    settled=True,
+    lease_s=1.0,
+    guard_lease_s=1.0,
+)
+
+
+def asked(documents: Documents, *names: str) -> list[str]:
+    todo = ToDo()
+    for name in names:
+        documents.want(replace(VALUE, document=name), ("edge1",), todo, 0.0)
+    return [one.document for one in todo.send if isinstance(one, do.FetchDocument)]
+
+
+def test_documents_that_are_not_valid_here_are_asked_for_once_each() -> None:
+    """Two in turn: the second one's refusal must not make the first one new again."""
+    documents = Documents("robot1", {})
+    assert asked(documents, "a", "b") == ["a", "b"]
+    documents.on_refused("a", "an unknown key")
+    documents.on_refused("b", "another one")
+    assert asked(documents, "a", "b", "a") == []
+    assert list(documents.refused.values())[-1] == "another one", "the newest is shown"
+
+
+def test_refused_documents_do_not_fill_the_memory() -> None:
+    documents = Documents("robot1", {})
+    names = [f"d{number}" for number in range(MAX_WANTED + 2)]
+    for name in names:
+        documents.on_refused(name, "an unknown key")
+    assert list(documents.refused) == names[2:]
