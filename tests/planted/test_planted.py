@@ -91,7 +91,7 @@ def test_a_bug_whose_text_is_gone_says_so() -> None:
 
 
 def test_a_module_that_is_already_there_cannot_be_planted() -> None:
-    from zsched.core.vote.register import Register
+    from zsched.core.register.register import Register
 
     assert Register.__module__ == HARMLESS.module
     with pytest.raises(PlantError, match="imported already"):

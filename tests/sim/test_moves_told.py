@@ -6,8 +6,8 @@ from dataclasses import replace
 
 from support.fleets import fleet_of, task_of, tuning_of
 from zsched.core.handlers.work import _move_of
+from zsched.core.register.register import FROM_A_PEER
 from zsched.core.values.fleet import WorkerSpec
-from zsched.core.vote.register import FROM_A_PEER
 from zsched_lab.sim.simulator import Simulator
 
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")

@@ -14,6 +14,7 @@ from support.registers import Step, did
 from support.states import state_of
 from support.todos import agreed
 from zsched.core.events import AcceptAsked, PrepareAsked
+from zsched.core.register.task_register import TaskRegister
 from zsched.core.values.change import MoveOwner
 from zsched.core.values.fleet import WorkerSpec, electorate_hash
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise
@@ -23,7 +24,6 @@ from zsched.core.values.model import (
     RegisterState,
 )
 from zsched.core.vote.agreement import Agreement
-from zsched.core.vote.task_register import TaskRegister
 
 ELECTORS = ("r1", "r2", "r3")
 INITIAL = allocation_of(0, None, tuning=tuning_of(cpu=1.0, memory=0.0))

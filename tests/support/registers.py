@@ -1,4 +1,4 @@
-"""Registers, and the messages between them, for one situation at a time. Knows: `zsched.core.vote.register`."""
+"""Registers, and the messages between them, for one situation at a time. Knows: `zsched.core.register.register`."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from support.allocations import allocation_of
 from support.ballots import ballot_of
 from support.fleets import tuning_of
 from zsched.core.instructions import SendAccept, SendPrepare
+from zsched.core.register.task_register import TaskRegister
 from zsched.core.todo import ToDo
 from zsched.core.values.change import Change, MoveOwner, RoundOutcome
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refused
 from zsched.core.values.model import Acceptance, Allocation, Ballot, RegisterState
-from zsched.core.vote.task_register import TaskRegister
 
 ELECTORS = ("r1", "r2", "r3")
 TUNING = tuning_of()

@@ -40,7 +40,7 @@ class Bug:
 
 CHANGE, BEATS = "zsched.core.values.change", "zsched.core.handlers.beats"
 SEQUENCE, IDENTITY = "zsched.core.sequence", "zsched.core.membership.identity"
-REGISTER, LEASE, TENURE = "zsched.core.vote.register", "zsched.core.vote.lease", "zsched.core.executor.tenure"
+REGISTER, LEASE, TENURE = "zsched.core.register.register", "zsched.core.vote.lease", "zsched.core.executor.tenure"
 SEALING, WITNESS = "zsched.core.executor.sealing", "zsched.core.vote.witness"
 NAMESAKES = "zsched.core.membership.namesakes"
 BELIEF = "zsched.core.vote.belief"
@@ -58,10 +58,10 @@ SCHEDULER, SCORING, EXECUTOR = (
 
 _REGISTER = (
     "tests/sim/test_register_rules.py",
-    "tests/unit/core/vote/test_register.py",
-    "tests/unit/core/vote/test_register_proposer.py",
+    "tests/unit/core/register/test_register.py",
+    "tests/unit/core/register/test_register_proposer.py",
 )
-_SCHEDULES = ("tests/unit/core/vote/test_register_schedules.py",)
+_SCHEDULES = ("tests/unit/core/register/test_register_schedules.py",)
 _AGREEMENT = ("tests/unit/core/vote/test_agreement.py",)
 _JOINING = ("tests/unit/core/vote/test_joining.py",)
 _LEASE = ("tests/sim/test_lease_rules.py", "tests/sim/test_exclusive.py")
@@ -573,14 +573,14 @@ MEMBERSHIP_BUGS = (
         REGISTER,
         "return running.phase is _Phase.ACCEPT and passes.issuperset(running.no.values()) and bool(running.no)",
         "return False",
-        ("tests/unit/core/vote/test_register_proposer.py",),
+        ("tests/unit/core/register/test_register_proposer.py",),
     ),
     _bug(
         "who is overtaken ends the accept that waits",
         REGISTER,
         "now < (until := min(self._lease_over_at, running.give_up_at))",
         "now < (until := -math.inf)",
-        ("tests/unit/core/vote/test_register_proposer.py", "tests/sim/test_exclusive.py"),
+        ("tests/unit/core/register/test_register_proposer.py", "tests/sim/test_exclusive.py"),
     ),
     _bug(
         "token resurrects a peer",

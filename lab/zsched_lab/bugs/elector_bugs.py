@@ -218,7 +218,7 @@ ELECTOR_BUGS: tuple[Bug, ...] = (
                 "        if running is not None and running.is_ahead:\n            pass",
             ),
         ),
-        tests=("tests/unit/core/vote/test_register_proposer.py",),
+        tests=("tests/unit/core/register/test_register_proposer.py",),
         has_schedules=False,
     ),
     Bug(
@@ -230,7 +230,7 @@ ELECTOR_BUGS: tuple[Bug, ...] = (
                 "            self._prepare(todo, now)\n\n    def prepare_ahead",
             ),
         ),
-        tests=("tests/unit/core/vote/test_register_proposer.py",),
+        tests=("tests/unit/core/register/test_register_proposer.py",),
         has_schedules=False,
     ),
     _bug(

@@ -15,13 +15,13 @@ from zsched.core.electorate.changes import FleetChange
 from zsched.core.electorate.founding import recovered
 from zsched.core.electorate.roll import Admission, Roll
 from zsched.core.instructions import AskElectors, AskFleet, SendAccept, SendPrepare, TellFleet
+from zsched.core.register.task_register import TaskRegister
 from zsched.core.todo import ToDo
 from zsched.core.values.change import MoveOwner, Rewrite, RoundOutcome
 from zsched.core.values.electorate import CREATION_STEP, Creation, Elector, FleetValue
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refused
 from zsched.core.values.model import Allocation, NodeId, RegisterState, TaskId, Tuning, Weights
 from zsched.core.values.struct import replace
-from zsched.core.vote.task_register import TaskRegister
 from zsched_lab.sim.chosen import Chosen
 
 BALLOT_S: Final = 0.3

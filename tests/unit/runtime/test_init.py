@@ -10,11 +10,11 @@ import pytest
 from zsched.adapters.host.state_file import StateFile, hardware_id
 from zsched.config.load import check_bytes
 from zsched.core.electorate.recovery import NEW_DISK, Sides
+from zsched.core.register.register import MAX_REVISION
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet, electorate_hash
 from zsched.core.values.model import MAX_COUNTER, NO_BALLOT, RegisterState
 from zsched.core.vote.belief import GENERATION_STEP, MAX_GENERATION
-from zsched.core.vote.register import MAX_REVISION
 from zsched.errors import AdapterError
 from zsched.runtime.init import begin_anew, init_state
 

@@ -1,6 +1,6 @@
 """What may be changed in a fleet value, and when: one elector at a time, and only on a settled value.
 
-Knows: the rules of a change. Does not know: rounds (`zsched.core.vote.register`), who wants the change and why.
+Knows: the rules of a change. Does not know: rounds (`zsched.core.register.register`), who wants the change and why.
 
 * A change of the electors adds one or removes one, never the last. It raises the number and unsettles the value.
 * A change of the lease's length raises the number, too: an elector of the number before waits for another length.

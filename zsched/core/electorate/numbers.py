@@ -17,6 +17,7 @@ from zsched.core.electorate.changes import AddElector, AdoptDocument, FleetChang
 from zsched.core.electorate.documents import Documents
 from zsched.core.electorate.founding import founded
 from zsched.core.electorate.roll import Admission, Roll
+from zsched.core.register.task_register import TaskRegister
 from zsched.core.todo import ToDo
 from zsched.core.values.adoption import obstacle
 from zsched.core.values.change import Rewrite
@@ -27,7 +28,6 @@ from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refusal, Refused
 from zsched.core.values.model import NO_BALLOT, NodeId, RegisterState, TaskId
 from zsched.core.values.struct import replace
-from zsched.core.vote.task_register import TaskRegister
 
 
 class Numbers:

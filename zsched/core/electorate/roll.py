@@ -20,14 +20,14 @@ from enum import StrEnum
 from random import Random
 
 from zsched.core.electorate.changes import AdoptDocument, FleetChange, SetDocument
-from zsched.core.electorate.fleet_register import FleetRegister
 from zsched.core.electorate.settling import Settling
 from zsched.core.instructions import AskFleet, TellFleet
+from zsched.core.register.fleet_register import FleetRegister
+from zsched.core.register.task_register import TaskRegister
 from zsched.core.todo import ToDo
 from zsched.core.values.electorate import Creation, Elector, FleetValue
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refusal, Refused
 from zsched.core.values.model import NO_BALLOT, Ballot, NodeId, RegisterState, TaskId
-from zsched.core.vote.task_register import TaskRegister
 
 
 class Admission(StrEnum):

@@ -1,7 +1,7 @@
 """When the electors of a new number are settled: what an elector does for it, and how far it is.
 
 Knows: the registers of the document, what was written under which number, the guard time, whose turn it is. Does not
-know: how a round goes (`zsched.core.vote.register`), whether somebody else settles (several do no harm).
+know: how a round goes (`zsched.core.register.register`), whether somebody else settles (several do no harm).
 
 1. An identity round of every task's register under the new number. It writes what it reads: from then on a majority of
    the new electors holds it, and no majority of the old ones can choose anything any more. A blank register needs no
@@ -18,10 +18,10 @@ import math
 from collections.abc import Iterable
 
 from zsched.core.electorate.changes import Settle
+from zsched.core.register.task_register import TaskRegister
 from zsched.core.todo import ToDo
 from zsched.core.values.electorate import Electorate, FleetValue
 from zsched.core.vote.lease import hold_s
-from zsched.core.vote.task_register import TaskRegister
 
 
 class Settling:

@@ -12,13 +12,13 @@ from typing import Any, Final
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.executor.workers import failed_workers
+from zsched.core.register.register import FROM_A_PEER
 from zsched.core.stages import Handler, PastValue, Stages, Unready
 from zsched.core.todo import ToDo
 from zsched.core.values.decision import Move
 from zsched.core.values.electorate import CREATION_STEP
 from zsched.core.values.model import Allocation, NodeId, PeerState, TaskId, Weights, WorkerState, told_by
 from zsched.core.values.plan import StreamCount
-from zsched.core.vote.register import FROM_A_PEER
 
 FIRST_NEWS: Final = "known from a peer, the first news here"
 """Why a task has its owner, at a node that knew nothing of the task."""

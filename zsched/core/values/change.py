@@ -1,7 +1,7 @@
 """Changes of a register that a node proposes, and how they end.
 
 Knows: which fields of an allocation each change touches. Does not know: ballots and rounds
-(`zsched.core.vote.register`), who wants a change and why.
+(`zsched.core.register.register`), who wants a change and why.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""Stage 4: votes, the register and the lease."""
+"""Stage 4: votes, agreement and the lease."""

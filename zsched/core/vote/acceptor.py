@@ -1,7 +1,7 @@
 """VOTE, the acceptor: which questions about its registers this node answers, and which wait for a lease.
 
 Knows: whose ballot may be answered, at which rate, what an exclusive task's owner has to do with an accept. Does not
-know: the rules of a round (`zsched.core.vote.register`), what is learnt (`zsched.core.vote.agreement`).
+know: the rules of a round (`zsched.core.register.register`), what is learnt (`zsched.core.vote.agreement`).
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from collections.abc import Mapping
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.electorate.numbers import Numbers
+from zsched.core.register.task_register import TaskRegister
 from zsched.core.todo import ToDo
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import Accepted, Prepare, Promise, Refusal, Refused, fleet_answer
 from zsched.core.values.model import Ballot, NodeId, TaskId
 from zsched.core.vote.belief import is_fit
 from zsched.core.vote.lease import Leases
-from zsched.core.vote.task_register import TaskRegister
 from zsched.core.vote.witness import Witness
 
 PREPARES_PER_S = 20.0

@@ -1,8 +1,8 @@
 """VOTE, between the registers and the node: one register per task, the durable state they share, the messages.
 
 Knows: which messages a register's step becomes, what is learnt of whom, what goes to disk. Does not know: the rules of
-a round (`zsched.core.vote.register`), what a proposer is answered (`zsched.core.vote.acceptor`), the effect of a learnt
-allocation (the node applies it).
+a round (`zsched.core.register.register`), what a proposer is answered (`zsched.core.vote.acceptor`), the effect of a
+learnt allocation (the node applies it).
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from zsched.core.electorate.helm import Helm, voters
 from zsched.core.electorate.numbers import Numbers
 from zsched.core.electorate.orders import Orders
 from zsched.core.electorate.strangers import Strangers
+from zsched.core.register.task_register import TaskRegister
 from zsched.core.todo import ToDo
 from zsched.core.values.change import Change, Ended, MoveOwner, RoundOutcome
 from zsched.core.values.document import Flag
@@ -54,7 +55,6 @@ from zsched.core.vote.commands import answer_end, refuse_gone, wanted_retune
 from zsched.core.vote.generations import lost_text, moved_text
 from zsched.core.vote.lease import Leases, hold_s
 from zsched.core.vote.questions import ASK_AT_ONCE_S, ASK_LEARNT_EVERY_S, Questions
-from zsched.core.vote.task_register import TaskRegister
 from zsched.core.vote.witness import Witness, as_seen, as_tuple
 
 SETTLE_AFTER_START_S = 0.3

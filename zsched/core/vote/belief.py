@@ -9,11 +9,11 @@ question, and an answer is believed only if it could be true.
 
 from __future__ import annotations
 
+from zsched.core.register.register import MAX_REVISION
+from zsched.core.register.task_register import TaskRegister
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import Allocation, NodeId
-from zsched.core.vote.register import MAX_REVISION
-from zsched.core.vote.task_register import TaskRegister
 
 GENERATION_STEP = 2**32
 """Revision and epoch of generation G start at G times this (`zsched init --generation G`)."""

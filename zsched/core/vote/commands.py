@@ -1,6 +1,6 @@
 """VOTE, an operator's change of a task: which change it asks for, and the answer when that has ended.
 
-Knows: commands, outcomes in words. Does not know: rounds (`zsched.core.vote.register`), how an answer travels.
+Knows: commands, outcomes in words. Does not know: rounds (`zsched.core.register.register`), how an answer travels.
 """
 
 from __future__ import annotations
@@ -9,12 +9,12 @@ from collections.abc import Mapping
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
+from zsched.core.register.task_register import TaskRegister
 from zsched.core.todo import ToDo
 from zsched.core.values.change import Ended, Retune, RoundOutcome, SetLeased
 from zsched.core.values.messages import CommandOutcome, CommandResult
 from zsched.core.values.model import Allocation, TaskId, Weights
 from zsched.core.values.struct import replace
-from zsched.core.vote.task_register import TaskRegister
 
 _ENDED = {
     RoundOutcome.COMMITTED: (CommandOutcome.OK, "committed by a majority of the electors"),

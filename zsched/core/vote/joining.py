@@ -4,8 +4,8 @@ Ten tasks that are read anew under a new number of the fleet (`zsched.core.elect
 to each elector, ten writes there and ten answers, twice. With them goes what an elector needs to answer them at once:
 the fleet value that brought the number, and the first question of the change that will say that all is settled.
 
-Knows: which instructions may travel together. Does not know: why a register asks (`zsched.core.vote.register`), what an
-elector answers (`zsched.core.vote.acceptor`).
+Knows: which instructions may travel together. Does not know: why a register asks (`zsched.core.register.register`),
+what an elector answers (`zsched.core.vote.acceptor`).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """VOTE: plurality of the robots' proposals, with the tie rules (Alg. 3, Consensus).
 
 Knows: counting fresh proposals on one base. Does not know: the reason of a robot's proposal, how the winner is
-committed (`zsched.core.vote.register`).
+committed (`zsched.core.register.register`).
 
 An outcome needs fresh proposals on the same base revision from a majority of the robots. (For an escape: of the robots
 that are not gone; the electors' majority alone guards uniqueness.) Then the most proposed candidate wins. Ties go to

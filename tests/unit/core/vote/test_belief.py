@@ -10,11 +10,11 @@ import pytest
 from support.allocations import allocation_of
 from support.ballots import ballot_of
 from support.fleets import fleet_of, task_of
+from zsched.core.register.register import MAX_REVISION
+from zsched.core.register.task_register import TaskRegister
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import Acceptance, Allocation, RegisterState
 from zsched.core.vote.belief import GENERATION_STEP, MAX_AHEAD, MAX_GENERATION, is_fit, is_proven
-from zsched.core.vote.register import MAX_REVISION
-from zsched.core.vote.task_register import TaskRegister
 
 TASK = task_of(candidates=("edge1", "robot2"))
 NAMES = ("edge1", "robot1", "robot2")

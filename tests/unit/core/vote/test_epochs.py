@@ -21,10 +21,10 @@ from support.registers import (
     make,
     promise_all,
 )
+from zsched.core.register.task_register import TaskRegister
 from zsched.core.values.change import Change, MoveOwner, Retune, RoundOutcome
 from zsched.core.values.model import PeerState
 from zsched.core.vote.tally import VoteOutcome
-from zsched.core.vote.task_register import TaskRegister
 from zsched.core.vote.voting import Voting
 
 TODAY = allocation(3)

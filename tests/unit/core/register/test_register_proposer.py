@@ -1,4 +1,4 @@
-"""The proposing side of `zsched.core.vote.register`: rounds, conflicts, unknown outcomes, one situation at a time."""
+"""The proposing side of `zsched.core.register.register`: rounds, conflicts, unknown outcomes, one case at a time."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from support.registers import (
     promise_all,
     promised,
 )
+from zsched.core.register.task_register import TaskRegister
 from zsched.core.values.change import MoveOwner, Retune, RoundOutcome
 from zsched.core.values.electorate import Elector, Electorate
 from zsched.core.values.messages import Accepted, Promise, Refusal, Refused
 from zsched.core.values.model import Acceptance, Allocation
-from zsched.core.vote.task_register import TaskRegister
 
 # --- proposer --------------------------------------------------------------------------------------------------------
 

@@ -1,17 +1,17 @@
 """VOTE, a task's register: what a round must know of an allocation.
 
 Knows: allocations and their changes, which instructions a round's questions are. Does not know: the rules of a round
-(`zsched.core.vote.register`).
+(`zsched.core.register.register`).
 """
 
 from __future__ import annotations
 
 from zsched.core.instructions import SendAccept, SendPrepare
+from zsched.core.register.register import Register
 from zsched.core.todo import ToDo
 from zsched.core.values.change import MoveOwner, Retune, Rewrite, RoundOutcome, SetHold, SetLeased
 from zsched.core.values.messages import Accept, Prepare
 from zsched.core.values.model import Allocation
-from zsched.core.vote.register import Register
 
 
 class TaskRegister(Register[Allocation]):

@@ -1,7 +1,7 @@
 """The fleet register: what a round must know of a fleet value.
 
 Knows: which counters a fleet value has, to whom its questions go. Does not know: the rules of a round
-(`zsched.core.vote.register`), which value a node follows (`zsched.core.electorate.roll`).
+(`zsched.core.register.register`), which value a node follows (`zsched.core.electorate.roll`).
 """
 
 from __future__ import annotations
@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from zsched.core.instructions import AskElectors
+from zsched.core.register.register import Register
 from zsched.core.todo import ToDo
 from zsched.core.values.change import Rewrite, RoundOutcome
 from zsched.core.values.electorate import Electorate, FleetValue
 from zsched.core.values.messages import Accept, Prepare
-from zsched.core.vote.register import Register
 
 
 class FleetRegister(Register[FleetValue]):

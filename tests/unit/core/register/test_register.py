@@ -1,4 +1,4 @@
-"""Each rule of `zsched.core.vote.register`, one situation at a time.
+"""Each rule of `zsched.core.register.register`, one situation at a time.
 
 The proposing side is in test_register_proposer.py, random schedules in test_register_schedules.py.
 """
@@ -33,12 +33,12 @@ from support.registers import (
     promise_all,
     promised,
 )
+from zsched.core.register.register import BACKOFF_CAP_S, MAX_JUMP, MAX_REVISION
+from zsched.core.register.task_register import TaskRegister
 from zsched.core.todo import ToDo
 from zsched.core.values.change import RoundOutcome
 from zsched.core.values.messages import Accepted, Prepare, Promise, Refusal, Refused
 from zsched.core.values.model import MAX_COUNTER, Acceptance
-from zsched.core.vote.register import BACKOFF_CAP_S, MAX_JUMP, MAX_REVISION
-from zsched.core.vote.task_register import TaskRegister
 
 # --- acceptor --------------------------------------------------------------------------------------------------------
 

@@ -1,0 +1,1 @@
+"""One agreed value: ballots, promises and acceptances, and the two kinds of values that they agree on."""
