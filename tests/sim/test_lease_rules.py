@@ -16,9 +16,10 @@ from zsched.core.executor.handover import Executor
 from zsched.core.executor.tenure import Tenure
 from zsched.core.instructions import SetRole
 from zsched.core.values.fleet import Fleet, WorkerSpec, lease_terms
+from zsched.core.values.lease import RHO, hold_s
 from zsched.core.values.model import Beat, Grant
 from zsched.core.values.plan import WorkerRole
-from zsched.core.vote.lease import RHO, SENT_KEPT, Granter, Holder, Leases, hold_s
+from zsched.core.vote.lease import SENT_KEPT, Granter, Holder, Leases
 
 LEASE_S, HOLD_S = 1.0, hold_s(1.0)
 ELECTORS = ("r1", "r2", "r3")

@@ -41,6 +41,7 @@ class Bug:
 CHANGE, BEATS = "zsched.core.values.change", "zsched.core.handlers.beats"
 SEQUENCE, IDENTITY = "zsched.core.sequence", "zsched.core.membership.identity"
 REGISTER, LEASE, TENURE = "zsched.core.register.register", "zsched.core.vote.lease", "zsched.core.executor.tenure"
+HOLD = "zsched.core.values.lease"
 SEALING, WITNESS = "zsched.core.executor.sealing", "zsched.core.vote.witness"
 NAMESAKES = "zsched.core.membership.namesakes"
 BELIEF = "zsched.core.vote.belief"
@@ -436,7 +437,7 @@ LEASE_BUGS = (
     ),
     _bug(
         "hold shorter than the lease",
-        LEASE,
+        HOLD,
         "return lease_s * (1 + RHO) / (1 - RHO)",
         "return lease_s * (1 - RHO) / (1 + RHO) - 0.02",
         _LEASE,

@@ -11,8 +11,8 @@ from functools import partial
 from random import Random
 
 from zsched.core.values.fleet import Fleet
+from zsched.core.values.lease import RHO
 from zsched.core.values.model import NodeId
-from zsched.core.vote.lease import RHO
 from zsched_lab.sim.files import CHANGES, RELOADED, other_electors
 from zsched_lab.sim.parts import Machine
 from zsched_lab.sim.scene import Carry, Scene

@@ -22,10 +22,10 @@ from zsched.core.executor.handover import Phase
 from zsched.core.node import Node
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet, WorkerSpec, electorate_hash
+from zsched.core.values.lease import hold_s
 from zsched.core.values.messages import Accept, Accepted, Learnt, Promise
 from zsched.core.values.model import NO_BALLOT, Acceptance, NodeId, RegisterState, TaskId
 from zsched.core.values.plan import WorkerRole
-from zsched.core.vote.lease import hold_s
 from zsched_lab.sim.simulator import Simulator
 
 TASK = "merge"

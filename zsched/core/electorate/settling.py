@@ -21,7 +21,7 @@ from zsched.core.electorate.changes import Settle
 from zsched.core.register.task_register import TaskRegister
 from zsched.core.todo import ToDo
 from zsched.core.values.electorate import Electorate, FleetValue
-from zsched.core.vote.lease import hold_s
+from zsched.core.values.lease import hold_s
 
 
 class Settling:

@@ -34,6 +34,7 @@ from zsched.core.values.electorate import (
     terms_of,
 )
 from zsched.core.values.fleet import Fleet, TaskSpec
+from zsched.core.values.lease import hold_s
 from zsched.core.values.messages import (
     FleetQuestion,
     Learnt,
@@ -53,7 +54,7 @@ from zsched.core.vote.acceptor import Acceptor
 from zsched.core.vote.belief import GENERATION_STEP, MAX_GENERATION, is_proven
 from zsched.core.vote.commands import answer_end, refuse_gone, wanted_retune
 from zsched.core.vote.generations import lost_text, moved_text
-from zsched.core.vote.lease import Leases, hold_s
+from zsched.core.vote.lease import Leases
 from zsched.core.vote.questions import ASK_AT_ONCE_S, ASK_LEARNT_EVERY_S, Questions
 from zsched.core.vote.witness import Witness, as_seen, as_tuple
 

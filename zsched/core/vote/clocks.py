@@ -14,8 +14,8 @@ from __future__ import annotations
 import math
 
 from zsched.core.events import ClockCompared
+from zsched.core.values.lease import RHO
 from zsched.core.values.struct import Struct
-from zsched.core.vote.lease import RHO
 
 JUMP_S = 1e-3
 """Two clocks may move apart by this at once, beyond their rates; reading both takes a fiftieth of it."""

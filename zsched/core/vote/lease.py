@@ -41,25 +41,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from zsched.core.values.fleet import Fleet, lease_terms
+from zsched.core.values.lease import hold_s
 from zsched.core.values.model import Allocation, Beat, Grant, NodeId, TaskId
 from zsched.core.values.quorum import majority
 from zsched.core.values.struct import Struct
 
-RHO = 1e-3
-"""Bound on the relative difference of two clocks' rates (a crystal is within 1e-4)."""
 SENT_KEPT = 128
 """Newest numbers whose sending time an owner keeps; an echo of an older one gives no lease."""
 HURRY_S = 0.05
 """An empty release (nothing was used) causes a beat of its own at most this often."""
-
-
-def hold_s(lease_s: float) -> float:
-    """How long after its last grant an elector must refuse others, on its own clock.
-
-    >>> round(hold_s(1.0), 4)
-    1.002
-    """
-    return lease_s * (1 + RHO) / (1 - RHO)
 
 
 @dataclass(slots=True)

@@ -18,11 +18,11 @@ from zsched.core.node import Node
 from zsched.core.todo import ToDo
 from zsched.core.values.change import MoveOwner
 from zsched.core.values.durable import DurableState
+from zsched.core.values.lease import hold_s
 from zsched.core.values.messages import Accept, Accepted, Learnt, Refusal, Refused
 from zsched.core.values.model import Acceptance, Allocation, RegisterState
 from zsched.core.vote.acceptor import PARK_SHARE
 from zsched.core.vote.agreement import Agreement
-from zsched.core.vote.lease import hold_s
 
 ROBOTS = ("robot1", "robot2", "robot3")
 FLEET = fleet_of(task_of("guard", ROBOTS, exclusive=True), of=ROBOTS, electors=ROBOTS)
