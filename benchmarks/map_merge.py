@@ -22,9 +22,9 @@ from zsched.tasks.map_merge.cdr import decode_grid, encode_grid
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid
 from zsched.tasks.map_merge.merger import Merger, MergeResult, MergerSettings, Mode
+from zsched_lab.maps.laser_log import LaserLog, load_log, malaga_path, split_log
 from zsched_lab.maps.mapping import GridMapper, displacements, truth_grid
 from zsched_lab.maps.metrics import pose_errors, score_map
-from zsched_lab.robots.laser_log import LaserLog, load_log, malaga_path, split_log
 
 ROBOTS = ("robot1", "robot2", "robot3")
 SEARCH_MS = "estimate, search"

@@ -12,6 +12,7 @@ from mcap.reader import make_reader
 from zsched.adapters.machine.cgroup import LimitedGroup
 from zsched_lab.fleet.netns import why_not
 from zsched_lab.fleet.recorder import read_records
+from zsched_lab.maps.laser_log import malaga_path
 from zsched_lab.paper.bench import BenchOptions, InputsOf
 from zsched_lab.paper.cells import Cell, bandwidth_of, world_of
 from zsched_lab.paper.metrics import Truth, measure
@@ -20,7 +21,6 @@ from zsched_lab.paper.robots import ExploreRobots, LogRobots
 from zsched_lab.paper.run import CellRun, Inputs
 from zsched_lab.paper.scenario import LoadPlan, load_scenario
 from zsched_lab.paper.schemes import SCHEMES
-from zsched_lab.robots.laser_log import malaga_path
 
 pytestmark = pytest.mark.long
 

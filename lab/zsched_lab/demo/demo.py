@@ -20,7 +20,7 @@ from zsched_lab.demo.run import DemoRun, RunPlan
 from zsched_lab.fleet.children import Children
 from zsched_lab.fleet.schedule import SchedulePolicy
 from zsched_lab.fleet.signals import Interrupted, interruptible
-from zsched_lab.robots.laser_log import load_log, malaga_path
+from zsched_lab.maps.laser_log import load_log, malaga_path
 
 MODES = ("known", "track", "estimate")
 MIN_DURATION_S, MAX_DURATION_S = 20.0, 3600.0

@@ -28,8 +28,8 @@ from zsched_lab.fleet.recorder import Recorder
 from zsched_lab.fleet.runner import CLI, FleetRunner, LabFleet, read_tree, write_fleet
 from zsched_lab.fleet.schedule import SchedulePolicy, make_schedule
 from zsched_lab.fleet.view import FleetView, Move, NodeView, Status, TaskView, node_views, problems, task_view
+from zsched_lab.maps.laser_log import LaserLog
 from zsched_lab.maps.mapping import displacements
-from zsched_lab.robots.laser_log import LaserLog
 from zsched_lab.robots.watch import RobotWatch
 
 TICK_S = 0.25

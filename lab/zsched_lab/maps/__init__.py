@@ -1,1 +1,1 @@
-"""Maps of laser scans, and how good they are."""
+"""Maps of laser scans, the logs with the scans, and how good the maps are."""

@@ -13,8 +13,8 @@ import numpy.typing as npt
 
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid
+from zsched_lab.maps.laser_log import LaserLog, Scan
 from zsched_lab.maps.log_odds import Box, LogOdds
-from zsched_lab.robots.laser_log import LaserLog, Scan
 
 RESOLUTION_M = 0.05
 _Ints = npt.NDArray[np.int32]

@@ -10,8 +10,8 @@ import sys
 from pathlib import Path
 
 from zsched.tasks.map_merge.cdr import encode_grid
+from zsched_lab.maps.laser_log import load_log
 from zsched_lab.maps.mapping import truth_grid
-from zsched_lab.robots.laser_log import load_log
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -20,6 +20,7 @@ from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_SIGNAL, EXIT_USAGE
 from zsched_lab.fleet.netns import why_not
 from zsched_lab.fleet.runner import read_tree
 from zsched_lab.fleet.signals import Interrupted, interruptible
+from zsched_lab.maps.laser_log import malaga_path
 from zsched_lab.paper.cells import Cell, cells_of, merge_of, world_of
 from zsched_lab.paper.coverage_report import save_coverage
 from zsched_lab.paper.figures import save_all, save_gains, save_panels
@@ -34,7 +35,6 @@ from zsched_lab.paper.run import CellRun, Inputs, write_json
 from zsched_lab.paper.scenario import MATRIX, Scenario, load_scenario
 from zsched_lab.paper.schemes import QUICK_SCHEMES
 from zsched_lab.paper.snippet import snippet
-from zsched_lab.robots.laser_log import malaga_path
 
 RESULTS_SCHEMA = "zsched.paper/1"
 QUICK_S = 34.0

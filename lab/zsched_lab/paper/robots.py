@@ -16,8 +16,8 @@ from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid
 from zsched_lab.explore.body import Drift
 from zsched_lab.explore.worlds import load_world
+from zsched_lab.maps.laser_log import load_log
 from zsched_lab.maps.mapping import RESOLUTION_M, displacements, truth_grid
-from zsched_lab.robots.laser_log import load_log
 
 ODOMETRY = Drift(yaw=0.02, way=0.02)
 """Of robots whose SLAM corrects it: half a metre to two after 30 to 60 m, and up to 11 degrees (three offices)."""

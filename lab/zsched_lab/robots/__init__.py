@@ -1,1 +1,1 @@
-"""The lab's robots: their applications and their laser logs."""
+"""The lab's robots: their applications, and what is watched of them."""

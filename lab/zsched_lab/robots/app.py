@@ -25,9 +25,9 @@ from zsched.tasks.map_merge.cdr import CdrError, decode_grid, encode_grid
 from zsched_lab.fleet import application
 from zsched_lab.fleet.recorder import Record, Recorder
 from zsched_lab.fleet.signals import StopFlag
+from zsched_lab.maps.laser_log import LaserLog, Scan, load_log, malaga_path, split_log
 from zsched_lab.maps.mapping import GridMapper, displacements
 from zsched_lab.maps.picture import MapPicture
-from zsched_lab.robots.laser_log import LaserLog, Scan, load_log, malaga_path, split_log
 
 MAP_PERIOD_S = 1.0
 PROGRESS_PERIOD_S = 1.0

@@ -14,8 +14,8 @@ import zenoh
 from support.waiting import free_endpoint
 from zsched.tasks.map_merge.cdr import decode_grid
 from zsched_lab.fleet.recorder import read_records
+from zsched_lab.maps.laser_log import LaserLog, load_log, malaga_path
 from zsched_lab.robots.app import Drive, parse
-from zsched_lab.robots.laser_log import LaserLog, load_log, malaga_path
 
 REQUIRED = ["--robot", "robot1", "--endpoint", "tcp/127.0.0.1:1", "--records", "records"]
 

@@ -9,8 +9,8 @@ import pytest
 
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid
+from zsched_lab.maps.laser_log import Scan, load_log, malaga_path
 from zsched_lab.maps.mapping import GridMapper, displacements, map_scans, truth_grid
-from zsched_lab.robots.laser_log import Scan, load_log, malaga_path
 
 
 def _scan(pose: Pose2, *beams: tuple[float, float]) -> Scan:

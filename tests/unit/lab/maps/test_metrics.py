@@ -11,9 +11,9 @@ import pytest
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid
 from zsched.tasks.map_merge.merger import Merger, MergerSettings, Mode
+from zsched_lab.maps.laser_log import load_log, malaga_path, split_log
 from zsched_lab.maps.mapping import displacements, map_scans, truth_grid
 from zsched_lab.maps.metrics import grey, pose_errors, score_map, ssim
-from zsched_lab.robots.laser_log import load_log, malaga_path, split_log
 
 
 @pytest.fixture(scope="module")

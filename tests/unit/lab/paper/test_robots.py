@@ -8,6 +8,7 @@ import pytest
 from zsched.config.load import load_fleet
 from zsched_lab.explore.robot import parse as parse_explorer
 from zsched_lab.fleet.recorder import Recorder
+from zsched_lab.maps.laser_log import malaga_path
 from zsched_lab.paper.cells import Cell
 from zsched_lab.paper.node_state import is_calm, ready_workers
 from zsched_lab.paper.places import robots_scenario_path, scenario_path
@@ -16,7 +17,6 @@ from zsched_lab.paper.run import CellRun, Inputs, Seen
 from zsched_lab.paper.scenario import LinkView, MergeTask, load_scenario
 from zsched_lab.paper.schemes import SCHEMES
 from zsched_lab.robots.app import parse
-from zsched_lab.robots.laser_log import malaga_path
 
 
 def a_place(records: Path, robot: str = "robot2", index: int = 1) -> Place:

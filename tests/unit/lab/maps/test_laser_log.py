@@ -11,7 +11,7 @@ import pytest
 
 from zsched.errors import ConfigError
 from zsched.tasks.map_merge.geometry import Pose2
-from zsched_lab.robots.laser_log import LaserLog, load_log, malaga_path, split_log
+from zsched_lab.maps.laser_log import LaserLog, load_log, malaga_path, split_log
 
 
 def _flaser(beams: int, *, t_s: float = 1.0, reading: float = 2.0, pose: str = "1 2 0.5") -> str:
