@@ -11,7 +11,7 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -182,12 +182,88 @@ def find_circle(graph: dict[str, set[str]]) -> list[str]:
     return next((circle for name in sorted(graph) if (circle := visit(name, []))), [])
 
 
+GRAPH: Final = {name: targets(module) for name, module in MODULES.items()}
+
+
 def test_there_are_no_circles() -> None:
-    assert find_circle({name: targets(module) for name, module in MODULES.items()}) == []
+    assert find_circle(GRAPH) == []
 
 
 def test_planted_circle_is_found() -> None:
     assert find_circle({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == ["b", "c", "b"]
+
+
+FOLDERS: Final = ("", *sorted({name[: match.start()] for name in GRAPH for match in re.finditer(r"\.", name)}))
+"""Every folder with code, by its dotted name; ``""`` is ``zsched/`` itself."""
+
+
+def rooms_in(folder: str, graph: dict[str, set[str]]) -> dict[str, set[str]]:
+    """{room: rooms that it imports} of one folder: its folders and its modules.
+
+    No circle of modules is needed for a circle of rooms: two modules of one folder are enough.
+    """
+    prefix = f"{folder}." if folder else ""
+
+    def inside(names: Iterable[str]) -> set[str]:
+        return {name.removeprefix(prefix).partition(".")[0] for name in names if name.startswith(prefix)}
+
+    rooms: dict[str, set[str]] = {room: set() for room in inside(graph)}
+    for name, found in graph.items():
+        for room in inside([name]):
+            rooms[room] |= inside(found & set(graph)) - {room}
+    return rooms
+
+
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_there_are_no_circles_of_rooms(folder: str) -> None:
+    assert find_circle(rooms_in(folder, GRAPH)) == []
+
+
+@pytest.mark.parametrize(
+    ("importer", "imported"),
+    [
+        ("core.electorate.settling", "core.vote.lease"),
+        ("core.values.model", "core.hop.serial"),
+        ("relay.streams.crowd", "relay.task"),
+        ("lab.fleet.view", "lab.robots.watch"),
+    ],
+)
+def test_planted_circle_of_rooms_is_found(importer: str, imported: str) -> None:
+    """Each of these imports makes a circle of folders; the first one had none of modules."""
+    graph = {**GRAPH, importer: GRAPH[importer] | {imported}}
+    assert any(find_circle(rooms_in(folder, graph)) for folder in FOLDERS)
+
+
+STAGES: Final = ("profile", "gateway", "scheduler", "vote", "executor", "route")
+"""The folders of the core that are stages, in the order in which data passes them."""
+LENT: Final = frozenset({("core.executor.handover", "core.route.route")})
+"""What a stage takes of a later one: functions that make a plan of a task's streams, without any state."""
+
+
+def later_stages(name: str, found: set[str]) -> list[str]:
+    """The modules of later stages that a stage's module imports; those of ``LENT`` are left out."""
+
+    def place(module: str) -> int:
+        parts = module.split(".")
+        return STAGES.index(parts[1]) if parts[0] == "core" and len(parts) > 1 and parts[1] in STAGES else -1
+
+    own = place(name)
+    return sorted(one for one in found if -1 < own < place(one) and (name, one) not in LENT)
+
+
+@pytest.mark.parametrize("name", sorted(name for name in GRAPH if name.startswith("core.")))
+def test_no_stage_imports_a_later_one(name: str) -> None:
+    assert later_stages(name, GRAPH[name]) == []
+
+
+def test_planted_import_of_a_later_stage_is_found() -> None:
+    assert later_stages("core.gateway.gateway", {"core.vote.tally", "core.profile.means"}) == ["core.vote.tally"]
+    assert later_stages("core.executor.handover", {"core.route.route", "core.route.gaps"}) == ["core.route.gaps"]
+    assert later_stages("core.handlers.work", {"core.vote.tally"}) == []
+
+
+def test_what_a_stage_takes_of_a_later_one_is_still_taken() -> None:
+    assert [pair for pair in LENT if pair[1] not in GRAPH[pair[0]]] == []
 
 
 CORE: Final = sorted(name for name in MODULES if name.partition(".")[0] == "core")
