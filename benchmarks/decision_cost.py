@@ -20,17 +20,8 @@ from zsched.core.scheduler.judge import Judge
 from zsched.core.scheduler.scoring import compare, score
 from zsched.core.values.fleet import Demand, Fleet, NodeSpec, TaskSpec, Timing
 from zsched.core.values.messages import Utilities
-from zsched.core.values.model import (
-    Allocation,
-    Link,
-    LinkSource,
-    NodeKind,
-    PeerState,
-    Profile,
-    Tuning,
-    UtilityVector,
-    Weights,
-)
+from zsched.core.values.model import Allocation, NodeKind, PeerState, Tuning, UtilityVector, Weights
+from zsched.core.values.profile import Link, LinkSource, Profile
 from zsched.wire import codec as wire
 
 CANDIDATES, ROBOTS = (3, 10, 50, 200), (3, 10, 50)

@@ -25,8 +25,9 @@ import psutil
 
 from benchmarks.common import cpu_s, machine
 from zsched.core.relay_protocol import StreamAck, StreamAcks
+from zsched.core.values.beat import Beat
 from zsched.core.values.messages import Prepare
-from zsched.core.values.model import Ballot, Beat, Proposal
+from zsched.core.values.model import Ballot, Proposal
 from zsched.runtime.access_rules import Side
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import Keyspace

@@ -39,7 +39,8 @@ from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.node import Node
 from zsched.core.values.fleet import Fleet, electorate_hash
-from zsched.core.values.model import DeviceSample, NodeId, NodeKind, WorkerState
+from zsched.core.values.model import NodeId, NodeKind
+from zsched.core.values.profile import DeviceSample, WorkerState
 from zsched.runtime.endpoints import endpoints_for, free_port
 from zsched.runtime.init import init_state
 from zsched.sessions import config as zenoh_config
