@@ -18,7 +18,7 @@ from support.profiles import profile_of
 from support.waiting import between
 from zsched.core.gateway.demand import Demands
 from zsched.core.values.fleet import Demand
-from zsched.core.values.model import Jobs, WorkerLoad, WorkerState
+from zsched.core.values.profile import Jobs, WorkerLoad, WorkerState
 from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 
 pytestmark = pytest.mark.long

@@ -12,7 +12,7 @@ from support.profiles import SAMPLE
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.profile.profile import Profiler
 from zsched.core.values.fleet import Timing
-from zsched.core.values.model import DeviceSample, LinkSample, LinkSource, Profile
+from zsched.core.values.profile import DeviceSample, LinkSample, LinkSource, Profile
 
 TIMING = Timing()
 FLEET = fleet_of(

@@ -18,16 +18,8 @@ from zsched.core.scheduler.judge import Judge, Outcome
 from zsched.core.scheduler.scoring import compare, pick, score
 from zsched.core.values.fleet import Timing, WorkerSpec
 from zsched.core.values.messages import Utilities
-from zsched.core.values.model import (
-    Allocation,
-    Link,
-    LinkSource,
-    PeerState,
-    Proposal,
-    Tuning,
-    UtilityVector,
-    Weights,
-)
+from zsched.core.values.model import Allocation, PeerState, Proposal, Tuning, UtilityVector, Weights
+from zsched.core.values.profile import Link, LinkSource
 
 BOTH = Weights(cpu=0.5, memory=0.5, network=0.0)
 TUNING = Tuning(weights=BOTH)

@@ -17,16 +17,9 @@ from zsched.core.instructions import ApplyRoutes, AskUtilities, Instruction, Pub
 from zsched.core.profile.profile import Profiler
 from zsched.core.values.change import MoveOwner, Retune
 from zsched.core.values.fleet import StreamRule, WorkerSpec
-from zsched.core.values.model import (
-    Allocation,
-    DeviceSample,
-    LinkSample,
-    LinkSource,
-    PeerState,
-    Proposal,
-    WorkerState,
-)
+from zsched.core.values.model import Allocation, PeerState, Proposal
 from zsched.core.values.plan import Direction, RoutePhase, RoutePlan
+from zsched.core.values.profile import DeviceSample, LinkSample, LinkSource, WorkerState
 from zsched.core.vote.tally import Tally, VoteOutcome, tally
 
 ROBOTS = ("robot1", "robot2", "robot3")

@@ -29,7 +29,8 @@ from zsched.adapters.host.state_file import StateFile
 from zsched.clock import ClockWatch, Drift
 from zsched.core import events as ev
 from zsched.core.values.fleet import Fleet, NodeSpec
-from zsched.core.values.model import DeviceSample, NodeKind
+from zsched.core.values.model import NodeKind
+from zsched.core.values.profile import DeviceSample
 from zsched.core.vote.clocks import is_bad
 from zsched.errors import AdapterError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_OK

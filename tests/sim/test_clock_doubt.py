@@ -11,10 +11,11 @@ from support.allocations import allocation_of
 from support.beats import beat_of
 from support.fleets import fleet_of, task_of, tuning_of
 from zsched.core.events import ClockCompared
+from zsched.core.values.beat import Beat, Grant
 from zsched.core.values.fleet import Fleet, WorkerSpec
 from zsched.core.values.lease import RHO, hold_s
-from zsched.core.values.model import Beat, Grant, WorkerState
 from zsched.core.values.plan import WorkerRole
+from zsched.core.values.profile import WorkerState
 from zsched.core.vote.clocks import DOUBT_S, JUMP_S, ClockDoubt
 from zsched.core.vote.lease import Leases
 from zsched_lab.sim.clocks import LOOK_S, slew

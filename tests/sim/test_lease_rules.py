@@ -15,9 +15,9 @@ from zsched.core import instructions as do
 from zsched.core.executor.handover import Executor
 from zsched.core.executor.tenure import Tenure
 from zsched.core.instructions import SetRole
+from zsched.core.values.beat import Beat, Grant
 from zsched.core.values.fleet import Fleet, WorkerSpec, lease_terms
 from zsched.core.values.lease import RHO, hold_s
-from zsched.core.values.model import Beat, Grant
 from zsched.core.values.plan import WorkerRole
 from zsched.core.vote.lease import SENT_KEPT, Granter, Holder, Leases
 

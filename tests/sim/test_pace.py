@@ -10,7 +10,7 @@ from collections import Counter
 import pytest
 
 from zsched.core.membership import pace
-from zsched.core.values.model import Beat
+from zsched.core.values.beat import Beat
 from zsched_lab.sim.simulate import Job, play_all
 
 SEEDS = range(9_100_000, 9_100_016)

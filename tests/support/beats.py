@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from zsched.core.values.model import Beat, NodeId
+from zsched.core.values.beat import Beat
+from zsched.core.values.model import NodeId
 
 
 def beat_of(node: NodeId, sequence: int = 1, **options: Any) -> Beat:

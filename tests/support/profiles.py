@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from zsched.core.values.model import DeviceSample, NodeId, Profile, TaskId, WorkerLoad, WorkerState
+from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.profile import DeviceSample, Profile, WorkerLoad, WorkerState
 
 USUAL: dict[str, Any] = {
     "incarnation": 1,

@@ -16,6 +16,7 @@ from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.electorate.changes import AdoptDocument
 from zsched.core.electorate.founding import founded
+from zsched.core.values.beat import Grant
 from zsched.core.values.document import Document, Flag, FlagKind, Text
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet, OnIsolation, Standby, StreamRule, TaskSpec, WorkerSpec, electorate_hash
@@ -40,21 +41,9 @@ from zsched.core.values.messages import (
     fleet_answer,
     fleet_question,
 )
-from zsched.core.values.model import (
-    Acceptance,
-    Allocation,
-    Asked,
-    Ballot,
-    DeviceSample,
-    Grant,
-    TaskProgress,
-    Tuning,
-    Utility,
-    UtilityVector,
-    Weights,
-    WorkerState,
-)
+from zsched.core.values.model import Acceptance, Allocation, Asked, Ballot, Tuning, Utility, UtilityVector, Weights
 from zsched.core.values.plan import Direction, ReadyWhen, StreamCount
+from zsched.core.values.profile import DeviceSample, TaskProgress, WorkerState
 from zsched.core.values.rehearsal import FAULTS, KeepRehearsal, ReadRehearsals, Strike
 from zsched.wire import codec as wire
 

@@ -21,7 +21,8 @@ from zsched.adapters.radio.network_profiler import readers_for
 from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import LinkSpec, NodeSpec, WorkerSpec
-from zsched.core.values.model import LinkSource, NodeKind, WorkerState
+from zsched.core.values.model import NodeKind
+from zsched.core.values.profile import LinkSource, WorkerState
 
 WORKER = """
 import json, os, pathlib, subprocess, time

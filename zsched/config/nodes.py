@@ -11,7 +11,8 @@ from pathlib import Path
 from zsched.config.blocks import Located, Section
 from zsched.config.reader import Collector, Place, nearest
 from zsched.core.values.fleet import LinkSpec, LocalMode, LocalSide, NodeSpec, dial_endpoint
-from zsched.core.values.model import LinkSource, NodeId, NodeKind
+from zsched.core.values.model import NodeId, NodeKind
+from zsched.core.values.profile import LinkSource
 from zsched.core.values.struct import Struct
 
 _SOURCES = ("wifi", "wired", "fixed", "trace")

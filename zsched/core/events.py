@@ -7,6 +7,7 @@ Knows: the facts that adapters report. Does not know: what follows from them.
 
 from __future__ import annotations
 
+from zsched.core.values.beat import Beat
 from zsched.core.values.document import Flag
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import (
@@ -35,20 +36,9 @@ from zsched.core.values.messages import (
     Utilities,
     Votes,
 )
-from zsched.core.values.model import (
-    MAX_COUNTER,
-    Beat,
-    DeviceSample,
-    LinkSample,
-    NodeId,
-    Profile,
-    Proposal,
-    TaskId,
-    WorkerState,
-    check_counter,
-    check_name,
-)
+from zsched.core.values.model import MAX_COUNTER, NodeId, Proposal, TaskId, check_counter, check_name
 from zsched.core.values.plan import StreamCount
+from zsched.core.values.profile import DeviceSample, LinkSample, Profile, WorkerState
 from zsched.core.values.rehearsal import KeepRehearsal, ReadRehearsals, Strike
 from zsched.core.values.struct import Struct
 from zsched.core.values.words import check_range

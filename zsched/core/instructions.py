@@ -9,6 +9,7 @@ safe when it is cut after any prefix.
 
 from __future__ import annotations
 
+from zsched.core.values.beat import Beat
 from zsched.core.values.decision import Decision, Explanation, Move
 from zsched.core.values.document import Document, Flag
 from zsched.core.values.durable import DurableState
@@ -28,8 +29,9 @@ from zsched.core.values.messages import (
     Utilities,
     Votes,
 )
-from zsched.core.values.model import Beat, NodeId, Profile, Proposal, TaskId
+from zsched.core.values.model import NodeId, Proposal, TaskId
 from zsched.core.values.plan import Role, RoutePlan
+from zsched.core.values.profile import Profile
 from zsched.core.values.rehearsal import KeepRehearsal, RehearsalsTold, Strike
 from zsched.core.values.snapshot import Snapshot
 from zsched.core.values.struct import Struct

@@ -45,8 +45,9 @@ from zsched.core.todo import ToDo
 from zsched.core.values.document import Flag
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet, TaskSpec, file_hash, fleet_hash
-from zsched.core.values.model import Allocation, NodeId, NodeKind, PeerState, Profile, TaskId
+from zsched.core.values.model import Allocation, NodeId, NodeKind, PeerState, TaskId
 from zsched.core.values.plan import StreamCount
+from zsched.core.values.profile import Profile
 from zsched.core.values.struct import Struct
 from zsched.core.vote.agreement import Agreement
 from zsched.core.vote.expiry import Expiry

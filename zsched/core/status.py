@@ -18,8 +18,9 @@ from zsched.core.values.decision import Explanation
 from zsched.core.values.document import Flag
 from zsched.core.values.fleet import NodeSpec, TaskSpec
 from zsched.core.values.gauges import possible
-from zsched.core.values.model import Allocation, NodeId, Pause, PeerState, Pin, TaskId, WorkerLoad, WorkerState
+from zsched.core.values.model import Allocation, NodeId, Pause, PeerState, Pin, TaskId
 from zsched.core.values.plan import Direction, ReadyWhen, Route, StreamCount
+from zsched.core.values.profile import WorkerLoad, WorkerState
 from zsched.core.values.quorum import majority
 from zsched.core.values.snapshot import (
     SCHEMA,

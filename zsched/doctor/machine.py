@@ -19,7 +19,7 @@ from zsched.adapters.radio.nl80211 import GenericNetlink, Nl80211Error
 from zsched.clock import ClockWatch
 from zsched.core.events import ClockCompared
 from zsched.core.values.fleet import LinkSpec, SharedMemory, runs_worker
-from zsched.core.values.model import LinkSource
+from zsched.core.values.profile import LinkSource
 from zsched.core.vote.clocks import is_bad
 from zsched.doctor.model import Result, Scene, counted, failed, joined, passed, skipped, warned
 from zsched.procfs import names, read_file

@@ -18,8 +18,9 @@ from zsched.clock import monotonic_s, wall_time
 from zsched.core import events as ev
 from zsched.core.relay_protocol import WorkerMatched, WorkerSeen, WorkerTrouble
 from zsched.core.values.fleet import Fleet, TaskSpec
-from zsched.core.values.model import MAX_REASON, NodeId, TaskId, WorkerState
+from zsched.core.values.model import MAX_REASON, NodeId, TaskId
 from zsched.core.values.plan import ReadyWhen
+from zsched.core.values.profile import WorkerState
 from zsched.core.values.words import WAS_READY
 from zsched.runtime.sessions import SessionsRead
 from zsched.wire.keyspace import Keyspace, counter

@@ -23,6 +23,8 @@ import msgpack
 
 from zsched.core.membership.beat_room import MAX_BEAT_BYTES
 from zsched.core.values import decision, document, durable, messages, model, plan, rehearsal, snapshot
+from zsched.core.values.beat import Beat
+from zsched.core.values.profile import Profile
 from zsched.errors import WireError
 
 VERSION = 1
@@ -35,8 +37,8 @@ Reader = Callable[[Any], Any]
 Writer = Callable[[Any], Any]
 
 KINDS: dict[str, tuple[type, int]] = {
-    "beat": (model.Beat, MAX_BEAT_BYTES),
-    "profile": (model.Profile, 8 * SMALL),
+    "beat": (Beat, MAX_BEAT_BYTES),
+    "profile": (Profile, 8 * SMALL),
     "proposal": (model.Proposal, SMALL),
     "utilities": (messages.Utilities, LARGE),
     "prepare": (messages.Prepare, SMALL),

@@ -31,6 +31,7 @@ from zsched.core import instructions as do
 from zsched.core.electorate.founding import founded
 from zsched.core.node import Node
 from zsched.core.status import build_snapshot
+from zsched.core.values.beat import Beat
 from zsched.core.values.document import Text
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import FleetValue
@@ -53,18 +54,8 @@ from zsched.core.values.messages import (
     fleet_answer,
     votes_of,
 )
-from zsched.core.values.model import (
-    Beat,
-    DeviceSample,
-    NodeKind,
-    Profile,
-    Proposal,
-    ScoreForm,
-    Tuning,
-    Weights,
-    WorkerLoad,
-    WorkerState,
-)
+from zsched.core.values.model import NodeKind, Proposal, ScoreForm, Tuning, Weights
+from zsched.core.values.profile import DeviceSample, Profile, WorkerLoad, WorkerState
 from zsched.core.values.rehearsal import FAULTS, Strike
 from zsched.errors import WireError
 from zsched.ipc import pipe as relay_pipe

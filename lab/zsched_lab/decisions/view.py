@@ -18,15 +18,8 @@ from zsched.core.gateway.gateway import Gateway
 from zsched.core.profile.profile import Profiler
 from zsched.core.scheduler.scoring import Standing, compare, score
 from zsched.core.values.fleet import Fleet, TaskSpec
-from zsched.core.values.model import (
-    Allocation,
-    DeviceSample,
-    LinkSample,
-    LinkSource,
-    NodeId,
-    PeerState,
-    UtilityVector,
-)
+from zsched.core.values.model import Allocation, NodeId, PeerState, UtilityVector
+from zsched.core.values.profile import DeviceSample, LinkSample, LinkSource
 from zsched_lab.decisions.world import DT_S, MEMORY_MB, World
 
 START_S: Final = 100.0

@@ -20,18 +20,9 @@ from zsched.core.values.decision import Decision
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import Accepted, Promise
-from zsched.core.values.model import (
-    NO_BALLOT,
-    Acceptance,
-    Allocation,
-    Ballot,
-    NodeId,
-    Proposal,
-    RegisterState,
-    TaskId,
-    WorkerState,
-)
+from zsched.core.values.model import NO_BALLOT, Acceptance, Allocation, Ballot, NodeId, Proposal, RegisterState, TaskId
 from zsched.core.values.plan import Role, RoutePlan, WorkerRole
+from zsched.core.values.profile import WorkerState
 from zsched.core.vote.belief import GENERATION_STEP
 from zsched.errors import InvariantError
 from zsched.wire.codec import as_plain, from_plain

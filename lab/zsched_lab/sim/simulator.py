@@ -20,8 +20,9 @@ from zsched.core.node import Node
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet, electorate_hash, fleet_hash
 from zsched.core.values.messages import FleetQuestion, Refused, fleet_question
-from zsched.core.values.model import Allocation, DeviceSample, NodeId, PeerState, TaskId
+from zsched.core.values.model import Allocation, NodeId, PeerState, TaskId
 from zsched.core.values.plan import RoutePlan
+from zsched.core.values.profile import DeviceSample
 from zsched.core.values.struct import replace
 from zsched.core.values.words import Readings
 from zsched.core.vote.generations import blank_state

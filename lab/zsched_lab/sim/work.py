@@ -15,8 +15,9 @@ from typing import Any, Protocol
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.values.fleet import Fleet
-from zsched.core.values.model import NodeId, TaskId, WorkerState
+from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.plan import Role, RoutePhase, RoutePlan, WorkerRole
+from zsched.core.values.profile import WorkerState
 from zsched_lab.sim.checks import Invariants
 from zsched_lab.sim.parts import Machine
 

@@ -16,8 +16,9 @@ from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
 from zsched.core import events as ev
 from zsched.core.relay_protocol import WorkerMatched, WorkerSeen, WorkerTrouble
 from zsched.core.values.fleet import WorkerSpec
-from zsched.core.values.model import MAX_REASON, WorkerState
+from zsched.core.values.model import MAX_REASON
 from zsched.core.values.plan import ReadyWhen
+from zsched.core.values.profile import WorkerState
 from zsched.core.values.words import WAS_READY, told_of_worker
 from zsched.runtime import crew as crew_module
 from zsched.runtime.crew import OTHERS, Crew

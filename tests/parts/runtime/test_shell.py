@@ -51,8 +51,9 @@ from zsched.core.values.messages import (
     Utilities,
     Votes,
 )
-from zsched.core.values.model import Acceptance, Asked, Tuning, Weights, WorkerState
+from zsched.core.values.model import Acceptance, Asked, Tuning, Weights
 from zsched.core.values.plan import STILL_S, Role, RoutePhase, RoutePlan, StreamCount, WorkerRole
+from zsched.core.values.profile import WorkerState
 from zsched.errors import AdapterError, WireError
 from zsched.runtime import shell as shell_module
 from zsched.runtime.desk import LOCAL_REQUESTS_FROM, Desk, command_of

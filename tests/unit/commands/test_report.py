@@ -19,8 +19,9 @@ from support.fleets import tuning_of
 from zsched.commands.page import Page, cut, memory, size, span
 from zsched.commands.report import degradations, printable, render_status
 from zsched.core.report import snapshot_json
-from zsched.core.values.model import Link, LinkSource, Utility, WorkerLoad, WorkerState
+from zsched.core.values.model import Utility
 from zsched.core.values.plan import StreamCount
+from zsched.core.values.profile import Link, LinkSource, WorkerLoad, WorkerState
 from zsched.core.values.snapshot import (
     DecisionStatus,
     NodeStatus,

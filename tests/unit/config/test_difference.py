@@ -13,7 +13,8 @@ from zsched.config.difference import Change, Danger, Effect, difference, wanted_
 from zsched.config.editing import add_entries
 from zsched.config.load import check_bytes
 from zsched.core.values.fleet import Cell, Fleet, LinkSpec, LocalSide, NodeSpec, TaskSpec
-from zsched.core.values.model import LinkSource, NodeKind, Weights
+from zsched.core.values.model import NodeKind, Weights
+from zsched.core.values.profile import LinkSource
 from zsched.runtime.restarts import restarts
 
 TEXT = (Path(__file__).parents[3] / "configs" / "fleet.yaml").read_text()

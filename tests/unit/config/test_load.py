@@ -26,8 +26,9 @@ from zsched.core.values.fleet import (
     electorate_hash,
     fleet_hash,
 )
-from zsched.core.values.model import Aggregate, LinkSource, NodeKind, Objective, PairReading, Reach, ScoreForm
+from zsched.core.values.model import Aggregate, NodeKind, Objective, PairReading, Reach, ScoreForm
 from zsched.core.values.plan import Direction, HandoverRule, ReadyWhen, StreamClass
+from zsched.core.values.profile import LinkSource
 from zsched.errors import ConfigError
 
 ROOT = Path(__file__).parents[3]

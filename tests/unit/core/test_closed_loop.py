@@ -33,16 +33,8 @@ from zsched.core.values.fleet import (
     Timing,
     WorkerSpec,
 )
-from zsched.core.values.model import (
-    DeviceSample,
-    LinkSample,
-    LinkSource,
-    PeerState,
-    ScoreForm,
-    Tuning,
-    Weights,
-    WorkerState,
-)
+from zsched.core.values.model import PeerState, ScoreForm, Tuning, Weights
+from zsched.core.values.profile import DeviceSample, LinkSample, LinkSource, WorkerState
 from zsched.core.vote.tally import VoteOutcome, tally
 
 HOUR_S = 3600.0

@@ -23,6 +23,7 @@ from zsched.core.membership.identity import QUIET_S
 from zsched.core.membership.knocking import KNOCKERS_KEPT, SHOWN_AFTER_S
 from zsched.core.node import Node
 from zsched.core.status import build_snapshot
+from zsched.core.values.beat import Beat
 from zsched.core.values.document import Text
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import CREATION_STEP
@@ -43,17 +44,9 @@ from zsched.core.values.messages import (
     TakeCertificate,
     Utilities,
 )
-from zsched.core.values.model import (
-    Acceptance,
-    Allocation,
-    Ballot,
-    Beat,
-    Echo,
-    PeerState,
-    RegisterState,
-    WorkerState,
-)
+from zsched.core.values.model import Acceptance, Allocation, Ballot, PeerState, RegisterState
 from zsched.core.values.plan import Direction, ReadyWhen, RoutePhase, WorkerRole
+from zsched.core.values.profile import Echo, WorkerState
 
 T = TypeVar("T")
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")

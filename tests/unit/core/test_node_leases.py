@@ -14,14 +14,11 @@ from support.states import state_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.node import Node
+from zsched.core.values.beat import Grant
 from zsched.core.values.fleet import WorkerSpec, lease_terms
 from zsched.core.values.messages import Learnt
-from zsched.core.values.model import (
-    Allocation,
-    Grant,
-    RegisterState,
-    WorkerState,
-)
+from zsched.core.values.model import Allocation, RegisterState
+from zsched.core.values.profile import WorkerState
 
 ROBOTS = ("robot1", "robot2", "robot3")
 WORKER = WorkerSpec(command=("true",))

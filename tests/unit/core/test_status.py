@@ -25,8 +25,9 @@ from zsched.core.scheduler.patience import FIRST_PATIENCE
 from zsched.core.status import build_explanation, build_snapshot, status_line
 from zsched.core.values.fleet import WorkerSpec, electorate_hash, lease_terms
 from zsched.core.values.messages import Learnt
-from zsched.core.values.model import DeviceSample, Echo, Jobs, LinkSample, LinkSource, ScoreForm, WorkerState
+from zsched.core.values.model import ScoreForm
 from zsched.core.values.plan import StreamCount
+from zsched.core.values.profile import DeviceSample, Echo, Jobs, LinkSample, LinkSource, WorkerState
 from zsched.core.values.snapshot import SCHEMA, Snapshot
 from zsched.core.values.words import RESTARTING, WAS_READY
 from zsched.core.vote.agreement import Agreement

@@ -8,7 +8,7 @@ import pytest
 
 from zsched.config.load import check_bytes, load_fleet
 from zsched.core.values.fleet import Fleet, SharedMemory
-from zsched.core.values.model import LinkSource
+from zsched.core.values.profile import LinkSource
 from zsched.dev.fleet import Addresses, LoopbackFile, on_loopback
 
 ROOT = Path(__file__).parents[3]

@@ -19,7 +19,9 @@ from hypothesis import strategies as st
 from zsched.core.electorate.founding import founded
 from zsched.core.membership.beat_room import MAX_BEAT_BYTES
 from zsched.core.values import document, messages, model
+from zsched.core.values.beat import Beat
 from zsched.core.values.electorate import FleetValue
+from zsched.core.values.profile import DeviceSample, Profile
 from zsched.core.values.rehearsal import FAULTS, Strike
 from zsched.core.values.struct import Struct
 from zsched.errors import WireError
@@ -43,7 +45,7 @@ def load_samples() -> dict[str, Any]:
 
 SAMPLES = load_samples()
 CLASSES: tuple[type[Any], ...] = tuple(cls for cls, _ in wire.KINDS.values())
-BEAT = model.Beat(node="r1", incarnation=1, sequence=1, loop_lag_s=0.0)
+BEAT = Beat(node="r1", incarnation=1, sequence=1, loop_lag_s=0.0)
 
 
 def frame_of(body: object, kind: object = "beat", version: object = wire.VERSION, *more: object) -> bytes:
@@ -213,7 +215,7 @@ def test_defaults_do_not_travel() -> None:
 
 def test_whole_number_is_read_as_float_where_a_float_stands() -> None:
     body = {"node": "r1", "incarnation": 1, "sequence": 1, "loop_lag_s": 2}
-    assert type(wire.decode(frame_of(body), model.Beat).loop_lag_s) is float
+    assert type(wire.decode(frame_of(body), Beat).loop_lag_s) is float
 
 
 # --- newer and older peers -------------------------------------------------------------------------------------------
@@ -240,7 +242,7 @@ def test_unknown_fields_of_a_newer_peer_are_ignored_at_every_depth() -> None:
 
 def test_further_frame_parts_of_a_newer_peer_are_ignored() -> None:
     body = msgpack.unpackb(wire.encode(BEAT))[2]
-    assert wire.decode(frame_of(body, "beat", wire.VERSION, "more"), model.Beat) == BEAT
+    assert wire.decode(frame_of(body, "beat", wire.VERSION, "more"), Beat) == BEAT
 
 
 @pytest.mark.parametrize("version", [0, 2, -1, "1", None, 1.0, True, [1]])
@@ -254,19 +256,19 @@ def test_unknown_kind_is_refused(kind: object) -> None:
 
 
 def test_kind_that_this_key_does_not_carry_is_refused() -> None:
-    assert reason_of(wire.encode(BEAT), model.Profile, model.Proposal) == "kind"
+    assert reason_of(wire.encode(BEAT), Profile, model.Proposal) == "kind"
 
 
 def test_class_that_may_not_travel_is_not_encoded() -> None:
     with pytest.raises(KeyError):
-        wire.encode(model.DeviceSample(cpu_cores=1.0, cpu_used_cores=None, memory_mb=1.0, memory_used_mb=None))
+        wire.encode(DeviceSample(cpu_cores=1.0, cpu_used_cores=None, memory_mb=1.0, memory_used_mb=None))
 
 
 def test_kind_or_class_is_registered_once() -> None:
     with pytest.raises(ValueError, match="twice"):
         wire.register("beat", dict, 1)
     with pytest.raises(ValueError, match="twice"):
-        wire.register("beat2", model.Beat, 1)
+        wire.register("beat2", Beat, 1)
 
 
 # --- what is no frame ------------------------------------------------------------------------------------------------
@@ -337,7 +339,7 @@ def test_deeply_nested_bytes_are_refused_or_ignored(place: str, depth: int) -> N
         "unknown field": b"\x93\x01\xa4beat\x85\xa3new" + deep + good[1:],
     }
     if place == "unknown field" and depth < 1024:
-        assert wire.decode(frames[place], model.Beat) == BEAT
+        assert wire.decode(frames[place], Beat) == BEAT
         return
     assert reason_of(frames[place]) in REASONS
 
@@ -357,8 +359,8 @@ def test_frame_larger_than_its_kind_allows_is_neither_sent_nor_read() -> None:
         wire.encode(big)
     assert caught.value.reason == "size"
     body = {"node": "r1", "incarnation": 1, "sequence": 1, "loop_lag_s": 0.0, "new": "x" * MAX_BEAT_BYTES}
-    assert reason_of(frame_of(body), model.Beat) == "size"
-    assert reason_of(frame_of(body), model.Beat, messages.Learnt) == "size"  # a large kind beside it does not help
+    assert reason_of(frame_of(body), Beat) == "size"
+    assert reason_of(frame_of(body), Beat, messages.Learnt) == "size"  # a large kind beside it does not help
 
 
 def test_frame_of_the_largest_allowed_size_is_read() -> None:
@@ -366,7 +368,7 @@ def test_frame_of_the_largest_allowed_size_is_read() -> None:
     body["new"] = "x" * (MAX_BEAT_BYTES - len(frame_of(body)) - 2)
     frame = frame_of(body)
     assert len(frame) == MAX_BEAT_BYTES
-    assert wire.decode(frame, model.Beat) == BEAT
+    assert wire.decode(frame, Beat) == BEAT
 
 
 # --- fuzz ------------------------------------------------------------------------------------------------------------

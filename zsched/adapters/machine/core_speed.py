@@ -19,7 +19,7 @@ from random import Random
 from time import thread_time
 from typing import Final
 
-from zsched.core.values.model import MAX_SPEED, MIN_SPEED
+from zsched.core.values.profile import MAX_SPEED, MIN_SPEED
 from zsched.files import read_regular
 
 NAME: Final = "speed.json"

@@ -24,7 +24,8 @@ from pathlib import Path
 from zsched.adapters.machine.cgroup import CgroupTree, CpuQuota, MemoryQuota
 from zsched.clock import monotonic_s
 from zsched.core.profile.appetite import Appetite, Thread
-from zsched.core.values.model import DeviceSample, TaskId, WorkerLoad, WorkerState
+from zsched.core.values.model import TaskId
+from zsched.core.values.profile import DeviceSample, WorkerLoad, WorkerState
 from zsched.core.values.struct import Struct
 from zsched.procfs import PAGE_MB, TICKS_PER_S, ProcessTimes, names, parse_process_stat, parse_schedstat, read_file
 

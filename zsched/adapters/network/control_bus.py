@@ -25,6 +25,7 @@ from zsched.adapters.network.seals import Seals
 from zsched.clock import monotonic_s
 from zsched.core import events as ev
 from zsched.core.events import commanded
+from zsched.core.values.beat import Beat
 from zsched.core.values.certificates import Holder, Role
 from zsched.core.values.decision import Explanation
 from zsched.core.values.messages import (
@@ -53,7 +54,8 @@ from zsched.core.values.messages import (
     Votes,
     WorkerLines,
 )
-from zsched.core.values.model import Asked, Beat, NodeId, Profile, Proposal
+from zsched.core.values.model import Asked, NodeId, Proposal
+from zsched.core.values.profile import Profile
 from zsched.core.values.rehearsal import ReadRehearsals, RehearsalsTold
 from zsched.core.values.snapshot import Snapshot
 from zsched.core.values.struct import replace

@@ -20,7 +20,7 @@ from typing import Protocol
 from zsched.adapters.radio.nl80211 import GenericNetlink, Nl80211Error, Station
 from zsched.clock import monotonic_s
 from zsched.core.values.fleet import LinkSpec, NodeSpec
-from zsched.core.values.model import LinkSample, LinkSource
+from zsched.core.values.profile import LinkSample, LinkSource
 from zsched.core.values.struct import Struct
 from zsched.files import read_packed
 

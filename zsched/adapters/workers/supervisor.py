@@ -36,7 +36,8 @@ from zsched.adapters.workers.launch import EXIT_CANNOT
 from zsched.adapters.workers.process import ProcessWatch, WorkerGuard, WorkerProcess
 from zsched.clock import awake_s
 from zsched.core.values.fleet import WorkerSpec
-from zsched.core.values.model import MAX_REASON, NodeId, TaskId, WorkerState, as_reason
+from zsched.core.values.model import MAX_REASON, NodeId, TaskId, as_reason
+from zsched.core.values.profile import WorkerState
 from zsched.core.values.struct import Struct, field
 from zsched.core.values.words import RESTARTING
 from zsched.guard import guarded

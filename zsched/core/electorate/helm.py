@@ -10,10 +10,11 @@ from zsched.core import instructions as do
 from zsched.core.electorate.numbers import Numbers
 from zsched.core.electorate.pilot import Course, Pilot, Word
 from zsched.core.todo import ToDo
+from zsched.core.values.beat import Beat
 from zsched.core.values.document import Flag, FlagKind
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet
-from zsched.core.values.model import Beat, NodeId
+from zsched.core.values.model import NodeId
 
 _NOBODY: tuple[NodeId, ...] = ()
 

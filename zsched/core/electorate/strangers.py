@@ -11,9 +11,10 @@ from __future__ import annotations
 from functools import lru_cache
 
 from zsched.core.electorate.founding import founded_id
+from zsched.core.values.beat import Beat
 from zsched.core.values.electorate import SAID_DIGITS, TOLD_DIGITS, FleetValue, generation_in
 from zsched.core.values.messages import Learnt
-from zsched.core.values.model import Beat, NodeId
+from zsched.core.values.model import NodeId
 from zsched.core.values.struct import Struct, field
 
 SHOWN_S = 10.0

@@ -27,8 +27,9 @@ from zsched.core.instructions import RecordStory, RestartWorker
 from zsched.core.scheduler.probation import LIMIT_S
 from zsched.core.todo import ToDo
 from zsched.core.values.fleet import Fleet, TaskSpec
-from zsched.core.values.model import NodeId, Profile, TaskId, TaskProgress, WorkerState
+from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.plan import Direction, StreamCount
+from zsched.core.values.profile import Profile, TaskProgress, WorkerState
 from zsched.core.values.struct import Struct
 
 COUNT_S = 1.0

@@ -26,7 +26,8 @@ from enum import StrEnum
 from zsched.core.instructions import RecordStory, RenewWorker
 from zsched.core.todo import ToDo
 from zsched.core.values.fleet import Standby, TaskSpec
-from zsched.core.values.model import Allocation, NodeId, Profile, Renewal, TaskId, WorkerState
+from zsched.core.values.model import Allocation, NodeId, TaskId
+from zsched.core.values.profile import Profile, Renewal, WorkerState
 from zsched.core.values.struct import Struct, field
 
 SAME_FILE_S = 1.0

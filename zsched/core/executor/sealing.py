@@ -20,10 +20,11 @@ import math
 from collections.abc import Mapping
 
 from zsched.core.executor.handover import Executor
+from zsched.core.values.beat import Beat
 from zsched.core.values.change import SetLeased
 from zsched.core.values.fleet import Fleet, TaskSpec, fleet_hash, lease_terms
 from zsched.core.values.messages import Learnt
-from zsched.core.values.model import Allocation, Beat, NodeId, TaskId
+from zsched.core.values.model import Allocation, NodeId, TaskId
 from zsched.core.values.struct import Struct, field
 
 ASK_EVERY_S = 0.2

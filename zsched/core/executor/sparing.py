@@ -11,7 +11,8 @@ from enum import StrEnum
 
 from zsched.core.scheduler.scoring import may_get
 from zsched.core.values.fleet import TaskSpec
-from zsched.core.values.model import Allocation, NodeId, Profile, TaskId, WorkerState
+from zsched.core.values.model import Allocation, NodeId, TaskId
+from zsched.core.values.profile import Profile, WorkerState
 from zsched.core.values.struct import Struct
 
 

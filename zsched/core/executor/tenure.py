@@ -13,8 +13,9 @@ from zsched.core.events import ClockCompared
 from zsched.core.executor.handover import Executor
 from zsched.core.membership.peers import Membership
 from zsched.core.todo import ToDo
+from zsched.core.values.beat import Beat
 from zsched.core.values.fleet import Fleet, OnIsolation
-from zsched.core.values.model import Allocation, Beat, NodeId, PeerState, TaskId
+from zsched.core.values.model import Allocation, NodeId, PeerState, TaskId
 from zsched.core.values.quorum import majority
 from zsched.core.vote.clocks import ClockDoubt
 from zsched.core.vote.lease import Leases

@@ -11,7 +11,8 @@ from collections.abc import Set as AbstractSet
 from zsched.core import events as ev
 from zsched.core.instructions import RecordStory
 from zsched.core.values.fleet import Fleet, runs_worker
-from zsched.core.values.model import NodeId, Profile, Renewal, TaskId, WorkerState, as_reason
+from zsched.core.values.model import NodeId, TaskId, as_reason
+from zsched.core.values.profile import Profile, Renewal, WorkerState
 from zsched.core.values.struct import Struct, field
 from zsched.core.values.words import told_of_worker
 

@@ -11,7 +11,8 @@ but for a common factor, so an unchanging fleet has no limit cycle.
 from __future__ import annotations
 
 from zsched.core.values.fleet import Demand, TaskSpec
-from zsched.core.values.model import Jobs, NodeId, Profile, TaskId, WorkerLoad, WorkerState
+from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.profile import Jobs, Profile, WorkerLoad, WorkerState
 from zsched.core.values.struct import Struct, replace
 
 STARVED_CPU_RATIO = 0.9

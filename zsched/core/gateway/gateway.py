@@ -11,7 +11,8 @@ from zsched.core.gateway.demand import Demands
 from zsched.core.gateway.sharing import Shares
 from zsched.core.sequence import Order, Track
 from zsched.core.values.fleet import Demand, Fleet, TaskSpec
-from zsched.core.values.model import NodeId, Profile, TaskId
+from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.profile import Profile
 from zsched.core.values.struct import Struct
 
 

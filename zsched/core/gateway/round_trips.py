@@ -12,7 +12,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 
-from zsched.core.values.model import Echo, NodeId, Profile
+from zsched.core.values.model import NodeId
+from zsched.core.values.profile import Echo, Profile
 
 KEPT = 8
 """The least of this many round trips counts."""

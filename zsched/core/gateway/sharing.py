@@ -10,7 +10,8 @@ both promise more than they give would pass the task back and forth for ever.
 
 from __future__ import annotations
 
-from zsched.core.values.model import NodeId, Profile, TaskId
+from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.profile import Profile
 
 
 def fair_share(capacity: float, threads: float, others: float) -> float:

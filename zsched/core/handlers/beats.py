@@ -16,7 +16,8 @@ from zsched.core.membership.identity import Verdict
 from zsched.core.membership.peers import LOSS_FACTOR, Transition
 from zsched.core.stages import Handler, Stages
 from zsched.core.todo import ToDo
-from zsched.core.values.model import Beat, NodeId, PeerState
+from zsched.core.values.beat import Beat
+from zsched.core.values.model import NodeId, PeerState
 
 # --- sent ------------------------------------------------------------------------------------------------------------
 

@@ -16,7 +16,8 @@ from zsched.core.status import build_explanation, build_snapshot
 from zsched.core.todo import ToDo
 from zsched.core.values.fleet import runs_worker
 from zsched.core.values.messages import CommandOutcome, CommandResult
-from zsched.core.values.model import Asked, NodeId, TaskId, WorkerState, told_by
+from zsched.core.values.model import Asked, NodeId, TaskId, told_by
+from zsched.core.values.profile import WorkerState
 
 
 def _on_status(node: Stages, event: ev.StatusAsked, todo: ToDo, now: float) -> None:

@@ -20,7 +20,8 @@ from zsched.core.rehearsal.promises import promises
 from zsched.core.stages import Handler, Stages
 from zsched.core.todo import ToDo
 from zsched.core.values.messages import CommandOutcome, CommandResult
-from zsched.core.values.model import Allocation, PeerState, TaskId, WorkerState, told_by
+from zsched.core.values.model import Allocation, PeerState, TaskId, told_by
+from zsched.core.values.profile import WorkerState
 from zsched.core.values.quorum import majority
 from zsched.core.values.rehearsal import RehearsalsTold, Step, Strike
 

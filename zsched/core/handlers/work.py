@@ -17,8 +17,9 @@ from zsched.core.stages import Handler, PastValue, Stages, Unready
 from zsched.core.todo import ToDo
 from zsched.core.values.decision import Move
 from zsched.core.values.electorate import CREATION_STEP
-from zsched.core.values.model import Allocation, NodeId, PeerState, TaskId, Weights, WorkerState, told_by
+from zsched.core.values.model import Allocation, NodeId, PeerState, TaskId, Weights, told_by
 from zsched.core.values.plan import StreamCount
+from zsched.core.values.profile import WorkerState
 
 FIRST_NEWS: Final = "known from a peer, the first news here"
 """Why a task has its owner, at a node that knew nothing of the task."""

@@ -8,8 +8,8 @@ Knows: how many bytes a beat's parts take at most. Does not know: the bytes them
 
 from __future__ import annotations
 
+from zsched.core.values.beat import Beat, Grant
 from zsched.core.values.fleet import Fleet
-from zsched.core.values.model import Beat, Grant
 from zsched.core.values.struct import Struct, replace
 
 MAX_BEAT_BYTES = 16 * 1024

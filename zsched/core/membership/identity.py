@@ -16,7 +16,8 @@ import math
 from collections.abc import Mapping
 from enum import StrEnum
 
-from zsched.core.values.model import Beat, NodeId
+from zsched.core.values.beat import Beat
+from zsched.core.values.model import NodeId
 from zsched.core.values.struct import Struct, field
 
 YOUNG_S = 3.0

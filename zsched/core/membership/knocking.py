@@ -12,8 +12,9 @@ Knows: names and beats of unknown nodes. Does not know: the other content of the
 from __future__ import annotations
 
 from zsched.core.membership.identity import ONE_FILE, QUIET_S, here
+from zsched.core.values.beat import Beat
 from zsched.core.values.electorate import SAID_DIGITS
-from zsched.core.values.model import Beat, NodeId
+from zsched.core.values.model import NodeId
 from zsched.core.values.struct import Struct, field
 
 SHOWN_AFTER_S = 5.0

@@ -14,7 +14,8 @@ from __future__ import annotations
 import math
 
 from zsched.core.membership.identity import QUIET_S
-from zsched.core.values.model import Beat, NodeId
+from zsched.core.values.beat import Beat
+from zsched.core.values.model import NodeId
 from zsched.core.values.struct import Struct, field
 
 BESIDE_S = 1.0

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import math
 
+from zsched.core.values.beat import Beat
 from zsched.core.values.fleet import Timing
-from zsched.core.values.model import Beat
 from zsched.core.values.struct import Struct, replace
 
 FULL_S = 5.0

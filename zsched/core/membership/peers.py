@@ -25,8 +25,9 @@ from __future__ import annotations
 import math
 
 from zsched.core.sequence import Order, Track
+from zsched.core.values.beat import Beat
 from zsched.core.values.fleet import Timing
-from zsched.core.values.model import Beat, NodeId, PeerState
+from zsched.core.values.model import NodeId, PeerState
 from zsched.core.values.struct import Struct, field
 
 SMALL_FLEET = 3

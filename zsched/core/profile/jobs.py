@@ -21,7 +21,7 @@ from typing import Final
 
 from zsched.core.events import WorkerJobs
 from zsched.core.profile.means import STALE_S, Ewma
-from zsched.core.values.model import MAX_JOB_S, MAX_JOBS_HZ, Jobs
+from zsched.core.values.profile import MAX_JOB_S, MAX_JOBS_HZ, Jobs
 
 QUEUE_S = 2.0
 """A longer wait shows that the worker is behind, and not that several jobs came at once."""

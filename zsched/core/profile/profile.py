@@ -19,7 +19,8 @@ from zsched.core.profile.jobs import JobMeter
 from zsched.core.profile.means import STALE_S, Ewma
 from zsched.core.values.fleet import Timing
 from zsched.core.values.gauges import possible
-from zsched.core.values.model import (
+from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.profile import (
     MAX_BITRATE_MBPS,
     MAX_CPU_CORES,
     MAX_MEMORY_MB,
@@ -30,10 +31,8 @@ from zsched.core.values.model import (
     Link,
     LinkSample,
     LinkSource,
-    NodeId,
     Profile,
     Renewal,
-    TaskId,
     TaskProgress,
     WorkerLoad,
     WorkerState,

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from zsched.core.values.model import DeviceSample, LinkSample, LinkSource
+from zsched.core.values.profile import DeviceSample, LinkSample, LinkSource
 from zsched.core.values.struct import Struct
 
 REST_S: Final = 1.0

@@ -14,7 +14,8 @@ from zsched.core.scheduler.judge import Judge, Judgement, Outcome, escape_ahead,
 from zsched.core.scheduler.scoring import Standing, compare
 from zsched.core.values.decision import Figures, Rules, Verdict
 from zsched.core.values.fleet import TaskSpec, WorkerSpec
-from zsched.core.values.model import Allocation, PeerState, WorkerState
+from zsched.core.values.model import Allocation, PeerState
+from zsched.core.values.profile import WorkerState
 from zsched.core.values.quorum import majority
 from zsched.core.values.struct import Struct, replace
 

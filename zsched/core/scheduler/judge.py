@@ -19,18 +19,8 @@ from zsched.core.scheduler.patience import LONGEST_GAP_S, LearntPatience, spend
 from zsched.core.scheduler.scoring import Standing, joined, pick
 from zsched.core.values.decision import JudgeMemory
 from zsched.core.values.fleet import TaskSpec
-from zsched.core.values.model import (
-    Allocation,
-    NodeId,
-    Pause,
-    PeerState,
-    Pin,
-    Profile,
-    Renewal,
-    ScoreForm,
-    WorkerState,
-    told_by,
-)
+from zsched.core.values.model import Allocation, NodeId, Pause, PeerState, Pin, ScoreForm, told_by
+from zsched.core.values.profile import Profile, Renewal, WorkerState
 from zsched.core.values.struct import Struct, field
 from zsched.core.values.words import told_of_worker
 

@@ -12,7 +12,8 @@ from __future__ import annotations
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.utility import network_utility
 from zsched.core.values.fleet import LinkLimits
-from zsched.core.values.model import Link, LinkSource, NodeId, PairReading, Profile
+from zsched.core.values.model import NodeId, PairReading
+from zsched.core.values.profile import Link, LinkSource, Profile
 from zsched.core.values.struct import Struct
 
 WIRED_DBM = 0.0

@@ -31,15 +31,14 @@ from zsched.core.values.model import (
     Allocation,
     NodeId,
     PeerState,
-    Profile,
     Reach,
     ScoreForm,
     TaskId,
     Tuning,
     Utility,
     UtilityVector,
-    WorkerState,
 )
+from zsched.core.values.profile import Profile, WorkerState
 from zsched.core.values.quorum import majority
 from zsched.core.values.struct import Struct, field
 

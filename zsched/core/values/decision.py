@@ -8,7 +8,8 @@ seconds, because the judgement itself goes by them.
 
 from __future__ import annotations
 
-from zsched.core.values.model import Allocation, NodeId, PeerState, Profile, Reach, TaskId, UtilityVector
+from zsched.core.values.model import Allocation, NodeId, PeerState, Reach, TaskId, UtilityVector
+from zsched.core.values.profile import Profile
 from zsched.core.values.snapshot import VoteStatus
 from zsched.core.values.struct import Struct
 

@@ -19,15 +19,12 @@ from zsched.core.values.document import Rollout
 from zsched.core.values.gauges import check_limits
 from zsched.core.values.limits import Range, check_ranges, key
 from zsched.core.values.model import (
-    MAX_CPU_CORES,
     MAX_FORESEE_S,
     MAX_MEMORY_FLOOR,
-    MAX_MEMORY_MB,
     MAX_MOVES_PER_MINUTE,
     RSSI_MAX_DBM,
     RSSI_MIN_DBM,
     Allocation,
-    LinkSource,
     NodeId,
     NodeKind,
     PairReading,
@@ -37,6 +34,7 @@ from zsched.core.values.model import (
     Tuning,
 )
 from zsched.core.values.plan import Direction, ReadyWhen, ServiceSettings, StreamSettings
+from zsched.core.values.profile import MAX_CPU_CORES, MAX_MEMORY_MB, LinkSource
 from zsched.core.values.struct import Struct, replace
 from zsched.core.values.words import Readings
 

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 from enum import StrEnum
 
-from zsched.core.values.model import Link, NodeId, TaskId, Tuning, Utility, WorkerLoad
+from zsched.core.values.model import NodeId, TaskId, Tuning, Utility
 from zsched.core.values.plan import StreamCount
+from zsched.core.values.profile import Link, WorkerLoad
 from zsched.core.values.struct import Struct
 from zsched.core.values.words import Readings
 

@@ -30,7 +30,7 @@ _READY = "ready"
 
 
 def told_of_worker(state: str, reason: str) -> str:
-    """The state of a worker (`zsched.core.values.model.WorkerState`) in words, to follow its name."""
+    """The state of a worker (`zsched.core.values.profile.WorkerState`) in words, to follow its name."""
     if state != _READY and reason.startswith(WAS_READY):
         return reason
     if state != _READY and reason.startswith(RESTARTING):

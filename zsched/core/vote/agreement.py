@@ -22,6 +22,7 @@ from zsched.core.electorate.orders import Orders
 from zsched.core.electorate.strangers import Strangers
 from zsched.core.register.task_register import TaskRegister
 from zsched.core.todo import ToDo
+from zsched.core.values.beat import Beat
 from zsched.core.values.change import Change, Ended, MoveOwner, RoundOutcome
 from zsched.core.values.document import Flag
 from zsched.core.values.durable import DurableState
@@ -41,14 +42,7 @@ from zsched.core.values.messages import (
     Refused,
     votes_of,
 )
-from zsched.core.values.model import (
-    NO_BALLOT,
-    Allocation,
-    Beat,
-    NodeId,
-    RegisterState,
-    TaskId,
-)
+from zsched.core.values.model import NO_BALLOT, Allocation, NodeId, RegisterState, TaskId
 from zsched.core.values.struct import replace
 from zsched.core.vote.acceptor import Acceptor
 from zsched.core.vote.belief import GENERATION_STEP, MAX_GENERATION, is_proven

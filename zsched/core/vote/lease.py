@@ -40,9 +40,10 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from zsched.core.values.beat import Beat, Grant
 from zsched.core.values.fleet import Fleet, lease_terms
 from zsched.core.values.lease import hold_s
-from zsched.core.values.model import Allocation, Beat, Grant, NodeId, TaskId
+from zsched.core.values.model import Allocation, NodeId, TaskId
 from zsched.core.values.quorum import majority
 from zsched.core.values.struct import Struct
 

@@ -16,8 +16,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
+from zsched.core.values.beat import Beat
 from zsched.core.values.messages import Learnt
-from zsched.core.values.model import Beat, NodeId
+from zsched.core.values.model import NodeId
 from zsched.core.values.quorum import majority
 
 ASK_ALL_S = 0.5

@@ -18,18 +18,8 @@ from zsched.core.gateway.gateway import Gateway
 from zsched.core.profile.profile import Profiler
 from zsched.core.scheduler.scoring import Standing, book, compare, score
 from zsched.core.values.fleet import TaskSpec
-from zsched.core.values.model import (
-    Allocation,
-    DeviceSample,
-    LinkSample,
-    LinkSource,
-    NodeId,
-    PeerState,
-    TaskId,
-    Tuning,
-    WorkerLoad,
-    WorkerState,
-)
+from zsched.core.values.model import Allocation, NodeId, PeerState, TaskId, Tuning
+from zsched.core.values.profile import DeviceSample, LinkSample, LinkSource, WorkerLoad, WorkerState
 from zsched_lab.decisions.replay import TICKS, rounds
 from zsched_lab.decisions.rules import Move, Rule
 from zsched_lab.decisions.service.history import History, mask_of, rank_of

@@ -20,7 +20,7 @@ import pytest
 from zsched.adapters.workers.process import LINES_BURST
 from zsched.adapters.workers.supervisor import RestartPolicy, WorkerContext, WorkerSupervisor
 from zsched.core.values.fleet import WorkerSpec
-from zsched.core.values.model import WorkerState
+from zsched.core.values.profile import WorkerState
 
 QUICK = RestartPolicy(first_s=0.02, most_s=0.1)
 SLEEP = "import time; time.sleep(60)"

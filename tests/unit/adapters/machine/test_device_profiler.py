@@ -23,7 +23,7 @@ from zsched.adapters.machine.device_profiler import (
     parse_pressure,
     parse_running,
 )
-from zsched.core.values.model import WorkerState
+from zsched.core.values.profile import WorkerState
 from zsched.procfs import parse_process_stat, parse_schedstat
 
 MEMINFO = "MemTotal:        4096000 kB\nMemFree: 100 kB\nMemAvailable:    3072000 kB\nHugePages_Total: 0\n"

@@ -19,7 +19,8 @@ from zsched.adapters.radio.network_profiler import (
 )
 from zsched.adapters.radio.nl80211 import GenericNetlink, Nl80211Error, Station
 from zsched.core.values.fleet import LinkSpec, NodeSpec
-from zsched.core.values.model import LinkSample, LinkSource, NodeKind
+from zsched.core.values.model import NodeKind
+from zsched.core.values.profile import LinkSample, LinkSource
 
 WIRELESS = """Inter-| sta-|   Quality        |   Discarded packets               | Missed | WE
  face | tus | link level noise |  nwid  crypt   frag  retry   misc | beacon | 22

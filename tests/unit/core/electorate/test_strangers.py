@@ -22,11 +22,12 @@ from zsched.core.membership.knocking import SHOWN_AFTER_S
 from zsched.core.node import Node
 from zsched.core.status import build_snapshot
 from zsched.core.todo import ToDo
+from zsched.core.values.beat import Beat, Grant
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import Learnt, Prepare
-from zsched.core.values.model import Allocation, Ballot, Beat, Grant, PeerState, Proposal, RegisterState
+from zsched.core.values.model import Allocation, Ballot, PeerState, Proposal, RegisterState
 from zsched.core.vote.agreement import Agreement
 
 NAMES = ("edge1", "robot1", "robot2", "robot3")

@@ -21,13 +21,9 @@ from zsched.core.instructions import Instruction, RecordStory, RestartWorker
 from zsched.core.node import Node
 from zsched.core.scheduler.probation import LIMIT_S
 from zsched.core.values.fleet import StreamRule, TaskSpec, WorkerSpec, electorate_hash
-from zsched.core.values.model import (
-    Profile,
-    RegisterState,
-    TaskProgress,
-    WorkerState,
-)
+from zsched.core.values.model import RegisterState
 from zsched.core.values.plan import Direction, StreamCount
+from zsched.core.values.profile import Profile, TaskProgress, WorkerState
 
 ROBOTS = ("robot1", "robot2")
 DEADLINE_S = 4.0

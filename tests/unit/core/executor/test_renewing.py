@@ -14,7 +14,8 @@ from zsched.core.executor.renewing import GIVE_AWAY_S, OTHER_FILE_S, SAME_FILE_S
 from zsched.core.instructions import RecordStory, RenewWorker
 from zsched.core.todo import ToDo
 from zsched.core.values.fleet import Standby, WorkerSpec
-from zsched.core.values.model import Allocation, NodeId, Profile, Renewal, WorkerState
+from zsched.core.values.model import Allocation, NodeId
+from zsched.core.values.profile import Profile, Renewal, WorkerState
 
 SPEC = task_of("merge", ("edge1", "edge2", "edge3"), worker=WorkerSpec(command=("work",)))
 OWNED = allocation_of(3, "edge2", task="merge")

@@ -9,7 +9,7 @@ from support.fleets import task_of
 from support.profiles import load_of, profile_of
 from zsched.core.executor.sparing import Sparing, lacking
 from zsched.core.values.fleet import Standby, WorkerSpec
-from zsched.core.values.model import Profile, WorkerState
+from zsched.core.values.profile import Profile, WorkerState
 
 WARM = WorkerSpec(command=("work",))
 COLD = WorkerSpec(command=("work",), standby=Standby.COLD)

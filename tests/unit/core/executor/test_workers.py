@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from zsched.core import events as ev
 from zsched.core.executor.workers import TROUBLE_S, Workers
-from zsched.core.values.model import MAX_REASON, WorkerState
+from zsched.core.values.model import MAX_REASON
+from zsched.core.values.profile import WorkerState
 
 CUT = "x" * (MAX_REASON - 1) + "…"
 

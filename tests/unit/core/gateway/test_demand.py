@@ -12,7 +12,7 @@ from support.fleets import task_of
 from support.profiles import load_of, profile_of
 from zsched.core.gateway.demand import QUEUE_RATIO, SETTLE_S, SHORT_RATIO, STARVED_CPU_RATIO, UNSURE, Demands, is_short
 from zsched.core.values.fleet import Demand
-from zsched.core.values.model import Jobs, Profile, WorkerLoad, WorkerState
+from zsched.core.values.profile import Jobs, Profile, WorkerLoad, WorkerState
 
 TASK = task_of(demand=Demand(cpu_cores=0.4, memory_mb=250.0))
 EVERY_S = 2 * SETTLE_S

@@ -8,7 +8,7 @@ from support.fleets import fleet_of, task_of
 from support.profiles import load_of, profile_of
 from zsched.core.gateway.gateway import EdgeData, Gateway
 from zsched.core.values.fleet import Demand
-from zsched.core.values.model import Profile, WorkerState
+from zsched.core.values.profile import Profile, WorkerState
 
 TASK = task_of(demand=Demand(cpu_cores=0.4, memory_mb=250.0))
 FLEET = fleet_of(TASK, of=("edge1", "edge2", "robot1"), electors=("robot1",))

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from support.profiles import profile_of
 from zsched.core.gateway.round_trips import ECHO_S, KEPT, SENT, RoundTrips
-from zsched.core.values.model import Echo
+from zsched.core.values.profile import Echo
 
 MINE = profile_of("robot1", incarnation=7, sequence=0, memory_mb=100.0, memory_used_mb=1.0)
 EDGE = replace(MINE, node="edge1", incarnation=3)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from support.profiles import load_of, profile_of
 from zsched.core.gateway.sharing import Shares, fair_share
-from zsched.core.values.model import Profile
+from zsched.core.values.profile import Profile
 
 
 def profile(

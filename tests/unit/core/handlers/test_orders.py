@@ -32,7 +32,8 @@ from zsched.core.values.messages import (
     RetryTask,
     TuneTask,
 )
-from zsched.core.values.model import Acceptance, Allocation, Asked, RegisterState, WorkerState
+from zsched.core.values.model import Acceptance, Allocation, Asked, RegisterState
+from zsched.core.values.profile import WorkerState
 from zsched.core.values.snapshot import FlagStatus
 
 ADA = Asked(by="ada@robot1", reason="new battery")

@@ -20,15 +20,8 @@ from zsched.core.node import Node
 from zsched.core.values.document import Flag, FlagKind, Text
 from zsched.core.values.fleet import Fleet, Security, WorkerSpec, electorate_hash
 from zsched.core.values.messages import CommandOutcome, CommandResult
-from zsched.core.values.model import (
-    Acceptance,
-    Asked,
-    Pause,
-    PeerState,
-    Pin,
-    RegisterState,
-    WorkerState,
-)
+from zsched.core.values.model import Acceptance, Asked, Pause, PeerState, Pin, RegisterState
+from zsched.core.values.profile import WorkerState
 from zsched.core.values.rehearsal import KeepRehearsal, ReadRehearsals, Step, Strike
 
 ADA = Asked(by="ada@robot1", reason="rehearsal 1")

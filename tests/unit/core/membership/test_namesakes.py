@@ -5,7 +5,7 @@ from __future__ import annotations
 from support.beats import beat_of
 from zsched.core.membership.identity import QUIET_S
 from zsched.core.membership.namesakes import BESIDE_BEATS, BESIDE_S, LIVES_KEPT, TWINS_TOLD, WHERE_EVERY_S, Namesakes
-from zsched.core.values.model import Beat
+from zsched.core.values.beat import Beat
 
 BEAT_S = 0.2
 

@@ -9,8 +9,8 @@ import pytest
 from support.beats import beat_of
 from zsched.config.timing import PROFILES, WIFI
 from zsched.core.membership.pace import FULL_S, Pace
+from zsched.core.values.beat import Beat
 from zsched.core.values.fleet import Timing
-from zsched.core.values.model import Beat
 
 
 def sent(pace: Pace, number: int, now: float, *, is_restless: bool = False, suspects: tuple[str, ...] = ()) -> Beat:

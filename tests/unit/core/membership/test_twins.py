@@ -13,7 +13,7 @@ from zsched.core.membership.identity import (
     Identity,
     Verdict,
 )
-from zsched.core.values.model import Beat
+from zsched.core.values.beat import Beat
 
 BEAT_S = 0.5
 STAYS = int(STAYS_S / BEAT_S)

@@ -18,7 +18,7 @@ from zsched.core.profile.profile import (
     SignalFilter,
 )
 from zsched.core.values.fleet import Timing
-from zsched.core.values.model import DeviceSample, LinkSample, LinkSource, Profile, WorkerLoad, WorkerState
+from zsched.core.values.profile import DeviceSample, LinkSample, LinkSource, Profile, WorkerLoad, WorkerState
 
 TIMING = Timing()
 READY = {"merge": WorkerState.READY}

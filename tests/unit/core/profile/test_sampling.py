@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from zsched.core.profile.sampling import CHANGING_S, LOAD_CHANGE, REST_S, Sampling
-from zsched.core.values.model import DeviceSample, LinkSample, LinkSource, WorkerLoad, WorkerState
+from zsched.core.values.profile import DeviceSample, LinkSample, LinkSource, WorkerLoad, WorkerState
 
 IDLE = DeviceSample(
     cpu_cores=4.0,

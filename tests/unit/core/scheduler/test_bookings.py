@@ -12,12 +12,8 @@ from support.profiles import load_of, profile_of
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.scoring import score
 from zsched.core.values.fleet import Demand, TaskSpec, WorkerSpec
-from zsched.core.values.model import (
-    PeerState,
-    Utility,
-    WorkerLoad,
-    WorkerState,
-)
+from zsched.core.values.model import PeerState, Utility
+from zsched.core.values.profile import WorkerLoad, WorkerState
 
 TASKS = tuple(
     task_of(name, ("edge1",), worker=WorkerSpec(command=("work",)), demand=Demand(cpu_cores=0.5, memory_mb=200.0))

@@ -16,7 +16,8 @@ from support.fleets import fleet_of, task_of, tuning_of
 from zsched.core.scheduler.decision import decide_again, verdict_of
 from zsched.core.values.decision import Decision
 from zsched.core.values.fleet import Fleet, WorkerSpec
-from zsched.core.values.model import NodeId, TaskId, WorkerState
+from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.profile import WorkerState
 from zsched.errors import InvariantError
 from zsched.wire.codec import as_plain, from_plain
 from zsched_lab.sim.checks import check_replayed

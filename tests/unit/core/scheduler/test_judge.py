@@ -23,15 +23,8 @@ from zsched.core.scheduler.judge import (
 from zsched.core.scheduler.patience import FORGIVEN_IN_S
 from zsched.core.scheduler.scoring import Standing, compare
 from zsched.core.values.fleet import TaskSpec, WorkerSpec
-from zsched.core.values.model import (
-    Allocation,
-    Asked,
-    Pause,
-    PeerState,
-    Pin,
-    Profile,
-    WorkerState,
-)
+from zsched.core.values.model import Allocation, Asked, Pause, PeerState, Pin
+from zsched.core.values.profile import Profile, WorkerState
 
 TUNING = tuning_of(cpu=1.0, memory=0.0, bonus=0.10, cool_down_s=10.0)
 SPEC = task_of(

@@ -15,12 +15,8 @@ from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.scoring import score
 from zsched.core.scheduler.utility import on_time, service_utility
 from zsched.core.values.fleet import Demand, WorkerSpec
-from zsched.core.values.model import (
-    Jobs,
-    PeerState,
-    ScoreForm,
-    Tuning,
-)
+from zsched.core.values.model import PeerState, ScoreForm, Tuning
+from zsched.core.values.profile import Jobs
 
 TUNING = tuning_of(cpu=1.0, memory=0.0, score=ScoreForm.SERVICE, deadline_ms=100.0)
 EDGES = ("edge1", "edge2")

@@ -19,11 +19,8 @@ from zsched.core.scheduler.judge import Outcome
 from zsched.core.scheduler.rounds import TaskRound
 from zsched.core.values.fleet import Fleet, WorkerSpec
 from zsched.core.values.messages import Utilities
-from zsched.core.values.model import (
-    Allocation,
-    PeerState,
-    WorkerState,
-)
+from zsched.core.values.model import Allocation, PeerState
+from zsched.core.values.profile import WorkerState
 from zsched.core.vote.tally import VoteOutcome
 from zsched.core.vote.voting import Voting, vote_time
 

@@ -14,18 +14,15 @@ from zsched.core.scheduler.utility import NEARLY_FULL, service_utility
 from zsched.core.values.fleet import DEFAULT_BONUS, Demand, LinkLimits, Standby, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.model import (
     Allocation,
-    Link,
-    LinkSource,
     PairReading,
     PeerState,
-    Profile,
     ScoreForm,
     Tuning,
     Utility,
     UtilityVector,
     Weights,
-    WorkerState,
 )
+from zsched.core.values.profile import Link, LinkSource, Profile, WorkerState
 
 CPU = Weights(cpu=1.0, memory=0.0, network=0.0)
 HALVES = Weights(cpu=0.5, memory=0.0, network=0.5)

@@ -14,12 +14,8 @@ from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.scoring import book, score
 from zsched.core.scheduler.turns import in_turn, who_moves_first
 from zsched.core.values.fleet import Demand
-from zsched.core.values.model import (
-    Allocation,
-    PeerState,
-    UtilityVector,
-    WorkerLoad,
-)
+from zsched.core.values.model import Allocation, PeerState, UtilityVector
+from zsched.core.values.profile import WorkerLoad
 from zsched.core.vote.voting import Voting
 
 

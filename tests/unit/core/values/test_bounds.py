@@ -28,6 +28,7 @@ from zsched.core.events import (
 )
 from zsched.core.relay_protocol import EndMarker, SnapshotChunk, StreamAck, WorkerTrouble
 from zsched.core.values import model
+from zsched.core.values.beat import Grant
 from zsched.core.values.document import Text
 from zsched.core.values.fleet import Demand
 from zsched.core.values.messages import (
@@ -47,20 +48,21 @@ from zsched.core.values.messages import (
     SetWeights,
     WorkerLines,
 )
-from zsched.core.values.model import (
-    MAX_COUNTER,
-    Asked,
+from zsched.core.values.model import MAX_COUNTER, Asked, ScoreForm, Utility, UtilityVector
+from zsched.core.values.plan import ServiceSettings, StreamSettings
+from zsched.core.values.profile import (
+    MAX_BITRATE_MBPS,
+    MAX_CPU_CORES,
+    MAX_HELD_S,
+    MAX_JOB_S,
+    MAX_JOBS_HZ,
+    MAX_MEMORY_MB,
     Echo,
-    Grant,
     Jobs,
     Link,
     LinkSource,
-    ScoreForm,
     TaskProgress,
-    Utility,
-    UtilityVector,
 )
-from zsched.core.values.plan import ServiceSettings, StreamSettings
 from zsched.core.values.rehearsal import (
     MAX_CUT_S,
     MAX_KEPT_BYTES,
@@ -173,22 +175,22 @@ RANGES = [
     (TUNING, "cool_down_s", "cool_down_s", (0.0, 86400.0)),
     (LINK, "rssi_dbm", "link.rssi_dbm", (-120.0, 0.0)),
     (LINK, "trend_db_s", "link.trend_db_s", (-100.0, 100.0)),
-    (LINK, "bitrate_mbps", "link.bitrate_mbps", (0.0, model.MAX_BITRATE_MBPS)),
+    (LINK, "bitrate_mbps", "link.bitrate_mbps", (0.0, MAX_BITRATE_MBPS)),
     (LINK, "retry_ratio", "link.retry_ratio", RATIO),
-    (LOAD, "cpu_cores", "worker.cpu_cores", (0.0, model.MAX_CPU_CORES)),
-    (LOAD, "memory_mb", "worker.memory_mb", (0.0, model.MAX_MEMORY_MB)),
-    (PROFILE, "cpu_cores", "profile.cpu_cores", (0.001, model.MAX_CPU_CORES)),
-    (PROFILE, "cpu_used_cores", "profile.cpu_used_cores", (0.0, model.MAX_CPU_CORES)),
-    (PROFILE, "memory_mb", "profile.memory_mb", (1.0, model.MAX_MEMORY_MB)),
-    (PROFILE, "memory_used_mb", "profile.memory_used_mb", (0.0, model.MAX_MEMORY_MB)),
+    (LOAD, "cpu_cores", "worker.cpu_cores", (0.0, MAX_CPU_CORES)),
+    (LOAD, "memory_mb", "worker.memory_mb", (0.0, MAX_MEMORY_MB)),
+    (PROFILE, "cpu_cores", "profile.cpu_cores", (0.001, MAX_CPU_CORES)),
+    (PROFILE, "cpu_used_cores", "profile.cpu_used_cores", (0.0, MAX_CPU_CORES)),
+    (PROFILE, "memory_mb", "profile.memory_mb", (1.0, MAX_MEMORY_MB)),
+    (PROFILE, "memory_used_mb", "profile.memory_used_mb", (0.0, MAX_MEMORY_MB)),
     (PROFILE, "cpu_pressure", "profile.cpu_pressure", RATIO),
-    (LOAD, "wanted_cores", "worker.wanted_cores", (0.0, model.MAX_CPU_CORES)),
+    (LOAD, "wanted_cores", "worker.wanted_cores", (0.0, MAX_CPU_CORES)),
     (TUNING, "deadline_ms", "deadline_ms", (model.MIN_DEADLINE_MS, model.MAX_DEADLINE_MS)),
-    *((JOBS, name, f"jobs.{name}", (0.0, model.MAX_JOB_S)) for name in ("time_s", "cpu_s", "wait_s", "age_s")),
-    *((JOBS, name, f"jobs.{name}", (0.0, model.MAX_JOBS_HZ)) for name in ("done_hz", "wanted_hz")),
+    *((JOBS, name, f"jobs.{name}", (0.0, MAX_JOB_S)) for name in ("time_s", "cpu_s", "wait_s", "age_s")),
+    *((JOBS, name, f"jobs.{name}", (0.0, MAX_JOBS_HZ)) for name in ("done_hz", "wanted_hz")),
     (JOBS, "late_ratio", "jobs.late_ratio", RATIO),
     *((WORD, name, f"jobs.{name}", (0.0, MAX_COUNTER)) for name in ("at_s", "time_s", "cpu_s", "wait_s", "age_s")),
-    (ECHO, "held_s", "echo.held_s", (0.0, model.MAX_HELD_S)),
+    (ECHO, "held_s", "echo.held_s", (0.0, MAX_HELD_S)),
     (UTILITY, "value", "utility.value", RATIO),
     (UTILITY, "cpu", "utility.cpu", RATIO),
     (UTILITY, "memory", "utility.memory", RATIO),

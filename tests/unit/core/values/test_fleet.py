@@ -22,8 +22,9 @@ from zsched.core.values.fleet import (
     electorate_hash,
     fleet_hash,
 )
-from zsched.core.values.model import Aggregate, LinkSource, NodeKind, PairReading, Reach, Weights
+from zsched.core.values.model import Aggregate, NodeKind, PairReading, Reach, Weights
 from zsched.core.values.plan import Direction
+from zsched.core.values.profile import LinkSource
 
 TUNING = tuning_of()
 TASK = TaskSpec(

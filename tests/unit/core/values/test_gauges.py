@@ -13,7 +13,8 @@ from zsched.core.values import gauges
 from zsched.core.values.fleet import Demand, fleet_hash
 from zsched.core.values.gauges import BY_NAME, GAUGES
 from zsched.core.values.messages import SetWeights
-from zsched.core.values.model import Profile, Tuning, Weights
+from zsched.core.values.model import Tuning, Weights
+from zsched.core.values.profile import Profile
 from zsched.errors import WireError
 from zsched.wire.codec import as_plain, from_plain
 

@@ -8,27 +8,25 @@ from inspect import Parameter, signature
 
 import pytest
 
+from zsched.core.values import beat as beat_values
 from zsched.core.values import model
+from zsched.core.values import profile as profile_values
+from zsched.core.values.beat import Beat
 from zsched.core.values.model import (
     MAX_COUNTER,
     MAX_REASON,
     NO_BALLOT,
     Allocation,
     Ballot,
-    Beat,
-    Link,
-    LinkSource,
-    Profile,
     Proposal,
     Tuning,
     Utility,
     UtilityVector,
     Weights,
-    WorkerLoad,
-    WorkerState,
     as_reason,
     check_name,
 )
+from zsched.core.values.profile import Link, LinkSource, Profile, WorkerLoad, WorkerState
 from zsched.core.values.words import check_range
 
 EVEN = Weights(cpu=0.5, memory=0.25, network=0.25)
@@ -169,7 +167,8 @@ def test_profile_finds_a_task_s_worker_or_none() -> None:
 
 def test_values_are_frozen_slotted_and_keyword_only() -> None:
     """No object is ever shared with an adapter that could change it."""
-    values = [cls for cls in vars(model).values() if isinstance(cls, type) and is_dataclass(cls)]
+    found = [cls for module in (model, profile_values, beat_values) for cls in vars(module).values()]
+    values = [cls for cls in found if isinstance(cls, type) and is_dataclass(cls)]
     assert len(values) > 15
     for cls in values:
         assert not cls.__dictoffset__, cls

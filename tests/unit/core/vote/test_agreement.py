@@ -18,6 +18,7 @@ from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.electorate.founding import founded
 from zsched.core.todo import ToDo
+from zsched.core.values.beat import Beat
 from zsched.core.values.change import MoveOwner
 from zsched.core.values.messages import (
     Accept,
@@ -31,13 +32,7 @@ from zsched.core.values.messages import (
     Refused,
     SetWeights,
 )
-from zsched.core.values.model import (
-    NO_BALLOT,
-    Acceptance,
-    Allocation,
-    Beat,
-    RegisterState,
-)
+from zsched.core.values.model import NO_BALLOT, Acceptance, Allocation, RegisterState
 from zsched.core.vote.agreement import SETTLE_AFTER_START_S, Agreement
 from zsched.core.vote.belief import GENERATION_STEP, MAX_AHEAD, MAX_GENERATION
 from zsched.core.vote.questions import ASK_AT_ONCE_S, ASK_LEARNT_EVERY_S, READ_EVERY_S

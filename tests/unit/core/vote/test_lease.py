@@ -10,9 +10,10 @@ import pytest
 from support.allocations import allocation_of
 from support.beats import beat_of
 from support.fleets import fleet_of, task_of, tuning_of
+from zsched.core.values.beat import Beat, Grant
 from zsched.core.values.fleet import Fleet, lease_terms
 from zsched.core.values.lease import hold_s
-from zsched.core.values.model import Allocation, Beat, Grant
+from zsched.core.values.model import Allocation
 from zsched.core.vote.lease import HURRY_S, Granter, Leases
 
 NAMES = ("r1", "r2", "r3")

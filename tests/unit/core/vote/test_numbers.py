@@ -21,12 +21,13 @@ from zsched.core import instructions as do
 from zsched.core.electorate.changes import AddElector, AdoptDocument, RemoveElector, SetDocument, SetLease
 from zsched.core.electorate.founding import founded
 from zsched.core.todo import ToDo
+from zsched.core.values.beat import Beat, Grant
 from zsched.core.values.change import MoveOwner
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.lease import hold_s
 from zsched.core.values.messages import Accept, Accepted, Learnt, Prepare, Promise, Refusal, Refused
-from zsched.core.values.model import NO_BALLOT, Acceptance, Ballot, Beat, Grant, RegisterState
+from zsched.core.values.model import NO_BALLOT, Acceptance, Ballot, RegisterState
 from zsched.core.vote.agreement import Agreement
 from zsched.core.vote.belief import GENERATION_STEP
 from zsched.core.vote.lease import Leases

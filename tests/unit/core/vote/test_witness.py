@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from support.beats import beat_of
+from zsched.core.values.beat import Beat
 from zsched.core.values.messages import Learnt
-from zsched.core.values.model import Beat
 from zsched.core.vote.witness import ASK_ALL_S, Witness, as_seen, as_tuple
 
 ELECTORS = ("robot1", "robot2", "robot3", "robot4", "robot5")

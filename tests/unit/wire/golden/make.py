@@ -22,6 +22,8 @@ from zsched.core.values import (
     rehearsal,
     snapshot,
 )
+from zsched.core.values.beat import Beat
+from zsched.core.values.profile import Link, LinkSource, Profile, WorkerLoad, WorkerState
 from zsched.ipc import pipe as relay_pipe
 from zsched.ipc import protocol
 from zsched.wire import codec as wire
@@ -37,8 +39,8 @@ _VALUE = model.Allocation(
 _ASKED = model.Asked(by="ada@robot1", reason="new battery")
 _BALLOT = model.Ballot(counter=12, node="robot1", incarnation=3)
 _ACCEPTANCE = model.Acceptance(ballot=_BALLOT, value=_VALUE)
-_WORKER = model.WorkerLoad(task="map_merge", state=model.WorkerState.READY, cpu_cores=0.5, memory_mb=200.0)
-_LINK = model.Link(source=model.LinkSource.NL80211, peer="edge1", rssi_dbm=-61.5, bitrate_mbps=433.3, retry_ratio=0.05)
+_WORKER = WorkerLoad(task="map_merge", state=WorkerState.READY, cpu_cores=0.5, memory_mb=200.0)
+_LINK = Link(source=LinkSource.NL80211, peer="edge1", rssi_dbm=-61.5, bitrate_mbps=433.3, retry_ratio=0.05)
 _FLEET_VALUE = electorate.FleetValue(
     fleet="lab",
     generation_id="0a1b",
@@ -165,10 +167,10 @@ _TASK_STATUS = snapshot.TaskStatus(
 )
 
 SAMPLES: dict[str, object] = {
-    "beat": model.Beat(
+    "beat": Beat(
         node="robot1", incarnation=3, sequence=99, loop_lag_s=0.25, learnt=(("map_merge", 7, 4),), suspects=("edge2",)
     ),
-    "profile": model.Profile(
+    "profile": Profile(
         node="edge1",
         incarnation=3,
         sequence=99,
