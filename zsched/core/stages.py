@@ -90,6 +90,28 @@ class Stages:
         flags: {hash: its flags} of those of them that have any.
     """
 
+    has_foreign_state = False
+    """The state file is whole, and of another electorate than the fleet file: it stays on its disk."""
+    lacks_state_file = False
+    """There is none at all, rather than one that cannot be used."""
+    fleet_path = ""
+    """Where the fleet file lies, for the status."""
+    copied_file = ""
+    """Hash of the file that was written here as a copy of an earlier document; empty: it is the operator's own."""
+    joins_at: tuple[str, ...] = ()
+    """Where applications on this machine join its streams, for the status."""
+    security = ""
+    """Who is let in to this node's sessions, for the status (`Exposure`)."""
+    is_draining = False
+    loop_lag_s = 0.0
+    stream_counts: tuple[StreamCount, ...] = ()
+    frames_dropped_at: float | None = None
+    """When the newest invalid frame came."""
+    beat_sequence = 0
+    # what the door (`zsched.core.node`) keeps from one event to the next
+    _promised = math.inf
+    """The deadline that the last batch was given out with."""
+
     def __init__(
         self,
         *,
@@ -110,29 +132,15 @@ class Stages:
         self.incarnation = incarnation
         self.started_at = now
         self.has_state = durable is not None
-        self.has_foreign_state = False
-        """The state file is whole, and of another electorate than the fleet file: it stays on its disk."""
-        self.lacks_state_file = False
-        """There is none at all, rather than one that cannot be used."""
         self.told_fleet = fleet
         """The newest fleet file that was given to the runtime; what of it is in force is `fleet`."""
         self.fleet_file = fleet_hash(fleet)
         self.text_hash = file_hash(fleet)
         """Hash of it as its text says it, without rollouts."""
-        self.fleet_path = ""
-        """Where that file lies, for the status."""
         self.by_file = self.text_hash
         """Hash of what that file says; once a document is agreed, the node does not go by the file."""
-        self.copied_file = ""
-        """Hash of the file that was written here as a copy of an earlier document; empty: it is the operator's own."""
-        self.joins_at: tuple[str, ...] = ()
-        """Where applications on this machine join its streams, for the status."""
-        self.security = ""
-        """Who is let in to this node's sessions, for the status (`Exposure`)."""
         self.counters: Counter[str] = Counter()
         self.problems: dict[str, str] = {}
-        self.is_draining = False
-        self.loop_lag_s = 0.0
         self.history: dict[TaskId, deque[PastValue]] = {task.name: deque(maxlen=HISTORY) for task in fleet.tasks}
 
         # PROFILE, GATEWAY
@@ -163,7 +171,13 @@ class Stages:
         self.retuning = Retuning(me)
         self.expiry = Expiry(rank=self.flags.rank)
         self.flags.take(self.agreement.flags, now)
-        # EXECUTOR, ROUTE
+        self._begin_work(fleet, now)
+        self._begin_membership(fleet, now)
+        self._todo = ToDo()
+
+    def _begin_work(self, fleet: Fleet, now: float) -> None:
+        """EXECUTOR and ROUTE: the tasks' slots, the workers, the streams."""
+        me = self.me
         self.executors = {
             task.name: Executor(spec=task, me=me, has_streams=self.kind is NodeKind.ROBOT) for task in fleet.tasks
         }
@@ -175,20 +189,20 @@ class Stages:
         self.hangs = HangWatch(fleet)
         self.tenure = Tenure(fleet, me, self.agreement.leases, self.executors)
         self.sealing = Sealing(fleet, me, self.executors, self.agreement.leases.over_at)
-        self.stream_counts: tuple[StreamCount, ...] = ()
         self.dropped: dict[str, tuple[int, float]] = {}
         """{stream: (how many samples it has dropped, when that last rose)}."""
         self.rates = StreamRates()
         self.gaps = StreamGaps()
         self.killed_at: dict[TaskId, float] = {}
         """{task: when our worker was last killed for a rehearsal}."""
-        self.frames_dropped_at: float | None = None
-        """When the newest invalid frame came."""
         self.unready: dict[TaskId, Unready] = {}
         """The slots whose worker our relay does not see, or not any more."""
-        # membership
+
+    def _begin_membership(self, fleet: Fleet, now: float) -> None:
+        """Who is there, who this node is to them, and when to beat."""
+        me = self.me
         self.membership = Membership(me, tuple(node.name for node in fleet.nodes), fleet.timing)
-        self.identity = Identity(me, incarnation, self.fleet_file, now, fleet.timing.beat_s)
+        self.identity = Identity(me, self.incarnation, self.fleet_file, now, fleet.timing.beat_s)
         self.namesakes = Namesakes(fleet.timing.rest_beat_s)
         self.knocking = Knocking(self.fleet_file)
         self.introductions, self.mute_links = Introductions(), MuteLinks()
@@ -200,12 +214,7 @@ class Stages:
         self.beat_room = BeatRoom()
         self.beat_at = now
         """When the next beat is due that nothing brings forward."""
-        self.beat_sequence = 0
         self.pace = Pace(timing=fleet.timing)
-        # what the door (`zsched.core.node`) keeps from one event to the next
-        self._promised = math.inf
-        """The deadline that the last batch was given out with."""
-        self._todo = ToDo()
 
     # --- queries -----------------------------------------------------------------------------------------------------
 
