@@ -188,8 +188,10 @@ def _keys_of(task: TaskSpec, rule: StreamRule, node: NodeSpec) -> tuple[list[str
     speaks: list[str] = []
     asks: list[str] = []
     if node.kind is NodeKind.ROBOT:
-        speaks.append(widened(outer, **here))
-        asks += [widened(outer, **here), widened(inner, **here)]
+        if node.local is None:  # else its applications are on a network of their own, whatever keys they have there
+            speaks.append(widened(outer, **here))
+            asks.append(widened(outer, **here))
+        asks.append(widened(inner, **here))
         if rule.direction is Direction.INPUT:
             speaks.append(widened(inner, **here))
     if rule.direction is not Direction.INPUT and runs_worker(task, node.name, node.kind):

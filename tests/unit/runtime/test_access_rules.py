@@ -33,15 +33,15 @@ security: {operators: [ana], guests: [screen], revoked: [robot2]}
 KEYS = Keyspace("yard")
 
 
-def fleet() -> Fleet:
-    result = check_bytes(TEXT.encode())
+def fleet(text: str = TEXT) -> Fleet:
+    result = check_bytes(text.encode())
     assert result.fleet is not None, result.report()
     return result.fleet
 
 
-def may(side: Side, who: str, flow: str, message: str, key: str) -> bool:
+def may(side: Side, who: str, flow: str, message: str, key: str, text: str = TEXT) -> bool:
     """Whether the rules let ``who`` (a common name's first part); a rule must include the key, as zenoh has it."""
-    yard = fleet()
+    yard = fleet(text)
     assert yard.security is not None
     rules: dict[str, Any] = access_control(yard, yard.security, side)
     assert rules["default_permission"] == "deny"
@@ -133,6 +133,27 @@ def test_robots_feed_their_own_inputs_and_owners_answer_for_their_own_tasks() ->
     assert not speaks("edge2", "edge1/merge/robot1/plan", "reply")
     assert may(Side.DATA, "robot1", "ingress", "query", "edge1/merge/robot1/plan")
     assert not may(Side.DATA, "robot1", "ingress", "query", "edge1/merge/robot2/plan")
+
+
+def test_what_stays_on_a_robot_s_local_side_gives_it_no_right_among_the_others() -> None:
+    """A rule that takes all of a robot's own network would else let it speak under everybody's keys."""
+    local = "local: {mode: peer, listen: [tcp/127.0.0.1:7460]}"
+    text = TEXT.replace("robot}", f"robot, {local}}}", 2).replace("{robot}/map/**", "**", 1)
+    assert text.count(local) == 2
+    for message, key in (
+        ("put", "robot2/scan"),
+        ("put", "edge1/merge/7/robot1/out"),
+        ("put", "edge1/merge/robot2/map/a"),
+        ("put", KEYS.role("edge1", "merge")),
+        ("put", KEYS.ack("edge1", "merge", 1, "abc")),
+        ("reply", KEYS.snapshot("edge1", "merge")),
+        ("liveliness_token", KEYS.worker("edge2", "merge", 1)),
+        ("query", "robot2/plan"),
+    ):
+        assert not may(Side.DATA, "robot1", "ingress", message, key, text), key
+    assert may(Side.DATA, "robot1", "ingress", "put", "edge1/merge/robot1/map/a", text)
+    assert may(Side.DATA, "robot1", "ingress", "query", "edge1/merge/robot1/plan", text)
+    assert may(Side.DATA, "edge1", "ingress", "put", "edge1/merge/7/robot1/out", text)
 
 
 def test_a_workers_words_are_of_its_own_node() -> None:
