@@ -280,7 +280,8 @@ class Daemon:
             log.info("document in force revision=%d document=%s", value.revision, value.document)
 
     def _exposure(self, points: Endpoints) -> Exposure:
-        found = daemon_tls.exposure(self._fleet, self._protocol, (*points.control_listen, *points.data_listen))
+        listens = (*points.control_listen, *points.data_listen)
+        found = daemon_tls.exposure(self._fleet, self._spec, self._protocol, listens)
         if found is Exposure.OPEN:
             log.warning(
                 "not_secured: whoever reaches this network reads and changes everything; see docs/guide/secure.md"

@@ -12,9 +12,11 @@ from zsched.config.nodes import Cast
 from zsched.config.reader import Collector
 from zsched.config.schema import PKI_FOLDER
 from zsched.core.values.certificates import MAX_COMMON_NAME, Holder, Role, parse_label
-from zsched.core.values.fleet import Security, Signatures
+from zsched.core.values.fleet import Security, Signatures, is_own_host
+from zsched.core.values.struct import replace
 
 ENCRYPTED = ("tls/", "quic/")
+_A = {"node": "a node", "operator": "an operator", "guest": "a guest"}
 
 
 def read_security(section: Section, cast: Cast, folder: Path, out: Collector) -> Security | None:
@@ -67,7 +69,14 @@ def _revoked(given: Section, known: set[tuple[str, Role]], out: Collector) -> tu
     found: tuple[Located[str], ...] = given.get("revoked", ())
     for one in found:
         holder = parse_label(one.value)
-        if holder is not None and (holder.name, holder.role) not in known:
+        if holder is None or (holder.name, holder.role) in known:
+            continue
+        meant = sorted(str(role) for name, role in known if name == holder.name)
+        if meant:
+            label = replace(holder, role=Role(meant[0])).label
+            message = f"{one.value!r} is a key of nobody: {holder.name} is no {holder.role} here, but {_A[meant[0]]}"
+            out.warn(one.place, message, f"the line keeps nobody out; if that key is meant: {label}")
+        else:
             message = f"{one.value!r} is a key of nobody in this file"
             out.warn(one.place, message, "who is not in the file is not let in: the line may go")
     return tuple(sorted({one.value for one in found}))
@@ -85,3 +94,9 @@ def _check_endpoints(section: Section, given: Section, out: Collector) -> None:
                 plain, _, address = endpoint.partition("/")
                 message = f"{plain}/ is plain text, and the fleet is secured (line {given.place.line})"
                 out.error(listen.where(kind), message, f"tls/{address}")
+        local: Section | None = entry.value.get("local") if entry.value is not None else None
+        ends: tuple[Located[str], ...] = () if local is None else local.get("listen", ())
+        for end in ends:
+            if not is_own_host(end.value):
+                message = f"{end.value}: other machines reach this local side, and it has no certificates"
+                out.warn(end.place, message, "who reaches it speaks as the node's applications: listen on 127.0.0.1")

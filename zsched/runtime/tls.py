@@ -11,12 +11,11 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
-from zsched.core.values.fleet import Fleet, NodeSpec
+from zsched.core.values.fleet import Fleet, NodeSpec, is_own_host
 from zsched.core.values.snapshot import Exposure
 from zsched.errors import ConfigError
 from zsched.files import read_regular
 from zsched.runtime.access_rules import Side
-from zsched.runtime.own_addresses import is_loopback
 from zsched.runtime.secured import identity_of, secured_text
 from zsched.sessions import config as zenoh_config
 
@@ -86,28 +85,38 @@ def protocol_of(fleet: Fleet, text: str) -> str:
     return "tls"
 
 
-def exposure(fleet: Fleet, protocol: str, listens: Iterable[str]) -> Exposure:
-    """The names that a node lets in, which listens with ``protocol``, or as the file says, at ``listens``."""
+def exposure(fleet: Fleet, me: NodeSpec, protocol: str, listens: Iterable[str]) -> Exposure:
+    """Who may speak to the node ``me``, which listens with ``protocol``, or as the file says, at ``listens``.
+
+    Its local side is for programs of its machine; where it listens beyond, no certificate keeps anybody out.
+    """
+    if _open_sides(me):
+        return Exposure.OPEN
     if fleet.security is not None:
         return Exposure.SECURED
     plain = [end for end in listens if _scheme(end) not in ENCRYPTED]
     if protocol != PLAIN and not plain:
         return Exposure.ENCRYPTED
-    return Exposure.LOCAL if all(_is_local(end) for end in plain) else Exposure.OPEN
+    return Exposure.LOCAL if all(is_own_host(end) for end in plain) else Exposure.OPEN
 
 
-def _is_local(endpoint: str) -> bool:
-    host = endpoint.partition("/")[2].rpartition(":")[0]
-    return host == "localhost" or is_loopback(host)
+def _open_sides(me: NodeSpec) -> tuple[str, ...]:
+    """Where the node's local side listens for other machines, too."""
+    return () if me.local is None else tuple(end for end in me.local.listen if not is_own_host(end))
 
 
 def plain_text_problem(me: NodeSpec, protocol: str) -> str | None:
     """Where this node listens in plain text although the fleet has TLS, because the fleet file says so."""
     given = (me.listen_control, me.listen_data, me.listen_streams)
     plain = [end for end in given if end and _scheme(end) not in ENCRYPTED]
-    if protocol == PLAIN or not plain:
+    if protocol == PLAIN or not (plain or _open_sides(me)):
         return None
-    return f"TLS is set up, but the fleet file lets {me.name} listen on {', '.join(plain)}: write tls/ there"
+    if plain:
+        return f"TLS is set up, but the fleet file lets {me.name} listen on {', '.join(plain)}: write tls/ there"
+    return (
+        f"TLS is set up, but the local side of {me.name}, which is plain text, listens for other machines on "
+        f"{', '.join(_open_sides(me))}: who reaches it speaks as its applications; write 127.0.0.1 there"
+    )
 
 
 def _scheme(endpoint: str) -> str:

@@ -64,6 +64,32 @@ def test_each_fault_is_said_with_what_to_do() -> None:
     assert "'gone' is a key of nobody" in check("{revoked: [gone]}").report()
 
 
+def test_a_revoked_name_in_another_role_is_told_with_the_label_that_keeps_its_key_out() -> None:
+    """Who writes the name alone means a node: an operator's key would go on being let in, without a word."""
+    result = check("{operators: [ana], guests: [screen], revoked: [ana.k2, screen.operator, robot1]}")
+    assert result.fleet is not None
+    told = {one.message: one.hint.rpartition(" ")[2] for one in result.warnings if " is a key of " in one.message}
+    assert told == {
+        "'ana.k2' is a key of nobody: ana is no node here, but an operator": "ana.operator.k2",
+        "'screen.operator' is a key of nobody: screen is no operator here, but a guest": "screen.guest",
+    }
+
+
+def test_a_local_side_that_other_machines_reach_is_told() -> None:
+    def told(endpoint: str, section: str = "{}") -> list[str]:
+        local = f"kind: robot, local: {{mode: peer, listen: ['{endpoint}']}}"
+        text = TEXT.replace("robot2: {kind: robot}", f"robot2: {{{local}}}")
+        result = check(section, text) if section else check_bytes(text.replace("security:", "").encode())
+        assert result.fleet is not None, result.report()
+        return [one.message for one in result.warnings if "local side" in one.message]
+
+    for endpoint in ("tcp/0.0.0.0:7460", "tcp/[::]:7460", "udp/192.0.2.7:7460", "tcp/robot2:7460", "ws/10.0.0.1:1"):
+        assert told(endpoint) == [f"{endpoint}: other machines reach this local side, and it has no certificates"]
+        assert told(endpoint, "") == [], "without certificates everything is plain text"
+    for endpoint in ("tcp/127.0.0.1:7460", "tcp/[::1]:7460", "tcp/localhost:7460", "unixsock-stream//run/robot"):
+        assert told(endpoint) == []
+
+
 def test_plain_text_beside_the_section_is_a_fault_with_the_line_to_write() -> None:
     result = check("{}", TEXT.replace("tls/0.0.0.0:7457", "tcp/0.0.0.0:7457"))
     (fault,) = result.faults

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from support.fleets import fleet_of, node_of
-from zsched.core.values.fleet import Fleet, Security
+from zsched.core.values.fleet import Fleet, LocalMode, LocalSide, Security
 from zsched.core.values.snapshot import Exposure
 from zsched.errors import ConfigError
 from zsched.runtime.tls import exposure, operator_json5, plain_text_problem, protocol_of
@@ -73,8 +73,16 @@ def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
     ],
 )
 def test_who_is_let_in_is_told_by_where_it_listens(protocol: str, listens: list[str], found: Exposure) -> None:
-    assert exposure(fleet(), protocol, listens) is found
-    assert exposure(replace(fleet(), security=Security(folder="pki")), protocol, listens) is Exposure.SECURED
+    (node,) = fleet().nodes
+    secured = replace(fleet(), security=Security(folder="pki"))
+    assert exposure(fleet(), node, protocol, listens) is found
+    assert exposure(secured, node, protocol, listens) is Exposure.SECURED
+    at_home = replace(node, local=LocalSide(mode=LocalMode.PEER, listen=("tcp/127.0.0.1:7460", "tcp/localhost:7461")))
+    assert exposure(fleet(), at_home, protocol, listens) is found
+    assert exposure(secured, at_home, protocol, listens) is Exposure.SECURED
+    abroad = replace(node, local=LocalSide(mode=LocalMode.PEER, listen=("tcp/127.0.0.1:7460", "tcp/0.0.0.0:7461")))
+    assert exposure(fleet(), abroad, protocol, listens) is Exposure.OPEN
+    assert exposure(secured, abroad, protocol, listens) is Exposure.OPEN
 
 
 def test_plain_text_that_the_file_asks_for_is_a_problem_only_beside_tls() -> None:
@@ -82,3 +90,12 @@ def test_plain_text_that_the_file_asks_for_is_a_problem_only_beside_tls() -> Non
     assert plain_text_problem(node, "tcp") is None
     assert f"lets robot1 listen on {PLAIN}: write tls/" in (plain_text_problem(node, "tls") or "")
     assert plain_text_problem(fleet(TLS).nodes[0], "tls") is None
+
+
+def test_a_local_side_that_listens_for_other_machines_is_a_problem_beside_tls() -> None:
+    (node,) = fleet(TLS).nodes
+    at_home = replace(node, local=LocalSide(mode=LocalMode.PEER, listen=("tcp/127.0.0.1:7460",)))
+    assert plain_text_problem(at_home, "tls") is None
+    abroad = replace(node, local=LocalSide(mode=LocalMode.PEER, listen=("tcp/127.0.0.1:7460", "tcp/0.0.0.0:7461")))
+    assert plain_text_problem(abroad, "tcp") is None
+    assert "listens for other machines on tcp/0.0.0.0:7461: " in (plain_text_problem(abroad, "tls") or "")
