@@ -167,6 +167,15 @@ def test_the_document_and_its_flags_are_changed_in_the_name_of_the_certificate(
         history = zsched(bed, "robot2", "history", TASK).stdout
         assert "paused by ana.operator" in history, "each node tells who gave an order about a task"
 
+        # a program on robot2 that says her name at the socket there
+        order = {"verb": "hold", "task": TASK, "hold": "resume", "by": "ana.operator", "node": "robot1"}
+        assert ask(bed.folder / "robot2.sock", order, 10.0)["outcome"] == "ok"
+        bed.wait(
+            lambda: "resumed by ana.operator@robot2" in zsched(bed, "robot1", "history", TASK).stdout,
+            60,
+            "the order with the machine from which it came",
+        )
+
 
 def refusals(bed: Testbed, node: str) -> dict[str, int]:
     """{counter: how many} of frames that were dropped for their seals."""

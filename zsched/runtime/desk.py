@@ -38,6 +38,7 @@ from zsched.core.values.messages import (
     TakeCertificate,
     TuneTask,
     WorkerLines,
+    asked_at,
 )
 from zsched.core.values.model import MAX_REASON, Asked, NodeId, Tuning
 from zsched.core.values.rehearsal import KeepRehearsal, ReadRehearsals, RehearsalsTold, Step, Strike
@@ -91,7 +92,7 @@ class Desk:
                 return {"error": f"{verb}: {error} is missing"}
             except (TypeError, ValueError, OverflowError) as error:
                 return {"error": f"{verb}: {error}"}
-            return self._ask(node, command)
+            return self._ask(node, asked_at(self._node, command))
         if verb == "access" and self._access is not None:
             return self._access(node)
         if verb == "log" and self._log is not None:

@@ -394,6 +394,22 @@ def test_an_order_becomes_the_event_that_says_all_of_it() -> None:
     assert kinds == [ev.MoveCommanded, ev.HoldCommanded, ev.TuneCommanded]
 
 
+def test_a_program_on_this_machine_orders_in_no_operator_s_and_no_other_node_s_name(
+    house: House, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("zsched.runtime.desk.ANSWER_TIMEOUT_S", 0.001)
+    for said, told in (
+        ({"by": "ada@robot1"}, "ada@robot1"),
+        ({"by": "ana.operator"}, "ana.operator@robot1"),
+        ({"by": "eve@robot2"}, "eve@robot1"),
+        ({}, "robot1"),
+    ):
+        house.desk.answer({"verb": "change", "text": "x", **said})
+        (event,) = house.events()
+        assert isinstance(event, ev.FleetCommanded)
+        assert event.command.asked == Asked(by=told)
+
+
 def test_a_daemon_is_ended_for_good_on_its_own_machine_only(house: House) -> None:
     ended: list[str] = []
     desk = Desk("robot1", house.inbox, house.adapter, leave=lambda: ended.append("robot1"))

@@ -53,6 +53,7 @@ from zsched.core.values.messages import (
     Utilities,
     Votes,
     WorkerLines,
+    asked_at,
 )
 from zsched.core.values.model import Asked, NodeId, Proposal
 from zsched.core.values.profile import Profile
@@ -119,8 +120,13 @@ def answer_classes(command: Command | None) -> tuple[type[Answer], ...]:
 
 
 def signed_by(holder: Holder, command: Command) -> Command:
-    """A command that tells who has ordered it, with the name of the certificate instead of what the tool says."""
-    if holder.role is Role.NODE or not isinstance(command, Ordered):
+    """A command that tells who has ordered it, with the name of the certificate instead of what the tool says.
+
+    A node signs for the programs of its machine, and tells whose they are.
+    """
+    if holder.role is Role.NODE:
+        return asked_at(holder.name, command)
+    if not isinstance(command, Ordered):
         return command
     said = command.asked  # an older tool says nothing
     asked = Asked(by=holder.label) if said is None else replace(said, by=holder.label)

@@ -30,7 +30,7 @@ from zsched.core.values.model import (
 )
 from zsched.core.values.rehearsal import KeepRehearsal, ReadRehearsals, Strike
 from zsched.core.values.struct import Struct, replace
-from zsched.core.values.words import Readings, check_range
+from zsched.core.values.words import MAX_ASKER, Readings, check_range
 
 _CURSOR: Final = re.compile(r"([0-9]{1,20}:[0-9]{1,15})?")
 """A file of the log and an offset in it (`zsched.adapters.host.decision_log`)."""
@@ -516,6 +516,22 @@ Command = (
 COMMANDS: tuple[type, ...] = get_args(Command)
 Ordered = SetWeights | Strike | KeepRehearsal | RetryTask | RestartTask | MoveTask | HoldTask | TuneTask | ChangeFleet
 """Commands that carry who gives them (``asked``)."""
+
+
+def asked_at(node: NodeId, command: Command) -> Command:
+    """A command as ``node`` may pass it on: a program there names its user, and neither an operator nor another node.
+
+    The user may come from another cell (``user@fleet/node``). A program that names nobody leaves the node's own name.
+    """
+    if not isinstance(command, Ordered):
+        return command
+    said = command.asked
+    if said is None:
+        return replace(command, asked=Asked(by=node))
+    user, _, place = said.by.partition("@")
+    if place == node or place.endswith(f"/{node}"):
+        return command
+    return replace(command, asked=replace(said, by=f"{user[: MAX_ASKER - len(node) - 1]}@{node}"))
 
 
 class FleetTold(Struct, frozen=True, kw_only=True):

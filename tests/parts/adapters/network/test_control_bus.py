@@ -23,7 +23,7 @@ from zsched.adapters.network.control_bus import RING, ControlBus, signed_by
 from zsched.adapters.network.open_questions import Questions
 from zsched.core import events as ev
 from zsched.core.values.certificates import Holder, Role
-from zsched.core.values.document import Text
+from zsched.core.values.document import Document, Text
 from zsched.core.values.fleet import Timing
 from zsched.core.values.messages import (
     COMMANDS,
@@ -53,6 +53,7 @@ from zsched.core.values.messages import (
 from zsched.core.values.model import Acceptance, Asked
 from zsched.core.values.rehearsal import KeepRehearsal, Step, Strike
 from zsched.core.values.snapshot import QuorumStatus, Snapshot
+from zsched.core.values.words import MAX_ASKER
 from zsched.errors import AdapterError
 from zsched.sessions.config import control_config
 from zsched.wire import codec as wire
@@ -161,11 +162,28 @@ ORDERS: tuple[Ordered, ...] = (
 
 @pytest.mark.parametrize("order", ORDERS, ids=lambda order: type(order).__name__)
 def test_an_operator_s_order_has_the_name_of_its_certificate_whatever_the_tool_says(order: Ordered) -> None:
-    ana, robot = Holder(name="ana", role=Role.OPERATOR), Holder(name="robot1")
+    ana = Holder(name="ana", role=Role.OPERATOR)
     signed = signed_by(ana, order)
     assert isinstance(signed, type(order))
     assert signed.asked == Asked(by="ana.operator", reason="why")
-    assert signed_by(robot, order) == order, "the user of a node's machine, as that node tells it"
+
+
+@pytest.mark.parametrize("order", ORDERS, ids=lambda order: type(order).__name__)
+def test_a_node_names_users_of_its_own_machine_and_neither_operators_nor_other_nodes(order: Ordered) -> None:
+    robot1, robot2 = Holder(name="robot1"), Holder(name="robot2")
+    assert signed_by(robot1, order) == order, "the user of a node's machine, as that node tells it"
+    for said, told in (
+        ("bob@robot1", "bob@robot2"),
+        ("ana.operator", "ana.operator@robot2"),
+        ("ana.operator/robot2", "ana.operator/robot2@robot2"),
+        ("bob@robot22", "bob@robot2"),
+        ("bob@yard/robot2", "bob@yard/robot2"),
+        ("", "@robot2"),
+        ("x" * MAX_ASKER, f"{'x' * (MAX_ASKER - 7)}@robot2"),
+    ):
+        signed = signed_by(robot2, replace(order, asked=Asked(by=said, reason="why")))
+        assert isinstance(signed, type(order))
+        assert signed.asked == Asked(by=told, reason="why")
 
 
 def test_an_operator_whose_tool_says_nothing_is_named_too_and_questions_have_no_name() -> None:
@@ -175,6 +193,9 @@ def test_an_operator_whose_tool_says_nothing_is_named_too_and_questions_have_no_
     signed = signed_by(ana, RetryTask(task="merge"))
     assert isinstance(signed, RetryTask)
     assert signed.asked == Asked(by="ana.operator")
+    signed = signed_by(Holder(name="robot1"), ChangeFleet(document=Document(text=Text("x"))))
+    assert isinstance(signed, ChangeFleet)
+    assert signed.asked == Asked(by="robot1"), "else a document's flags would go on under any name"
     question = ExplainTask(task="merge")
     assert signed_by(ana, question) == question
 
