@@ -12,6 +12,7 @@ from datetime import datetime, timedelta
 from typing import Final
 
 from cryptography import x509
+from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ec, ed25519
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
@@ -25,6 +26,7 @@ LIFE: Final = timedelta(days=30)
 """Of all certificates but the authority's own."""
 EARLY: Final = timedelta(hours=1)
 """A certificate is valid that long before it is made: clocks of robots may be behind."""
+OTHER_KIND: Final = "its key is neither Ed25519 nor P-256"
 LOCAL: Final = ("localhost", "127.0.0.1")
 """Workers and tools dial the relay of their own machine there."""
 
@@ -116,11 +118,15 @@ def requested_key(pem: bytes) -> PublicKey:
     """
     try:
         request = x509.load_pem_x509_csr(pem)
-    except ValueError as error:
+    except (ValueError, x509.InvalidVersion) as error:
         raise ValueError("it is no certificate request in PEM") from error
-    if not request.is_signature_valid:
+    try:
+        is_signed, public = request.is_signature_valid, request.public_key()
+    except (ValueError, UnsupportedAlgorithm) as error:  # of a kind that is not even known
+        raise ValueError(OTHER_KIND) from error
+    if not is_signed:
         raise ValueError("its signature is not by the key in it")
-    return _fit(request.public_key())
+    return _fit(public)
 
 
 def certified_key(certificate: x509.Certificate) -> PublicKey:
@@ -152,7 +158,7 @@ def read_key(pem: bytes, passphrase: bytes) -> PrivateKey:
     """
     try:
         key = serialization.load_pem_private_key(pem, passphrase or None)
-    except TypeError as error:  # a passphrase is missing, or none is needed
+    except (TypeError, UnsupportedAlgorithm) as error:  # a passphrase is missing, or none is needed
         raise ValueError(str(error)) from error
     if not isinstance(key, ed25519.Ed25519PrivateKey):
         raise ValueError("it is no Ed25519 key")  # noqa: TRY004 - a file's content, not a caller's type
@@ -172,7 +178,7 @@ def is_key_of(pem: bytes, certificate: bytes) -> bool:
     """
     try:
         key = serialization.load_pem_private_key(pem, None)
-    except TypeError as error:  # it is locked
+    except (TypeError, UnsupportedAlgorithm) as error:  # it is locked, or of a kind that is not known
         raise ValueError(str(error)) from error
     return fingerprint(_fit(key.public_key())) == fingerprint(certified_key(read_certificate(certificate)))
 
@@ -229,4 +235,4 @@ def _fit(public: object) -> PublicKey:
         return public
     if isinstance(public, ec.EllipticCurvePublicKey) and isinstance(public.curve, ec.SECP256R1):
         return public
-    raise ValueError("its key is neither Ed25519 nor P-256")
+    raise ValueError(OTHER_KIND)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import os
 import stat
@@ -120,10 +121,33 @@ def test_requests_that_are_none_or_of_a_weak_kind_are_refused(authority: Authori
         (b"nothing", "no certificate request"),
         (weak, "neither Ed25519 nor P-256"),
         (pem, "not by the"),
+        (changed(whole, ED25519, UNKNOWN), "neither Ed25519 nor P-256"),
+        (changed(whole, VERSION_1, VERSION_2), "no certificate request"),
     ):
         with pytest.raises(AdapterError, match=f"the certificate request: .*{why}"):
             issue(authority, request=request)
     assert not authority.record.entries
+
+
+ED25519, UNKNOWN = bytes.fromhex("06032b6570"), bytes.fromhex("06032b656d")
+"""Object identifiers: of the kind of key, and one of nothing."""
+VERSION_1, VERSION_2 = bytes.fromhex("020100"), bytes.fromhex("020101")
+"""Of requests there is only the first."""
+
+
+def changed(pem: bytes, old: bytes, new: bytes) -> bytes:
+    """A PEM file in which the first of these bytes is another."""
+    lines = pem.splitlines()
+    der = base64.b64decode(b"".join(lines[1:-1]))
+    assert old in der
+    return b"\n".join((lines[0], base64.b64encode(der.replace(old, new, 1)), lines[-1], b""))
+
+
+def test_a_key_of_a_kind_that_nobody_knows_is_said_to_be_none_of_ours() -> None:
+    key = changed(made.key_pem(made.new_key()), ED25519, UNKNOWN)
+    for read in (lambda: made.read_key(key, b""), lambda: made.is_key_of(key, b"")):
+        with pytest.raises(ValueError, match="key"):
+            read()
 
 
 def test_openssls_request_is_taken(authority: Authority, tmp_path: Path) -> None:
