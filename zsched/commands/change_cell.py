@@ -66,7 +66,7 @@ from zsched.core.values.struct import Struct
 from zsched.errors import AdapterError, ConfigError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_UNREACHABLE, EXIT_USAGE, EXIT_WOULD_CHANGE
 from zsched.runtime import next_cell
-from zsched.runtime.membership import belongings, whose
+from zsched.runtime.membership import belongings, papers_problem, whose
 from zsched.runtime.next_cell import Change
 from zsched.wire.invitation import Invitation
 
@@ -220,6 +220,8 @@ def _found(way: Way, fleet: str, word: str, going: Change | None) -> _Next:
         papers = invitation.papers
         if fleet_of(invitation.document.text).security is not None and (papers is None or not papers.key):
             raise CliError(EXIT_FAILED, f"{word} holds no certificate with its key; {_invite(invitation.fleet, me)}")
+        if why := papers_problem(invitation):
+            raise CliError(EXIT_FAILED, f"{word}: its {why}; {_invite(invitation.fleet, me)}")
         return _Next(fleet=invitation.fleet, invitation=invitation, is_invited=True)
     if is_closed:
         told = f"{cell.name} is secured, and takes {me} by an invitation"

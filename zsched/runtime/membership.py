@@ -14,6 +14,7 @@ import os
 import secrets
 import shutil
 from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
@@ -28,7 +29,7 @@ from zsched.adapters.host.state_file import (
     sync_folder,
 )
 from zsched.adapters.machine import core_speed
-from zsched.clock import wall_tenths
+from zsched.clock import wall_ns, wall_tenths
 from zsched.config.load import check_bytes
 from zsched.config.reader import MAX_FILE_BYTES, render_all
 from zsched.config.schema import PKI_FOLDER
@@ -44,7 +45,7 @@ from zsched.errors import AdapterError, ConfigError, WireError
 from zsched.files import read_regular
 from zsched.pki.files import PRIVATE, PUBLIC, write_whole
 from zsched.runtime.secured import CERTIFICATE, KEY, TRUSTED
-from zsched.sessions.certificate import common_names
+from zsched.sessions.certificate import common_names, ders_of, parts_of
 from zsched.wire.codec import decode_state, document_hash
 from zsched.wire.invitation import Invitation, Papers
 
@@ -226,21 +227,66 @@ def _check_papers(fleet: Fleet, invitation: Invitation) -> None:
     """Refuse certificates that are not this node's, and to take the place of somebody else's."""
     if invitation.papers is None or fleet.security is None:
         return
-    mine = _named(invitation.papers.certificate.encode())
-    holder = None if mine is None else parse_common_name(mine, fleet.name)
-    if holder is None or (holder.name, holder.role) != (invitation.node, Role.NODE):
-        raise ConfigError(f"the invitation's certificate names {mine!r}, and its node is {invitation.node}")
+    if why := papers_problem(invitation):
+        raise ConfigError(f"the invitation's {why}")
     if not invitation.papers.key:
         _check_own_key(Path(fleet.security.folder) / KEY, invitation)
     path = Path(fleet.security.folder) / CERTIFICATE
     try:
         theirs = _named(read_regular(path, MAX_FILE_BYTES))
     except FileNotFoundError:
+        _check_no_others(path.parent, invitation.papers)
         return
     except OSError as error:
         raise AdapterError(f"{path}: cannot be read: {error.strerror}; move the folder away") from error
-    if theirs != mine:
+    if theirs != _named(invitation.papers.certificate.encode()):
         raise AdapterError(f"{path} is the certificate of {theirs!r}, and is left as it is; move the folder away")
+
+
+def papers_problem(invitation: Invitation) -> str | None:
+    """What is wrong with the certificate that an invitation brings; ``None``: nothing, or it brings none.
+
+    A node that has it is let in by nobody, or cannot even listen, and says so only after it has left another cell.
+    """
+    from zsched.pki.certificates import is_key_of  # noqa: PLC0415 - imports cryptography
+    from zsched.pki.signatures import Trust  # noqa: PLC0415 - as above
+
+    papers = invitation.papers
+    if papers is None:
+        return None
+    pem = papers.certificate.encode()
+    name = _named(pem)
+    holder = None if name is None else parse_common_name(name, invitation.fleet)
+    if holder is None or (holder.name, holder.role) != (invitation.node, Role.NODE):
+        return f"certificate names {name!r}, and its node is {invitation.node}"
+    try:
+        der = ders_of(pem)[0]
+        parts, trust = parts_of(der), Trust(papers.trusted.encode())
+        if trust.certified(der, parts.begins) is None:
+            return "certificate is of another authority than the one that it says is trusted; have another one written"
+        if papers.key and not is_key_of(papers.key.encode(), pem):
+            return "certificate is for another key than the one that it brings; have another one written"
+    except ValueError as error:
+        return f"certificate cannot be used: {error}; have another one written"
+    now = datetime.fromtimestamp(wall_ns() / 1e9, UTC)
+    if not parts.begins <= now <= parts.ends:
+        span = f"from {parts.begins:%Y-%m-%d %H:%M} to {parts.ends:%Y-%m-%d %H:%M} UTC"
+        advice = "set the clock, or have another one written"
+        return f"certificate is valid {span}, and this machine's clock says {now:%Y-%m-%d %H:%M}; {advice}"
+    return None
+
+
+def _check_no_others(folder: Path, papers: Papers) -> None:
+    """Refuse to take the place of a key, or of authorities, that are not those of an invitation broken off before."""
+    for name, pem in ((KEY, papers.key), (TRUSTED, papers.trusted)):
+        try:
+            is_other = pem != "" and read_regular(folder / name, MAX_FILE_BYTES) != pem.encode()
+        except FileNotFoundError:
+            continue
+        except OSError as error:
+            raise AdapterError(f"{folder / name}: cannot be read: {error.strerror}; move it away") from error
+        if is_other:
+            raise AdapterError(f"{folder / name} is not the invitation's, and is left as it is; move it away")
 
 
 def _check_own_key(path: Path, invitation: Invitation) -> None:

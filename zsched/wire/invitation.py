@@ -124,7 +124,7 @@ def _papers(body: dict[str, Any]) -> Papers | None:
         return None
     if not {"certificate", "trusted"} <= given.keys():
         raise WireError("type", "it lacks one of certificate, trusted")
-    if not all(isinstance(one, str) and len(one) <= MAX_PEM for one in given.values()):
+    if not all(isinstance(one, str) and one.isascii() and len(one) <= MAX_PEM for one in given.values()):
         raise WireError("type", f"one of {', '.join(PEMS)} is no certificate or key")
     return Papers(**given)
 

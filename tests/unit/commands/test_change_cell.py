@@ -30,7 +30,7 @@ from zsched.core.vote.generations import blank_state
 from zsched.runtime import membership, next_cell
 from zsched.runtime.membership import whose
 from zsched.wire.codec import as_plain, document_hash, from_plain
-from zsched.wire.invitation import encode_invitation
+from zsched.wire.invitation import Papers, decode_invitation, encode_invitation
 
 STATUS = json.loads((Path(__file__).parent / "recorded_status" / "healthy.json").read_text())
 ME = "robot3"
@@ -492,6 +492,19 @@ def test_an_invitation_from_elsewhere_is_as_good_as_the_name_of_its_cell(site: S
     assert done.exit_code == 0, done.stderr
     assert whose(site.folder / "state") == ("hall-b", ME)
     assert there.done == [], "it was invited"
+
+
+def test_an_invitation_with_a_certificate_that_nobody_would_take_moves_nothing(site: Site, tmp_path: Path) -> None:
+    """The machine would be out of its cell, and in no other."""
+    there, here = site.cells["hall-b"], site.cells["hall-a"]
+    there.text = there.text.replace("tasks:", f"  {ME}: {{kind: robot}}\ntasks:")
+    file = membership_invitation(tmp_path)
+    brought = replace(decode_invitation(file.read_bytes()), papers=Papers(certificate="c", key="k", trusted="t"))
+    file.write_text(encode_invitation(brought))
+    refused = run("--to", str(file), "--yes")
+    assert refused.exit_code == 1
+    assert "its certificate names None, and its node is robot3" in " ".join(refused.stderr.split())
+    assert (here.done, there.done, site.running) == ([], [], "hall-a")
 
 
 def membership_invitation(folder: Path) -> Path:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import stat
 from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
@@ -20,12 +21,15 @@ from zsched.commands import membership, papers
 from zsched.commands.common import CliError
 from zsched.commands.membership import Address, address_of, dial_order, own_address
 from zsched.config.load import check_bytes, load_fleet
+from zsched.core.values.certificates import Role
 from zsched.core.values.document import Document, Rollout, Text
 from zsched.core.values.electorate import Elector, FleetValue
+from zsched.core.values.struct import replace
 from zsched.errors import ConfigError
+from zsched.pki.authority import create
 from zsched.runtime.secured import require_own
 from zsched.wire.codec import as_plain, document_hash, from_plain
-from zsched.wire.invitation import decode_invitation
+from zsched.wire.invitation import decode_invitation, encode_invitation
 
 Json = dict[str, Any]
 TEXT = """\
@@ -550,6 +554,64 @@ def test_another_machines_certificate_is_left_as_it_is(node: Node, tmp_path: Pat
     assert other.exit_code == 1
     assert "is the certificate of 'robot2.hall.zsched.internal'" in other.stderr
     assert (folder / "pki" / "key.pem").read_bytes() == before
+
+
+def test_an_invitation_whose_parts_do_not_go_together_changes_nothing(
+    node: Node, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else the machine has the files, and a daemon that nobody lets in."""
+    secured(tmp_path, node)
+    file, folder = tmp_path / "robot2.invite", tmp_path / "robot2"
+    assert run("invite", "robot2", "--address", "192.0.2.12", "--yes", "-o", file).exit_code == 0
+    whole = decode_invitation(file.read_bytes())
+    assert whole.papers is not None
+    other = create(tmp_path / "other", "hall", b"", datetime.now(UTC))
+    theirs = other.issue("robot2", Role.NODE, (), b"", b"", datetime.now(UTC))
+    stranger = other.issue("robot1", Role.NODE, (), b"", b"", datetime.now(UTC))
+    for brought, why in (
+        (replace(whole.papers, key=theirs.key.decode()), "is for another key than the one that it brings"),
+        (replace(whole.papers, key="junk"), "cannot be used: "),
+        (replace(whole.papers, trusted=theirs.trusted.decode()), "is of another authority than the one"),
+        (replace(whole.papers, trusted="junk"), "cannot be used: there is no certificate in it"),
+        (replace(whole.papers, certificate="junk"), "names None, and its node is robot2"),
+        (replace(whole.papers, certificate=stranger.certificate.decode()), "names 'robot1.hall.zsched.internal'"),
+    ):
+        file.write_text(encode_invitation(replace(whole, papers=brought)))
+        done = run("join", file, *here(folder))
+        assert done.exit_code == 78, done.stderr
+        assert f"the invitation's certificate {why}" in done.stderr
+        assert not folder.exists()
+    file.write_text(encode_invitation(whole))
+    for later, then in ((timedelta(days=31), "31 days later"), (timedelta(days=-2), "before it was made")):
+        moment = int((datetime.now(UTC) + later).timestamp() * 1e9)
+        monkeypatch.setattr("zsched.runtime.membership.wall_ns", lambda moment=moment: moment)
+        done = run("join", file, *here(folder))
+        assert done.exit_code == 78, then
+        assert "and this machine's clock says" in done.stderr
+        assert not folder.exists()
+
+
+@pytest.mark.parametrize("name", ["key.pem", "ca.pem"])
+def test_a_key_and_authorities_that_lie_where_an_invitation_s_go_are_left_as_they_are(
+    node: Node, tmp_path: Path, name: str
+) -> None:
+    """The document says where: `folder:` may name any place, and `join` runs as root."""
+    secured(tmp_path, node)
+    file, folder = tmp_path / "robot2.invite", tmp_path / "robot2"
+    assert run("invite", "robot2", "--address", "192.0.2.12", "--yes", "-o", file).exit_code == 0
+    place = folder / "pki" / name
+    place.parent.mkdir(parents=True)
+    place.write_text("somebody's own")
+    refused = run("join", file, *here(folder))
+    assert refused.exit_code == 1
+    assert f"{place} is not the invitation's, and is left as it is; move it away" in " ".join(refused.stderr.split())
+    assert [one.name for one in place.parent.iterdir()] == [name]
+    assert place.read_text() == "somebody's own"
+    brought = decode_invitation(file.read_bytes()).papers
+    assert brought is not None
+    place.write_text(brought.key if name == "key.pem" else brought.trusted)  # of a try that was broken off
+    done = run("join", file, *here(folder))
+    assert done.exit_code == 0, done.stderr
 
 
 def test_without_the_authority_the_invitation_says_what_is_missing(node: Node, tmp_path: Path) -> None:

@@ -72,6 +72,7 @@ def test_a_file_that_was_changed_or_cut_off_is_refused() -> None:
         ({"trusted": None}, "lacks one of certificate, trusted"),
         ({"key": "k" * 70_000}, "one of certificate, key, trusted is no certificate or key"),
         ({"key": 7}, "is no certificate or key"),
+        ({"certificate": "\ud800"}, "is no certificate or key"),
         ({"document": {"text": "fleet: other\n"}}, "not the one of its fleet value"),
         ({"value": {"fleet": "hall"}}, "missing"),
         ({"value": 7}, "type"),
