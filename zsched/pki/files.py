@@ -28,7 +28,9 @@ def make_folder(path: Path) -> None:
     missing = [one for one in (path, *path.parents) if not one.exists()]
     path.mkdir(mode=PRIVATE_FOLDER, parents=True, exist_ok=True)
     for one in reversed(missing):
-        _give(one, one.parent)
+        if os.geteuid() == 0:
+            owner = one.parent.stat()
+            os.chown(one, owner.st_uid, owner.st_gid, follow_symlinks=False)
 
 
 def write_whole(path: Path, content: bytes, mode: int) -> None:
@@ -42,7 +44,7 @@ def write_whole(path: Path, content: bytes, mode: int) -> None:
     try:
         with os.fdopen(descriptor, "wb") as file:
             os.fchmod(file.fileno(), mode)
-            _give(part, path.parent)
+            _give(file.fileno(), path.parent)
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
@@ -53,11 +55,11 @@ def write_whole(path: Path, content: bytes, mode: int) -> None:
     _sync(path.parent)
 
 
-def _give(path: Path, folder: Path) -> None:
-    """Hand a file over to its folder's owner (root only)."""
+def _give(descriptor: int, folder: Path) -> None:
+    """Hand an open file over to its folder's owner (root only): its name there may lead elsewhere by now."""
     if os.geteuid() == 0:
         owner = folder.stat()
-        os.chown(path, owner.st_uid, owner.st_gid)
+        os.fchown(descriptor, owner.st_uid, owner.st_gid)
 
 
 def _sync(folder: Path) -> None:

@@ -551,8 +551,7 @@ def _put(path: Path, content: bytes, mode: int) -> None:
     """
     try:
         _make_folder(path.parent)
-        replace_synced(path, path.with_name(f"{path.name}.new"), content)
-        path.chmod(mode)
+        replace_synced(path, path.with_name(f"{path.name}.new"), content, mode)
     except OSError as error:
         raise AdapterError(f"cannot write {path}: {error.strerror}; {_advice(error, path)}") from error
 

@@ -92,6 +92,33 @@ def test_a_file_that_cannot_be_written_whole_is_as_it_was(tmp_path: Path, monkey
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.root
+def test_root_gives_away_the_file_that_it_has_written_and_not_what_its_name_leads_to(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The folder may be a service's: what runs as it could have any file of the machine."""
+    if os.geteuid() != 0:
+        pytest.skip("only root gives files away")
+    folder, victim = tmp_path / "theirs", tmp_path / "shadow"
+    folder.mkdir()
+    victim.write_text("root's own")
+    os.chown(folder, 65_533, 65_533)
+    change_mode = os.fchmod
+
+    def swap(descriptor: int, mode: int) -> None:
+        change_mode(descriptor, mode)
+        (part,) = folder.iterdir()
+        part.unlink()
+        part.symlink_to(victim)
+
+    monkeypatch.setattr(os, "fchmod", swap)
+    write_whole(folder / "key.pem", b"new", 0o600)
+    assert victim.stat().st_uid == 0
+    monkeypatch.undo()
+    write_whole(folder / "ca.pem", b"new", 0o644)
+    assert ((folder / "ca.pem").stat().st_uid, victim.read_text()) == (65_533, "root's own")
+
+
 def test_a_passphrase_locks_the_key_and_a_wrong_one_is_said_to_be(tmp_path: Path) -> None:
     authority = create(tmp_path / "authority", FLEET, b"correct", NOW)
     assert authority.is_locked

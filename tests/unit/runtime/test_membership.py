@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import shutil
+import stat
 import subprocess
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from zsched.adapters.host import state_file
 from zsched.adapters.host.document_store import DocumentStore
 from zsched.adapters.host.state_file import StateFile
 from zsched.config.load import load_fleet
@@ -166,6 +168,29 @@ def test_what_was_written_in_part_is_written_again(second: Places, invitation: I
     assert not is_joined(invitation, second)
     join(invitation, second, is_plan=False)
     assert is_joined(invitation, second)
+
+
+def test_the_mode_is_that_of_the_file_that_was_written_and_not_of_what_its_name_leads_to(
+    second: Places, invitation: Invitation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The state folder is the service's, and `join` runs as root."""
+    victim = tmp_path / "passwd"
+    victim.write_text("root's own")
+    victim.chmod(0o644)
+    sync = state_file.sync_folder
+
+    def swap(folder: Path) -> None:
+        sync(folder)
+        copied = second.state / "copied"
+        if copied.exists() and not copied.is_symlink():
+            copied.unlink()
+            copied.symlink_to(victim)
+
+    monkeypatch.setattr(state_file, "sync_folder", swap)
+    join(invitation, second, is_plan=False)
+    assert (second.state / "copied").is_symlink()
+    assert stat.S_IMODE(victim.stat().st_mode) == 0o644
+    assert stat.S_IMODE(second.config.stat().st_mode) == 0o644
 
 
 def test_a_state_folder_in_use_is_refused_before_anything_is_written(second: Places, invitation: Invitation) -> None:

@@ -222,19 +222,20 @@ def _parts(hardware: str) -> dict[str, str]:
     return dict(part.partition(":")[::2] for part in hardware.split(",") if part)
 
 
-def replace_synced(path: Path, new: Path, content: bytes) -> None:
+def replace_synced(path: Path, new: Path, content: bytes, mode: int = 0o600) -> None:
     """Let the file at ``path`` hold ``content``; when this returns it survives a power cut.
 
     Args:
         path: the file.
         new: where it is written first, in the same folder.
         content: all of it.
+        mode: its permissions, whatever the umask.
 
     Raises:
         OSError: the disk is full, read-only or gone; what was at ``path`` is whole.
     """
     try:
-        _write_synced(new, content)
+        _write_synced(new, content, mode)
         new.replace(path)
         sync_folder(path.parent)
     except OSError:
@@ -258,10 +259,11 @@ def _open_own(path: Path) -> int:
     return fd
 
 
-def _write_synced(path: Path, content: bytes) -> None:
+def _write_synced(path: Path, content: bytes, mode: int) -> None:
     path.unlink(missing_ok=True)  # of a save that was cut off, or what leads elsewhere: the file is always a new one
     fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
     try:
+        os.fchmod(fd, mode)  # not by its name, which may lead elsewhere once it is there
         written = 0
         while written < len(content):
             written += os.write(fd, content[written:])
