@@ -17,7 +17,7 @@ from zsched.core.values.messages import CommandOutcome, CommandResult
 from zsched.errors import ConfigError
 from zsched.pki.files import PUBLIC, make_folder, write_whole
 from zsched.runtime.secured import bytes_of, files_of, identity_of, renewed_in
-from zsched.sessions.certificate import ders_of, parts_of
+from zsched.sessions.certificate import ders_of, parts_of, pem_of
 
 SOON: Final = timedelta(days=7)
 """This long before its certificate ends a node says so: it is due since 3 days then, and nobody has renewed it."""
@@ -59,7 +59,7 @@ def take(fleet: Fleet, state: Path, pem: str) -> CommandResult:
     path = renewed_in(state)
     try:
         make_folder(path.parent)
-        write_whole(path, pem.encode(), PUBLIC)
+        write_whole(path, pem_of(der), PUBLIC)  # what else the text holds, nobody has vouched for
     except OSError as error:
         return _refused(f"{path}: cannot be written: {error.strerror}")
     _log.info("certificate renewed until=%s", f"{offered.ends:%Y-%m-%d}")

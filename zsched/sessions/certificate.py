@@ -17,6 +17,7 @@ from zsched.core.values.struct import Struct
 T = TypeVar("T")
 
 PEM: Final = re.compile(rb"-----BEGIN CERTIFICATE-----(.*?)-----END CERTIFICATE-----", re.DOTALL)
+PEM_COLUMNS: Final = 64
 COMMON_NAME: Final = bytes((0x06, 0x03, 0x55, 0x04, 0x03))
 """The object identifier 2.5.4.3, as DER."""
 SEQUENCE, VERSION, UTC_TIME, GENERALIZED_TIME = 0x30, 0xA0, 0x17, 0x18
@@ -40,16 +41,16 @@ class Parts(Struct, frozen=True, kw_only=True):
 def parts_of(der: bytes) -> Parts:
     """A certificate (DER), taken apart.
 
+    What the signature is not over must be as TLS takes it: no byte more, and the algorithm that is signed, too.
+
     Raises:
         ValueError: it is malformed.
     """
     try:
-        body = _inside(der, SEQUENCE)[0]
-        bits = _inside(_after(_after(body)), BIT_STRING)[0]
         begins, ends = _validity(der)
         return Parts(
-            signed=_first(body),
-            signature=bits[1:],  # the first byte: how many bits of the last one are not used, here none
+            signed=_first(_inside(der, SEQUENCE)[0]),
+            signature=_signature(der),
             common_name=_common_name(der),
             begins=begins,
             ends=ends,
@@ -59,6 +60,15 @@ def parts_of(der: bytes) -> Parts:
         raise ValueError(f"the certificate is malformed: {error}") from error
 
 
+def _signature(der: bytes) -> bytes:
+    body, behind = _inside(der, SEQUENCE)
+    algorithm = _first(_after(body))
+    bits, rest = _inside(_after(_after(body)), BIT_STRING)
+    if behind or rest or algorithm != _first(_algorithm_on(der)) or bits[0]:  # the last: bits that are not used
+        raise IndexError("what its signature is not over is not as it was made")
+    return bits[1:]
+
+
 def ders_of(pem: bytes) -> tuple[bytes, ...]:
     """Every certificate of a PEM file as DER, in its order.
 
@@ -66,6 +76,13 @@ def ders_of(pem: bytes) -> tuple[bytes, ...]:
         ValueError: there is none, or one is no base64.
     """
     return _each(pem, bytes)
+
+
+def pem_of(der: bytes) -> bytes:
+    """A certificate as PEM (RFC 7468)."""
+    text = binascii.b2a_base64(der, newline=False)
+    lines = (text[at : at + PEM_COLUMNS] for at in range(0, len(text), PEM_COLUMNS))
+    return b"\n".join((b"-----BEGIN CERTIFICATE-----", *lines, b"-----END CERTIFICATE-----", b""))
 
 
 def validities(pem: bytes) -> tuple[tuple[datetime, datetime], ...]:
@@ -96,14 +113,15 @@ def _each(pem: bytes, read: Callable[[bytes], T]) -> tuple[T, ...]:
         raise ValueError(f"a certificate in it is malformed: {error}") from error
 
 
-def _from_validity(der: bytes) -> bytes:
-    """Of Certificate: its first part, of which the serial number, the algorithm and the issuer are passed over."""
+def _algorithm_on(der: bytes) -> bytes:
+    """Of Certificate: its first part, from the algorithm on, behind the version and the serial number."""
     body = _inside(_inside(der, SEQUENCE)[0], SEQUENCE)[0]
-    if body[0] == VERSION:
-        body = _after(body)
-    for _ in range(3):
-        body = _after(body)
-    return body
+    return _after(_after(body) if body[0] == VERSION else body)
+
+
+def _from_validity(der: bytes) -> bytes:
+    """The same from the validity on, behind the issuer."""
+    return _after(_after(_algorithm_on(der)))
 
 
 def _validity(der: bytes) -> tuple[datetime, datetime]:
@@ -129,6 +147,8 @@ def _element(data: bytes) -> tuple[int, bytes, bytes]:
     if length & 0x80:
         count = length & 0x7F
         length, at = int.from_bytes(data[2 : 2 + count], "big"), 2 + count
+        if data[2] == 0 or length < 0x80:
+            raise IndexError("a length in more bytes than it takes")  # DER has one way to write it
     if at + length > len(data):
         raise IndexError(f"an element of {length} bytes where {len(data) - at} are left")
     return tag, data[at : at + length], data[at + length :]

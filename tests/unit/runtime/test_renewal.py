@@ -57,6 +57,18 @@ def test_a_newer_certificate_for_the_same_key_is_gone_by(fleet: Fleet, authority
     assert files.certificate.read_text() == pem
 
 
+def test_of_what_is_sent_only_the_certificate_is_kept(fleet: Fleet, authority: Authority, tmp_path: Path) -> None:
+    """zenoh reads the file in its own way: it could find another first, or one that it cannot load, and not listen."""
+    assert fleet.security is not None
+    pem, other = renewed(authority), make_authority(tmp_path / "other", "yard")
+    install(other, tmp_path / "mallory", "robot1")
+    forged = (tmp_path / "mallory" / "certificate.pem").read_text()
+    sent = f"# {pem.replace(chr(10), ' ')}\n{forged}-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n"
+    result = take(fleet, tmp_path / "state", sent)
+    assert result.outcome is OK, result
+    assert files_of(fleet.security).certificate.read_text() == pem
+
+
 def test_what_systemd_hands_over_is_renewed_too(
     fleet: Fleet, authority: Authority, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
