@@ -22,7 +22,7 @@ from zsched.clock import wall_ns
 from zsched.commands.ask import Door, ask_door, find_door, fleet_here
 from zsched.commands.common import CliError, Json, nearest, print_json, say, warn
 from zsched.config.load import load_fleet
-from zsched.core.values.certificates import Role, parse_label
+from zsched.core.values.certificates import Holder, Role, parse_common_name, parse_label
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.struct import Struct
 from zsched.core.values.words import NAME
@@ -30,6 +30,7 @@ from zsched.errors import AdapterError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE
 from zsched.files import read_regular
 from zsched.runtime.secured import CERTIFICATE, KEY, TRUSTED
+from zsched.sessions.certificate import common_names
 
 if TYPE_CHECKING:
     from zsched.pki.authority import Authority, Entry, Issued  # imports cryptography
@@ -92,6 +93,7 @@ def issue(where: Where, name: str, role: Role, request: Path | None, out: Path |
     """
     with _opened(where) as (office, authority):
         hosts = _check_name(office.fleet, name, role)
+        _check_free(out, office.fleet.name, Holder(name=name, role=role), makes_key=request is None)
         issued = authority.issue(name, role, hosts, _request(request), _passphrase(authority), _now())
         folder = out or Path(issued.entry.label)
         _write(folder, issued)
@@ -217,6 +219,8 @@ def renew(where: Where, label: str | None, request: Path | None, out: Path | Non
         hosts = {node.name: (node.host,) if node.host else () for node in office.fleet.nodes}
         for one in labels:
             holder = parse_label(one)
+            if holder is not None:
+                _check_free(out, office.fleet.name, holder, makes_key=False)
             named = hosts.get(holder.name) if holder is not None and holder.role is Role.NODE else None
             issued = authority.renew(one, named, _request(request), secret, _now())
             folder = out or Path(one)
@@ -434,6 +438,29 @@ def _how_to_install(folder: Path, role: Role, *, has_key: bool) -> str:
         f"  sudo install -m 600 {folder}/{KEY} /etc/zsched/pki/ && rm -r {folder}\n"
         "then delete the folder here, too"
     )
+
+
+def _check_free(folder: Path | None, fleet: str, holder: Holder, *, makes_key: bool) -> None:
+    """Refuse to write over somebody else's certificate, or over a key, of which there may be no other copy.
+
+    Raises:
+        CliError: such a file is in the folder.
+    """
+    if folder is None:  # one of its own, by the label
+        return
+    try:
+        names = common_names(read_regular(folder / CERTIFICATE, MAX_BYTES))
+    except (OSError, ValueError):
+        names = ()
+    found = parse_common_name(names[0], fleet) if names else None
+    is_other = bool(names) and (found is None or (found.name, found.role) != (holder.name, holder.role))
+    taken = CERTIFICATE if is_other else KEY if makes_key and (folder / KEY).exists() else ""
+    if taken:
+        whose = f" ({names[0]})" if names else ""
+        raise CliError(
+            EXIT_FAILED,
+            f"{folder / taken}{whose} is there, and is left as it is; give another folder with --out, or move it away",
+        )
 
 
 def _write(folder: Path, issued: Issued) -> None:

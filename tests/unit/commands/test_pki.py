@@ -62,6 +62,29 @@ def test_issue_writes_three_files_of_which_only_the_key_is_secret(here: Path) ->
     assert common_names((here / "laptop" / "certificate.pem").read_bytes()) == ("ana.operator.yard.zsched.internal",)
 
 
+def test_somebody_else_s_files_are_not_written_over(here: Path) -> None:
+    """On a robot the folder `pki` beside the fleet file is the robot's own, and of its key there is no other copy."""
+    pki("init")
+    pki("issue", "robot1", "--out", "pki")
+    before = {path.name: path.read_bytes() for path in (here / "pki").iterdir()}
+    refused = " ".join(pki("issue", "ana", "--role", "operator", "--out", "pki", code=1).stderr.split())
+    assert "pki/certificate.pem (robot1.yard.zsched.internal) is there, and is left as it is" in refused
+    pki("issue", "ana", "--role", "operator", "--out", "ana")
+    assert "(robot1.yard" in pki("renew", "ana.operator", "--out", "pki", code=1).stderr
+    (here / "pki" / "certificate.pem").unlink()
+    assert "pki/key.pem is there" in " ".join(pki("issue", "robot2", "--out", "pki", code=1).stderr.split())
+    del before["certificate.pem"]
+    assert {path.name: path.read_bytes() for path in (here / "pki").iterdir()} == before
+    names = [one["name"] for one in json.loads(pki("show", "--json").stdout)["certificates"]]
+    assert names == ["ana.operator", "robot1"], "nothing was issued"
+    pki("renew", "robot1", "--out", "pki")
+    pki("renew", "robot1", "--out", "pki")
+    pki("revoke", "robot1")
+    (here / "pki" / "key.pem").unlink()
+    pki("issue", "robot1", "--out", "pki")
+    assert common_names((here / "pki" / "certificate.pem").read_bytes()) == ("robot1.k2.yard.zsched.internal",)
+
+
 def test_names_that_the_fleet_file_does_not_fit_are_refused_or_told(here: Path) -> None:
     pki("init")
     assert "did you mean robot1?; for people: --role operator" in pki("issue", "robt1", code=2).stderr
