@@ -26,14 +26,20 @@ _GZIP: Final = 31
 """zlib's number for a gzip header."""
 
 
-def read_regular(path: Path, most_bytes: int) -> bytes:
+def read_regular(path: Path, most_bytes: int, *, is_own: bool = False) -> bytes:
     """What a regular file holds.
+
+    ``is_own``: it has no other name and is no link. In a folder of somebody else that could lead root to any file.
 
     Raises:
         OSError: it cannot be read, is no regular file, or holds more than ``most_bytes``; ``strerror`` says which.
     """
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-    mode = os.fstat(descriptor).st_mode
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | (os.O_NOFOLLOW if is_own else 0))
+    found = os.fstat(descriptor)
+    mode = found.st_mode
+    if is_own and found.st_nlink > 1:
+        os.close(descriptor)
+        raise OSError(errno.EMLINK, os.strerror(errno.EMLINK), str(path))
     if not stat.S_ISREG(mode):
         os.close(descriptor)
         raise OSError(errno.EINVAL, f"it is {_kind(mode)}, not a regular file", str(path))

@@ -101,7 +101,7 @@ def _decision_logs(folder: Path, secrets: tuple[str, ...]) -> Iterator[Member]:
     """This machine's decision log, for `zsched replay`; the older of its two files is there once one was full."""
     for name in (OLD_NAME, NAME):
         try:
-            text = read_regular(folder / name, 2 * FILE_BYTES).decode("utf-8", errors="replace")
+            text = read_regular(folder / name, 2 * FILE_BYTES, is_own=True).decode("utf-8", errors="replace")
         except FileNotFoundError as error:
             if name == NAME:
                 yield Member(name=name, missing=f"{folder / name}: {error.strerror}")

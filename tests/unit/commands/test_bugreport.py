@@ -13,6 +13,7 @@ from typer.testing import CliRunner, Result
 
 from support.clinic import FLEET, fleet_scene
 from support.schemas import faults
+from zsched.adapters.host.decision_log import NAME, OLD_NAME
 from zsched.cli import app
 from zsched.commands.bugreport import gathered
 
@@ -50,6 +51,23 @@ def test_every_node_s_status_the_doctor_s_words_and_no_secret_are_in_it(tmp_path
     assert json.loads(members["status/robot1.json"].content)["problems"] == ["the worker printed REMOVED"]
     assert json.loads(members["doctor.json"].content)["schema"] == "zsched.doctor/1"
     assert {"zsched", "wire", "zenoh", "python", "system"} <= set(json.loads(members["versions.json"].content))
+
+
+@pytest.mark.parametrize("is_hard", [False, True])
+def test_a_link_in_the_state_folder_brings_no_other_file_into_the_report(tmp_path: Path, *, is_hard: bool) -> None:
+    """The folder is the service's, so a worker may write there, and root makes the report and hands it out."""
+    scene = fleet_scene(tmp_path)
+    scene.state_folder.mkdir(exist_ok=True)
+    secret = tmp_path / "shadow"
+    secret.write_text("root:$6$salt$hash:1:2:3:::")
+    for name in (NAME, OLD_NAME):
+        path = scene.state_folder / name
+        path.unlink(missing_ok=True)
+        path.hardlink_to(secret) if is_hard else path.symlink_to(secret)
+    members = {one.name: one for one in gathered(scene, lambda: "")}
+    for name in (NAME, OLD_NAME):
+        assert members[name].content == b""
+        assert "link" in members[name].missing
 
 
 def test_what_cannot_be_had_is_said(tmp_path: Path) -> None:
