@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import io
+import json
 import os
 import pty
 import struct
@@ -15,7 +16,8 @@ from pathlib import Path
 import pytest
 
 from zsched import screen
-from zsched.screen import fitted, wrapped
+from zsched.commands.common import print_json
+from zsched.screen import fitted, harmless, wrapped
 
 WIDTH = 80
 SENTENCE = "zsched apply: nothing was changed, for " + "the fleet has another revision by now and " * 3
@@ -111,3 +113,14 @@ def test_what_a_verb_refuses_fits_the_terminal(arguments: list[str], words: str,
     said = shown_on_a_terminal(arguments, tmp_path)
     assert words in " ".join(said.split())
     assert [line for line in said.split("\n") if len(line) > WIDTH] == []
+
+
+def test_json_for_a_terminal_holds_nothing_that_it_obeys_and_says_the_same(capsys: pytest.CaptureFixture[str]) -> None:
+    """JSON itself escapes the controls below 32 only; half a character could not even be written."""
+    body = {"text": "a\x1b[2J\x7f\x9b2J\u202ecod.exe\u2066\ud800 \u00e9\u2713"}
+    for is_line in (False, True):
+        print_json(body, is_line=is_line)
+        told = capsys.readouterr().out
+        assert json.loads(told) == body
+        assert harmless(told) == told
+        assert "\u00e9\u2713" in told, "what people read stays"

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -29,6 +30,8 @@ NAMED_OTHERWISE: Final = {
     **dict.fromkeys(("pin", "unpin", "pause", "resume"), "task"),
     **dict.fromkeys(("undrain", "eligible"), "drain"),
 }
+OBEYED: Final = re.compile("[\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+"""What JSON leaves as it is and a terminal may obey: more controls, turns of the writing, halves of characters."""
 LONGEST_SENTENCE: Final = 1000
 """Characters."""
 USAGE_ERROR: Final = "Error: "
@@ -204,8 +207,12 @@ class Verbs(TyperGroup):
 def print_json(body: Mapping[str, Any], *, is_line: bool = False) -> None:
     """One JSON object on stdout: indented for people, or on one line (a stream of them is NDJSON)."""
     text = json.dumps(body, ensure_ascii=False, indent=None if is_line else 2)
-    sys.stdout.write(f"{text}\n")
+    sys.stdout.write(f"{OBEYED.sub(_escaped, text)}\n")
     sys.stdout.flush()
+
+
+def _escaped(found: re.Match[str]) -> str:
+    return rf"\u{ord(found[0]):04x}"
 
 
 def say(text: str, indent: int = 2) -> None:
