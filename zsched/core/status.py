@@ -36,7 +36,7 @@ from zsched.core.values.snapshot import (
     VoteStatus,
 )
 from zsched.core.values.struct import replace
-from zsched.core.values.words import NEVER_INITIALISED, RESTARTING, told_of_worker
+from zsched.core.values.words import NEVER_INITIALISED, RESTARTING, TAKEN_OUT, told_of_worker
 from zsched.core.vote.generations import way_out
 from zsched.core.vote.voting import Voting
 
@@ -106,9 +106,15 @@ def _problems(node: Stages, quorum: QuorumStatus, now: float) -> tuple[str, ...]
             "Stop every daemon, run `zsched init` on every node, and start them again"
         )
         return (first, *(f"{source}: {text}" for source, text in sorted(others.items())))
-    problems = [f"{source}: {text}" for source, text in sorted({**node.problems, **node.agreement.problems}.items())]
+    said = {**node.problems, **node.agreement.problems}
+    is_out = TAKEN_OUT in said.get("fleet/document", "")
+    states = node.membership.states()
+    if is_out:  # the others go by another document, as they should
+        said = {source: text for source, text in said.items() if source.partition("/")[2] not in states}
+    problems = [f"{source}: {text}" for source, text in sorted(said.items())]
+    is_apart = any(source.startswith("generation/") for source in said)
     is_alone = node.solitude.is_alone(now, has_heard=node.membership.has_heard)
-    if is_alone and not node.knocking.problems(now):
+    if is_alone and not is_apart and not node.knocking.problems(now):
         problems.insert(0, node.solitude.problem())
     if quorum.stateless:
         names = ", ".join(quorum.stateless)
@@ -124,9 +130,10 @@ def _problems(node: Stages, quorum: QuorumStatus, now: float) -> tuple[str, ...]
         )
     if not quorum.ok:
         told = f"no quorum: {quorum.alive} of {quorum.electors} electors can answer, {quorum.needed} needed"
-        problems.append(
-            told + (f"; if the others are gone for good, {RECOVER}" if node.agreement.document_hash else "")
-        )
+        # A fleet that lives on elsewhere must not become two.
+        is_left_behind = is_out or is_apart or (is_alone and not node.agreement.is_elector)
+        may_recover = node.agreement.document_hash and not is_left_behind
+        problems.append(told + (f"; if the others are gone for good, {RECOVER}" if may_recover else ""))
         if not is_alone:
             problems += [f"elector {told}" for name in node.fleet.electors if (told := _why_silent(node, name, now))]
     elif quorum.alive == quorum.needed < quorum.electors:

@@ -22,6 +22,7 @@ from zsched.core.values.document import Document, Rollout
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId
 from zsched.core.values.struct import replace
+from zsched.core.values.words import TAKEN_OUT
 from zsched.errors import AdapterError, ConfigError, WireError
 from zsched.guard import guarded
 from zsched.wire.codec import decode_document, document_hash
@@ -159,7 +160,7 @@ def read_document(content: Document, fleet: str, node: NodeId, config: Path) -> 
     if result.fleet.name != fleet:
         raise ConfigError(f"the document is of the fleet {result.fleet.name!r}, this node of {fleet!r}")
     if all(one.name != node for one in result.fleet.nodes):
-        advice = "this machine was taken out, and goes on by its last one until `zsched leave`"
+        advice = f"{TAKEN_OUT}, and goes on by its last one until `zsched leave`"
         raise ConfigError(f"the document names no node {node!r}: {advice}")
     return with_rollouts(result.fleet, content.rollouts)
 

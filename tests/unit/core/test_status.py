@@ -29,7 +29,7 @@ from zsched.core.values.model import ScoreForm
 from zsched.core.values.plan import StreamCount
 from zsched.core.values.profile import DeviceSample, Echo, Jobs, LinkSample, LinkSource, WorkerState
 from zsched.core.values.snapshot import SCHEMA, Snapshot
-from zsched.core.values.words import RESTARTING, WAS_READY
+from zsched.core.values.words import RESTARTING, TAKEN_OUT, WAS_READY
 from zsched.core.vote.agreement import Agreement
 from zsched_lab.sim.simulator import Simulator
 
@@ -125,6 +125,24 @@ def test_where_a_document_is_agreed_a_lost_majority_is_recovered_on_one_node() -
     assert problems[2].startswith("nothing can be agreed: too many electors without their states (each says why); ")
     assert problems[2].endswith("run `zsched recover` there, and start it")
     assert not any("--generation" in one for one in problems)
+
+
+@pytest.mark.parametrize("subject", ["generation/robot3", "fleet/document", "alone"])
+def test_a_node_of_a_fleet_that_lives_on_elsewhere_is_told_nothing_of_a_recovery(subject: str) -> None:
+    """Its electors are there, and do not hear this node: a recovery would make a second fleet."""
+    node = make("edge1", alive=())
+    if subject == "generation/robot3":
+        node.problems[subject] = "robot3 counts by another generation of this fleet"
+    if subject == "fleet/document":
+        node.problems[subject] = f"the document names no node 'edge1': {TAKEN_OUT}"
+        node.problems["fleet/robot1"] = "robot1 goes by another fleet file"
+    with patch.object(Agreement, "document_hash", "0d"):
+        problems = build_snapshot(node, 110.0).problems
+    assert "no quorum: 0 of 3 electors can answer, 2 needed" in problems
+    assert not any("recover`" in one for one in problems)
+    is_lonely = any("heard nobody" in one for one in problems)
+    assert is_lonely is (subject != "generation/robot3"), "who has heard of another generation has heard somebody"
+    assert not any("fleet/robot1" in one for one in problems), "the others go by another document, as they should"
 
 
 def forgotten(me: str = "robot1", *, lacks_file: bool = True, stateless: tuple[str, ...] = ROBOTS) -> Node:

@@ -22,6 +22,8 @@ PAPER_METRICS = ("cpu", "memory", "network")
 
 NEVER_INITIALISED = "never initialised"
 """First words of the problem that no elector has a state, and no node remembers one."""
+TAKEN_OUT = "this machine was taken out"
+"""Of the problem that the agreed document does not name this node: `zsched leave` puts its files away."""
 WAS_READY = "was ready until "
 """First words of the reason of a worker that was ready and no longer is; its supervisor calls that starting."""
 RESTARTING = "restarting"
