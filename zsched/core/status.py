@@ -115,7 +115,7 @@ def _problems(node: Stages, quorum: QuorumStatus, now: float) -> tuple[str, ...]
     is_apart = any(source.startswith("generation/") for source in said)
     is_alone = node.solitude.is_alone(now, has_heard=node.membership.has_heard)
     if is_alone and not is_apart and not node.knocking.problems(now):
-        problems.insert(0, node.solitude.problem())
+        problems.insert(0, node.solitude.problem(node.me if node.fleet.security is not None else ""))
     if quorum.stateless:
         names = ", ".join(quorum.stateless)
         problems.append(f"electors without their state, {len(quorum.stateless)} of {quorum.electors}: {names}")

@@ -19,11 +19,12 @@ from zsched.commands.report import degradations, render_status
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.instructions import RecordStory
+from zsched.core.membership.solitude import TAKEN
 from zsched.core.node import Node
 from zsched.core.report import snapshot_json
 from zsched.core.scheduler.patience import FIRST_PATIENCE
 from zsched.core.status import build_explanation, build_snapshot, status_line
-from zsched.core.values.fleet import WorkerSpec, electorate_hash, lease_terms
+from zsched.core.values.fleet import Security, WorkerSpec, electorate_hash, lease_terms
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import ScoreForm
 from zsched.core.values.plan import StreamCount
@@ -427,6 +428,19 @@ def test_a_node_that_reaches_nobody_says_whom_it_dials_and_what_becomes_of_it() 
     assert not any("heard nobody" in one for one in build_snapshot(node, 140.0).problems)
     after = (one for now in (170.0, 201.0) for one in node.handle(ev.DeadlineReached(), now))
     assert not any(isinstance(one, do.TryAddresses) for one in after), "it has heard somebody once"
+
+
+def test_a_node_that_others_do_not_let_in_is_told_that_its_certificate_may_be_old() -> None:
+    """An earlier invitation's key is refused in silence: the address takes connections, and nobody is heard."""
+    node = make(alive=())
+    node.solitude.dialled = ("tls/192.0.2.1:7457", "tls/192.0.2.2:7457")
+    node.handle(ev.AddressesTried(found=((node.solitude.dialled[0], TAKEN),)), 110.0)
+    invite = "On a node of the fleet `zsched invite robot1`, then `zsched join` here"
+    assert not any(invite in one for one in build_snapshot(node, 110.0).problems), "nobody needs a certificate"
+    node.fleet = replace(node.fleet, security=Security(folder="/pki"))
+    assert invite in build_snapshot(node, 110.0).problems[0]
+    node.handle(ev.AddressesTried(found=((node.solitude.dialled[0], "refused"),)), 110.0)
+    assert not any(invite in one for one in build_snapshot(node, 110.0).problems), "nobody is there at all"
 
 
 @pytest.mark.parametrize(

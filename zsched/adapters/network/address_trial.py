@@ -15,6 +15,7 @@ from collections.abc import Callable
 from typing import Final
 
 from zsched.core import events as ev
+from zsched.core.membership.solitude import TAKEN
 from zsched.guard import guarded
 
 CONNECT_S: Final = 1.0
@@ -69,7 +70,7 @@ def outcome_of(endpoint: str) -> str:
         return ""
     try:
         with socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_S):
-            return "takes connections"
+            return TAKEN
     except TimeoutError:
         return f"no answer in {CONNECT_S:g} s"
     except ConnectionRefusedError:

@@ -20,6 +20,8 @@ TRY_PAUSE_S = 30.0
 ADDRESSES_SHOWN = 8
 """More addresses are counted only."""
 
+TAKEN = "takes connections"
+"""What became of an address at which somebody listens (`AddressesTried`)."""
 CHECK = "Check host, port, firewall, and that every node has the same `fleet:`"
 
 
@@ -50,8 +52,8 @@ class Solitude(Struct):
         """Take (address, what became of it) of the newest trial."""
         self._found = found
 
-    def problem(self) -> str:
-        """What to tell an operator of a node that is alone."""
+    def problem(self, secured: str = "") -> str:
+        """What to tell an operator of a node that is alone; ``secured``: its name, where certificates let nodes in."""
         if not self.dialled:
             way = f"the others dial it at {self.dialled_at}" if self.dialled_at else "nobody has an address to dial"
             return f"heard nobody since the start: this node dials nobody, {way}. {CHECK}"
@@ -59,4 +61,11 @@ class Solitude(Struct):
         told = [f"{one} ({causes[one]})" if causes.get(one) else one for one in self.dialled[:ADDRESSES_SHOWN]]
         if len(self.dialled) > ADDRESSES_SHOWN:
             told.append(f"{len(self.dialled) - ADDRESSES_SHOWN} more")
-        return f"heard nobody since the start: dialled {', '.join(told)}. {CHECK}"
+        where = f"heard nobody since the start: dialled {', '.join(told)}. "
+        if not secured or TAKEN not in causes.values():
+            return f"{where}{CHECK}"
+        return (
+            f"{where}Who takes connections and is not heard may not let this node in: its certificate is of an earlier "
+            f"invitation, or its key is revoked. On a node of the fleet `zsched invite {secured}`, then `zsched join` "
+            f"here; else: {CHECK[0].lower()}{CHECK[1:]}"
+        )
