@@ -462,6 +462,35 @@ def test_a_machine_that_is_invited_again_gets_another_key_and_the_former_one_is_
             require_own(fleet, fleet.security, "robot2")
 
 
+def test_a_machine_that_joined_by_an_earlier_invitation_takes_the_key_of_a_later_one(
+    node: Node, tmp_path: Path
+) -> None:
+    """Nobody lets it in by the earlier key, and it cannot leave: the others do not hear it."""
+    secured(tmp_path, node)
+    first, second, folder = tmp_path / "1.invite", tmp_path / "2.invite", tmp_path / "robot2"
+    words = ("invite", "robot2", "--yes", "-o")
+    assert run(*words, first, "--address", "192.0.2.12").exit_code == 0
+    assert run(*words, second).exit_code == 0
+    assert run("join", first, *here(folder)).exit_code == 0
+    state = (folder / "state" / "state").read_bytes()
+    earlier = (folder / "pki" / "key.pem").read_bytes()
+    planned = run("join", second, "--plan", *here(folder))
+    assert (planned.exit_code, (folder / "pki" / "key.pem").read_bytes()) == (10, earlier), planned.stderr
+    taken = run("join", second, *here(folder))
+    assert taken.exit_code == 0, taken.stderr
+    assert "is robot2 already, and has the certificate and key of this later invitation" in taken.stdout
+    fleet = check_bytes(node.text.encode(), str(folder / "fleet.yaml")).fleet
+    assert fleet is not None
+    assert fleet.security is not None
+    assert fleet.security.revoked == ("robot2",)
+    require_own(fleet, fleet.security, "robot2")
+    assert (folder / "state" / "state").read_bytes() == state, "it is the same node"
+    for file in (second, first):
+        again = run("join", file, *here(folder))
+        assert "nothing to do" in again.stdout, "an earlier key never takes the place of a later one"
+    require_own(fleet, fleet.security, "robot2")
+
+
 def test_a_request_for_the_same_key_is_answered_again(node: Node, tmp_path: Path) -> None:
     secured(tmp_path, node)
     folder, csr, file = tmp_path / "robot2", tmp_path / "robot2.csr", tmp_path / "robot2.invite"
