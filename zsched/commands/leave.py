@@ -30,6 +30,7 @@ from zsched.config.load import check_bytes
 from zsched.core.electorate.pilot import may_go
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.struct import Struct
+from zsched.core.values.words import TAKEN_OUT
 from zsched.errors import AdapterError, ConfigError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_UNREACHABLE, EXIT_USAGE, EXIT_WOULD_CHANGE
 from zsched.runtime.membership import Places, Written, belongings, check_ended, put_away, whose
@@ -159,6 +160,9 @@ def _accept(order: LeaveOrder, name: str, means: str) -> None:
 def _take_leave(way: Way, status: Json) -> int:
     """Have the fleet agree, step by step; the exit code."""
     order, me = way.order, way.me
+    if any(TAKEN_OUT in str(problem) for problem in status["problems"]):  # the others may not answer it any more
+        way.tell(f"{me} is no node of {status['fleet']} any more: it was taken out")
+        return _planned(way, str(status["fleet"])) if order.is_plan else EXIT_OK
     held = _newest(way, status)
     members = members_of(held, status)
     danger = _danger(way, status, held, members)

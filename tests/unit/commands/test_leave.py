@@ -44,6 +44,7 @@ class Hall:
         self.seat_goes_after: float = 2
         self.looks_of_robot2, self.fetches_after = 0, 0
         self.asked: list[str] = []
+        self.problems: list[str] = []
         self.step: Callable[[], None] = lambda: None
         self.door = OperatorSocket(folder / "run" / "robot3.sock", self.answer)
 
@@ -84,7 +85,7 @@ class Hall:
         }
         quorum = {**STATUS["quorum"], "ok": self.quorum_ok, "names": self.electors, "pilot": "it waits for a spare"}
         body = {**STATUS, "fleet": "hall", "node": who, "nodes": nodes, "tasks": [task], "quorum": quorum}
-        return {**body, "fleet_revision": self.revision}
+        return {**body, "fleet_revision": self.revision, "problems": self.problems}
 
     def _fleet(self, who: str) -> Json:
         if who == "robot3" and any(flag["kind"] == "leave" for flag in self.flags):
@@ -251,6 +252,16 @@ def test_a_machine_that_was_taken_out_only_stops(hall: Hall) -> None:
     done = run("--yes")
     assert (done.exit_code, hall.asked, left(hall.folder)) == (0, ["leave"], RENAMED)
     assert "robot3 is no node of hall since revision 7" in done.stdout
+
+
+def test_a_machine_that_was_taken_out_and_is_not_answered_any_more_only_stops_too(hall: Hall) -> None:
+    """It has the last document that names it, and no quorum: there is nobody left to tell."""
+    hall.quorum_ok = False
+    hall.problems = ["fleet/document: the document names no node 'robot3': this machine was taken out, and goes on"]
+    done = run("--yes")
+    assert done.exit_code == 0, done.output
+    assert (hall.asked, left(hall.folder)) == (["leave"], RENAMED)
+    assert "robot3 is no node of hall any more: it was taken out" in done.stdout
 
 
 @pytest.mark.parametrize(
