@@ -196,6 +196,8 @@ def create(view: CreateView) -> int:
     """
     if NAME.fullmatch(view.fleet) is None:
         raise CliError(EXIT_USAGE, f"{view.fleet!r} is not a name ([a-z0-9][a-z0-9_-]{{0,62}})")
+    if NAME.fullmatch(view.node) is None:
+        raise CliError(EXIT_USAGE, f"--node: {view.node!r} is not a name ([a-z0-9][a-z0-9_-]{{0,62}})")
     host = own_address() if view.address is None else ""
     if view.address is None and not host:
         raise CliError(EXIT_FAILED, "this machine has no address in a network: connect it, or give one with --address")

@@ -99,10 +99,10 @@ def found(
         ConfigError: the text has faults.
     """
     fleet = _read(text, places.config)
+    _check_no_state(fleet.name, me, places.state)
     if places.config.exists():
         advice = "use it (`zsched init`), or give another file with --config"
         raise AdapterError(f"{places.config} exists already, and is left as it is; {advice}")
-    _check_no_state(fleet.name, me, places.state)
     content = Document(text=Text(text))
     disk = secrets.token_hex(8)
     value = created(fleet, me, disk=disk, generation_id=secrets.token_hex(16), document=document_hash(content))
@@ -508,9 +508,9 @@ def _read(text: str, config: Path) -> Fleet:
 
 def _check_no_state(fleet: str, node: NodeId, folder: Path) -> None:
     file = StateFile(folder, fleet=fleet, node=node)
-    file.check_owner()
+    file.check_owner("or take this machine out of its fleet first (`zsched leave`)")
     if not file.load().is_missing:
-        advice = "leave that fleet first (`zsched leave --purge`), or give a folder with --state-dir"
+        advice = "leave that fleet first (`zsched leave`), or give a folder with --state-dir"
         raise AdapterError(f"{file.path} exists already: this machine belongs to a fleet; {advice}")
 
 

@@ -94,10 +94,13 @@ def test_a_plan_writes_nothing(first: Places, second: Places, invitation: Invita
 
 def test_no_fleet_is_founded_where_one_is(first: Places, second: Places) -> None:
     found(TEXT, "robot1", first, is_plan=False)
-    with pytest.raises(AdapterError, match="exists already, and is left as it is"):
-        found(TEXT, "robot1", first, is_plan=False)
-    with pytest.raises(AdapterError, match="this machine belongs to a fleet"):
-        found(TEXT, "robot1", replace(first, config=second.config), is_plan=False)
+    for places in (first, replace(first, config=second.config)):
+        with pytest.raises(AdapterError, match=r"belongs to a fleet; leave that fleet first \(`zsched leave`\)"):
+            found(TEXT, "robot1", places, is_plan=False)
+    with pytest.raises(AdapterError, match=r"or take this machine out of its fleet first \(`zsched leave`\)"):
+        found(TEXT.replace("fleet: hall", "fleet: yard"), "robot1", first, is_plan=False)
+    with pytest.raises(AdapterError, match=r"exists already, and is left as it is; use it \(`zsched init`\)"):
+        found(TEXT, "robot1", replace(first, state=second.state), is_plan=False)
     assert not second.config.exists()
 
 
