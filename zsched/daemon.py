@@ -151,7 +151,7 @@ class Daemon:
         self.begins_anew = False
         """The process is to become another daemon, in place, once this one has ended."""
         self._has_foreign_state = False
-        self._lacks_state_file = False
+        self._has_others_state = self._lacks_state_file = False
         self._door = Door(options.runtime_dir, options.node)
         self._is_ready = False
         self._library = Library(
@@ -211,7 +211,7 @@ class Daemon:
             node.fleet_path = str(self._options.config.absolute())
             node.by_file = self._in_file
             node.copied_file = copied_file(self._options.state_dir)
-            node.lacks_state_file = self._lacks_state_file
+            node.has_others_state, node.lacks_state_file = self._has_others_state, self._lacks_state_file
             if self._memory_objection:
                 log.warning("shared_memory off why=%s", self._memory_objection)
                 node.problems["shared_memory"] = f"shared memory is off here: {self._memory_objection}"
@@ -230,9 +230,10 @@ class Daemon:
         loaded = state_file.load()
         self._lacks_state_file = loaded.is_missing
         if loaded.state is None:
-            here = self._options
+            self._has_others_state, here = loaded.is_others, self._options
             command = f"zsched init --config {here.config} --node {here.node} --state-dir {here.state_dir}"
-            log.warning("no_state why=%s (here: `%s`); no elector", loaded.problem, command)
+            advice = "" if loaded.is_others else f" (here: `{command}`)"
+            log.warning("no_state why=%s%s; no elector", loaded.problem, advice)
             return None, loaded.problem
         if loaded.state.electorate != electorate_hash(self._fleet) and not _is_agreed(loaded.state):
             generation = loaded.state.generation + 1

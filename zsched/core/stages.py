@@ -92,6 +92,8 @@ class Stages:
 
     has_foreign_state = False
     """The state file is whole, and of another electorate than the fleet file: it stays on its disk."""
+    has_others_state = False
+    """The state file is whole, and another fleet's or node's, of whose electors it says nothing here."""
     lacks_state_file = False
     """There is none at all, rather than one that cannot be used."""
     fleet_path = ""

@@ -153,9 +153,9 @@ def _problems(node: Stages, quorum: QuorumStatus, now: float) -> tuple[str, ...]
             f"no planned moves: {len(voters) - len(silent)} of {len(voters)} robots can vote, {needed} needed; "
             f"not {', '.join(silent)}. An owner that is gone, drains or fails is still replaced"
         )
-    if not has_enough:
+    if not has_enough and not node.has_others_state:
         problems.append(_nothing_agreed(node, quorum, fresh))
-    if not node.has_state and not node.has_foreign_state:
+    if not node.has_state and not node.has_foreign_state and not node.has_others_state:
         problems.append("no valid state file: this node is no elector (see `zsched init --help`)")
     return tuple(problems)
 

@@ -36,6 +36,8 @@ def valid(scene: Scene) -> Result:
     fix = f"sudo zsched init --config {scene.file} --node {scene.node}, with the daemon stopped"
     if not found.is_missing:
         fix = "zsched init --help says how a node becomes an elector again; do not copy a state from elsewhere"
+    if found.is_others:
+        fix = "the fleet file and name of that state, or zsched leave; zsched init refuses here"
     if scene.node not in scene.fleet.electors:
         return warned(told, f"{scene.node} is {role}: it works without", fix=fix)
     return failed(told, f"{scene.node} is {role} and cannot vote", fix=fix)

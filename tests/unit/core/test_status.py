@@ -128,6 +128,19 @@ def test_where_a_document_is_agreed_a_lost_majority_is_recovered_on_one_node() -
     assert not any("--generation" in one for one in problems)
 
 
+def test_a_node_with_another_fleets_state_is_not_told_to_begin_anew() -> None:
+    """`zsched init` refuses there; the state's own problem says what to do."""
+    node = make(has_state=False)
+    for sequence, name in enumerate(("robot2", "robot3"), 2):
+        node.handle(ev.BeatReceived(beat=beat_of(name, sequence, incarnation=3, has_lost_state=True)), 100.0)
+    node.problems["state"] = "/x/state belongs to the fleet 'yard', not 'hall': ... (`zsched leave`)"
+    assert any("zsched init" in one for one in build_snapshot(node, 100.0).problems)
+    node.has_others_state = True
+    told = build_snapshot(node, 100.0).problems
+    assert any("`zsched leave`" in one for one in told)
+    assert not any("zsched init" in one for one in told)
+
+
 @pytest.mark.parametrize("subject", ["generation/robot3", "fleet/document", "alone"])
 def test_a_node_of_a_fleet_that_lives_on_elsewhere_is_told_nothing_of_a_recovery(subject: str) -> None:
     """Its electors are there, and do not hear this node: a recovery would make a second fleet."""

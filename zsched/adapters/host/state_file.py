@@ -46,6 +46,8 @@ class LoadResult(Struct, frozen=True, kw_only=True):
     problem: str | None = None
     is_missing: bool = False
     """There is no such file: this node was never initialised, or its folder is gone."""
+    is_others: bool = False
+    """It is whole, and another fleet's or node's: `zsched init` refuses it."""
 
 
 class StateFile:
@@ -155,7 +157,14 @@ class StateFile:
         if found.state is None:
             return found
         problem = self._foreign(found.state)
-        return found if problem is None else LoadResult(problem=f"{self.path} {problem}")
+        if problem is None:
+            return found
+        state = found.state
+        if state.fleet == self._fleet and state.node == self._node:
+            return LoadResult(problem=f"{self.path} {problem}")
+        own = f"the fleet file of {state.fleet}" if state.fleet != self._fleet else f"--node {state.node}"
+        advice = f"start this daemon with {own}, or take this machine out of that fleet first (`zsched leave`)"
+        return LoadResult(problem=f"{self.path} {problem}: {advice}", is_others=True)
 
     def save(self, state: DurableState) -> None:
         """Replace the state; when this returns it survives a power cut.

@@ -92,6 +92,7 @@ def test_state_of_somebody_else_is_lost_state(tmp_path: Path, fleet: str, node: 
     assert result.state is None
     assert result.problem is not None
     assert word in result.problem
+    assert result.is_others is ("`zsched leave`" in result.problem) is (word != "another machine")
     assert not result.is_missing, "it is lost"
 
 
