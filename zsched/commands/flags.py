@@ -100,7 +100,8 @@ def drain(view: OrderView, order: DrainOrder) -> int:
     found = {} if order.is_detached else _statuses(view.door, status, nodes)
     before = {name: _counts(found, name) for name in _owned(status, nodes)}
     revision = _commit(view, held, after, f"{order.kind} {', '.join(nodes)}")
-    what = "It is agreed" if is_change else "It is so already"
+    had = "; ".join(f"{row[0]}: {row[2]}" for row in rows if row[1] == order.kind)
+    what = "It is agreed" if is_change else f"It is so already ({had})"
     watch = ". Ctrl-C ends the watching, not the drain"
     if order.kind == LEAVE:  # this command does the rest, once the node is empty
         watch = f". After Ctrl-C the same command goes on, and `zsched undrain {' '.join(nodes)}` takes it back"
@@ -408,10 +409,19 @@ def _look(watch: _Watch, nodes: Sequence[str], revision: int) -> list[str]:
         missed = missing(Condition(kind="empty", node=name), found)
         if not missed and name not in watch.empty:
             watch.empty.add(name)
-            until = f" until `zsched undrain {name}`" if watch.kind == DRAIN else ""
+            until = _until(first, name) if watch.kind == DRAIN else ""
             watch.tell("empty", f"{name}: empty, and gets nothing new{until}", node=name)
         lacks += missed
     return lacks
+
+
+def _until(status: Json, name: str) -> str:
+    """When a drained node gets tasks again."""
+    node = next(node for node in status["nodes"] if node["name"] == name)
+    flag = next((flag for flag in node.get("flags", ()) if flag["kind"] == DRAIN), None)
+    if flag is None or flag["for_s"] is None:
+        return f" until `zsched undrain {name}`"
+    return f" for {span(max(flag['for_s'] - flag['known_s'], 0.0))}, or until `zsched undrain {name}`"
 
 
 def _statuses(door: Door, first: Json, nodes: Sequence[str]) -> dict[str, Json]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -97,6 +98,17 @@ def events(*words: str) -> list[Json]:
     return found
 
 
+def test_a_drain_that_ends_by_itself_says_when_the_node_gets_tasks_again(daemon: Daemon) -> None:
+    """Whoever opens the machine must not think that it stays empty until somebody says so."""
+    for name in ("echo", "merge"):
+        daemon.own(name, "edge2")
+    ends = "edge1: empty, and gets nothing new for 27s, or until `zsched undrain edge1`"
+    assert ends in run("drain", "edge1", "--yes", "--for", "30s").stdout
+    again = run("drain", "edge1", "--yes").stdout
+    assert "It is so already (edge1: drained, for 30s, " in again
+    assert ends in again
+
+
 @pytest.mark.parametrize("words", [("drain", "edge1"), ("eligible", "edge1", "off")])
 def test_off_a_terminal_nothing_is_done_and_the_command_is_printed(daemon: Daemon, words: tuple[str, ...]) -> None:
     result = run(*words)
@@ -164,7 +176,7 @@ def test_it_is_watched_until_the_node_is_empty_and_every_move_is_told(daemon: Da
     ]
     daemon.own("echo", "edge1")
     again = run("drain", "edge1", "--yes", "--deadline", "0s")
-    assert "It is so already. Ctrl-C ends the watching, not the drain." in again.stdout
+    assert re.search(r"It is so already \(edge1: drained, \S+@robot1\)\. Ctrl-C ends the watching", again.stdout)
     assert len(daemon.changes) == 1, "who gives it again only watches"
 
 
