@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 PLAIN, TLS = "tcp/", "tls/"
 SECURE_PAGE = "docs/guide/secure.md"
+PASSES_ON = "passes on no command from elsewhere"
+"""Of a node of a secured fleet that is asked by who is no node, for another node."""
 CONTROL_PORT = 7457
 """Where a node's control session listens by the guides."""
 UNITS = tuple(
@@ -344,9 +346,29 @@ def _ask_elsewhere(door: Door, request: Json) -> Json:
             return answer_json(_ask_cell(door.cell, door.node, command))
         return answer_json(_client(door.endpoint).ask(door.node, command))
     except AdapterError as error:
-        secured = f"; a secured fleet is asked at {TLS}{door.endpoint.removeprefix(PLAIN)}"
-        advice = secured if door.cell is None and door.endpoint.startswith(PLAIN) else ""
+        advice = "" if door.cell is not None else _why_silent(door, visit, is_command=command is not None)
         raise CliError(EXIT_UNREACHABLE, f"{error}{advice}") from error
+
+
+def _why_silent(door: Door, visit: _Visit, *, is_command: bool) -> str:
+    """What else a silence of another machine may mean, and what to do; behind the error."""
+    if door.endpoint.startswith(PLAIN):
+        return f"; a secured fleet is asked at {TLS}{door.endpoint.removeprefix(PLAIN)}"
+    try:
+        client = _client(door.endpoint)
+    except AdapterError:
+        return ""  # there is no link at all
+    try:
+        there = client.status().node
+    except AdapterError:
+        role = "guests" if visit.is_guest else "operators"
+        return (
+            f" A secured fleet is silent to whom it does not let in: its document must name {visit.asker} (`security: "
+            f"{{{role}: [...]}}` for people), not revoke the key, and the daemons must have begun anew since"
+        )
+    if is_command and door.node not in (None, there):
+        return f"; in a secured fleet {there} {PASSES_ON}: ask {door.node} itself (--connect)"
+    return ""
 
 
 def _guest_may_not(visit: _Visit) -> str:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from zsched.commands.apply import ApplyView, apply, read_text
-from zsched.commands.ask import Door
+from zsched.commands.ask import PASSES_ON, Door
 from zsched.commands.common import CliError, Json, print_json, say
 from zsched.commands.document import QUESTION, InForce, ask_all, document_text, in_force, status_of
 from zsched.errors import ConfigError
@@ -65,7 +65,7 @@ def _text(held: InForce, told: list[Json]) -> str:
 
 def _said(held: InForce, one: Json, told: list[Json]) -> str:
     if one["problem"] is not None:
-        return "no answer"
+        return f"unknown here: {held.node} {PASSES_ON}" if PASSES_ON in one["problem"] else "no answer"
     if one["revision"] is None:
         return "does not know the fleet's generation yet"
     if not held.document and not one["document"]:

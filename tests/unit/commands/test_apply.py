@@ -14,6 +14,9 @@ from typer.testing import CliRunner, Result
 from support.schemas import faults
 from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.cli import app
+from zsched.commands import document, fleet
+from zsched.commands.ask import PASSES_ON
+from zsched.commands.common import CliError
 from zsched.config.editing import add_entries
 from zsched.config.load import check_bytes
 from zsched.core.values.fleet import fleet_hash
@@ -457,6 +460,18 @@ def test_show_names_the_electors_and_who_goes_by_something_else(node: Node) -> N
         "  edge1   no answer",
     ]
     assert faults(json.loads(run("fleet", "show", "--json").stdout)) == []
+
+
+def test_show_does_not_take_who_may_not_be_asked_for_who_is_away(node: Node, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An operator's laptop asks one node of a secured fleet, and no other one through it."""
+    assert node.states["edge1"] == "alive"
+    asked = document.ask_all
+
+    def ask_some(*given: Any) -> dict[str, Any]:
+        return {**asked(*given), "edge1": CliError(3, f"edge1 did not answer within 3 s; robot1 {PASSES_ON}")}
+
+    monkeypatch.setattr(fleet, "ask_all", ask_some)
+    assert "  edge1   unknown here: robot1 passes on no command from elsewhere" in run("fleet", "show").stdout
 
 
 @pytest.mark.parametrize("reason", ["by night\n2026-11-24 INFO forged", "x" * 201])

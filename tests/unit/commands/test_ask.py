@@ -98,6 +98,40 @@ def test_nobody_at_a_plain_endpoint_may_be_a_secured_fleet(monkeypatch: pytest.M
     assert caught.value.code == EXIT_UNREACHABLE
 
 
+@pytest.mark.parametrize(
+    ("node", "is_let_in", "why"),
+    [
+        ("edge1", True, "in a secured fleet robot1 passes on no command from elsewhere: ask edge1 itself"),
+        ("robot1", True, None),
+        ("edge1", False, "its document must name ana (`security: {operators: [...]}` for people), not revoke the key"),
+    ],
+)
+def test_a_silent_node_of_a_secured_fleet_is_not_taken_for_a_wrong_address(
+    monkeypatch: pytest.MonkeyPatch, node: str, *, is_let_in: bool, why: str | None
+) -> None:
+    class There:
+        """robot1, which passes on questions for the status only."""
+
+        def ask(self, node: str, _command: object) -> None:
+            raise AdapterError(f"{node} did not answer within 3 s")
+
+        def status(self) -> object:
+            if not is_let_in:
+                raise AdapterError("it is silent")
+            return SimpleNamespace(node="robot1")
+
+    monkeypatch.setattr(ask, "_client", lambda _endpoint: There())
+    monkeypatch.setattr(ask, "_visit", lambda *_given: SimpleNamespace(is_guest=False, asker="ana"))
+    door = Door(socket=Path(), endpoint="tls/robot1:7457", node=node)
+    with pytest.raises(CliError) as caught:
+        ask_door(door, {"verb": "retry", "task": "merge", "by": "ana"})
+    assert caught.value.code == EXIT_UNREACHABLE
+    if why is None:
+        assert str(caught.value) == "robot1 did not answer within 3 s"
+    else:
+        assert why in str(caught.value)
+
+
 def test_where_systemd_has_the_unit_it_says_how_systemd_starts_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
