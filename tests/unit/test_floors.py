@@ -57,6 +57,7 @@ CORE_MAY: Final = frozenset(
             "enum",
             "functools",
             "hashlib",
+            "ipaddress",
         ),
         *("abc", "heapq", "itertools", "math", "operator", "random", "re", "statistics", "types", "typing"),
     }
