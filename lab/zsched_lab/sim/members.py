@@ -268,8 +268,8 @@ class Members:
         for name in self._invited:
             if self._is_due(name) and name not in named:
                 self._add(name, value, fleet, flags)
-        for name in (*self._leaving, *sorted(self.dead)):
-            if name in self.sim.machines and self._is_due(name):
+        for name in (*self._leaving, *sorted(self.dead)):  # a recovery may name a dead one that was taken out before it
+            if (name in self.sim.machines or name in named) and self._is_due(name):
                 self._take_out(name, value, fleet, flags)
 
     def _is_due(self, name: NodeId) -> bool:
@@ -352,7 +352,7 @@ class Members:
 
     def _take_out(self, name: NodeId, value: FleetValue, fleet: Fleet, flags: tuple[Flag, ...]) -> None:
         """The next step of `zsched leave`, or for a dead one of `zsched node remove`."""
-        machine = self.sim.machines[name]
+        machine = self.sim.machines.get(name)
         others = [one for one in self.sim.running() if self.sim.machines[one].name != name]
         if not others:
             return
@@ -395,8 +395,11 @@ class Members:
         """Whether the electors replace a dead one by themselves: three do not become two without a spare."""
         return len(value.electors) > 3 and fleet.is_auto
 
-    def _has_learnt_that(self, machine: Machine) -> bool:
-        known = None if machine.node is None else machine.node.agreement.fleet_value
+    @staticmethod
+    def _has_learnt_that(machine: Machine | None) -> bool:
+        if machine is None or machine.node is None:
+            return False
+        known = machine.node.agreement.fleet_value
         return known is not None and may_go(known, machine.name)
 
     # --- the end of faults -------------------------------------------------------------------------------------------
