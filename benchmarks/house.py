@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Final
 
 HERE: Final = Path(__file__).parents[1]
+GENERATED: Final = "_version.py"
 
 Graph = Mapping[str, frozenset[str]]
 
@@ -33,8 +34,8 @@ class Shape:
 
 
 def sources(folder: Path) -> list[Path]:
-    """All Python files below a folder."""
-    return sorted(folder.rglob("*.py"))
+    """All Python files below a folder, but for the one that a build writes."""
+    return sorted(path for path in folder.rglob("*.py") if path.name != GENERATED)
 
 
 def imports(tree: ast.AST) -> Iterator[str]:
@@ -55,7 +56,7 @@ def graph_of(package: Path, prefix: str, without: frozenset[str] = frozenset()) 
         without: rooms that do not count.
     """
     entries = {path.stem for path in package.iterdir() if path.suffix == ".py" or (path.is_dir() and sources(path))}
-    rooms = sorted(entries - {"__init__", "__pycache__"} - without)
+    rooms = sorted(entries - {"__init__", "__pycache__", Path(GENERATED).stem} - without)
     found = {}
     for room in rooms:
         folder, module = package / room, package / f"{room}.py"
@@ -149,7 +150,7 @@ def rows_of(root: Path) -> dict[str, str]:
 
 
 def _loose(package: Path) -> int:
-    return sum(path.name != "__init__.py" for path in package.glob("*.py"))
+    return sum(path.name not in {"__init__.py", GENERATED} for path in package.glob("*.py"))
 
 
 def main() -> None:
