@@ -102,9 +102,12 @@ class KeptLane(Struct, kw_only=True, eq=False):
     def hear(self, relay: str, node: str, ack: StreamAck, now: float) -> None:
         """Take a relay's word."""
         with self.lock:
-            before = self.state.crowded_out
+            before, spoken_for = self.state.crowded_out, self.state.contradicted
             self.state.hear(relay, node, ack, now)
             is_first = before < self.state.crowded_out == 1
+            is_contradicted = spoken_for < self.state.contradicted == 1
+        if is_contradicted:
+            _log.warning("%s: %s acknowledges answers as a relay that another node speaks for", self.key, node)
         if is_first:
             _log.warning("%s: more than %d relays acknowledge answers: some are strangers", self.key, MAX_RECEIVERS)
 
@@ -155,7 +158,7 @@ class KeptLane(Struct, kw_only=True, eq=False):
     def _way(self, session: Session, relay: str) -> zenoh.Publisher:
         way = self.ways.get(relay)
         if way is None:
-            key = f"{self.key}/{AGAIN_CHUNK}/{relay}"
+            key = f"{self.key}/{AGAIN_CHUNK}/{relay.partition(' ')[0]}"  # whoever speaks for it
             way = self.ways[relay] = session.declare_publisher(key, congestion_control=CongestionControl.BLOCK)
         return way
 

@@ -292,6 +292,23 @@ def test_strangers_who_acknowledge_are_bounded_and_a_robot_that_was_reached_stay
     until(lambda: set(lane.ways) <= set(lane.state.receivers), "the others' publishers are given back")
 
 
+@pytest.mark.parametrize("is_first", [False, True], ids=["behind the robot", "before the robot"])
+def test_a_member_that_speaks_for_another_s_relay_takes_nothing_from_it(bench: Bench, *, is_first: bool) -> None:
+    """Rules bind the key to the member's certificate, and not the relay's id in it."""
+    lane = bench.lane()
+    robot, member = bench.robot("robot1", "aa1"), bench.robot("robot2", "aa1")
+    keep(lane, 0, 1, 2, 3)
+    words = [lambda: robot.ack(bench.eid, 1), lambda: member.ack(bench.eid, 4, has_left=True, is_ended=True)]
+    for word in reversed(words) if is_first else words:
+        word()
+    until(lambda: len(lane.state.receivers) == 2, "both words")
+    robot.ack(bench.eid, 1, has_gap=True, until=4)
+    until(lambda: set(robot.got) == {1, 2, 3}, "what the robot lacks, at the robot")
+    assert lane.state.contradicted == 1
+    robot.ack(bench.eid, 4)
+    until(lambda: not lane.state.kept, "both have all")
+
+
 def test_an_acknowledgement_under_a_malformed_key_is_nobody_s(bench: Bench) -> None:
     lane = bench.lane()
     robot = bench.robot("robot1")

@@ -9,7 +9,9 @@ Every sample goes to everybody at once. What one receiver lacks goes to that one
 no progress for a while. Nobody is greeted: a receiver is known by its first acknowledgement. One that comes late
 begins with number 0, so the first samples are kept for `NEWCOMERS_S`. Losses are counted by each receiver, not here.
 
-Anybody can acknowledge under any receiver's name. So at most `MAX_RECEIVERS` are remembered.
+Anybody can acknowledge under any receiver's name. So at most `MAX_RECEIVERS` are remembered. The node is the one that
+the word's key is bound to (in a secured fleet by its certificate), the receiver's name is its own word. So what two
+nodes say of one name is kept apart: neither lets go of what the other lacks.
 """
 
 from __future__ import annotations
@@ -35,6 +37,8 @@ NEWCOMERS_S: Final = 3.0
 """For this time behind the first sample a receiver may begin with it: one that learnt of it late, or had no link."""
 STALLED_S: Final = 1.0
 """A receiver that lacks something and has not come further for this time is stalled: nothing waits for it."""
+BESIDE: Final = " by "
+"""Between a receiver's name, which has no blanks, and the node that speaks for it beside another one."""
 BATCH: Final = 512
 BATCH_BYTES: Final = 4 << 20
 """At most this much is put again at one time; progress brings the next."""
@@ -58,6 +62,8 @@ class Receiver(Struct, eq=False):
     """One that acknowledges: ``arrived`` is the number it comes to next."""
 
     node: str
+    beside: str = ""
+    """The name of the receiver that another node speaks for, too; empty: there was none when this one was heard."""
     arrived: int = -1
     had: int | None = None
     """The numbers below this one an earlier life of it has acknowledged; it is not sent them."""
@@ -125,6 +131,8 @@ class SharedSender(Struct, kw_only=True, eq=False):
     """Nobody looks after it any more: there is nothing left to do."""
     crowded_out: int = 0
     """Receivers that were forgotten for want of room."""
+    contradicted: int = 0
+    """Receivers that two nodes have spoken for."""
 
     # --- what goes out -----------------------------------------------------------------------------------------------
 
@@ -180,7 +188,12 @@ class SharedSender(Struct, kw_only=True, eq=False):
 
     def hear(self, name: str, node: str, ack: StreamAck, now: float) -> Receiver:
         """Take an acknowledgement of the receiver with this name, on a node."""
-        receiver = self.receivers.get(name) or self._add(name, node)
+        other = self.receivers.get(name)
+        beside = "" if other is None or other.node == node else name
+        alias = f"{name}{BESIDE}{node}"
+        if beside or alias in self.receivers:
+            name = alias
+        receiver = self.receivers.get(name) or self._add(name, node, beside)
         ack = near(ack, self.count)
         receiver.waits_for = min(ack.arrived, self.count)  # nobody can have more than was sent
         arrived = max(receiver.waits_for, receiver.had or 0)
@@ -205,13 +218,14 @@ class SharedSender(Struct, kw_only=True, eq=False):
             receiver.wanted = Wanted(self.count)
         receiver.question = None
 
-    def _add(self, name: str, node: str) -> Receiver:
+    def _add(self, name: str, node: str, beside: str) -> Receiver:
         """One that is heard for the first time; one that begins another life has another name on the same node."""
         for old in [other for other, one in self.receivers.items() if one.node == node]:
             self.forget(old)
         if len(self.receivers) >= MAX_RECEIVERS:
             self._make_room()
-        receiver = self.receivers[name] = Receiver(node=node, had=self._had_by(name, node))
+        receiver = self.receivers[name] = Receiver(node=node, beside=beside, had=self._had_by(name, node))
+        self.contradicted += bool(beside)
         return receiver
 
     def forget(self, name: str) -> None:
@@ -241,10 +255,12 @@ class SharedSender(Struct, kw_only=True, eq=False):
 
         An input waits for its answers: for its own receiver until that has them, wants no more of them, or is
         forgotten; for any other one while it comes further, since a frozen one must not stop the inputs of the others.
+        Where two nodes speak for its own, nobody knows which is right, and each is like any other.
         """
         if self.is_over:
             return self.count
-        awaited = [one for other, one in self.receivers.items() if one.is_awaited(now, is_own=other == name)]
+        own = "" if any(one.beside == name for one in self.receivers.values()) else name
+        awaited = [one for other, one in self.receivers.items() if one.is_awaited(now, is_own=other == own)]
         is_known = name in self.receivers or name in self.had
         low = self.count if is_known or not self._is_expected(name, now) else 0
         return min((one.arrived for one in awaited), default=low) if low else 0

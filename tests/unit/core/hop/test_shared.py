@@ -13,6 +13,7 @@ from zsched.core.hop.shared import (
     LOOK_S,
     MAX_PAUSE_S,
     NEWCOMERS_S,
+    STALLED_S,
     TICK_S,
     SharedSender,
 )
@@ -169,3 +170,45 @@ def test_numbers_go_on_beyond_what_travels() -> None:
     books = sender(6, first=SPAN - 3)
     ack(books, "a", 1, 1.0, has_gap=True, until=2)
     assert owed(books, "a", 1.0) == (None, [SPAN + 1])
+
+
+def say(books: SharedSender, name: str, node: str, arrived: int, now: float, **more: Any) -> None:
+    books.hear(name, node, StreamAck(eid=1, first=0, arrived=arrived, processed=arrived, **more), now)
+
+
+def test_what_another_node_says_of_a_relay_lets_go_of_nothing_that_it_lacks() -> None:
+    """Its key is its own, and the relay's id in it is its own word: it could have the relay's answers thrown away."""
+    books = sender(6)
+    say(books, "a", "robot1", 2, 1.0)
+    say(books, "a", "robot2", 6, 1.0, has_left=True, is_ended=True)
+    assert books.settled("a", 1.0 + STALLED_S) == 2, "its inputs wait for what it lacks"
+    late = NEWCOMERS_S + 1.0
+    books.look_after(late)
+    say(books, "a", "robot2", 6, late, has_left=True)
+    assert owed(books, "a", late) == (None, [2, 3, 4, 5])
+    assert books.contradicted == 1
+    say(books, "a", "robot1", 6, late + 0.1, is_ended=True)
+    assert books.settled("a", late + 0.1) == 6
+    assert not books.kept
+
+
+def test_whoever_speaks_first_for_a_relay_the_relay_is_heard_and_sent_what_it_lacks() -> None:
+    books = sender(6)
+    say(books, "a", "robot2", 6, 1.0, has_left=True, is_ended=True)
+    say(books, "a", "robot1", 2, 1.0, has_gap=True)
+    (name,) = books.owing()
+    assert name.split()[0] == "a"
+    assert owed(books, name, 1.0) == (None, [2, 3, 4, 5])
+    assert books.settled("a", 1.0) == 2
+    books.forget("a")
+    say(books, "a", "robot1", 4, 1.1)
+    assert list(books.receivers) == [name]
+    assert books.receivers[name].arrived == 4
+
+
+def test_another_node_cannot_hold_back_the_inputs_of_a_relay_by_standing_still() -> None:
+    books = sender(6)
+    say(books, "a", "robot1", 6, 1.0)
+    say(books, "a", "robot2", 0, 1.0)
+    assert books.settled("a", 1.5) == 0
+    assert books.settled("a", 1.0 + STALLED_S + 0.1) == 6
