@@ -448,6 +448,8 @@ def _belongings(places: Places, *, is_purged: bool) -> Iterator[Written]:
     if is_purged:
         yield from _there(places.config.with_name(f"{places.config.name}{BEFORE}"), "the fleet file of before")
     for folder in (_pki_folder(places.config), places.state / PKI_FOLDER):
+        if folder.parent == places.state and folder.is_symlink():
+            continue  # the service's, and root renames and deletes: it would choose whose keys
         for name, what in _WHAT.items():
             yield from _there(folder / name, what, is_purged=is_purged)
     logs = (decision_log.OLD_NAME, decision_log.NAME)

@@ -4,11 +4,15 @@ Knows: the folder, its files, in which order they are written. Does not know: wh
 (`zsched.commands.change_cell`), what becomes of the files of its node (`zsched.runtime.membership`).
 
 The folder is there from before the former cell is asked to let the machine go until it is no node of it any more.
+It lies in the state folder, which is the service's, and root writes and reads it. So a link in its place is never gone
+by, nor a folder that somebody else has made.
 """
 
 from __future__ import annotations
 
+import os
 import shutil
+import stat
 from pathlib import Path
 from typing import Final
 
@@ -60,10 +64,12 @@ def begin(state: Path, fleet: Fleet, text: str, invitation: Invitation) -> Chang
     """
     folder = state / NEXT_CELL
     try:
+        if folder.is_symlink():
+            folder.unlink()
         shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True, mode=PRIVATE_FOLDER)
         for name in (FORMER, NEXT):
             (folder / name / PKI_FOLDER).mkdir(parents=True, mode=PRIVATE_FOLDER)
-        folder.chmod(PRIVATE_FOLDER)
         _write(folder / FORMER / FILE, text.encode())
         _write(folder / NEXT / FILE, invitation.document.text.encode())
         if fleet.security is not None:
@@ -89,6 +95,14 @@ def under_way(state: Path) -> Change | None:
         AdapterError: its files cannot be read.
     """
     folder = state / NEXT_CELL
+    try:
+        found = folder.lstat()
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise AdapterError(f"{folder}: {error.strerror}; run this as root") from error
+    if not stat.S_ISDIR(found.st_mode) or (os.geteuid() == 0 and found.st_uid != 0):
+        raise AdapterError(f"{folder} is none that this command has made; look what is there, and delete it")
     try:
         return _change(folder, decode_invitation(read_regular(folder / INVITATION, MAX_BYTES)))
     except FileNotFoundError:

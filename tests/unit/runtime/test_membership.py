@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import stat
 import subprocess
@@ -18,8 +19,9 @@ from zsched.core.values.document import Document
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import fleet_hash
 from zsched.errors import AdapterError, ConfigError
+from zsched.runtime import next_cell
 from zsched.runtime.init import init_state
-from zsched.runtime.membership import BEFORE, Places, copied_file, found, is_joined, join
+from zsched.runtime.membership import BEFORE, NEXT_CELL, Places, copied_file, found, is_joined, join, put_away
 from zsched.wire.codec import document_hash
 from zsched.wire.invitation import Invitation, Papers
 
@@ -194,6 +196,48 @@ def test_the_mode_is_that_of_the_file_that_was_written_and_not_of_what_its_name_
     assert (second.state / "copied").is_symlink()
     assert stat.S_IMODE(victim.stat().st_mode) == 0o644
     assert stat.S_IMODE(second.config.stat().st_mode) == 0o644
+
+
+def test_a_link_in_the_state_folder_never_chooses_whose_keys_are_put_away(
+    second: Places, invitation: Invitation, tmp_path: Path
+) -> None:
+    """The folder is the service's, and `leave` runs as root."""
+    join(invitation, second, is_plan=False)
+    theirs = tmp_path / "elsewhere"
+    theirs.mkdir()
+    (theirs / "key.pem").write_text("somebody's own")
+    (second.state / "pki").symlink_to(theirs)
+    put_away("hall", "robot2", second, is_purged=True)
+    assert [one.name for one in theirs.iterdir()] == ["key.pem"]
+    assert not (second.state / "state").exists()
+
+
+def test_a_link_in_place_of_the_next_cell_s_folder_is_not_gone_by(
+    first: Places, invitation: Invitation, tmp_path: Path
+) -> None:
+    """As above: root would close somebody's folder to all others, and put keys there, or believe what lies there."""
+    fleet, theirs = load_fleet(first.config), tmp_path / "elsewhere"
+    theirs.mkdir(mode=0o755)
+    link = first.state / NEXT_CELL
+    link.symlink_to(theirs)
+    next_cell.begin(first.state, fleet, TEXT, invitation)
+    assert (stat.S_IMODE(theirs.stat().st_mode), list(theirs.iterdir())) == (0o755, [])
+    assert stat.S_IMODE(link.lstat().st_mode) == 0o700
+    assert next_cell.under_way(first.state) is not None
+    link.rename(theirs / "mine")
+    link.symlink_to(theirs / "mine")
+    with pytest.raises(AdapterError, match="is none that this command has made"):
+        next_cell.under_way(first.state)
+
+
+@pytest.mark.root
+def test_root_goes_by_no_change_of_cells_that_the_service_has_written(first: Places, invitation: Invitation) -> None:
+    if os.geteuid() != 0:
+        pytest.skip("only root may read it at all")
+    next_cell.begin(first.state, load_fleet(first.config), TEXT, invitation)
+    os.chown(first.state / NEXT_CELL, 65_533, 65_533)
+    with pytest.raises(AdapterError, match="is none that this command has made"):
+        next_cell.under_way(first.state)
 
 
 def test_a_state_folder_in_use_is_refused_before_anything_is_written(second: Places, invitation: Invitation) -> None:
