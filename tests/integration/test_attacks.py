@@ -558,6 +558,45 @@ def test_a_guest_reads_status_and_streams_and_commands_nothing(fresh: Yard) -> N
     assert not fresh.control.heard
 
 
+@pytest.mark.parametrize("which", ["control", "data"])
+@pytest.mark.parametrize("who", ["screen", "ana"])
+def test_who_is_no_node_says_and_answers_nothing_under_any_key(fresh: Yard, who: str, which: str) -> None:
+    """As a peer, by every way to speak, under keys of its own, of others, and under wildcards that meet them."""
+    victim: Victim = getattr(fresh, which)
+    kinds = ("beat", "profile", "proposal", "allocation", "register", "command", "status", "role", "snapshot", "alive")
+    keys = [f"@zsched/yard/{kind}/{node}" for kind in kinds for node in (who, "robot1", "edge1")]
+    keys += [f"{key}/{who}" for key in keys] + [*FORGED_PUTS["control"].values(), *FORGED_PUTS["data"].values()]
+    keys += ["robot1/in", "robot1/out", "edge1/merge/robot1/in/@adv/pub/1", "@ros2_lv/1/x", "@adv/x"]
+    wide = ["@zsched/yard/*/*", "@zsched/yard/**", "@zsched/**", "**", "*/merge/robot1/in", "robot1/*"]
+    asked = [KEYS.register("*", "robot1"), KEYS.snapshot("edge1", "merge"), KEYS.role("edge1", "merge"), "robot1/plan"]
+
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            query.reply(str(query.key_expr), b"forged")
+
+    with fresh.member(who, victim) as session:
+        for key in (*keys, *wide):
+            session.put(key, b"forged", congestion_control=zenoh.CongestionControl.BLOCK)
+            session.delete(key, congestion_control=zenoh.CongestionControl.BLOCK)
+        for key in keys:
+            session.liveliness().declare_token(key)
+        for key in (*wide, *asked):
+            session.declare_queryable(key, answer)
+        for key in asked:
+            replies = victim.session.get(
+                key, target=zenoh.QueryTarget.ALL, timeout=ANSWER_S, allowed_destination=zenoh.Locality.REMOTE
+            )
+            assert not [reply.ok for reply in replies if reply.ok is not None], key
+        for key in (*wide[:3], KEYS.register("*", who), KEYS.learnt("robot1", who), KEYS.status("*", "*")):
+            asks = session.get(key, timeout=ANSWER_S, allowed_destination=zenoh.Locality.REMOTE)
+            assert not [one for one in asks if one.ok is not None], key
+    until_alone(victim)
+    with fresh.member("robot2", victim) as session:
+        session.put(OWN[which], b"own")
+        until(lambda: OWN[which] in victim.heard, "a member's own frame")
+    assert (victim.heard, victim.tokens, victim.asked) == ([OWN[which]], [], [])
+
+
 def test_an_operator_commands_in_its_own_name(fresh: Yard) -> None:
     with fresh.session(fresh.control, fresh.tls("ana")) as session:
         until(lambda: list(session.get(KEYS.command("robot1", "ana"), timeout=ANSWER_S)), "the command's answer")
