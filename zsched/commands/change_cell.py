@@ -76,6 +76,8 @@ PAUSE_S: Final = 0.2
 TRIES: Final = 10
 REACH_S: Final = 60.0
 """How long the next cell is asked by the node's new certificate: its daemons begin again in turns to let it in."""
+LONG_S: Final = 3.0
+"""Of a silence that is told: a cell that lets the node in answers at once, or begins again first."""
 TAKE_S: Final = 60.0
 """How long the next cell may take to count the node, once its daemon runs there; then it goes back."""
 SYSTEMD: Final = Path("/run/systemd/system")
@@ -385,10 +387,17 @@ def _wait_for_the_next(way: Way, going: Change) -> None:
             raise _TakenError(EXIT_FAILED, _taken(fleet, way.me, state))
         return "" if state is not None else f"{status['node']} of {fleet} does not name {way.me}"
 
-    lack = _wait(look, REACH_S)
+    back = f"{way.me} works on in {going.former}; `zsched leave --to {going.former}` takes back what was begun"
+    asked = f"{fleet} is asked to let {way.me} in, for at most {REACH_S:g} s"
+    try:
+        lack = _wait(look, REACH_S, lambda lack: way.tell(f"{asked}: {lack}"))
+    except KeyboardInterrupt:
+        warn(f"broken off while {asked}; {back}, and the same command goes on")
+        raise
     if lack:
-        back = f"{way.me} works on in {going.former}; `zsched undrain {way.me}` if it is drained"
-        raise CliError(EXIT_FAILED, f"{fleet} does not let {way.me} in: {lack}; {back}")
+        papers = going.invitation.papers
+        is_old = f"; its key may be of an earlier invitation: there `zsched invite {way.me}`" if papers else ""
+        raise CliError(EXIT_FAILED, f"{fleet} does not let {way.me} in: {lack}{is_old}; {back}")
 
 
 class _TakenError(CliError):
@@ -404,9 +413,13 @@ def _door_by(fleet: str, addresses: tuple[str, ...], file: Path) -> Door:
     return door_of(Cell(name=fleet, gateways=addresses, file=str(file)), fleet, None)
 
 
-def _wait(look: Callable[[], str], for_s: float) -> str:
-    """Look again and again until nothing is missing; what is missing still when the time is over."""
-    until = monotonic_s() + for_s
+def _wait(look: Callable[[], str], for_s: float, tell: Callable[[str], None] | None = None) -> str:
+    """Look again and again until nothing is missing; what is missing still when the time is over.
+
+    ``tell`` is told once what is missing, where it takes long.
+    """
+    began = monotonic_s()
+    until = began + for_s
     while True:
         try:
             lack = look()
@@ -417,6 +430,9 @@ def _wait(look: Callable[[], str], for_s: float) -> str:
             close_sessions()
         if not lack or monotonic_s() > until:
             return lack
+        if tell is not None and monotonic_s() >= began + LONG_S:
+            tell(lack)
+            tell = None
         time.sleep(PAUSE_S)
 
 

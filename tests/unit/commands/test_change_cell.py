@@ -515,7 +515,10 @@ def membership_invitation(folder: Path) -> Path:
     return path
 
 
-def test_a_cell_that_does_not_name_it_any_more_takes_nothing_from_it(site: Site, tmp_path: Path) -> None:
+def test_a_cell_that_does_not_name_it_any_more_takes_nothing_from_it(
+    site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(change_cell, "LONG_S", 0.0)
     there, here = site.cells["hall-b"], site.cells["hall-a"]
     there.text = B.replace("tasks:", f"  {ME}: {{kind: robot}}\ntasks:")
     invitation = membership_invitation(tmp_path)
@@ -523,7 +526,21 @@ def test_a_cell_that_does_not_name_it_any_more_takes_nothing_from_it(site: Site,
     refused = run("--to", str(invitation), "--yes")
     assert refused.exit_code == 1
     assert "hall-b does not let robot3 in: robot1 of hall-b does not name robot3" in refused.stderr
+    back = "robot3 works on in hall-a; `zsched leave --to hall-a` takes back what was begun"
+    assert back in refused.stderr
+    assert refused.stdout.count("hall-b is asked to let robot3 in, for at most ") == 1, "it does not wait in silence"
     assert (here.done, site.running, whose(site.folder / "state")) == ([], "hall-a", ("hall-a", ME))
+
+    def ctrl_c(*_given: object) -> str:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(change_cell, "_wait", ctrl_c)
+    ended = run("--to", str(invitation), "--yes")
+    assert ended.exit_code
+    assert "broken off while hall-b is asked to let robot3 in" in ended.stderr
+    assert back in ended.stderr
+    assert run("--to", "hall-a", "--yes").exit_code == 0
+    assert next_cell.under_way(site.folder / "state") is None
 
 
 def test_a_public_address_is_not_taken_into_a_cell_without_certificates_unasked(site: Site) -> None:
