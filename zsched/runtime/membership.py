@@ -57,6 +57,8 @@ COPY_NAME: Final = "copied"
 """In the state folder: the hash of the fleet file that was written as a copy of the document."""
 NEXT_CELL: Final = "next-cell"
 """In the state folder, while the machine changes cells: private keys are in it, and only its owner may read it."""
+LOGS: Final = (decision_log.OLD_NAME, decision_log.NAME)
+"""They go with the fleet of which they tell: tasks and epochs of the next one may have the same names and numbers."""
 PUBLIC_MODE, PRIVATE_MODE, FOLDER_MODE = 0o644, 0o600, 0o755
 _WHAT: Final = {
     CERTIFICATE: "the certificate",
@@ -428,8 +430,9 @@ def bring_back(fleet: str, node: NodeId, places: Places, *, is_secured: bool) ->
     with StateFile(places.state, fleet=fleet, node=node) as file:
         file.check_owner()
         for one in reversed(tuple(_belongings(places, is_purged=False))):
-            _put_one_away(one.path, is_deleted=True)
-        names = [places.config, *(places.state / name for name in (COPY_NAME, FOLDER_NAME))]
+            if one.path.name not in LOGS:  # the former one's take their places
+                _put_one_away(one.path, is_deleted=True)
+        names = [places.config, *(places.state / name for name in (*LOGS, COPY_NAME, FOLDER_NAME))]
         folders = (places.config.parent / PKI_FOLDER, places.state / PKI_FOLDER)
         names += [folder / name for folder in folders for name in _WHAT if is_secured]
         for path in (*names, places.state / STATE_NAME):
@@ -452,13 +455,17 @@ def _belongings(places: Places, *, is_purged: bool) -> Iterator[Written]:
             continue  # the service's, and root renames and deletes: it would choose whose keys
         for name, what in _WHAT.items():
             yield from _there(folder / name, what, is_purged=is_purged)
-    logs = (decision_log.OLD_NAME, decision_log.NAME)
-    more = (*logs, rehearsals.FOLDER_NAME, core_speed.NAME, NEXT_CELL) if is_purged else ()
-    for name in (*more, COPY_NAME, FOLDER_NAME, STATE_NAME):
+    more = (rehearsals.FOLDER_NAME, core_speed.NAME, NEXT_CELL) if is_purged else ()
+    for name in (*more, *LOGS, COPY_NAME, FOLDER_NAME, STATE_NAME):
         yield from _there(places.state / name, _KEPT.get(name, "the node's records"), is_purged=is_purged)
 
 
-_KEPT: Final = {COPY_NAME: "which fleet file was a copy", FOLDER_NAME: "agreed documents", STATE_NAME: "the state"}
+_KEPT: Final = {
+    **dict.fromkeys(LOGS, "the decision log"),
+    COPY_NAME: "which fleet file was a copy",
+    FOLDER_NAME: "agreed documents",
+    STATE_NAME: "the state",
+}
 
 
 def _pki_folder(config: Path) -> Path:

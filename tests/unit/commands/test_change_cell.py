@@ -215,6 +215,7 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
     (tmp_path / "state" / "documents").mkdir()
     (tmp_path / "state" / "documents" / "ab").write_text("x")
     (tmp_path / "state" / "copied").write_text("0123\n")
+    (tmp_path / "state" / "decisions.ndjson").write_text("{}\n")
     one = Site(tmp_path)
 
     def gate(cell: Cell, _fleet: str, _here: Door | None) -> Door:
@@ -339,9 +340,13 @@ def test_a_cell_that_does_not_take_it_gives_it_back(site: Site) -> None:
     assert site.cells["hall-a"].done == ["leave", "undrain"]
     assert kept(site.folder) == before
     assert (site.folder / "etc" / "fleet.yaml").read_text() == A
+    log = site.folder / "state" / "decisions.ndjson"
+    assert log.read_text() == "{}\n"
     site.is_taken = True
     assert run("--to", "hall-b", "--yes").exit_code == 0
     assert whose(site.folder / "state") == ("hall-b", ME)
+    assert not log.exists(), "`history` and `explain --at` tell of one fleet"
+    assert log.with_name("decisions.ndjson.left").read_text() == "{}\n"
 
 
 def test_a_daemon_that_does_not_start_there_is_the_former_cell_s_again(site: Site) -> None:
@@ -367,7 +372,7 @@ def test_nobody_starts_it_and_the_operator_takes_it_back(site: Site, monkeypatch
     assert site.cells["hall-a"].flags == []
 
 
-@pytest.mark.parametrize("number", range(8))
+@pytest.mark.parametrize("number", range(9))
 @pytest.mark.parametrize("call", ["_put_one_away", "_put"])
 def test_files_that_were_changed_in_part_are_changed_to_the_end(
     site: Site, monkeypatch: pytest.MonkeyPatch, call: str, number: int
@@ -389,7 +394,7 @@ def test_files_that_were_changed_in_part_are_changed_to_the_end(
     check_arrived(site)
 
 
-@pytest.mark.parametrize("number", range(8))
+@pytest.mark.parametrize("number", range(9))
 def test_a_way_back_that_was_broken_off_goes_on_either_way(
     site: Site, monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:

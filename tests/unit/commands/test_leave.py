@@ -167,7 +167,7 @@ def left(folder: Path) -> list[str]:
     return sorted(path.name for path in kept if path.name not in ("run", "state", "lock") or path.is_file())
 
 
-RENAMED = ["decisions.ndjson", "documents.left", "fleet.yaml.left", "lock", "state.left"]
+RENAMED = ["decisions.ndjson.left", "documents.left", "fleet.yaml.left", "lock", "state.left"]
 UNTOUCHED = ["decisions.ndjson", "documents", "fleet.yaml", "lock", "state"]
 
 
