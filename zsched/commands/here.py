@@ -34,6 +34,11 @@ def need_file(file: Path) -> None:
         read_regular(file, MAX_FILE_BYTES)
     except PermissionError as error:
         raise CliError(EXIT_CONFIG, f"{file}: cannot be read: {error.strerror}; {owner_of(file)}") from error
+    except FileNotFoundError as error:
+        advice = (
+            "name it with --config, or make this machine a node: zsched fleet create NAME, or zsched join INVITATION"
+        )
+        raise CliError(EXIT_CONFIG, f"{file}: cannot be read: {error.strerror}; {advice}") from error
     except OSError as error:
         raise CliError(
             EXIT_CONFIG, f"{file}: cannot be read: {error.strerror}; name the fleet file with --config or ZSCHED_CONFIG"

@@ -99,7 +99,10 @@ def _unread_hint(file: Path, error: OSError | ValueError) -> str:
     if number == errno.EFBIG:
         return "a rule stands for every robot and candidate: write {robot} and {target} in place of their names"
     if number == errno.ENOENT:
-        return "name the fleet file, or begin with `zsched init --example python`"
+        return (
+            "name the fleet file; `zsched fleet create NAME` and `zsched join INVITATION` write this machine's, "
+            "`zsched init --example python` one to try"
+        )
     return "give the path of a fleet file"
 
 

@@ -318,7 +318,8 @@ def test_up_without_a_fleet_file_exits_with_78_and_says_which(tmp_path: Path) ->
     result = run("up", "--config", tmp_path / "none.yaml", "--node", "robot1")
     assert result.exit_code == 78
     assert str(tmp_path / "none.yaml") in result.stderr
-    assert "--config" in result.stderr
+    for way in ("--config", "zsched fleet create NAME", "zsched join INVITATION"):
+        assert way in result.stderr
 
 
 def test_demo_hands_its_options_on_to_the_lab() -> None:
