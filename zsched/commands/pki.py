@@ -244,6 +244,7 @@ def deliver(where: Where, door: Door, label: str | None) -> int:
     """
     members = {str(one["name"]) for one in ask_door(door, {"verb": "status"})["nodes"]}
     with _opened(where) as (_, authority):
+        _see_anew(door, authority, members)
         now, number = int(_now().timestamp()), authority.record.number
         live = [one for one in authority.record.entries if one.revoked is None and one.holder.role is Role.NODE]
         named = [one for one in live if label in (None, one.label)]
@@ -257,6 +258,27 @@ def deliver(where: Where, door: Door, label: str | None) -> int:
         newest = [entry for one in named if (entry := authority.record.entry(one.label)) is not None]
     results = [_send(door, entry) for entry in newest if entry.holder.name in members]
     return EXIT_OK if all(one in (SENT, HAD) for one in results) else EXIT_FAILED
+
+
+def _see_anew(door: Door, authority: Authority, members: set[str]) -> None:
+    """Refuse to send certificates of a new authority while a node's sessions are older than it.
+
+    Such a node lets nobody in by them, so those that go by theirs would be cut off from it.
+
+    Raises:
+        CliError: some nodes have not begun anew since the rotation began.
+    """
+    if not authority.is_rotating:
+        return
+    age_s, old = (_now() - authority.since).total_seconds(), []
+    for name in sorted(members):
+        with contextlib.suppress(CliError):  # it is away
+            status = ask_door(Door(socket=door.socket, node=name), {"verb": "status"})
+            old += [name] if float(status.get("up_s", 0.0)) > age_s else []
+    if old:
+        told = f"{', '.join(old)}: not begun anew since the new authority was made, and would cut off who goes by it"
+        advice = f"put {TRUSTED} there, and wait until `up` in its `zsched status` begins again"
+        raise CliError(EXIT_FAILED, f"nothing was sent: {told}; {advice}")
 
 
 def _send(door: Door, entry: Entry) -> str:
@@ -324,7 +346,8 @@ def rotate(where: Where, *, is_end: bool) -> int:
             authority.rotate(_passphrase(authority), _now())
             _say(
                 f"authority {authority.record.number} signs from now on; the former one is trusted until the end",
-                f"1. put {authority.folder / TRUSTED} on every machine as {TRUSTED}: daemons begin anew in turn",
+                f"1. put {authority.folder / TRUSTED} on every machine as {TRUSTED}, and wait until each daemon has "
+                "begun anew, in its turn: its `up` in `zsched status` begins again",
                 "2. `zsched pki renew`: put every new certificate in its place, and wait likewise "
                 "(with --deliver the nodes get theirs by themselves)",
                 f"3. `zsched pki rotate --finish`; put {TRUSTED} on every machine once more",
@@ -359,6 +382,7 @@ def _see_delivered(authority: Authority) -> None:
         _say("no daemon of the fleet answers here: nobody has seen whether every node has its new certificate")
         return
     members = {str(one["name"]) for one in told["nodes"]}
+    _see_anew(door, authority, members)
     live = [one for one in authority.record.entries if one.revoked is None and one.holder.role is Role.NODE]
     results = {one.label: _send(door, one) for one in live if one.holder.name in members}
     if lacking := [label for label, result in results.items() if result not in (SENT, HAD)]:

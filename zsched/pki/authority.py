@@ -28,6 +28,7 @@ from zsched.errors import AdapterError
 from zsched.files import read_regular
 from zsched.pki import certificates as x509
 from zsched.pki.files import PRIVATE, PUBLIC, make_folder, write_whole
+from zsched.sessions.certificate import validities
 
 TRUSTED, RECORD, LOCK = "ca.pem", "authority.json", ".lock"
 FORMAT: Final = 1
@@ -121,6 +122,11 @@ class Authority:
     def is_rotating(self) -> bool:
         """Whether the former authority is still trusted."""
         return len(self.record.trusted) > 1
+
+    @property
+    def since(self) -> datetime:
+        """When the authority that signs now was made."""
+        return validities(self.record.trusted[0].encode())[0][0] + x509.EARLY
 
     @property
     def trusted(self) -> bytes:

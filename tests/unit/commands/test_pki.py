@@ -174,6 +174,39 @@ def test_what_is_due_is_sent_to_the_nodes_and_so_is_what_a_node_has_missed(
         assert "go without --deliver" in pki(*words, "robot2", "--out", "x", code=2).stderr
 
 
+def test_no_certificate_of_a_new_authority_is_sent_while_a_node_would_not_know_it(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The nodes that go by theirs would be cut off from it, and a majority with them."""
+    ups, asked = {"robot1": 0.0, "robot2": 3600.0}, list[str]()
+
+    def answer(request: Json) -> Json:
+        if request["verb"] == "status":
+            nodes = [{"name": "robot1"}, {"name": "robot2"}]
+            return {"fleet": "yard", "nodes": nodes, "up_s": ups[request.get("node", "robot1")]}
+        asked.append(request["node"])
+        return {"outcome": "ok", "detail": "as it is", "revision": None}
+
+    pki("init")
+    for name in ("robot1", "robot2"):
+        pki("issue", name)
+    assert "wait until each daemon has begun anew" in pki("rotate").stdout
+    monkeypatch.setenv("ZSCHED_RUNTIME_DIR", str(here))
+    with closing(OperatorSocket(here / "robot1.sock", answer)) as door:
+        door.open()
+        monkeypatch.setenv("ZSCHED_NODE", "robot1")
+        words = ("renew", "--deliver", "--runtime-dir", str(here))
+        refused = pki(*words, code=1)
+        assert "nothing was sent: robot2: not begun anew since the new authority was made" in refused.stderr
+        assert not asked
+        pki("renew")
+        assert "nothing was sent: robot2" in pki("rotate", "--finish", code=1).stderr
+        assert not asked
+        ups["robot2"] = 0.0
+        pki(*words)
+        assert asked == ["robot1", "robot2"]
+
+
 def test_names_are_those_of_the_document_where_a_daemon_tells_one(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The fleet file may be a copy from before the newest node came."""
     told: Json = {
