@@ -396,9 +396,10 @@ def _task_problems(node: Stages, task: TaskSpec, value: Allocation, now: float) 
         )
     if task.rollout is not None:
         held, first = waiting(node.fleet, task), ", ".join(task.rollout.first)
+        wait = "wait" if len(held) > 1 else "waits"
         yield (
-            f"the changed worker runs on {first or 'no node'} first, {', '.join(held) or 'no node'} waits with that of "
-            f"before: `zsched task promote {task.name}` goes on"
+            f"the changed worker runs on {first or 'no node'} first, {', '.join(held) or 'no node'} {wait} with that "
+            f"of before: `zsched task promote {task.name}` goes on"
         )
     if executor.is_local:
         yield f"cut off from {owner}: this robot works alone, degraded"

@@ -182,7 +182,7 @@ class Authority:
         """
         entry = self.record.entry(label)
         if entry is None:
-            raise AdapterError(f"no certificate {label!r}; `zsched pki show` lists them")
+            raise AdapterError(f"no certificate {label!r}{self._meant(label)}; `zsched pki show` lists them")
         if entry.revoked is not None:
             raise AdapterError(f"the key of {label} is revoked; `zsched pki issue {entry.holder.name}` makes another")
         public = self._requested(request) if request else self._key_in(entry.certificate)
@@ -206,11 +206,17 @@ class Authority:
         """
         entry = self.record.entry(label)
         if entry is None:
-            raise AdapterError(f"no certificate {label!r}; `zsched pki show` lists them")
+            raise AdapterError(f"no certificate {label!r}{self._meant(label)}; `zsched pki show` lists them")
         if entry.revoked is None:
             entry = replace(entry, revoked=_seconds(now))
             self._keep(entry)
         return entry
+
+    def _meant(self, name: str) -> str:
+        """The newest keys of a holder that is named without its role."""
+        newest = [self.record.newest(name, role) for role in Role]
+        labels = [one.label for one in newest if one is not None]
+        return f", did you mean {' or '.join(labels)}?" if labels else ""
 
     def rotate(self, passphrase: bytes, now: datetime) -> None:
         """Begin with a new authority, whose key gets the same passphrase; the former one stays trusted until `finish`.

@@ -55,7 +55,8 @@ def take(fleet: Fleet, state: Path, pem: str) -> CommandResult:
         return _refused(f"it is {offered.common_name}'s, or for another key; this node is {own.common_name}")
     until = f"until {offered.ends:%Y-%m-%d}"
     if offered.ends <= own.ends:
-        return CommandResult(outcome=CommandOutcome.UNCHANGED, detail=f"its certificate lasts {own.ends:%Y-%m-%d}")
+        lasts = f"its certificate lasts until {own.ends:%Y-%m-%d}"
+        return CommandResult(outcome=CommandOutcome.UNCHANGED, detail=lasts)
     path = renewed_in(state)
     try:
         make_folder(path.parent)

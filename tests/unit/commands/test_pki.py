@@ -126,7 +126,9 @@ def test_revoke_says_which_line_keeps_the_key_out_and_the_next_key_has_a_number(
     assert "`security: {revoked: [robot1]}`" in pki("revoke", "robot1").stdout
     assert "robot1.k2" in pki("issue", "robot1").stdout
     assert (here / "robot1.k2" / "key.pem").exists()
-    assert "no certificate 'robot3'" in pki("revoke", "robot3", code=1).stderr
+    assert "no certificate 'robot3'; `zsched pki show`" in pki("revoke", "robot3", code=1).stderr
+    pki("issue", "ana", "--role", "operator")
+    assert "no certificate 'ana', did you mean ana.operator?" in pki("revoke", "ana", code=1).stderr
 
 
 def test_renew_takes_what_is_due_or_one_by_name_and_makes_no_key(here: Path) -> None:
