@@ -5,7 +5,7 @@ Does not know: zenoh itself (imported only to read an operator's JSON5), which n
 
 Every function returns JSON text for ``zenoh.Config.from_json5``. Our settings lie on top of the operator's own file.
 What they are for: multicast scouting off and explicit endpoints (no surprise neighbours), gossip on (seeds suffice),
-a short lease (a frozen peer is seen after 0.75-1 lease; zenoh's default is 10 s), a quick and bounded connect retry,
+a short lease (a frozen peer is seen after 0.67-1 lease; zenoh's default is 10 s), a quick and bounded connect retry,
 random zids (a fixed one keeps a restarted node out until its old link's lease ends), a small send buffer on data links
 (a full default buffer delays everything behind it by 0.4 s on a 20 Mbit/s radio).
 """
@@ -360,7 +360,7 @@ def _common(timing: Timing) -> Settings:
     return {
         "scouting/multicast/enabled": False,
         "transport/link/tx/lease": round(timing.zenoh_lease_s * 1000),
-        "transport/link/tx/keep_alive": 4,
+        "transport/link/tx/keep_alive": timing.data_signs,
         "transport/unicast/open_timeout": round(OPEN_TIMEOUT_S * 1000),
         "transport/unicast/accept_timeout": round(ACCEPT_TIMEOUT_S * 1000),
         "timestamping/enabled": False,

@@ -83,7 +83,7 @@ class LinkSocket(Struct, frozen=True):
         return self._tcp_info(_BYTES_ACKED, _BYTES_ACKED_AT)
 
     def silent_s(self) -> float:
-        """How long nothing has come from the other end; zenoh sends a sign of life four times in a lease."""
+        """How long nothing has come from the other end; zenoh sends three or four signs of life in a lease."""
         return self._tcp_info(_LAST_DATA_RECV, _LAST_DATA_RECV_AT) / 1000
 
     def _tcp_info(self, value: struct.Struct, at: int) -> int:

@@ -64,3 +64,14 @@ def test_a_link_that_is_held_up_outlives_what_makes_its_node_suspect() -> None:
     for timing in (WIFI, WIRED):
         assert 0.75 * timing.control_lease_s >= LOSS_FACTOR * timing.suspect_s
     assert WAN.control_lease_s == WAN.zenoh_lease_s < WAN.suspect_s
+
+
+@pytest.mark.parametrize(
+    ("timing", "signs"),
+    [(WIRED, 3), (WIFI, 3), (WAN, 4), (replace(WIFI, lease_s=1.01), 4), (replace(WIFI, zenoh_lease_s=1.6), 3)],
+)
+def test_a_frozen_workers_link_outlives_its_lease(timing: Timing, signs: int) -> None:
+    """zenoh may end it one period of the signs of life before its own lease is over."""
+    assert timing_faults(timing) == ()
+    assert timing.data_signs == signs
+    assert timing.zenoh_lease_s * (1 - 1 / timing.data_signs) >= timing.lease_s

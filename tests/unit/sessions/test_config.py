@@ -42,6 +42,7 @@ def test_every_session_scouts_nowhere_and_has_our_lease(text: str) -> None:
     assert read(text, "scouting/multicast/enabled") is False
     lease_s = TIMING.control_lease_s if text == ALL["control"] else 1.25
     assert read(text, "transport/link/tx/lease") == round(1000 * lease_s)
+    assert read(text, "transport/link/tx/keep_alive") == (3 if text == ALL["control"] else TIMING.data_signs)
     assert read(text, "timestamping/enabled") is False
     assert read(text, "id") is None  # random: a fixed one keeps a restarted node out for a lease
 

@@ -51,6 +51,8 @@ DEFAULT_COOL_DOWN_S = 2.0
 """The cool-down of a task whose fleet file gives none (docs/decisions/0033)."""
 DEFAULT_FORESEE_S = 3.0
 """How far ahead the signals of a task count when its fleet file does not say."""
+FEWEST_SIGNS, MOST_SIGNS = 3, 4
+"""Of life in a lease of data sessions; `zsched.config.timing` keeps ``lease_s`` short enough for the latter."""
 SECONDS = Range(0.01, 3600, "s")
 DBM = Range(RSSI_MIN_DBM, RSSI_MAX_DBM, "dBm")
 
@@ -317,6 +319,16 @@ class Timing:
         """
         is_second = self.zenoh_lease_s >= self.suspect_s
         return max(self.zenoh_lease_s, 2 * self.suspect_s) if is_second else self.zenoh_lease_s
+
+    @property
+    def data_signs(self) -> int:
+        """How many signs of life a data session sends in one ``zenoh_lease_s``, where it sends nothing else: 3 or 4.
+
+        A frozen worker's link may end one period of these signs before its lease is over, but not before ``lease_s``:
+        what the worker might still send must be past its lease by then (decision 0111).
+        """
+        longest_s = self.zenoh_lease_s - self.lease_s  # between two signs
+        return FEWEST_SIGNS if longest_s * FEWEST_SIGNS >= self.zenoh_lease_s - 1e-9 else MOST_SIGNS
 
 
 class SharedMemory(StrEnum):
