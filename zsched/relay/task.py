@@ -295,7 +295,8 @@ class TaskRelay:
         for sink in self._outputs.values():
             sink.look_after()
         self._services.look_after()
-        self._acks.stalled.buffers.look()
+        stalled = self._acks.stalled
+        stalled.buffers.look(is_still=stalled.is_resting and self._is_still())
         if self._leaving is not None:
             self._leave_when_still(self._leaving)
         elif self._resume_by is not None:
@@ -738,6 +739,11 @@ class TaskRelay:
     def _before(self, epoch: int) -> list[_OpenSlot]:
         """The open slots of older epochs, the oldest first."""
         return [self._slots[old] for old in sorted(self._slots) if old < epoch]
+
+    def _is_still(self) -> bool:
+        """Whether no stream has carried anything for a while."""
+        streams: list[InputStream | OutputStream] = [*self._inputs.values(), *self._outputs.values()]
+        return all(stream.is_still for stream in streams) and self._services.is_still
 
     def _is_counted(self) -> bool:
         """True when something may have to be sent (again) without a sample coming in."""

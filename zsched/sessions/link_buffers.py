@@ -25,6 +25,8 @@ LOOK_S: Final = 0.04
 REST_S: Final = 0.25
 """...or than this, when for `CALM_S` no link has taken so much as a small buffer holds between two looks."""
 CALM_S: Final = 1.0
+STILL_LOOK_S: Final = 1.0
+"""...or than this, when nothing is carried at all: each link costs five system calls."""
 
 _log = logging.getLogger("zsched.streams")
 
@@ -42,10 +44,16 @@ class LinkBuffers:
         self._moved_at = 0.0
         self._lock = threading.Lock()
 
-    def look(self, *, at_once: bool = False) -> None:
-        """See how fast each link has been, and size its buffer; ``at_once``: however soon after the look before."""
+    def look(self, *, at_once: bool = False, is_still: bool = False) -> None:
+        """See how fast each link has been, and size its buffer.
+
+        Args:
+            at_once: however soon after the look before.
+            is_still: for seconds nothing has been carried by these links.
+        """
         now = monotonic_s()
-        pause_s = REST_S if now - self._moved_at > CALM_S else LOOK_S
+        rest_s = STILL_LOOK_S if is_still else REST_S
+        pause_s = rest_s if now - self._moved_at > CALM_S else LOOK_S
         if (now - self._looked_at < pause_s and not at_once) or not self._lock.acquire(blocking=False):
             return
         try:

@@ -9,6 +9,8 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 import zenoh
@@ -16,6 +18,7 @@ import zenoh
 from support.certificates import make_tls
 from support.waiting import free_endpoint, until
 from zsched.core.hop.room import OWN, SMALL
+from zsched.sessions import link_buffers
 from zsched.sessions.config import data_config
 from zsched.sessions.link_buffers import LinkBuffers
 from zsched.sessions.link_sockets import LinkSocket, LinkSockets
@@ -150,6 +153,29 @@ def test_the_receive_buffer_stays_as_the_operator_has_set_it() -> None:
         assert link.set_send_buffer(OWN)
         assert link.send_buffer() == OWN
         assert ours.getsockopt(socket.SOL_SOCKET, SO_BUF_LOCK) == RCVBUF_LOCKED
+
+
+def test_links_that_carry_nothing_are_looked_at_once_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    now, looks = 100.0, list[float]()
+
+    def links() -> tuple[zenoh.Link, ...]:
+        looks.append(now)
+        return ()
+
+    monkeypatch.setattr(link_buffers, "monotonic_s", lambda: now)
+    buffers = LinkBuffers(cast("zenoh.Session", SimpleNamespace(info=SimpleNamespace(links=links))))
+    for is_still, count in ((True, 10), (False, 25)):
+        looks.clear()
+        for _ in range(50):
+            now += 0.2
+            buffers.look(is_still=is_still)
+        assert len(looks) == count
+    now += 0.3
+    looks.clear()
+    buffers.look(is_still=True)
+    assert not looks
+    buffers.look()
+    assert looks == [now], "what begins to flow is seen as soon as before"
 
 
 def test_a_session_that_rests_is_not_looked_at_by_anybody() -> None:

@@ -162,6 +162,11 @@ class ServiceStream:
         slot = self._slots.get(epoch)
         return slot is None or not slot.pending
 
+    @property
+    def is_still(self) -> bool:
+        """Whether nobody has asked for a while (`StreamCounter.is_still`), and nobody waits for an answer."""
+        return self._counter.is_still and not self._running
+
     def look_after(self) -> None:
         """End the requests that nobody has been there to answer for `UNSERVED_GRACE_S`."""
         now = monotonic_s()
@@ -393,6 +398,11 @@ class Services:
         self._session = session
         for stream in self._streams.values():
             stream.rejoin(session)
+
+    @property
+    def is_still(self) -> bool:
+        """Whether no service has carried anything for a while."""
+        return all(stream.is_still for stream in self._streams.values())
 
     def look_after(self) -> None:
         """End the requests whose owner is gone without a word."""

@@ -6,7 +6,7 @@ Knows: `StreamCount`. Does not know: zenoh, routes. Its owner's lock guards it.
 from __future__ import annotations
 
 from zsched.clock import monotonic_s
-from zsched.core.values.plan import StreamCount
+from zsched.core.values.plan import STILL_S, StreamCount
 from zsched.relay.streams.tally import Tally
 
 
@@ -59,6 +59,11 @@ class StreamCounter:
             if epoch > self._passed_epoch:
                 self._move_gap_s, self._move_epoch = gap_s, epoch
         self._passed_at, self._passed_epoch = now, max(epoch, self._passed_epoch)
+
+    @property
+    def is_still(self) -> bool:
+        """Whether no sample has come in for `STILL_S`."""
+        return self._last_seen is None or monotonic_s() - self._last_seen >= STILL_S
 
     @property
     def last_seen(self) -> float:

@@ -453,6 +453,11 @@ class InputStream:
             self._counter.dropped(*slot.outlet.send(sample, stamp))
         slot.sent = self._number
 
+    @property
+    def is_still(self) -> bool:
+        """Whether no sample has come for a while (`StreamCounter.is_still`)."""
+        return self._counter.is_still
+
     def look_after(self) -> None:
         """Have sent (again) what workers have not acknowledged in time, or a rate held back; call it now and then."""
         with self._lock:

@@ -345,6 +345,11 @@ class OutputStream:
         if self._acks is not None:
             self._acks.close()
 
+    @property
+    def is_still(self) -> bool:
+        """Whether no sample has come for a while (`StreamCounter.is_still`)."""
+        return self._counter.is_still
+
     def look_after(self) -> None:
         """Let through what waits for answers that never come, or for a highest rate; call it now and then."""
         self._outlet.look_after()

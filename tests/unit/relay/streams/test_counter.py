@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import pytest
+
+from zsched.core.values.plan import STILL_S
+from zsched.relay.streams import counter as module
 from zsched.relay.streams.counter import StreamCounter
 
 
@@ -27,3 +31,15 @@ def test_the_first_answer_of_a_new_owner_ends_the_gap_of_its_move() -> None:
     assert counter.value().move_gap_s == 0.25, "it lasts until the next move"
     counter.passed(7, 101.5)
     assert (counter.value().move_gap_s, counter.value().move_epoch) == (0.5, 7)
+
+
+def test_a_stream_is_still_until_a_sample_comes_and_a_while_after_the_last(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr(module, "monotonic_s", lambda: now[0])
+    counter = StreamCounter("echo/in/0")
+    told = [counter.is_still]
+    counter.seen(3)
+    for passed_s in (0.0, STILL_S - 0.1, STILL_S):
+        now[0] = 100.0 + passed_s
+        told.append(counter.is_still)
+    assert told == [True, False, False, True]
