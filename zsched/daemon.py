@@ -50,7 +50,7 @@ from zsched.core.values.struct import Struct, replace
 from zsched.errors import AdapterError, ConfigError, NameTakenError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_LEFT, EXIT_NAME_TAKEN, EXIT_OK
 from zsched.guard import on_failure
-from zsched.heap import give_back, share_heaps
+from zsched.heap import Leftovers, give_back, share_heaps
 from zsched.ipc.takeover import Door
 from zsched.log_limit import log_to_stderr
 from zsched.runtime import renewal
@@ -131,6 +131,7 @@ class Daemon:
         on_failure(lambda kind, text: self._inbox.post(ev.ProblemReported(source=f"thread/{kind}", problem=text)))
         self._notify = Notifier()
         self._next_status = 0.0
+        self._leftovers = Leftovers()
         self._is_restart = False
         self._has_left = False
         """This machine is in no fleet any more, by `zsched leave`."""
@@ -536,6 +537,7 @@ class Daemon:
                 self._notify.watchdog()
             if now >= self._next_status:
                 self._next_status = now + 1.0
+                self._leftovers.tend(now)
                 self._notify.status(status_line(node))
 
     # --- sessions that are opened again -------------------------------------------------------------------------------

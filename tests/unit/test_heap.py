@@ -5,7 +5,10 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from zsched.heap import give_back, share_heaps
+import pytest
+
+from zsched import heap
+from zsched.heap import GIVE_BACK_S, Leftovers, give_back, share_heaps
 from zsched.procfs import PAGE_MB
 
 
@@ -21,6 +24,15 @@ def test_freed_memory_beneath_what_stays_is_given_back() -> None:
     give_back()
     assert before - rss_mb() > 25.0
     assert stays
+
+
+def test_what_a_running_process_frees_is_given_back_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
+    now, times = 0.0, list[float]()
+    monkeypatch.setattr(heap, "give_back", lambda: times.append(now))
+    leftovers = Leftovers()
+    for now in (100.0, 101.0, 99.0 + GIVE_BACK_S, 100.0 + GIVE_BACK_S, 101.0 + GIVE_BACK_S, 200.0):
+        leftovers.tend(now)
+    assert times == [100.0, 100.0 + GIVE_BACK_S, 200.0]
 
 
 def test_heaps_may_be_shared_again_and_again() -> None:
