@@ -91,6 +91,7 @@ class Sampler:
             if self._wake.wait(self._wait_s):
                 self._wake.clear()
                 self._pace.hurry(monotonic_s())
+                self._device.look_closely()
 
     def _report(self, source: str, problem: str | None) -> None:
         """Report a problem, or its end, when it is news."""

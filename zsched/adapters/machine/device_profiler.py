@@ -36,6 +36,13 @@ MIN_INTERVAL_S = 0.02
 RESTING_CORES = 0.05
 RESTING_LOOK_S = 1.0
 """Threads and children of a worker that uses less are read this often: there may be dozens, with two files each."""
+STILL_CORES = 0.015
+STILL_LOOK_S = 3.0
+"""The same of a worker that uses less than this (two of the kernel's ticks in a second), where nobody lacks a CPU."""
+CALM_PRESSURE = 0.05
+"""Where some process lacks a CPU for this share of the time, a worker may use little because it does not run..."""
+CALM_USE = 0.5
+"""...and, where the kernel does not tell that, where this share of the cores is in use."""
 
 
 class CpuTimes(Struct, frozen=True, kw_only=True):
@@ -126,16 +133,26 @@ class DeviceProfiler:
         stat = read_file(f"{self._proc}/stat")
         times = parse_cpu_stat(stat, self._allowed)
         memory_mb, memory_used_mb = self._memory()
+        cores, used_cores, pressure = self._capacity(times), self._cpu_used(times, now), self._cpu_pressure(now)
+        is_calm = (
+            pressure < CALM_PRESSURE
+            if pressure is not None
+            else used_cores is not None and used_cores < CALM_USE * cores
+        )
         return DeviceSample(
-            cpu_cores=self._capacity(times),
-            cpu_used_cores=self._cpu_used(times, now),
+            cpu_cores=cores,
+            cpu_used_cores=used_cores,
             memory_mb=memory_mb,
             memory_used_mb=memory_used_mb,
-            workers=self._trees.loads(workers, now),
+            workers=self._trees.loads(workers, now, is_calm=is_calm),
             speed=self.speed,
-            cpu_pressure=self._cpu_pressure(now),
+            cpu_pressure=pressure,
             runnable=self._runnable(stat),
         )
+
+    def look_closely(self) -> None:
+        """Work has come: the next sample looks at all threads and children of the workers."""
+        self._trees.forget_rest()
 
     def _cpu_pressure(self, now: float) -> float | None:
         """Share of the last seconds in which some process of this machine, or of the group that it is, lacked a CPU.
@@ -221,18 +238,28 @@ class _ProcessTrees:
         self._seen: dict[TaskId, tuple[float, dict[int, ProcessTimes]]] = {}
         self._appetites: dict[TaskId, Appetite] = {}
         self._rests_until: dict[TaskId, float] = {}
-        """Until when the threads and children of a worker that is at rest are not looked at."""
+        """Until when the threads and children of a worker that is at rest are not looked at..."""
+        self._looked_at: dict[TaskId, float] = {}
+        """...since they last were."""
 
-    def loads(self, workers: Mapping[TaskId, tuple[WorkerState, int | None]], now: float) -> tuple[WorkerLoad, ...]:
-        """One load per worker, sorted by task."""
+    def forget_rest(self) -> None:
+        """No worker counts as one at rest until the next look."""
+        self._rests_until.clear()
+
+    def loads(
+        self, workers: Mapping[TaskId, tuple[WorkerState, int | None]], now: float, *, is_calm: bool
+    ) -> tuple[WorkerLoad, ...]:
+        """One load per worker, sorted by task; ``is_calm``: nobody lacks a CPU on this machine."""
         children = None if self._has_children_files else self._scan_children()
         seen = {task: (now, self._tree(task, pid, children, now)) for task, (_, pid) in workers.items() if pid}
-        loads = tuple(self._load(task, workers[task][0], seen.get(task)) for task in sorted(workers))
+        loads = tuple(self._load(task, workers[task][0], seen.get(task), is_calm) for task in sorted(workers))
         self._seen = seen
         self._appetites = {task: self._appetites[task] for task in seen if task in self._appetites}
         return loads
 
-    def _load(self, task: TaskId, state: WorkerState, seen: tuple[float, dict[int, ProcessTimes]] | None) -> WorkerLoad:
+    def _load(
+        self, task: TaskId, state: WorkerState, seen: tuple[float, dict[int, ProcessTimes]] | None, is_calm: bool
+    ) -> WorkerLoad:
         if seen is None or not seen[1]:
             return WorkerLoad(task=task, state=state)
         now, tree = seen
@@ -241,9 +268,12 @@ class _ProcessTrees:
         appetite = self._appetites.setdefault(task, Appetite())
         if not self._is_at_rest(task, now):
             appetite.look(self._threads(tree), now)
-            self._rests_until[task] = now + RESTING_LOOK_S - MIN_INTERVAL_S
+            self._looked_at[task] = now
         if cpu_cores is None or cpu_cores >= RESTING_CORES or appetite.wanted_cores() is not None:
             self._rests_until[task] = now
+        else:
+            rest_s = STILL_LOOK_S if is_calm and cpu_cores < STILL_CORES else RESTING_LOOK_S
+            self._rests_until[task] = self._looked_at[task] + rest_s - MIN_INTERVAL_S
         return WorkerLoad(
             task=task,
             state=state,

@@ -254,7 +254,7 @@ def test_a_wait_that_is_told_when_it_ends_counts_in_full(tmp_path: Path, clock: 
     assert all(wanted is not None and wanted > 0.9 for wanted in seen[120:])
 
 
-def test_the_threads_and_children_of_a_worker_that_rests_are_looked_at_once_a_second(
+def test_the_threads_and_children_of_a_worker_that_rests_are_looked_at_now_and_then(
     tmp_path: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     looks: list[float] = []
@@ -276,7 +276,14 @@ def test_the_threads_and_children_of_a_worker_that_rests_are_looked_at_once_a_se
         return len(looks) - before
 
     sample(5)
-    assert sample(50) == 10
+    assert sample(50) == 10, "nobody knows whether it lacks a CPU"
+    write(tmp_path, {"proc/pressure/cpu": "some avg10=0 avg60=0 avg300=0 total=5\n"})
+    sample(20)
+    assert 3 <= sample(50) <= 4, "it is still, and nobody lacks a CPU: every 3 s"
+    profiler.look_closely()
+    assert sample(1) == 1, "work has come"
+    write(tmp_path, process(10, 1, own=2))
+    assert sample(10) >= 1, "it runs a little: within a second"
     found = 0
     for step in range(10):
         write(tmp_path, process(10, 1, own=100 + 10 * step))
