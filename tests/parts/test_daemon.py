@@ -297,8 +297,11 @@ def test_work_wakes_a_sampler_at_rest(tmp_path: Path, monkeypatch: pytest.Monkey
     sampler.start()
     until(lambda: sampler._wait_s == 3600.0, "rest")
     list(inbox.waiting())
+    closely: list[None] = []
+    monkeypatch.setattr(sampler._device, "look_closely", lambda: closely.append(None))
     sampler.hurry()
     until(lambda: next(inbox.waiting(), None) or inbox.take(0.0), "a sample")
+    assert closely, "at all threads, too"
     until(lambda: sampler._wait_s == 3600.0, "rest again")
     sampler.stop()
     assert not sampler._thread.is_alive(), "and a stop does not wait"
