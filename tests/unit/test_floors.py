@@ -57,7 +57,6 @@ CORE_MAY: Final = frozenset(
             "enum",
             "functools",
             "hashlib",
-            "ipaddress",
         ),
         *("abc", "heapq", "itertools", "math", "operator", "random", "re", "statistics", "types", "typing"),
     }

@@ -100,6 +100,22 @@ def endpoint_fault(text: str) -> str | None:
     return "an IPv6 address stands in brackets" if ":" in host else host_fault(host)
 
 
+def is_own_host(endpoint: str) -> bool:
+    """Whether only programs of its machine reach a listener at a zenoh endpoint; a name but ``localhost`` is no proof.
+
+    >>> [is_own_host(f"{end}:1") for end in ("tcp/127.1.2.3", "tcp/[::1]", "ws/localhost", "tcp/0.0.0.0", "tcp/box")]
+    [True, True, True, False, False]
+    """
+    protocol, _, address = endpoint.partition("/")
+    if protocol in ("unixsock-stream", "unixpipe"):
+        return True
+    host = address.partition("#")[0].partition("?")[0].rpartition(":")[0]
+    try:
+        return host == "localhost" or ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return False
+
+
 def _matches(pattern: re.Pattern[str], why: str) -> Any:
     return lambda text: None if pattern.fullmatch(text) is not None else why
 

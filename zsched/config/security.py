@@ -10,9 +10,9 @@ from pathlib import Path
 from zsched.config.blocks import Located, Section
 from zsched.config.nodes import Cast
 from zsched.config.reader import Collector
-from zsched.config.schema import PKI_FOLDER
+from zsched.config.schema import PKI_FOLDER, is_own_host
 from zsched.core.values.certificates import MAX_COMMON_NAME, Holder, Role, parse_label
-from zsched.core.values.fleet import Security, Signatures, is_own_host
+from zsched.core.values.fleet import Security, Signatures
 from zsched.core.values.struct import replace
 
 ENCRYPTED = ("tls/", "quic/")

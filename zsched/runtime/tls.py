@@ -11,7 +11,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
-from zsched.core.values.fleet import Fleet, NodeSpec, is_own_host
+from zsched.config.schema import is_own_host
+from zsched.core.values.fleet import Fleet, NodeSpec
 from zsched.core.values.snapshot import Exposure
 from zsched.errors import ConfigError
 from zsched.files import read_regular

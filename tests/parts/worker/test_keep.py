@@ -298,9 +298,10 @@ def test_a_member_that_speaks_for_another_s_relay_takes_nothing_from_it(bench: B
     lane = bench.lane()
     robot, member = bench.robot("robot1", "aa1"), bench.robot("robot2", "aa1")
     keep(lane, 0, 1, 2, 3)
-    words = [lambda: robot.ack(bench.eid, 1), lambda: member.ack(bench.eid, 4, has_left=True, is_ended=True)]
-    for word in reversed(words) if is_first else words:
-        word()
+    words: list[tuple[Robot, int, dict[str, bool]]] = [(robot, 1, {})]
+    words.insert(0 if is_first else 1, (member, 4, {"has_left": True, "is_ended": True}))
+    for who, arrived, more in words:
+        who.ack(bench.eid, arrived, **more)
     until(lambda: len(lane.state.receivers) == 2, "both words")
     robot.ack(bench.eid, 1, has_gap=True, until=4)
     until(lambda: set(robot.got) == {1, 2, 3}, "what the robot lacks, at the robot")

@@ -9,7 +9,6 @@ fleet file gets that says nothing else.
 from __future__ import annotations
 
 import hashlib
-import ipaddress
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
@@ -452,22 +451,6 @@ def dial_endpoint(endpoint: str, host: str) -> str:
     if not address or port == "0":
         return ""
     return f"{protocol}/{address}"
-
-
-def is_own_host(endpoint: str) -> bool:
-    """Whether only programs of its machine reach a listener at a zenoh endpoint; a name but ``localhost`` is no proof.
-
-    >>> [is_own_host(f"{end}:1") for end in ("tcp/127.1.2.3", "tcp/[::1]", "ws/localhost", "tcp/0.0.0.0", "tcp/box")]
-    [True, True, True, False, False]
-    """
-    protocol, _, address = endpoint.partition("/")
-    if protocol in ("unixsock-stream", "unixpipe"):
-        return True
-    host = address.partition("#")[0].partition("?")[0].rpartition(":")[0]
-    try:
-        return host == "localhost" or ipaddress.ip_address(host.strip("[]")).is_loopback
-    except ValueError:
-        return False
 
 
 @lru_cache(maxsize=8)
