@@ -42,7 +42,7 @@ from zsched.core.values.words import NAME
 from zsched.errors import WireError, ZschedError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
 from zsched.files import read_regular
-from zsched.runtime.membership import Places, Written, found, is_joined, take_later_papers
+from zsched.runtime.membership import Places, Written, belongings, found, is_joined, is_of_a_later_key, put_away
 from zsched.runtime.membership import join as join_here
 from zsched.runtime.own_addresses import is_loopback
 from zsched.wire.codec import from_plain
@@ -459,11 +459,18 @@ def join(file: str, where: Places, *, is_plan: bool, is_json: bool) -> int:
     invitation = read_invitation(file)
     fleet, node = invitation.fleet, invitation.node
     if is_joined(invitation, where):
-        if later := take_later_papers(invitation, where, is_plan=is_plan):
-            return _tell_of_later_papers(invitation, later, where, is_plan=is_plan, is_json=is_json)
-        said = f"{where.state}: this machine is {node} of fleet {fleet} already: nothing to do"
-        Told(fleet=fleet, node=node, outcome="unchanged", said=said).tell(is_json=is_json)
-        return EXIT_OK
+        if not is_of_a_later_key(invitation, where):
+            said = f"{where.state}: this machine is {node} of fleet {fleet} already: nothing to do"
+            Told(fleet=fleet, node=node, outcome="unchanged", said=said).tell(is_json=is_json)
+            return EXIT_OK
+        if is_plan:
+            said = f"{fleet}: this machine would join as {node} once more, with the key of this later invitation"
+            old = belongings(where, is_purged=False)
+            Told(fleet=fleet, node=node, outcome="planned", said=said, files=old).tell(is_json=is_json)
+            return EXIT_WOULD_CHANGE
+        put_away(fleet, node, where, is_purged=False)
+        if not is_json:
+            warn(f"{node} had the key of an earlier invitation: its files are named *.left, and it joins once more")
     read, files = join_here(invitation, where, is_plan=is_plan)
     would = "would become" if is_plan else "is"
     said = f"{fleet}: this machine {would} {node} (generation {invitation.value.generation_id[:8]})"
@@ -471,24 +478,6 @@ def join(file: str, where: Places, *, is_plan: bool, is_json: bool) -> int:
     outcome = "planned" if is_plan else "joined"
     Told(fleet=fleet, node=node, outcome=outcome, said=said, files=files, next=follow).tell(is_json=is_json)
     return EXIT_WOULD_CHANGE if is_plan else EXIT_OK
-
-
-def _tell_of_later_papers(
-    invitation: Invitation, files: tuple[Written, ...], where: Places, *, is_plan: bool, is_json: bool
-) -> int:
-    """Say that this machine has the key of a later invitation now; the exit code."""
-    fleet, node = invitation.fleet, invitation.node
-    has = "would have" if is_plan else "has"
-    said = f"{fleet}: this machine is {node} already, and {has} the certificate and key of this later invitation"
-    again = "delete the invitation: it holds the private key", _restart(node, where)
-    outcome, follow = ("planned", ()) if is_plan else ("joined", again)
-    Told(fleet=fleet, node=node, outcome=outcome, said=said, files=files, next=follow).tell(is_json=is_json)
-    return EXIT_WOULD_CHANGE if is_plan else EXIT_OK
-
-
-def _restart(node: NodeId, where: Places) -> str:
-    """How a daemon that may run comes to go by another key."""
-    return f"if its daemon runs, end it; then {how_to_start(node, where)[-1].replace('enable --now', 'restart')}"
 
 
 def request(name: str, where: Places, out: Path | None, *, is_json: bool) -> int:

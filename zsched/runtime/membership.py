@@ -209,36 +209,25 @@ def join(invitation: Invitation, places: Places, *, is_plan: bool) -> tuple[Flee
     )
 
 
-def take_later_papers(invitation: Invitation, places: Places, *, is_plan: bool) -> tuple[Written, ...]:
-    """Take the certificate and key of a later invitation of the node that this machine is; empty: there are none.
+def is_of_a_later_key(invitation: Invitation, places: Places) -> bool:
+    """Whether an invitation brings this machine, which is its node already, a key of a higher number than it has.
 
-    The others let nobody in by the key of an earlier invitation. Only a key of a higher number takes another's place.
+    The others let nobody in by the key of an earlier invitation.
 
     Raises:
-        AdapterError: a file cannot be written.
         ConfigError: the document cannot be used here.
     """
     fleet, papers = _read(invitation.document.text, places.config), invitation.papers
     if papers is None or not papers.key or fleet.security is None:
-        return ()
-    folder = Path(fleet.security.folder)
+        return False
     own = b""
     with contextlib.suppress(OSError):
-        own = read_regular(folder / CERTIFICATE, MAX_FILE_BYTES)
+        own = read_regular(Path(fleet.security.folder) / CERTIFICATE, MAX_FILE_BYTES)
     names = [parse_common_name(_named(pem) or "", fleet.name) for pem in (papers.certificate.encode(), own)]
     offered, held = names
-    if offered is None or (offered.name, offered.role) != (invitation.node, Role.NODE):
-        return ()
-    if held is not None and ((held.name, held.role) != (offered.name, offered.role) or held.key >= offered.key):
-        return ()
-    if not is_plan:
-        try:
-            _put_papers(folder, papers)
-        except OSError as error:
-            raise AdapterError(
-                f"cannot write {error.filename or folder}: {error.strerror}; run this as root"
-            ) from error
-    return tuple(Written(path=folder / name, what=_WHAT[name]) for name in (CERTIFICATE, TRUSTED, KEY))
+    if offered is None or held is None or (held.name, held.role) != (offered.name, offered.role):
+        return False
+    return held.key < offered.key
 
 
 def _check_file(path: Path, fleet: str) -> None:

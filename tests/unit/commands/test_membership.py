@@ -472,19 +472,20 @@ def test_a_machine_that_joined_by_an_earlier_invitation_takes_the_key_of_a_later
     assert run(*words, first, "--address", "192.0.2.12").exit_code == 0
     assert run(*words, second).exit_code == 0
     assert run("join", first, *here(folder)).exit_code == 0
-    state = (folder / "state" / "state").read_bytes()
     earlier = (folder / "pki" / "key.pem").read_bytes()
     planned = run("join", second, "--plan", *here(folder))
     assert (planned.exit_code, (folder / "pki" / "key.pem").read_bytes()) == (10, earlier), planned.stderr
+    with StateFile(folder / "state", fleet="hall", node="robot2"):
+        refused = run("join", second, *here(folder))
+        assert (refused.exit_code, "stop that daemon first" in refused.stderr) == (1, True)
     taken = run("join", second, *here(folder))
     assert taken.exit_code == 0, taken.stderr
-    assert "is robot2 already, and has the certificate and key of this later invitation" in taken.stdout
-    fleet = check_bytes(node.text.encode(), str(folder / "fleet.yaml")).fleet
-    assert fleet is not None
+    assert "it joins once more" in taken.stderr
+    fleet = load_fleet(folder / "fleet.yaml")
     assert fleet.security is not None
-    assert fleet.security.revoked == ("robot2",)
+    assert fleet.security.revoked == ("robot2",), "the document of before lets nobody in by the new key"
     require_own(fleet, fleet.security, "robot2")
-    assert (folder / "state" / "state").read_bytes() == state, "it is the same node"
+    assert (folder / "pki" / "key.pem.left").read_bytes() == earlier
     for file in (second, first):
         again = run("join", file, *here(folder))
         assert "nothing to do" in again.stdout, "an earlier key never takes the place of a later one"

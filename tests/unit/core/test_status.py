@@ -448,7 +448,7 @@ def test_a_node_that_others_do_not_let_in_is_told_that_its_certificate_may_be_ol
     node = make(alive=())
     node.solitude.dialled = ("tls/192.0.2.1:7457", "tls/192.0.2.2:7457")
     node.handle(ev.AddressesTried(found=((node.solitude.dialled[0], TAKEN),)), 110.0)
-    invite = "On a node of the fleet `zsched invite robot1`, then `zsched join` here"
+    invite = "On a node of the fleet `zsched invite robot1`, then stop this daemon and `zsched join` here"
     assert not any(invite in one for one in build_snapshot(node, 110.0).problems), "nobody needs a certificate"
     node.fleet = replace(node.fleet, security=Security(folder="/pki"))
     assert invite in build_snapshot(node, 110.0).problems[0]

@@ -66,6 +66,6 @@ class Solitude(Struct):
             return f"{where}{CHECK}"
         return (
             f"{where}Who takes connections and is not heard may not let this node in: its certificate is of an earlier "
-            f"invitation, or its key is revoked. On a node of the fleet `zsched invite {secured}`, then `zsched join` "
-            f"here; else: {CHECK[0].lower()}{CHECK[1:]}"
+            f"invitation, or its key is revoked. On a node of the fleet `zsched invite {secured}`, then stop this "
+            f"daemon and `zsched join` here; else: {CHECK[0].lower()}{CHECK[1:]}"
         )
