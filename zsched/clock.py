@@ -3,6 +3,7 @@
 Decisions go by CLOCK_MONOTONIC_RAW, which no time service slews (chrony does by up to 8.3 %, and a lease may err by
 0.1 %), plus the time that the machine has slept, so that a laptop that was shut for a minute does not think its lease,
 its peers' beats or its samples are fresh. `ClockWatch` holds it against CLOCK_BOOTTIME, which is slewed.
+`SleepWatch` tells of a sleep before anything is judged by the time after it: some machines know its length to a second.
 A wait for a process of this machine goes by `awake_s`: that process slept, too.
 """
 
@@ -53,6 +54,18 @@ def monotonic_s() -> float:
         if slept - _Slept.seconds > NAP_S:
             _Slept.seconds = slept
     return time.clock_gettime(time.CLOCK_MONOTONIC_RAW) + _Slept.seconds
+
+
+class SleepWatch:
+    """Tells of each sleep of the machine once, as soon as `monotonic_s` counts it."""
+
+    def __init__(self) -> None:
+        self._told_s = _Slept.seconds
+
+    def look(self) -> float:
+        """How long the machine has slept since the look before, seconds, by what `monotonic_s` counts; mostly zero."""
+        before, self._told_s = self._told_s, _Slept.seconds
+        return self._told_s - before
 
 
 class Drift(NamedTuple):

@@ -34,7 +34,7 @@ from zsched.adapters.network.control_bus import ControlBus
 from zsched.adapters.network.limits import in_turn_hz, limit_for
 from zsched.adapters.relay.streams import SILENCE_S, Bequest, RelayHandle
 from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
-from zsched.clock import monotonic_s, wall_tenths
+from zsched.clock import SleepWatch, monotonic_s, wall_tenths
 from zsched.config.load import load_fleet, require_node
 from zsched.core import events as ev
 from zsched.core.electorate.numbers import in_force
@@ -136,6 +136,7 @@ class Daemon:
         self._has_left = False
         """This machine is in no fleet any more, by `zsched leave`."""
         self._reopening = Reopening(options.node)
+        self._sleeps = SleepWatch()
         self._lets_in_others = False
         """Open sessions go by other access rules than the fleet in force."""
         self._moved, self._left = Moved(), frozenset[NodeId]()
@@ -512,7 +513,7 @@ class Daemon:
             if monotonic_s() < alert_until:
                 wait = min(wait, ALERT_WAIT_S)
             event = self._inbox.take(wait) or ev.DeadlineReached()
-            now = monotonic_s()
+            now = self._now(node)
             if now >= node.next_deadline() or now < alert_until or isinstance(event, ev.TokenLost):
                 self._absorb_waiting(node, shell)  # before the event: they came before it, and nobody may look silent
             now = self._handle(node, shell, event)
@@ -636,17 +637,28 @@ class Daemon:
 
     def _handle(self, node: Node, shell: Shell, event: ev.Event) -> float:
         """One event, and what must come before any other (a disk that refused); when that was."""
-        now = monotonic_s()
+        now = self._now(node)
         shell.carry_out(node.handle(event, now))
         while (first := self._inbox.take_first()) is not None:
-            now = monotonic_s()
+            now = self._now(node)
             shell.carry_out(node.handle(first, now))
+        return now
+
+    def _now(self, node: Node) -> float:
+        """The time by which an event is judged; the node hears first that the machine has slept.
+
+        The sampler would tell of it up to a second later. By then an elector whose clock counts too long a sleep might
+        have granted a task to a second owner.
+        """
+        now = monotonic_s()
+        if slept_s := self._sleeps.look():
+            node.absorb(ev.ClockCompared(error_ratio=0.0, jump_s=slept_s), now)
         return now
 
     def _absorb_waiting(self, node: Node, shell: Shell) -> None:
         """Let the node absorb what has come without waking the loop: our own samples, and periodic frames."""
         for waiting in (*self._inbox.waiting(), *shell.waiting_frames()):
-            node.absorb(waiting, monotonic_s())
+            node.absorb(waiting, self._now(node))
             self._note_ready(node, waiting)
 
     def _note_ready(self, node: Node, event: ev.Event) -> None:

@@ -23,10 +23,10 @@ import zenoh
 from support.fleets import fleet_of, node_of
 from support.sessions import matches
 from support.waiting import until
-from zsched import daemon
+from zsched import clock, daemon
 from zsched.adapters.host.operator_client import ask
 from zsched.adapters.host.state_file import StateFile
-from zsched.clock import ClockWatch, Drift
+from zsched.clock import ClockWatch, Drift, SleepWatch
 from zsched.core import events as ev
 from zsched.core.values.fleet import Fleet, NodeSpec
 from zsched.core.values.model import NodeKind
@@ -335,6 +335,35 @@ def test_the_sampler_tells_the_node_of_a_slew_and_a_jump(tmp_path: Path) -> None
     assert [round(event.error_ratio, 3) for event in aloud] == [0.021, 0.033, 0.05, 0.0], "a slew, and one jump"
     assert [round(event.jump_s, 2) for event in aloud[-1:]] == [59.95]
     assert len(quiet) == 4, "three before, one after"
+
+
+def test_a_node_hears_of_a_sleep_before_what_is_judged_by_the_time_after_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The watch looks a second later: by then a clock that counts too long a sleep has ended a grant's hold."""
+    heard: list[ev.Event] = []
+
+    class Hearing:
+        def absorb(self, event: ev.Event, _now: float) -> None:
+            heard.append(event)
+
+        def handle(self, event: ev.Event, now: float) -> tuple[()]:
+            self.absorb(event, now)
+            return ()
+
+    node: Any = Hearing()
+    frame = ev.StopRequested()  # any event
+    shell: Any = SimpleNamespace(carry_out=lambda _batch: None, waiting_frames=lambda: iter([frame]))
+    one = object.__new__(daemon.Daemon)
+    one._inbox, one._sleeps, one._is_ready = Inbox(), SleepWatch(), True
+    one._absorb_waiting(node, shell)
+    assert heard == [frame], "nothing is told of no sleep"
+    for step in (lambda: one._absorb_waiting(node, shell), lambda: one._handle(node, shell, frame)):
+        heard.clear()
+        monkeypatch.setattr(clock._Slept, "seconds", clock._Slept.seconds + 60.0)
+        step()
+        told, *rest = heard
+        assert isinstance(told, ev.ClockCompared)
+        assert is_bad(told)
+        assert (round(told.jump_s), rest) == (60, [frame])
 
 
 # --- the process -----------------------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from zsched import clock
-from zsched.clock import ClockWatch, Drift, monotonic_s, wall_tenths, wall_time
+from zsched.clock import ClockWatch, Drift, SleepWatch, monotonic_s, wall_tenths, wall_time
 
 
 def test_monotonic_s_never_goes_back() -> None:
@@ -50,6 +50,15 @@ def test_a_suspend_counts_and_a_process_put_aside_between_two_readings_does_not(
     assert all(told == pytest.approx(raw + 7.0, abs=1e-4) for told, raw in readings), "neither slewed nor put aside"
     real["slept"] = 67.0
     assert monotonic_s() == pytest.approx(real["raw"] + 67.0, abs=1e-4)
+
+
+def test_a_sleep_is_told_once_as_soon_as_it_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    sleeps, real = SleepWatch(), clock._Slept.seconds
+    monotonic_s()
+    assert sleeps.look() == 0.0
+    monkeypatch.setattr(clock._Slept, "seconds", real + 60.0)
+    assert sleeps.look() == pytest.approx(60.0)
+    assert sleeps.look() == 0.0, "once"
 
 
 def watch(*readings: tuple[float, float]) -> list[Drift | None]:

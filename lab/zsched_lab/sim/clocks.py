@@ -76,7 +76,7 @@ def slew(
 
 
 def awake(
-    slept_s: float,
+    counted_s: float,
     *,
     tell: Callable[[ev.Event], None],
     later: Callable[[float, Callable[[], None]], None],
@@ -84,14 +84,15 @@ def awake(
 ) -> None:
     """Report what the watch finds after the machine has slept, until its clock is believed again.
 
-    The sleep is in CLOCK_BOOTTIME only: `ClockWatch` is given the readings from before and after it.
+    The sleep, as long as the machine counts it, is in CLOCK_BOOTTIME only: `ClockWatch` is given the readings from
+    before and after it.
     """
     watch, before = ClockWatch(), round(WINDOW_S / LOOK_S)
     for step in range(before):
         watch.judge(step * LOOK_S, 0.0)
 
     def look(step: int) -> None:
-        drift = watch.judge(step * LOOK_S, slept_s)
+        drift = watch.judge(step * LOOK_S, counted_s)
         assert drift is not None
         tell(ev.ClockCompared(error_ratio=drift.error_ratio, jump_s=drift.jump_s, since_s=drift.since_s))
         if (step - before) * LOOK_S < DOUBT_S + 2 * LOOK_S or not is_believed():

@@ -195,6 +195,8 @@ class Machine:
     asleep_since: float | None = None
     """Since when the machine sleeps, its clock going on; ``None``: it does not."""
     sleep_error_s: float = 0.0
+    untold_sleep_s: float = 0.0
+    """How long it has slept by its own clock, until its node hears of that."""
     """By how much it then misjudges how long that was."""
     late_until: float = -math.inf
     """By its own clock: leases until then were begun before it last stood still."""
@@ -218,3 +220,4 @@ class Machine:
         self.inbox.clear()
         self.busy_until, self.is_paused, self.wake_at = -math.inf, False, math.inf
         self.frozen_at = self.asleep_since = None
+        self.untold_sleep_s = 0.0

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from random import Random
 from typing import Any
 
+from zsched.clock import NAP_S
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.node import Node
@@ -284,8 +285,13 @@ class Simulator(Links):
         self.work.thaw(machine, self.fleet.timing.lease_s)
 
     def woken_up(self, machine: Machine, slept_s: float) -> None:
-        """Its workers go on; its watch looks at the clocks a little later, as often as the daemon's does."""
+        """Its workers go on; its watch looks at the clocks a little later, as often as the daemon's does.
+
+        The node hears of the sleep before the next event, as the daemon's loop tells it.
+        """
         life = machine.life
+        counted_s = slept_s + max(machine.sleep_error_s, -slept_s)
+        machine.untold_sleep_s += counted_s if counted_s > NAP_S else 0.0
         self.work.thaw(machine, max(-machine.sleep_error_s, 0.0))
 
         def tell(event: ev.Event) -> None:
@@ -296,7 +302,7 @@ class Simulator(Links):
             node, is_behind = machine.node, machine.is_paused or bool(machine.inbox)  # it has not heard of it yet
             return machine.life != life or node is None or not (is_behind or "clock" in node.problems)
 
-        self.later(LOOK_S, lambda: awake(slept_s, tell=tell, later=self.later, is_believed=is_believed))
+        self.later(LOOK_S, lambda: awake(counted_s, tell=tell, later=self.later, is_believed=is_believed))
 
     # --- events ------------------------------------------------------------------------------------------------------
 
@@ -313,6 +319,9 @@ class Simulator(Links):
             raise InvariantError(f"{self.events} events until {self.now:.3f}: the fleet storms")
         local = self.now if machine.clock.is_true else machine.clock.local(self.now)
         try:
+            if machine.untold_sleep_s:
+                slept_s, machine.untold_sleep_s = machine.untold_sleep_s, 0.0
+                node.absorb(ev.ClockCompared(error_ratio=0.0, jump_s=slept_s), local)
             batch = node.handle(event, local)
         except Exception as error:
             raise InvariantError(f"{machine.key} raised {error!r} on {event}") from error
