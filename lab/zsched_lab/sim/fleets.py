@@ -386,8 +386,8 @@ class Schedule:
 
     def _change_once_more(self) -> None:
         """What is at rest can be changed again."""
-        outcome = None
-        for _ in range(6):  # an operator's change of before may still come first, once its document is fetched
+        outcome, until = None, self.sim.now + REST_S
+        while self.sim.now < until:  # operators who take machines out, a step a second, may come first
             value = self._newest()
             assert value is not None
             said = replace(self.sim.documents.says.get(value.document, self.fleet), relay_orphan_s=99.0)
