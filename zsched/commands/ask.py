@@ -48,6 +48,8 @@ AGAIN_S, LOOK_S = 30.0, 0.05
 CONNECT_S = 3.0
 ONLY_THERE = frozenset({"access", "leave", "log"})
 """What a daemon answers on its own machine only."""
+READS = frozenset({"access", "explain", "fleet", "history", "lines", "log", "rehearsals", "status"})
+"""Asked twice they change nothing."""
 ASK_TIMEOUT_S = 5.0
 """Above the daemon's own limits (3 s for its loop, 3 s for another node), so that their reasons arrive."""
 
@@ -285,9 +287,8 @@ def ask_door(door: Door, request: Json, timeout_s: float = ASK_TIMEOUT_S) -> Jso
         return _ask_elsewhere(door, request)
     if door.node is not None:
         request = {**request, "node": door.node}
-    await_beginners(door.socket.parent)
     try:
-        answer = ask(door.socket, request, timeout_s)
+        answer = _asked(door, request, timeout_s)
     except AdapterError as error:
         raise _unanswered(door, error) from error
     if "error" not in answer:
@@ -300,6 +301,21 @@ def ask_door(door: Door, request: Json, timeout_s: float = ASK_TIMEOUT_S) -> Jso
     runtime = door.socket.parent
     here = [path.stem for path in places.local_sockets(runtime)]
     raise CliError(EXIT_UNREACHABLE, _no_daemon(door.node, runtime, here, " and none answers in the network"))
+
+
+def _asked(door: Door, request: Json, timeout_s: float) -> Json:
+    """As `ask`; once more where the daemon began again just then, and nothing can have come of the first time."""
+    runtime = door.socket.parent
+    await_beginners(runtime)
+    try:
+        return ask(door.socket, request, timeout_s)
+    except AdapterError as error:
+        is_untaken = isinstance(error.__cause__, (ConnectionRefusedError, FileNotFoundError))
+        is_safe = is_untaken or (isinstance(error.__cause__, ConnectionError) and request["verb"] in READS)
+        if not (is_safe and any(map(_is_fresh, places.local_marks(runtime)))):
+            raise
+    await_beginners(runtime)
+    return ask(door.socket, request, timeout_s)
 
 
 def _no_daemon(node: str, runtime: Path, here: Iterable[str], more: str = "") -> str:

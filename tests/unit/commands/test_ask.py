@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import socket
 import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -40,6 +42,62 @@ def test_a_daemon_that_begins_again_is_waited_for(tmp_path: Path) -> None:
     assert [one.socket for one in found] == [socket_path(tmp_path, "robot1")]
     assert ask_door(found[0], {"verb": "status"}) == {"verb": "status"}
     door.close()
+
+
+class Begins:
+    """A daemon that begins again just when it is asked: the connection ends, and its next socket answers."""
+
+    def __init__(self, folder: Path) -> None:
+        self._path, self._mark = socket_path(folder, "robot1"), again_path(folder, "robot1")
+        self.heard: list[str] = []
+        self._first = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self._first.bind(str(self._path))
+        self._next = OperatorSocket(self._path, self._answer)
+        self._first.listen(1)
+        self._thread = threading.Thread(target=self._begin_again, daemon=True)
+        self._thread.start()
+
+    def _answer(self, request: dict[str, Any]) -> dict[str, Any]:
+        self.heard.append(request["verb"])
+        return {"verb": request["verb"]}
+
+    def _begin_again(self) -> None:
+        connection, _ = self._first.accept()
+        with connection, connection.makefile("rb") as lines:
+            lines.readline()
+            self._mark.touch()
+        self._first.close()
+        self._path.unlink()
+        self._next.open()
+        self._mark.unlink()
+
+    def close(self) -> None:
+        self._thread.join(30)
+        self._next.close()
+
+
+def test_a_question_that_meets_a_daemon_beginning_again_is_asked_once_more(tmp_path: Path) -> None:
+    daemon = Begins(tmp_path)
+    door = Door(socket=socket_path(tmp_path, "robot1"))
+    assert ask_door(door, {"verb": "fleet"}) == {"verb": "fleet"}
+    daemon.close()
+
+
+def test_an_order_that_it_may_have_taken_is_not_given_twice(tmp_path: Path) -> None:
+    daemon = Begins(tmp_path)
+    door = Door(socket=socket_path(tmp_path, "robot1"))
+    with pytest.raises(CliError, match="it ended before it answered"):
+        ask_door(door, {"verb": "move"})
+    daemon.close()
+    assert daemon.heard == []
+
+
+def test_one_that_dies_is_not_asked_again(tmp_path: Path) -> None:
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    listener.bind(str(socket_path(tmp_path, "robot1")))
+    listener.close()
+    with pytest.raises(CliError, match="no daemon answers at"):
+        ask_door(Door(socket=socket_path(tmp_path, "robot1")), {"verb": "fleet"})
 
 
 @pytest.mark.parametrize("ago_s", [AGAIN_S + 1.0, None])

@@ -7,6 +7,7 @@ verb which only asks loads no logging.
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import socket
 from pathlib import Path
@@ -30,7 +31,10 @@ def ask(path: Path, request: Json, timeout_s: float = 5.0) -> Json:
             with contextlib.suppress(BrokenPipeError):  # it has said why already
                 connection.sendall(json.dumps(request).encode() + b"\n")
             with connection.makefile("rb") as lines:
-                answer = json.loads(lines.readline())
+                line = lines.readline()
+            if not line:
+                raise ConnectionAbortedError(errno.ECONNABORTED, "it ended before it answered")
+            answer = json.loads(line)
     except (BlockingIOError, TimeoutError) as error:  # the first: its queue of connections is full
         raise AdapterError(f"the daemon at {path} did not answer within {timeout_s:g} s; is it wedged?") from error
     except (OSError, ValueError) as error:
