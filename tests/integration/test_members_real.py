@@ -28,6 +28,7 @@ tasks:
     outputs:
       - {from: "{target}/echo/{epoch}/{robot}/out", to: "{robot}/out", class: reliable, handover: all}
 """
+LEFT = ["etc/fleet.yaml.left", "state/decisions.ndjson.left", "state/state.left"]
 QUICK = "replace_s: 2\n"
 """So that electors follow within seconds."""
 
@@ -88,7 +89,7 @@ def test_a_fleet_grows_from_one_machine_and_shrinks_to_none_while_a_stream_runs(
             assert elects(hall, "robot1", "robot2")
             assert hall.status("robot1")["tasks"][0]["owner"] in ("robot1", "robot2")
             kept = files(hall, "robot3")
-            assert [one for one in kept if one.endswith(".left")] == ["etc/fleet.yaml.left", "state/state.left"], kept
+            assert [one for one in kept if one.endswith(".left")] == LEFT, kept
             assert not {"etc/fleet.yaml", "state/state"} & set(kept)
 
             # the same machine comes back under its name, and is another member
