@@ -14,18 +14,17 @@ from collections.abc import Collection, Mapping, Sequence
 from zsched.core.executor.sparing import Sparing
 from zsched.core.values.fleet import Timing
 from zsched.core.values.model import NodeId
-from zsched.core.values.quorum import majority
 from zsched.core.values.struct import Struct, field
 
+LEAST_FIRST_S = 2.0
+"""The first one waits at least this long: the daemons' own work may take longer than the round trips."""
 FIRST_BALLOTS = 4
-"""The first one waits for so many times ``ballot_s``: all learn of a change within 6.5 round trips, and a phase of a
+"""And at least so many times ``ballot_s``: all learn of a change within 6.5 round trips, and a phase of a
 vote is over after ``ballot_s``. Who learns of it after the first has begun again waits for that one's whole turn."""
 TURN_S = 10.0
 """Each has at most this long: a daemon that owns tasks gives them away (3 s), ends (2 s) and is heard again (3 s)."""
 SETTLE_S = 1.0
 """Once all before it are heard in a new life, the next one waits this long: their workers start meanwhile."""
-SHORT_SETTLE_S = 0.5
-"""So long does a started elector ask at most before it votes. Enough where a majority votes without it and the next."""
 OWNER_S = 30.0
 """An owner waits this much longer for another candidate that starts: without one its task would have no owner."""
 LEAST_ELECTORS = 3
@@ -142,31 +141,26 @@ class Reopening(Struct):
         """
         if self.due_at is None or now < self._first_at:
             return False
-        if now < self.due_at and (lack or not self._is_next(lives, now, _settle_s(electors))):
+        if now < self.due_at and (lack or not self._is_next(lives, now)):
             return False
         if now < self.due_at + OWNER_S and Sparing.STARTING in lack:
             return False
         missing = {name for name in electors if name not in lives} - {self.me}
         return self.me not in electors or not missing or now >= self.due_at + LONGEST_WAIT_S
 
-    def _is_next(self, lives: Mapping[NodeId, int | None], now: float, settle_s: float) -> bool:
+    def _is_next(self, lives: Mapping[NodeId, int | None], now: float) -> bool:
         """Whether all before it have begun again, and have had time to start their workers."""
         if not all(_is_newer(lives.get(name), before) for name, before in self._before.items()):
             self._anew_at = None
             return False
         if self._anew_at is None:
             self._anew_at = now
-        return not self._before or now >= self._anew_at + settle_s
+        return not self._before or now >= self._anew_at + SETTLE_S
 
 
 def first_wait_s(timing: Timing) -> float:
     """How long the first one waits, seconds: by then the others have learnt of the change."""
-    return FIRST_BALLOTS * timing.ballot_s
-
-
-def _settle_s(electors: Collection[NodeId]) -> float:
-    """How long the next one waits for those before it that are heard again, seconds."""
-    return SHORT_SETTLE_S if len(electors) - 2 >= majority(len(electors)) else SETTLE_S
+    return max(LEAST_FIRST_S, FIRST_BALLOTS * timing.ballot_s)
 
 
 def _is_newer(life: int | None, before: int | None) -> bool:
