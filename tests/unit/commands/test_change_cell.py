@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner, Result
 
+from support.fleet_values import fleet_value_of
 from support.schemas import faults
 from zsched.adapters.host.operator_socket import Json, OperatorSocket
 from zsched.adapters.host.state_file import StateFile, sync_folder
@@ -110,15 +111,12 @@ class Hall:
 
     def _fleet(self, who: str) -> Json:
         content = Document(text=Text(self.text), flags=tuple(from_plain(flag, Flag) for flag in self.flags))
-        value = FleetValue(
+        value = fleet_value_of(
+            self.revision,
+            *(Elector(name=name, disk="01", joining=1) for name in self.electors),
+            number=2,
             fleet=self.name,
             generation_id=self.generation * 16,
-            revision=self.revision,
-            number=2,
-            electors=tuple(Elector(name=name, disk="01", joining=1) for name in self.electors),
-            settled=True,
-            lease_s=1.0,
-            guard_lease_s=1.0,
             document=document_hash(content),
         )
         body = {"node": who, "fleet": self.name, "revision": self.revision, "number": 2, "settled": True}

@@ -10,13 +10,14 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
+from support.fleet_values import fleet_value_of
 from support.schemas import faults
 from zsched.adapters.host.operator_socket import Json, OperatorSocket
 from zsched.adapters.host.state_file import StateFile
 from zsched.cli import app
 from zsched.commands import flags, leave
 from zsched.config.load import load_fleet
-from zsched.core.values.electorate import Elector, FleetValue
+from zsched.core.values.electorate import Elector
 from zsched.core.vote.generations import blank_state
 from zsched.wire.codec import as_plain
 
@@ -93,15 +94,10 @@ class Hall:
             if self.seat_goes_after <= 0 and "electorate:" not in self.text:
                 self._remove_elector()
         names = [{"name": name, "disk": "01"} for name in self.electors]
-        value = FleetValue(
-            fleet="hall",
-            generation_id="ab" * 16,
-            revision=self.revision,
+        value = fleet_value_of(
+            self.revision,
+            *(Elector(name=name, disk="01", joining=1) for name in self.electors),
             number=2,
-            electors=tuple(Elector(name=name, disk="01", joining=1) for name in self.electors),
-            settled=True,
-            lease_s=1.0,
-            guard_lease_s=1.0,
             document="cd" * 16,
         )
         text = "" if (who == "robot3" and self.is_told_gone) or not self._knows(who) else self.text

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner, Result
 
+from support.fleet_values import fleet_value_of
 from support.schemas import faults
 from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.adapters.host.state_file import StateFile
@@ -23,7 +24,6 @@ from zsched.commands.membership import Address, address_of, dial_order, own_addr
 from zsched.config.load import check_bytes, load_fleet
 from zsched.core.values.certificates import Role
 from zsched.core.values.document import Document, Rollout, Text
-from zsched.core.values.electorate import Elector, FleetValue
 from zsched.core.values.struct import replace
 from zsched.errors import ConfigError
 from zsched.pki.authority import create
@@ -67,17 +67,7 @@ class Node:
             return {"outcome": "ok", "detail": "agreed", "revision": self.revision}
         waiting = tuple(from_plain(one, Rollout) for one in self.rollouts)
         content = Document(text=Text(self.text), rollouts=waiting)
-        value = FleetValue(
-            fleet="hall",
-            generation_id="ab" * 16,
-            revision=self.revision,
-            number=2,
-            electors=(Elector(name="robot1", disk="01", joining=1),),
-            settled=True,
-            lease_s=1.0,
-            guard_lease_s=1.0,
-            document=document_hash(content),
-        )
+        value = fleet_value_of(self.revision, number=2, document=document_hash(content))
         body = {
             "node": "robot1",
             "fleet": "hall",

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 from support.clinic import FLEET, assert_finds, make_state, run, scene_of
+from support.fleet_values import fleet_value_of
 from support.planted_faults import found_in
 from zsched.adapters.host.document_store import DocumentStore
 from zsched.adapters.host.operator_socket import OperatorSocket
@@ -136,17 +137,7 @@ def agreed_on(folder: Path) -> FleetValue:
     file.write_text(AGREED)
     content = Document(text=Text(AGREED))
     DocumentStore(folder / "state").save(content)
-    value = FleetValue(
-        fleet="hall",
-        generation_id="ab" * 16,
-        revision=9,
-        number=1,
-        electors=(Elector(name="edge1", disk="01", joining=1),),
-        settled=True,
-        lease_s=1.0,
-        guard_lease_s=1.0,
-        document=document_hash(content),
-    )
+    value = fleet_value_of(9, Elector(name="edge1", disk="01", joining=1), document=document_hash(content))
     make_state(load_fleet(file), "edge1", folder / "state", fleet_register=RegisterState(task="hall", learnt=value))
     return value
 

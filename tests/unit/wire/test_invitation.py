@@ -7,22 +7,17 @@ from dataclasses import replace
 
 import pytest
 
+from support.fleet_values import fleet_value_of
 from zsched.core.values.document import Document, Flag, FlagKind, Text
-from zsched.core.values.electorate import Creation, Elector, FleetValue
+from zsched.core.values.electorate import Creation
 from zsched.errors import WireError
 from zsched.wire.codec import document_hash
 from zsched.wire.invitation import Invitation, Papers, decode_invitation, encode_invitation
 
 DOCUMENT = Document(text=Text("fleet: hall  # ä\n"), flags=(Flag(kind=FlagKind.DRAIN, subject="edge1", for_s=1.5),))
-VALUE = FleetValue(
-    fleet="hall",
-    generation_id="ab" * 16,
-    revision=7,
+VALUE = fleet_value_of(
+    7,
     number=3,
-    electors=(Elector(name="robot1", disk="01", joining=1),),
-    settled=True,
-    lease_s=1.0,
-    guard_lease_s=1.0,
     creations=4,
     tasks=(Creation(task="merge", number=4, exclusive=True),),
     document=document_hash(DOCUMENT),

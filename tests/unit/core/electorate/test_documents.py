@@ -2,22 +2,13 @@
 
 from __future__ import annotations
 
+from support.fleet_values import fleet_value_of
 from zsched.core import instructions as do
 from zsched.core.electorate.documents import MAX_WANTED, Documents
 from zsched.core.todo import ToDo
-from zsched.core.values.electorate import Elector, FleetValue
 from zsched.core.values.struct import replace
 
-VALUE = FleetValue(
-    fleet="f",
-    generation_id="ab",
-    revision=1,
-    number=1,
-    electors=(Elector(name="robot1", disk="0", joining=1),),
-    settled=True,
-    lease_s=1.0,
-    guard_lease_s=1.0,
-)
+VALUE = fleet_value_of()
 
 
 def asked(documents: Documents, *names: str) -> list[str]:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from support.fleet_values import fleet_value_of
 from zsched.core.electorate.changes import AddElector, RemoveElector, SetAway
 from zsched.core.electorate.pilot import PAUSE_SHARE, STEADY, TARGET, Course, Pilot, Word, may_go
 from zsched.core.values.electorate import Elector, FleetValue
@@ -21,15 +22,12 @@ COURSE = Course(
 
 
 def value(names: str, **changes: object) -> FleetValue:
-    plain = FleetValue(
+    plain = fleet_value_of(
+        7,
+        *(Elector(name=name, disk=disk_of(name), joining=1) for name in names),
+        number=3,
         fleet="f",
         generation_id="ab",
-        revision=7,
-        number=3,
-        electors=tuple(Elector(name=name, disk=disk_of(name), joining=1) for name in names),
-        settled=True,
-        lease_s=1.0,
-        guard_lease_s=1.0,
         document="d",
     )
     return replace(plain, **changes)  # type: ignore[arg-type]

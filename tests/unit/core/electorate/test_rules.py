@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import pytest
 
+from support.fleet_values import fleet_value_of
 from zsched.core.electorate.changes import AddElector, FleetChange, RemoveElector, SetDocument, SetLease, Settle
 from zsched.core.electorate.founding import founded, recovered
 from zsched.core.todo import ToDo
@@ -67,13 +68,12 @@ def give(world: Machines, messages: list[Message]) -> None:
 
 # --- one at a time, on a settled value -------------------------------------------------------------------------------
 
-VALUE = FleetValue(
+VALUE = fleet_value_of(
+    7,
+    *(Elector(name=name, disk="0", joining=1) for name in "abc"),
+    number=3,
     fleet="f",
     generation_id="ab",
-    revision=7,
-    number=3,
-    electors=tuple(Elector(name=name, disk="0", joining=1) for name in "abc"),
-    settled=True,
     lease_s=2.0,
     guard_lease_s=2.0,
     creations=2,

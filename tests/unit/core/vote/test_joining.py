@@ -11,6 +11,7 @@ import pytest
 from support.allocations import allocation_of
 from support.ballots import ballot_of
 from support.beats import beat_of
+from support.fleet_values import fleet_value_of
 from support.fleets import fleet_of, task_of
 from support.states import state_of
 from support.todos import agreed
@@ -163,16 +164,7 @@ def test_a_frame_counts_as_one_question_at_the_rate() -> None:
 
 
 def test_the_newest_fleet_value_goes_along_once() -> None:
-    value = FleetValue(
-        fleet="lab",
-        generation_id="aa",
-        revision=2,
-        number=2,
-        electors=(Elector(name="robot1"),),
-        settled=True,
-        lease_s=1.0,
-        guard_lease_s=1.0,
-    )
+    value = fleet_value_of(2, Elector(name="robot1"), number=2, fleet="lab", generation_id="aa")
     no = Refused(
         elector="robot1",
         task="merge",
