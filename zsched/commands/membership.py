@@ -33,6 +33,7 @@ from zsched.commands.papers import (
 )
 from zsched.config.editing import add_entries, add_names, is_list
 from zsched.config.load import check_bytes
+from zsched.config.schema import is_loopback
 from zsched.core.values.document import Document
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet, NodeSpec, dial_endpoint
@@ -44,7 +45,6 @@ from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
 from zsched.files import read_regular
 from zsched.runtime.membership import Places, Written, belongings, found, is_joined, is_of_a_later_key, put_away
 from zsched.runtime.membership import join as join_here
-from zsched.runtime.own_addresses import is_loopback
 from zsched.wire.codec import from_plain
 from zsched.wire.invitation import MAX_BYTES, Invitation, decode_invitation, encode_invitation
 

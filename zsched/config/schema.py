@@ -100,6 +100,18 @@ def endpoint_fault(text: str) -> str | None:
     return "an IPv6 address stands in brackets" if ":" in host else host_fault(host)
 
 
+def is_loopback(host: str) -> bool:
+    """Whether a host is an address that only this machine reaches; a name is none.
+
+    >>> [is_loopback(host) for host in ("127.0.0.1", "[::1]", "192.0.2.1", "localhost", "")]
+    [True, True, False, False, False]
+    """
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return False
+
+
 def is_own_host(endpoint: str) -> bool:
     """Whether only programs of its machine reach a listener at a zenoh endpoint; a name but ``localhost`` is no proof.
 
@@ -110,10 +122,7 @@ def is_own_host(endpoint: str) -> bool:
     if protocol in ("unixsock-stream", "unixpipe"):
         return True
     host = address.partition("#")[0].partition("?")[0].rpartition(":")[0]
-    try:
-        return host == "localhost" or ipaddress.ip_address(host.strip("[]")).is_loopback
-    except ValueError:
-        return False
+    return host == "localhost" or is_loopback(host)
 
 
 def _matches(pattern: re.Pattern[str], why: str) -> Any:

@@ -17,11 +17,11 @@ from concurrent.futures import TimeoutError as LateError
 from pathlib import Path
 from typing import Final
 
+from zsched.config.schema import is_loopback
 from zsched.core.values.fleet import NodeSpec, dial_endpoint
 from zsched.core.values.struct import Struct
 from zsched.doctor.model import Result, Scene, counted, failed, joined, passed, skipped, warned
 from zsched.procfs import names, read_file
-from zsched.runtime.own_addresses import is_loopback
 
 RESOLVE_S: Final = 5.0
 CONNECT_S: Final = 2.0

@@ -32,18 +32,6 @@ def addresses_at(root: Path, host: str) -> Iterator[Address]:
         yield from _ipv6(root)
 
 
-def is_loopback(host: str) -> bool:
-    """Whether a host is an address that only this machine reaches; a name is none.
-
-    >>> [is_loopback(host) for host in ("127.0.0.1", "[::1]", "192.0.2.1", "localhost", "")]
-    [True, True, False, False, False]
-    """
-    try:
-        return ipaddress.ip_address(host.strip("[]")).is_loopback
-    except ValueError:
-        return False
-
-
 def _ipv4(root: Path) -> Iterator[Address]:
     seen: set[Address] = set()
     last = ""

@@ -16,8 +16,8 @@ import socket
 from collections.abc import Iterable, Sequence
 from typing import Final
 
+from zsched.config.schema import is_loopback
 from zsched.core.values.struct import Struct
-from zsched.runtime.own_addresses import is_loopback
 
 STAY_S: Final = 2.0
 """A new address must have been there for this long: a radio that roams may have none, or two, for a moment."""
