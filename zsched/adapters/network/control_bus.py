@@ -54,12 +54,12 @@ from zsched.core.values.messages import (
     Votes,
     WorkerLines,
     asked_at,
+    asked_by,
 )
-from zsched.core.values.model import Asked, NodeId, Proposal
+from zsched.core.values.model import NodeId, Proposal
 from zsched.core.values.profile import Profile
 from zsched.core.values.rehearsal import ReadRehearsals, RehearsalsTold
 from zsched.core.values.snapshot import Snapshot
-from zsched.core.values.struct import replace
 from zsched.core.values.words import NAME
 from zsched.errors import AdapterError, WireError
 from zsched.guard import ends_within, tolerant
@@ -126,11 +126,7 @@ def signed_by(holder: Holder, command: Command) -> Command:
     """
     if holder.role is Role.NODE:
         return asked_at(holder.name, command)
-    if not isinstance(command, Ordered):
-        return command
-    said = command.asked  # an older tool says nothing
-    asked = Asked(by=holder.label) if said is None else replace(said, by=holder.label)
-    return replace(command, asked=asked)
+    return asked_by(holder.label, command) if isinstance(command, Ordered) else command
 
 
 def task_of(command: Command) -> str:

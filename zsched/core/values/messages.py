@@ -518,6 +518,12 @@ Ordered = SetWeights | Strike | KeepRehearsal | RetryTask | RestartTask | MoveTa
 """Commands that carry who gives them (``asked``)."""
 
 
+def asked_by(name: str, command: Ordered) -> Command:
+    """An order that ``name`` gives, whoever it says has given it (an older tool says nothing)."""
+    said = command.asked
+    return replace(command, asked=Asked(by=name) if said is None else replace(said, by=name))
+
+
 def asked_at(node: NodeId, command: Command) -> Command:
     """A command as ``node`` may pass it on: a program there names its user, and neither an operator nor another node.
 
@@ -525,13 +531,12 @@ def asked_at(node: NodeId, command: Command) -> Command:
     """
     if not isinstance(command, Ordered):
         return command
-    said = command.asked
-    if said is None:
-        return replace(command, asked=Asked(by=node))
-    user, _, place = said.by.partition("@")
+    if command.asked is None:
+        return asked_by(node, command)
+    user, _, place = command.asked.by.partition("@")
     if place == node or place.endswith(f"/{node}"):
         return command
-    return replace(command, asked=replace(said, by=f"{user[: MAX_ASKER - len(node) - 1]}@{node}"))
+    return asked_by(f"{user[: MAX_ASKER - len(node) - 1]}@{node}", command)
 
 
 class FleetTold(Struct, frozen=True, kw_only=True):
