@@ -38,7 +38,7 @@ from zsched.core.hop.held import HeldInputs
 from zsched.core.hop.kept import Owed
 from zsched.core.hop.receiver import SourceName
 from zsched.core.hop.serial import serial_of
-from zsched.core.hop.shared import MAX_RECEIVERS, TICK_S, SharedSender
+from zsched.core.hop.shared import MAX_RECEIVERS, TICK_S, SharedSender, spoken_for
 from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks
 from zsched.core.values.struct import Struct, field
 from zsched.errors import WireError
@@ -158,7 +158,7 @@ class KeptLane(Struct, kw_only=True, eq=False):
     def _way(self, session: Session, relay: str) -> zenoh.Publisher:
         way = self.ways.get(relay)
         if way is None:
-            key = f"{self.key}/{AGAIN_CHUNK}/{relay.partition(' ')[0]}"  # whoever speaks for it
+            key = f"{self.key}/{AGAIN_CHUNK}/{spoken_for(relay)}"
             way = self.ways[relay] = session.declare_publisher(key, congestion_control=CongestionControl.BLOCK)
         return way
 

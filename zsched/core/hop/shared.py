@@ -48,6 +48,15 @@ TICK_S: Final = 0.1
 """A worker looks after kept answers this often: a way to a receiver does not say when it comes to match."""
 
 
+def spoken_for(name: str) -> str:
+    """The receiver that is meant by a name of `SharedSender.receivers`, whichever node speaks for it.
+
+    >>> spoken_for("a1"), spoken_for("a1 by robot2")
+    ('a1', 'a1')
+    """
+    return name.partition(BESIDE)[0]
+
+
 class Wanted(NamedTuple):
     """What a receiver is to be put again: everything that it lacks below a number."""
 
