@@ -237,8 +237,7 @@ class TaskRelay:
     def counts(self) -> tuple[StreamCount, ...]:
         """The counters of every stream, by name."""
         with self._changing:
-            streams: list[InputStream | OutputStream] = [*self._inputs.values(), *self._outputs.values()]
-            counts = added(tuple(stream.count() for stream in streams), self._closed)
+            counts = added(tuple(stream.count() for stream in self._streams()), self._closed)
         return tuple(sorted((*counts, *self._services.counts()), key=lambda count: count.stream))
 
     # --- the thread --------------------------------------------------------------------------------------------------
@@ -335,8 +334,7 @@ class TaskRelay:
         for state in self._slots.values():
             state.is_ready, state.seen, state.gone_at = False, frozenset(), None
             state.lacks_since = state.lack = None
-        streams: list[InputStream | OutputStream] = [*self._inputs.values(), *self._outputs.values()]
-        for stream in streams:
+        for stream in self._streams():
             try:
                 stream.rejoin(session, own_ids)
             except (ValueError, zenoh.ZError) as error:
@@ -374,8 +372,7 @@ class TaskRelay:
     def _close_all(self) -> None:
         for epoch in sorted(self._slots):
             self._close(epoch)
-        streams: list[InputStream | OutputStream] = [*self._inputs.values(), *self._outputs.values()]
-        for stream in streams:
+        for stream in self._streams():
             stream.close()
         self._inputs.clear()
         self._outputs.clear()
@@ -391,8 +388,7 @@ class TaskRelay:
                 for source in self._inputs.values():
                     source.look_after()
                 sleep(BUSY_S)
-            streams: list[InputStream | OutputStream] = [*self._inputs.values(), *self._outputs.values()]
-            for stream in streams:
+            for stream in self._streams():
                 stream.close()
         finally:
             finish.is_done.set()
@@ -740,15 +736,16 @@ class TaskRelay:
         """The open slots of older epochs, the oldest first."""
         return [self._slots[old] for old in sorted(self._slots) if old < epoch]
 
+    def _streams(self) -> list[InputStream | OutputStream]:
+        return [*self._inputs.values(), *self._outputs.values()]
+
     def _is_still(self) -> bool:
         """Whether no stream has carried anything for a while."""
-        streams: list[InputStream | OutputStream] = [*self._inputs.values(), *self._outputs.values()]
-        return all(stream.is_still for stream in streams) and self._services.is_still
+        return all(stream.is_still for stream in self._streams()) and self._services.is_still
 
     def _is_counted(self) -> bool:
         """True when something may have to be sent (again) without a sample coming in."""
-        streams: list[InputStream | OutputStream] = [*self._inputs.values(), *self._outputs.values()]
-        return any(stream.route.settings.stream_class is not StreamClass.BEST_EFFORT for stream in streams)
+        return any(stream.route.settings.stream_class is not StreamClass.BEST_EFFORT for stream in self._streams())
 
 
 def _replays(slot: Slot) -> bool:
