@@ -16,7 +16,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-from zsched.adapters.host.decision_log import FILE_BYTES, NAME, OLD_NAME
+from zsched.adapters.host.decision_log import FILE_BYTES, NAME, NAMES
 from zsched.clock import wall_ns
 from zsched.commands.common import CliError, Json, print_json, say
 from zsched.commands.doctor import as_json, as_text
@@ -99,7 +99,7 @@ def gathered(scene: Scene, journal: Journal | None = None) -> Iterator[Member]:
 
 def _decision_logs(folder: Path, secrets: tuple[str, ...]) -> Iterator[Member]:
     """This machine's decision log, for `zsched replay`; the older of its two files is there once one was full."""
-    for name in (OLD_NAME, NAME):
+    for name in NAMES:
         try:
             text = read_regular(folder / name, 2 * FILE_BYTES, is_own=True).decode("utf-8", errors="replace")
         except FileNotFoundError as error:

@@ -57,7 +57,7 @@ COPY_NAME: Final = "copied"
 """In the state folder: the hash of the fleet file that was written as a copy of the document."""
 NEXT_CELL: Final = "next-cell"
 """In the state folder, while the machine changes cells: private keys are in it, and only its owner may read it."""
-LOGS: Final = (decision_log.OLD_NAME, decision_log.NAME)
+LOGS: Final = decision_log.NAMES
 """They go with the fleet of which they tell: tasks and epochs of the next one may have the same names and numbers."""
 PUBLIC_MODE, PRIVATE_MODE, FOLDER_MODE = 0o644, 0o600, 0o755
 _WHAT: Final = {
@@ -223,8 +223,7 @@ def is_of_a_later_key(invitation: Invitation, places: Places) -> bool:
     own = b""
     with contextlib.suppress(OSError):
         own = read_regular(Path(fleet.security.folder) / CERTIFICATE, MAX_FILE_BYTES)
-    names = [parse_common_name(_named(pem) or "", fleet.name) for pem in (papers.certificate.encode(), own)]
-    offered, held = names
+    offered, held = (parse_common_name(_named(pem) or "", fleet.name) for pem in (papers.certificate.encode(), own))
     if offered is None or held is None or (held.name, held.role) != (offered.name, offered.role):
         return False
     return held.key < offered.key

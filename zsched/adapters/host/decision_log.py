@@ -32,6 +32,7 @@ from zsched.wire.codec import as_plain, from_plain
 
 SCHEMA = "zsched.event/1"
 NAME, OLD_NAME = "decisions.ndjson", "decisions.1.ndjson"
+NAMES = OLD_NAME, NAME
 FILE_BYTES = 2 * 1024 * 1024
 PAGE_BYTES = 512 * 1024
 """One answer tells of at most this much of a file, so that a question keeps a daemon busy for milliseconds only."""
@@ -330,7 +331,7 @@ def read_page(folder: Path, cursor: str, most_bytes: int = PAGE_BYTES) -> tuple[
         OSError: a file cannot be read.
     """
     mark, _, offset_text = cursor.partition(":")
-    found = [path for path in (folder / OLD_NAME, folder / NAME) if path.exists()]
+    found = [path for path in (folder / name for name in NAMES) if path.exists()]
     marks = [str(path.stat().st_ino) for path in found]
     first = marks.index(mark) if mark in marks else 0
     offset = int(offset_text) if mark in marks and offset_text.isdigit() else 0
