@@ -304,7 +304,10 @@ def ask_door(door: Door, request: Json, timeout_s: float = ASK_TIMEOUT_S) -> Jso
 
 
 def _asked(door: Door, request: Json, timeout_s: float) -> Json:
-    """As `ask`; once more where the daemon began again just then, and nothing can have come of the first time."""
+    """As `ask`; once more where nothing can have come of the first time: the daemon may have begun again just then.
+
+    Whether it did is not asked of its mark: one that is quick has taken the mark away before it is looked for.
+    """
     runtime = door.socket.parent
     await_beginners(runtime)
     try:
@@ -312,7 +315,7 @@ def _asked(door: Door, request: Json, timeout_s: float) -> Json:
     except AdapterError as error:
         is_untaken = isinstance(error.__cause__, (ConnectionRefusedError, FileNotFoundError))
         is_safe = is_untaken or (isinstance(error.__cause__, ConnectionError) and request["verb"] in READS)
-        if not (is_safe and any(map(_is_fresh, places.local_marks(runtime)))):
+        if not is_safe:
             raise
     await_beginners(runtime)
     return ask(door.socket, request, timeout_s)
