@@ -14,7 +14,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from support.schemas import faults
-from support.waiting import within
+from support.waiting import until, within
 from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.cli import app
 from zsched.commands.common import CliError
@@ -143,7 +143,7 @@ def test_time_over_exits_with_5_and_names_what_is_missing(daemon: Daemon) -> Non
 
 def test_it_looks_again_until_the_condition_holds(daemon: Daemon) -> None:
     def move() -> None:
-        time.sleep(0.7)
+        until(lambda: len(daemon.asked) > 1, "it looks again")
         daemon.status["tasks"][0]["owner"] = "edge2"
 
     began = time.monotonic()
