@@ -1,4 +1,4 @@
-"""What the benchmarks share: percentiles, result lines, a quiet-machine warning, processes, a robot's application."""
+"""What the benchmarks share: percentiles, result lines, a quiet machine, processes, an application, revisions."""
 
 from __future__ import annotations
 
@@ -9,12 +9,15 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 
 import psutil
 import zenoh
 
 from zsched.core.values.model import NodeId
 from zsched_lab.fleet.testbed import Testbed
+
+REPO = Path(__file__).parents[1]
 
 
 def percentile(values: Sequence[float], share: float) -> float:
@@ -123,3 +126,15 @@ class Pinger:
         """Stop sending."""
         self._stop.set()
         self._thread.join(5)
+
+
+def unpacked(revision: str, folder: Path, *paths: str) -> Path:
+    """This clone as it was at a git revision (only ``paths``, if any), in the new folder ``folder``, which it returns.
+
+    Raises:
+        subprocess.CalledProcessError: there is no such revision or path.
+    """
+    folder.mkdir()
+    archive = subprocess.run(["git", "-C", str(REPO), "archive", revision, *paths], capture_output=True, check=True)
+    subprocess.run(["tar", "-x", "-C", str(folder)], input=archive.stdout, check=True)
+    return folder

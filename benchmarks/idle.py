@@ -36,7 +36,7 @@ from benchmarks.record import progress
 from zsched.core.values.model import NodeId
 from zsched_lab.fleet.limits import NodeLimits, make_limits
 from zsched_lab.fleet.netbed import Netbed, descendants
-from zsched_lab.fleet.netns import INTERFACE, run
+from zsched_lab.fleet.netns import INTERFACE
 from zsched_lab.fleet.testbed import echo_fleet
 
 KIB_PER_MIB = 1024
@@ -144,7 +144,7 @@ def memory(pid: int) -> tuple[float, float]:
 
 def sent(bed: Netbed, node: NodeId) -> tuple[int, int, int, int]:
     """(packets, bytes, local packets, local bytes) that a node has sent."""
-    text = run("nsenter", f"--net=/run/netns/{bed.network.name_of(node)}", "cat", "/proc/net/dev")
+    text = bed.network.run(node, "cat", "/proc/net/dev")
     lines = {name.strip(): words.split() for name, _, words in (line.partition(":") for line in text.splitlines())}
     (outside, local) = lines[INTERFACE], lines["lo"]
     return int(outside[9]), int(outside[8]), int(local[9]), int(local[8])

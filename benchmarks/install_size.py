@@ -16,17 +16,15 @@ import tempfile
 from pathlib import Path
 from typing import Final
 
-HERE: Final = Path(__file__).parents[1]
+from benchmarks.common import unpacked
+
 MIB: Final = 1024 * 1024
 STEP_S: Final = 900.0
 
 
-def run(*command: str | Path, stdin: bytes | None = None) -> bytes:
-    """The output of a command. Raises `subprocess.CalledProcessError`."""
-    done = subprocess.run(
-        [str(part) for part in command], input=stdin, stdout=subprocess.PIPE, timeout=STEP_S, check=True
-    )
-    return done.stdout
+def run(*command: str | Path) -> None:
+    """Run a command. Raises `subprocess.CalledProcessError`."""
+    subprocess.run([str(part) for part in command], stdout=subprocess.DEVNULL, timeout=STEP_S, check=True)
 
 
 def pip(*arguments: str | Path) -> None:
@@ -37,9 +35,7 @@ def pip(*arguments: str | Path) -> None:
 def installed(revision: str, folder: Path) -> tuple[Path, Path]:
     """(wheel, the environment's site-packages) of a revision, built and installed in ``folder``."""
     tree, wheels, environment = folder / "tree", folder / "wheels", folder / "environment"
-    tree.mkdir()
-    run("tar", "-x", "-C", tree, stdin=run("git", "-C", HERE, "archive", revision))
-    pip("wheel", "--no-deps", "-w", wheels, tree)
+    pip("wheel", "--no-deps", "-w", wheels, unpacked(revision, tree))
     (wheel,) = wheels.glob("zsched-*.whl")
     run(sys.executable, "-m", "venv", "--without-pip", environment)
     pip("--python", environment / "bin" / "python", "install", wheel)

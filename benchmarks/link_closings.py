@@ -39,7 +39,7 @@ def ends(bed: TreeBed) -> set[End]:
     """Both ends of every link between nodes that there is now."""
     found = set()
     for node in bed.names:
-        for line in inside(bed, node, "ss", "-Htn", "state", "established").splitlines():
+        for line in bed.network.run(node, "ss", "-Htn", "state", "established").splitlines():
             ours, theirs = line.split()[2:4]
             kind = next((kind for port, kind in KINDS.items() if ours.endswith(port) or theirs.endswith(port)), "")
             if kind and not ours.startswith("127."):
@@ -47,16 +47,11 @@ def ends(bed: TreeBed) -> set[End]:
     return found
 
 
-def inside(bed: TreeBed, node: NodeId, *command: str) -> str:
-    """What a command prints in a node's namespace."""
-    return netns.run("nsenter", f"--net=/run/netns/{bed.network.name_of(node)}", *command)
-
-
 def begin(bed: TreeBed, congestion: str) -> None:
     """Start all, with this congestion control."""
     for node in bed.names:
         if congestion:
-            inside(bed, node, "sh", "-c", f"echo {congestion} > {CONGESTION_FILE}")
+            bed.network.run(node, "sh", "-c", f"echo {congestion} > {CONGESTION_FILE}")
     bed.init()
     bed.start()
     bed.wait_settled(90)

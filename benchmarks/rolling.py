@@ -19,12 +19,11 @@ from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
-from benchmarks.common import machine
+from benchmarks.common import REPO, machine, unpacked
 from zsched.core.values.model import NodeId
 from zsched_lab.fleet.openings import Stream
 from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 
-REPO = Path(__file__).parents[1]
 ROBOTS, EDGES = ("robot1", "robot2"), ("edge1", "edge2")
 OLD = "0+old."
 """Begins the version of the older code."""
@@ -35,9 +34,7 @@ QUIET_S = 2.0
 
 def code_of(ref: str, folder: Path) -> Path:
     """A folder for ``PYTHONPATH`` with the package as it was at a commit."""
-    archive = subprocess.run(["git", "-C", str(REPO), "archive", ref, "zsched"], capture_output=True, check=True)
-    folder.mkdir()
-    subprocess.run(["tar", "-x", "-C", str(folder)], input=archive.stdout, check=True)
+    unpacked(ref, folder, "zsched")
     version = subprocess.run(
         ["git", "-C", str(REPO), "describe", "--always", ref], capture_output=True, text=True, check=True
     ).stdout.strip()

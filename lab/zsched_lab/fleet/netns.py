@@ -155,8 +155,18 @@ class Network:
 
     def wrap(self, name: str, command: Sequence[str | Path]) -> list[str | Path]:
         """``command`` as it must be started to run in a namespace (same pid, dies with the thread that starts it)."""
-        enter = ("nsenter", f"--net=/run/netns/{self.name_of(name)}")
-        return [*enter, "setpriv", "--pdeathsig", "KILL", "--", *command]
+        return [*self._enter(name), "setpriv", "--pdeathsig", "KILL", "--", *command]
+
+    def run(self, name: str, *command: str, text: str = "") -> str:
+        """What a short command prints in a namespace; ``text`` goes into it.
+
+        Raises:
+            NetworkError: it fails, or takes longer than `COMMAND_S`.
+        """
+        return run(*self._enter(name), *command, text=text)
+
+    def _enter(self, name: str) -> tuple[str, str]:
+        return ("nsenter", f"--net=/run/netns/{self.name_of(name)}")
 
     # --- faults ------------------------------------------------------------------------------------------------------
 
@@ -240,7 +250,7 @@ class Network:
         for chain, hook in (("in", "input"), ("out", "output")):
             lines.append(f"add chain inet zsched c_{chain} {{ type filter hook {hook} priority 0; policy accept; }}")
         lines += [f"add rule inet zsched c_{rule}" for rule in rules]
-        run("nsenter", f"--net=/run/netns/{self.name_of(name)}", "nft", "-f", "-", text="\n".join(lines) + "\n")
+        self.run(name, "nft", "-f", "-", text="\n".join(lines) + "\n")
 
     # --- end ---------------------------------------------------------------------------------------------------------
 
