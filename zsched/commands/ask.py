@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from zsched import paths as places
 from zsched.adapters.host.operator_client import ask
 from zsched.clock import wall_s
-from zsched.commands.common import CliError, Json, nearest
+from zsched.commands.common import CliError, Json, check_name, nearest
 from zsched.core.values.struct import Struct, replace
 from zsched.core.values.words import NAME
 from zsched.errors import AdapterError, WireError
@@ -88,8 +88,8 @@ def find_door(
     if connect is None and node is not None and "/" in node:
         return _door_of_cell(runtime_dir, node, env)
     if connect is not None:
-        if node is not None and not NAME.fullmatch(node):
-            raise CliError(EXIT_USAGE, f"--node: {node!r} is not a name")
+        if node is not None:
+            check_name(node, "--node")
         return Door(socket=Path(), node=node, endpoint=endpoint_of(connect))
     runtime = places.asked_folder(runtime_dir, env)
     await_beginners(runtime)

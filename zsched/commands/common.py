@@ -16,7 +16,7 @@ from typing import Any, Final, TextIO
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from zsched.core.values.words import MAX_ASKED
+from zsched.core.values.words import A_NAME, MAX_ASKED, NAME
 from zsched.errors import AdapterError, ConfigError, ZschedError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE
 from zsched.screen import fitted
@@ -244,6 +244,13 @@ def says_yes(question: str, stream: TextIO) -> bool:
     stream.write(f"{fitted(question, stream, 0)} [y/N] ")
     stream.flush()
     return sys.stdin.readline().strip().lower() in ("y", "yes")
+
+
+def check_name(name: str, where: str = "", advice: str = "") -> None:
+    """Raise `CliError` (2) unless ``name``, given by ``where`` (``--node``), may be a node's, a task's or a fleet's."""
+    if NAME.fullmatch(name) is None:
+        said = f"{where}: {name!r} is not a name" if where else f"{name!r} is not a name"
+        raise CliError(EXIT_USAGE, f"{said} ({A_NAME}){'; ' if advice else ''}{advice}")
 
 
 def check_reason(reason: str) -> None:

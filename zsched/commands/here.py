@@ -9,22 +9,17 @@ import os
 from pathlib import Path
 
 from zsched import paths as places
-from zsched.commands.common import CliError
+from zsched.commands.common import CliError, check_name
 from zsched.config.reader import MAX_FILE_BYTES
-from zsched.core.values.words import NAME
-from zsched.exits import EXIT_CONFIG, EXIT_USAGE
+from zsched.exits import EXIT_CONFIG
 from zsched.files import owner_of, read_regular
 
 
 def own_name(given: str | None) -> str:
     """This node's name. Raises `CliError` (2) when it is no name."""
     name = places.node_name(given, os.environ)
-    if NAME.fullmatch(name) is None:
-        where = "--node" if given else "ZSCHED_NODE" if os.environ.get("ZSCHED_NODE") else "the host name"
-        raise CliError(
-            EXIT_USAGE,
-            f"{where}: {name!r} is not a name ([a-z0-9][a-z0-9_-]{{0,62}}); give the fleet file's with --node",
-        )
+    where = "--node" if given else "ZSCHED_NODE" if os.environ.get("ZSCHED_NODE") else "the host name"
+    check_name(name, where, "give the fleet file's with --node")
     return name
 
 

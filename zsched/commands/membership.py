@@ -19,7 +19,7 @@ from typing import Final
 from zsched import paths as places
 from zsched.commands.apply import ApplyView, apply
 from zsched.commands.ask import CONTROL_PORT, Door, ask_door
-from zsched.commands.common import CliError, Json, nearest, print_json, say, warn
+from zsched.commands.common import CliError, Json, check_name, nearest, print_json, say, warn
 from zsched.commands.document import InForce, document_text, in_force, status_of
 from zsched.commands.entries import DOCUMENT, HERE
 from zsched.commands.papers import (
@@ -39,7 +39,6 @@ from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet, NodeSpec, dial_endpoint
 from zsched.core.values.model import NodeId, NodeKind
 from zsched.core.values.struct import Struct
-from zsched.core.values.words import NAME
 from zsched.errors import WireError, ZschedError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
 from zsched.files import read_regular
@@ -194,10 +193,8 @@ def create(view: CreateView) -> int:
         AdapterError: the machine belongs to a fleet already, or a file cannot be written.
         ConfigError: what comes of the options is no good fleet file.
     """
-    if NAME.fullmatch(view.fleet) is None:
-        raise CliError(EXIT_USAGE, f"{view.fleet!r} is not a name ([a-z0-9][a-z0-9_-]{{0,62}})")
-    if NAME.fullmatch(view.node) is None:
-        raise CliError(EXIT_USAGE, f"--node: {view.node!r} is not a name ([a-z0-9][a-z0-9_-]{{0,62}})")
+    check_name(view.fleet)
+    check_name(view.node, "--node")
     host = own_address() if view.address is None else ""
     if view.address is None and not host:
         raise CliError(EXIT_FAILED, "this machine has no address in a network: connect it, or give one with --address")
@@ -286,8 +283,7 @@ def invite(door: Door, view: ApplyView, guest: Guest, file: Path | None) -> int:
         CliError, ConfigError: as of `zsched.commands.apply.apply`; or the name is taken, or a task is not there.
         AdapterError: its certificate cannot be made.
     """
-    if NAME.fullmatch(guest.name) is None:
-        raise CliError(EXIT_USAGE, f"{guest.name!r} is not a name ([a-z0-9][a-z0-9_-]{{0,62}})")
+    check_name(guest.name)
     if file is None and sys.stdout.isatty() and not view.is_plan:
         raise CliError(EXIT_USAGE, f"the invitation is a file: zsched invite {guest.name} > {guest.name}.invite")
     held = in_force(door)

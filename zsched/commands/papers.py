@@ -16,11 +16,10 @@ from typing import TYPE_CHECKING, Final
 
 from zsched import paths as places
 from zsched.commands.apply import DANGERS, OPEN_NETWORK
-from zsched.commands.common import CliError, nearest, warn
+from zsched.commands.common import CliError, check_name, nearest, warn
 from zsched.commands.pki import begin_for, former_keys, holds_authority, issue_for, passphrase_for, supersede
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId
-from zsched.core.values.words import NAME
 from zsched.errors import AdapterError
 from zsched.exits import EXIT_FAILED, EXIT_USAGE
 from zsched.files import read_regular
@@ -182,8 +181,7 @@ def ask_for_certificate(name: str, where: Places, out: Path | None) -> tuple[Wri
         CliError: it is no name.
         AdapterError: this machine has a certificate already, or a file cannot be written.
     """
-    if NAME.fullmatch(name) is None:
-        raise CliError(EXIT_USAGE, f"{name!r} is not a name ([a-z0-9][a-z0-9_-]{{0,62}})")
+    check_name(name)
     return request_here(name, where, out or Path(f"{name}.csr"))
 
 

@@ -20,12 +20,11 @@ import typer
 from zsched import paths as places
 from zsched.clock import wall_ns
 from zsched.commands.ask import Door, ask_door, find_door, fleet_here
-from zsched.commands.common import CliError, Json, nearest, print_json, say, warn
+from zsched.commands.common import CliError, Json, check_name, nearest, print_json, say, warn
 from zsched.config.load import load_fleet
 from zsched.core.values.certificates import Holder, Role, parse_common_name, parse_label
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.struct import Struct
-from zsched.core.values.words import NAME
 from zsched.errors import AdapterError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE
 from zsched.files import read_regular
@@ -422,8 +421,7 @@ def _opened(where: Where) -> Iterator[tuple[_Office, Authority]]:
 
 def _check_name(fleet: Fleet, name: str, role: Role) -> tuple[str, ...]:
     """At which addresses the holder is dialled, by the fleet file."""
-    if not NAME.fullmatch(name):
-        raise CliError(EXIT_USAGE, f"{name!r} is no name: lower-case letters, digits, '-' and '_', at most 63")
+    check_name(name)
     nodes = {node.name: node for node in fleet.nodes}
     if role is Role.NODE and name not in nodes:
         hint = nearest(name, sorted(nodes))

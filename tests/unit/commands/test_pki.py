@@ -89,7 +89,7 @@ def test_names_that_the_fleet_file_does_not_fit_are_refused_or_told(here: Path) 
     pki("init")
     assert "did you mean robot1?; for people: --role operator" in pki("issue", "robt1", code=2).stderr
     assert "'robot1' is a node" in pki("issue", "robot1", "--role", "guest", code=2).stderr
-    assert "is no name" in pki("issue", "Ana", "--role", "guest", code=2).stderr
+    assert "is not a name" in pki("issue", "Ana", "--role", "guest", code=2).stderr
     assert "write bob under `security: {guests: [...]}`" in pki("issue", "bob", "--role", "guest").stdout
     assert "there is no authority" in pki("show", "--authority", str(here / "none"), code=1).stderr
 

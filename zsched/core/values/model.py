@@ -17,7 +17,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
 from zsched.core.values.struct import Struct
-from zsched.core.values.words import MAX_ASKED, MAX_ASKER, NAME, PAPER_METRICS, Readings, check_range
+from zsched.core.values.words import A_NAME, MAX_ASKED, MAX_ASKER, NAME, PAPER_METRICS, Readings, check_range
 
 NodeId = str
 """A node's name: ``[a-z0-9][a-z0-9_-]{0,62}``, unique in the fleet."""
@@ -43,7 +43,7 @@ def as_reason(text: str, longest: int = MAX_REASON) -> str:
 def check_name(field: str, value: str) -> None:
     """Raise `ValueError` unless ``value`` is a valid node, task or fleet name."""
     if NAME.fullmatch(value) is None:
-        raise ValueError(f"{field}: {value!r} is not a name ([a-z0-9][a-z0-9_-]{{0,62}})")
+        raise ValueError(f"{field}: {value!r} is not a name ({A_NAME})")
 
 
 def check_readings(field: str, readings: Readings, low: float = -MAX_READING, high: float = MAX_READING) -> None:

@@ -15,6 +15,8 @@ Readings = tuple[tuple[GaugeName, float], ...]
 
 NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}")
 """Of a node, a task or a fleet."""
+A_NAME = "lower-case letters, digits, '-' and '_', at most 63, the first a letter or a digit"
+"""`NAME` in words."""
 MAX_ASKER, MAX_ASKED = 96, 200
 """Characters of an operator's name and reason: they travel with every ballot of a task."""
 PAPER_METRICS = ("cpu", "memory", "network")
