@@ -165,8 +165,8 @@ class Fork:
             if number in {signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP}:
                 return UNJUDGED, ""
             return (TIMEOUT, "") if number == signal.SIGPROF else (KILLED, f"signal {number}")
-        if not text:
-            return KILLED, "the process broke down"
+        if not text:  # an exception in the tests or in a schedule has said so: this one is of the tool
+            return UNJUDGED, ""
         return (KILLED, text.strip()) if text.strip() != "-" else (SURVIVED, "")
 
 
@@ -258,6 +258,8 @@ def reach_of(session: pytest.Session, file: Path, at_import: list[str], jobs: in
         whole.at_import = at_import
         whole.save(file)
     reach = Reach(**json.loads(file.read_text(encoding="utf-8")))
+    if not any(reach.functions.values()):
+        raise SystemExit(f"no test reaches the core, by {file}: the measurement is broken")
     for test in reach.broken:
         print(f"fails without any mutant, left out: {test}", flush=True)
     return reach
@@ -299,7 +301,7 @@ def try_all(
                 key=mutant.key, path=mutant.path, text=str(mutant), verdict=verdict, found_by=found_by, seconds=seconds
             )
             if verdict == UNJUDGED:
-                print(f"not judged within {LONGEST_S:g} s, or ended by somebody: {mutant}", flush=True)
+                print(f"not judged within {LONGEST_S:g} s, ended by somebody, or broken down: {mutant}", flush=True)
                 continue
             results.take(one)
             reach.learn(mutant, found_by)

@@ -129,6 +129,7 @@ def test_survivors_are_tried_again_and_the_others_keep_their_verdicts(tmp_path: 
         ("", signal.SIGKILL, UNJUDGED),
         ("", signal.SIGTERM, UNJUDGED),
         ("", signal.SIGSEGV, KILLED),
+        ("", 0, UNJUDGED),
         ("-", 0, SURVIVED),
         ("tests/a.py::test_b", 0, KILLED),
     ],
@@ -158,11 +159,14 @@ def test_what_found_a_mutant_is_tried_first_at_the_next_one_of_its_function() ->
     assert reach.chosen(second) == ["slow", "quick"]
 
 
-def run(tmp_path: Path, tests: Path, *mutants: Mutant) -> str:
-    """The command on the line of one mutant, with tests of our own."""
+def run(tmp_path: Path, tests: Path, *given: Mutant | str) -> str:
+    """The command on the lines of mutants, our own tests, and more options; what lives is frozen, as in the suite."""
+    (tmp_path / "conftest.py").write_text("import gc\ndef pytest_collection_finish():\n    gc.freeze()\n")
+    mutants = [one for one in given if isinstance(one, Mutant)]
     lines = sorted({f"{one.path}:{one.line}" for one in mutants})
     words = [word for line in lines for word in ("--module", line)]
     command = [sys.executable, "-m", "zsched_lab.bugs.mutate", *words, "--mutants", "50", "--tests", str(tests)]
+    command += [one for one in given if isinstance(one, str)]
     done = subprocess.run(
         command,
         cwd=ROOT,
@@ -177,7 +181,7 @@ def run(tmp_path: Path, tests: Path, *mutants: Mutant) -> str:
 
 
 def test_the_command_plants_into_functions_and_into_what_the_import_runs(tmp_path: Path) -> None:
-    """Both ways: `majority` is called, `EARLY_FAILURE_S` is made at the import; an empty test finds neither."""
+    """Both ways: `majority` is called, `EARLY_FAILURE_S` is made at the import."""
     quorum, damping = (
         mutants_of(f"zsched.core.{name}".replace("/", "."), (CORE / f"{name}.py").read_text(encoding="utf-8"))
         for name in ("values/quorum", "scheduler/damping")
@@ -195,5 +199,15 @@ def test_the_command_plants_into_functions_and_into_what_the_import_runs(tmp_pat
         encoding="utf-8",
     )
     text = run(tmp_path, good, found[0], made[0])
-    assert "survived:" not in text
+    assert "survived (" not in text
     assert " 100.0 %" in text
+
+
+def test_a_test_that_looks_away_finds_nothing(tmp_path: Path) -> None:
+    source = (CORE / "values/quorum.py").read_text(encoding="utf-8")
+    one = next(one for one in mutants_of("zsched.core.values.quorum", source) if one.function == "=majority")
+    weak = tmp_path / "test_weak.py"
+    weak.write_text("from zsched.core.values.quorum import majority\ndef test_majority():\n    majority(3)\n")
+    text = run(tmp_path, weak, one, "--schedules", "0")
+    assert "survived (" in text
+    assert " 100.0 %" not in text
