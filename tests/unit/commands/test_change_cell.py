@@ -522,6 +522,7 @@ def test_a_cell_that_does_not_name_it_any_more_takes_nothing_from_it(
     site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(change_cell, "LONG_S", 0.0)
+    monkeypatch.setattr(change_cell, "REACH_S", 2.0)
     there, here = site.cells["hall-b"], site.cells["hall-a"]
     there.text = B.replace("tasks:", f"  {ME}: {{kind: robot}}\ntasks:")
     invitation = membership_invitation(tmp_path)
