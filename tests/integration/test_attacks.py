@@ -26,7 +26,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from support.authorities import install, make_authority
 from support.waiting import free_endpoint, until
 from zsched.adapters.network.control_bus import ControlBus
-from zsched.adapters.network.limits import limit_for
+from zsched.adapters.network.limits import Limit, limit_for
 from zsched.config.load import check_file
 from zsched.core import events as ev
 from zsched.core.values.certificates import Role
@@ -62,6 +62,9 @@ REFUSED_S = 0.4
 """Who is let in is so within some milliseconds; zenoh tries again until this time is over."""
 ANSWER_S = 0.5
 TOKENS = 5000
+FLOOD = 60
+"""Questions."""
+VOTES = {"utility/rate", "register/rate"}
 SHORT_S = 3
 """So long a certificate lives that shall end: long enough for a handshake on a busy machine."""
 
@@ -330,7 +333,9 @@ def test_who_is_dialled_because_a_member_named_its_address_says_and_hears_nothin
 
 
 @contextlib.contextmanager
-def _bus(yard: Yard, *, has_rules: bool = True) -> Iterator[tuple[ControlBus, Victim, list[ev.Event]]]:
+def _bus(
+    yard: Yard, *, has_rules: bool = True, limit: Limit | None = None
+) -> Iterator[tuple[ControlBus, Victim, list[ev.Event]]]:
     """A daemon's control session, as robot1; where it listens; what it tells."""
     endpoint = free_endpoint().replace("tcp/", "tls/")
     config = json.loads(yard.text("robot1", listen=(endpoint,)))
@@ -345,7 +350,7 @@ def _bus(yard: Yard, *, has_rules: bool = True) -> Iterator[tuple[ControlBus, Vi
         zenoh_config=json.dumps(config),
         post=events.append,
         members=common_names_of(fleet, fleet.security),
-        limit=limit_for(fleet.timing, 1),
+        limit=limit or limit_for(fleet.timing, 1),
         names=names_of(fleet),
     )
     bus.open()
@@ -470,6 +475,22 @@ def test_a_member_that_asks_in_anothers_name_is_not_answered(fresh: Yard, questi
         assert not list(session.get(question("robot1", "edge1"), timeout=ANSWER_S))
         until(lambda: list(session.get(question("robot1", "robot2"), timeout=ANSWER_S)), "its own question's answer")
     assert set(fresh.control.asked) == {question("robot1", "robot2")}
+
+
+def test_questions_for_the_status_in_anothers_name_leave_its_votes_their_room(fresh: Yard) -> None:
+    """A node passes such questions on, so they may bear any name: a flood of them must not silence that name's votes."""
+    limit = Limit(hz=0.01, burst=FLOOD / 2)
+    with _bus(fresh, limit=limit) as (bus, victim, events), fresh.member("robot2", victim) as flood:
+        for _ in range(FLOOD):
+            flood.get(KEYS.status("robot1", "edge1"), lambda _: None, timeout=ANSWER_S)
+        until(lambda: "status/rate" in _dropped(bus, events), "the flood to be counted")
+        with fresh.member("edge1", victim) as session:
+            session.get(KEYS.utility("robot1", "edge1"), lambda _: None, timeout=ANSWER_S)
+            until(
+                lambda: any(isinstance(event, ev.UtilityAsked) for event in events) or _dropped(bus, events) & VOTES,
+                "the other member's own question",
+            )
+            assert not _dropped(bus, events) & VOTES
 
 
 def test_a_member_that_answers_for_another_is_not_believed(fresh: Yard) -> None:

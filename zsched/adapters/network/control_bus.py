@@ -90,8 +90,8 @@ _PUTS: dict[str, type[Beat | Profile | Proposal | Learnt]] = {
     "proposal": Proposal,
     "allocation": Learnt,
 }
-_LIMITED = ("put", "question", "answer", "token")
-"""A peer has a bucket for each of these."""
+_LIMITED = ("put", "question", "status", "answer", "token")
+"""A peer has a bucket for each of these. Nodes pass questions for the status on, so any node may ask in any name."""
 _QUESTIONS = frozenset({"utility", "register", "allocation", "document", "status", "command"})
 
 
@@ -379,7 +379,7 @@ class ControlBus:
         chunks = str(query.key_expr).split("/")
         kind, asker = chunks[2] if len(chunks) > 2 else "", chunks[-1]
         told = kind if kind in _QUESTIONS else "key"
-        if not self._is_let_in("question", told, asker):
+        if not self._is_let_in("status" if kind == "status" else "question", told, asker):
             query.drop()
             return
         try:
