@@ -174,13 +174,13 @@ def _stream_keys(fleet: Fleet, node: NodeSpec) -> tuple[list[str], list[str]]:
     asks: list[str] = []
     for task in fleet.tasks:
         for rule in task.rules:
-            spoken, asked = _keys_of(task, rule, node)
+            spoken, asked = _keys_of(fleet, task, rule, node)
             speaks += spoken
             asks += asked
     return list(dict.fromkeys(speaks)), list(dict.fromkeys(asks))
 
 
-def _keys_of(task: TaskSpec, rule: StreamRule, node: NodeSpec) -> tuple[list[str], list[str]]:
+def _keys_of(fleet: Fleet, task: TaskSpec, rule: StreamRule, node: NodeSpec) -> tuple[list[str], list[str]]:
     here = {"robot": node.name, "node": node.name, "task": task.name}
     there = {"target": node.name, "task": task.name}
     inner = rule.to_template if rule.direction is not Direction.OUTPUT else rule.from_template
@@ -188,12 +188,27 @@ def _keys_of(task: TaskSpec, rule: StreamRule, node: NodeSpec) -> tuple[list[str
     speaks: list[str] = []
     asks: list[str] = []
     if node.kind is NodeKind.ROBOT:
+        owners = [one.name for one in fleet.nodes if runs_worker(task, one.name, one.kind)]
+        towards = _opened(inner, ("target",), owners, here)
         if node.local is None:  # else its applications are on a network of their own, whatever keys they have there
             speaks.append(widened(outer, **here))
             asks.append(widened(outer, **here))
-        asks.append(widened(inner, **here))
+        asks += towards
         if rule.direction is Direction.INPUT:
-            speaks.append(widened(inner, **here))
+            speaks += towards
     if rule.direction is not Direction.INPUT and runs_worker(task, node.name, node.kind):
-        speaks.append(widened(inner, **there))
+        robots = [one.name for one in fleet.nodes if one.kind is NodeKind.ROBOT]
+        speaks += _opened(inner, ("robot", "node"), robots, there)
     return speaks, asks
+
+
+def _opened(template: str, free: tuple[str, ...], names: Iterable[str], known: dict[str, str]) -> list[str]:
+    """The keys of a template for all ``names`` in the place of its ``free`` placeholders.
+
+    One that is a chunk by itself stays open. Beside other text it would also stand for the rest of a longer name:
+    ``robot1_*`` is a key of ``robot1_b``, too.
+    """
+    braces = [f"{{{name}}}" for name in free]
+    if not any(brace in chunk and chunk != brace for chunk in template.split("/") for brace in braces):
+        return [widened(template, **known)]
+    return [widened(template, **known, **dict.fromkeys(free, name)) for name in names]

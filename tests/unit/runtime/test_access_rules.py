@@ -156,6 +156,34 @@ def test_what_stays_on_a_robot_s_local_side_gives_it_no_right_among_the_others()
     assert may(Side.DATA, "edge1", "ingress", "put", "edge1/merge/7/robot1/out", text)
 
 
+def test_a_name_that_begins_like_another_gives_no_right_to_that_ones_keys() -> None:
+    """Where a rule joins two names in one chunk, ``robot1_*`` would be robot1_b's key, too."""
+    text = TEXT.replace("robot2", "robot1_b").replace("edge2", "edge1_b").replace("[edge1]", "[edge1, edge1_b]")
+    for own, joined in (
+        ("{target}/merge/{robot}/map/**", "m/{robot}_{target}/**"),
+        ("{target}/merge/{epoch}/{robot}/out", "m/{target}_{robot}/{epoch}/out"),
+        ("{target}/merge/{robot}/plan", "p/{robot}_{target}"),
+    ):
+        text = text.replace(own, joined)
+
+    def speaks(who: str, key: str, message: str = "put") -> bool:
+        return may(Side.DATA, who, "ingress", message, key, text)
+
+    for robot in ("robot1", "robot1_b.k2"):
+        name = robot.partition(".")[0]
+        assert speaks(robot, f"m/{name}_edge1/a")
+        assert speaks(robot, f"m/{name}_edge1_b/a")
+        assert speaks(robot, f"p/{name}_edge1", "query")
+    for edge in ("edge1", "edge1_b"):
+        assert speaks(edge, f"m/{edge}_robot1/7/out")
+        assert speaks(edge, f"m/{edge}_robot1_b/7/out")
+        assert speaks(edge, f"p/robot1_b_{edge}", "reply")
+    assert not speaks("robot1", "m/robot1_b_edge1/a")
+    assert not speaks("robot1", "p/robot1_b_edge1", "query")
+    assert not speaks("edge1", "m/edge1_b_robot1/7/out")
+    assert not speaks("edge1_b", "p/robot1_edge1", "reply")
+
+
 def test_a_workers_words_are_of_its_own_node() -> None:
     for message, key in (
         ("liveliness_token", KEYS.worker("edge1", "merge", 1)),
