@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import socket
 import threading
 import time
 from collections import Counter
@@ -65,6 +66,9 @@ TOKENS = 5000
 FLOOD = 60
 """Questions."""
 VOTES = {"utility/rate", "register/rate"}
+THIN_BYTES_S, LARGE_BYTES = 50_000.0, 16_000
+MOST_HELD_UP_S = 1.5
+"""Of a put: 0.3 s, and what a busy machine adds."""
 SHORT_S = 3
 """So long a certificate lives that shall end: long enough for a handshake on a busy machine."""
 
@@ -478,7 +482,7 @@ def test_a_member_that_asks_in_anothers_name_is_not_answered(fresh: Yard, questi
 
 
 def test_questions_for_the_status_in_anothers_name_leave_its_votes_their_room(fresh: Yard) -> None:
-    """A node passes such questions on, so they may bear any name: a flood of them must not silence that name's votes."""
+    """A node passes such questions on, so they may bear any name: a flood must not silence that name's votes."""
     limit = Limit(hz=0.01, burst=FLOOD / 2)
     with _bus(fresh, limit=limit) as (bus, victim, events), fresh.member("robot2", victim) as flood:
         for _ in range(FLOOD):
@@ -616,6 +620,89 @@ def test_who_is_no_node_says_and_answers_nothing_under_any_key(fresh: Yard, who:
         session.put(OWN[which], b"own")
         until(lambda: OWN[which] in victim.heard, "a member's own frame")
     assert (victim.heard, victim.tokens, victim.asked) == ([OWN[which]], [], [])
+
+
+@contextlib.contextmanager
+def _thin(endpoint: str, is_thin: threading.Event) -> Iterator[str]:
+    """A way to an endpoint that carries `THIN_BYTES_S` of what comes back, once it is thin."""
+    host, _, port = endpoint.partition("/")[2].rpartition(":")
+    with socket.create_server(("127.0.0.1", 0)) as listener, contextlib.ExitStack() as stack:
+        is_over = threading.Event()
+
+        def there(near: socket.socket, far: socket.socket) -> None:
+            with contextlib.suppress(OSError):
+                while data := near.recv(65536):
+                    far.sendall(data)
+
+        def back(near: socket.socket, far: socket.socket) -> None:
+            with contextlib.suppress(OSError):
+                while data := far.recv(1024 if is_thin.is_set() else 65536):
+                    near.sendall(data)
+                    if is_thin.is_set():
+                        is_over.wait(len(data) / THIN_BYTES_S)
+            for end in (near, far):
+                with contextlib.suppress(OSError):
+                    end.shutdown(socket.SHUT_RDWR)
+
+        def serve() -> None:
+            with contextlib.suppress(OSError):
+                while True:
+                    near = stack.enter_context(listener.accept()[0])
+                    far = stack.enter_context(socket.create_connection((host, int(port))))
+                    for way in (there, back):
+                        threading.Thread(target=way, args=(near, far), daemon=True).start()
+
+        threading.Thread(target=serve, daemon=True).start()
+        yield f"tls/127.0.0.1:{listener.getsockname()[1]}"
+        is_over.set()
+        listener.shutdown(socket.SHUT_RDWR)
+
+
+@pytest.mark.parametrize("who", ["screen", "ana"])
+def test_who_only_looks_and_reads_too_slowly_holds_no_stream_up(fresh: Yard, who: str) -> None:
+    """A `reliable` input waits for each receiver; the guest shows that it lives, and takes little."""
+    endpoint, told, got = free_endpoint().replace("tcp/", "tls/"), list[str](), list[float]()
+    make = zenoh_config.data_config
+    text = make(listen=(endpoint,), connect=(), operator_json5=session_text(fresh.fleet("robot1"), Side.DATA))
+    members, is_thin = members_of(text), threading.Event()
+    assert members is not None
+    with contextlib.ExitStack() as stack:
+        session = stack.enter_context(zenoh.open(zenoh.Config.from_json5(text)))
+        expulsion = Expulsion(session, "yard", members, told.append, has_streams=True)
+        stack.callback(expulsion.close)
+        victim = Victim(session, endpoint.partition("#")[0])
+        owner = stack.enter_context(fresh.member("edge1", victim))
+        owner.declare_subscriber("edge1/merge/robot1/in", lambda _: got.append(time.monotonic()))
+        thin = Victim(session, stack.enter_context(_thin(victim.endpoint, is_thin)))
+        slow = stack.enter_context(fresh.session(thin, fresh.tls(who)))
+        seen = threading.Event()
+        slow.declare_subscriber("**", lambda _: seen.set())
+        way = session.declare_publisher(
+            "edge1/merge/robot1/in",
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            reliability=zenoh.Reliability.RELIABLE,
+        )
+
+        def put_until(is_done: Callable[[], object], deadline_s: float = 20.0) -> float:
+            """The longest put, in seconds."""
+            longest, end = 0.0, time.monotonic() + deadline_s
+            while not is_done():
+                assert time.monotonic() < end
+                began = time.monotonic()
+                way.put(bytes(LARGE_BYTES))
+                longest = max(longest, time.monotonic() - began)
+                time.sleep(0.005)  # the rate of a stream
+            return longest
+
+        put_until(lambda: seen.is_set() and got)
+        assert not told, "who reads quickly stays"
+        is_thin.set()
+        longest = put_until(lambda: "slow" in told)
+        assert longest < MOST_HELD_UP_S
+        before = len(got)
+        longest = put_until(lambda: len(got) > before + 500)
+        assert longest < MOST_HELD_UP_S, "it is shut out for a while"
+        assert told.count("slow") == 1
 
 
 def test_an_operator_commands_in_its_own_name(fresh: Yard) -> None:

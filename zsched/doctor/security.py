@@ -37,6 +37,8 @@ REFUSED: Final = {
     "dropped_link_too_many": "links of a certificate with too many sessions",
     "dropped_link_shut_out": "links of a node that had shown too many tokens",
     "dropped_data_link_stranger": "links to the relay of a certificate that is not let in",
+    "dropped_data_link_slow": "links to the relay of a guest or operator who reads too slowly",
+    "dropped_data_link_shut_out": "links to the relay of one who had read too slowly",
     "dropped_data_link_too_many": "links to the relay of a certificate with too many sessions",
     "dropped_alive_too_many": "tokens of a node that shows too many",
 }

@@ -254,7 +254,7 @@ class RelayProcess:
     def _expel_from(self, session: zenoh.Session, members: frozenset[str] | None) -> Expulsion | None:
         if members is None:
             return None
-        return Expulsion(session, self._fleet, members, self._refuse, MAX_DATA_SESSIONS)
+        return Expulsion(session, self._fleet, members, self._refuse, MAX_DATA_SESSIONS, has_streams=True)
 
     def _refuse(self, why: Refusal) -> None:
         with self._counting:

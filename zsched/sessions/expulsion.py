@@ -1,8 +1,11 @@
-"""Ends links whose other end may say nothing here, or shows more tokens or has more sessions than a node needs.
+"""Ends links whose other end may say nothing here, has more tokens or sessions than it needs, or looks on too slowly.
 
 zenoh keeps each key and token that comes by a link until the link ends, and the time for one grows with their number;
 no access rule forbids the keys. So what ends is the link. Whoever dialled it dials again at once, 40 times a second,
 each time with a handshake. So a link is *held* first: zenoh reads nothing more of it, and it ends after `HOLD_S`.
+
+A put that must not lose anything waits for each receiver. Nodes are waited for, since what they do is what the streams
+are for; who only looks is not.
 
 Knows: which certificate is at the other end of a link, who is let in, how many tokens each node shows. Does not know:
 access rules, what tokens mean.
@@ -24,7 +27,7 @@ import zenoh
 from zsched.clock import monotonic_s
 from zsched.core.values.certificates import Role, parse_common_name
 from zsched.guard import guarded, tolerant
-from zsched.sessions.link_sockets import LinkSocket, LinkSockets
+from zsched.sessions.link_sockets import LinkSocket, LinkSockets, with_room
 
 MAX_SHOWN: Final = 64
 """Tokens of one node: it has one for each of its lives, and of those that have ended some may not be gone yet."""
@@ -38,6 +41,9 @@ HOLD_S: Final = 0.8
 """A link that is held reads nothing, so zenoh ends it itself after its lease (1 s or more)."""
 MAX_HELD: Final = 16
 """More are ended at once: what has come by a link that is held waits in the kernel, up to some MiB."""
+SLOW_S: Final = 0.3
+"""So much longer without room than with it, and the link of one who only looks ends."""
+SLOW_LOOK_S: Final = 0.05
 LOOK_AGAIN_S: Final = 0.05
 LOOKS: Final = 10
 """A link is told of before it is in zenoh's list."""
@@ -51,7 +57,8 @@ class Refusal(StrEnum):
 
     STRANGER = "stranger"  # its certificate is not let in
     TOO_MANY = "too_many"  # its certificate has too many sessions here
-    SHUT_OUT = "shut_out"  # its node has just shown too many tokens
+    SHUT_OUT = "shut_out"  # its holder has just shown too many tokens, or was too slow
+    SLOW = "slow"  # it only looks, and takes what it reads too slowly
 
 
 def members_of(config: str) -> frozenset[str] | None:
@@ -73,14 +80,18 @@ class Expulsion:
         members: Iterable[str],
         tell: Callable[[Refusal], None],
         max_sessions: int | None = None,
+        *,
+        has_streams: bool = False,
     ) -> None:
         """Look at every link from now on.
 
         ``members``: common names that are let in; each has at most ``max_sessions`` (`MAX_SESSIONS`).
-        ``tell`` hears of each link that is refused, in zenoh's threads. Nothing runs before the first one.
+        ``tell`` hears of each link that is refused, in zenoh's threads and ours. ``has_streams``: guests and operators
+        must read quickly. Nothing runs before the first of them, or the first link that is refused.
         """
         self._session, self._fleet, self._members, self._tell = session, fleet, frozenset(members), tell
         self._max_sessions = MAX_SESSIONS if max_sessions is None else max_sessions
+        self._has_streams = has_streams
         self._sockets = LinkSockets(session)
         self._queue: queue.Queue[Callable[[zenoh.Link], bool] | None] = queue.Queue(MAX_WAITING)
         self._lock = threading.Lock()
@@ -90,18 +101,23 @@ class Expulsion:
         self._shown: dict[str, int] = {}
         """{node: tokens}; whoever shows one in a node's name has its certificate."""
         self._shut_out: dict[str, float] = {}
-        """{node that has shown too many: until when}."""
+        """{holder that has shown too many, or was too slow: until when}."""
+        self._lookers: dict[str, str] = {}
+        """{session: its holder, who is no node}, with streams; those that are shut out, too, while they are held."""
+        self._slow: dict[LinkSocket, float] = {}
+        """{its link: how much longer it has been without room than with it}; the thread's own."""
+        self._looked_at = 0.0
         self._linked: dict[str, set[str]] = {}
         """{common name: its sessions}."""
         self._names: dict[str, str] = {}
         """{session that is let in: its common name}."""
+        self._is_closed = False
         self._watch = session.info.declare_link_events_listener(tolerant(self._on_link, "link"), history=True)
 
     def close(self) -> None:
         """Look at nothing more; the session may be closed already."""
-        with self._lock:
-            if self._thread is not None:
-                self._put(None)
+        self._is_closed = True
+        self._put(None)
 
     def shows(self, node: str, *, is_present: bool) -> bool:
         """A token of a node came or went; ``False``: it shows too many, and its links are ended."""
@@ -137,6 +153,8 @@ class Expulsion:
         )
         if name in self._members:
             holder = parse_common_name(name, self._fleet)
+            if self._has_streams and holder is not None and holder.role is not Role.NODE:
+                self._look_at(zid, holder.name, is_present=is_present)
             is_shut_out = holder is not None and self._shut_out.get(holder.name, 0.0) > monotonic_s()
             if is_present and is_shut_out:
                 self._refuse(zid, Refusal.SHUT_OUT)
@@ -145,6 +163,14 @@ class Expulsion:
         elif is_present:
             _log.warning("stranger certificate=%r address=%s: it may nothing here", name, event.link.dst)
             self._refuse(zid, Refusal.STRANGER)
+
+    def _look_at(self, zid: str, holder: str, *, is_present: bool) -> None:
+        if not is_present:
+            self._lookers.pop(zid, None)
+            return
+        self._lookers[zid] = holder
+        self._begin()
+        self._put(None)
 
     def _refuse(self, zid: str, why: Refusal) -> None:
         self._tell(why)
@@ -170,11 +196,14 @@ class Expulsion:
         return "" if held is None else held.name
 
     def _end(self, is_meant: Callable[[zenoh.Link], bool]) -> None:
+        self._begin()
+        self._put(is_meant)
+
+    def _begin(self) -> None:
         with self._lock:
             if self._thread is None:
                 self._thread = guarded(self._run, name="expulsion", is_lasting=False)
                 self._thread.start()
-        self._put(is_meant)
 
     def _put(self, is_meant: Callable[[zenoh.Link], bool] | None) -> None:
         try:
@@ -188,18 +217,48 @@ class Expulsion:
         pause = threading.Event()
         while True:
             try:
-                wait_s = max(0.0, min(self._held.values()) - monotonic_s()) if self._held else None
-                is_meant = self._queue.get(timeout=wait_s)
+                is_meant = self._queue.get(timeout=self._wait_s())
             except queue.Empty:
-                self._end_held()
-                continue
-            if is_meant is None:
+                is_meant = None
+            if self._is_closed:
                 return
+            self._end_slow()
+            self._end_held()
+            if is_meant is None:
+                continue
             for _ in range(LOOKS):
                 if self._halt(is_meant):
                     break
                 self._end_held()
+                self._end_slow()
                 pause.wait(LOOK_AGAIN_S)
+
+    def _wait_s(self) -> float | None:
+        due = [self._looked_at + SLOW_LOOK_S] if self._lookers else []
+        due += self._held.values()
+        return max(0.0, min(due) - monotonic_s()) if due else None
+
+    def _end_slow(self) -> None:
+        """Look whether those who only look have room, and end the links of those that have none too often."""
+        lookers, now = dict(self._lookers), monotonic_s()
+        if now - self._looked_at < SLOW_LOOK_S or not (lookers or self._slow):
+            return
+        passed_s, self._looked_at = min(now - self._looked_at, 2 * SLOW_LOOK_S), now
+        try:
+            links = [link for link in self._sockets.links() if link.zid in lookers]
+        except zenoh.ZError:
+            return  # the session closes
+        ready, before, self._slow = with_room(links, 0.0), self._slow, {}
+        for link in links:
+            lacks_s = before.get(link, 0.0) + (-passed_s if link.fd in ready else passed_s)
+            if lacks_s >= SLOW_S:
+                self._shut_out[lookers[link.zid]] = now + SHUT_OUT_S
+                self._held.pop(link, None)
+                self._tell(Refusal.SLOW)
+                if link.abort():
+                    _log.warning("the link to %s is ended: %s reads too slowly", link.name, lookers[link.zid])
+            elif lacks_s > 0.0:
+                self._slow[link] = lacks_s
 
     def _end_held(self) -> None:
         now = monotonic_s()
