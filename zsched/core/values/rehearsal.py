@@ -80,7 +80,7 @@ class KeepRehearsal(Struct, frozen=True, kw_only=True):
         check_name("rehearsal.name", self.name)
         if len(self.told) > MAX_REASON:
             raise ValueError(f"rehearsal.told: {len(self.told)} characters, at most {MAX_REASON}")
-        if len(self.body.encode("utf-8", "surrogatepass")) > MAX_KEPT_BYTES:
+        if len(self.body.encode()) > MAX_KEPT_BYTES:  # half a character is a `ValueError`, too: no file can hold it
             raise ValueError(f"rehearsal.body: larger than {MAX_KEPT_BYTES} bytes")
 
 

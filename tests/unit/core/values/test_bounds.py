@@ -278,3 +278,5 @@ def test_a_rehearsal_keeps_within_its_bounds() -> None:
         replace(keep, body=Text("x" * (MAX_KEPT_BYTES + 1)))
     with pytest.raises(ValueError, match=r"rehearsal\.told: 401 characters"):
         replace(keep, told="x" * 401)
+    with pytest.raises(ValueError, match="surrogates not allowed"):  # JSON may hold one; it cannot be written down
+        replace(keep, body=Text("\ud800"))
