@@ -32,7 +32,8 @@ from zsched.config.load import check_file
 from zsched.core import events as ev
 from zsched.core.values.certificates import Role
 from zsched.core.values.fleet import Fleet
-from zsched.core.values.messages import Learnt
+from zsched.core.values.messages import Learnt, MoveTask
+from zsched.core.values.model import Asked
 from zsched.pki.authority import Authority
 from zsched.runtime.access_rules import Side, common_names_of, names_of
 from zsched.runtime.tls import session_text
@@ -772,3 +773,16 @@ def test_a_p256_key_is_let_in_like_any_other(fresh: Yard) -> None:
     )
     with fresh.member("p256", fresh.control):
         assert fresh.control.links() == {"robot2.yard.zsched.internal"}
+
+
+@pytest.mark.parametrize(("who", "said"), [("ana", "ana.operator"), ("robot2", "eve@robot2")])
+def test_an_order_that_is_not_signed_bears_the_name_of_its_link(fresh: Yard, who: str, said: str) -> None:
+    """With ``signatures: off``, or from an older version: the rules bind the asker's name to the certificate."""
+    order = wire.encode(MoveTask(task="merge", node="edge1", asked=Asked(by="eve@robot1", reason="mine")))
+    with _bus(fresh) as (_, victim, events), fresh.session(victim, fresh.tls(who)) as session:
+
+        def orders() -> list[Asked]:
+            session.get(KEYS.command("robot1", who), lambda _: None, payload=order, timeout=ANSWER_S)
+            return [event.command.asked for event in events if isinstance(event, ev.MoveCommanded)]
+
+        assert until(orders, "the order")[0] == Asked(by=said, reason="mine")
