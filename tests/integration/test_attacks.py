@@ -30,11 +30,13 @@ from zsched.adapters.network.control_bus import ControlBus
 from zsched.adapters.network.limits import Limit, limit_for
 from zsched.config.load import check_file
 from zsched.core import events as ev
+from zsched.core.events import RoleEnded
 from zsched.core.values.certificates import Role
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import Learnt, MoveTask
 from zsched.core.values.model import Asked
 from zsched.pki.authority import Authority
+from zsched.relay import tokens
 from zsched.runtime.access_rules import Side, common_names_of, names_of
 from zsched.runtime.tls import session_text
 from zsched.sessions import config as zenoh_config
@@ -388,6 +390,30 @@ def test_who_shows_thousands_of_tokens_loses_its_link(
     here = Counter(event.node for event in events if isinstance(event, ev.TokenSeen))
     here.subtract(event.node for event in events if isinstance(event, ev.TokenLost))
     assert max(here.values(), default=0) <= MAX_SHOWN
+
+
+def test_tokens_of_one_member_take_no_other_workers_place(fresh: Yard, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A relay remembers so many: were they all one node's, no next owner's worker would be seen to be ready."""
+    monkeypatch.setattr(tokens, "MAX_TOKENS", FLOOD)
+    monkeypatch.setattr(tokens, "MAX_OF_NODE", FLOOD // 2, raising=False)
+    ended = list[RoleEnded]()
+    seen = tokens.Tokens(
+        fresh.data.session, KEYS, lambda _: None, lambda _, role: ended.append(role), wake=lambda: None
+    )
+    with fresh.member("robot2", fresh.data) as flood, fresh.member("edge1", fresh.data) as session:
+        held = [flood.liveliness().declare_token(KEYS.worker("robot2", "merge", number)) for number in range(2 * FLOOD)]
+        until(lambda: len(fresh.data.tokens) == len(held), "the flood")
+        ready = session.liveliness().declare_token(KEYS.worker("edge1", "merge", 1))
+        until(lambda: seen.has_worker("edge1", "merge", "1"), "the worker's token")
+        ready.undeclare()
+        until(lambda: not seen.has_worker("edge1", "merge", "1"), "the worker's token to go")
+        for token in held:
+            token.undeclare()
+        until(lambda: not seen.seen(), "all tokens to go")
+        last = flood.liveliness().declare_token(KEYS.worker("robot2", "merge", 1))
+        until(lambda: seen.has_worker("robot2", "merge", "1"), "its own worker, once there is room")
+        last.undeclare()
+    seen.leave()
 
 
 def test_a_member_has_so_many_sessions_and_no_more(

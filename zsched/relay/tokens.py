@@ -8,6 +8,7 @@ sees the token has also learnt of the subscriptions. (Zenoh's "matching" alone i
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from functools import partial
 
@@ -21,6 +22,8 @@ from zsched.wire.keyspace import Keyspace, counter, parse
 
 MAX_TOKENS = 16_384
 """Tokens that are remembered: a fleet has one or two per worker."""
+MAX_OF_NODE = 1024
+"""...and of one node: its flood must not take the place of other nodes' workers."""
 WORKER = "worker"
 ROLE = "role"
 
@@ -41,6 +44,7 @@ class Tokens:
         self._on_role_ended = on_role_ended
         self._wake = wake
         self._present: frozenset[str] = frozenset()  # replaced whole: readers need no lock
+        self._of_node: Counter[NodeId] = Counter()
         self._sessions = 0
         """How many we have had, so that what an earlier one still says is told apart."""
         self.rejoin(session)
@@ -48,7 +52,7 @@ class Tokens:
     def leave(self) -> None:
         """The session is about to close: what goes with it has not gone."""
         self._sessions += 1
-        self._present = frozenset()
+        self._present, self._of_node = frozenset(), Counter()
 
     def rejoin(self, session: Session) -> None:
         """Watch on this session, with no token to begin with."""
@@ -81,12 +85,15 @@ class Tokens:
             self._note(str(sample.key_expr), is_present=sample.kind == SampleKind.PUT)
 
     def _note(self, key: str, *, is_present: bool) -> None:
-        if is_present and len(self._present) >= MAX_TOKENS:
+        parsed = parse(key)
+        node = "" if parsed is None else parsed.owner
+        if is_present and (len(self._present) >= MAX_TOKENS or self._of_node[node] >= MAX_OF_NODE):
             return
+        if (key in self._present) != is_present:
+            self._of_node[node] += 1 if is_present else -1
         self._present = self._present | {key} if is_present else self._present - {key}
         if (worker := _worker(key, is_present=is_present)) is not None:
             self._on_worker(worker)
-        parsed = parse(key)
         if parsed is not None and parsed.kind == ROLE and len(parsed.rest) == 2 and not is_present:
             task, epoch = parsed.rest
             number = counter(epoch)
