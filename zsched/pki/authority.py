@@ -54,6 +54,8 @@ class Entry(Struct, frozen=True, kw_only=True):
     """The number of the authority that signed it."""
     revoked: int | None = None
     """When the key was revoked; ``None``: it was not."""
+    former: tuple[str, ...] = ()
+    """The same of keys whose place this one took (`Authority.renew` with a request): they are its holder's, too."""
 
     @property
     def holder(self) -> Holder:
@@ -279,13 +281,14 @@ class Authority:
         self, holder: Holder, public: x509.PublicKey, hosts: tuple[str, ...], passphrase: bytes, now: datetime
     ) -> Issued:
         mark = x509.fingerprint(public)
-        other = next(
-            (one for one in self.record.entries if one.fingerprint == mark and one.label != holder.label), None
-        )
+        others = (one for one in self.record.entries if one.label != holder.label)
+        other = next((one for one in others if mark in (one.fingerprint, *one.former)), None)
         if other is not None:
             state = "revoked" if other.revoked is not None else "in use"
             raise AdapterError(f"that key is {other.label}'s and {state}: every holder has a key of its own, make one")
         certificate = x509.sign(self._signer(passphrase), holder, self.record.fleet, public, hosts, now)
+        before = self.record.entry(holder.label)
+        had = () if before is None else (*before.former, before.fingerprint)
         entry = Entry(
             label=holder.label,
             fingerprint=mark,
@@ -294,6 +297,7 @@ class Authority:
             certificate=x509.certificate_pem(certificate).decode(),
             hosts=hosts,
             authority=self.record.number,
+            former=tuple(one for one in had if one != mark),
         )
         self._keep(entry)
         return Issued(entry=entry, certificate=entry.certificate.encode(), trusted=self.trusted)
@@ -400,7 +404,10 @@ def opened(folder: Path, fleet: str) -> Iterator[Authority]:
 def _record(body: dict[str, Any]) -> Record:
     if body["format"] != FORMAT:
         raise ValueError(f"format {body['format']}")
-    entries = tuple(Entry(**{**one, "hosts": tuple(one["hosts"])}) for one in body["entries"])
+    entries = tuple(
+        Entry(**{**one, "hosts": tuple(one["hosts"]), "former": tuple(one.get("former", ()))})
+        for one in body["entries"]
+    )
     trusted = tuple(str(one) for one in body["trusted"])
     return Record(fleet=str(body["fleet"]), number=int(body["number"]), trusted=trusted, entries=entries)
 

@@ -196,6 +196,20 @@ def test_two_holders_never_share_a_key(authority: Authority) -> None:
         issue(authority, request=request)
 
 
+def test_a_key_whose_place_another_took_stays_its_holders(authority: Authority) -> None:
+    """A stolen key does not come back under another name, once its holder has another one and is revoked."""
+    first, second = request_of(made.new_key()), request_of(made.new_key())
+    issue(authority, request=first)
+    authority.renew("robot1", None, second, b"", NOW)
+    with pytest.raises(AdapterError, match="that key is robot1's and in use"):
+        issue(authority, "robot2", request=first)
+    authority.revoke("robot1", NOW)
+    for name in ("robot1", "robot2"):
+        refused = pytest.raises(AdapterError, match="that key is robot1's and revoked")
+        with opened(authority.folder, FLEET) as again, refused:
+            issue(again, name, request=first)
+
+
 def test_a_renewal_keeps_key_number_and_hosts_and_a_new_key_has_the_next_number(authority: Authority) -> None:
     first = x509.load_pem_x509_certificate(issue(authority))
     with pytest.raises(AdapterError, match="`zsched pki renew robot1` keeps its key"):
