@@ -422,7 +422,8 @@ def bring_back(fleet: str, node: NodeId, places: Places, *, is_secured: bool) ->
                 _put_one_away(one.path, is_deleted=True)
         names = [places.config, *(places.state / name for name in (*LOGS, COPY_NAME, FOLDER_NAME))]
         folders = (places.config.parent / PKI_FOLDER, places.state / PKI_FOLDER)
-        names += [folder / name for folder in folders for name in _WHAT if is_secured]
+        own = [folder for folder in folders if is_secured and not _is_planted(folder, places)]
+        names += [folder / name for folder in own for name in _WHAT]
         for path in (*names, places.state / STATE_NAME):
             old = path.with_name(f"{path.name}{LEFT}")
             try:
@@ -439,13 +440,18 @@ def _belongings(places: Places, *, is_purged: bool) -> Iterator[Written]:
     if is_purged:
         yield from _there(places.config.with_name(f"{places.config.name}{BEFORE}"), "the fleet file of before")
     for folder in (_pki_folder(places.config), places.state / PKI_FOLDER):
-        if folder.parent == places.state and folder.is_symlink():
-            continue  # the service's, and root renames and deletes: it would choose whose keys
+        if _is_planted(folder, places):
+            continue
         for name, what in _WHAT.items():
             yield from _there(folder / name, what, is_purged=is_purged)
     more = (rehearsals.FOLDER_NAME, core_speed.NAME, NEXT_CELL) if is_purged else ()
     for name in (*more, *LOGS, COPY_NAME, FOLDER_NAME, STATE_NAME):
         yield from _there(places.state / name, _KEPT.get(name, "the node's records"), is_purged=is_purged)
+
+
+def _is_planted(folder: Path, places: Places) -> bool:
+    """Whether it is a link in the state folder: that is the service's, and it would choose whose keys root renames."""
+    return folder.parent == places.state and folder.is_symlink()
 
 
 _KEPT: Final = {

@@ -21,7 +21,17 @@ from zsched.core.values.fleet import fleet_hash
 from zsched.errors import AdapterError, ConfigError
 from zsched.runtime import next_cell
 from zsched.runtime.init import init_state
-from zsched.runtime.membership import BEFORE, NEXT_CELL, Places, copied_file, found, is_joined, join, put_away
+from zsched.runtime.membership import (
+    BEFORE,
+    NEXT_CELL,
+    Places,
+    bring_back,
+    copied_file,
+    found,
+    is_joined,
+    join,
+    put_away,
+)
 from zsched.wire.codec import document_hash
 from zsched.wire.invitation import Invitation, Papers
 
@@ -210,6 +220,23 @@ def test_a_link_in_the_state_folder_never_chooses_whose_keys_are_put_away(
     put_away("hall", "robot2", second, is_purged=True)
     assert [one.name for one in theirs.iterdir()] == ["key.pem"]
     assert not (second.state / "state").exists()
+
+
+def test_a_link_in_the_state_folder_never_chooses_whose_keys_come_back(
+    second: Places, invitation: Invitation, tmp_path: Path
+) -> None:
+    """As above, where a change of cells goes back: an old key would take the place of somebody's own."""
+    join(invitation, second, is_plan=False)
+    put_away("hall", "robot2", second, is_purged=False, comes_back=True)
+    join(invitation, second, is_plan=False)
+    theirs = tmp_path / "elsewhere"
+    theirs.mkdir()
+    (theirs / "key.pem").write_text("somebody's own")
+    (theirs / "key.pem.left").write_text("an old one")
+    (second.state / "pki").symlink_to(theirs)
+    bring_back("hall", "robot2", second, is_secured=True)
+    assert (theirs / "key.pem").read_text() == "somebody's own"
+    assert (second.state / "state").exists()
 
 
 def test_a_link_in_place_of_the_next_cell_s_folder_is_not_gone_by(
