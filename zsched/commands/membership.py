@@ -6,8 +6,10 @@ Knows: what is asked of an operator, what is said in the end. Does not know: whi
 
 from __future__ import annotations
 
+import errno
 import ipaddress
 import os
+import secrets
 import shlex
 import socket
 import stat
@@ -431,14 +433,27 @@ def _write(invitation: Invitation, guest: Guest, file: Path | None) -> None:
 
 
 def _write_private(file: Path, text: str) -> None:
+    """In a new file of that name: one that is there may be somebody else's, or open at who has looked at it."""
     try:
-        number = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC, PRIVATE)
-        with os.fdopen(number, "w", encoding="utf-8") as out:
-            os.fchmod(number, PRIVATE)
-            out.write(text)
+        _replace(file, text)
     except OSError as error:
         advice = "the node is in the document; write its invitation elsewhere: zsched invite NAME -o FILE"
         raise CliError(EXIT_FAILED, f"{file}: {error.strerror}; {advice}") from error
+
+
+def _replace(file: Path, text: str) -> None:
+    if os.path.lexists(file) and not stat.S_ISREG(file.lstat().st_mode):
+        raise OSError(errno.EINVAL, "it is no regular file")
+    part = file.with_name(f".{file.name}.{secrets.token_hex(4)}")
+    number = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, PRIVATE)
+    try:
+        with os.fdopen(number, "w", encoding="utf-8") as out:
+            os.fchmod(number, PRIVATE)
+            out.write(text)
+        part.rename(file)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
 
 
 # --- join ------------------------------------------------------------------------------------------------------------

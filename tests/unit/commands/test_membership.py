@@ -425,6 +425,25 @@ def test_in_a_secured_fleet_the_certificate_and_its_key_come_along(node: Node, t
     assert "is a node of the fleet" in again.stderr
 
 
+def test_who_had_the_invitations_file_open_before_reads_no_key(node: Node, tmp_path: Path) -> None:
+    """In a folder that others write to, it may even be theirs."""
+    secured(tmp_path, node)
+    file = tmp_path / "robot2.invite"
+    file.write_text("")
+    with file.open() as theirs:
+        result = run("invite", "robot2", "--address", "192.0.2.12", "--yes", "-o", file)
+        assert result.exit_code == 0, result.stderr
+        assert theirs.read() == ""
+    assert "PRIVATE KEY" in file.read_text()
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    link = tmp_path / "link.invite"
+    link.symlink_to(file)
+    refused = run("invite", "robot2", "--yes", "-o", link)
+    assert refused.exit_code == 1
+    assert "it is no regular file" in refused.stderr
+    assert sorted(one.name for one in tmp_path.glob("*.invite")) == ["link.invite", "robot2.invite"]
+
+
 @pytest.mark.parametrize("has_left", [False, True], ids=["the invitation was lost", "the machine has left"])
 def test_a_machine_that_is_invited_again_gets_another_key_and_the_former_one_is_worth_nothing(
     node: Node, tmp_path: Path, *, has_left: bool
