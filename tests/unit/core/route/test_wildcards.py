@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from zsched.core.route import wildcards as capture
 from zsched.core.route.keyexpr import is_valid, matches
-from zsched.core.route.wildcards import ambiguity, capture_fault, rewriter, wildcards
+from zsched.core.route.wildcards import KEPT_OWNERS, Rewriting, ambiguity, capture_fault, rewriter, wildcards
 
 
 @pytest.mark.parametrize(
@@ -119,3 +119,21 @@ def test_an_expression_that_can_be_read_two_ways_is_ambiguous(expr: str) -> None
 
 def test_examples_in_the_module_hold() -> None:
     assert doctest.testmod(capture).failed == 0
+
+
+def test_keys_of_several_owners_lead_to_one_place() -> None:
+    rewriting = Rewriting("edge1/merge/1/robot1/**", "robot1/merged/**")
+    assert rewriting.key("edge1/merge/1/robot1/a") == "robot1/merged/a"
+    assert rewriting.key("edge2/merge/2/robot1/a") is None
+    rewriting.also_from("edge2/merge/2/robot1/**")
+    assert rewriting.key("edge2/merge/2/robot1/b") == "robot1/merged/b"
+    assert rewriting.key("edge1/merge/1/robot1/a") == "robot1/merged/a", "what the former owner still sends"
+    for number in range(KEPT_OWNERS):
+        rewriting.also_from(f"edge1/merge/{number + 3}/robot1/**")
+    assert rewriting.key("edge1/merge/1/robot1/a") is None, "it is forgotten"
+
+
+def test_where_one_key_is_meant_every_owner_s_leads_to_it() -> None:
+    rewriting = Rewriting("edge1/merge/1/robot1/map", "robot1/merged")
+    rewriting.also_from("edge2/merge/2/robot1/map")
+    assert (rewriting.is_wild, rewriting.key("edge2/merge/2/robot1/map")) == (False, "robot1/merged")

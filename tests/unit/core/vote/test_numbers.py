@@ -227,6 +227,17 @@ def test_a_peer_s_beat_with_a_newer_fleet_value_leads_to_a_question_and_its_answ
     assert answer.refusal is Refusal.NOT_ELECTOR
 
 
+def test_a_fleet_value_counts_once_its_document_is_on_disk() -> None:
+    agreement = make(stored={})
+    told = Learnt(node="robot2", values=(), generation=GENERATION, fleet=WITHOUT_ROBOT1)
+    agreed(agreement.on_learnt, ev.LearntReceived(learnt=told, is_answer=True), 100.1)
+    assert (agreement.number, agreement.witness.electors) == (0, ROBOTS), "it waits for the document"
+    agreement.on_stored(ev.DocumentStored(document="0d", fleet=FLEET), ToDo(), 100.2)
+    assert (agreement.number, agreement.is_elector) == (3, False)
+    assert agreement.witness.electors == ("robot2", "robot3"), "and what counts by it does so, too"
+    assert not agreement.acceptor.is_elector
+
+
 def test_what_is_told_unasked_leads_to_a_question_only() -> None:
     agreement = make()
     told = Learnt(node="robot2", values=(), generation=GENERATION, fleet=WITH_EDGE)
