@@ -29,6 +29,7 @@ from zsched.wire.keyspace import Keyspace
 WHAT_FITS = 5500
 """Of 10 kB: in flight 1677 (16 MiB), in the queue 1024, before it 256, the rest in sockets and at the worker."""
 MORE_THAN_FITS = 7000
+FORGED, FAR = 400, 100_000
 
 
 @pytest.fixture
@@ -103,6 +104,29 @@ def test_an_acknowledgement_from_another_session_takes_nothing_from_what_is_kept
     assert app.back == list(range(app.sent))
     until(lambda: told(rig).acknowledged == app.sent, "every acknowledgement")
     assert (told(rig).lost, told(rig).at_most_lost, told(rig).drops) == (0, 0, ())
+
+
+def test_who_names_anothers_publisher_under_a_key_of_its_own_says_nothing_of_that_ones_stream(rig: Rig) -> None:
+    """Rules bind the key to the member's certificate, and not the publisher that it names in a sample."""
+    rig.start_worker("edge1")
+    app, _ = through(rig)
+    put: list[zenoh.Sample] = []
+    recorder = rig.app.declare_subscriber(f"edge1/{TASK}/{ROBOT}/in", put.append)
+    until(lambda: app.put() or (put and app.back), "the stream through edge1, seen by a member")
+    for _ in range(FORGED):
+        app.put()
+        info = put[-1].source_info
+        assert info is not None
+        source = zenoh.SourceInfo(info.source_id, info.source_sn + FAR)
+        rig.app.put(
+            f"edge1/{TASK}/other/in", b"x", source_info=source, congestion_control=zenoh.CongestionControl.BLOCK
+        )
+        time.sleep(0.005)  # the rate of a stream: what is wrongly asked for again is sent again
+    until(lambda: len(app.back) == app.sent, "every answer")
+    until(lambda: told(rig).acknowledged == app.sent, "every acknowledgement")
+    recorder.undeclare()
+    assert app.back == list(range(app.sent))
+    assert (told(rig).doubled, told(rig).replayed, told(rig).lost) == (0, 0, 0)
 
 
 def test_the_newest_answer_of_a_frozen_worker_reaches_its_robot(rig: Rig) -> None:

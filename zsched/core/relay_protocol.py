@@ -11,7 +11,9 @@ Commands (daemon to relay): `RoutePlan`, `Role`, `WorkerWatch`, `TaskEnded`, `Re
 
 from __future__ import annotations
 
+import hashlib
 from enum import StrEnum
+from functools import lru_cache
 from typing import Final
 
 from zsched.core.events import (
@@ -175,6 +177,12 @@ class ServiceProblem(StrEnum):
     TIMEOUT = "timeout"
 
 
+@lru_cache(maxsize=512)
+def mark_of(key: str) -> int:
+    """A number from 1 to 2^56 for a key, which no other key is known to have."""
+    return int.from_bytes(hashlib.blake2s(key.encode(), digest_size=7, person=b"zsched1", salt=b"ack").digest()) + 1
+
+
 class StreamAck(Struct, frozen=True, kw_only=True):
     """A worker's progress on one publisher of a relay, or a relay's on one of a worker; a hop's numbers start at 0."""
 
@@ -201,6 +209,8 @@ class StreamAck(Struct, frozen=True, kw_only=True):
     """A worker's: what a start marker has told it of the stream's class (`EndMarker.is_whole`); ``None``: nothing."""
     replays: int = 0
     """A worker's: this many numbers from `arrived` on count as replays, by a start marker."""
+    of: int = 0
+    """`mark_of` the key under which it was heard: there anybody may name any publisher; 0: not told."""
 
     def __post_init__(self) -> None:
         for name in ("eid", "first", "arrived", "processed", "lost", "doubled", "reordered", "until", "replays"):

@@ -234,7 +234,7 @@ class Acknowledger:
         for name in self._dirty:
             source = self._sources.get(name)
             if source is not None:
-                changed.setdefault(name[1], []).append(source.ack(name[2]))
+                changed.setdefault(name[1], []).append(source.ack(name[2], name[0]))
         self._dirty.clear()
         self._samples = self._bytes = 0
         return [

@@ -39,7 +39,7 @@ from zsched.core.hop.kept import Owed
 from zsched.core.hop.receiver import SourceName
 from zsched.core.hop.serial import serial_of
 from zsched.core.hop.shared import MAX_RECEIVERS, TICK_S, SharedSender, spoken_for
-from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks
+from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks, mark_of
 from zsched.core.values.struct import Struct, field
 from zsched.errors import WireError
 from zsched.guard import guarded, tolerant
@@ -313,7 +313,7 @@ class Keeper:
         node = f"{key.owner}{BESIDE}" if frame.is_application else key.owner
         for ack in frame.acks:
             lane = self._lanes.get(ack.eid)
-            if lane is not None:
+            if lane is not None and ack.of in (0, mark_of(lane.key)):  # else an owner has named ours under its own key
                 self._acknowledged(lane, key.rest[0], node, ack)
 
     def _acknowledged(self, lane: KeptLane, relay: str, node: str, ack: StreamAck) -> None:

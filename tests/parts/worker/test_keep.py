@@ -12,7 +12,7 @@ import zenoh
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import until
 from zsched.core.hop import shared
-from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks
+from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks, mark_of
 from zsched.hop.acknowledger import Acknowledger
 from zsched.ipc.pipe import decode_end
 from zsched.sessions.stalled_links import StalledLinks
@@ -308,6 +308,17 @@ def test_a_member_that_speaks_for_another_s_relay_takes_nothing_from_it(bench: B
     assert lane.state.contradicted == 1
     robot.ack(bench.eid, 4)
     until(lambda: not lane.state.kept, "both have all")
+
+
+def test_a_word_about_another_key_is_none_about_ours(bench: Bench) -> None:
+    """Another owner has named our publisher under its own key, so a robot's relay has answered to that."""
+    lane = bench.lane()
+    robot = bench.robot("robot1")
+    keep(lane, 0, 1)
+    robot.ack(bench.eid, 2, of=mark_of("edge2/merge/1/robot1/out"))
+    robot.ack(bench.eid, 1, of=mark_of(lane.key))
+    until(lambda: lane.state.receivers, "the robot's word, behind that one")
+    assert [one.arrived for one in lane.state.receivers.values()] == [1]
 
 
 def test_an_acknowledgement_under_a_malformed_key_is_nobody_s(bench: Bench) -> None:

@@ -19,7 +19,7 @@ from collections import deque
 from typing import Final
 
 from zsched.core.hop.serial import number_near, serial_of
-from zsched.core.relay_protocol import StreamAck
+from zsched.core.relay_protocol import StreamAck, mark_of
 from zsched.core.values.struct import Struct, field
 
 SourceName = tuple[str, str, int]
@@ -121,10 +121,11 @@ class Source(Struct):
         """The number that a serial stands for."""
         return number_near(serial, self.arrived)
 
-    def ack(self, eid: int) -> StreamAck:
-        """How far it is; ``eid`` is what its sender calls it."""
+    def ack(self, eid: int, key: str = "") -> StreamAck:
+        """How far it is; ``eid`` is what its sender calls it, ``key`` where it was heard."""
         return StreamAck(
             eid=eid,
+            of=mark_of(key) if key else 0,
             first=self.first,
             arrived=self.arrived,
             processed=self.processed,

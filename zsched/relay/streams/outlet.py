@@ -31,7 +31,7 @@ from zenoh import Priority, Sample, Session, Timestamp
 from zsched.clock import monotonic_s
 from zsched.core.hop.kept import NOTHING, Owed
 from zsched.core.hop.sender import KEPT_BYTES, KEPT_BYTES_LATEST, KEPT_SAMPLES
-from zsched.core.relay_protocol import EndMarker, StreamAck
+from zsched.core.relay_protocol import EndMarker, StreamAck, mark_of
 from zsched.core.route.wildcards import Rewriting
 from zsched.core.values.plan import OnCrash, StreamClass, StreamSettings
 from zsched.relay.streams.acks import WorkerAcks
@@ -516,6 +516,8 @@ class Outlet:
     # --- acknowledgements (their thread) -----------------------------------------------------------------------------
 
     def _acknowledged(self, lane: Lane, ack: StreamAck, incarnation: str) -> None:
+        if ack.of not in (0, mark_of(lane.key)):
+            return  # a member has named our publisher under a key of its own
         now = monotonic_s()
         is_new = incarnation != lane.incarnation
         if is_new and (self._acks is None or not self._acks.has_token(incarnation)):
