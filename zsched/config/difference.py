@@ -186,7 +186,8 @@ def _joined(path: str, before: str | None, after: str | None, found: list[_Verdi
         before, after = before or whole.before, after or whole.after
     found = sorted(found, key=lambda one: (one.danger is None, -_ORDER.index(one.effect)))
     effect = max((one.effect for one in found), key=_ORDER.index)
-    text = "; ".join(dict.fromkeys(one.text for one in found))
+    texts = list(dict.fromkeys(one.text for one in found))
+    text = "; ".join([one for one in texts if one != AT_ONCE.text] or texts)  # beside another one it would contradict
     first = found[0]
     yield Change(
         path=path,

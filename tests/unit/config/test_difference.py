@@ -265,6 +265,15 @@ def test_what_a_secured_fleet_lets_in_follows_when_its_daemons_begin_anew() -> N
     assert any("begin again" in one[3] for one in told(task, secured) if one[0] == "tasks.pick")
 
 
+def test_what_comes_later_is_not_told_together_with_at_once() -> None:
+    """A new candidate counts at once, and is let in only once the daemons have begun anew: the later one is told."""
+    secured = f"{TEXT.replace('tcp/', 'tls/')}\nsecurity: {{}}\n"
+    old = with_("candidates: {kind: edge}", "candidates: [edge1]", secured)
+    new = with_("candidates: [edge1]", "candidates: [edge1, edge2]", old)
+    anew = "daemons begin again in turns: a robot's streams stop for that moment"
+    assert [one[3] for one in told(new, old)] == [anew]
+
+
 # --- who dials whom --------------------------------------------------------------------------------------------------
 
 
