@@ -101,7 +101,7 @@ def drain(view: OrderView, order: DrainOrder) -> int:
     before = {name: _counts(found, name) for name in _owned(status, nodes)}
     revision = _commit(view, held, after, f"{order.kind} {', '.join(nodes)}")
     had = "; ".join(f"{row[0]}: {row[2]}" for row in rows if row[1] == order.kind)
-    what = "It is agreed" if is_change else f"It is so already ({had})"
+    what = f"It is agreed{_endless(held.flags, after)}" if is_change else f"It is so already ({had})"
     watch = ". Ctrl-C ends the watching, not the drain"
     if order.kind == LEAVE:  # this command does the rest, once the node is empty
         watch = f". After Ctrl-C the same command goes on, and `zsched undrain {' '.join(nodes)}` takes it back"
@@ -166,7 +166,16 @@ def _set(view: OrderView, kind: str, nodes: tuple[str, ...], *, is_on: bool, acc
     revision = _commit(view, held, after, f"{verb} {', '.join(nodes)}")
     left = [name for name in nodes if not is_on and any(flag["subject"] == name for flag in after)]
     more = "".join(f" {name} still gets nothing new: `zsched {_way_out(after, name)}`." for name in left)
-    return tell(view, "agreed", f"It is agreed.{more}", after_s=0.0, nodes=nodes, revision=revision)
+    text = f"It is agreed{_endless(held.flags, after)}.{more}"
+    return tell(view, "agreed", text, after_s=0.0, nodes=nodes, revision=revision)
+
+
+def _endless(before: Sequence[Json], after: Sequence[Json]) -> str:
+    """Which nodes' flags had an end by themselves, and have none any more; empty: none."""
+    had = {(flag["kind"], flag["subject"]): flag["for_s"] for flag in before if flag.get("for_s") is not None}
+    ones = [flag for flag in after if flag.get("for_s") is None and (flag["kind"], flag["subject"]) in had]
+    told = ", ".join(f"{one['subject']}, was for {span(had[one['kind'], one['subject']])}" for one in ones)
+    return f", and ends by hand only ({told})" if told else ""
 
 
 def _way_out(flags: Sequence[Json], name: str) -> str:
@@ -274,14 +283,19 @@ def _held(view: OrderView) -> InForce:
 
 
 def _with(view: OrderView, held: InForce, kind: str, nodes: Sequence[str]) -> tuple[Json, ...]:
-    """The flags with this one of each node; one that a node has stays unless a reason or a duration is given."""
+    """The flags with this one of each node, which ends when this order says, or by hand alone.
+
+    One that a node has stays where it says the same; its reason stays where no other is given.
+    """
     flags = list(held.flags)
     for name in nodes:
         known = next((flag for flag in flags if (flag["kind"], flag["subject"]) == (kind, name)), None)
-        if known is not None and not view.reason and view.for_s is None:
+        if known is not None and not view.reason and view.for_s is None and known.get("for_s") is None:
             continue
         flags = [flag for flag in flags if flag is not known]
         said = {"kind": kind, "subject": name, **view.asked, "for_s": view.for_s, "revision": held.revision + 1}
+        if known is not None and not view.reason:
+            said["reason"] = known.get("reason", "")
         flags.append(said)
     return tuple(sorted(flags, key=lambda flag: (flag["subject"], flag["kind"])))
 
