@@ -5,6 +5,8 @@ Knows: how names and endpoints relate to it. Does not know: certificates, zenoh'
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
 from pathlib import Path
 
 from zsched.config.blocks import Located, Section
@@ -65,6 +67,23 @@ def _names(given: Section, key: str, cast: Cast, out: Collector) -> tuple[str, .
     return tuple(sorted(seen))
 
 
+def _misspelt(name: str, known: Iterable[str]) -> str:
+    """The name of the file that another one is near to; empty: none is.
+
+    A name with other digits is another machine's. It may have left the fleet: its line keeps its key out if the name
+    comes back, so nothing is to be said of it.
+
+    >>> _misspelt("robto1", ["robot1", "robot2"]), _misspelt("robot3", ["robot1", "robot2"])
+    ('robot1', '')
+    """
+    alike = [one for one in known if _digits(one) == _digits(name)]
+    return next(iter(difflib.get_close_matches(name, alike, n=1)), "")
+
+
+def _digits(name: str) -> str:
+    return "".join(filter(str.isdigit, name))
+
+
 def _revoked(given: Section, known: set[tuple[str, Role]], out: Collector) -> tuple[str, ...]:
     found: tuple[Located[str], ...] = given.get("revoked", ())
     for one in found:
@@ -76,9 +95,9 @@ def _revoked(given: Section, known: set[tuple[str, Role]], out: Collector) -> tu
             label = replace(holder, role=Role(meant[0])).label
             message = f"{one.value!r} is a key of nobody: {holder.name} is no {holder.role} here, but {_A[meant[0]]}"
             out.warn(one.place, message, f"the line keeps nobody out; if that key is meant: {label}")
-        else:
+        elif close := _misspelt(holder.name, {name for name, _ in known}):
             message = f"{one.value!r} is a key of nobody in this file"
-            out.warn(one.place, message, "who is not in the file is not let in: the line may go")
+            out.warn(one.place, message, f"the line keeps nobody out; did you mean {close!r}?")
     return tuple(sorted({one.value for one in found}))
 
 

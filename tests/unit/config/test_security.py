@@ -61,7 +61,16 @@ def test_each_fault_is_said_with_what_to_do() -> None:
         result = check(section)
         assert result.fleet is None
         assert said in result.report(), result.report()
-    assert "'gone' is a key of nobody" in check("{revoked: [gone]}").report()
+
+
+def test_a_revoked_key_of_a_node_that_has_left_is_no_fault_and_a_misspelt_one_is() -> None:
+    """`invite` and `pki revoke` write these lines, and the name may come back: nobody is to take them out."""
+    for left in ("robot3", "robot3.k2", "gone", "ana.operator"):
+        assert check(f"{{revoked: [{left}]}}").report() == check("{}").report(), left
+    for wrong in ("robto1", "rbot1.k2", "robot-1"):
+        report = check(f"{{revoked: [{wrong}]}}").report()
+        assert f"{wrong!r} is a key of nobody in this file" in report
+        assert "the line keeps nobody out; did you mean 'robot1'?" in report
 
 
 def test_a_revoked_name_in_another_role_is_told_with_the_label_that_keeps_its_key_out() -> None:
