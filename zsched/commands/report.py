@@ -579,7 +579,9 @@ def _unanswered(task: Json) -> list[str]:
 def all_problems(status: Json) -> list[str]:
     """What is wrong, causes first."""
     causes = [problem for problem in status["problems"] if problem.startswith(CAUSES)]
-    found = [*causes, *degradations(status), *status["problems"]]
+    said = status["problems"]
+    short = [one for one in degradations(status) if not any(text.startswith(f"{one};") for text in said)]
+    found = [*causes, *short, *said]
     found += [f"{task['name']}: {problem}" for task in status["tasks"] for problem in task["problems"]]
     return list(dict.fromkeys(found))
 

@@ -209,6 +209,8 @@ class Stages:
         self.knocking = Knocking(self.fleet_file)
         self.introductions, self.mute_links = Introductions(), MuteLinks()
         self.solitude = Solitude(timing=fleet.timing, started_at=now)
+        self.quorum_at = now
+        """When this node last knew a majority of the electors to answer; its start, if never."""
         self.stateless: set[NodeId] = set()
         """Electors whose newest beat says that they answer no proposer."""
         self.fileless: set[NodeId] = set()

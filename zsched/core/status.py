@@ -45,6 +45,11 @@ STARTED_BEFORE = (
     "there: the session {owner}-{task}.zenoh.json5 has this robot's address since"
 )
 INIT_THERE = "stop zsched there, run `zsched init` (it asks the fleet, and refuses where that is unsafe), and start it"
+RECOVER_AFTER_S = 60.0
+"""A recovery is named only once there was no quorum for so long: daemons that begin anew, and machines that boot, come.
+
+A recovery beside electors that come back makes two fleets of one.
+"""
 RECOVER = "stop zsched on one that has its state, run `zsched recover` there, and start it"
 UNREADY_SHOWN_S = 2.0
 """A slot that no worker takes for longer is a problem: a handover takes less."""
@@ -129,11 +134,9 @@ def _problems(node: Stages, quorum: QuorumStatus, now: float) -> tuple[str, ...]
             f"{len(quorum.apart)} of {quorum.electors}: {', '.join(quorum.apart)}; they and this node refuse each other"
         )
     if not quorum.ok:
-        told = f"no quorum: {quorum.alive} of {quorum.electors} electors can answer, {quorum.needed} needed"
         # A fleet that lives on elsewhere must not become two.
         is_left_behind = is_out or is_apart or (is_alone and not node.agreement.is_elector)
-        may_recover = node.agreement.document_hash and not is_left_behind
-        problems.append(told + (f"; if the others are gone for good, {RECOVER}" if may_recover else ""))
+        problems.append(_no_quorum(node, quorum, now, is_left_behind=is_left_behind))
         if not is_alone:
             problems += [f"elector {told}" for name in node.fleet.electors if (told := _why_silent(node, name, now))]
     elif quorum.alive == quorum.needed < quorum.electors:
@@ -158,6 +161,25 @@ def _problems(node: Stages, quorum: QuorumStatus, now: float) -> tuple[str, ...]
     if not node.has_state and not node.has_foreign_state and not node.has_others_state:
         problems.append("no valid state file: this node is no elector (see `zsched init --help`)")
     return tuple(problems)
+
+
+def _no_quorum(node: Stages, quorum: QuorumStatus, now: float, *, is_left_behind: bool) -> str:
+    """How many electors lack, for whom this node waits, and after a while what to do if those never come."""
+    told = f"no quorum: {quorum.alive} of {quorum.electors} electors can answer, {quorum.needed} needed"
+    silent = [name for name in node.fleet.electors if node.membership.state(name) is not PeerState.ALIVE]
+    if is_left_behind:
+        return told
+    if silent:
+        told += f"; waiting for {', '.join(silent)}"
+    if not node.agreement.document_hash or now < node.quorum_at + RECOVER_AFTER_S:
+        return told
+    return f"{told}. Only for nodes that will never come back: {RECOVER}"
+
+
+def has_quorum(node: Stages) -> bool:
+    """Whether a majority of the electors can answer, as far as this node hears."""
+    electors = node.fleet.electors
+    return sum(_can_answer(node, name) for name in electors) >= majority(len(electors))
 
 
 def _never_had_one(node: Stages, quorum: QuorumStatus) -> list[NodeId]:

@@ -17,7 +17,7 @@ import pytest
 
 from support.fleets import tuning_of
 from zsched.commands.page import Page, cut, memory, size, span
-from zsched.commands.report import degradations, printable, render_status
+from zsched.commands.report import all_problems, degradations, printable, render_status
 from zsched.core.report import snapshot_json
 from zsched.core.values.model import Utility
 from zsched.core.values.plan import StreamCount
@@ -362,6 +362,13 @@ def test_a_vote_that_is_won_and_not_agreed_on_is_shown_as_such(base: int, has_qu
 def test_healthy_fleet_is_not_degraded() -> None:
     assert degradations(recorded("healthy")) == ()
     assert degradations(recorded("edge")) == ()
+
+
+def test_a_lost_quorum_is_told_once_with_what_the_daemon_says_of_it() -> None:
+    status = recorded("degraded")
+    said = "no quorum: 1 of 3 electors can answer, 2 needed; waiting for robot2, robot3"
+    status["problems"] = [said]
+    assert [one for one in all_problems(status) if one.startswith("no quorum")] == [said]
 
 
 def test_lost_quorum_and_lost_owner_are_degraded() -> None:

@@ -122,10 +122,27 @@ def test_where_a_document_is_agreed_a_lost_majority_is_recovered_on_one_node() -
         node.handle(ev.BeatReceived(beat=beat_of(name, sequence, incarnation=3, has_lost_state=True)), 100.0)
     with patch.object(Agreement, "document_hash", "0d"):
         problems = build_snapshot(node, 100.0).problems
-    assert problems[1].startswith("no quorum: 1 of 3 electors can answer, 2 needed; if the others are gone for good, ")
+    assert problems[1] == "no quorum: 1 of 3 electors can answer, 2 needed"
     assert problems[2].startswith("nothing can be agreed: too many electors without their states (each says why); ")
     assert problems[2].endswith("run `zsched recover` there, and start it")
     assert not any("--generation" in one for one in problems)
+
+
+def test_electors_are_waited_for_before_a_recovery_is_named() -> None:
+    """Daemons that begin anew are back in seconds; a recovery beside them would make two fleets."""
+    node = make(alive=ROBOTS)
+    for now in (100.5, 101.0):
+        node.handle(ev.DeadlineReached(), now)
+    waiting = "no quorum: 1 of 3 electors can answer, 2 needed; waiting for robot2, robot3"
+    with patch.object(Agreement, "document_hash", "0d"):
+        for now in (110.0, 130.0, 160.0):
+            node.handle(ev.DeadlineReached(), now)
+            assert waiting in build_snapshot(node, now).problems
+            assert not any("recover" in one for one in build_snapshot(node, now).problems)
+        node.handle(ev.DeadlineReached(), 162.0)
+        (told,) = (one for one in build_snapshot(node, 162.0).problems if one.startswith("no quorum"))
+    assert told.startswith(f"{waiting}. Only for nodes that will never come back: stop zsched on one ")
+    assert told.endswith("run `zsched recover` there, and start it")
 
 
 def test_a_node_with_another_fleets_state_is_not_told_to_begin_anew() -> None:
@@ -151,7 +168,7 @@ def test_a_node_of_a_fleet_that_lives_on_elsewhere_is_told_nothing_of_a_recovery
         node.problems[subject] = f"the document names no node 'edge1': {TAKEN_OUT}"
         node.problems["fleet/robot1"] = "robot1 goes by another fleet file"
     with patch.object(Agreement, "document_hash", "0d"):
-        problems = build_snapshot(node, 110.0).problems
+        problems = build_snapshot(node, 200.0).problems
     assert "no quorum: 0 of 3 electors can answer, 2 needed" in problems
     assert not any("recover`" in one for one in problems)
     is_lonely = any("heard nobody" in one for one in problems)
@@ -380,7 +397,7 @@ def test_problems_say_what_is_missing_in_words() -> None:
     assert build_snapshot(node, 100.0).problems == (
         "profile: no /proc",
         "electors without their state, 1 of 3: robot1",
-        "no quorum: 0 of 3 electors can answer, 2 needed",
+        "no quorum: 0 of 3 electors can answer, 2 needed; waiting for robot2, robot3",
         "no valid state file: this node is no elector (see `zsched init --help`)",
     )
     assert build_snapshot(make(), 100.0).problems == ()

@@ -15,6 +15,7 @@ from zsched.core import instructions as do
 from zsched.core.membership.identity import Verdict
 from zsched.core.membership.peers import LOSS_FACTOR, Transition
 from zsched.core.stages import Handler, Stages
+from zsched.core.status import has_quorum
 from zsched.core.todo import ToDo
 from zsched.core.values.beat import Beat
 from zsched.core.values.model import NodeId, PeerState
@@ -26,6 +27,8 @@ def send_beat(node: Stages, todo: ToDo, now: float) -> None:
     """Send the beat that is due or urgent."""
     is_news, todo.must_beat = todo.must_beat, False
     node.beat_sequence += 1
+    if has_quorum(node):
+        node.quorum_at = now
     if "membership" in node.problems:
         _complain(node, now)
     node.membership.fade_lag_factor()
