@@ -13,8 +13,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from zsched import paths as places
-from zsched.commands.common import CliError, nearest, say, says_yes
+from zsched.commands.common import CliError, nearest, say, says_yes, warn
 from zsched.commands.here import own_name
+from zsched.commands.orders import user_name
 from zsched.config.load import load_fleet, require_node
 from zsched.core.electorate.recovery import Danger, Recovery, consider
 from zsched.core.values.durable import DurableState
@@ -22,6 +23,7 @@ from zsched.core.values.electorate import SAID_DIGITS, FleetValue
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId, RegisterState
 from zsched.core.values.struct import Struct
+from zsched.core.values.words import MAX_ASKER
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
 from zsched.runtime import recovery as runtime
 
@@ -91,7 +93,14 @@ def recover(place: Place, manner: Manner, brought: Sequence[Path]) -> int:
         raise CliError(EXIT_FAILED, f"nothing was changed; if this may be:\n{lines}\n{manner.again(*names)}")
     _confirm(manner, f"Make {place.node} the only elector of a new generation of {place.fleet.name}?")
     state = runtime.recover(plan, place.config, place.folder, brought)
-    say(_next(plan, _value_of(state)))
+    before, after = plan.before, _value_of(state)
+    _note(
+        place,
+        state,
+        f"recovered {after.fleet}: generation {before.generation_id[:SAID_DIGITS]} -> "
+        f"{after.generation_id[:SAID_DIGITS]}, electors {', '.join(before.electorate.names)} -> {place.node}",
+    )
+    say(_next(plan, after))
     return EXIT_OK
 
 
@@ -111,10 +120,18 @@ def rejoin(place: Place, manner: Manner, wanted: str) -> int:
     if manner.is_plan:
         return EXIT_WOULD_CHANGE
     _confirm(manner, f"Let {place.node} change sides?")
-    path = runtime.rejoin(place.fleet, place.node, place.folder, own, side)
+    path, state = runtime.rejoin(place.fleet, place.node, place.folder, own, side)
+    _note(place, state, f"rejoined generation {side.generation_id[:SAID_DIGITS]}{by}")
     say(f"{path}: blank state of {place.node}, which is to follow {side.generation_id[:SAID_DIGITS]}")
     say("next: start this daemon; it fetches the rest, and is no elector until it is added as one")
     return EXIT_OK
+
+
+def _note(place: Place, state: DurableState, what: str) -> None:
+    """`zsched history` on this node tells of it."""
+    by = f"{user_name()}@{place.node}"[:MAX_ASKER]
+    if trouble := runtime.note(place.folder, place.node, state, f"{by}: {what}", by):
+        warn(trouble)
 
 
 def _confirm(manner: Manner, question: str) -> None:

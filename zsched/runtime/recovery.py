@@ -13,11 +13,13 @@ import secrets
 from collections.abc import Sequence
 from pathlib import Path
 
+from zsched.adapters.host import decision_log
 from zsched.adapters.host.document_store import DocumentStore
 from zsched.adapters.host.state_file import MAX_STATE_BYTES, StateFile, hardware_id
 from zsched.clock import wall_tenths
 from zsched.core.electorate.founding import newest_fleet
 from zsched.core.electorate.recovery import Found, Recovery, Sides, choose_side, rejoined, sides_of
+from zsched.core.instructions import RecordStory
 from zsched.core.values.document import Document, Text
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet
@@ -90,6 +92,15 @@ def _document_of(config: Path) -> Document:
         raise AdapterError(f"{config} cannot be a document: {error}") from error
 
 
+def note(folder: Path, node: NodeId, state: DurableState, text: str, by: str) -> str:
+    """Tell the decision log of this folder what an operator has done; why that failed, empty: it did not."""
+    try:
+        decision_log.note(folder, node, state.incarnation, RecordStory(stage="membership", text=text, by=by))
+    except OSError as error:
+        return f"the decision log in {folder} does not tell of it: {error.strerror}"
+    return ""
+
+
 def read_state(path: Path) -> DurableState:
     """A state file from another machine's disk.
 
@@ -149,8 +160,10 @@ def find_side(fleet: Fleet, node: NodeId, folder: Path, wanted: str) -> tuple[Du
     return own, choose_side(fleet, own, sides_of(ask_others(fleet, node).answers), wanted)
 
 
-def rejoin(fleet: Fleet, node: NodeId, folder: Path, own: DurableState | None, side: Sides) -> Path:
-    """Write the blank state of a node that changes sides; the file's path.
+def rejoin(
+    fleet: Fleet, node: NodeId, folder: Path, own: DurableState | None, side: Sides
+) -> tuple[Path, DurableState]:
+    """Write the blank state of a node that changes sides; the file's path, and the state.
 
     Raises:
         AdapterError: the disk is full or read-only, or a daemon was started meanwhile; the old state is whole.
@@ -166,4 +179,4 @@ def rejoin(fleet: Fleet, node: NodeId, folder: Path, own: DurableState | None, s
     )
     with StateFile(folder, fleet=fleet.name, node=node) as file:
         file.save(state)
-        return file.path
+        return file.path, state

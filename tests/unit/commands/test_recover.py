@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from zsched.adapters.host import decision_log
 from zsched.adapters.host.state_file import StateFile
-from zsched.commands.common import CliError
+from zsched.commands.common import CliError, Json
+from zsched.commands.history import changes_of
 from zsched.commands.recover import Manner, Place, recover, rejoin
 from zsched.config.load import load_fleet
 from zsched.core.values.durable import DurableState
@@ -98,6 +101,11 @@ def refusal(do: Callable[[], int]) -> tuple[int, str]:
     with pytest.raises(CliError) as caught:
         do()
     return caught.value.code, str(caught.value)
+
+
+def log_of(place: Place) -> list[Json]:
+    lines, _, _ = decision_log.read_page(place.folder, "")
+    return [json.loads(line) for line in lines]
 
 
 def at_a_terminal(monkeypatch: pytest.MonkeyPatch, answer: str) -> None:
@@ -219,6 +227,33 @@ def test_a_node_changes_sides_by_word(hall: Hall, capsys: pytest.CaptureFixture[
     after = hall.state("robot1")
     assert (after.joins, after.fleet_register, after.registers) == ("5be01c77" * 4, None, ())
     assert capsys.readouterr().out.splitlines()[-1].startswith("next: start this daemon; it fetches the rest")
+
+
+def test_the_history_of_a_node_tells_of_its_recovery_and_of_changing_sides(
+    hall: Hall, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Who asks later why the fleet counts anew finds who did it, and when."""
+    assert recover(hall.place("robot1"), manner(is_sure=True, accepted=BOTH), ()) == EXIT_OK
+    named = capsys.readouterr().out.partition("only elector of generation ")[2][:8]
+    (told,) = changes_of(log_of(hall.place("robot1")), 0.0, None)
+    assert told["by"].endswith("@robot1")
+    assert told["text"].startswith(f"{told['by']}: recovered hall: generation ")
+    assert told["text"].endswith(f" -> {named}, electors robot1, robot2, robot3 -> robot1")
+    hall.says("robot1", "5be01c77" * 4, "robot1")
+    assert rejoin(hall.place("robot2"), manner("rejoin", is_sure=True), "") == EXIT_OK
+    (told,) = changes_of(log_of(hall.place("robot2")), 0.0, None)
+    assert told["text"] == f"{told['by']}: rejoined generation 5be01c77, recovered by robot1"
+
+
+def test_a_full_disk_of_the_log_keeps_no_recovery_back(
+    hall: Hall, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(decision_log, "note", refuse)
+    assert recover(hall.place("robot1"), manner(is_sure=True, accepted=BOTH), ()) == EXIT_OK
+    assert "does not tell of it: No space left on device" in capsys.readouterr().err
 
 
 def test_of_two_other_generations_one_must_be_named(hall: Hall) -> None:

@@ -15,11 +15,13 @@ from __future__ import annotations
 import json
 import os
 import queue
+import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from zsched.adapters.host.state_file import hand_over
 from zsched.clock import wall_s
 from zsched.core.instructions import RecordStory
 from zsched.core.values.decision import Decision, HistoryLine, Move
@@ -168,6 +170,14 @@ class DecisionLog:
                 self._on_problem(None)
             self._is_failing = False
 
+    def append(self, story: RecordStory) -> None:
+        """Write a story at once, of a log that was not started.
+
+        Raises:
+            OSError: the disk refused.
+        """
+        self._append(self._line(wall_s(), story))
+
     def _line(self, at: float, story: RecordStory) -> bytes:
         entry = Entry(
             schema=SCHEMA,
@@ -199,6 +209,8 @@ class DecisionLog:
         flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC | os.O_NOFOLLOW
         with os.fdopen(os.open(path, flags, 0o640), "wb", buffering=0) as file:
             before = os.fstat(file.fileno()).st_size
+            if not before:
+                hand_over(file.fileno(), self._folder)
             if before and not self._is_whole:
                 with path.open("rb") as there:
                     there.seek(-1, os.SEEK_END)
@@ -246,6 +258,16 @@ class DecisionLog:
                     told.append(one)
             looked += TOLD_BYTES
         return HistoryTold(node=self._node, now=wall_s(), lines=tuple(told), cursor=cursor, has_more=has_more)
+
+
+def note(folder: Path, node: NodeId, life: int, story: RecordStory) -> None:
+    """Append one line while no daemon runs in that folder; a full file is left for the daemon to set aside.
+
+    Raises:
+        OSError: the disk refused.
+    """
+    log = DecisionLog(folder, node, life, on_problem=lambda _: None, file_bytes=sys.maxsize)
+    log.append(story)
 
 
 def _history_line(line: bytes) -> HistoryLine | None:

@@ -90,7 +90,7 @@ class StateFile:
         with contextlib.suppress(OSError):  # on a full disk the number is missing, the lock holds all the same
             os.ftruncate(fd, 0)
             os.pwrite(fd, f"{os.getpid()}\n".encode("ascii"), 0)
-        _hand_over(fd, self.folder)
+        hand_over(fd, self.folder)
         self._lock_fd = fd
 
     def release(self) -> None:
@@ -276,13 +276,13 @@ def _write_synced(path: Path, content: bytes, mode: int) -> None:
         written = 0
         while written < len(content):
             written += os.write(fd, content[written:])
-        _hand_over(fd, path.parent)
+        hand_over(fd, path.parent)
         os.fsync(fd)
     finally:
         os.close(fd)
 
 
-def _hand_over(fd: int, folder: Path) -> None:
+def hand_over(fd: int, folder: Path) -> None:
     """Give a file that root writes (`zsched init`) to the folder's owner: the service must be able to read it."""
     if os.geteuid() == 0:
         with contextlib.suppress(OSError):  # a file system without owners
