@@ -21,6 +21,7 @@ def snapshot_json(snapshot: Snapshot) -> Json:
     """The status as JSON values; pairs become objects, ``None`` becomes null, times are ages in seconds."""
     body = plain(snapshot)
     body["counters"] = dict(snapshot.counters)
+    body["dropped_ages"] = dict(snapshot.dropped_ages)
     for task, status in zip(body["tasks"], snapshot.tasks, strict=True):
         task["decision"] = None if status.decision is None else _decision(status.decision)
         task["vote"] = None if status.vote is None else _vote(status.vote)

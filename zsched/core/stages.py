@@ -109,6 +109,8 @@ class Stages:
     stream_counts: tuple[StreamCount, ...] = ()
     frames_dropped_at: float | None = None
     """When the newest invalid frame came."""
+    dropped_at: dict[str, float]
+    """{counter: when it rose last}, of those that count invalid frames and links."""
     beat_sequence = 0
     # what the door (`zsched.core.node`) keeps from one event to the next
     _promised = math.inf
@@ -211,6 +213,7 @@ class Stages:
         self.solitude = Solitude(timing=fleet.timing, started_at=now)
         self.quorum_at = now
         """When this node last knew a majority of the electors to answer; its start, if never."""
+        self.dropped_at = {}
         self.stateless: set[NodeId] = set()
         """Electors whose newest beat says that they answer no proposer."""
         self.fileless: set[NodeId] = set()

@@ -353,7 +353,7 @@ class Fuzz:
         registers = [register.state for register in node.registers.values()]
         if not is_whole:
             return registers, node.membership.states()
-        return registers, replace(build_snapshot(node, self.now), counters=(), frames_dropped_s=None)
+        return registers, replace(build_snapshot(node, self.now), counters=(), frames_dropped_s=None, dropped_ages=())
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -145,6 +145,14 @@ def test_electors_are_waited_for_before_a_recovery_is_named() -> None:
     assert told.endswith("run `zsched recover` there, and start it")
 
 
+def test_each_counter_of_what_was_refused_tells_when_it_rose_last() -> None:
+    node = make(alive=())
+    node.handle(ev.FrameDropped(kind="link", reason="stranger"), 100.0)
+    node.handle(ev.FrameDropped(kind="beat", reason="rate"), 150.0)
+    told = snapshot_json(build_snapshot(node, 160.0))["dropped_ages"]
+    assert told == {"dropped_link_stranger": 60.0, "dropped_beat_rate": 10.0}
+
+
 def test_a_node_with_another_fleets_state_is_not_told_to_begin_anew() -> None:
     """`zsched init` refuses there; the state's own problem says what to do."""
     node = make(has_state=False)

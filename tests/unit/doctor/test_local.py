@@ -302,6 +302,19 @@ def test_who_was_refused_is_told_with_the_counter(tmp_path: Path) -> None:
     assert "beat_rate" not in str(found)
 
 
+def test_who_was_refused_before_and_is_not_any_more_is_no_warning(tmp_path: Path) -> None:
+    """Every machine that joins dials before the others let it in."""
+    scene = scene_of(tmp_path)
+    counters = {"dropped_link_stranger": 30, "dropped_data_link_stranger": 3, "dropped_beat_rate": 9}
+    ages = {"dropped_link_stranger": 61.0, "dropped_data_link_stranger": 300.0, "dropped_beat_rate": 1.0}
+    over = answer(scene, counters=counters, dropped_ages=ages)
+    assert run("tls.refused", over).verdict is PASS
+    assert "before, since it started: 30 `dropped_link_stranger`, 3 `dropped_data" in str(run("tls.refused", over))
+    again = answer(scene, counters=counters, dropped_ages={**ages, "dropped_link_stranger": 2.0})
+    assert_finds(run("tls.refused", again), WARN, "not let in: 30 (`dropped_link_stranger`)")
+    assert "dropped_data_link" not in str(run("tls.refused", again))
+
+
 def test_a_task_without_an_owner_and_a_lost_quorum_are_found(tmp_path: Path) -> None:
     scene = scene_of(tmp_path)
     assert run("task.owners", scene).verdict is PASS

@@ -112,8 +112,9 @@ def _on_certificate(_node: Stages, event: ev.CertificateSent, todo: ToDo, _now: 
 
 
 def _on_dropped(node: Stages, event: ev.FrameDropped, _todo: ToDo, now: float) -> None:
-    node.counters[f"dropped_{event.kind}_{event.reason}"] += event.count
-    node.frames_dropped_at = now
+    name = f"dropped_{event.kind}_{event.reason}"
+    node.counters[name] += event.count
+    node.dropped_at[name] = node.frames_dropped_at = now
 
 
 def _on_commanded(node: Stages, event: ev.Commanded, todo: ToDo, _now: float) -> None:

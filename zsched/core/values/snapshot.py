@@ -240,5 +240,7 @@ class Snapshot(Struct, frozen=True, kw_only=True):
     problems: tuple[str, ...] = ()
     frames_dropped_s: float | None = None
     """Seconds since the newest invalid frame, ``None`` when none has come."""
+    dropped_ages: tuple[tuple[str, float], ...] = ()
+    """{counter of invalid frames or links that are refused: seconds since it rose last}."""
     security: str = ""
     """How the answering node's sessions are let in to (`Exposure`); empty: an older version, which does not tell."""
