@@ -589,11 +589,13 @@ def all_problems(status: Json) -> list[str]:
 def troubles(page: Page, status: Json) -> None:
     """The last block: frames that were dropped, and the problems."""
     dropped = [f"{name.removeprefix('dropped_')} {n}" for name, n in status["counters"].items() if "dropped_" in name]
-    problems = all_problems(status)
-    if dropped or problems:
+    problems, refused = all_problems(status), status.get("refused", ())  # a later field, as below
+    if dropped or refused or problems:
         page.lines.append("")
     if dropped:
         over = none_for(status.get("frames_dropped_s"))  # a later field of the schema's major version
         page.block("dropped", *((text, "") for text in dropped), *([(over.strip(" ()"), "dim")] if over else []))
+    for number, text in enumerate(refused):
+        page.block("" if number else "refused", (text, "yellow"))
     for number, problem in enumerate(problems):
         page.block("" if number else TROUBLES, (problem, "alarm"))

@@ -478,6 +478,13 @@ class FrameDropped(Struct, frozen=True, kw_only=True):
     count: int = 1
 
 
+class LinkRefused(Struct, frozen=True, kw_only=True):
+    """Somebody has dialled us with a certificate of this fleet that is not let in."""
+
+    key: str
+    """Label of the certificate's key, such as ``robot1.k2``."""
+
+
 class Commanded(Struct, frozen=True, kw_only=True):
     """A command that changes something came, and its seal is right: it is told with the name of whoever gave it."""
 
@@ -572,6 +579,7 @@ Event = (
     | FleetCommanded
     | FleetReadAsked
     | FrameDropped
+    | LinkRefused
     | Commanded
     | AddressesTried
     | ProblemReported

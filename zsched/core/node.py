@@ -46,6 +46,7 @@ _OFTEN_QUIET: Final = frozenset(
         ev.WorkerTroubled,
         ev.WorkerJobs,
         ev.FrameDropped,
+        ev.LinkRefused,
         ev.ClockCompared,
     }
 )

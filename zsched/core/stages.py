@@ -31,6 +31,7 @@ from zsched.core.membership.knocking import Knocking
 from zsched.core.membership.namesakes import Namesakes
 from zsched.core.membership.pace import Pace
 from zsched.core.membership.peers import Membership
+from zsched.core.membership.refused import RefusedKeys
 from zsched.core.membership.relink import Introductions, MuteLinks
 from zsched.core.membership.solitude import Solitude
 from zsched.core.profile.profile import Profiler
@@ -209,6 +210,7 @@ class Stages:
         self.identity = Identity(me, self.incarnation, self.fleet_file, now, fleet.timing.beat_s)
         self.namesakes = Namesakes(fleet.timing.rest_beat_s)
         self.knocking = Knocking(self.fleet_file)
+        self.refused_keys = RefusedKeys()
         self.introductions, self.mute_links = Introductions(), MuteLinks()
         self.solitude = Solitude(timing=fleet.timing, started_at=now)
         self.quorum_at = now

@@ -77,6 +77,7 @@ def build_snapshot(node: Stages, now: float) -> Snapshot:
         counters=tuple(sorted((node.counters + node.agreement.counters).items())),
         frames_dropped_s=None if node.frames_dropped_at is None else now - node.frames_dropped_at,
         dropped_ages=tuple(sorted((name, now - at) for name, at in node.dropped_at.items())),
+        refused=node.refused_keys.told(node.fleet, now),
         security=node.security,
         problems=(
             *node.namesakes.problems(now),

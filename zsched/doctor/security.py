@@ -196,6 +196,7 @@ def nobody_is_refused(scene: Scene) -> Result:
     names += [name for name in sorted(counters) if name not in REFUSED and name.endswith(ends) and counters[name]]
     names = [name for name in names if name.startswith("dropped_")]
     found = [f"{_refused(name)}: {counters[name]} (`{name}`)" for name in names if ages.get(name, 0.0) < OVER_S]
+    found += scene.status.get("refused", ())
     if found:
         return warned(
             *found, fix="the daemon's log names certificate and address; a node that is new or revoked dials, too"

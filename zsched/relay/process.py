@@ -256,7 +256,7 @@ class RelayProcess:
             return None
         return Expulsion(session, self._fleet, members, self._refuse, MAX_DATA_SESSIONS, has_streams=True)
 
-    def _refuse(self, why: Refusal) -> None:
+    def _refuse(self, why: Refusal, _name: str) -> None:
         with self._counting:
             self._refused[why] += 1
 

@@ -78,7 +78,7 @@ class Expulsion:
         session: zenoh.Session,
         fleet: str,
         members: Iterable[str],
-        tell: Callable[[Refusal], None],
+        tell: Callable[[Refusal, str], None],
         max_sessions: int | None = None,
         *,
         has_streams: bool = False,
@@ -86,8 +86,8 @@ class Expulsion:
         """Look at every link from now on.
 
         ``members``: common names that are let in; each has at most ``max_sessions`` (`MAX_SESSIONS`).
-        ``tell`` hears of each link that is refused, in zenoh's threads and ours. ``has_streams``: guests and operators
-        must read quickly. Nothing runs before the first of them, or the first link that is refused.
+        ``tell`` hears of each link that is refused, and its common name, in zenoh's threads and ours. ``has_streams``:
+        guests and operators must read quickly. Nothing runs before the first of them, or the first link that is refused.
         """
         self._session, self._fleet, self._members, self._tell = session, fleet, frozenset(members), tell
         self._max_sessions = MAX_SESSIONS if max_sessions is None else max_sessions
@@ -157,12 +157,12 @@ class Expulsion:
                 self._look_at(zid, holder.name, is_present=is_present)
             is_shut_out = holder is not None and self._shut_out.get(holder.name, 0.0) > monotonic_s()
             if is_present and is_shut_out:
-                self._refuse(zid, Refusal.SHUT_OUT)
+                self._refuse(zid, Refusal.SHUT_OUT, name)
             elif not self._has_room(name, zid, is_present=is_present):
-                self._refuse(zid, Refusal.TOO_MANY)
+                self._refuse(zid, Refusal.TOO_MANY, name)
         elif is_present:
             _log.warning("stranger certificate=%r address=%s: it may nothing here", name, event.link.dst)
-            self._refuse(zid, Refusal.STRANGER)
+            self._refuse(zid, Refusal.STRANGER, name)
 
     def _look_at(self, zid: str, holder: str, *, is_present: bool) -> None:
         if not is_present:
@@ -172,8 +172,8 @@ class Expulsion:
         self._begin()
         self._put(None)
 
-    def _refuse(self, zid: str, why: Refusal) -> None:
-        self._tell(why)
+    def _refuse(self, zid: str, why: Refusal, name: str) -> None:
+        self._tell(why, name)
         self._end(lambda link: str(link.zid) == zid)
 
     def _has_room(self, name: str, zid: str, *, is_present: bool) -> bool:
@@ -254,7 +254,7 @@ class Expulsion:
             if lacks_s >= SLOW_S:
                 self._shut_out[lookers[link.zid]] = now + SHUT_OUT_S
                 self._held.pop(link, None)
-                self._tell(Refusal.SLOW)
+                self._tell(Refusal.SLOW, link.name)
                 if link.abort():
                     _log.warning("the link to %s is ended: %s reads too slowly", link.name, lookers[link.zid])
             elif lacks_s > 0.0:

@@ -92,6 +92,14 @@ def test_frames_that_were_dropped_long_ago_are_told_as_over() -> None:
     assert "dropped    beat_stale 3 · none in the last minute, last 3m05s ago\n" in told
 
 
+def test_who_is_not_let_in_is_told_and_is_no_problem() -> None:
+    status = recorded("healthy")
+    status["refused"] = ["robot9 dials with a key that is revoked"]
+    told = render_brief(status, 100, color=False)
+    assert "refused    robot9 dials with a key that is revoked\n" in told
+    assert told.splitlines()[0].endswith(" ok")
+
+
 def test_text_of_another_node_cannot_steer_the_terminal() -> None:
     status = recorded("healthy")
     status["tasks"][0]["owner"] = "a\x1b[2J"

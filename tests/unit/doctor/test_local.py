@@ -313,6 +313,8 @@ def test_who_was_refused_before_and_is_not_any_more_is_no_warning(tmp_path: Path
     again = answer(scene, counters=counters, dropped_ages={**ages, "dropped_link_stranger": 2.0})
     assert_finds(run("tls.refused", again), WARN, "not let in: 30 (`dropped_link_stranger`)")
     assert "dropped_data_link" not in str(run("tls.refused", again))
+    named = answer(scene, counters=counters, dropped_ages=ages, refused=["robot9 dials with a key that is revoked"])
+    assert_finds(run("tls.refused", named), WARN, "robot9 dials with a key that is revoked")
 
 
 def test_a_task_without_an_owner_and_a_lost_quorum_are_found(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from typing import Any
 import zenoh
 
 from zsched.adapters.network import seals as sealing
-from zsched.adapters.network.limits import Buckets, Drops, Limit
+from zsched.adapters.network.limits import Buckets, Drops, Limit, Names
 from zsched.adapters.network.open_questions import Questions
 from zsched.adapters.network.seals import Seals
 from zsched.clock import monotonic_s
@@ -162,7 +162,7 @@ class ControlBus:
         gather utilities here. Periodic frames are posted at once, or wait for `waiting`. ``seals``: ``None`` where
         nothing is sealed. ``limit``: what each of ``names`` may send, and all others together; ``None``: no limit.
         """
-        self._seals, self._drops = seals, Drops()
+        self._seals, self._drops, self._refused_keys = seals, Drops(), Names()
         self._buckets = None if limit is None else {what: Buckets(limit, names) for what in _LIMITED}
         self._lives: dict[NodeId, int] = {}
         """{node: its newest incarnation}, by the tokens."""
@@ -260,6 +260,8 @@ class ControlBus:
                 yield event
         for kind, reason, count in self._drops.take():
             yield ev.FrameDropped(kind=kind, reason=reason, count=count)
+        for key in self._refused_keys.take():
+            yield ev.LinkRefused(key=key)
 
     def _publisher(
         self, session: zenoh.Session, key: str, priority: zenoh.Priority, *, is_express: bool = True
@@ -352,8 +354,11 @@ class ControlBus:
         owner, event = _event_of(value)
         return event if owner == key.owner else ev.FrameDropped(kind=key.kind, reason="foreign")
 
-    def _refused(self, why: Refusal) -> None:
+    def _refused(self, why: Refusal, name: str) -> None:
         self._drops.add("link", why)
+        holder = parse_common_name(name, self._fleet) if why is Refusal.STRANGER else None
+        if holder is not None:
+            self._refused_keys.add(holder.label)
 
     def _on_token(self, sample: zenoh.Sample) -> None:
         key = parse(str(sample.key_expr))

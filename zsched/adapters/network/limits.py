@@ -24,6 +24,7 @@ BURST_S: Final = 2.0
 """After a silence a peer may send what this many seconds allow at once."""
 PER_TASK_HZ: Final = 10.0
 """For each task: proposals, two phases of a round, their answers, what was learnt."""
+MAX_NAMES: Final = 16
 EVERYBODY_ELSE: Final = ""
 """The one bucket of all names that are no node's, operator's or guest's."""
 
@@ -83,6 +84,28 @@ class Buckets:
             is_there = tokens >= 1.0
             self._left[whose] = (tokens - 1.0 if is_there else tokens, now)
         return is_there
+
+
+class Names:
+    """Names of whom somebody will be told, until somebody takes them; more than `MAX_NAMES` are left out."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._held: set[str] = set()
+
+    def add(self, name: str) -> None:
+        """One more, unless it waits already."""
+        with self._lock:
+            if len(self._held) < MAX_NAMES:
+                self._held.add(name)
+
+    def take(self) -> tuple[str, ...]:
+        """Those since the last call, sorted."""
+        if not self._held:
+            return ()
+        with self._lock:
+            held, self._held = self._held, set()
+        return tuple(sorted(held))
 
 
 class Drops:

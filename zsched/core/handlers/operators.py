@@ -117,6 +117,10 @@ def _on_dropped(node: Stages, event: ev.FrameDropped, _todo: ToDo, now: float) -
     node.dropped_at[name] = node.frames_dropped_at = now
 
 
+def _on_link_refused(node: Stages, event: ev.LinkRefused, _todo: ToDo, now: float) -> None:
+    node.refused_keys.on_refused(event.key, now)
+
+
 def _on_commanded(node: Stages, event: ev.Commanded, todo: ToDo, _now: float) -> None:
     """Tell who has given a command, whatever becomes of it."""
     executor = node.executors.get(event.task)
@@ -145,6 +149,7 @@ HANDLERS: Final[Mapping[type[Any], Handler]] = {
     ev.HistoryAsked: _on_history,
     ev.CertificateSent: _on_certificate,
     ev.FrameDropped: _on_dropped,
+    ev.LinkRefused: _on_link_refused,
     ev.Commanded: _on_commanded,
     ev.ProblemReported: _on_problem,
     ev.StopRequested: _on_stop,

@@ -242,5 +242,7 @@ class Snapshot(Struct, frozen=True, kw_only=True):
     """Seconds since the newest invalid frame, ``None`` when none has come."""
     dropped_ages: tuple[tuple[str, float], ...] = ()
     """{counter of invalid frames or links that are refused: seconds since it rose last}."""
+    refused: tuple[str, ...] = ()
+    """Who dials with a certificate of this fleet and is not let in, and what to do; no problem of the fleet."""
     security: str = ""
     """How the answering node's sessions are let in to (`Exposure`); empty: an older version, which does not tell."""

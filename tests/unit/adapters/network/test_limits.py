@@ -8,7 +8,7 @@ import threading
 import zenoh
 
 from support.fleets import fleet_of
-from zsched.adapters.network.limits import BURST_S, Buckets, Drops, Limit, in_turn_hz, limit_for
+from zsched.adapters.network.limits import BURST_S, MAX_NAMES, Buckets, Drops, Limit, Names, in_turn_hz, limit_for
 from zsched.config.timing import PROFILES
 from zsched.core.values.fleet import Timing
 from zsched.sessions.config import control_config
@@ -75,6 +75,17 @@ def test_each_node_s_periodic_frames_are_thinned_far_above_their_rate() -> None:
         found = json.loads(zenoh.Config.from_json5(text).get_json("downsampling"))
         assert len(found) == count, "the operator's own stay"
         assert {rule["key_expr"] for rule in found[0]["rules"]} == set(rates)
+
+
+def test_names_are_told_once_and_no_flood_of_them_is_kept() -> None:
+    names = Names()
+    for number in range(100):
+        names.add(f"robot{number % 3}")
+    assert names.take() == ("robot0", "robot1", "robot2")
+    assert names.take() == ()
+    for number in range(100):
+        names.add(f"robot{number}")
+    assert len(names.take()) == MAX_NAMES
 
 
 def test_drops_of_several_threads_are_all_counted() -> None:
