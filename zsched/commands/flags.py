@@ -375,7 +375,7 @@ def lift_quietly(view: OrderView, since: int) -> tuple[str, ...]:
 
 def is_given_for(reason: str, flag: Json) -> bool:
     """Whether a flag is a drain for this reason; who gave it, each node that takes a command may call another name."""
-    return bool(flag["kind"] == DRAIN and flag["reason"] == reason)
+    return bool(flag["kind"] == DRAIN and flag.get("reason", "") == reason)
 
 
 # --- watching --------------------------------------------------------------------------------------------------------

@@ -16,7 +16,9 @@ from support.schemas import faults
 from zsched.adapters.host.operator_client import Json
 from zsched.cli import app
 from zsched.commands import flags as verbs
+from zsched.commands.ask import Door
 from zsched.commands.brief import render_brief
+from zsched.commands.orders import OrderView
 from zsched.commands.report import render_status
 
 TEXT = "fleet: lab\n"
@@ -281,3 +283,14 @@ def test_a_reason_that_is_not_one_short_line_is_refused(daemon: Daemon, reason: 
     assert done.exit_code == 2
     assert "--reason: " in done.stderr
     assert daemon.changes == []
+
+
+def test_the_end_of_a_rehearsals_drain_leaves_one_that_was_given_without_a_reason(
+    daemon: Daemon, tmp_path: Path
+) -> None:
+    """A rehearsal that could not end its own drain would leave the machine empty for a minute or more."""
+    plain = {"kind": "drain", "subject": "edge2", "by": "ada@robot1", "revision": 2}
+    daemon.set_flags([plain, {**plain, "subject": "edge1", "reason": "rehearsal 7"}])
+    view = OrderView(door=Door(socket=tmp_path / "robot1.sock"), is_yes=True, reason="rehearsal 7")
+    assert verbs.lift_quietly(view, since=1) == ("edge1",)
+    assert [flag["subject"] for flag in daemon.flags] == ["edge2"]
