@@ -300,7 +300,7 @@ def ask_door(door: Door, request: Json, timeout_s: float = ASK_TIMEOUT_S) -> Jso
         raise CliError(EXIT_TIMED_OUT, text)  # the daemon is up, and its loop is stuck
     runtime = door.socket.parent
     here = [path.stem for path in places.local_sockets(runtime)]
-    raise CliError(EXIT_UNREACHABLE, _no_daemon(door.node, runtime, here, " and none answers in the network"))
+    raise CliError(EXIT_UNREACHABLE, _no_daemon(door.node, runtime, here, is_asked=True))
 
 
 def _asked(door: Door, request: Json, timeout_s: float) -> Json:
@@ -321,11 +321,13 @@ def _asked(door: Door, request: Json, timeout_s: float) -> Json:
     return ask(door.socket, request, timeout_s)
 
 
-def _no_daemon(node: str, runtime: Path, here: Iterable[str], more: str = "") -> str:
-    return (
-        f"no daemon of {node} in {runtime} (here: {', '.join(here)}){more}; start it with `zsched up --node {node}`, "
-        "or ask another one with --node"
-    )
+def _no_daemon(node: str, runtime: Path, here: Iterable[str], *, is_asked: bool = False) -> str:
+    """``is_asked``: through the network, too; then it is likely to be another machine's, and is not started here."""
+    start = f"start it with `zsched up --node {node}`"
+    if is_asked:
+        start = f"look at zsched on the machine of {node} (`sudo systemctl restart zsched`), and at its network"
+    more = " and none answers in the network" if is_asked else ""
+    return f"no daemon of {node} in {runtime} (here: {', '.join(here)}){more}; {start}, or ask another one with --node"
 
 
 # --- without a daemon ------------------------------------------------------------------------------------------------

@@ -25,6 +25,8 @@ def answers(scene: Scene) -> Result:
     if "permission denied" in scene.refusal:
         return skipped(scene.refusal)
     fix = f"sudo systemctl start zsched (or zsched up --node {scene.node}); journalctl -u zsched says why it ended"
+    if "did not answer within" in scene.refusal:  # systemd would find it started
+        fix = "sudo systemctl restart zsched; journalctl -u zsched says where it stood"
     return failed(scene.refusal or f"the daemon of {scene.node} does not answer", fix=fix)
 
 
@@ -99,7 +101,7 @@ def tasks_have_owners(scene: Scene) -> Result:
         owner, state = task["owner"], task["owner_state"]
         if owner is None or state in ("gone", "unknown"):
             told = f"{task['name']} has no owner" if owner is None else f"{task['name']}: its owner {owner} is {state}"
-            fix = "zsched status names why each candidate cannot have it"
+            fix = f"zsched explain {task['name']} names why each candidate cannot have it"
             found.append(failed(told, fix=fix))
     owners = ", ".join(f"{task['name']} on {task['owner']}" for task in status["tasks"])
     return joined(

@@ -235,7 +235,8 @@ def test_status_of_a_silent_node_elsewhere_exits_with_3(daemon: Daemon) -> None:
     result = run("status", "--node", "robot3")
     assert result.exit_code == 3
     assert "no daemon of robot3 in " in result.stderr
-    assert "and none answers in the network; start it with `zsched up --node robot3`" in result.stderr
+    assert "and none answers in the network; look at zsched on the machine of robot3" in result.stderr
+    assert "zsched up" not in result.stderr, "a second daemon of that name is none to start here"
     assert "within 3 s" not in result.stderr, "it may have been told at once"
 
 

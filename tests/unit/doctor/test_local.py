@@ -256,7 +256,17 @@ def test_a_full_and_a_read_only_disk_are_found(tmp_path: Path, monkeypatch: pyte
 
 def test_a_daemon_that_is_not_there_is_found(tmp_path: Path) -> None:
     scene = replace(scene_of(tmp_path), own=None, refusal="cannot reach edge1.sock: no such file")
-    assert_finds(run("daemon.answers", scene), FAIL, "cannot reach")
+    found = run("daemon.answers", scene)
+    assert_finds(found, FAIL, "cannot reach")
+    assert found.fix.startswith("sudo systemctl start zsched")
+
+
+def test_a_wedged_daemon_is_to_be_restarted(tmp_path: Path) -> None:
+    """`systemctl start` finds it started, and does nothing."""
+    refusal = "the daemon at edge1.sock did not answer within 5 s; is it wedged?"
+    found = run("daemon.answers", replace(scene_of(tmp_path), own=None, refusal=refusal))
+    assert_finds(found, FAIL, "is it wedged")
+    assert found.fix.startswith("sudo systemctl restart zsched")
 
 
 def answer(scene: Scene, **changes: Any) -> Scene:
@@ -323,6 +333,8 @@ def test_a_task_without_an_owner_and_a_lost_quorum_are_found(tmp_path: Path) -> 
     (task,) = scene.status["tasks"]
     lost = answer(scene, tasks=[{**task, "owner": None}], quorum={**scene.status["quorum"], "ok": False, "alive": 1})
     assert_finds(run("task.owners", lost), FAIL, "no quorum: 1 of 3", "merge has no owner")
+    nobody = run("task.owners", answer(scene, tasks=[{**task, "owner": None}]))
+    assert nobody.fix.startswith("zsched explain merge"), "which says why each candidate cannot have it"
     assert_finds(run("task.owners", answer(scene, tasks=[{**task, "owner_state": "gone"}])), FAIL, "edge1 is gone")
 
 

@@ -36,7 +36,8 @@ def ask(path: Path, request: Json, timeout_s: float = 5.0) -> Json:
                 raise ConnectionAbortedError(errno.ECONNABORTED, "it ended before it answered")
             answer = json.loads(line)
     except (BlockingIOError, TimeoutError) as error:  # the first: its queue of connections is full
-        raise AdapterError(f"the daemon at {path} did not answer within {timeout_s:g} s; is it wedged?") from error
+        what = f"the daemon at {path} did not answer within {timeout_s:g} s; is it wedged?"
+        raise AdapterError(f"{what} If it stays so: sudo systemctl restart zsched (its relay goes on)") from error
     except (OSError, ValueError) as error:
         detail = getattr(error, "strerror", None) or error
         raise AdapterError(f"no daemon answers at {path} ({detail}); start it with `zsched up`") from error
