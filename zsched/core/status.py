@@ -139,7 +139,7 @@ def _problems(node: Stages, quorum: QuorumStatus, now: float) -> tuple[str, ...]
         # A fleet that lives on elsewhere must not become two.
         is_left_behind = is_out or is_apart or (is_alone and not node.agreement.is_elector)
         problems.append(_no_quorum(node, quorum, now, is_left_behind=is_left_behind))
-        if not is_alone:
+        if not is_alone and not is_out:  # who was taken out is let in nowhere: the electors are well
             problems += [f"elector {told}" for name in node.fleet.electors if (told := _why_silent(node, name, now))]
     elif quorum.alive == quorum.needed < quorum.electors:
         missing = [name for name in node.fleet.electors if not _can_answer(node, name)]

@@ -184,6 +184,17 @@ def test_a_node_of_a_fleet_that_lives_on_elsewhere_is_told_nothing_of_a_recovery
     assert not any("fleet/robot1" in one for one in problems), "the others go by another document, as they should"
 
 
+def test_a_machine_that_was_taken_out_is_not_told_to_start_the_others() -> None:
+    node = make("edge1", alive=ROBOTS)
+    for tick in range(20):
+        node.handle(ev.DeadlineReached(), 100.5 + tick / 2)
+    assert any(one.startswith("elector robot1 is gone: start") for one in build_snapshot(node, 110.0).problems)
+    node.problems["fleet/document"] = f"the document names no node 'edge1': {TAKEN_OUT}"
+    problems = build_snapshot(node, 110.0).problems
+    assert any(TAKEN_OUT in one for one in problems)
+    assert not any(one.startswith("elector ") for one in problems), "they run, and let it in no more"
+
+
 def forgotten(me: str = "robot1", *, lacks_file: bool = True, stateless: tuple[str, ...] = ROBOTS) -> Node:
     """A node of a fleet whose electors say that they have no state."""
     node = make(me, has_state=me not in stateless)
