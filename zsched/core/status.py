@@ -151,12 +151,15 @@ def _problems(node: Stages, quorum: QuorumStatus, now: float) -> tuple[str, ...]
     voters = node.agreement.voters
     silent = [name for name in voters if node.membership.state(name) is not PeerState.ALIVE]
     needed = majority(len(voters))
+    # Who has just started knows nothing of an owner that it never heard: only a vote replaces that one.
+    never_heard = f"; one that was never heard, once they are away for {node.fleet.away_s:g} s"
+    never_heard = never_heard if node.agreement.document_hash else ""
     if quorum.ok and not voters:
         problems.append("nobody votes: the fleet has no robot, so no task gets an owner; `zsched invite` brings one")
     elif quorum.ok and len(voters) - len(silent) < needed:
         problems.append(
             f"no planned moves: {len(voters) - len(silent)} of {len(voters)} robots can vote, {needed} needed; "
-            f"not {', '.join(silent)}. An owner that is gone, drains or fails is still replaced"
+            f"not {', '.join(silent)}. An owner that is gone, drains or fails is still replaced{never_heard}"
         )
     if not has_enough and not node.has_others_state:
         problems.append(_nothing_agreed(node, quorum, fresh))
