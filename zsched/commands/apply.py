@@ -182,6 +182,8 @@ def make_plan(door: Door, held: InForce, text: str, file: str, view: ApplyView |
     config = places.config_path(None, os.environ)
     folder = config.absolute().parent if config.exists() else None  # where the nodes read it
     result = check_bytes(text.encode(), file, folder)
+    if held.document:
+        result = replace(result, warnings=warnings_in_force(text, result.warnings))
     if result.fleet is None:
         raise ConfigError(result.report())
     fleet = result.fleet
@@ -196,7 +198,6 @@ def make_plan(door: Door, held: InForce, text: str, file: str, view: ApplyView |
         if pause_after is not None:
             raise CliError(EXIT_FAILED, f"--pause-after: {held.fleet} has no document yet; agree its file first")
         return _first(door, held, text, fleet, warnings)
-    warnings = render_all(file, warnings_in_force(text, result.warnings), "warning")
     old = check_bytes(document_text(held).encode(), file, folder).fleet
     if old is None:
         advice = "update zsched here; `zsched fleet export` shows the document"

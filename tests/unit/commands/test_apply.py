@@ -130,6 +130,19 @@ def changed(tmp_path: Path, old: str, new: str) -> Path:
 # --- apply -----------------------------------------------------------------------------------------------------------
 
 
+def test_a_text_with_faults_is_not_warned_of_electors_that_it_does_not_name(node: Node, tmp_path: Path) -> None:
+    """Those that are agreed stay: "two electors" would send an operator after what is not so."""
+    file = changed(tmp_path, "electorate: [robot1, robot2, edge1]\n", "")
+    file.write_text(file.read_text().replace("cpu: 0.5", "cpu: much"))
+    node.document = "ab12" * 8
+    result = run("apply", file, "--yes")
+    assert (result.exit_code, node.changes) == (78, [])
+    assert "much" in result.stderr
+    assert "electors" not in result.stderr
+    node.document = ""
+    assert "electors" in run("apply", file, "--yes").stderr, "a first document says who they are"
+
+
 def test_files_that_the_document_names_are_looked_for_beside_the_fleet_file(
     node: Node, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
