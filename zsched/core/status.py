@@ -20,7 +20,7 @@ from zsched.core.values.fleet import NodeSpec, TaskSpec
 from zsched.core.values.gauges import possible
 from zsched.core.values.model import Allocation, NodeId, Pause, PeerState, Pin, TaskId
 from zsched.core.values.plan import Direction, ReadyWhen, Route, StreamCount
-from zsched.core.values.profile import WorkerLoad, WorkerState
+from zsched.core.values.profile import Jobs, WorkerLoad, WorkerState
 from zsched.core.values.quorum import majority
 from zsched.core.values.snapshot import (
     SCHEMA,
@@ -51,6 +51,10 @@ RECOVER_AFTER_S = 60.0
 A recovery beside electors that come back makes two fleets of one.
 """
 RECOVER = "stop zsched on one that has its state, run `zsched recover` there, and start it"
+HUNG_HZ = 0.002
+"""The smoothed rate of a worker falls to this about 8 s after its last job."""
+HUNG_JOB_S = 0.5
+"""Of longer jobs none may have ended for so long, and all is well."""
 UNREADY_SHOWN_S = 2.0
 """A slot that no worker takes for longer is a problem: a handover takes less."""
 
@@ -446,10 +450,20 @@ def _task_problems(node: Stages, task: TaskSpec, value: Allocation, now: float) 
             yield f"the worker on {spec.name} {told_of_worker(load.state, load.reason)}"
         elif load.state is WorkerState.READY and load.reason:
             yield f"the worker on {spec.name}{why}"
+        elif spec.name == owner and load.jobs is not None and _hangs(load.jobs):
+            yield (
+                f"the worker on {spec.name} has finished no job for some seconds, and {load.jobs.backlog} wait: it may "
+                f"hang in a callback; see `zsched logs {task.name}`, `zsched restart {task.name}` starts it anew"
+            )
     since = _unready_since(node, executor)
     if is_owner_ready and now - since >= UNREADY_SHOWN_S:
         waited = f"this robot's streams have waited for {executor.owner} for {now - since:.0f} s"
         yield f"{waited}: {_untaken(task, executor, node.unready.get(task.name))}"
+
+
+def _hangs(jobs: Jobs) -> bool:
+    """Whether jobs wait, and none has ended for many times as long as one took before."""
+    return jobs.backlog > 0 and jobs.done_hz < HUNG_HZ and jobs.time_s <= HUNG_JOB_S
 
 
 def _is_in_the_way(task: TaskSpec, load: WorkerLoad) -> bool:

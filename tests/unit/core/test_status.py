@@ -595,12 +595,32 @@ def test_a_slot_that_somebody_else_s_worker_does_not_take_is_told_with_what_mend
     assert "the session edge1-merge.zenoh.json5" in waits
 
 
-def told_by(node: Node, name: str, sequence: int, state: WorkerState, reason: str = "") -> None:
+def told_by(
+    node: Node, name: str, sequence: int, state: WorkerState, reason: str = "", jobs: Jobs | None = None
+) -> None:
     """A node's profile says how its worker is."""
-    profile = profile_of(
-        name, incarnation=3, sequence=sequence, memory_used_mb=100.0, workers=(load_of(state=state, reason=reason),)
-    )
+    load = load_of(state=state, reason=reason, jobs=jobs)
+    profile = profile_of(name, incarnation=3, sequence=sequence, memory_used_mb=100.0, workers=(load,))
     node.handle(ev.ProfileReceived(profile=profile), 100.0)
+
+
+@pytest.mark.parametrize(
+    ("jobs", "is_told"),
+    [
+        (Jobs(time_s=0.01, cpu_s=0.01, done_hz=0.0011, wanted_hz=9.9, backlog=86), True),
+        (Jobs(time_s=0.01, cpu_s=0.01, done_hz=0.0011, wanted_hz=0.0011), False),  # nothing waits: it is idle
+        (Jobs(time_s=0.01, cpu_s=0.01, done_hz=4.0, wanted_hz=9.9, backlog=86), False),  # behind, and at work
+        (Jobs(time_s=20.0, cpu_s=0.01, done_hz=0.0011, wanted_hz=9.9, backlog=86), False),  # a job takes this long
+    ],
+)
+def test_an_owner_whose_jobs_wait_and_never_end_is_a_problem(jobs: Jobs, *, is_told: bool) -> None:
+    """Its token is there and samples flow in: without this line all would look well."""
+    node = make()
+    node.handle(ev.BeatReceived(beat=beat_of("edge1", incarnation=3)), 100.0)
+    learn(node, 1, "edge1")
+    told_by(node, "edge1", 1, WorkerState.READY, jobs=jobs)
+    problems = build_snapshot(node, 101.0).tasks[0].problems
+    assert any("finished no job for some seconds, and 86 wait" in one for one in problems) is is_told
 
 
 def test_a_slot_that_is_not_taken_is_told_of_only_once_the_owner_s_own_worker_is_ready() -> None:
