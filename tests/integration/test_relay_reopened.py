@@ -107,6 +107,20 @@ def test_nothing_of_a_reliable_stream_is_lost_or_doubled(host: Host, on_crash: O
     assert (counted.lost, counted.at_most_lost, dict(counted.drops)) == (0, 0, {})
 
 
+@pytest.mark.parametrize("stream_class", [StreamClass.RELIABLE, StreamClass.LATEST])
+def test_an_owner_that_heard_a_session_of_before_drains_all_the_same(host: Host, stream_class: StreamClass) -> None:
+    """It waits for the end of all that it has heard: of what came by the session of before nothing else would come."""
+    first, second = (slot(epoch, f"edge{epoch}", stream_class, 0) for epoch in (1, 2))
+    app, thread = flowing(host, first)
+    host.start_worker("edge2")
+    until(lambda: len(app.back) > 20, "answers")
+    host.begin_anew(first)
+    here = len(app.back)
+    until(lambda: len(app.back) > here + 20, "the stream goes on")
+    host.move(second, first)
+    app.halt(thread)
+
+
 @pytest.mark.parametrize("stream_class", [StreamClass.BEST_EFFORT, StreamClass.LATEST])
 def test_other_classes_carry_on(host: Host, stream_class: StreamClass) -> None:
     only = slot(1, "edge1", stream_class, 1)

@@ -102,6 +102,7 @@ class Outlet:
         self._epoch = epoch
         self._lock = threading.Lock()
         self._lanes: dict[tuple[str, str], Lane] = {}
+        self._has_put_ends = False
         self.tally = Tally()
         self._handed = 0
         """Samples taken and not dropped (the stream's lock guards it)..."""
@@ -384,6 +385,7 @@ class Outlet:
         return lane
 
     def _put_ends(self, epoch: int) -> None:
+        self._has_put_ends = True
         for lane in tuple(self._lanes.values()):
             self._put_marker(lane, epoch, lane.count)
 
@@ -415,9 +417,17 @@ class Outlet:
                 put_marker(self._session, lane.key, lane.source_id, lane.publisher.priority, marker)
 
     def _leave(self) -> None:
-        """The last words to a worker of class ``reliable``: it must not do any more what it still has."""
+        """The last words to a worker: of class ``reliable`` it must not do any more what it still has.
+
+        A lane of which it has done all, and that has not ended, is left for good, too: for the worker's end, which
+        waits for the end of all that it has heard, nothing comes of it any more (`reopen` of the data session).
+        """
         with self._lock:
-            open_lanes = [lane for lane in self._lanes.values() if self._greetings is not None and lane.in_flight]
+            lanes = tuple(self._lanes.values())
+            is_left = self._acks is not None and not self._has_put_ends
+            open_lanes = [one for one in lanes if is_left and one.count and not one.in_flight]
+            if self._greetings is not None:
+                open_lanes += [one for one in lanes if one.in_flight]
         try:
             for lane in open_lanes:
                 marker = EndMarker(epoch=SKIP_EPOCH, count=lane.count, slot=self._epoch, is_given_up=True)

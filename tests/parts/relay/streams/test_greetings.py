@@ -383,10 +383,11 @@ def test_the_sample_that_the_thread_has_just_taken_goes_to_the_next_owner(
     assert (said.waiting, said.in_flight) == (0, 0)
 
 
-@pytest.mark.parametrize("done", [1, 2])
+@pytest.mark.parametrize(("done", "has_ended"), [(1, False), (1, True), (2, False), (2, True)])
 def test_a_worker_is_told_its_epoch_and_when_it_is_left_with_work_that_this_is_given_up(
-    bench: Bench, done: int
+    bench: Bench, done: int, *, has_ended: bool
 ) -> None:
+    """It waits for the end of all that it has heard, so what is left without one is given up, also with all done."""
     receiver = Receiver(bench.other, bench.relay, "edge1/in")
     outlet = bench.outlet("robot1/in", "edge1/in", epoch=7)
     outlet.send(sample := bench.sample())
@@ -396,11 +397,16 @@ def test_a_worker_is_told_its_epoch_and_when_it_is_left_with_work_that_this_is_g
     until(lambda: receiver.got == [0, 1], "both")
     receiver.ack(done)
     settled(outlet, in_flight=2 - done, acknowledged=done)
+    if has_ended:
+        has_put = threading.Event()
+        outlet.send_end(7, has_put.set)
+        assert has_put.wait(60)
     outlet.undeclare()
     last = bench.outlet("robot1/in", "edge1/in", epoch=8)
     until(lambda: cared(last) and receiver.starts[-1].slot == 8, "the next one's start marker")
     given_up = [start for start in receiver.starts if start.is_given_up]
-    assert given_up == [EndMarker(epoch=0, count=2, slot=7, is_given_up=True)] * (2 - done)
+    is_told = done < 2 or not has_ended
+    assert given_up == [EndMarker(epoch=0, count=2, slot=7, is_given_up=True)] * is_told
     last.undeclare()
 
 
