@@ -695,7 +695,7 @@ def test_who_only_looks_and_reads_too_slowly_holds_no_stream_up(fresh: Yard, who
     assert members is not None
     with contextlib.ExitStack() as stack:
         session = stack.enter_context(zenoh.open(zenoh.Config.from_json5(text)))
-        expulsion = Expulsion(session, "yard", members, told.append, has_streams=True)
+        expulsion = Expulsion(session, "yard", members, lambda why, _name: told.append(why), has_streams=True)
         stack.callback(expulsion.close)
         victim = Victim(session, endpoint.partition("#")[0])
         owner = stack.enter_context(fresh.member("edge1", victim))

@@ -87,7 +87,7 @@ class Expulsion:
 
         ``members``: common names that are let in; each has at most ``max_sessions`` (`MAX_SESSIONS`).
         ``tell`` hears of each link that is refused, and its common name, in zenoh's threads and ours. ``has_streams``:
-        guests and operators must read quickly. Nothing runs before the first of them, or the first link that is refused.
+        guests and operators must read quickly. Nothing runs before the first of them, or of the refused links.
         """
         self._session, self._fleet, self._members, self._tell = session, fleet, frozenset(members), tell
         self._max_sessions = MAX_SESSIONS if max_sessions is None else max_sessions
@@ -254,7 +254,7 @@ class Expulsion:
             if lacks_s >= SLOW_S:
                 self._shut_out[lookers[link.zid]] = now + SHUT_OUT_S
                 self._held.pop(link, None)
-                self._tell(Refusal.SLOW, link.name)
+                self._tell(Refusal.SLOW, self._names.get(link.zid, ""))
                 if link.abort():
                     _log.warning("the link to %s is ended: %s reads too slowly", link.name, lookers[link.zid])
             elif lacks_s > 0.0:
