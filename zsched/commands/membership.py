@@ -46,6 +46,7 @@ from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
 from zsched.files import read_regular
 from zsched.runtime.membership import Places, Written, belongings, found, is_joined, is_of_a_later_key, put_away
 from zsched.runtime.membership import join as join_here
+from zsched.runtime.own_addresses import addresses_at
 from zsched.wire.codec import from_plain
 from zsched.wire.invitation import MAX_BYTES, Invitation, decode_invitation, encode_invitation
 
@@ -142,8 +143,28 @@ def _is_of_nobody(host: str) -> bool:
     return address.is_unspecified or address.is_multicast or host == "255.255.255.255"
 
 
-def own_address() -> str:
-    """The address of this machine from which packets for other networks would leave; empty: it has none."""
+def own_address(root: Path = Path("/")) -> str:
+    """The address at which others dial this machine: the one that its default route uses, else the only one it has.
+
+    ``root`` is "/" but in tests.
+
+    Raises:
+        CliError: it has none, or several.
+    """
+    if routed := _routed_address():
+        return routed
+    everywhere = "0.0.0.0"  # noqa: S104 - nothing listens
+    found = [one for one in addresses_at(root, everywhere) if not one.is_loopback and not one.is_link_local]
+    if not found:
+        raise CliError(EXIT_FAILED, "this machine has no address in a network: connect it, or give one with --address")
+    if len(found) > 1:
+        here = ", ".join(map(str, found))
+        raise CliError(EXIT_FAILED, f"which of its addresses do others dial? Give one with --address (here: {here})")
+    return str(found[0])
+
+
+def _routed_address() -> str:
+    """From which packets for other networks would leave; empty: there is no default route."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(("192.0.2.1", 9))  # of documentation, and nothing is sent: the kernel only looks for the way
@@ -197,10 +218,7 @@ def create(view: CreateView) -> int:
     """
     check_name(view.fleet)
     check_name(view.node, "--node")
-    host = own_address() if view.address is None else ""
-    if view.address is None and not host:
-        raise CliError(EXIT_FAILED, "this machine has no address in a network: connect it, or give one with --address")
-    address = Address(host=host) if view.address is None else address_of(view.address)
+    address = Address(host=own_address()) if view.address is None else address_of(view.address)
     if not view.is_secured:
         refuse_open_network((address.host, address.listened_host), view.accepted)
     papers = _first_papers(view) if view.is_secured else None

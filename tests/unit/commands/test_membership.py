@@ -145,12 +145,9 @@ def test_who_dials_whom_is_kept_when_it_is_written_down() -> None:
 # --- create ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_fleet_of_one_is_created_with_this_machines_address(tmp_path: Path) -> None:
+def test_a_fleet_of_one_is_created_with_this_machines_address(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(membership, "_routed_address", lambda: "192.0.2.9")
     result = run("fleet", "create", "hall", "--node", "robot1", *here(tmp_path))
-    if not own_address():
-        assert result.exit_code == 1
-        assert "give one with --address" in result.stderr
-        return
     assert result.exit_code == 0, result.stderr
     fleet = load_fleet(tmp_path / "fleet.yaml")
     assert (fleet.name, [node.name for node in fleet.nodes], fleet.tasks, fleet.seeds) == (
@@ -159,9 +156,32 @@ def test_a_fleet_of_one_is_created_with_this_machines_address(tmp_path: Path) ->
         (),
         ("robot1",),
     )
-    assert fleet.node("robot1").host == own_address()
+    assert fleet.node("robot1").host == "192.0.2.9"
     assert fleet.security is not None, "secured, unless somebody says otherwise"
     assert "next: zsched up --config" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("addresses", "said"),
+    [
+        (("127.0.0.1", "10.42.0.7", "169.254.3.4"), "10.42.0.7"),
+        (("127.0.0.1",), "has no address in a network"),
+        (("127.0.0.1", "10.42.0.7", "192.168.7.2"), r"with --address \(here: 10\.42\.0\.7, 192\.168\.7\.2\)"),
+    ],
+)
+def test_without_a_default_route_the_only_address_is_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, addresses: tuple[str, ...], said: str
+) -> None:
+    """A hall whose Wi-Fi leads nowhere else."""
+    monkeypatch.setattr(membership, "_routed_address", lambda: "")
+    table = tmp_path / "proc" / "net" / "fib_trie"
+    table.parent.mkdir(parents=True)
+    table.write_text("Main:\n" + "".join(f"  |-- {one}\n     /32 host LOCAL\n" for one in addresses))
+    if said in addresses:
+        assert own_address(tmp_path) == said
+    else:
+        with pytest.raises(CliError, match=said):
+            own_address(tmp_path)
 
 
 def test_create_says_what_it_would_write_and_what_it_wrote(tmp_path: Path) -> None:
