@@ -84,6 +84,10 @@ class Dev:
         match: re.Match[str] = until(pressed, pattern)
         return match
 
+    def wait_ready(self) -> None:
+        """Both edges' workers are ready: on a busy machine the second one begins much later than the owner's."""
+        self.press_until("s", r"edge1 +edge[^\n]*ready[^\n]*\n[^\n]*edge2 +edge[^\n]*ready")
+
     @property
     def application(self) -> list[str]:
         """The words of the line that starts the example's application."""
@@ -154,6 +158,7 @@ def test_an_example_answers_survives_a_kill_and_leaves_nothing(folder: Path, exa
         run.wait(r"shout: on (\w+) \(epoch 1")
         with Application(run.application) as application:
             application.wait_answer(r"\(by \w+\)")
+            run.wait_ready()  # else the task waits for its owner, which comes back after 5 s
             told = len(run.said)
             run.press("k")
             # the owner of now: on a busy machine the task may have moved since it was placed
