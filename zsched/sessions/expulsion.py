@@ -16,6 +16,7 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import math
 import queue
 import threading
 from collections.abc import Callable, Iterable
@@ -43,6 +44,8 @@ MAX_HELD: Final = 16
 """More are ended at once: what has come by a link that is held waits in the kernel, up to some MiB."""
 SLOW_S: Final = 0.3
 """So much longer without room than with it, and the link of one who only looks ends."""
+SLOW_OUT_S: Final = 1.0
+"""Then it gets no other link for this long, as a radio that fades needs; twice as long each time soon after that."""
 SLOW_LOOK_S: Final = 0.05
 LOOK_AGAIN_S: Final = 0.05
 LOOKS: Final = 10
@@ -102,6 +105,8 @@ class Expulsion:
         """{node: tokens}; whoever shows one in a node's name has its certificate."""
         self._shut_out: dict[str, float] = {}
         """{holder that has shown too many, or was too slow: until when}."""
+        self._slow_out: dict[str, tuple[float, float]] = {}
+        """{holder that was too slow: (for how long it was shut out, until when)}; the thread's own."""
         self._lookers: dict[str, str] = {}
         """{session: its holder, who is no node}, with streams; those that are shut out, too, while they are held."""
         self._slow: dict[LinkSocket, float] = {}
@@ -252,13 +257,21 @@ class Expulsion:
         for link in links:
             lacks_s = before.get(link, 0.0) + (-passed_s if link.fd in ready else passed_s)
             if lacks_s >= SLOW_S:
-                self._shut_out[lookers[link.zid]] = now + SHUT_OUT_S
+                self._shut_out_slow(lookers[link.zid], now)
                 self._held.pop(link, None)
                 self._tell(Refusal.SLOW, self._names.get(link.zid, ""))
                 if link.abort():
                     _log.warning("the link to %s is ended: %s reads too slowly", link.name, lookers[link.zid])
             elif lacks_s > 0.0:
                 self._slow[link] = lacks_s
+
+    def _shut_out_slow(self, holder: str, now: float) -> None:
+        last_s, until = self._slow_out.get(holder, (0.0, -math.inf))
+        if now < until:
+            return  # another link of the same moment
+        out_s = min(SHUT_OUT_S, 2 * last_s) if now < until + SHUT_OUT_S else SLOW_OUT_S
+        self._slow_out[holder] = out_s, now + out_s
+        self._shut_out[holder] = max(self._shut_out.get(holder, 0.0), now + out_s)
 
     def _end_held(self) -> None:
         now = monotonic_s()
