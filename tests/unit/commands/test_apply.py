@@ -14,7 +14,7 @@ from typer.testing import CliRunner, Result
 from support.schemas import faults
 from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.cli import app
-from zsched.commands import document, fleet
+from zsched.commands import apply, document, fleet
 from zsched.commands.ask import PASSES_ON
 from zsched.commands.common import CliError
 from zsched.config.editing import add_entries
@@ -55,6 +55,8 @@ class Node:
         self.refused = "nothing"
         """The kind of change that another operator has overtaken."""
         self.meanwhile: list[tuple[str, list[str]]] = []
+        self.unlearnt = 0
+        """Conflicts before the node has learnt what came first."""
         """(document, electors) of what comes first at each change."""
 
     def answer(self, request: Json) -> Json:
@@ -81,6 +83,9 @@ class Node:
         assert verb == "change"
         self.changes.append(request)
         if self.refused in request:
+            return {"outcome": "conflict", "detail": "it was overtaken", "revision": None}
+        if self.unlearnt:
+            self.unlearnt -= 1
             return {"outcome": "conflict", "detail": "it was overtaken", "revision": None}
         if self.meanwhile:
             self.revision += 1
@@ -247,10 +252,13 @@ def test_a_revision_that_was_overtaken_is_refused_with_the_one_there_is(node: No
 def test_electors_that_the_fleet_changes_by_itself_are_no_conflict_with_another_document(
     node: Node, tmp_path: Path
 ) -> None:
-    node.meanwhile = [(node.document, ["edge1", "robot1"]), (node.document, ["edge1", "robot1", "robot2"])]
+    """However many come one after another; the first conflict comes before the node has learnt what made it one."""
+    node.unlearnt = 1
+    node.meanwhile = [(node.document, ["edge1", "robot1"]), (node.document, ["edge1", "robot1", "robot2"])] * 3
     file = changed(tmp_path, "cpu: 0.5, memory: 0.5", "cpu: 1")
     result = run("apply", file, "--yes")
-    assert (result.exit_code, [one["base_revision"] for one in node.changes]) == (0, [7, 8, 9]), result.output
+    bases = [one["base_revision"] for one in node.changes]
+    assert (result.exit_code, bases) == (0, [7, 7, 8, 9, 10, 11, 12, 13]), result.output
     assert node.text == file.read_text()
 
 
@@ -265,7 +273,10 @@ def test_another_document_or_a_revision_that_was_named_is_not_overtaken(
 
 
 @pytest.mark.parametrize(("outcome", "code"), [("conflict", 1), ("invalid", 1), ("no_quorum", 4), ("unknown", 5)])
-def test_what_does_not_come_about_has_its_exit_code(node: Node, tmp_path: Path, outcome: str, code: int) -> None:
+def test_what_does_not_come_about_has_its_exit_code(
+    node: Node, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, outcome: str, code: int
+) -> None:
+    monkeypatch.setattr(apply, "OVERTAKEN_S", 0.2)
     node.outcome = outcome
     result = run("apply", changed(tmp_path, "cpu: 0.5, memory: 0.5", "cpu: 1"), "--yes")
     assert result.exit_code == code
