@@ -9,22 +9,19 @@ from __future__ import annotations
 import os
 import shlex
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TextIO
 
 from zsched import paths as places
-from zsched.clock import monotonic_s
 from zsched.commands.ask import Door
 from zsched.commands.common import CliError, Json, check_reason, nearest, print_json, say, says_yes, warn
 from zsched.commands.document import (
-    PAUSE_S,
     QUESTION,
-    ConflictError,
     InForce,
     ask_all,
     change,
+    change_over,
     document_text,
     in_force,
     ordered,
@@ -52,8 +49,6 @@ OPEN_NETWORK = "open-network"
 DANGERS = (*(danger.value for danger in Danger), OTHER_FILES, OPEN_NETWORK)
 PATH_ROOM, VALUE_ROOM = 44, 28
 STDIN = "-"
-OVERTAKEN_S = 5.0
-"""For this long a document is asked for while the fleet changes its electors by itself."""
 
 
 class ApplyView(Struct, frozen=True, kw_only=True):
@@ -373,29 +368,13 @@ def _commit(door: Door, view: ApplyView, plan: Plan) -> int:
 def _agreed(door: Door, step: Json, held: InForce, view: ApplyView) -> int:
     """The revision that one change made.
 
-    A fleet also changes its electors by itself. That is no reason to refuse another document: it is asked for again on
-    the newest revision, as long as the document and the orders are those that were looked at.
-
     Raises:
         CliError: it is refused; somebody else was first, or the fleet does not come to rest.
     """
-    base = held.revision
-    by = ordered(shlex.join(view.words), {"by": asker(door), "reason": view.reason})
-    until = monotonic_s() + OVERTAKEN_S
-    while True:
-        try:
-            answer = change(door, {**step, "base_revision": base, **by})
-        except ConflictError:
-            now = in_force(door)
-            is_same = (now.document, now.flags, now.rollouts) == (held.document, held.flags, held.rollouts)
-            is_ours = "text" in step and view.revision is None
-            if not is_same or not is_ours or monotonic_s() > until:
-                raise
-            if now.revision == base:
-                time.sleep(PAUSE_S)  # the node has yet to learn what came first
-            base = now.revision
-        else:
-            return int(answer["revision"])
+    what = {**step, **ordered(shlex.join(view.words), {"by": asker(door), "reason": view.reason})}
+    if "text" in step and view.revision is None:
+        return int(change_over(door, what, held)["revision"])
+    return int(change(door, {**what, "base_revision": held.revision})["revision"])
 
 
 def _check_same(held: InForce, document: str) -> None:

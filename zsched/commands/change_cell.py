@@ -26,6 +26,7 @@ from zsched.commands.document import (
     InForce,
     ask_all,
     change,
+    change_over,
     document_text,
     in_force,
     ordered,
@@ -351,9 +352,9 @@ def _invited(way: Way, there: _Next, going: Change | None) -> Change:
         assert there.door is not None
         assert there.held is not None
         if not there.is_invited:
-            asked = {"base_revision": there.held.revision, **_ordered(way)}
             kept = {"flags": list(there.held.flags), "rollouts": list(there.held.rollouts)}
-            answer = change(there.door, {"text": _text_with(way, there.held), **kept, **asked})
+            what = {"text": _text_with(way, there.held), **kept, **_ordered(way)}
+            answer = change_over(there.door, what, there.held)
             wait_until_settled(there.door, int(answer["revision"]))
             way.tell(f"{there.fleet}: revision {answer['revision']} is agreed, and {way.me} may join")
         invitation = invitation_for(there.door, Guest(name=way.me), b"")

@@ -27,6 +27,8 @@ AT_ONCE = 8
 PAUSE_S = 0.1
 IN_FORCE_S = 10.0
 """How long a change that is agreed is waited for at the node that was asked."""
+OVERTAKEN_S = 5.0
+"""For this long a document is asked for while the fleet changes its electors by itself."""
 CODES = {"invalid": EXIT_FAILED, "conflict": EXIT_FAILED, "no_quorum": EXIT_DEGRADED, "unknown": EXIT_TIMED_OUT}
 TELL_S = 1.0
 """After this time it says what it waits for."""
@@ -143,6 +145,31 @@ def change(door: Door, what: Json) -> Json:
     words = f"{outcome.replace('_', ' ')}: {detail}{'; ' if advice else ''}{advice}"
     kind = ConflictError if outcome == "conflict" else CliError
     raise kind(CODES.get(outcome, EXIT_FAILED), words)
+
+
+def change_over(door: Door, what: Json, held: InForce) -> Json:
+    """As `change`, of what was in force when it was looked at.
+
+    A fleet also changes its electors by itself, several times in a row while it grows. That is no reason to refuse
+    another document: it is asked for again on the newest revision, for `OVERTAKEN_S`, as long as the document and the
+    orders are those that were looked at.
+
+    Raises:
+        ConflictError: somebody else was first, or the fleet does not come to rest.
+        CliError: as of `change`.
+    """
+    base, until = held.revision, monotonic_s() + OVERTAKEN_S
+    while True:
+        try:
+            return change(door, {**what, "base_revision": base})
+        except ConflictError:
+            now = in_force(door)
+            is_same = (now.document, now.flags, now.rollouts) == (held.document, held.flags, held.rollouts)
+            if not is_same or monotonic_s() > until:
+                raise
+        if now.revision == base:
+            time.sleep(PAUSE_S)  # the node has yet to learn what came first
+        base = now.revision
 
 
 def wait_until_settled(door: Door, revision: int) -> InForce:

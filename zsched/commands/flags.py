@@ -15,7 +15,7 @@ from typing import Any, Final
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, nearest, print_json, say
-from zsched.commands.document import InForce, change, document_text, in_force, ordered
+from zsched.commands.document import InForce, change_over, document_text, in_force, ordered
 from zsched.commands.orders import OrderView, Row, begin, check_said
 from zsched.commands.page import span
 from zsched.commands.report import millis, told_flag
@@ -341,7 +341,7 @@ def _commit(view: OrderView, held: InForce, flags: Sequence[Json], what: str) ->
     if tuple(flags) == held.flags:
         return held.revision
     text = {"text": held.text, "flags": list(flags), "rollouts": list(held.rollouts)}
-    answer = change(view.door, {**text, "base_revision": held.revision, **ordered(what, view.asked)})
+    answer = change_over(view.door, {**text, **ordered(what, view.asked)}, held)
     return int(answer["revision"])
 
 

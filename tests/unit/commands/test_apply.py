@@ -14,7 +14,7 @@ from typer.testing import CliRunner, Result
 from support.schemas import faults
 from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.cli import app
-from zsched.commands import apply, document, fleet
+from zsched.commands import document, fleet
 from zsched.commands.ask import PASSES_ON
 from zsched.commands.common import CliError
 from zsched.config.editing import add_entries
@@ -276,7 +276,7 @@ def test_another_document_or_a_revision_that_was_named_is_not_overtaken(
 def test_what_does_not_come_about_has_its_exit_code(
     node: Node, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, outcome: str, code: int
 ) -> None:
-    monkeypatch.setattr(apply, "OVERTAKEN_S", 0.2)
+    monkeypatch.setattr(document, "OVERTAKEN_S", 0.2)
     node.outcome = outcome
     result = run("apply", changed(tmp_path, "cpu: 0.5, memory: 0.5", "cpu: 1"), "--yes")
     assert result.exit_code == code

@@ -49,6 +49,8 @@ class Daemon:
         self.document = "ab" * 16
         self.changes: list[Json] = []
         self.outcome = "ok"
+        self.overtaken = 0
+        """Changes that the fleet's own new electors come before."""
         self.step: Callable[[], None] = lambda: None
 
     def answer(self, request: Json) -> Json:
@@ -66,6 +68,10 @@ class Daemon:
             return {**body, **told}
         assert request["verb"] == "change"
         self.changes.append(request)
+        if self.overtaken:
+            self.overtaken -= 1
+            self.status["fleet_revision"] += 1
+            return {"outcome": "conflict", "detail": "another change came first", "revision": None}
         if self.outcome == "ok":
             self.status["fleet_revision"] += 1
             self.set_flags(request["flags"])
@@ -108,6 +114,14 @@ def test_a_drain_that_ends_by_itself_says_when_the_node_gets_tasks_again(daemon:
         daemon.own(name, "edge2")
     ends = "edge1: empty, and gets nothing new for 27s, or until `zsched undrain edge1`"
     assert ends in run("drain", "edge1", "--yes", "--for", "30s").stdout
+
+
+def test_electors_that_the_fleet_changes_by_itself_are_no_conflict_with_a_drain(daemon: Daemon) -> None:
+    for name in ("echo", "merge"):
+        daemon.own(name, "edge2")
+    daemon.overtaken = 5
+    assert run("drain", "edge1", "--yes").exit_code == 0
+    assert [one["base_revision"] for one in daemon.changes] == [4, 5, 6, 7, 8, 9]
 
 
 def test_a_drain_without_a_time_ends_by_hand_only_also_where_one_had_a_time(daemon: Daemon) -> None:
