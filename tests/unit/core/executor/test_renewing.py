@@ -72,6 +72,11 @@ def test_a_stopped_worker_of_another_candidate(command: tuple[str, ...], standby
     assert step(spec, "edge2", OWNED, known, is_at_work=True) is wanted
 
 
+def test_a_worker_that_somebody_else_has_started_can_have_the_task() -> None:
+    spec = replace(SPEC, worker=replace(SPEC.worker, command=()))
+    assert step(spec, "edge2", OWNED, {"edge1": seen("edge1")}, is_at_work=True) is Step.GIVE_AWAY
+
+
 def test_who_still_drains_waits_and_a_task_that_may_not_move_stays() -> None:
     assert chosen("edge1", seen("edge2"), is_at_work=True) is Step.WAIT
     for held in ({"paused": True}, {"pinned": True}):
