@@ -24,6 +24,13 @@ def test_the_longest_gap_of_the_last_seconds_is_told_until_it_is_too_old() -> No
     assert gaps.of("echo/out/1", 103.0) is None
 
 
+def test_gaps_that_are_too_old_take_no_memory() -> None:
+    gaps = StreamGaps()
+    for number in range(50):
+        gaps.absorb([counted(0.2)], 100.0 + number)
+    assert len(gaps._gaps[STREAM]) == GAP_WINDOW_S
+
+
 def test_the_gap_of_a_move_is_news_once() -> None:
     gaps = StreamGaps()
     assert gaps.absorb([counted(0.1)], 100.0) == ()
