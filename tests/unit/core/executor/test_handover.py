@@ -14,7 +14,8 @@ from support.fleets import task_of
 from support.todos import done
 from zsched.core.executor.handover import LEAVES_S, MAX_OLD, ROLE_DRAIN_MARGIN_S, Executor, Phase
 from zsched.core.instructions import ApplyRoutes, Instruction, RecordStory, SetRole, StartWorker, StopWorker
-from zsched.core.values.fleet import Standby, StreamRule, TaskSpec, WorkerSpec
+from zsched.core.todo import ToDo
+from zsched.core.values.fleet import OnIsolation, Standby, StreamRule, TaskSpec, WorkerSpec
 from zsched.core.values.model import Allocation
 from zsched.core.values.plan import Direction, RoutePlan, WorkerRole
 
@@ -476,3 +477,14 @@ def test_a_worker_that_was_told_to_stop_at_once_has_nothing_to_hear() -> None:
     done(one.execute, replace(allocation_of(2, "edge2"), leased=True), 1.0)
     done(one.tick, one.next_deadline())
     assert not one.may_work_unleased(1.0)
+
+
+@pytest.mark.parametrize("later", OnIsolation)
+def test_who_works_alone_does_so_while_its_file_lets_it(later: OnIsolation) -> None:
+    spec = replace(SPEC, on_isolation=OnIsolation.LOCAL)
+    alone = Executor(spec=spec, me="robot1", has_streams=True)
+    done(alone.execute, allocation_of(1, "edge1"), 0.0)
+    done(alone.isolate)
+    assert alone.is_local
+    alone.adopt(replace(spec, on_isolation=later, drain_s=3.0), ToDo(), is_agreed_leased=False)
+    assert alone.is_local is (later is OnIsolation.LOCAL)
