@@ -230,3 +230,9 @@ def test_sums_add_up_with_gauges_too(form: ScoreForm) -> None:
             assert view.utility == pytest.approx(by_hand)
         joint = statistics.fmean([view.utility or 0.0 for view in candidate.robots])
         assert candidate.joint == pytest.approx(joint)
+
+
+def test_a_candidate_that_a_robot_does_not_reach_is_worth_nothing_to_it() -> None:
+    unreached = Utility(candidate="edge1", value=0.0, reachable=False, cpu=0.9, memory=0.9, network=0.9)
+    assert utility_of(unreached, TUNING) == 0.0
+    assert utility_of(replace(unreached, reachable=True), TUNING) == pytest.approx(value_of((0.9, 0.9, 0.9), TUNING))
