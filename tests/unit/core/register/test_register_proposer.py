@@ -496,6 +496,16 @@ def test_promises_for_which_no_change_comes_are_forgotten() -> None:
     assert did(proposer.propose_prepared, FIRST, 10.0).prepare is not None
 
 
+def test_a_change_that_was_asked_for_ahead_has_a_time_of_its_own() -> None:
+    """The first questions are lost: it is tried again, as any change."""
+    proposer = make(ELECTORS[0])
+    did(proposer.prepare_ahead, 0.0)
+    did(proposer.propose_prepared, FIRST, 0.9 * BALLOT_S)
+    did(proposer.tick, BALLOT_S)
+    assert did(proposer.tick, proposer.next_deadline()).prepare is not None
+    assert proposer.wanted == (FIRST,)
+
+
 def test_promises_of_a_number_are_none_of_the_next_one() -> None:
     proposer = ahead()[0]
     count = Electorate(number=3, generation_id="ab", electors=tuple(Elector(name=name) for name in ELECTORS))
