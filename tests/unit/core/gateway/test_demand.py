@@ -132,6 +132,8 @@ def test_only_another_figure_is_news() -> None:
     assert not demands.learn("merge", profile(1.5), 1.0)
     assert not demands.learn("merge", profile(1.5, node="edge2"), 2.0)
     assert demands.learn("merge", profile(1.6, node="edge2"), 3.0)
+    assert not demands.learn("merge", profile(9.0, node="edge2", state=WorkerState.STARTING), 4.0)
+    assert not demands.learn("merge", profile(9.0, node="edge2", cpu=None), 5.0)
 
 
 # --- by the worker's own word --------------------------------------------------------------------------------------
