@@ -9,7 +9,6 @@ from __future__ import annotations
 import errno
 import ipaddress
 import os
-import secrets
 import shlex
 import socket
 import stat
@@ -44,6 +43,7 @@ from zsched.core.values.struct import Struct
 from zsched.errors import WireError, ZschedError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
 from zsched.files import read_regular
+from zsched.pki.files import write_whole
 from zsched.runtime.membership import Places, Written, belongings, found, is_joined, is_of_a_later_key, put_away
 from zsched.runtime.membership import join as join_here
 from zsched.runtime.own_addresses import addresses_at
@@ -462,16 +462,7 @@ def _write_private(file: Path, text: str) -> None:
 def _replace(file: Path, text: str) -> None:
     if os.path.lexists(file) and not stat.S_ISREG(file.lstat().st_mode):
         raise OSError(errno.EINVAL, "it is no regular file")
-    part = file.with_name(f".{file.name}.{secrets.token_hex(4)}")
-    number = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, PRIVATE)
-    try:
-        with os.fdopen(number, "w", encoding="utf-8") as out:
-            os.fchmod(number, PRIVATE)
-            out.write(text)
-        part.rename(file)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
+    write_whole(file, text.encode(), PRIVATE, is_for_folder=False)
 
 
 # --- join ------------------------------------------------------------------------------------------------------------

@@ -33,8 +33,10 @@ def make_folder(path: Path) -> None:
             os.chown(one, owner.st_uid, owner.st_gid, follow_symlinks=False)
 
 
-def write_whole(path: Path, content: bytes, mode: int) -> None:
+def write_whole(path: Path, content: bytes, mode: int, *, is_for_folder: bool = True) -> None:
     """Replace a file by one with ``content`` and ``mode``; nobody ever sees a part of it, or the key with another mode.
+
+    ``is_for_folder``: what root writes is handed over to the folder's owner.
 
     Raises:
         OSError: it cannot be written; the file is as it was.
@@ -44,7 +46,8 @@ def write_whole(path: Path, content: bytes, mode: int) -> None:
     try:
         with os.fdopen(descriptor, "wb") as file:
             os.fchmod(file.fileno(), mode)
-            _give(file.fileno(), path.parent)
+            if is_for_folder:
+                _give(file.fileno(), path.parent)
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
