@@ -108,8 +108,6 @@ class Stages:
     is_draining = False
     loop_lag_s = 0.0
     stream_counts: tuple[StreamCount, ...] = ()
-    frames_dropped_at: float | None = None
-    """When the newest invalid frame came."""
     dropped_at: dict[str, float]
     """{counter: when it rose last}, of those that count invalid frames and links."""
     beat_sequence = 0

@@ -79,7 +79,7 @@ def build_snapshot(node: Stages, now: float) -> Snapshot:
         document=node.agreement.document_hash,
         joins_at=node.joins_at,
         counters=tuple(sorted((node.counters + node.agreement.counters).items())),
-        frames_dropped_s=None if node.frames_dropped_at is None else now - node.frames_dropped_at,
+        frames_dropped_s=now - max(node.dropped_at.values()) if node.dropped_at else None,
         dropped_ages=tuple(sorted((name, now - at) for name, at in node.dropped_at.items())),
         refused=node.refused_keys.told(node.fleet, now),
         security=node.security,
@@ -187,8 +187,11 @@ def _no_quorum(node: Stages, quorum: QuorumStatus, now: float, *, is_left_behind
 
 def has_quorum(node: Stages) -> bool:
     """Whether a majority of the electors can answer, as far as this node hears."""
-    electors = node.fleet.electors
-    return sum(_can_answer(node, name) for name in electors) >= majority(len(electors))
+    return len(_answering(node)) >= majority(len(node.fleet.electors))
+
+
+def _answering(node: Stages) -> list[NodeId]:
+    return [name for name in node.fleet.electors if _can_answer(node, name)]
 
 
 def _never_had_one(node: Stages, quorum: QuorumStatus) -> list[NodeId]:
@@ -266,7 +269,7 @@ def _can_answer(node: Stages, name: NodeId) -> bool:
 def _quorum(node: Stages) -> QuorumStatus:
     electors, value = node.fleet.electors, node.agreement.fleet_value
     stateless = [name for name in electors if _has_lost_state(node, name)]
-    alive = [name for name in electors if _can_answer(node, name)]
+    alive = _answering(node)
     needed = majority(len(electors))
     lost = "other_electorate" if node.has_foreign_state else "lost_state"
     role = "elector" if node.agreement.is_elector else (lost if node.me in electors else "no_elector")

@@ -145,7 +145,7 @@ def digest(thing: Any, seen: frozenset[int] = frozenset()) -> Any:
         return [digest(item, seen) for item in thing]
     names = [field.name for field in fields(thing)] if is_dataclass(thing) else list(getattr(thing, "__dict__", ()))
     names += [name for name in getattr(type(thing), "__slots__", ()) if hasattr(thing, name)]
-    skipped = {"counters", "frames_dropped_at", "dropped_at", "knocking", "_handlers", "fleet", "_fleet"}
+    skipped = {"counters", "dropped_at", "knocking", "_handlers", "fleet", "_fleet"}
     return {name: digest(getattr(thing, name), seen) for name in names if name not in skipped}
 
 

@@ -114,7 +114,7 @@ def _on_certificate(_node: Stages, event: ev.CertificateSent, todo: ToDo, _now: 
 def _on_dropped(node: Stages, event: ev.FrameDropped, _todo: ToDo, now: float) -> None:
     name = f"dropped_{event.kind}_{event.reason}"
     node.counters[name] += event.count
-    node.dropped_at[name] = node.frames_dropped_at = now
+    node.dropped_at[name] = now
 
 
 def _on_link_refused(node: Stages, event: ev.LinkRefused, _todo: ToDo, now: float) -> None:
