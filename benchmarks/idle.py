@@ -1,6 +1,7 @@
 """What a fleet costs while nothing happens: CPU, wake-ups, threads, memory and packets of all processes of its nodes.
 
-``python -m benchmarks.idle [--nodes 3 6 12] [--seconds 20] [--rounds 3] [--other PATH] [--threads]``.
+``python -m benchmarks.idle [--nodes 3 6 12] [--seconds 20] [--rounds 3] [--other PATH] [--threads]
+[--packets]``.
 Half of the nodes are robots, half edges; the echo worker runs on every edge, one of them owns. Every node has a network
 namespace and a control group of its own (root, Linux): a quota of one core makes the group the machine that its daemon
 measures, so that other work is not taken for load, as on a machine of its own.
@@ -14,16 +15,18 @@ what else the machine does then meets both. Daemons, relays and workers of the o
   that is its own.
 * packets, bytes: what leaves a node's interface for other nodes; between processes of one node: ``local``.
 
-``--threads`` adds CPU and wake-ups by group of threads.
+``--threads`` adds CPU and wake-ups by group of threads, ``--packets`` what the packets of one robot and one edge are.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import re
 import statistics
 import subprocess
+import sys
 import tempfile
 import time
 from collections import Counter
@@ -32,6 +35,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from benchmarks.common import machine
+from benchmarks.packets_sent import KINDS as PACKET_KINDS
 from benchmarks.record import progress
 from zsched.core.values.model import NodeId
 from zsched_lab.fleet.limits import NodeLimits, make_limits
@@ -164,6 +168,20 @@ def processes(bed: Netbed, owner: NodeId) -> Iterator[Process]:
 # --- measuring -------------------------------------------------------------------------------------------------------
 
 
+def packet_kinds(bed: Netbed, seconds: float) -> list[dict[str, float]]:
+    """What the packets of one edge and one robot are: {kind: packets a second} of each (`benchmarks.packets_sent`)."""
+    watches = []
+    for name in (bed.names[0], bed.names[-1]):
+        command = bed.network.wrap(name, (sys.executable, "-m", "benchmarks.packets_sent", str(seconds)))
+        watches.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
+    try:
+        return [json.loads(watch.communicate(timeout=seconds + 30)[0]) for watch in watches]
+    finally:
+        for watch in watches:
+            watch.kill()
+            watch.wait(10)
+
+
 def measure(bed: Netbed, owner: NodeId, seconds: float) -> tuple[list[Usage], list[Traffic]]:
     """Every process's use over ``seconds``, and every node's traffic."""
     found = list(processes(bed, owner))
@@ -193,8 +211,10 @@ def measure(bed: Netbed, owner: NodeId, seconds: float) -> tuple[list[Usage], li
     return usages, traffic
 
 
-def one_fleet(nodes: int, tree: Path | None, seconds: float) -> tuple[list[Usage], list[Traffic]]:
-    """Start a fleet of so many nodes, let it come to rest, measure it."""
+def one_fleet(
+    nodes: int, tree: Path | None, seconds: float, *, by_kind: bool
+) -> tuple[list[Usage], list[Traffic], list[dict[str, float]]]:
+    """Start a fleet of so many nodes, let it come to rest, measure it, and the kinds of its packets after that."""
     edges = nodes // 2
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -206,7 +226,8 @@ def one_fleet(nodes: int, tree: Path | None, seconds: float) -> tuple[list[Usage
             bed.init()
             owner = bed.wait_whole(120.0)
             time.sleep(REST_S)
-            return measure(bed, owner, seconds)
+            usages, traffic = measure(bed, owner, seconds)
+            return usages, traffic, packet_kinds(bed, seconds) if by_kind else []
         finally:
             bed.stop()
             bed.limits.remove()
@@ -281,23 +302,31 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=1)
     parser.add_argument("--other", type=Path)
     parser.add_argument("--threads", action="store_true")
+    parser.add_argument("--packets", action="store_true")
     given = parser.parse_args()
     trees: dict[str, Path | None] = {"this": None}
     if given.other is not None:
         trees["other"] = given.other.resolve()
     print(machine())
-    tables, threads = [], []
+    tables, threads, packets = [], [], []
     for nodes in given.nodes:
         found: dict[str, tuple[list[Usage], list[Traffic]]] = {name: ([], []) for name in trees}
+        kinds: dict[str, list[dict[str, float]]] = {name: [] for name in trees}
         for number in range(given.rounds):
             for name in sorted(trees, reverse=bool(number % 2)):
                 progress(f"{nodes} nodes, round {number + 1}, {name}")
-                usages, traffic = one_fleet(nodes, trees[name], given.seconds)
+                usages, traffic, of_kind = one_fleet(nodes, trees[name], given.seconds, by_kind=given.packets)
                 found[name][0].extend(usages)
                 found[name][1].extend(traffic)
+                kinds[name].extend(of_kind)
         for name in trees:
             tables += rows(nodes, name, *found[name])
             threads += thread_rows(nodes, name, found[name][0])
+            packets.append(
+                f"| {nodes} | {name} | "
+                + " | ".join(f"{mean([of[kind] for of in kinds[name]]):.1f}" for kind in PACKET_KINDS)
+                + " |"
+            )
     print(
         "| nodes | tree | process | CPU % | wake-ups/s | threads | PSS MiB | USS MiB | packets/s | kB/s | local |",
         "| ---: | --- | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
@@ -311,6 +340,13 @@ def main() -> None:
             sep="\n",
         )
         print(*threads, sep="\n")
+    if given.packets:
+        print(
+            f"\n| nodes | tree | {' | '.join(PACKET_KINDS)} |",
+            "| --- | --- |" + " ---: |" * len(PACKET_KINDS),
+            sep="\n",
+        )
+        print(*packets, sep="\n")
 
 
 if __name__ == "__main__":
