@@ -38,13 +38,13 @@ class Operator:
 class Stream:
     """An application that puts numbers into the first task's input and keeps what comes back."""
 
-    def __init__(self, session: zenoh.Session, period_s: float = PERIOD_S) -> None:
+    def __init__(self, session: zenoh.Session, period_s: float = PERIOD_S, *, robot: str = "robot1") -> None:
         self.back: list[int] = []
         self.sent = 0
         self._sub = session.declare_subscriber(
-            "robot1/out", lambda sample: self.back.append(int(sample.payload.to_bytes()))
+            f"{robot}/out", lambda sample: self.back.append(int(sample.payload.to_bytes()))
         )
-        self.publisher = session.declare_publisher("robot1/in", congestion_control=zenoh.CongestionControl.BLOCK)
+        self.publisher = session.declare_publisher(f"{robot}/in", congestion_control=zenoh.CongestionControl.BLOCK)
         self._period_s = period_s
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)

@@ -1,0 +1,199 @@
+"""A task goes from one cell to another by `zsched task hand`, on real daemons, while its streams run."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from support.operators import PERIOD_S, Stream
+from support.sessions import matches
+from support.waiting import until
+from zsched.config.handing import mark_of
+from zsched.sessions.config import client_config
+from zsched_lab.fleet.hall import Hall, block_of_ports
+
+pytestmark = [pytest.mark.long, pytest.mark.timeout(300)]
+A, B = "hall-a", "hall-b"
+STAYS = {A: "robot2", B: "robot3"}
+TASK = """\
+tasks:
+  echo:  # answers
+    candidates: {kind: robot}
+    weights: {cpu: 0.5, memory: 0.5}
+    scheduling: {score: paper, cool_down_s: 0}
+    worker: {command: [python, -m, zsched.tasks.echo]}
+    inputs: [{from: "{node}/in", to: "{target}/echo/{node}/in", class: reliable, on_crash: replay}]
+    outputs:
+      - {from: "{target}/echo/{epoch}/{node}/out", to: "{node}/out", class: reliable, handover: all}
+"""
+
+
+class Site:
+    """Two cells of one robot each, of which the first has the task, and knows the other one."""
+
+    def __init__(self, folder: Path, task: str = TASK) -> None:
+        self.folder = folder
+        self.port = block_of_ports(20)
+        self.halls = {name: Hall(folder / name) for name in (A, B)}
+        for number, (name, hall) in enumerate(self.halls.items()):
+            hall.folder.mkdir()
+            founder, address = STAYS[name], f"127.0.0.1:{self.port + 10 * number}"
+            hall.zsched(founder, "fleet", "create", name, "--insecure", "--address", address)
+            hall.start(founder)
+            until(lambda hall=hall, founder=founder: hall.alive(founder) == {founder}, "the first daemon")
+        here = self.halls[A]
+        text = here.zsched(STAYS[A], "fleet", "export")
+        file = here.folder / "agreed.yaml"
+        gateway = f"tcp/127.0.0.1:{self.port + 10}"
+        file.write_text(f'{text}{task}site: {{{B}: {{gateways: ["{gateway}"]}}}}\n')
+        here.zsched(STAYS[A], "apply", str(file), "--yes")
+        here.zsched(STAYS[A], "wait", "--for", "settled=echo", "--timeout", "60")
+
+    def text(self, cell: str) -> str:
+        return self.halls[cell].zsched(STAYS[cell], "fleet", "export")
+
+    def hand(self, *words: str) -> subprocess.CompletedProcess[str]:
+        return self.halls[A].run(STAYS[A], "task", "hand", "echo", *words, "--yes")
+
+    def begun(self, *words: str) -> subprocess.Popen[bytes]:
+        """The same, which goes on beside the test; what is printed goes to a file."""
+        home = self.halls[A].folder / STAYS[A]
+        more = {"CONFIG": home / "etc" / "fleet.yaml", "STATE_DIR": home / "state", "RUNTIME_DIR": home / "run"}
+        env = {**os.environ, **{f"ZSCHED_{name}": str(path) for name, path in more.items()}, "ZSCHED_NODE": STAYS[A]}
+        with (home / "told").open("wb") as told:
+            command = [sys.executable, "-m", "zsched.cli", "task", "hand", "echo", *words, "--yes"]
+            return subprocess.Popen(command, env=env, cwd=home, stdout=told, stderr=told)
+
+    def told(self) -> str:
+        return (self.halls[A].folder / STAYS[A] / "told").read_text()
+
+    def works(self, cell: str) -> bool:
+        """Whether the cell has the task, on a ready owner."""
+        tasks: list[Any] = self.halls[cell].status(STAYS[cell]).get("tasks", [])
+        return any(task["name"] == "echo" and task["owner"] == STAYS[cell] for task in tasks)
+
+    def session(self, cell: str) -> zenoh.Session:
+        """Of an application of the cell's robot."""
+        end = f"tcp/127.0.0.1:{self.port + 10 * (cell == B) + 1}"
+        return zenoh.open(zenoh.Config.from_json5(client_config(connect=(end,))))
+
+    def stop(self) -> None:
+        for hall in self.halls.values():
+            hall.stop()
+
+
+@pytest.fixture
+def folder() -> Iterator[Path]:
+    """With a short name: of a fleet in each of two folders of ``tmp_path`` a socket's path can be too long (107)."""
+    with tempfile.TemporaryDirectory(prefix="cells-") as name:
+        yield Path(name)
+
+
+def test_a_task_goes_over_while_both_cells_streams_run_and_the_command_is_killed(folder: Path) -> None:
+    site = Site(folder)
+    try:
+        with site.session(A) as ours, site.session(B) as theirs:
+            here, there = Stream(ours, robot=STAYS[A]), Stream(theirs, robot=STAYS[B])
+            until(lambda: matches(here.publisher), "the relay subscribes")
+            here.start()
+            there.start()  # nobody takes it yet
+            until(lambda: len(here.back) > 50, "it flows in hall-a")
+            going = site.begun(B)
+            until(lambda: "with echo" in site.told() or going.poll() is not None, "hall-b has it", 60.0)
+            going.send_signal(signal.SIGKILL)
+            going.wait(10)
+            assert mark_of(site.text(A), "echo") is not None, site.told()
+            assert site.works(A), "until it is ready there"
+            begun = time.monotonic()
+            done = site.hand(B)
+            took_s = time.monotonic() - begun
+            assert done.returncode == 0, (done.stdout, done.stderr)
+            reached = len(there.back)
+            until(lambda: len(there.back) > reached + 50, "it flows in hall-b", 30.0)
+            until(lambda: not site.works(A), "hall-a has it no more")
+            ended = here.sent
+            here.end()
+            there.end()
+            until(lambda: there.sent - 1 in there.back, "the last one is answered", 20.0)
+        ours_back, theirs_back = set(here.back), set(there.back)
+        last, first = max(ours_back), min(theirs_back)
+        lost = [number for number in range(last) if number not in ours_back]
+        print(f"the second command took {took_s:.1f} s")
+        print(f"of {here.sent} messages in hall-a, one every {PERIOD_S:g} s, up to {last} all but {len(lost)} answered")
+        print(f"hall-b answers from {first} of {there.sent} on, {len(there.back)} in all")
+        assert lost == []
+        assert last <= ended
+        assert theirs_back == set(range(first, there.sent)), "without a gap"
+        assert first < last, "it works there before it ends here"
+        assert "echo" not in site.text(A)
+        assert TASK.partition("\n")[2] in site.text(B), "with its comments"
+        again = site.hand(B)
+        assert (again.returncode, "nothing to do" in again.stdout) == (0, True), again
+    finally:
+        site.stop()
+
+
+def test_an_exclusive_task_works_never_in_both(folder: Path) -> None:
+    """One watcher asks both owners' workers by their answers: none comes from hall-a after the first of hall-b."""
+    site = Site(folder, TASK.replace("  echo:  # answers\n", "  echo:\n    exclusive: true\n"))
+    came: dict[str, list[float]] = {A: [], B: []}
+    try:
+        with site.session(A) as ours, site.session(B) as theirs:
+            streams = {}
+            for cell, session in ((A, ours), (B, theirs)):
+                key = f"{STAYS[cell]}/out"
+                session.declare_subscriber(key, lambda _sample, cell=cell: came[cell].append(time.monotonic()))
+                streams[cell] = Stream(session, robot=STAYS[cell])
+                streams[cell].start()
+            until(lambda: len(came[A]) > 50, "it flows in hall-a")
+            for signals in (signal.SIGKILL, None):
+                going = site.begun(B)
+                if signals is not None:
+                    until(lambda: "on its way" in site.told() or going.poll() is not None, "it has begun", 60.0)
+                    going.send_signal(signals)
+                    going.wait(10)
+                    until(lambda: not site.works(A), "it stops first")
+                    assert mark_of(site.text(A), "echo") is not None, site.told()
+                    assert "echo" not in site.text(B)
+            assert going.wait(90) == 0, site.told()
+            until(lambda: len(came[B]) > 50, "it flows in hall-b", 30.0)
+            for stream in streams.values():
+                stream.end()
+        pause_s = came[B][0] - came[A][-1]
+        print(f"nobody answered for {pause_s:.1f} s; hall-a answered {len(came[A])} times")
+        assert pause_s > 0, "not in both"
+        assert "nobody works on echo: robot2 renew no lease" in site.told()
+    finally:
+        site.stop()
+
+
+def test_a_cell_whose_workers_cannot_start_gives_it_back(folder: Path) -> None:
+    site = Site(folder)
+    try:
+        file = folder / "entry.yaml"
+        file.write_text(TASK.replace("[python, -m, zsched.tasks.echo]", "[python, -c, 'import time; time.sleep(999)']"))
+        with site.session(A) as ours:
+            stream = Stream(ours, robot=STAYS[A])
+            until(lambda: matches(stream.publisher), "the relay subscribes")
+            stream.start()
+            until(lambda: len(stream.back) > 50, "it flows")
+            refused = site.hand(B, "--entry", str(file), "--deadline", "4s")
+            assert refused.returncode == 1, (refused.stdout, refused.stderr)
+            assert "echo is a task of hall-a as before" in refused.stderr
+            stream.end()
+            until(lambda: stream.sent - 1 in stream.back, "the last one is answered", 20.0)
+        assert sorted(stream.back) == list(range(stream.sent)), "nothing was lost here"
+        assert "echo" not in site.text(B)
+        assert mark_of(site.text(A), "echo") is None
+    finally:
+        site.stop()

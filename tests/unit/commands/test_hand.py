@@ -1,0 +1,557 @@
+"""`zsched task hand`: its steps between two cells, broken off at each and given again; the nodes are stand-ins."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import json
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from support.doors import STATUS, living
+from support.fleet_values import fleet_value_of
+from support.schemas import faults
+from zsched.adapters.host.operator_socket import Json, OperatorSocket
+from zsched.cli import app
+from zsched.clock import monotonic_s
+from zsched.commands import hand, hand_steps
+from zsched.commands.ask import Door
+from zsched.config.handing import mark_of
+from zsched.config.load import check_bytes
+from zsched.core.values.document import Document, Text
+from zsched.core.values.electorate import Creation, Elector
+from zsched.core.values.fleet import Cell, Fleet
+from zsched.wire.codec import as_plain, document_hash
+
+ENTRY = """\
+  echo:  # answers
+    candidates: {kind: robot}
+    weights: {cpu: 0.5, memory: 0.5}
+    worker: {command: [python, -m, zsched.tasks.echo]}
+    inputs: [{from: "{robot}/in", to: "{target}/echo/{robot}/in"}]
+    outputs: [{from: "{target}/echo/{epoch}/{robot}/out", to: "{robot}/out"}]
+"""
+A = f"""\
+fleet: hall-a
+nodes:
+  robot1: {{kind: robot}}
+  robot2: {{kind: robot, host: 127.0.0.1, listen: {{control: tcp/127.0.0.1:7461, data: tcp/127.0.0.1:7462}}}}
+tasks:
+{ENTRY}  other: {{candidates: {{kind: robot}}, weights: {{cpu: 1}}}}
+site:
+  hall-b: {{gateways: ["tcp/127.0.0.1:7557", "tcp/127.0.0.1:7561"]}}
+"""
+B = """\
+fleet: hall-b
+nodes:
+  robot3: {kind: robot, host: 127.0.0.1, listen: {control: tcp/127.0.0.1:7557, data: tcp/127.0.0.1:7558}}
+  robot4: {kind: robot}
+# what hall-b does
+tasks:
+  sweep: {candidates: {kind: robot}, weights: {cpu: 1}}
+"""
+LABELLED = A.replace("{kind: robot}\n    w", "{labels: {arm: a}}\n    w").replace(
+    "t}\n  robot2", "t, labels: {arm: a}}\n  robot2"
+)
+"""Only nodes with a label may have the task, and hall-b has none."""
+LEASE_S = 0.05
+
+
+@cache
+def fleet_of(text: str) -> Fleet:
+    fleet = check_bytes(text.encode()).fleet
+    assert fleet is not None
+    return fleet
+
+
+class Hall:
+    """One cell, whose nodes agree on everything; of its electors some may be behind."""
+
+    def __init__(self, site: Site, text: str) -> None:
+        self.site, self.text = site, text
+        self.name = text.split()[1]
+        self.before = text
+        self.revision = 7
+        self.behind: set[str] = set()
+        """Nodes that have not learnt the newest document."""
+        self.is_whole = self.is_ready = self.answers = True
+        self.outcomes: list[str] = []
+        """Of the next changes, instead of being made."""
+        self.asked: list[str] = []
+        self.rollouts: list[Json] = []
+
+    @property
+    def has(self) -> bool:
+        return any(task.name == "echo" for task in fleet_of(self.text).tasks)
+
+    @property
+    def names(self) -> list[str]:
+        return [node.name for node in fleet_of(self.text).nodes]
+
+    def answer(self, request: Json, who: str) -> Json:
+        if not self.answers:
+            return {"error": f"{self.name} is cut off"}
+        who = str(request.get("node", who))
+        if request["verb"] == "status":
+            return self._status(who)
+        return self._fleet(who) if request["verb"] == "fleet" else self._change(request)
+
+    def _status(self, who: str) -> Json:
+        text = self.before if who in self.behind else self.text
+        fleet = fleet_of(text)
+        nodes = [living(name, "robot", *(task.name for task in fleet.tasks)) for name in self.names]
+        for worker in [one for node in nodes for one in node["workers"] if one["task"] == "echo"]:
+            worker["state"] = "ready" if self.is_ready else "starting"
+        tasks = []
+        for spec in fleet.tasks:
+            task = {**copy.deepcopy(STATUS["tasks"][0]), "name": spec.name, "owner": self.names[0], "streams": []}
+            task |= {"candidates": list(spec.candidates), "phase": "settled", "owner_state": "alive", "problems": []}
+            tasks.append(task | {"pin": None, "pause": None})
+        quorum = {**STATUS["quorum"], "ok": self.is_whole}
+        revision = self.revision - (who in self.behind)
+        body = {**STATUS, "fleet": self.name, "node": who, "nodes": nodes, "tasks": tasks, "quorum": quorum}
+        return {**body, "fleet_revision": revision}
+
+    def _fleet(self, who: str) -> Json:
+        fleet = fleet_of(self.text)
+        electors = [Elector(name=name, disk="01", joining=1) for name in self.names]
+        value = fleet_value_of(
+            self.revision,
+            *electors,
+            number=2,
+            fleet=self.name,
+            creations=9,
+            tasks=tuple(Creation(task=task.name, number=3) for task in fleet.tasks),
+            lease_s=LEASE_S,
+            guard_lease_s=LEASE_S,
+            document=document_hash(Document(text=Text(self.text))),
+        )
+        body = {"node": who, "fleet": self.name, "revision": self.revision, "number": 2, "settled": True}
+        told = {"electors": [{"name": name, "disk": "01"} for name in self.names], "document": value.document}
+        return {**body, **told, "text": self.text, "flags": [], "rollouts": self.rollouts, "value": as_plain(value)}
+
+    def _change(self, request: Json) -> Json:
+        assert request["base_revision"] == self.revision
+        if self.outcomes:
+            return {"outcome": self.outcomes.pop(0), "detail": "as told", "revision": self.revision}
+        if not self.is_whole:
+            return {"outcome": "no_quorum", "detail": "as told", "revision": self.revision}
+        self.before, self.text = self.text, request["text"]
+        self.revision += 1
+        if self.has:
+            self.behind.clear()  # the cut has healed
+        self.asked.append(f"{request['by']} {request['why']}")
+        self.site.look()
+        return {"outcome": "ok", "detail": "as told", "revision": self.revision}
+
+
+class Site:
+    """Two cells; what each change made of them."""
+
+    def __init__(self, folder: Path) -> None:
+        self.here, self.there = Hall(self, A), Hall(self, B)
+        self.seen = [(True, False, monotonic_s())]
+        self.doors = contextlib.ExitStack()
+        (folder / "run").mkdir()
+        (folder / "gates").mkdir()
+        self._open(folder / "run" / "robot1.sock", lambda request: self.here.answer(request, "robot1"))
+        self._open(folder / "gates" / "hall-b.sock", lambda request: self.there.answer(request, "robot3"))
+
+    def _open(self, path: Path, answer: Any) -> None:
+        door = OperatorSocket(path, answer)
+        door.open()
+        self.doors.callback(door.close)
+
+    def look(self) -> None:
+        self.seen.append((self.here.has, self.there.has, monotonic_s()))
+
+    @property
+    def has(self) -> tuple[bool, bool]:
+        return self.here.has, self.there.has
+
+    def make_exclusive(self) -> None:
+        self.here.text = A.replace("  echo:  # answers\n", "  echo:  # answers\n    exclusive: true\n")
+
+    def check(self, *, is_exclusive: bool) -> None:
+        """The task was never in neither cell; or, an exclusive one, never in both, nor in the next within a lease."""
+        for (here, there, at), (then_here, then_there, then) in zip(self.seen, self.seen[1:], strict=False):
+            if is_exclusive:
+                assert not (then_here and then_there)
+                is_begun = (then_here, then_there) != (here, there) and (then_here or then_there)
+                assert not is_begun or then - at >= LEASE_S
+            else:
+                assert then_here or then_there
+
+
+@pytest.fixture
+def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
+    monkeypatch.setenv("ZSCHED_RUNTIME_DIR", str(tmp_path / "run"))
+    monkeypatch.delenv("ZSCHED_NODE", raising=False)
+    for name in ("PAUSE_S", "BACK_S"):
+        monkeypatch.setattr(hand_steps, name, {"PAUSE_S": 0.001, "BACK_S": 0.3}[name])
+    one = Site(tmp_path)
+
+    def gate(cell: Cell, _fleet: str, _here: Door | None) -> Door:
+        return Door(socket=tmp_path / "gates" / f"{cell.name}.sock")
+
+    monkeypatch.setattr(hand, "door_of", gate)
+    with one.doors:
+        yield one
+
+
+def run(*words: str) -> Result:
+    result = CliRunner().invoke(app, ["task", "hand", "echo", *words])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result
+
+
+def sorted_tasks(text: str) -> list[Any]:
+    return sorted(fleet_of(text).tasks, key=lambda task: task.name)
+
+
+def check_arrived(site: Site) -> None:
+    assert site.has == (False, True)
+    assert "echo" not in site.here.text
+    assert site.here.text == A.replace(ENTRY, "")
+
+
+def test_the_plan_shows_both_cells_and_changes_nothing(site: Site) -> None:
+    plan = run("hall-b", "--plan")
+    words = [line.split() for line in plan.stdout.splitlines()]
+    assert plan.exit_code == 10
+    assert ["echo", "cell", "hall-a", "hall-b"] in words
+    assert ["echo", "owner", "robot1", "one", "of", "robot3,", "robot4"] in words
+    assert ["echo", "works", "for", "robot1,", "robot2", "robot3,", "robot4"] in words
+    assert ["echo", "in", "hall-a", "works", "works", "until", "hall-b", "is", "ready"] in words
+    asked = run("hall-b")
+    assert (asked.exit_code, "--yes" in asked.stderr) == (2, True)
+    assert (site.here.text, site.there.text) == (A, B)
+    assert faults(json.loads(run("hall-b", "--dry-run", "--json").stdout)) == []
+
+
+def test_it_goes_over_and_works_here_until_it_is_ready_there(site: Site) -> None:
+    done = run("hall-b", "-y", "-m", "new area")
+    assert done.exit_code == 0, done.stderr
+    check_arrived(site)
+    assert site.there.text == B + ENTRY, "its lines, comments and all"
+    site.check(is_exclusive=False)
+    order = ["hall-a: revision 8 is agreed: echo is on its way to hall-b", "hall-b: revision 8 is agreed, with echo"]
+    order += ["hall-b: echo is ready on robot3", "hall-a: revision 9 is agreed, without echo"]
+    order += ["echo has gone from hall-a to hall-b"]
+    places = [done.stdout.index(one) for one in order]
+    assert places == sorted(places)
+    assert all(asked.endswith(" new area") for asked in (*site.here.asked, *site.there.asked))
+    again = run("hall-b", "-y")
+    assert (again.exit_code, "none of hall-a: nothing to do" in again.stdout) == (0, True)
+    assert faults(json.loads(run("hall-b", "-y", "--json").stdout)) == []
+
+
+def test_an_exclusive_task_stops_here_before_it_begins_there(site: Site) -> None:
+    site.make_exclusive()
+    shown = run("hall-b", "--plan")
+    assert "stops first" in shown.stdout
+    done = run("hall-b", "-y")
+    assert done.exit_code == 0, done.stderr
+    check_arrived(site)
+    site.check(is_exclusive=True)
+    assert (True, True) not in [one[:2] for one in site.seen]
+    assert done.stdout.index("hall-a: nobody works on echo: robot1, robot2 renew no lease") < done.stdout.index(
+        "hall-b: revision 8 is agreed, with echo"
+    )
+
+
+def test_an_exclusive_task_of_which_a_lease_may_go_on_is_not_begun_there(site: Site) -> None:
+    site.make_exclusive()
+    site.here.behind = {"robot2"}  # one of two electors: no majority knows
+    refused = run("hall-b", "-y", "--deadline", "0.3s")
+    assert refused.exit_code == 1
+    assert "1 of the electors robot1, robot2 of hall-a know that it ends, 2 needed" in refused.stderr
+    assert (site.has, site.there.text) == ((True, False), B)
+    assert mark_of(site.here.text, "echo") is None
+    site.check(is_exclusive=True)
+
+
+def test_a_task_that_has_just_become_exclusive_stays_until_all_go_by_it(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    site.make_exclusive()
+    real = site.here._status
+
+    def told(who: str) -> Json:
+        status = real(who)
+        text = "exclusive by this node's fleet file, not yet for the fleet: robot2 waits, or works without a lease"
+        status["tasks"][0]["problems"] = [text]
+        return status
+
+    monkeypatch.setattr(site.here, "_status", told)
+    refused = run("hall-b", "-y")
+    assert (refused.exit_code, "not yet for the fleet" in refused.stderr) == (1, True)
+    assert len(site.seen) == 1
+
+
+@pytest.mark.parametrize("is_exclusive", [False, True])
+@pytest.mark.parametrize("is_after", [False, True])
+@pytest.mark.parametrize(("step", "number"), [("change_over", 0), ("change_over", 1), ("change_over", 2), ("_lack", 0)])
+@pytest.mark.parametrize("way", ["on", "back"])
+def test_broken_off_anywhere_it_goes_on_or_is_taken_back(
+    site: Site, monkeypatch: pytest.MonkeyPatch, step: str, number: int, is_after: bool, is_exclusive: bool, way: str
+) -> None:
+    if is_exclusive:
+        site.make_exclusive()
+    first = site.here.text
+    real, left = getattr(hand_steps, step), [number]
+
+    def broken(*given: Any, **more: Any) -> Any:
+        left[0] -= 1
+        if left[0] >= 0:
+            return real(*given, **more)
+        if is_after:
+            real(*given, **more)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(hand_steps, step, broken)
+        ended = CliRunner().invoke(app, ["task", "hand", "echo", "hall-b", "-y"])
+        assert ended.exit_code != 0
+        assert "broken off" in ended.stderr
+    if way == "on":
+        done = run("hall-b", "-y")
+        assert done.exit_code == 0, done.stderr
+        check_arrived(site)
+    elif mark_of(site.here.text, "echo") is not None or site.here.has:
+        done = run("hall-a", "-y")
+        assert done.exit_code == 0, done.stderr
+        assert site.has == (True, False)
+        assert site.there.text == B
+        assert mark_of(site.here.text, "echo") is None
+        assert sorted_tasks(site.here.text) == sorted_tasks(first)
+    site.check(is_exclusive=is_exclusive)
+
+
+@pytest.mark.parametrize("number", range(3))
+@pytest.mark.parametrize("is_exclusive", [False, True])
+@pytest.mark.parametrize("is_after", [False, True])
+def test_a_way_back_that_was_broken_off_goes_on_either_way(
+    site: Site, monkeypatch: pytest.MonkeyPatch, number: int, is_exclusive: bool, is_after: bool
+) -> None:
+    if is_exclusive:
+        site.make_exclusive()
+    real, left = hand_steps.change_over, [2 + number]
+    site.there.is_ready = False
+
+    def broken(*given: Any, **more: Any) -> Any:
+        left[0] -= 1
+        if left[0] >= 0:
+            return real(*given, **more)
+        if is_after:
+            real(*given, **more)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(hand_steps, "change_over", broken)
+        assert CliRunner().invoke(app, ["task", "hand", "echo", "hall-b", "-y", "--deadline", "0.1s"]).exit_code != 0
+    site.there.is_ready = True
+    done = run("hall-b", "-y")
+    assert done.exit_code == 0, done.stderr
+    assert site.has == (False, True)
+    site.check(is_exclusive=is_exclusive)
+
+
+@pytest.mark.parametrize("is_exclusive", [False, True])
+def test_a_cell_that_does_not_get_it_ready_gives_it_back(site: Site, is_exclusive: bool) -> None:
+    if is_exclusive:
+        site.make_exclusive()
+    site.there.is_ready = False
+    refused = run("hall-b", "-y", "--deadline", "0.2s")
+    assert refused.exit_code == 1
+    assert "hall-b has not taken it: the worker on robot3 is starting; it is taken back" in refused.stderr
+    assert "echo is a task of hall-a as before" in refused.stderr
+    assert (site.has, site.there.text) == ((True, False), B)
+    assert mark_of(site.here.text, "echo") is None
+    site.check(is_exclusive=is_exclusive)
+    site.there.is_ready = True
+    assert run("hall-b", "-y").exit_code == 0
+    check_arrived(site)
+
+
+def test_what_is_missing_is_told_while_it_waits(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hand_steps, "LONG_S", 0.0)
+    site.there.is_ready = False
+    refused = run("hall-b", "-y", "--deadline", "0.2s")
+    assert refused.stdout.count("echo: waits, for at most ") == 1
+    assert refused.stdout.count(": the worker on robot3 is starting") == 1
+
+
+@pytest.mark.parametrize("is_exclusive", [False, True])
+def test_a_cell_that_is_cut_off_meanwhile_keeps_nothing_from_being_said(
+    site: Site, monkeypatch: pytest.MonkeyPatch, is_exclusive: bool
+) -> None:
+    if is_exclusive:
+        site.make_exclusive()
+
+    def cut(*_given: object) -> str:
+        site.there.answers = False
+        return "it is silent"
+
+    with monkeypatch.context() as patch:
+        patch.setattr(hand_steps, "_lack", cut)
+        refused = run("hall-b", "-y", "--deadline", "0.1s")
+    assert refused.exit_code == 5
+    told = " ".join(refused.stderr.split())
+    works = "nobody does it in hall-a: it may work" if is_exclusive else "it works on in hall-a, and may work"
+    assert works in told
+    assert "echo is not taken back: hall-b is cut off" in told
+    assert "`zsched task hand echo hall-b` goes on, `zsched task hand echo hall-a` takes it back" in told
+    assert site.has == (not is_exclusive, True)
+    site.there.answers = True
+    assert run("hall-a", "-y").exit_code == 0
+    assert site.has == (True, False)
+    site.check(is_exclusive=is_exclusive)
+
+
+def test_what_the_other_cell_refuses_is_taken_back_at_once(site: Site) -> None:
+    site.there.outcomes = ["invalid"]
+    refused = run("hall-b", "-y", "--deadline", "1h")
+    assert (refused.exit_code, site.has) == (1, (True, False))
+    assert "hall-b has not taken it: invalid: as told" in refused.stderr
+
+
+def test_an_answer_that_is_lost_or_no_quorum_is_waited_for(site: Site) -> None:
+    site.there.outcomes = ["no_quorum", "unknown"]
+    assert run("hall-b", "-y").exit_code == 0
+    check_arrived(site)
+
+
+def test_what_another_change_overtakes_is_proposed_again(site: Site) -> None:
+    site.here.outcomes, site.there.outcomes = ["conflict"], ["conflict", "conflict"]
+    assert run("hall-b", "-y").exit_code == 0
+    check_arrived(site)
+
+
+def test_a_task_that_somebody_has_taken_back_meanwhile_is_not_begun_again(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    site.make_exclusive()
+    real = hand_steps._given
+
+    def overtaken(way: Any, text: str) -> str:
+        site.here.text = A
+        return real(way, text)
+
+    monkeypatch.setattr(hand_steps, "_given", overtaken)
+    refused = run("hall-b", "-y")
+    assert refused.exit_code == 1
+    assert "somebody else has brought that to its end" in refused.stderr
+    assert (site.here.text, site.there.text) == (A, B)
+
+
+def test_its_own_cell_s_name_has_nothing_to_do_for_a_task_that_is_not_on_its_way(site: Site) -> None:
+    done = run("hall-a", "-y")
+    assert (done.exit_code, "echo is a task of hall-a: nothing to do" in done.stdout) == (0, True)
+    assert len(site.seen) == 1
+
+
+def test_a_task_on_its_way_goes_nowhere_else(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    site.here.text = A + "  hall-c: {gateways: [tcp/127.0.0.1:1, tcp/127.0.0.1:2]}\n"
+
+    def broken(*_given: object) -> str:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(hand_steps, "_lack", broken)
+        CliRunner().invoke(app, ["task", "hand", "echo", "hall-b", "-y"])
+    wrong = run("hall-c", "-y")
+    assert (wrong.exit_code, "echo is on its way from hall-a to hall-b" in wrong.stderr) == (2, True)
+    assert "between hall-a and hall-b" in run("hall-a", "--plan").stdout
+    assert "between hall-a and hall-b" in run("hall-b", "--plan").stdout
+
+
+@pytest.mark.parametrize(
+    ("make", "words", "code", "told"),
+    [
+        (lambda _site: None, ("hall-x",), 2, "the site has no cell 'hall-x'"),
+        (lambda site: setattr(site.there, "text", B + ENTRY), ("hall-b",), 1, "hall-b has a task echo of its own"),
+        (lambda site: setattr(site.there, "is_whole", False), ("hall-b",), 1, "hall-b has no quorum now"),
+        (lambda site: setattr(site.here, "is_whole", False), ("hall-b",), 1, "hall-a has no quorum now"),
+        (lambda site: setattr(site.there, "answers", False), ("hall-b",), 1, "hall-b is cut off"),
+        (lambda site: setattr(site.here, "rollouts", [{"task": "echo"}]), ("hall-b",), 1, "waits for a look"),
+        (
+            lambda site: setattr(site.here, "text", A.replace("{kind: robot}\n    w", "[robot1, robot2]\n    w")),
+            ("hall-b",),
+            1,
+            "the entry of echo names robot1, robot2, no nodes of hall-b",
+        ),
+        (
+            lambda site: setattr(site.here, "text", A.replace('"{robot}/in"', '"robot2/{robot}/in"')),
+            ("hall-b",),
+            1,
+            "zsched task hand echo hall-b --entry FILE",
+        ),
+        (
+            lambda site: setattr(site.here, "text", LABELLED),
+            ("hall-b",),
+            78,
+            "the document of hall-b with echo",
+        ),
+    ],
+)  # fmt: skip
+def test_what_speaks_against_it_is_said_before_anything(
+    site: Site, make: Any, words: tuple[str, ...], code: int, told: str
+) -> None:
+    make(site)
+    before = site.here.text, site.there.text
+    refused = run(*words, "-y")
+    assert refused.exit_code == code, refused.stderr
+    assert told in " ".join(refused.stderr.split())
+    assert (site.here.text, site.there.text) == before
+
+
+def test_an_entry_for_the_other_cell_comes_from_a_file(
+    site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    site.here.text = A.replace("{kind: robot}\n    w", "[robot1, robot2]\n    w")
+    file = tmp_path / "echo.yaml"
+    file.write_text("tasks:\n  other: {candidates: [robot3], weights: {cpu: 1}}\n")
+    wrong = run("hall-b", "-y", "--entry", str(file))
+    assert (wrong.exit_code, "it holds other, and echo alone is handed over" in wrong.stderr) == (2, True)
+    file.write_text("tasks:\n  echo: {candidates: [robot3], weights: {cpu: 1}}\n")
+
+    def broken(*_given: object) -> str:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(hand_steps, "_lack", broken)
+        CliRunner().invoke(app, ["task", "hand", "echo", "hall-b", "-y", "--entry", str(file)])
+    other = tmp_path / "other.yaml"
+    other.write_text("tasks:\n  echo: {candidates: [robot4], weights: {cpu: 1}}\n")
+    refused = run("hall-b", "-y", "--entry", str(other))
+    assert (refused.exit_code, "by another entry than" in refused.stderr) == (1, True)
+    assert run("hall-b", "-y", "--entry", str(file)).exit_code == 0
+    assert site.has == (False, True)
+    assert "candidates: [robot3]" in site.there.text
+
+
+def test_an_exclusive_task_in_both_documents_is_nobody_s_to_hand(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    site.make_exclusive()
+
+    def broken(*_given: object) -> str:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(hand_steps, "_lack", broken)
+        CliRunner().invoke(app, ["task", "hand", "echo", "hall-b", "-y"])
+    site.here.text = site.here.text.replace("tasks:\n", "tasks:\n" + ENTRY, 1)  # an operator applied the old file
+    refused = run("hall-b", "-y")
+    assert (refused.exit_code, "stands in the documents of both cells" in refused.stderr) == (1, True)
+
+
+def test_an_unknown_task_is_named_beside_the_known_ones(site: Site) -> None:
+    result = CliRunner().invoke(app, ["task", "hand", "ech", "hall-b", "-y"])
+    assert (result.exit_code, "fleet hall-a has no task 'ech'; did you mean echo?" in result.stderr) == (2, True)
+    assert len(site.seen) == 1

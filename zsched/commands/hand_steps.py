@@ -1,0 +1,444 @@
+"""The steps of `zsched task hand`: from one cell to another, or back; each is seen in both, and passed over when done.
+
+Knows: what must be true before the next step, how it is seen, what is said. Does not know: what an operator may ask
+for, what is shown before (`zsched.commands.hand`).
+
+The task works on here until it is ready there. An exclusive one stops here first, and begins there once no lease of it
+can be left.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shlex
+import time
+from collections.abc import Callable, Iterator
+from typing import Final
+
+from zsched.clock import monotonic_s
+from zsched.commands.ask import Door, ask_door, close_sessions
+from zsched.commands.common import CliError, Json, print_json, say, warn
+from zsched.commands.document import (
+    ConflictError,
+    ask_all,
+    change_over,
+    document_text,
+    in_force,
+    ordered,
+    status_of,
+    wait_until_settled,
+)
+from zsched.commands.membership import fleet_of
+from zsched.commands.orders import OrderView
+from zsched.commands.page import span
+from zsched.commands.rollout import kept_rollouts
+from zsched.commands.wait import Condition, missing
+from zsched.config.editing import add_entries, remove_task, task_entry
+from zsched.config.handing import Mark, mark_of, marked, unmarked
+from zsched.config.load import check_bytes
+from zsched.core.values.electorate import FleetValue
+from zsched.core.values.fleet import Fleet, TaskSpec
+from zsched.core.values.lease import hold_s
+from zsched.core.values.model import TaskId
+from zsched.core.values.quorum import majority
+from zsched.core.values.struct import Struct, replace
+from zsched.errors import AdapterError, ConfigError
+from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT
+from zsched.wire.codec import from_plain
+
+SCHEMA: Final = "zsched.task.hand/1"
+PAUSE_S: Final = 0.2
+TRIES: Final = 10
+LONG_S: Final = 3.0
+"""Of something missing that is told."""
+BACK_S: Final = 60.0
+"""How long each step of taking it back may take."""
+
+
+class HandOrder(Struct, frozen=True, kw_only=True):
+    """What the operator has said."""
+
+    task: TaskId
+    cell: str
+    """Where it goes; this machine's own one: it is taken back."""
+    door: Door
+    """To a node of the cell that has it."""
+    entry: str | None = None
+    """A file with the task's entry as it shall be there; ``None``: as here."""
+    deadline_s: float = 120.0
+    """How long it may take to be ready there, in seconds."""
+    reason: str = ""
+    is_plan: bool = False
+    is_yes: bool = False
+    is_json: bool = False
+
+    @property
+    def verb(self) -> str:
+        """The command as it is to be given again."""
+        more = () if self.entry is None else ("--entry", self.entry)
+        return shlex.join(("zsched", "task", "hand", self.task, self.cell, *more))
+
+
+class Side(Struct, frozen=True, kw_only=True):
+    """One of the two cells."""
+
+    name: str
+    door: Door
+
+
+class Way(Struct, frozen=True, kw_only=True):
+    """One task on its way."""
+
+    order: HandOrder
+    here: Side
+    there: Side
+    began: float
+    wanted: str = ""
+    """Its entry there; empty: the other cell has it already, or it is taken back."""
+    is_exclusive: bool = False
+
+    @property
+    def task(self) -> TaskId:
+        """Its name, in both cells."""
+        return self.order.task
+
+    @property
+    def back(self) -> str:
+        """The command that takes it back."""
+        return shlex.join(("zsched", "task", "hand", self.task, self.here.name))
+
+    def tell(self, text: str) -> None:
+        """A step that is done, for people; programs read the end."""
+        if not self.order.is_json:
+            say(text)
+
+    def left_s(self) -> float:
+        """Of the deadline."""
+        return max(self.order.deadline_s - (monotonic_s() - self.began), 0.0)
+
+
+class _RefusedError(CliError):
+    """The other cell cannot have the task as it is: waiting does not help."""
+
+
+def task_in(fleet: Fleet, task: TaskId) -> TaskSpec | None:
+    """The task of this name; ``None``: the fleet has none."""
+    return next((one for one in fleet.tasks if one.name == task), None)
+
+
+def has_task(text: str, task: TaskId) -> bool:
+    """Whether a document has the task. Raises `CliError`: it has faults for this version."""
+    return task_in(fleet_of(text), task) is not None
+
+
+def told_task(status: Json, task: TaskId) -> Json:
+    """What a status tells of the task; empty: nothing."""
+    return next((one for one in status["tasks"] if one["name"] == task), {})
+
+
+def by_file(way: Way) -> str:
+    """What to do where the other cell cannot have the entry as it is here."""
+    again = shlex.join(("zsched", "task", "hand", way.task, way.order.cell, "--entry", "FILE"))
+    return f"write the entry as it shall be there, below the one key `tasks`: {again}"
+
+
+def text_with(way: Way, text: str, entry: str) -> str:
+    """The other cell's document with the task.
+
+    Raises:
+        ConfigError: it would have faults.
+    """
+    longer = add_entries(text, "tasks", entry, f"the entry of {way.task}")
+    result = check_bytes(longer.encode(), f"the document of {way.there.name} with {way.task}")
+    if result.fleet is None:
+        raise ConfigError(f"nothing was changed: {result.report()}\n{by_file(way)}")
+    return longer
+
+
+def body_of(order: HandOrder, here: str, there: str, outcome: str, owner: str | None = None) -> Json:
+    """What came of it, as JSON."""
+    return {"schema": SCHEMA, "task": order.task, "from": here, "to": there, "outcome": outcome, "owner": owner}
+
+
+def tell_end(order: HandOrder, here: str, there: str, outcome: str, said: str, owner: str | None = None) -> int:
+    """The end of it, for people or as JSON."""
+    if order.is_json:
+        print_json(body_of(order, here, there, outcome, owner))
+    else:
+        say(said)
+    return EXIT_OK
+
+
+# --- to the other cell -----------------------------------------------------------------------------------------------
+
+
+def go_over(way: Way) -> int:
+    """Step by step; what is done already is passed over.
+
+    Raises:
+        CliError: a step was not agreed, or the other cell did not get it ready in time.
+    """
+    task, here, there = way.task, way.here.name, way.there.name
+    way = replace(way, began=monotonic_s())
+    works = "nobody does it meanwhile" if way.is_exclusive else f"it works on in {here}"
+    with _advised(way, f"{works}; `{way.order.verb}` goes on, `{way.back}` takes it back"):
+        if way.wanted and (revision := _agree(way, way.here, lambda text: _begun(way, text))) is not None:
+            told = f", without {task}, which" if way.is_exclusive else f": {task}"
+            way.tell(f"{here}: revision {revision} is agreed{told} is on its way to {there}")
+        lack = _wait(lambda: _not_over(way, way.here), way) if way.is_exclusive and way.wanted else ""
+        if not lack:
+            lack = _taken(way)
+    if lack:
+        return _took_back(way, f"{there} has not taken it: {lack}")
+    owner = told_task(status_of(way.there.door), task).get("owner")
+    way.tell(f"{there}: {task} is ready on {owner}")
+    with _advised(way, f"{task} is ready in {there}; `{way.order.verb}` takes it out of {here}"):
+        revision = _agree(way, way.here, lambda text: _ended(text, task))
+    if revision is not None:
+        way.tell(f"{here}: revision {revision} is agreed, without {task}")
+    said = f"{task} has gone from {here} to {there}"
+    return tell_end(way.order, here, there, "handed", said, owner)
+
+
+@contextlib.contextmanager
+def _advised(way: Way, advice: str) -> Iterator[None]:
+    """Say how it goes on when a step fails, or is broken off."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        warn(f"{way.task}: broken off; {advice}")
+        raise
+    except CliError as error:
+        raise CliError(error.code, f"{error}; {advice}") from error
+    except (AdapterError, ConfigError) as error:
+        raise CliError(EXIT_FAILED, f"{error}; {advice}") from error
+
+
+def _begun(way: Way, text: str) -> str:
+    """This cell's document with the mark; without the task, if that is exclusive."""
+    if not has_task(text, way.task):
+        if mark_of(text, way.task) is None:
+            raise CliError(EXIT_FAILED, f"{way.here.name} has no task {way.task} any more")
+        return text
+    entry = task_entry(text, way.task)
+    if way.is_exclusive:
+        text = remove_task(text, way.task)
+    return marked(text, Mark(task=way.task, cell=way.there.name, entry=entry))
+
+
+def _ended(text: str, task: TaskId) -> str:
+    """This cell's document without the task, and without the mark.
+
+    Raises:
+        CliError: it has been taken back meanwhile.
+    """
+    if mark_of(text, task) is None:
+        if has_task(text, task):
+            raise CliError(EXIT_FAILED, f"{task} has been taken back meanwhile")
+        return text
+    return unmarked(remove_task(text, task) if has_task(text, task) else text, task)
+
+
+def _taken(way: Way) -> str:
+    """Have the other cell take the task, and wait until it is ready there; what is missing at the deadline."""
+    try:
+        return _wait(lambda: _not_ready(way), way)
+    except _RefusedError as error:
+        return str(error)
+
+
+def _not_ready(way: Way) -> str:
+    """What the task lacks in the other cell, whose document has it from now on; empty: nothing."""
+    if way.wanted:
+        try:
+            revision = _agree(way, way.there, lambda text: _given(way, text))
+        except ConflictError:
+            raise
+        except (CliError, ConfigError) as error:
+            if isinstance(error, CliError) and error.code != EXIT_FAILED:
+                raise
+            raise _RefusedError(EXIT_FAILED, str(error)) from error
+        if revision is not None:
+            way.tell(f"{way.there.name}: revision {revision} is agreed, with {way.task}")
+    return _lack(way.there.door, way.task)
+
+
+def _given(way: Way, text: str) -> str:
+    """The other cell's document with the task, if that is still on its way.
+
+    Raises:
+        _RefusedError: it has been taken back meanwhile.
+    """
+    if has_task(text, way.task):
+        return text
+    longer = text_with(way, text, way.wanted)
+    ours = document_text(in_force(way.here.door))
+    if mark_of(ours, way.task) is None or (way.is_exclusive and has_task(ours, way.task)):
+        raise _RefusedError(EXIT_FAILED, f"{way.here.name} has taken it back meanwhile")
+    return longer
+
+
+def _lack(door: Door, task: TaskId) -> str:
+    """What keeps a task from being settled on a ready owner, as every living robot of its cell sees it."""
+    first = status_of(door)
+    robots = [str(one["name"]) for one in first["nodes"] if one["kind"] == "robot" and one["state"] == "alive"]
+    statuses = {str(first["node"]): first}
+    for name, answer in ask_all(door, [one for one in robots if one not in statuses], {"verb": "status"}).items():
+        if isinstance(answer, CliError):
+            return str(answer)
+        statuses[name] = answer
+    for name, status in statuses.items():
+        if not told_task(status, task):
+            return f"{name} has not learnt of it yet"
+    return "; ".join(missing(Condition(kind="settled", task=task), statuses)).replace(f"{task}: ", "")
+
+
+def _not_over(way: Way, side: Side) -> str:
+    """Why a worker of the exclusive task may still work in a cell whose document is without it; empty: none can.
+
+    Its electors echo no beat of its owner any more from when they have learnt that document. Once a majority has, no
+    lease can be renewed, and the longest one that may run is over in a hold (`zsched.core.vote.lease`).
+
+    Raises:
+        _RefusedError: the cell has the task again.
+    """
+    told = ask_door(side.door, {"verb": "fleet"})
+    value = from_plain(told["value"], FleetValue)
+    if value.creation(way.task) is not None:
+        raise _RefusedError(EXIT_FAILED, f"{side.name} has a task {way.task} again")
+    electors = value.electorate.names
+    answers = ask_all(side.door, electors, {"verb": "status"})
+    knowing = [name for name, answer in answers.items() if _is_rid(answer, value.revision, way.task)]
+    needed = majority(len(electors))
+    if len(knowing) < needed:
+        return f"{len(knowing)} of the electors {', '.join(electors)} of {side.name} know that it ends, {needed} needed"
+    time.sleep(hold_s(value.guard_lease_s))
+    way.tell(f"{side.name}: nobody works on {way.task}: {', '.join(knowing)} renew no lease, and the last one is over")
+    return ""
+
+
+def _is_rid(answer: Json | CliError, revision: int, task: TaskId) -> bool:
+    if isinstance(answer, CliError):
+        return False
+    return int(answer["fleet_revision"]) >= revision and not told_task(answer, task)
+
+
+# --- and back --------------------------------------------------------------------------------------------------------
+
+
+def _took_back(way: Way, why: str) -> int:
+    """The other cell has not taken it: take it back.
+
+    Raises:
+        CliError: always: it did not come about.
+    """
+    warn(f"{way.task}: {why}; it is taken back")
+    bring_back(way)
+    raise CliError(EXIT_FAILED, f"{way.task} is a task of {way.here.name} as before, for {why}")
+
+
+def bring_back(way: Way) -> None:
+    """Have the other cell without the task, and this one with it as before.
+
+    Raises:
+        CliError: a step was not done in time.
+    """
+    task, here, there = way.task, way.here.name, way.there.name
+    text = document_text(in_force(way.here.door))
+    is_out = not has_task(text, task)
+    if mark_of(text, task) is None:
+        told = f"{task} is no more on its way from {here} to {there}: somebody else has brought that to its end"
+        raise CliError(EXIT_FAILED, f"{told}; `zsched site` tells where it is")
+    if is_out:
+        works = f"nobody does it in {here}: it may work in {there}"
+    else:
+        works = f"it works on in {here}, and may work in {there}, too"
+    with _advised(way, f"{works}; `{way.order.verb}` goes on, `{way.back}` takes it back"):
+        lack = _wait(lambda: _not_gone(way), way, BACK_S)
+        if not lack and is_out:
+            lack = _wait(lambda: _not_over(way, way.there), way, BACK_S)
+        if lack:
+            raise CliError(EXIT_TIMED_OUT, f"{task} is not taken back: {lack}")
+        revision = _agree(way, way.here, lambda text: _restored(text, task))
+    if revision is not None:
+        way.tell(f"{here}: revision {revision} is agreed, with {task}")
+    lack = _wait(lambda: _lack(way.here.door, task), way, BACK_S) if is_out else ""
+    if lack:
+        raise CliError(EXIT_TIMED_OUT, f"{task} is a task of {here} again, and is not ready: {lack}")
+
+
+def _not_gone(way: Way) -> str:
+    """Nothing, once the other cell's document is without the task."""
+    revision = _agree(way, way.there, lambda text: remove_task(text, way.task) if has_task(text, way.task) else text)
+    if revision is not None:
+        way.tell(f"{way.there.name}: revision {revision} is agreed, without {way.task}")
+    return ""
+
+
+def _restored(text: str, task: TaskId) -> str:
+    """This cell's document with the task as it was, and without the mark."""
+    mark = mark_of(text, task)
+    if mark is None:
+        return text
+    text = unmarked(text, task)
+    return text if has_task(text, task) else add_entries(text, "tasks", mark.entry, "what was kept")
+
+
+# --- agreeing, and waiting -------------------------------------------------------------------------------------------
+
+
+def _agree(way: Way, side: Side, make: Callable[[str], str]) -> int | None:
+    """Have a cell agree what ``make`` makes of its newest document; the revision, ``None``: it is so already.
+
+    Raises:
+        ConflictError: others change it again and again.
+        CliError: it is not agreed, or not settled in time.
+        ConfigError: the document would have faults.
+    """
+    for left in reversed(range(TRIES)):
+        held = in_force(side.door)
+        text = document_text(held)
+        new = make(text)
+        if new == text:
+            return None
+        result = check_bytes(new.encode(), f"the document of {side.name}")
+        if result.fleet is None:
+            raise ConfigError(result.report())
+        rollouts = list(kept_rollouts(held.rollouts, result.fleet))
+        view = OrderView(door=side.door, reason=way.order.reason)
+        what = f"task hand {way.task} {way.order.cell}"
+        kept = {"flags": list(held.flags), "rollouts": rollouts}
+        try:
+            answer = change_over(side.door, {"text": new, **kept, **ordered(what, view.asked)}, held)
+        except ConflictError:
+            if not left:
+                raise
+            time.sleep(PAUSE_S)
+        else:
+            return wait_until_settled(side.door, int(answer["revision"])).revision
+    raise AssertionError("it was tried")
+
+
+def _wait(look: Callable[[], str], way: Way, for_s: float | None = None) -> str:
+    """Look again and again until nothing is missing; what is missing still when the time is over.
+
+    What is missing is told where it takes long, and again when it is something else. ``for_s``: by default as long as
+    the deadline lets it.
+    """
+    began, told = monotonic_s(), ""
+    until = began + (way.left_s() if for_s is None else for_s)
+    while True:
+        try:
+            lack = look()
+        except _RefusedError:
+            raise
+        except (CliError, AdapterError, ConfigError) as error:
+            lack = str(error)
+            close_sessions()
+        now = monotonic_s()
+        if not lack or now > until:
+            return lack
+        if now >= began + LONG_S and lack != told:
+            told = lack
+            way.tell(f"{way.task}: waits, for at most {span(until - now)}: {lack}")
+        time.sleep(PAUSE_S)
