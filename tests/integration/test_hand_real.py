@@ -40,25 +40,43 @@ tasks:
 class Site:
     """Two cells of one robot each, of which the first has the task, and knows the other one."""
 
-    def __init__(self, folder: Path, task: str = TASK) -> None:
+    def __init__(self, folder: Path, task: str = TASK, *, is_secured: bool = False) -> None:
+        """``is_secured``: the other cell is, and this one's robot has an operator's certificate of it."""
         self.folder = folder
         self.port = block_of_ports(20)
         self.halls = {name: Hall(folder / name) for name in (A, B)}
         for number, (name, hall) in enumerate(self.halls.items()):
             hall.folder.mkdir()
             founder, address = STAYS[name], f"127.0.0.1:{self.port + 10 * number}"
-            hall.zsched(founder, "fleet", "create", name, "--insecure", "--address", address)
+            words = () if is_secured and name == B else ("--insecure",)
+            hall.zsched(founder, "fleet", "create", name, *words, "--address", address)
             hall.start(founder)
             until(lambda hall=hall, founder=founder: hall.alive(founder) == {founder}, "the first daemon")
         here = self.halls[A]
         text = here.zsched(STAYS[A], "fleet", "export")
         file = here.folder / "agreed.yaml"
-        gateway = f"tcp/127.0.0.1:{self.port + 10}"
-        file.write_text(f'{text}site: {{{B}: {{gateways: ["{gateway}"]}}}}\n')
+        gateway = f"{'tls' if is_secured else 'tcp'}/127.0.0.1:{self.port + 10}"
+        named = f'gateways: ["{gateway}"]'
+        if is_secured:
+            named += f", file: {self._certified()}"
+        file.write_text(f"{text}site: {{{B}: {{{named}}}}}\n")
         here.zsched(STAYS[A], "apply", str(file), "--yes")
         file.write_text(task)
         here.zsched(STAYS[A], "task", "add", str(file), "--yes")
         here.zsched(STAYS[A], "wait", "--for", "settled=echo", "--timeout", "60")
+
+    def _certified(self) -> str:
+        """The other cell's fleet file, beside this one's."""
+        there, etc = self.halls[B], self.halls[A].folder / STAYS[A] / "etc"
+        text = there.zsched(STAYS[B], "fleet", "export").replace("security: {}", "security: {operators: [ana]}")
+        assert "ana" in text, text
+        agreed = there.folder / "agreed.yaml"
+        agreed.write_text(text)
+        there.zsched(STAYS[B], "pki", "issue", "ana", "--role", "operator", "--out", str(etc / "pki-b"))
+        there.zsched(STAYS[B], "apply", str(agreed), "--yes")
+        copy = etc / "hall-b.yaml"
+        copy.write_text(text.replace("[ana]}", "[ana], folder: pki-b}"))
+        return copy.name
 
     def text(self, cell: str) -> str:
         return self.halls[cell].zsched(STAYS[cell], "fleet", "export")
@@ -195,5 +213,19 @@ def test_a_cell_whose_workers_cannot_start_gives_it_back(folder: Path) -> None:
         assert sorted(stream.back) == list(range(stream.sent)), "nothing was lost here"
         assert "echo" not in site.text(B)
         assert mark_of(site.text(A), "echo") is None
+    finally:
+        site.stop()
+
+
+def test_a_secured_cell_takes_a_task_by_the_word_of_its_operator(folder: Path) -> None:
+    site = Site(folder, is_secured=True)
+    try:
+        here = site.halls[A]
+        until(lambda: here.run(STAYS[A], "status", "--node", f"{B}/{STAYS[B]}").returncode == 0, "ana is let in", 60.0)
+        done = site.hand(B)
+        assert done.returncode == 0, (done.stdout, done.stderr)
+        until(lambda: site.works(B), "hall-b has it")
+        assert "echo" not in site.text(A)
+        assert "ana.operator" in site.halls[B].zsched(STAYS[B], "history")
     finally:
         site.stop()

@@ -8,9 +8,11 @@ Which step is done is asked of both cells: the command can be broken off at any 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from typing import Final
 
+from zsched import paths as places
 from zsched.clock import monotonic_s
 from zsched.commands.apply import read_text
 from zsched.commands.ask import door_of
@@ -33,6 +35,7 @@ from zsched.commands.membership import fleet_of
 from zsched.commands.orders import OrderView, Row, begin
 from zsched.config.editing import names_of, remove_task, task_entry
 from zsched.config.handing import Mark, mark_of, names_in
+from zsched.config.load import check_bytes
 from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.model import NodeKind, TaskId
 from zsched.core.values.struct import Struct, replace
@@ -80,7 +83,7 @@ def hand(order: HandOrder) -> int:
     if mark is not None and order.cell not in (here.name, mark.cell):
         told = f"{order.task} is on its way from {here.name} to {mark.cell}"
         raise CliError(EXIT_USAGE, f"{told}: name that one, or {here.name} to take it back")
-    there = _other(fleet, order, order.cell if mark is None else mark.cell)
+    there = _other(text, order, order.cell if mark is None else mark.cell)
     way = Way(order=order, here=here, there=there, began=monotonic_s())
     if order.cell == here.name:
         return _asked_back(way)
@@ -108,12 +111,14 @@ def _spec(fleet: Fleet, task: TaskId) -> TaskSpec:
     return found
 
 
-def _other(fleet: Fleet, order: HandOrder, name: str) -> Side:
-    """The other cell.
+def _other(text: str, order: HandOrder, name: str) -> Side:
+    """The other cell; what a secured one takes lies beside this machine's fleet file.
 
     Raises:
         CliError: the site has none of this name.
     """
+    fleet = check_bytes(text.encode(), str(places.config_path(None, os.environ))).fleet
+    assert fleet is not None  # it was read already
     cell = next((one for one in fleet.cells if one.name == name), None)
     if cell is None:
         known = [one.name for one in fleet.cells]

@@ -195,7 +195,8 @@ def go_over(way: Way) -> int:
     with _advised(way, f"{task} is ready in {there}; `{way.order.verb}` takes it out of {here}"):
         revision = _agree(way, way.here, lambda text: _ended(text, task))
     if revision is not None:
-        way.tell(f"{here}: revision {revision} is agreed, without {task}")
+        kept = f"and keeps nothing of {task}" if way.is_exclusive else f"without {task}"
+        way.tell(f"{here}: revision {revision} is agreed, {kept}")
     said = f"{task} has gone from {here} to {there}"
     return tell_end(way.order, here, there, "handed", said, owner)
 

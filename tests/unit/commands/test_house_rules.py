@@ -32,6 +32,7 @@ CHANGING = {
         "task add",
         "task remove",
         "task promote",
+        "task hand",
         "node add",
         "node remove",
         "node forget",
