@@ -367,6 +367,10 @@ def _added(text: str, section: str, fragment: str, added: Node) -> str:
         more = ", ".join(f"{name}: {flow(held)}" for name, held in _pairs(added))
         return f"{text[:at]}, {more}{text[at:]}"
     if not found.entries:
+        root = _find(text, ())
+        if found.is_flow and root is not None and root.is_flow:  # as of JSON: no block may stand in it
+            more = ", ".join(f"{name}: {flow(held)}" for name, held in _pairs(added))
+            return f"{text[: found.start]}{{{more}}}{text[found.end :]}"
         if found.is_flow:
             text = text[: found.start].rstrip(" ") + text[found.end :]
         at = _line_end(text, found.key_end + 1)

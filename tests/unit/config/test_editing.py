@@ -44,6 +44,12 @@ def lines_of(old: str, new: str) -> tuple[list[str], list[str]]:
     return [line[2:] for line in told if line[0] == "+"], [line[2:] for line in told if line[0] == "-"]
 
 
+def test_a_task_is_added_to_an_empty_section_of_json() -> None:
+    text = '{"fleet": "hall",\n "tasks": {},\n "nodes": {"r1": {"kind": "robot"}}}\n'
+    added = add_entries(text, "tasks", "tasks: {count: {candidates: [r1], weights: {cpu: 1}}}")
+    assert added == text.replace("{}", "{count: {candidates: [r1], weights: {cpu: 1}}}")
+
+
 def test_tasks_are_added_with_their_comments_and_nothing_else_changes() -> None:
     text = add_entries(ANNOTATED, "tasks", FRAGMENT)
     come, gone = lines_of(ANNOTATED, text)
