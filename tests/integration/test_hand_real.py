@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 import zenoh
 
-from support.operators import PERIOD_S, Stream
+from support.operators import PERIOD_S, Operator, Stream
 from support.sessions import matches
 from support.waiting import until
 from zsched.config.handing import mark_of
+from zsched.core.values.fleet import dial_endpoint
 from zsched.sessions.config import client_config
 from zsched_lab.fleet.hall import Hall, block_of_ports
+from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(300)]
 A, B = "hall-a", "hall-b"
@@ -51,7 +56,7 @@ class Site:
             words = () if is_secured and name == B else ("--insecure",)
             hall.zsched(founder, "fleet", "create", name, *words, "--address", address)
             hall.start(founder)
-            until(lambda hall=hall, founder=founder: hall.alive(founder) == {founder}, "the first daemon")
+            until(partial(self._is_alone, hall, founder), "the first daemon")
         here = self.halls[A]
         text = here.zsched(STAYS[A], "fleet", "export")
         file = here.folder / "agreed.yaml"
@@ -64,6 +69,10 @@ class Site:
         file.write_text(task)
         here.zsched(STAYS[A], "task", "add", str(file), "--yes")
         here.zsched(STAYS[A], "wait", "--for", "settled=echo", "--timeout", "60")
+
+    @staticmethod
+    def _is_alone(hall: Hall, founder: str) -> bool:
+        return hall.alive(founder) == {founder}
 
     def _certified(self) -> str:
         """The other cell's fleet file, beside this one's."""
@@ -162,6 +171,10 @@ def test_a_task_goes_over_while_both_cells_streams_run_and_the_command_is_killed
         site.stop()
 
 
+def _note(times: list[float], _sample: zenoh.Sample) -> None:
+    times.append(time.monotonic())
+
+
 def test_an_exclusive_task_works_never_in_both(folder: Path) -> None:
     """One watcher asks both owners' workers by their answers: none comes from hall-a after the first of hall-b."""
     site = Site(folder, TASK.replace("  echo:  # answers\n", "  echo:\n    exclusive: true\n"))
@@ -171,7 +184,7 @@ def test_an_exclusive_task_works_never_in_both(folder: Path) -> None:
             streams = {}
             for cell, session in ((A, ours), (B, theirs)):
                 key = f"{STAYS[cell]}/out"
-                session.declare_subscriber(key, lambda _sample, cell=cell: came[cell].append(time.monotonic()))
+                session.declare_subscriber(key, partial(_note, came[cell]))
                 streams[cell] = Stream(session, robot=STAYS[cell])
                 streams[cell].start()
             until(lambda: len(came[A]) > 50, "it flows in hall-a")
@@ -193,6 +206,60 @@ def test_an_exclusive_task_works_never_in_both(folder: Path) -> None:
         assert "nobody works on echo: robot2 renew no lease" in site.told()
     finally:
         site.stop()
+
+
+def test_an_owner_that_hears_of_nothing_has_stopped_before_it_begins_there(tmp_path: Path) -> None:
+    """Its daemon is frozen, and its worker goes on until its lease ends: a majority of the electors is enough."""
+    trees = {name: {**echo_fleet(robots=1, edges=2), "fleet": name, "timing": "wifi"} for name in (A, B)}
+    for name, other in ((A, B), (B, A)):
+        ends = [trees[other]["nodes"][edge] for edge in ("edge1", "edge2")]
+        gateways = [dial_endpoint(node["listen"]["control"], node["host"]) for node in ends]
+        trees[name] |= {"electorate": sorted(trees[name]["nodes"]), "site": {other: {"gateways": gateways}}}
+    trees[A]["tasks"]["echo"] |= {"exclusive": True}
+    trees[B]["tasks"] = {"other": {"candidates": {"kind": "edge"}, "weights": {"cpu": 1}}}
+    beds, came = {}, {A: list[float](), B: list[float]()}
+    with ExitStack() as stack:
+        for name, tree in trees.items():
+            (tmp_path / name).mkdir()
+            beds[name] = stack.enter_context(Testbed(tmp_path / name, tree))
+            beds[name].init()
+            beds[name].start()
+        owner = beds[A].wait_whole()
+        operators = {name: Operator(bed) for name, bed in beds.items()}
+        for name, bed in beds.items():
+            bed.wait(partial(_is_whole, bed), 30.0, "all alive")
+            operators[name].done("apply", bed.file, "--yes")
+            session = bed.app("robot1")
+            session.declare_subscriber("robot1/out", partial(_note, came[name]))
+            stack.callback(partial(Stream.end, _started(session)))
+        until(lambda: len(came[A]) > 50, "it flows in hall-a")
+        beds[A].send(owner, signal.SIGSTOP)
+        try:
+            given = time.monotonic()
+            done = operators[A].zsched("task", "hand", "echo", B, "--yes")
+            assert done.returncode == 0, (done.stdout, done.stderr)
+            until(lambda: len(came[B]) > 50, "it flows in hall-b", 30.0)
+        finally:
+            beds[A].send(owner, signal.SIGCONT)
+        after_s = [came[B][0] - since for since in (given, came[A][-1])]
+        print(f"hall-b answers {after_s[0]:.1f} s after the command, {after_s[1]:.1f} s after hall-a")
+        assert b"nobody works on echo" in done.stdout
+        until(lambda: not beds[A].status(owner)["tasks"], "it hears of it")
+        assert came[A][-1] < came[B][0]
+        reached = len(came[A])
+        operators[A].done("task", "hand", "echo", A, "--node", f"{B}/edge1", "--yes")  # as if it were typed there
+        until(lambda: len(came[A]) > reached + 50, "it flows in hall-a again", 30.0)
+        assert came[B][-1] < came[A][reached]
+
+
+def _is_whole(bed: Testbed) -> bool:
+    return all(peer["state"] == "alive" for node in bed.names for peer in bed.status(node)["nodes"])
+
+
+def _started(session: zenoh.Session) -> Stream:
+    stream = Stream(session)
+    stream.start()
+    return stream
 
 
 def test_a_cell_whose_workers_cannot_start_gives_it_back(folder: Path) -> None:

@@ -25,6 +25,7 @@ from zsched.commands.hand_steps import (
     body_of,
     bring_back,
     by_file,
+    check_steps,
     go_over,
     task_in,
     tell_end,
@@ -124,7 +125,8 @@ def _other(text: str, order: HandOrder, name: str) -> Side:
         known = [one.name for one in fleet.cells]
         hint = nearest(name, known) if known else f"; fleet {fleet.name} names no other under `site:`"
         raise CliError(EXIT_USAGE, f"the site has no cell {name!r}{hint}")
-    return Side(name=name, door=door_of(cell, fleet.name, order.door))
+    here = None if order.door.endpoint else order.door
+    return Side(name=name, door=door_of(cell, fleet.name, here))
 
 
 def _look(way: Way, held: InForce, fleet: Fleet, mark: Mark | None) -> _Seen:
@@ -176,7 +178,9 @@ def _checked(way: Way, seen: _Seen) -> Way:
     is_exclusive = spec.exclusive or (seen.here is not None and seen.here.exclusive)
     if is_exclusive and seen.here is not None:
         _check_leased(way, seen.status)
-    return replace(way, wanted=wanted, is_exclusive=is_exclusive)
+    way = replace(way, wanted=wanted, is_exclusive=is_exclusive)
+    check_steps(way, seen.text)
+    return way
 
 
 def _check_same(way: Way, seen: _Seen) -> None:

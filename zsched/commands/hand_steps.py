@@ -227,6 +227,22 @@ def _begun(way: Way, text: str) -> str:
     return marked(text, Mark(task=way.task, cell=way.there.name, entry=entry))
 
 
+def check_steps(way: Way, text: str) -> None:
+    """Refuse what could not be taken to its end, or back, in this cell's document, before anything is done.
+
+    Raises:
+        ConfigError: without the task it has faults, or the task could not be put in again.
+    """
+    try:
+        begun = _begun(way, text)
+        result = check_bytes(_ended(begun, way.task).encode(), f"the document of {way.here.name} without {way.task}")
+        _restored(begun, way.task)
+    except ConfigError as error:
+        raise ConfigError(f"nothing was changed: {error}") from error
+    if result.fleet is None:
+        raise ConfigError(f"nothing was changed: {result.report()}\nchange it first: zsched edit")
+
+
 def _ended(text: str, task: TaskId) -> str:
     """This cell's document without the task, and without the mark.
 

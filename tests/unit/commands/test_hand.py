@@ -59,6 +59,8 @@ LABELLED = A.replace("{kind: robot}\n    w", "{labels: {arm: a}}\n    w").replac
     "t}\n  robot2", "t, labels: {arm: a}}\n  robot2"
 )
 """Only nodes with a label may have the task, and hall-b has none."""
+AGREED = "change_over"
+"""The call by which a step is agreed."""
 LEASE_S = 0.05
 
 
@@ -342,7 +344,7 @@ def test_a_way_back_that_was_broken_off_goes_on_either_way(
 ) -> None:
     if is_exclusive:
         site.make_exclusive()
-    real, left = hand_steps.change_over, [2 + number]
+    real, left = getattr(hand_steps, AGREED), [2 + number]
     site.there.is_ready = False
 
     def broken(*given: Any, **more: Any) -> Any:
@@ -354,7 +356,7 @@ def test_a_way_back_that_was_broken_off_goes_on_either_way(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(hand_steps, "change_over", broken)
+        patch.setattr(hand_steps, AGREED, broken)
         assert CliRunner().invoke(app, ["task", "hand", "echo", "hall-b", "-y", "--deadline", "0.1s"]).exit_code != 0
     site.there.is_ready = True
     done = run("hall-b", "-y")
@@ -512,6 +514,19 @@ def test_what_speaks_against_it_is_said_before_anything(
     assert (site.here.text, site.there.text) == before
 
 
+@pytest.mark.parametrize("is_exclusive", [False, True])
+def test_a_document_that_could_not_lose_it_and_get_it_again_is_left_alone(site: Site, is_exclusive: bool) -> None:
+    """Another task says the same by an anchor in this one's entry."""
+    if is_exclusive:
+        site.make_exclusive()
+    text = site.here.text.replace("candidates: {kind: robot}\n", "candidates: &all {kind: robot}\n")
+    site.here.text = text.replace("other: {candidates: {kind: robot}", "other: {candidates: *all")
+    before = site.here.text
+    refused = run("hall-b", "-y")
+    assert (refused.exit_code, "nothing was changed: tasks.echo cannot be removed" in refused.stderr) == (78, True)
+    assert (site.here.text, site.there.text) == (before, B)
+
+
 def test_an_entry_for_the_other_cell_comes_from_a_file(
     site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -555,3 +570,9 @@ def test_an_unknown_task_is_named_beside_the_known_ones(site: Site) -> None:
     result = CliRunner().invoke(app, ["task", "hand", "ech", "hall-b", "-y"])
     assert (result.exit_code, "fleet hall-a has no task 'ech'; did you mean echo?" in result.stderr) == (2, True)
     assert len(site.seen) == 1
+
+
+def test_an_elector_that_has_not_heard_of_the_task_yet_may_still_grant_it_a_lease() -> None:
+    """It learns of its creation before it learns of its end."""
+    told = {"fleet_revision": 3, "tasks": []}
+    assert [hand_steps._is_rid(told, revision, "echo") for revision in (3, 4)] == [True, False]
