@@ -31,16 +31,19 @@ class Mark(Struct, frozen=True, kw_only=True):
     """Its entry here, a text with the one key ``tasks``."""
 
 
-def mark_of(text: str, task: TaskId) -> Mark | None:
-    """What a document says of a task that is on its way; ``None``: nothing."""
+def marks_of(text: str) -> Iterator[Mark]:
+    """What a document says of every task that is on its way."""
     lines = text.split("\n")
     for first, last in _places(lines):
         found = _BEGIN.fullmatch(lines[first])
         assert found is not None
-        if found[1] == task:
-            entry = "".join(f"{line[2:]}\n" for line in lines[first + 1 : last])
-            return Mark(task=task, cell=found[2], entry=_SECTION + entry)
-    return None
+        entry = "".join(f"{line[2:]}\n" for line in lines[first + 1 : last])
+        yield Mark(task=found[1], cell=found[2], entry=_SECTION + entry)
+
+
+def mark_of(text: str, task: TaskId) -> Mark | None:
+    """What a document says of a task that is on its way; ``None``: nothing."""
+    return next((mark for mark in marks_of(text) if mark.task == task), None)
 
 
 def marked(text: str, mark: Mark) -> str:

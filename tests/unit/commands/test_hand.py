@@ -566,6 +566,33 @@ def test_an_exclusive_task_in_both_documents_is_nobody_s_to_hand(site: Site, mon
     assert (refused.exit_code, "stands in the documents of both cells" in refused.stderr) == (1, True)
 
 
+@pytest.mark.parametrize("is_exclusive", [False, True])
+def test_a_document_that_forgets_what_is_on_its_way_is_a_danger(
+    site: Site, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, is_exclusive: bool
+) -> None:
+    if is_exclusive:
+        site.make_exclusive()
+    file = tmp_path / "old.yaml"
+    file.write_text(site.here.text)
+
+    def broken(*_given: object) -> str:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(hand_steps, "_lack", broken)
+        CliRunner().invoke(app, ["task", "hand", "echo", "hall-b", "-y"])
+    on_its_way = site.here.text
+    refused = CliRunner().invoke(app, ["apply", str(file), "--yes"])
+    told = " ".join(refused.stderr.split())
+    assert (refused.exit_code, "--accept between-cells" in told) == (1, True)
+    then = "it begins here, too" if is_exclusive else "nothing tells any more how it goes on"
+    assert f"between-cells: echo is on its way to hall-b, and may work there: {then}" in told
+    file.write_text(on_its_way.replace("site:", "timing: wifi\nsite:"))
+    assert CliRunner().invoke(app, ["apply", str(file), "--yes"]).exit_code == 0, "the mark stays"
+    file.write_text(A)
+    assert CliRunner().invoke(app, ["apply", str(file), "--yes", "--accept", "between-cells"]).exit_code == 0
+
+
 def test_an_unknown_task_is_named_beside_the_known_ones(site: Site) -> None:
     result = CliRunner().invoke(app, ["task", "hand", "ech", "hall-b", "-y"])
     assert (result.exit_code, "fleet hall-a has no task 'ech'; did you mean echo?" in result.stderr) == (2, True)
