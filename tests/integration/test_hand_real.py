@@ -50,6 +50,12 @@ class Site:
         self.folder = folder
         self.port = block_of_ports(20)
         self.halls = {name: Hall(folder / name) for name in (A, B)}
+        with ExitStack() as undone:
+            undone.callback(self.stop)
+            self._found(task, is_secured=is_secured)
+            undone.pop_all()
+
+    def _found(self, task: str, *, is_secured: bool) -> None:
         for number, (name, hall) in enumerate(self.halls.items()):
             hall.folder.mkdir()
             founder, address = STAYS[name], f"127.0.0.1:{self.port + 10 * number}"
