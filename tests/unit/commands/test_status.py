@@ -163,7 +163,7 @@ def test_every_verb_that_asks_a_daemon_takes_the_node_that_several_daemons_make_
     file = str(Path(__file__).parents[3] / "configs" / "fleet.yaml")
     arguments |= {"apply": [file], "add": [file], "remove": ["echo"], "forget": ["edge1"]}
     arguments |= {"record": ["-o", str(folder / "x.mcap"), "--for", "0.1s"], "trace": ["--once"]}
-    arguments |= {"ping": ["edge1"], "bugreport": [str(folder / "report.tar.gz")]}
+    arguments |= {"hand": ["echo", "hall-b", "--plan"], "ping": ["edge1"], "bugreport": [str(folder / "report.tar.gz")]}
     assert set(asking) >= {("status",), ("weights",), ("retry",), ("stream", "list"), ("stream", "tail")}
     del asking[asking.index(("up",))]  # it starts the daemon
     del asking[asking.index(("leave",))]  # the state folder says whose machine it is
