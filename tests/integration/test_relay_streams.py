@@ -241,6 +241,33 @@ def test_a_relay_that_is_killed_is_restarted_with_the_newest_plan(rig: Rig) -> N
     until(lambda: app.put() or len(app.back) > before, "the stream flows again")
 
 
+@pytest.mark.parametrize("stream_class", [StreamClass.RELIABLE, StreamClass.LATEST])
+@pytest.mark.parametrize("times", [1, 2])
+def test_an_owner_that_heard_a_relay_that_was_killed_drains_all_the_same(
+    rig: Rig, stream_class: StreamClass, times: int
+) -> None:
+    """It waits for the end of all that it has heard: of a relay's life that another one has followed nothing comes."""
+    first, second = (slot(epoch, f"edge{epoch}", stream_class, 0) for epoch in (1, 2))
+    rig.start_worker("edge1")
+    rig.start_worker("edge2")
+    app = Application(rig.app)
+    rig.move(first)
+    thread = app.flow(100, 20)
+    for _ in range(times):
+        pid = rig.relays[ROBOT].pid
+        assert pid is not None
+        os.kill(pid, signal.SIGKILL)
+        until(lambda pid=pid: rig.relays[ROBOT].pid not in (None, pid), "another relay")  # type: ignore[misc]
+        before = len(app.back)
+        until(lambda before=before: len(app.back) > before + 20, "the stream flows again")  # type: ignore[misc]
+    rig.prepare(second, first)
+    rig.flip(second, first)
+    rig.wait(SlotDrained, 5.0, task=TASK, epoch=1)
+    rig.plan(RoutePhase.CLOSE, second)
+    until(lambda: app.nodes[-1] == "edge2", "answers of the next owner")
+    app.halt(thread)
+
+
 def test_a_stream_does_not_hang_on_the_relay_beside_the_worker(rig: Rig) -> None:
     rig.start_worker("edge1")
     rig.start_worker("edge2")

@@ -194,6 +194,7 @@ class RelayProcess:
         self._matching = Matching(session, reporter.report)
         self._troubles = Troubles(session, keyspace, node, reporter.report)
         self._tokens = Tokens(session, keyspace, self._worker_seen, self._role_ended, self._wake)
+        self._token = self._shown(session)
         reporter.report(RelayStarted(pid=os.getpid(), zid=str(session.zid())))
         guarded(self._count, name="counters").start()
         if not local_config:
@@ -244,12 +245,17 @@ class RelayProcess:
                     part.rejoin(session)
             for task in tasks:
                 task.rejoin(session, self._own_ids)
+            self._token = self._shown(session)
             self._application.open(config)
         _log.warning(
             "the data session is opened anew: streams waited %.2f s for what was under way, it took %.2f s",
             left_at - began,
             awake_s() - left_at,
         )
+
+    def _shown(self, session: zenoh.Session) -> zenoh.LivelinessToken:
+        """The token of this life: workers wait for nothing of the one before that is not closed (`worker.lives`)."""
+        return session.liveliness().declare_token(Keyspace(self._fleet).relay(self._node, str(session.zid())))
 
     def _expel_from(self, session: zenoh.Session, members: frozenset[str] | None) -> Expulsion | None:
         if members is None:

@@ -129,6 +129,10 @@ class Keyspace(Struct, frozen=True):
         """Liveliness token of a worker on its data session: ready."""
         return self._key("worker", node, task, str(incarnation))
 
+    def relay(self, node: NodeId, session: str) -> str:
+        """Liveliness token of a relay on its data session, with its zenoh id: this life of it is there."""
+        return self._key("relay", node, session)
+
     def role(self, node: NodeId, task: TaskId) -> str:
         """Put and queryable, to the worker from its own node: idle, active or draining."""
         return self._key("role", node, task)

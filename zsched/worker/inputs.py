@@ -52,8 +52,11 @@ class Dispatcher:
         troubles: Troubles,
         debts: Debts,
         jobs: JobBook,
+        has_ended: Callable[[str], bool] = lambda _session: False,
     ) -> None:
+        """``has_ended``: whether nothing more comes of the session with that zenoh id, not even an end marker."""
         self._on_ended = on_ended
+        self._has_ended = has_ended
         self._jobs = jobs
         self._timer = self._jobs.timer()
         """Its counts of what waits are guarded by `_wake`."""
@@ -454,6 +457,8 @@ class Dispatcher:
             state = self._open.get(name)
             if state is not None:
                 state.number = max(state.number, number)
+                if self._has_ended(name[1]):  # nobody ends it: this may have been its last sample
+                    self._asked.add(state.epoch)
         if waiting.is_wanted and sample.congestion_control == zenoh.CongestionControl.BLOCK:
             is_unanswered = self._has_withheld and waiting.is_whole
             size = len(sample.payload)
@@ -489,7 +494,12 @@ class Dispatcher:
 
     def _is_over(self, epoch: int) -> bool:
         """Whether every input that was heard in the epoch has ended (under the lock)."""
-        return all(state.epoch > epoch for state in self._open.values())
+        return all(state.epoch > epoch or self._is_left(name) for name, state in self._open.items())
+
+    def _is_left(self, name: SourceName) -> bool:
+        """Whether nobody is there who would end a source, and all that has come of it is processed."""
+        is_left = self._has_ended(name[1])
+        return is_left and not any(one.name == name and one.sample is not None for one in self._queue)
 
 
 def _never() -> bool:

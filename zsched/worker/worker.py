@@ -53,6 +53,7 @@ from zsched.worker.inputs import Dispatcher
 from zsched.worker.jobs import Job, JobBook
 from zsched.worker.keep import Debts, Keeper
 from zsched.worker.keys import IN_OUTPUTS, filled, untaken
+from zsched.worker.lives import RelayLives
 from zsched.worker.outputs import OUTPUT_DEPTH, Output
 from zsched.worker.roles import RoleWatch
 from zsched.worker.samples import BY_CLASS, Input, KeepLast, Marker, Received
@@ -123,7 +124,11 @@ class Worker:
         self._keeper = Keeper(self._session, acks_key, self._debts, self._stalled)
         self._troubles = Troubles(self._tell_trouble)
         self._jobs = JobBook(task, incarnation, self._tell_jobs, deadline_s)
-        self._dispatcher = Dispatcher(self._inputs_ended, self._acks, self._troubles, self._debts, self._jobs)
+        self._lives = RelayLives(self._session, self._keyspace)
+        self._declared.append(self._lives)
+        self._dispatcher = Dispatcher(
+            self._inputs_ended, self._acks, self._troubles, self._debts, self._jobs, self._lives.is_over
+        )
         self._restorer = Restorer(self._fetch_snapshot, node, self._dispatcher)
         self._dispatcher.start()
         self._watch: RoleWatch | None = None

@@ -31,6 +31,7 @@ for _method, _arguments in {
     "learnt": ("edge1", "robot1"),
     "document": ("edge1", "robot1"),
     "worker": ("edge1", "map_merge", "7"),
+    "relay": ("robot1", "a1b2c3"),
     "role": ("edge1", "map_merge"),
     "trouble": ("edge1", "map_merge", "7"),
     "ack": ("edge1", "map_merge", "7", "a1b2c3"),
