@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from zsched.clock import wall_ns
+from zsched.core.membership.refused import SHOWN_S
 from zsched.core.values.fleet import Security
 from zsched.doctor.model import Result, Scene, failed, joined, passed, skipped, warned
 from zsched.errors import ConfigError
@@ -48,8 +49,6 @@ UNPROVEN: Final = {
     "_signature": "frames with a wrong signature",
 }
 """{end of a counter's name: what it counts}."""
-OVER_S: Final = 60.0
-"""Who dials and is refused dials again about once a second; what has not risen for so long is over."""
 
 
 def nothing_in_plain_text(scene: Scene) -> Result:
@@ -195,7 +194,7 @@ def nobody_is_refused(scene: Scene) -> Result:
     ends = tuple(UNPROVEN)
     names += [name for name in sorted(counters) if name not in REFUSED and name.endswith(ends) and counters[name]]
     names = [name for name in names if name.startswith("dropped_")]
-    found = [f"{_refused(name)}: {counters[name]} (`{name}`)" for name in names if ages.get(name, 0.0) < OVER_S]
+    found = [f"{_refused(name)}: {counters[name]} (`{name}`)" for name in names if ages.get(name, 0.0) < SHOWN_S]
     found += scene.status.get("refused", ())
     if found:
         return warned(
