@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +74,7 @@ class Hall:
         self.owner, self.is_whole = "robot1", True
         self.candidates: list[str] | None = None
         self.conflicts = 0
+        self.meanwhile: Callable[[], None] = lambda: None
         self.done: list[str] = []
 
     @property
@@ -128,6 +129,7 @@ class Hall:
         assert request["base_revision"] == self.revision
         if self.conflicts:
             self.conflicts -= 1
+            self.meanwhile()
             return {"outcome": "conflict", "detail": "another change came first", "revision": self.revision}
         if request["text"] != self.text:
             before, self.text = self.names, request["text"]
@@ -286,6 +288,27 @@ def test_what_another_change_overtakes_is_proposed_again(site: Site) -> None:
     done = run("--to", "hall-b", "--yes")
     assert done.exit_code == 0, done.stderr
     check_arrived(site)
+
+
+@pytest.mark.parametrize(("times", "code"), [(1, 0), (9, 1)])
+def test_what_an_operator_changes_meanwhile_is_looked_at_once(site: Site, times: int, code: int) -> None:
+    """Another machine leaves at the same time; a cell that changes again and again is not asked for a minute."""
+    hall = site.cells["hall-a"]
+    hall.conflicts = times
+
+    def meanwhile() -> None:
+        told = {"kind": "ineligible", "subject": "robot2", "by": "somebody", "reason": "", "for_s": None}
+        hall.flags = [{**told, "revision": 8 + times - hall.conflicts}]
+
+    hall.meanwhile = meanwhile
+    done = run("--to", "hall-b", "--yes")
+    assert done.exit_code == code, done.stderr
+    assert hall.conflicts == max(0, times - 2), "two drains, each asked for once"
+    if code:
+        assert "the fleet was changed meanwhile" in done.stderr
+        assert not [one for one in hall.done if one.startswith("-")]
+    else:
+        assert whose(site.folder / "state") == ("hall-b", ME)
 
 
 @pytest.mark.usefixtures("site")
