@@ -34,6 +34,7 @@ from zsched.commands.rollout import Wave, begun, kept_rollouts, told_in
 from zsched.config.difference import Change, Danger, difference, wanted_electors, warnings_in_force
 from zsched.config.handing import mark_of, marks_of
 from zsched.config.load import check_bytes
+from zsched.config.parts import Part
 from zsched.config.reader import MAX_FILE_BYTES, render_all
 from zsched.core.values.fleet import Fleet, fleet_hash
 from zsched.core.values.struct import Struct, replace
@@ -131,8 +132,10 @@ def read_text(file: str) -> str:
         raise ConfigError(f"{file}: byte 0x{error.object[error.start]:02x} is not UTF-8; save it as UTF-8") from error
 
 
-def apply(door: Door, view: ApplyView, make: Callable[[InForce], str], file: str) -> int:
+def apply(door: Door, view: ApplyView, make: Callable[[InForce], str], file: str, part: Part | None = None) -> int:
     """Plan the change that ``make`` makes of the document in force, show it, ask, have it agreed; the exit code.
+
+    ``part``: what it adds, as its file has it.
 
     Raises:
         CliError: nobody answers, the change is refused, overtaken, or not accepted.
@@ -141,7 +144,7 @@ def apply(door: Door, view: ApplyView, make: Callable[[InForce], str], file: str
     _check_accepted(view)
     check_reason(view.reason)
     held = in_force(door)
-    return agree(door, view, make_plan(door, held, make(held), file, view))
+    return agree(door, view, make_plan(door, held, make(held), file, view, part))
 
 
 def agree(door: Door, view: ApplyView, plan: Plan) -> int:
@@ -172,8 +175,12 @@ def agree(door: Door, view: ApplyView, plan: Plan) -> int:
     return _commit(door, view, plan)
 
 
-def make_plan(door: Door, held: InForce, text: str, file: str, view: ApplyView | None = None) -> Plan:
+def make_plan(
+    door: Door, held: InForce, text: str, file: str, view: ApplyView | None = None, part: Part | None = None
+) -> Plan:
     """What ``text`` would change, and which dangers are in it; ``view`` says which changed workers wait for a look.
+
+    ``part``: what was added to the document, as its file has it.
 
     Raises:
         CliError: it is another fleet's file, the document in force is not there or cannot be read here, or no changed
@@ -182,7 +189,7 @@ def make_plan(door: Door, held: InForce, text: str, file: str, view: ApplyView |
     """
     config = places.config_path(None, os.environ)
     folder = config.absolute().parent if config.exists() else None  # where the nodes read it
-    result = check_bytes(text.encode(), file, folder)
+    result = check_bytes(text.encode(), file, folder, part)
     if held.document:
         result = replace(result, warnings=warnings_in_force(text, result.warnings))
     if result.fleet is None:

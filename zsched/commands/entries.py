@@ -13,6 +13,7 @@ from zsched.commands.ask import Door
 from zsched.commands.common import CliError, Json, nearest
 from zsched.commands.document import InForce, document_text, status_of
 from zsched.config.editing import add_entries, remove_node, remove_task
+from zsched.config.parts import Part
 from zsched.exits import EXIT_FAILED, EXIT_USAGE
 
 HERE = ("alive", "suspect")
@@ -25,7 +26,10 @@ def add(door: Door, view: ApplyView, section: str, file: Path) -> int:
         CliError, ConfigError: as of `apply`; or the file holds something else, or an entry that is there already.
     """
     fragment = read_text(str(file))
-    return apply(door, view, lambda held: add_entries(document_text(held), section, fragment, str(file)), DOCUMENT)
+    part = Part(section=section, text=fragment, file=str(file))
+    return apply(
+        door, view, lambda held: add_entries(document_text(held), section, fragment, str(file)), DOCUMENT, part
+    )
 
 
 def drop_task(door: Door, view: ApplyView, task: str) -> int:

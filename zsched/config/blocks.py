@@ -372,7 +372,7 @@ def _distinct(node: Mapping, out: Collector) -> list[tuple[Scalar, Node]]:
     for key, value in node.pairs:
         known = first.setdefault(key.text, (key, value))
         if known[0] is not key:
-            out.error(key.place, f"the key {key.text!r} is there twice", f"first on line {known[0].place.line}")
+            out.error(key.place, f"the key {key.text!r} is there twice", f"first at {known[0].place.told()}")
     return list(first.values())
 
 

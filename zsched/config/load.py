@@ -12,6 +12,7 @@ from pathlib import Path
 
 from zsched.config.blocks import Located, Section
 from zsched.config.nodes import Cast, read_nodes, select, warn_missing
+from zsched.config.parts import Part, placed
 from zsched.config.reader import MAX_FILE_BYTES, Collector, Fault, Place, nearest, read_yaml, render_all
 from zsched.config.schema import FLEET
 from zsched.config.security import read_security
@@ -46,7 +47,8 @@ class CheckResult(Struct, frozen=True, kw_only=True):
     def report(self) -> str:
         """Faults, then warnings, as a compiler shows them; empty when there are none."""
         parts = (render_all(self.file, self.faults), render_all(self.file, self.warnings, "warning"))
-        note = f"{self.file}: {MORE}" if any(fault.line for fault in self.faults) else ""
+        placed_in = [fault.file or self.file for fault in self.faults if fault.line]
+        note = f"{placed_in[0]}: {MORE}" if placed_in else ""
         return "\n".join(part for part in (*parts, note) if part)
 
 
@@ -106,10 +108,19 @@ def _unread_hint(file: Path, error: OSError | ValueError) -> str:
     return "give the path of a fleet file"
 
 
-def check_bytes(data: bytes, file: str = "fleet.yaml", folder: Path | None = None) -> CheckResult:
-    """As `check_file` for ``data``; file names in it are relative to ``folder``, else to the folder of ``file``."""
+def check_bytes(
+    data: bytes, file: str = "fleet.yaml", folder: Path | None = None, part: Part | None = None
+) -> CheckResult:
+    """As `check_file` for ``data``; file names in it are relative to ``folder``, else to the folder of ``file``.
+
+    Faults in what came from ``part`` name its file.
+    """
     root, out = read_yaml(data)
     fleet = None
+    if root is not None and part is not None:
+        out.add_file(file, data.decode())
+        out.add_file(part.file, part.text)
+        root = placed(root, file, part)
     if root is not None:
         section = FLEET.read(root, out)
         if section is not None:

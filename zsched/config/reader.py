@@ -33,6 +33,12 @@ class Place(Struct, frozen=True, kw_only=True):
     line: int
     col: int
     width: int = 1
+    file: str = ""
+    """The file's name, where there are several (`zsched.config.parts`)."""
+
+    def told(self) -> str:
+        """As an operator is told of a place beside the fault's own."""
+        return f"{self.file}:{self.line}:{self.col}" if self.file else f"{self.line}:{self.col}"
 
 
 NOWHERE: Final = Place(line=0, col=0)
@@ -48,9 +54,12 @@ class Fault(Struct, frozen=True, kw_only=True):
     hint: str = ""
     source_line: str = ""
     width: int = 1
+    file: str = ""
+    """As `Place.file`."""
 
     def render(self, file: str, severity: str = "error") -> str:
         """The fault as a compiler shows it: place, message, the line, a caret, the hint."""
+        file = self.file or file
         if self.line == 0:
             lines = [f"{file}: {severity}: {self.message}"]
         else:
@@ -67,9 +76,13 @@ class Collector:
     """The faults and warnings of one file, in the order of their places."""
 
     def __init__(self, lines: tuple[str, ...]) -> None:
-        self._lines = lines
+        self._lines = {"": lines}
         self._faults: list[Fault] = []
         self._warnings: list[Fault] = []
+
+    def add_file(self, file: str, text: str) -> None:
+        """Some places are in this file, too."""
+        self._lines[file] = _lines(text)
 
     def error(self, place: Place, message: str, hint: str = "") -> None:
         """The file cannot be used."""
@@ -95,14 +108,16 @@ class Collector:
         return _in_order(self._warnings)
 
     def _fault(self, place: Place, message: str, hint: str) -> Fault:
-        source = self._lines[place.line - 1] if 0 < place.line <= len(self._lines) else ""
+        lines = self._lines[place.file]
+        source = lines[place.line - 1] if 0 < place.line <= len(lines) else ""
         source = "".join(char if char.isprintable() or char == "\t" else "\ufffd" for char in source)
         width = max(1, min(place.width, len(source) - place.col + 1))
-        return Fault(line=place.line, col=place.col, message=message, hint=hint, source_line=source, width=width)
+        line, col, file = place.line, place.col, place.file
+        return Fault(line=line, col=col, message=message, hint=hint, source_line=source, width=width, file=file)
 
 
 def _in_order(faults: Iterable[Fault]) -> tuple[Fault, ...]:
-    return tuple(sorted(dict.fromkeys(faults), key=lambda fault: (fault.line, fault.col)))
+    return tuple(sorted(dict.fromkeys(faults), key=lambda fault: (fault.file, fault.line, fault.col)))
 
 
 def render_all(file: str, faults: tuple[Fault, ...], severity: str = "error") -> str:

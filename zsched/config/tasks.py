@@ -307,7 +307,7 @@ def _check_mirrors(given: Section, streams: tuple[Located[StreamRule], ...], out
                 stream.place, "an exclusive task may not work twice, and mirror feeds two owners", "mirror: false"
             )
         elif whole:
-            where = f"{whole[0].place.line}:{whole[0].place.col}"
+            where = whole[0].place.told()
             message = f"mirror has both owners answer, and the output at {where} lets all answers through"
             out.error(stream.place, message, "handover: latest there, or mirror: false here")
 
@@ -386,7 +386,7 @@ def _placeholder_hint(template: str) -> str:
 
 def _report(conflict: RuleConflict, places: _Places, out: Collector) -> None:
     """Every rule of a conflict is named with its place; the fault stands at the last of them in the file."""
-    ordered = sorted((places[name].line, places[name].col, name) for name in conflict.streams)
-    named = ", ".join(f"{name} at {line}:{col}" for line, col, name in ordered)
+    ordered = sorted(conflict.streams, key=lambda name: (places[name].file, places[name].line, places[name].col, name))
+    named = ", ".join(f"{name} at {places[name].told()}" for name in ordered)
     tell = out.error if conflict.is_fatal else out.warn
-    tell(places[ordered[-1][2]], conflict.message, f"rules: {named}")
+    tell(places[ordered[-1]], conflict.message, f"rules: {named}")

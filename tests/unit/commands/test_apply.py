@@ -17,6 +17,7 @@ from zsched.cli import app
 from zsched.commands import document, fleet
 from zsched.commands.ask import PASSES_ON
 from zsched.commands.common import CliError
+from zsched.commands.entries import DOCUMENT
 from zsched.config.editing import add_entries
 from zsched.config.load import check_bytes
 from zsched.core.values.fleet import fleet_hash
@@ -387,6 +388,36 @@ def test_a_task_comes_and_goes_and_the_comments_stay(node: Node, tmp_path: Path)
     assert run("task", "remove", "merge", "--yes", "--accept", "remove-task").exit_code == 0
     assert "merge" not in node.text
     assert "# the large one" in node.text
+
+
+IN_FLOW = (
+    TEXT.partition("tasks:")[0] + "tasks: {merge: {candidates: {kind: robot}, weights: {cpu: 0.5, memory: 0.5}}}\n"
+)
+
+
+@pytest.mark.parametrize("text", [TEXT, IN_FLOW])
+def test_faults_of_a_new_task_name_the_operator_s_own_file_and_its_lines(node: Node, tmp_path: Path, text: str) -> None:
+    """By the lines of the merged document, which nobody has seen, they could not be found."""
+    node.text = text
+    file = tmp_path / "count.yaml"
+    file.write_text("# pallets\ntasks:\n\n    count:\n      candidates: [edge9]\n      weights: {cpu: 1, memory: -1}\n")
+    told = run("task", "add", file, "--yes").stderr
+    assert f"{file}:5:20: error: " in told, told
+    assert f"{file}:6:33: error: " in told, told
+    assert "\n          weights: {cpu: 1, memory: -1}\n" in told
+    assert DOCUMENT not in told
+    assert node.changes == []
+
+
+def test_a_fault_between_a_new_task_and_another_one_names_the_place_of_each(node: Node, tmp_path: Path) -> None:
+    rule = '    outputs: [{from: "{target}/NAME/{epoch}/out", to: "{robot}/map"}]\n'
+    node.text = TEXT + rule.replace("NAME", "merge")
+    file = tmp_path / "again.yaml"
+    entry = node.text.partition("tasks:\n")[2].replace("  merge:", "  again:")
+    file.write_text(f"tasks:\n{entry}".replace("/merge/", "/again/"))
+    result = run("task", "add", file, "--yes")
+    assert f"rules: again/out/0 at {file}:5:" in result.stderr, result.stderr
+    assert f", merge/out/0 at {DOCUMENT}:11:" in result.stderr, result.stderr
 
 
 def test_a_document_that_names_no_electors_is_not_warned_of_those_that_a_first_file_would_have(
