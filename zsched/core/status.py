@@ -20,7 +20,7 @@ from zsched.core.values.fleet import NodeSpec, TaskSpec
 from zsched.core.values.gauges import possible
 from zsched.core.values.model import Allocation, NodeId, Pause, PeerState, Pin, TaskId
 from zsched.core.values.plan import Direction, ReadyWhen, Route, StreamCount
-from zsched.core.values.profile import Jobs, WorkerLoad, WorkerState
+from zsched.core.values.profile import WorkerLoad, WorkerState
 from zsched.core.values.quorum import majority
 from zsched.core.values.snapshot import (
     SCHEMA,
@@ -51,10 +51,11 @@ RECOVER_AFTER_S = 60.0
 A recovery beside electors that come back makes two fleets of one.
 """
 RECOVER = "stop zsched on one that has its state, run `zsched recover` there, and start it"
-HUNG_HZ = 0.002
-"""The smoothed rate of a worker falls to this about 8 s after its last job."""
-HUNG_JOB_S = 0.5
-"""Of longer jobs none may have ended for so long, and all is well."""
+HUNG_TIMES = 16.0
+"""A job that takes so many times as long as jobs have taken may hang; one that takes less than
+`zsched.core.profile.jobs.UNENDED_S` does not..."""
+HUNG_FIRST_S = 30.0
+"""...and, of a worker that has ended none of late, one that takes so long: a first job may load a model."""
 UNREADY_SHOWN_S = 2.0
 """A slot that no worker takes for longer is a problem: a handover takes less."""
 
@@ -453,10 +454,11 @@ def _task_problems(node: Stages, task: TaskSpec, value: Allocation, now: float) 
             yield f"the worker on {spec.name} {told_of_worker(load.state, load.reason)}"
         elif load.state is WorkerState.READY and load.reason:
             yield f"the worker on {spec.name}{why}"
-        elif spec.name == owner and load.jobs is not None and _hangs(load.jobs):
+        elif spec.name == owner and load.unended_s is not None and _hangs(load):
+            more = f", and {load.jobs.backlog} wait" if load.jobs is not None and load.jobs.backlog else ""
             yield (
-                f"the worker on {spec.name} has finished no job for some seconds, and {load.jobs.backlog} wait: it may "
-                f"hang in a callback; see `zsched logs {task.name}`, `zsched restart {task.name}` starts it anew"
+                f"the worker on {spec.name} has had work for {load.unended_s:.0f} s and finished no job{more}: it "
+                f"may hang in a callback; see `zsched logs {task.name}`, `zsched restart {task.name}` starts it anew"
             )
     since = _unready_since(node, executor)
     if is_owner_ready and now - since >= UNREADY_SHOWN_S:
@@ -464,9 +466,10 @@ def _task_problems(node: Stages, task: TaskSpec, value: Allocation, now: float) 
         yield f"{waited}: {_untaken(task, executor, node.unready.get(task.name))}"
 
 
-def _hangs(jobs: Jobs) -> bool:
-    """Whether jobs wait, and none has ended for many times as long as one took before."""
-    return jobs.backlog > 0 and jobs.done_hz < HUNG_HZ and jobs.time_s <= HUNG_JOB_S
+def _hangs(load: WorkerLoad) -> bool:
+    """Whether there is work, and no job has ended for many times as long as one took before."""
+    bound_s = HUNG_FIRST_S if load.jobs is None else HUNG_TIMES * load.jobs.time_s
+    return load.unended_s is not None and load.unended_s >= bound_s
 
 
 def _is_in_the_way(task: TaskSpec, load: WorkerLoad) -> bool:

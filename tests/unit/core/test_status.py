@@ -596,31 +596,43 @@ def test_a_slot_that_somebody_else_s_worker_does_not_take_is_told_with_what_mend
 
 
 def told_by(
-    node: Node, name: str, sequence: int, state: WorkerState, reason: str = "", jobs: Jobs | None = None
+    node: Node,
+    name: str,
+    sequence: int,
+    state: WorkerState,
+    reason: str = "",
+    jobs: Jobs | None = None,
+    unended_s: float | None = None,
 ) -> None:
     """A node's profile says how its worker is."""
-    load = load_of(state=state, reason=reason, jobs=jobs)
+    load = load_of(state=state, reason=reason, jobs=jobs, unended_s=unended_s)
     profile = profile_of(name, incarnation=3, sequence=sequence, memory_used_mb=100.0, workers=(load,))
     node.handle(ev.ProfileReceived(profile=profile), 100.0)
 
 
 @pytest.mark.parametrize(
-    ("jobs", "is_told"),
+    ("unended_s", "jobs", "told"),
     [
-        (Jobs(time_s=0.01, cpu_s=0.01, done_hz=0.0011, wanted_hz=9.9, backlog=86), True),
-        (Jobs(time_s=0.01, cpu_s=0.01, done_hz=0.0011, wanted_hz=0.0011), False),  # nothing waits: it is idle
-        (Jobs(time_s=0.01, cpu_s=0.01, done_hz=4.0, wanted_hz=9.9, backlog=86), False),  # behind, and at work
-        (Jobs(time_s=20.0, cpu_s=0.01, done_hz=0.0011, wanted_hz=9.9, backlog=86), False),  # a job takes this long
+        (12.0, Jobs(time_s=0.01, cpu_s=0.01, backlog=86), "12 s and finished no job, and 86 wait: it may hang"),
+        (12.0, Jobs(time_s=0.01, cpu_s=0.01), "12 s and finished no job: it may hang"),
+        (None, Jobs(time_s=0.01, cpu_s=0.01, backlog=86), None),  # behind, and at work
+        (33.0, Jobs(time_s=2.0, cpu_s=0.01, backlog=86), "33 s and finished no job, and 86 wait"),
+        (31.0, Jobs(time_s=2.0, cpu_s=0.01, backlog=86), None),  # not many times as long as a job takes
+        (29.0, None, None),  # its first job
+        (31.0, None, "31 s and finished no job: it may hang"),
     ],
 )
-def test_an_owner_whose_jobs_wait_and_never_end_is_a_problem(jobs: Jobs, *, is_told: bool) -> None:
+def test_an_owner_that_has_work_and_ends_no_job_is_a_problem(
+    unended_s: float | None, jobs: Jobs | None, told: str | None
+) -> None:
     """Its token is there and samples flow in: without this line all would look well."""
     node = make()
     node.handle(ev.BeatReceived(beat=beat_of("edge1", incarnation=3)), 100.0)
     learn(node, 1, "edge1")
-    told_by(node, "edge1", 1, WorkerState.READY, jobs=jobs)
-    problems = build_snapshot(node, 101.0).tasks[0].problems
-    assert any("finished no job for some seconds, and 86 wait" in one for one in problems) is is_told
+    told_by(node, "edge1", 1, WorkerState.READY, jobs=jobs, unended_s=unended_s)
+    problems = [one for one in build_snapshot(node, 101.0).tasks[0].problems if "finished no job" in one]
+    assert len(problems) == (told is not None)
+    assert all(f"has had work for {told}" in one for one in problems)
 
 
 def test_a_slot_that_is_not_taken_is_told_of_only_once_the_owner_s_own_worker_is_ready() -> None:

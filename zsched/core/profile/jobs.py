@@ -27,6 +27,8 @@ QUEUE_S = 2.0
 """A longer wait shows that the worker is behind, and not that several jobs came at once."""
 MAX_AT_ONCE = 64.0
 """No worker runs more jobs at a time: a sum of times that rises faster was made up."""
+UNENDED_S = 8.0
+"""For less time than this nobody need be told that no job has ended."""
 LEAST_HZ = 1e-3
 """At a lower rate there are too few jobs for a mean: the last one stands."""
 
@@ -39,6 +41,8 @@ class JobMeter:
         self.value: Jobs | None = None
         """Result of the last look."""
         self._tau_s = tau_s
+        self._works_since: float | None = None
+        """Since when there has been work, and no job has ended; ``None``: it was idle by its newest report."""
         self._newest: WorkerJobs | None = None
         self._heard_at = -math.inf
         self._looked: WorkerJobs | None = None
@@ -56,9 +60,24 @@ class JobMeter:
             return False
         if not is_same_life:
             self._begin(report, now)
+        has_ended = newest is None or not is_same_life or report.done > newest.done
+        if report.is_idle:
+            self._works_since = None
+        elif self._works_since is None or has_ended or now - self._heard_at > STALE_S:  # silent: it was idle
+            self._works_since = now
         self._newest, self._heard_at = report, now
         self._queue.append((now, report.waiting))
         return True
+
+    def unended_s(self, now: float) -> float | None:
+        """For how many seconds the worker has had work, and has ended no job.
+
+        ``None``: for less than `UNENDED_S`, or it is silent.
+        """
+        if self._works_since is None or now - self._heard_at > STALE_S:
+            return None
+        for_s = now - self._works_since
+        return min(for_s, MAX_JOB_S) if for_s >= UNENDED_S else None
 
     def look(self, now: float) -> None:
         """Smooth the reports since the last look, at the moment of the machine's sample."""

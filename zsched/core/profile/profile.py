@@ -190,13 +190,15 @@ class Profiler:
 
     def _worker(self, load: WorkerLoad) -> WorkerLoad:
         cpu, memory = self._worker_cpu.get(load.task), self._worker_memory.get(load.task)
+        meter = self._jobs.get(load.task)
         return WorkerLoad(
             task=load.task,
             state=load.state,
             cpu_cores=None if cpu is None else cpu.value,
             memory_mb=None if memory is None else memory.value,
             wanted_cores=_possible(load.wanted_cores, MAX_CPU_CORES),
-            jobs=self._jobs[load.task].value if load.task in self._jobs else None,
+            jobs=None if meter is None else meter.value,
+            unended_s=None if meter is None else meter.unended_s(self._sampled_at),
         )
 
     def owe(self, now: float) -> None:
@@ -272,6 +274,7 @@ class Profiler:
                 reason=reasons.get(task, ""),
                 jobs=loads[task].jobs if task in loads else None,
                 renewal=renewals.get(task, Renewal.NONE),
+                unended_s=loads[task].unended_s if task in loads else None,
             )
             for task in sorted(states)
         )

@@ -131,9 +131,13 @@ class WorkerLoad(Struct, frozen=True, kw_only=True):
     jobs: Jobs | None = None
     """Its report of its jobs; ``None``: none."""
     renewal: Renewal = Renewal.NONE
+    unended_s: float | None = None
+    """For how long it has had work without a break, and has ended no job; ``None``: not for long, or it does not
+    report its jobs."""
 
     def __post_init__(self) -> None:
         check_name("worker.task", self.task)
+        check_range("worker.unended_s", self.unended_s, 0.0, MAX_JOB_S)
         if len(self.reason) > MAX_REASON:
             raise ValueError(f"worker.reason: {len(self.reason)} characters, at most {MAX_REASON}")
         check_range("worker.cpu_cores", self.cpu_cores, 0.0, MAX_CPU_CORES)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from zsched.core.events import WorkerJobs
-from zsched.core.profile.jobs import MAX_AT_ONCE, QUEUE_S, JobMeter
+from zsched.core.profile.jobs import MAX_AT_ONCE, QUEUE_S, UNENDED_S, JobMeter
 from zsched.core.profile.means import STALE_S
 from zsched.core.values.profile import Jobs
 
@@ -37,6 +37,7 @@ class Teller:
         wait_s: float = 0.01,
         waiting: int = 0,
         lost_words: int = 0,
+        is_idle: bool = False,
     ) -> Jobs | None:
         for number in range(round(for_s / LOOK_S)):
             self.now += LOOK_S
@@ -52,6 +53,7 @@ class Teller:
                 done=self.word.done + jobs,
                 skipped=int(self.skipped + 1e-9),
                 waiting=waiting,
+                is_idle=is_idle,
                 time_s=self.word.time_s + jobs * time_s,
                 cpu_s=self.word.cpu_s + jobs * cpu_s,
                 wait_s=self.word.wait_s + jobs * wait_s,
@@ -288,3 +290,32 @@ def test_a_word_says_nothing_of_what_it_leaves_out() -> None:
     word = WorkerJobs(task="merge", incarnation="1", at_s=0.0, done=0)
     assert (word.time_s, word.cpu_s, word.skipped, word.waiting) == (0.0, 0.0, 0, 0)
     assert (word.wait_s, word.age_s, word.late) == (None, None, None)
+
+
+def test_a_worker_that_has_work_and_ends_no_job_is_told_of_after_a_while() -> None:
+    """From its first job on, and however long it was idle before."""
+    teller = told()
+    teller.works(UNENDED_S - 1.0, done_hz=0.0)
+    assert teller.meter.unended_s(teller.now) is None
+    teller.works(4.0, done_hz=0.0)
+    assert teller.meter.unended_s(teller.now) == pytest.approx(UNENDED_S + 3.0, abs=2 * LOOK_S)
+    teller.works(1.0, done_hz=5.0)
+    assert teller.meter.unended_s(teller.now) is None
+    teller.works(LOOK_S, done_hz=0.0, is_idle=True)
+    for pause_s in (3.0, 60.0):
+        teller.now += pause_s
+        teller.works(UNENDED_S - 1.0, done_hz=0.0, waiting=3)
+        assert teller.meter.unended_s(teller.now) is None, "since there has been work"
+        teller.works(2.0, done_hz=0.0, waiting=3)
+        assert teller.meter.unended_s(teller.now) == pytest.approx(UNENDED_S + 1.0, abs=2 * LOOK_S)
+        teller.works(1.0, done_hz=5.0)  # its word that it is idle is lost
+
+
+def test_one_that_says_nothing_or_lives_anew_is_not_said_to_end_no_job() -> None:
+    teller = told()
+    teller.works(UNENDED_S + 2.0, done_hz=0.0)
+    assert teller.meter.unended_s(teller.now + STALE_S) is not None
+    assert teller.meter.unended_s(teller.now + STALE_S + 1.0) is None
+    teller.word = replace(teller.word, incarnation="2", at_s=0.0)
+    teller.works(LOOK_S, done_hz=0.0)
+    assert teller.meter.unended_s(teller.now) is None

@@ -496,3 +496,21 @@ def test_impossible_and_unknown_readings_are_no_readings_and_old_ones_neither() 
     assert gauges_of(profiler, 100.0, ("battery", 1.2), ("temperature_c", math.nan), ("wind", 3.0)) == {}
     assert gauges_of(profiler, 101.0, ("battery", 0.5)) == {"battery": 0.5}
     assert taken(profiler, 101.0 + STALE_S + 0.1).gauges == ()
+
+
+@pytest.mark.parametrize("rate_hz", [5.0, 5.3, 5.6, 6.0, 6.4, 6.8, 7.2])
+@pytest.mark.parametrize("sample_s", [0.2, 1.0])
+def test_a_hung_worker_is_told_of_however_seldom_its_machine_is_measured(rate_hz: float, sample_s: float) -> None:
+    """By its smoothed rate it was not, where one look in a second stepped over what counted as a hang: 3 of 10 did."""
+    profiler, told = make_profiler(), None
+    for step in range(200):
+        now = 0.2 * step
+        done = int(min(now, 8.0) * rate_hz)
+        word = WorkerJobs(task="merge", incarnation="1", at_s=now, done=done, time_s=0.01 * done, waiting=int(now > 8))
+        assert profiler.note_jobs(word, now)
+        if step % round(5 * sample_s) == 0:
+            profiler.absorb(device(1.0, 1000.0, load(0.1)), (), now)
+            sent = profiler.publishable(READY, is_draining=False, now=now)
+            told = told if sent is None else sent.worker("merge")
+    assert told is not None
+    assert told.unended_s == pytest.approx(39.8 - 8.0, abs=1.5)

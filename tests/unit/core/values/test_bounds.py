@@ -187,6 +187,7 @@ RANGES = [
     (LOAD, "wanted_cores", "worker.wanted_cores", (0.0, MAX_CPU_CORES)),
     (TUNING, "deadline_ms", "deadline_ms", (model.MIN_DEADLINE_MS, model.MAX_DEADLINE_MS)),
     *((JOBS, name, f"jobs.{name}", (0.0, MAX_JOB_S)) for name in ("time_s", "cpu_s", "wait_s", "age_s")),
+    (LOAD, "unended_s", "worker.unended_s", (0.0, MAX_JOB_S)),
     *((JOBS, name, f"jobs.{name}", (0.0, MAX_JOBS_HZ)) for name in ("done_hz", "wanted_hz")),
     (JOBS, "late_ratio", "jobs.late_ratio", RATIO),
     *((WORD, name, f"jobs.{name}", (0.0, MAX_COUNTER)) for name in ("at_s", "time_s", "cpu_s", "wait_s", "age_s")),
