@@ -5,14 +5,17 @@ Knows: the folder, its files, in which order they are written. Does not know: wh
 
 The folder is there from before the former cell is asked to let the machine go until it is no node of it any more.
 It lies in the state folder, which is the service's, and root writes and reads it. So a link in its place is never gone
-by, nor a folder that somebody else has made.
+by, nor a folder that somebody else has made. The service may rename the folder at any time, and put another one in its
+place: what is written, or read at the start of a command, goes by the folder that was opened once.
 """
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import os
 import shutil
-import stat
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
@@ -60,7 +63,8 @@ def begin(state: Path, fleet: Fleet, text: str, invitation: Invitation) -> Chang
         invitation: into the next one.
 
     Raises:
-        AdapterError: a file cannot be read or written, or the certificates are elsewhere than beside the fleet file.
+        AdapterError: a file cannot be read or written, the certificates are elsewhere than beside the fleet file, or
+            somebody has put something else in the place of the folder meanwhile.
     """
     folder = state / NEXT_CELL
     try:
@@ -68,24 +72,59 @@ def begin(state: Path, fleet: Fleet, text: str, invitation: Invitation) -> Chang
             folder.unlink()
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True, mode=PRIVATE_FOLDER)
-        for name in (FORMER, NEXT):
-            (folder / name / PKI_FOLDER).mkdir(parents=True, mode=PRIVATE_FOLDER)
-        _write(folder / FORMER / FILE, text.encode())
-        _write(folder / NEXT / FILE, invitation.document.text.encode())
-        if fleet.security is not None:
-            files = files_of(fleet.security)
-            for name, path in ((CERTIFICATE, files.certificate), (KEY, files.key), (TRUSTED, files.trusted)):
-                _write(folder / FORMER / PKI_FOLDER / name, read_regular(path, MAX_FILE_BYTES))
-        papers = invitation.papers
-        if papers is not None:
-            for name, pem in ((CERTIFICATE, papers.certificate), (KEY, papers.key), (TRUSTED, papers.trusted)):
-                _write(folder / NEXT / PKI_FOLDER / name, pem.encode())
-        for name in (FORMER, NEXT):
-            _check_folder(folder / name / FILE)
-        _write(folder / INVITATION, encode_invitation(invitation).encode())
+        with _opened(folder) as held:
+            _fill(held, fleet, text, invitation)
+            change = _change(folder, held, invitation)
+            if not os.path.samestat(held.stat(), folder.lstat()):
+                raise AdapterError(f"{folder} was moved away while it was written; look who did so, and begin again")
     except OSError as error:
         raise AdapterError(f"{error.filename or folder}: {error.strerror}; run this as root") from error
-    return _change(folder, invitation)
+    return change
+
+
+def _fill(folder: Path, fleet: Fleet, text: str, invitation: Invitation) -> None:
+    for name in (FORMER, NEXT):
+        (folder / name / PKI_FOLDER).mkdir(parents=True, mode=PRIVATE_FOLDER)
+    _write(folder / FORMER / FILE, text.encode())
+    _write(folder / NEXT / FILE, invitation.document.text.encode())
+    if fleet.security is not None:
+        files = files_of(fleet.security)
+        for name, path in ((CERTIFICATE, files.certificate), (KEY, files.key), (TRUSTED, files.trusted)):
+            _write(folder / FORMER / PKI_FOLDER / name, read_regular(path, MAX_FILE_BYTES))
+    papers = invitation.papers
+    if papers is not None:
+        for name, pem in ((CERTIFICATE, papers.certificate), (KEY, papers.key), (TRUSTED, papers.trusted)):
+            _write(folder / NEXT / PKI_FOLDER / name, pem.encode())
+    for name in (FORMER, NEXT):
+        _check_folder(folder / name / FILE)
+    _write(folder / INVITATION, encode_invitation(invitation).encode())
+
+
+@contextlib.contextmanager
+def _opened(folder: Path) -> Iterator[Path]:
+    """The folder as it is now, by a name that leads to it whatever becomes of its own.
+
+    Raises:
+        OSError: it cannot be opened, or it is a link.
+        AdapterError: this command has not made it.
+    """
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    try:
+        if os.geteuid() == 0 and os.fstat(descriptor).st_uid != 0:
+            raise _not_ours(folder)
+        held = f"/proc/self/fd/{descriptor}"
+        try:
+            yield Path(held)
+        except OSError as error:
+            if isinstance(error.filename, str):
+                error.filename = error.filename.replace(held, str(folder), 1)
+            raise
+    finally:
+        os.close(descriptor)
+
+
+def _not_ours(folder: Path) -> AdapterError:
+    return AdapterError(f"{folder} is none that this command has made; look what is there, and delete it")
 
 
 def under_way(state: Path) -> Change | None:
@@ -96,18 +135,13 @@ def under_way(state: Path) -> Change | None:
     """
     folder = state / NEXT_CELL
     try:
-        found = folder.lstat()
-    except FileNotFoundError:
-        return None
-    except OSError as error:
-        raise AdapterError(f"{folder}: {error.strerror}; run this as root") from error
-    if not stat.S_ISDIR(found.st_mode) or (os.geteuid() == 0 and found.st_uid != 0):
-        raise AdapterError(f"{folder} is none that this command has made; look what is there, and delete it")
-    try:
-        return _change(folder, decode_invitation(read_regular(folder / INVITATION, MAX_BYTES)))
+        with _opened(folder) as held:
+            return _change(folder, held, decode_invitation(read_regular(held / INVITATION, MAX_BYTES)))
     except FileNotFoundError:
         return None
     except (OSError, WireError) as error:
+        if isinstance(error, OSError) and error.errno in (errno.ENOTDIR, errno.ELOOP):
+            raise _not_ours(folder) from error
         raise AdapterError(f"{folder / INVITATION}: {error}; run this as root, or delete {folder}") from error
 
 
@@ -180,9 +214,10 @@ def end(state: Path) -> None:
         raise AdapterError(f"cannot delete {folder}: {error.strerror}; it holds private keys") from error
 
 
-def _change(folder: Path, invitation: Invitation) -> Change:
+def _change(folder: Path, held: Path, invitation: Invitation) -> Change:
+    """What the folder says, which is opened as ``held``."""
     former = folder / FORMER / FILE
-    fleet = check_bytes(read_regular(former, MAX_FILE_BYTES), str(former)).fleet
+    fleet = check_bytes(read_regular(held / FORMER / FILE, MAX_FILE_BYTES), str(former)).fleet
     if fleet is None:
         raise AdapterError(f"{former} has faults for this version of zsched; delete {folder}")
     return Change(

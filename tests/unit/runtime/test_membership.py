@@ -13,7 +13,7 @@ import pytest
 
 from zsched.adapters.host import state_file
 from zsched.adapters.host.document_store import DocumentStore
-from zsched.adapters.host.state_file import StateFile
+from zsched.adapters.host.state_file import StateFile, replace_synced
 from zsched.config.load import load_fleet
 from zsched.core.values.document import Document
 from zsched.core.values.electorate import FleetValue
@@ -255,6 +255,47 @@ def test_a_link_in_place_of_the_next_cell_s_folder_is_not_gone_by(
     link.symlink_to(theirs / "mine")
     with pytest.raises(AdapterError, match="is none that this command has made"):
         next_cell.under_way(first.state)
+
+
+@pytest.mark.parametrize("is_link", [True, False])
+@pytest.mark.parametrize("at", range(1, 4))
+def test_what_takes_the_place_of_the_next_cell_s_folder_while_it_is_written_gets_nothing(
+    first: Places, invitation: Invitation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: int, *, is_link: bool
+) -> None:
+    """The service may rename what lies in its own folder at any time: root's keys would go where it likes."""
+    folder, theirs = first.state / NEXT_CELL, tmp_path / "elsewhere"
+    for name in ("former", "next"):
+        (theirs / name / "pki").mkdir(parents=True)
+    count = 0
+
+    def replaced(path: Path, new: Path, content: bytes, mode: int = 0o600) -> None:
+        nonlocal count
+        count += 1
+        if count == at:
+            folder.rename(tmp_path / "away")
+            if is_link:
+                folder.symlink_to(theirs)
+            else:
+                theirs.rename(folder)
+        replace_synced(path, new, content, mode)
+
+    monkeypatch.setattr(next_cell, "replace_synced", replaced)
+    with pytest.raises(AdapterError, match="was moved away while it was written"):
+        next_cell.begin(first.state, load_fleet(first.config), TEXT, invitation)
+    assert count >= 3
+    assert [path for path in folder.rglob("*") if path.is_file()] == []
+    assert [path for path in theirs.rglob("*") if path.is_file()] == []
+
+
+def test_a_file_of_the_next_cell_that_cannot_be_written_is_named(
+    first: Places, invitation: Invitation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(_path: Path, new: Path, _content: bytes) -> None:
+        raise OSError(28, "No space left on device", str(new))
+
+    monkeypatch.setattr(next_cell, "replace_synced", refused)
+    with pytest.raises(AdapterError, match=f"^{first.state / NEXT_CELL}/former/fleet.yaml.new: No space left"):
+        next_cell.begin(first.state, load_fleet(first.config), TEXT, invitation)
 
 
 @pytest.mark.root
