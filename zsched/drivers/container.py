@@ -20,9 +20,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from zsched.drivers.engine import Ended, Look, ask, drive, said
+from zsched.drivers.engine import Ended, Look, ask, begin, said
 from zsched.drivers.place import Place
-from zsched.errors import ConfigError
 from zsched.exits import EXIT_CONFIG
 
 ENGINES: Final = ("podman", "docker")
@@ -219,12 +218,7 @@ def _parser() -> argparse.ArgumentParser:
 def main(arguments: list[str] | None = None) -> int:
     """The driver's command line; the exit status."""
     given = _parser().parse_args(arguments)
-    try:
-        place = Place.from_env(os.environ, given.env)
-    except ConfigError as error:
-        print(error, file=sys.stderr)
-        return EXIT_CONFIG
-    return drive(Container(given, place), place)
+    return begin(lambda place: Container(given, place), given.env)
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ from typing import Final, Protocol
 from zsched.adapters.workers.process import LAUNCHER
 from zsched.core.values.struct import Struct
 from zsched.drivers.place import Place
+from zsched.errors import ConfigError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_OK
 from zsched.guard import guarded
 
@@ -115,6 +116,19 @@ def said(done: subprocess.CompletedProcess[str]) -> str:
     """The last line that a command has printed about its failure."""
     lines = (done.stderr.strip() or done.stdout.strip()).splitlines()
     return lines[-1].strip() if lines else f"{done.args[0]} ended with status {done.returncode}"
+
+
+def begin(make: Callable[[Place], Engine], names: Sequence[str]) -> int:
+    """Drive what ``make`` gives for the worker that the daemon's variables name; the exit status.
+
+    ``names``: the task's own variables, of ``env:``.
+    """
+    try:
+        place = Place.from_env(os.environ, names)
+    except ConfigError as error:
+        print(error, file=sys.stderr)
+        return EXIT_CONFIG
+    return drive(make(place), place)
 
 
 def drive(engine: Engine, place: Place) -> int:

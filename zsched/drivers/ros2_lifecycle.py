@@ -42,7 +42,7 @@ from zsched.core.route.ros2 import (
     node_name_fault,
 )
 from zsched.core.values.plan import Role, WorkerRole
-from zsched.drivers.engine import Ended, Look, drive
+from zsched.drivers.engine import Ended, Look, begin
 from zsched.drivers.place import Place
 from zsched.errors import ConfigError
 from zsched.exits import EXIT_CONFIG
@@ -290,16 +290,11 @@ def _parser() -> argparse.ArgumentParser:
 def main(arguments: list[str] | None = None) -> int:
     """The driver's command line; the exit status."""
     given = _parser().parse_args(arguments)
-    try:
-        place = Place.from_env(os.environ, given.env)
-    except ConfigError as error:
-        print(error, file=sys.stderr)
-        return EXIT_CONFIG
-    engine = LifecycleNode(given, place, os.environ.get(DOMAIN, "0"))
-    try:
-        return drive(engine, place)
-    finally:
-        engine.close()
+    domain = os.environ.get(DOMAIN, "0")
+    with contextlib.ExitStack() as stack:
+        return begin(
+            lambda place: stack.enter_context(contextlib.closing(LifecycleNode(given, place, domain))), given.env
+        )
 
 
 if __name__ == "__main__":

@@ -9,16 +9,14 @@ Knows: systemctl(1), journalctl(1), what their answers mean. Does not know: D-Bu
 from __future__ import annotations
 
 import argparse
-import os
 import shlex
 import sys
 from collections.abc import Callable, Sequence
 from typing import Final
 
 from zsched.clock import wall_s
-from zsched.drivers.engine import Ended, Look, ask, drive, said
+from zsched.drivers.engine import Ended, Look, ask, begin, said
 from zsched.drivers.place import Place
-from zsched.errors import ConfigError
 from zsched.exits import EXIT_CONFIG
 from zsched.paths import ENVIRONMENT_SUFFIX
 
@@ -166,12 +164,7 @@ def _parser() -> argparse.ArgumentParser:
 def main(arguments: list[str] | None = None) -> int:
     """The driver's command line; the exit status."""
     given = _parser().parse_args(arguments)
-    try:
-        place = Place.from_env(os.environ, given.env)
-    except ConfigError as error:
-        print(error, file=sys.stderr)
-        return EXIT_CONFIG
-    return drive(SystemdUnit(given.unit, place), place)
+    return begin(lambda place: SystemdUnit(given.unit, place), given.env)
 
 
 if __name__ == "__main__":
