@@ -50,21 +50,10 @@ def new_authority(fleet: str, number: int, now: datetime) -> Signer:
     """The ``number``-th authority of a fleet: its key, and its own certificate, which allows no other authority."""
     key = new_key()
     name = _named(f"zsched authority {number} of {fleet}"[:MAX_COMMON_NAME])
-    usage = x509.KeyUsage(
-        digital_signature=False,
-        content_commitment=False,
-        key_encipherment=False,
-        data_encipherment=False,
-        key_agreement=False,
-        key_cert_sign=True,
-        crl_sign=False,
-        encipher_only=False,
-        decipher_only=False,
-    )
     certificate = (
         _begun(name, name, key.public_key(), now, AUTHORITY_LIFE)
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .add_extension(usage, critical=True)
+        .add_extension(_usage(is_authority=True), critical=True)
         .sign(key, None)
     )
     return Signer(key=key, certificate=certificate)
@@ -84,17 +73,6 @@ def sign(
             f"{name} has {len(name)} characters, and a certificate's name has at most {MAX_COMMON_NAME}; "
             "give the node or the fleet a shorter name"
         )
-    usage = x509.KeyUsage(
-        digital_signature=True,
-        content_commitment=False,
-        key_encipherment=False,
-        data_encipherment=False,
-        key_agreement=False,
-        key_cert_sign=False,
-        crl_sign=False,
-        encipher_only=False,
-        decipher_only=False,
-    )
     names = [_alternative(one) for one in dict.fromkeys((name, *LOCAL, *hosts))]
     issuer = signer.certificate
     authority = x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.key.public_key())
@@ -102,7 +80,7 @@ def sign(
     return (
         _begun(_named(name, str(holder.role)), issuer.subject, public, now, LIFE)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-        .add_extension(usage, critical=True)
+        .add_extension(_usage(is_authority=False), critical=True)
         .add_extension(purposes, critical=False)
         .add_extension(x509.SubjectAlternativeName(names), critical=False)
         .add_extension(authority, critical=False)
@@ -215,6 +193,21 @@ def _begun(
         .not_valid_before(now - EARLY)
         .not_valid_after(now + life)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(public), critical=False)
+    )
+
+
+def _usage(*, is_authority: bool) -> x509.KeyUsage:
+    """What its key may do: sign certificates and nothing else, or prove who dials."""
+    return x509.KeyUsage(
+        digital_signature=not is_authority,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        key_cert_sign=is_authority,
+        crl_sign=False,
+        encipher_only=False,
+        decipher_only=False,
     )
 
 
