@@ -43,6 +43,8 @@ from zsched_lab.fleet.hall import Hall, block_of_ports
 
 NODES: Final = ("robot1", "robot2", "robot3", "edge1", "edge2", "edge3")
 ASKS_HZ: Final = 10.0
+FLOWS_S: Final = 6.0
+"""The first screen shows the rate of a stream that has flowed for so long."""
 LONGEST_S: Final = 60.0
 QUIT_S: Final = 15.0
 SHOWN_PAUSE_S: Final = 1.0
@@ -337,6 +339,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="tour-", dir="/tmp") as name, Hall(Path(name)) as hall:
         found_fleet(hall, port)
         with application(hall):
+            time.sleep(FLOWS_S)
             for step in the_tour(port):
                 if step.verb == "up":
                     hall.stop(step.node)
