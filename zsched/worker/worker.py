@@ -233,6 +233,8 @@ class Worker:
         if text := untaken(key, self._output_keys):
             _log.warning("the worker %s", text)
             self._untaken = self._untaken or text
+            if self._role.role is WorkerRole.ACTIVE:  # as in a callback: its role was told before, and does not change
+                self._errands.put(lambda: self._tell_trouble(0, self._untaken))
         output = Output(
             self._session,
             key,

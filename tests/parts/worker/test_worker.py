@@ -797,3 +797,26 @@ def test_an_output_that_no_rule_takes_is_told_to_the_node_once_the_worker_is_the
     text = "puts on edge1/t/out, which no output rule takes: the rules take edge1/t/*/out"
     assert told[0] == WorkerTrouble(task="t", incarnation="3", count=0, text=text)
     heard.undeclare()
+
+
+def test_an_output_that_no_rule_takes_is_told_at_once_where_an_owner_declares_it(
+    relay: Relay, tmp_path: Path
+) -> None:
+    """A worker that declares an output in its first callback is the owner already: no role comes that would tell."""
+    told: list[WorkerTrouble] = []
+    heard = relay.session.declare_subscriber(
+        KEYS.trouble("edge1", "*", "*"),
+        lambda sample: told.append(wire.decode(sample.payload.to_bytes(), WorkerTrouble)),
+    )
+    env = {**environment(relay, tmp_path), "ZSCHED_OUTPUT_KEYS": '["edge1/t/*/out"]'}
+    with Worker.from_env(env, handles_signals=False) as worker:
+        worker.ready()
+        until(lambda: KEYS.worker("edge1", "t", 3) in relay.tokens, "the ready token")
+        relay.tell(WorkerRole.ACTIVE, 1)
+        until(lambda: worker.role.role is WorkerRole.ACTIVE, "the role")
+        worker.publisher("{prefix}/{epoch}/out")
+        worker.publisher("{prefix}/{epoch}/uot")
+        until(lambda: told, "the mistake")
+    text = "puts on edge1/t/{epoch}/uot, which no output rule takes: the rules take edge1/t/*/out"
+    assert told[0] == WorkerTrouble(task="t", incarnation="3", count=0, text=text)
+    heard.undeclare()
