@@ -553,16 +553,19 @@ def _unanswered(door: Door, error: AdapterError) -> CliError:
     if isinstance(error.__cause__, TimeoutError):
         return CliError(EXIT_TIMED_OUT, str(error))
     if isinstance(error.__cause__, PermissionError):
-        advice = f"run this as root or as a member of {_group_of(door.socket)}"
+        advice = f"run this as root{_group_of(door.socket)}"
         return CliError(EXIT_UNREACHABLE, f"may not open {door.socket} (permission denied); {advice}")
     return CliError(EXIT_UNREACHABLE, str(error))
 
 
 def _group_of(path: Path) -> str:
-    """Whose members may open a socket, in words."""
+    """Who else may open a socket, in words; root's group is nobody's to join: a daemon that root started is root's."""
     import grp  # noqa: PLC0415 - only who may not ask pays for it
 
     with contextlib.suppress(OSError, KeyError):
-        name = grp.getgrgid(path.stat().st_gid).gr_name
-        return f"the group {name} (sudo usermod -aG {name} $USER, then log in again)"
-    return "the socket's group"
+        group = path.stat().st_gid
+        if not group:
+            return ": root started this daemon"
+        name = grp.getgrgid(group).gr_name
+        return f" or as a member of the group {name} (sudo usermod -aG {name} $USER, then log in again)"
+    return " or as a member of the socket's group"

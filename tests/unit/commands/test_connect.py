@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner, Result
 
 from zsched.cli import app
-from zsched.commands.ask import endpoint_of
+from zsched.commands import ask
+from zsched.commands.ask import Door, ask_door, endpoint_of
+from zsched.commands.common import CliError
+from zsched.errors import AdapterError
 
 
 def run(*arguments: object) -> Result:
@@ -40,3 +46,27 @@ def test_what_is_no_endpoint_is_a_usage_error(folder: Path, text: str) -> None:
 @pytest.mark.usefixtures("folder")
 def test_connect_takes_the_name_of_a_node() -> None:
     assert run("status", "--connect", "robot1", "--node", "*").exit_code == 2
+
+
+@pytest.mark.parametrize(
+    ("group", "advice"),
+    [
+        (0, "run this as root: root started this daemon"),
+        (os.getgid() or 1, "$USER, then log in again)"),
+        (4_000_000_001, "run this as root or as a member of the socket's group"),
+    ],
+)
+def test_who_may_not_open_the_socket_is_never_told_to_join_root_s_group(
+    monkeypatch: pytest.MonkeyPatch, group: int, advice: str
+) -> None:
+    """A daemon that root started in the foreground has a socket of root's group: its members may do much else."""
+
+    def refuse(*_: Any, **__: Any) -> None:
+        raise AdapterError("no") from PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(ask, "_asked", refuse)
+    monkeypatch.setattr(Path, "stat", lambda _path: SimpleNamespace(st_gid=group))
+    with pytest.raises(CliError) as told:
+        ask_door(Door(socket=Path("/run/zsched/robot1.sock")), {"verb": "status"})
+    assert str(told.value).endswith(advice)
+    assert "-aG root" not in str(told.value)
