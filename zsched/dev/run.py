@@ -12,7 +12,7 @@ import re
 import selectors
 import signal
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from threading import Event
 from typing import IO, Final
 
@@ -32,6 +32,9 @@ AWAY_S: Final = 5.0
 """How long a node that was killed stays away."""
 TELLS_S: Final = 2.0
 """After a restart: how long a status may still tell of the worker before."""
+LASTING_S: Final = 5.0
+"""A problem is told once it has lasted for so long: a start, a move and a kill make shorter ones."""
+NUMBER: Final = re.compile(r"\b\d[\d.]*")
 KEPT_LINES: Final = 8
 READ_BYTES: Final = 65_536
 END_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -62,6 +65,23 @@ class Log(Struct, kw_only=True):
     last: deque[str] = field(default_factory=lambda: deque(maxlen=KEPT_LINES))
 
 
+class Lasting:
+    """Problems as they come and go: each is told once when it has lasted, and again when it comes back."""
+
+    def __init__(self) -> None:
+        self._since: dict[str, float] = {}
+        self._told: set[str] = set()
+
+    def told(self, problems: Iterable[str], now: float) -> list[str]:
+        """Those that are to be told now of ``problems``, all that there are; a count that rises makes no new one."""
+        here = {NUMBER.sub("#", text): text for text in problems}
+        self._since = {kind: self._since.get(kind, now) for kind in here}
+        self._told &= here.keys()
+        due = [kind for kind, at in self._since.items() if now - at >= LASTING_S and kind not in self._told]
+        self._told.update(due)
+        return [here[kind] for kind in due]
+
+
 class Run:
     """The loop of one run. ``say`` takes a line, ``show`` a status; ``stop`` ends it."""
 
@@ -86,6 +106,7 @@ class Run:
         self._failed: set[tuple[NodeId, TaskId]] = set()
         self._rollouts: dict[TaskId, Rollout] = {}
         self._status: Json | None = None
+        self._lasting = Lasting()
         self._is_over = False
         self._code = EXIT_OK
         self._selector = selectors.DefaultSelector()
@@ -188,6 +209,8 @@ class Run:
         for node in status["nodes"]:
             for worker in node["workers"]:
                 self._tell_worker(node["name"], worker["task"], worker["state"])
+        for problem in self._lasting.told(self._problems(status), now):
+            self._say(problem)
         for task, rollout in tuple(self._rollouts.items()):
             self._roll_on(task, rollout, status, now)
 
@@ -212,6 +235,12 @@ class Run:
             self._say(f"{task}: its worker on {node} has failed; {again}")
         elif state == "ready" and known:
             self._failed.discard((node, task))
+
+    def _problems(self, status: Json) -> Iterator[str]:
+        """What the tasks' status calls wrong, but for workers that have failed: these have lines of their own."""
+        for task in status["tasks"]:
+            failed = tuple(f"the worker on {node} failed" for node, name in self._failed if name == task["name"])
+            yield from (f"{task['name']}: {text}" for text in task["problems"] if not text.startswith(failed))
 
     # --- workers that have changed -----------------------------------------------------------------------------------
 

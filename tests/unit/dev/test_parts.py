@@ -20,7 +20,7 @@ from zsched.commands.dev import DEFAULT_JOINS, ENTER, DevOptions, _commands, app
 from zsched.config.load import load_fleet
 from zsched.core.values.model import NodeId
 from zsched.dev.nodes import shares
-from zsched.dev.run import Run, _of_a_worker, _parts
+from zsched.dev.run import LASTING_S, Lasting, Run, _of_a_worker, _parts
 from zsched.dev.watch import Watched
 
 EXAMPLE = Path(__file__).parents[3] / "zsched" / "examples" / "python" / "fleet.yaml"
@@ -221,3 +221,33 @@ def test_a_failed_worker_whose_file_is_not_watched_is_tried_again_by_a_verb(tmp_
     run = Run(nodes, Watched({"shout": command}, tmp_path), say=told.append, show=lambda _: None, stop=Event())  # type: ignore[arg-type]
     run._tell_worker(NodeId("edge1"), "shout", "failed")
     assert f"then `zsched retry shout edge1 --runtime-dir {tmp_path} --node edge1`" in told[0]
+
+
+def test_what_is_wrong_with_a_task_is_told_once_when_it_has_lasted_and_again_when_it_comes_back() -> None:
+    lasting = Lasting()
+    waits = "shout: this robot's streams have waited for edge1 for {} s: nobody subscribes to edge1/shout"
+    assert lasting.told([waits.format(2)], 100.0) == []
+    assert lasting.told([], 102.0) == [], "a move makes such a problem for a moment"
+    assert lasting.told([waits.format(2)], 103.0) == []
+    assert lasting.told([waits.format(7), "shout: it may hang"], 103.0 + LASTING_S) == [waits.format(7)]
+    assert lasting.told([waits.format(8), "shout: it may hang"], 103.1 + LASTING_S) == []
+    assert lasting.told(["shout: it may hang"], 103.0 + 2 * LASTING_S) == ["shout: it may hang"]
+    assert lasting.told([waits.format(2)], 120.0) == []
+    assert lasting.told([waits.format(7)], 120.0 + LASTING_S) == [waits.format(7)]
+
+
+def test_a_run_tells_what_is_wrong_with_its_tasks_but_no_failed_worker_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    nodes, told = _Nodes(), list[str]()
+    nodes.folder = Path("/run/dev")
+    run = Run(nodes, Watched({}, EXAMPLE.parent), say=told.append, show=lambda _: None, stop=Event())  # type: ignore[arg-type]
+    task = {
+        "name": "shout",
+        "owner": None,
+        "epoch": 0,
+        "problems": ["the worker on edge1 failed: exited with status 3", "the worker on edge2: it may hang"],
+    }
+    node = {"name": "edge1", "workers": [{"task": "shout", "state": "failed"}]}
+    monkeypatch.setattr(nodes, "status", lambda: {"tasks": [task], "nodes": [node]}, raising=False)
+    run._look(100.0)
+    run._look(100.0 + LASTING_S)
+    assert [line for line in told if "has failed" not in line] == ["shout: the worker on edge2: it may hang"]
