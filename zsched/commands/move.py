@@ -164,6 +164,7 @@ def _tell_move(
         say(f"{order.task}: not settled after {span(order.timeout_s)}")
         for lack in lacks:
             say(f"  {lack}", indent=4)
+        say("the move stands; `zsched status` on such a node names what it waits for")
     else:
         took = "" if switched_s is None else f", streams switched in {millis(switched_s)}"
         took += "" if gap_s is None else f", no answer for at most {millis(gap_s)}"

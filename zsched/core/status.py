@@ -491,11 +491,13 @@ def _untaken(task: TaskSpec, executor: Executor, known: Unready | None) -> str:
     newer = "" if task.worker.command else f"; {STARTED_BEFORE.format(owner=executor.owner, task=task.name)}"
     told = known.slot if known is not None and known.slot.epoch == executor.epoch else None
     untaken = () if told is None else told.untaken
+    # The control sessions meet, and its daemon calls it ready: what is between us is the way of the data.
+    look = f": `zsched ping {executor.owner}` tells whether its data session answers here"
     if task.worker.ready_when is ReadyWhen.TOKEN:
         if told is None or told.has_token is None:
-            return f"our relay does not see its worker's token, or its subscriptions{newer}"
+            return f"our relay does not see its worker's token, or its subscriptions{look}{newer}"
         if not told.has_token:
-            return f"our relay does not see its worker's token{newer}"
+            return f"our relay does not see its worker's token{look}{newer}"
         if not untaken:
             return f"our relay has just seen its worker's subscriptions{newer}"
         return (

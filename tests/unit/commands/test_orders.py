@@ -226,6 +226,7 @@ def test_a_move_that_does_not_settle_in_time_exits_with_5(daemon: Daemon) -> Non
     result = run("move", "echo", "edge2", "--timeout", "0", "--yes")
     assert (result.exit_code, len(daemon.orders)) == (5, 1)
     assert "not settled after" in result.stdout
+    assert "`zsched status` on such a node names what it waits for" in result.stdout
 
 
 @pytest.mark.parametrize(("outcome", "code"), [("conflict", 1), ("no_quorum", 4), ("invalid", 1), ("unknown", 5)])

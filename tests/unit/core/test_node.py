@@ -480,7 +480,9 @@ def test_a_relay_that_has_gone_leaves_every_slot_to_be_taken_again() -> None:
     node.handle(ev.RelayChanged(is_running=True), 110.5)
     (problem,) = build_snapshot(node, 115.0).tasks[0].problems
     assert problem.startswith("this robot's streams have waited for edge1 for 5 s")
-    assert problem.endswith("worker's token, or its subscriptions"), "what the old relay missed is its own affair"
+    assert "worker's token, or its subscriptions: `zsched ping" in problem, (
+        "what the old relay missed is its own affair"
+    )
     node.handle(ev.SlotReady(task="merge", epoch=1), 116.0)
     assert build_snapshot(node, 120.0).tasks[0].problems == ()
 

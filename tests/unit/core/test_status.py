@@ -650,11 +650,15 @@ def test_a_slot_that_is_not_taken_is_told_of_only_once_the_owner_s_own_worker_is
     assert build_snapshot(node, 103.0).tasks[0].problems == ("the worker on edge1 is starting",)
 
 
+LOOK = ": `zsched ping edge1` tells whether its data session answers here"
+"""A closed port of its data session is the usual reason: its daemon is heard, and calls its worker ready."""
+
+
 def test_a_slot_whose_worker_is_not_seen_is_a_problem_until_it_is() -> None:
     node = make()
     learn(node, 1, "edge1")
     assert build_snapshot(node, 101.0).tasks[0].problems == ()
-    waits = "our relay does not see its worker's token, or its subscriptions"
+    waits = f"our relay does not see its worker's token, or its subscriptions{LOOK}"
     assert len(build_snapshot(node, 102.0).tasks[0].problems) == 1
     assert build_snapshot(node, 103.0).tasks[0].problems == (
         f"this robot's streams have waited for edge1 for 3 s: {waits}",
@@ -688,9 +692,9 @@ def test_a_key_that_nobody_subscribes_to_is_named_with_what_to_do() -> None:
     assert "`Worker.subscribe`" in told
     assert "token" not in told, "it is there"
     told = lack_of(node, ev.SlotReady(task="merge", epoch=1, is_ready=False, has_token=False, untaken=keys))
-    assert told == "our relay does not see its worker's token"
+    assert told == f"our relay does not see its worker's token{LOOK}"
     told = lack_of(node, ev.SlotReady(task="merge", epoch=0, is_ready=False, has_token=True, untaken=keys))
-    assert told == "our relay does not see its worker's token, or its subscriptions", "that was another slot"
+    assert told == f"our relay does not see its worker's token, or its subscriptions{LOOK}", "that was another slot"
     node.handle(ev.SlotReady(task="merge", epoch=1), 104.0)
     assert build_snapshot(node, 110.0).tasks[0].problems == ()
 
@@ -703,7 +707,7 @@ def test_how_long_streams_wait_does_not_begin_again_when_the_relay_says_why() ->
     node.handle(ev.SlotReady(task="merge", epoch=1, is_ready=False), 110.0)
     node.handle(ev.SlotReady(task="merge", epoch=1, is_ready=False, has_token=False), 111.0)
     assert build_snapshot(node, 114.0).tasks[0].problems == (
-        "this robot's streams have waited for edge1 for 4 s: our relay does not see its worker's token",
+        f"this robot's streams have waited for edge1 for 4 s: our relay does not see its worker's token{LOOK}",
     )
 
 
