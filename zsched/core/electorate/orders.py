@@ -31,10 +31,10 @@ MAX_STORY = 500
 """Characters of a line of the journal: a text on the wire has at most 512."""
 
 _ENDED = {
-    RoundOutcome.CONFLICT: (CommandOutcome.CONFLICT, "another change came first; look and try again"),
+    RoundOutcome.CONFLICT: (CommandOutcome.CONFLICT, "another change came first"),
     RoundOutcome.UNCHANGED: (CommandOutcome.UNCHANGED, "that is what is agreed"),
-    RoundOutcome.NO_QUORUM: (CommandOutcome.NO_QUORUM, "no majority of the electors answered; nothing is changed"),
-    RoundOutcome.UNKNOWN: (CommandOutcome.UNKNOWN, "the electors fell silent; `zsched status` tells"),
+    RoundOutcome.NO_QUORUM: (CommandOutcome.NO_QUORUM, "no majority of the electors answered"),
+    RoundOutcome.UNKNOWN: (CommandOutcome.UNKNOWN, "the electors fell silent"),
 }
 
 

@@ -18,10 +18,10 @@ from zsched.core.values.struct import replace
 
 _ENDED = {
     RoundOutcome.COMMITTED: (CommandOutcome.OK, "committed by a majority of the electors"),
-    RoundOutcome.CONFLICT: (CommandOutcome.CONFLICT, "another change came first; look and try again"),
+    RoundOutcome.CONFLICT: (CommandOutcome.CONFLICT, "another change came first"),
     RoundOutcome.UNCHANGED: (CommandOutcome.UNCHANGED, "it is so already"),
     RoundOutcome.NO_QUORUM: (CommandOutcome.NO_QUORUM, "no majority of the electors answered"),
-    RoundOutcome.UNKNOWN: (CommandOutcome.UNKNOWN, "the electors fell silent; `zsched status` tells"),
+    RoundOutcome.UNKNOWN: (CommandOutcome.UNKNOWN, "the electors fell silent"),
 }
 
 

@@ -13,6 +13,7 @@ from support.states import state_of
 from support.todos import agreed
 from zsched.core import events as ev
 from zsched.core import instructions as do
+from zsched.core.electorate import orders
 from zsched.core.electorate.changes import AdoptDocument
 from zsched.core.electorate.documents import RECENT
 from zsched.core.electorate.founding import founded
@@ -37,6 +38,7 @@ from zsched.core.values.messages import (
 )
 from zsched.core.values.model import Acceptance, Asked, Ballot, RegisterState
 from zsched.core.values.words import MAX_ASKED, MAX_ASKER
+from zsched.core.vote import commands
 from zsched.core.vote.agreement import Agreement
 
 T = TypeVar("T")
@@ -499,3 +501,9 @@ def test_the_first_document_knows_the_leases_of_the_files_before() -> None:
     """They may be longer, and still run when the document's electors and tasks change."""
     adopted = document_change(FIRST, "0d", FLEET, file_lease_s=9.0).apply(FIRST)
     assert (adopted.lease_s, adopted.guard_lease_s) == (FLEET.timing.lease_s, 9.0)
+
+
+@pytest.mark.parametrize("ended", [commands._ENDED, orders._ENDED])
+def test_how_a_command_ended_is_told_without_what_to_do(ended: dict[RoundOutcome, tuple[CommandOutcome, str]]) -> None:
+    """The verbs add that: both together say everything twice."""
+    assert [text for _, text in ended.values() if ";" in text or "nothing" in text] == []
