@@ -212,7 +212,8 @@ def _seeds(section: Section, cast: Cast, out: Collector) -> tuple[NodeId, ...]:
     given: tuple[Located[str], ...] | None = section.get("seeds")
     if given is None:
         seeds = tuple(node.name for node in cast.nodes if _can_be_dialled(node))[:_SEEDS]
-        if not seeds and len(cast.names) > 1 and cast.is_whole and "seeds" not in section.places:
+        is_sound = cast.is_whole and cast.sound == set(cast.names)  # a faulty `listen:` is told of in its own place
+        if not seeds and len(cast.names) > 1 and is_sound and "seeds" not in section.places:
             message = "no node can be dialled, so none would find another"
             hint = "give one or two nodes `host:` and `listen: {control: tcp/0.0.0.0:7457, data: tcp/0.0.0.0:7458}`"
             out.error(cast.place, message, hint)

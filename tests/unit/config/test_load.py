@@ -796,6 +796,10 @@ def test_nodes_that_nobody_can_dial_are_refused() -> None:
     text = "fleet: f\nnodes:\n  r1: {kind: robot}\n  r2: {kind: robot}\n"
     assert "no node can be dialled" in check(text).report()
     assert check("fleet: f\nnodes:\n  r1: {kind: robot}\n").fleet is not None
+    where = "host: 192.0.2.1, listen: {control: '0.0.0.0:7457', data: 'tcp/0.0.0.0:7458'}"
+    told = check(f"fleet: f\nnodes:\n  r1: {{kind: robot, {where}}}\n  r2: {{kind: robot}}\n").report()
+    assert "is not a zenoh endpoint" in told
+    assert "no node can be dialled" not in told, "that follows from it"
 
 
 def test_network_weight_without_any_link_is_a_warning() -> None:
