@@ -21,7 +21,7 @@ from zsched.clock import wall_s
 from zsched.commands.common import CliError, Json, check_name, nearest
 from zsched.core.values.struct import Struct, replace
 from zsched.core.values.words import NAME
-from zsched.errors import AdapterError, WireError
+from zsched.errors import AdapterError, ConfigError, WireError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_TIMED_OUT, EXIT_UNREACHABLE, EXIT_USAGE
 
 if TYPE_CHECKING:
@@ -530,10 +530,19 @@ def _visit(endpoint: str, cell: Cell | None) -> _Visit:
     if cell is not None and fleet.name != cell.name:
         advice = f"put a copy of {cell.name}'s there (docs/guide/scale.md)"
         raise CliError(EXIT_CONFIG, f"{file} is the file of fleet {fleet.name}, and not of {cell.name}; {advice}")
-    text = session_text(fleet, Side.VISIT)
-    if fleet.security is None:
-        return _Visit(text=text, asker=asker, fleet=any_fleet)
-    holder = identity_of(fleet, fleet.security).holder
+    try:
+        text = session_text(fleet, Side.VISIT)
+        if fleet.security is None:
+            return _Visit(text=text, asker=asker, fleet=any_fleet)
+        holder = identity_of(fleet, fleet.security).holder
+    except ConfigError as error:
+        if cell is None:
+            raise
+        raise CliError(
+            EXIT_CONFIG,
+            f"{error}. {cell.name} lets in certificates of its own authority: write `security: {{folder: FOLDER}}` in "
+            f"{file}, with your operator's certificate of that fleet in the folder (docs/guide/scale.md)",
+        ) from error
     return _Visit(
         text=text,
         asker=holder.name,

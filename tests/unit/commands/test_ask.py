@@ -140,6 +140,19 @@ def test_a_cell_with_the_file_of_another_fleet_says_whose_it_is(tmp_path: Path) 
     assert caught.value.code == EXIT_CONFIG
 
 
+def test_a_cell_s_file_without_a_certificate_of_that_cell_says_what_to_write_in_it(tmp_path: Path) -> None:
+    """A copy of its fleet file names this machine's own folder, where the certificate is of another authority."""
+    file = tmp_path / "hall-b.yaml"
+    nodes = "robot1: {kind: robot, listen: {control: tls/127.0.0.1:1, data: tls/127.0.0.1:2}}"
+    file.write_text(f"fleet: hall-b\nnodes: {{{nodes}}}\ntasks: {{}}\nsecurity: {{folder: {tmp_path}}}\n")
+    cell = Cell(name="hall-b", gateways=("tls/127.0.0.1:1", "tls/127.0.0.1:2"), file=str(file))
+    with pytest.raises(
+        CliError, match=r"`security: \{folder: FOLDER\}` in .*hall-b\.yaml, with your operator's"
+    ) as told:
+        ask_door(door_of(cell, "hall-a", None), {"verb": "status"})
+    assert told.value.code == EXIT_CONFIG
+
+
 def test_a_name_that_a_cell_has_not_is_refused_with_those_it_has(monkeypatch: pytest.MonkeyPatch) -> None:
     class Gateway:
         """It passes questions on, and nobody answers them."""
