@@ -5,12 +5,16 @@ Knows: the contract (stdout is data, stderr everything else). Does not know: any
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
+import signal
 import sys
-from collections.abc import Mapping, Sequence
+import threading
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import FrameType
 from typing import Any, Final, TextIO
 
 import typer
@@ -276,3 +280,33 @@ def nearest(name: str, known: Sequence[str]) -> str:
 def wants_color(is_refused: bool, env: Mapping[str, str] = os.environ) -> bool:
     """Colour only on a terminal, and not when ``--no-color``, ``NO_COLOR`` (no-color.org) or a dumb one says no."""
     return not is_refused and not env.get("NO_COLOR") and env.get("TERM") != "dumb" and sys.stdout.isatty()
+
+
+@contextlib.contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Ctrl-C does nothing meanwhile: for files that belong together, which are written in a part of a second."""
+    with _at_ctrl_c(_too_late):
+        yield
+
+
+@contextlib.contextmanager
+def interruptible() -> Iterator[None]:
+    """Ctrl-C works as ever meanwhile: while somebody is asked, within `uninterrupted`."""
+    with _at_ctrl_c(signal.default_int_handler):
+        yield
+
+
+def _too_late(_number: int, _frame: FrameType | None) -> None:
+    """What is begun ends in a moment, and the verb says what it has made."""
+
+
+@contextlib.contextmanager
+def _at_ctrl_c(handler: Any) -> Iterator[None]:
+    if threading.current_thread() is not threading.main_thread():  # only that one may say what a signal does
+        yield
+        return
+    before = signal.signal(signal.SIGINT, handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)

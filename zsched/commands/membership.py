@@ -20,7 +20,7 @@ from typing import Final
 from zsched import paths as places
 from zsched.commands.apply import ApplyView, apply
 from zsched.commands.ask import CONTROL_PORT, Door, ask_door
-from zsched.commands.common import CliError, Json, check_name, nearest, print_json, say, warn
+from zsched.commands.common import CliError, Json, check_name, nearest, print_json, say, uninterrupted, warn
 from zsched.commands.document import InForce, document_text, in_force, status_of
 from zsched.commands.entries import DOCUMENT, HERE
 from zsched.commands.papers import (
@@ -225,7 +225,8 @@ def create(view: CreateView) -> int:
     certify = None if papers is None else papers.certify
     text = _first_text(view, address)
     try:
-        fleet, files = found(text, view.node, view.places, is_plan=view.is_plan, certify=certify)
+        with uninterrupted():  # a fleet that is founded by half would be in the way of the next try
+            fleet, files = found(text, view.node, view.places, is_plan=view.is_plan, certify=certify)
         if papers is not None and view.is_plan:
             papers.check()
     except ZschedError:

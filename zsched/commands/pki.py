@@ -20,7 +20,7 @@ import typer
 from zsched import paths as places
 from zsched.clock import wall_ns
 from zsched.commands.ask import Door, ask_door, find_door, fleet_here
-from zsched.commands.common import CliError, Json, check_name, nearest, print_json, say, warn
+from zsched.commands.common import CliError, Json, check_name, interruptible, nearest, print_json, say, warn
 from zsched.config.load import load_fleet
 from zsched.core.values.certificates import Holder, Role, parse_common_name, parse_label
 from zsched.core.values.fleet import Fleet
@@ -528,7 +528,7 @@ def _new_passphrase() -> bytes:
 
 def _asked(what: str, *, is_new: bool = False) -> bytes:
     try:
-        with warnings.catch_warnings(action="ignore", category=getpass.GetPassWarning):  # there is no terminal
+        with interruptible(), warnings.catch_warnings(action="ignore", category=getpass.GetPassWarning):  # no terminal
             text: str = typer.prompt(what, hide_input=True, confirmation_prompt=is_new, err=True)
     except typer.Abort:
         text = f"nobody has typed it ({what}): run this on a terminal, or set {PASSPHRASE}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import stat
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import typer
 from typer.testing import CliRunner, Result
 
 from support.fleet_values import fleet_value_of
@@ -21,6 +23,7 @@ from zsched.cli import app
 from zsched.commands import membership, papers
 from zsched.commands.common import CliError
 from zsched.commands.membership import Address, address_of, dial_order, own_address
+from zsched.commands.pki import begin_for
 from zsched.config.load import check_bytes, load_fleet
 from zsched.core.values.certificates import Role
 from zsched.core.values.document import Document, Rollout, Text
@@ -246,6 +249,45 @@ def test_a_fleet_that_cannot_be_written_leaves_no_authority(tmp_path: Path, auth
     result = run(*words, *here(tmp_path))
     assert "key.pem exists already, and is left as it is" in result.stderr
     assert (tmp_path / "pki" / "key.pem").read_text() == "somebody's"
+    assert not authority.exists()
+
+
+def test_ctrl_c_while_a_fleet_is_founded_leaves_no_half_of_it(
+    tmp_path: Path, authority: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An authority, or a fleet file, without a state would be in the way of the next try."""
+
+    def interrupted(*words: Any, **more: Any) -> Any:
+        begun = begin_for(*words, **more)
+        signal.raise_signal(signal.SIGINT)
+        return begun
+
+    monkeypatch.setattr(papers, "begin_for", interrupted)
+    before = signal.getsignal(signal.SIGINT)
+    result = run("fleet", "create", "hall", "--node", "robot1", "--address", "127.0.0.1", *here(tmp_path))
+    assert result.exit_code == 0, result.stderr
+    assert (tmp_path / "fleet.yaml").exists()
+    assert StateFile(tmp_path / "state", fleet="hall", node="robot1").load().state is not None
+    assert authority.exists()
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_ctrl_c_at_the_question_for_the_passphrase_founds_nothing(
+    tmp_path: Path, authority: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def asked(*_: Any, **__: Any) -> str:
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            raise typer.Abort from None
+        return "typed"
+
+    monkeypatch.setattr("zsched.commands.pki.typer.prompt", asked)
+    words = ("--address", "127.0.0.1", "--passphrase")
+    result = run("fleet", "create", "hall", "--node", "robot1", *words, *here(tmp_path))
+    assert result.exit_code == 1
+    assert "nobody has typed it" in result.stderr
+    assert not (tmp_path / "fleet.yaml").exists()
     assert not authority.exists()
 
 
