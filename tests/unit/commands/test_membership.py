@@ -388,13 +388,21 @@ def test_off_a_terminal_an_invitation_takes_a_yes(node: Node) -> None:
     assert node.changes == []
 
 
+def test_a_node_is_not_added_when_its_invitation_has_nowhere_to_go(node: Node, tmp_path: Path) -> None:
+    """It would stay in the document, and everybody would miss a machine that nobody can bring."""
+    result = run("invite", "robot2", "--address", "192.0.2.12", "--yes", "-o", tmp_path / "none" / "file")
+    assert result.exit_code == 1
+    assert "that folder takes no file; nothing was done" in result.stderr
+    assert node.changes == []
+
+
 def test_a_node_that_was_never_there_gets_its_file_once_more(node: Node, tmp_path: Path) -> None:
     file = tmp_path / "robot3.invite"
     result = run("invite", "robot3", "-o", file)
     assert (result.exit_code, result.stdout, node.changes) == (0, "", [])
     assert decode_invitation(file.read_bytes()).node == "robot3"
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
-    failed = run("invite", "robot3", "-o", tmp_path / "none" / "file")
+    failed = run("invite", "robot3", "-o", tmp_path)
     assert failed.exit_code == 1
     assert "write its invitation elsewhere" in failed.stderr
 
