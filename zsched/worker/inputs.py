@@ -420,6 +420,7 @@ class Dispatcher:
             key=key,
             payload=sample.payload,
             attachment=sample.attachment,
+            encoding=str(sample.encoding),
             deleted=sample.kind == zenoh.SampleKind.DELETE,
             replayed=replayed,
         )

@@ -30,6 +30,7 @@ class Received(Struct, frozen=True, kw_only=True):
     key: str
     payload: zenoh.ZBytes
     attachment: zenoh.ZBytes | None = None
+    encoding: str = ""
     deleted: bool = False
     replayed: bool = False
     """An owner that died may have had this sample, too, and have done it (`on_crash: replay`)."""
