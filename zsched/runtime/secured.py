@@ -89,8 +89,12 @@ def _is_handed(path: Path) -> bool:
         return True  # its reader says what is wrong with it
 
 
-def secured_text(fleet: Fleet, security: Security, side: Side, operator_json5: str) -> str:
+def secured_text(
+    fleet: Fleet, security: Security, side: Side, operator_json5: str, env: Mapping[str, str] = os.environ
+) -> str:
     """The zenoh configuration on which a session of a secured fleet is built; over the operator's own.
+
+    ``env``: as in `files_of`.
 
     Raises:
         ConfigError: a file is missing or cannot be read, or the operator's file has TLS or access control of its own.
@@ -103,7 +107,7 @@ def secured_text(fleet: Fleet, security: Security, side: Side, operator_json5: s
             )
     except ValueError as error:
         raise ConfigError(f"{fleet.zenoh_config}: {error}") from error
-    files = files_of(security)
+    files = files_of(security, env)
     for path in (files.certificate, files.key, files.trusted):
         bytes_of(path)
     rules = access_control(fleet, security, side)

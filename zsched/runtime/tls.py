@@ -7,7 +7,8 @@ Where TLS is set up, nothing of ours listens in plain text: what the fleet file 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import os
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Final
 
@@ -43,14 +44,16 @@ def operator_json5(fleet: Fleet) -> str:
         ) from error
 
 
-def session_text(fleet: Fleet, side: Side) -> str:
+def session_text(fleet: Fleet, side: Side, env: Mapping[str, str] = os.environ) -> str:
     """The zenoh configuration on which sessions of one kind are built: the operator's own, secured where the file says.
+
+    ``env``: where systemd has put this machine's key, if it has.
 
     Raises:
         ConfigError: the operator's file or this machine's certificate cannot be used.
     """
     text = operator_json5(fleet)
-    return text if fleet.security is None else secured_text(fleet, fleet.security, side, text)
+    return text if fleet.security is None else secured_text(fleet, fleet.security, side, text, env)
 
 
 def asker_in(fleet: Fleet, name: str) -> str:
