@@ -22,7 +22,7 @@ from zsched.clock import monotonic_s
 from zsched.core.values.model import PeerState
 from zsched_lab.fleet import netns
 from zsched_lab.fleet.chaos import GUARD, ChaosBed
-from zsched_lab.fleet.netbed import descendants, stop_group
+from zsched_lab.fleet.netbed import DATA_PORT, descendants, stop_group
 from zsched_lab.fleet.testbed import TASK
 
 pytestmark = pytest.mark.root
@@ -81,6 +81,20 @@ def test_partial_cut_makes_nobody_gone_and_an_ordinary_vote_decides(bed: ChaosBe
     assert gone(bed, start) == set()
     reasons = [bed.task(robot)["history"][-1]["reason"] for robot in ("robot1", "robot2", "robot3")]
     assert not any("gone" in reason for reason in reasons), reasons
+
+
+def test_owner_whose_data_no_robot_reaches_is_left_and_gets_nothing_until_one_does(bed: ChaosBed) -> None:
+    """A firewall lets control pass and not the streams: the node lives, its worker is ready, and nothing flows."""
+    owner, start = bed.calm(), monotonic_s()
+    bed.network.shut(owner, DATA_PORT)
+    bed.wait(lambda: bed.moved_from(owner, "robot1", "robot2", "robot3"), 60, "a move to where the streams reach")
+    bed.wait(bed.probes["robot1"].is_flowing, 60, "echoes at robot1")
+    assert gone(bed, start) == set()
+    assert "reached by" in bed.task("robot1")["history"][-1]["reason"]
+    told = f"the worker on {owner} is ready, and our relay does not see its token"
+    bed.wait(lambda: any(told in one for one in bed.task("robot1")["problems"]), 30, "status to say why")
+    bed.network.heal(owner)
+    bed.wait(lambda: not bed.task("robot1")["problems"], 60, "the streams to reach it again")
 
 
 # --- processes and machines ------------------------------------------------------------------------------------------

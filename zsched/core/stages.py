@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from random import Random
 from types import MappingProxyType
 from typing import Any
@@ -42,13 +42,14 @@ from zsched.core.scheduler.flags import NodeFlags
 from zsched.core.scheduler.probation import Probation
 from zsched.core.scheduler.rounds import Rounds
 from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts
+from zsched.core.scheduler.unseen import Unseen
 from zsched.core.todo import ToDo
 from zsched.core.values.document import Flag
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet, TaskSpec, file_hash, fleet_hash
 from zsched.core.values.model import Allocation, NodeId, NodeKind, PeerState, TaskId
 from zsched.core.values.plan import StreamCount
-from zsched.core.values.profile import Profile
+from zsched.core.values.profile import Profile, WorkerState
 from zsched.core.values.struct import Struct
 from zsched.core.vote.agreement import Agreement
 from zsched.core.vote.expiry import Expiry
@@ -154,7 +155,7 @@ class Stages:
         self.has_deadlines = any(task.tuning.deadline_ms is not None for task in fleet.tasks)
         # SCHEDULER, VOTE
         self.votes = Votes(fleet, me)
-        self.probation = Probation(fleet)
+        self.probation, self.unseen = Probation(fleet), Unseen()
         self.flags = NodeFlags(rank=[node.name for node in fleet.nodes].index(me))
         self.rounds = Rounds(
             fleet, me, self.gateway, self.votes.tasks, rng, now, self._doubts, self.round_trips, self.flags
@@ -282,9 +283,20 @@ class Stages:
     def _doubts(self, spec: TaskSpec, now: float) -> Doubts:
         in_grace, unproven = self.membership.in_grace(), self.probation.doubts(spec, now)
         unfit = self.agreement.leases.unfit() if self.executors[spec.name].is_leased else {}
-        if not in_grace and not unproven and not unfit:
+        unseen = self.unseen.look(spec, self._ready(spec, now), self.probation, now)
+        if not in_grace and not unproven and not unfit and not unseen:
             return NO_DOUBTS
-        return Doubts(in_grace=in_grace, unproven=unproven, unfit=unfit)
+        return Doubts(in_grace=in_grace, unproven=unproven, unseen=unseen, unfit=unfit)
+
+    def _ready(self, spec: TaskSpec, now: float) -> Iterator[NodeId]:
+        """The other living candidates whose newest word is that the worker is ready."""
+        for name in spec.candidates:
+            if name == self.me or self.membership.state(name) is not PeerState.ALIVE:
+                continue
+            profile = self.gateway.fresh(name, now)
+            load = None if profile is None else profile.worker(spec.name)
+            if load is not None and load.state is WorkerState.READY:
+                yield name
 
     def set_problem(self, source: str, problem: str | None) -> None:
         """Show a problem in the status, or (``None``) that it is over."""

@@ -460,6 +460,12 @@ def _task_problems(node: Stages, task: TaskSpec, value: Allocation, now: float) 
                 f"the worker on {spec.name} has had work for {load.unended_s:.0f} s and finished no job{more}: it "
                 f"may hang in a callback; see `zsched logs {task.name}`, `zsched restart {task.name}` starts it anew"
             )
+    for name in sorted(node.unseen.found.get(task.name, ())):
+        if name != owner:  # of the owner the wait is told, below
+            yield (
+                f"the worker on {name} is ready, and our relay does not see its token: {name} gets nothing for this "
+                f"robot; `zsched ping {name}` tells whether its data session answers here"
+            )
     since = _unready_since(node, executor)
     if is_owner_ready and now - since >= UNREADY_SHOWN_S:
         waited = f"this robot's streams have waited for {executor.owner} for {now - since:.0f} s"

@@ -842,6 +842,20 @@ VOTE_BUGS = (
         (*_SCHEDULER, "tests/sim/test_return.py"),
     ),
     _bug(
+        "who beats is reached by streams",
+        SCORING,
+        " or candidate in doubts.unseen:",
+        ":",
+        _SCHEDULER,
+    ),
+    _bug(
+        "a token of a task that we do not know yet is missed",
+        "zsched.core.handlers.work",
+        "    node.probation.on_token(event.node",
+        "    _ = event.task in node.executors and node.probation.on_token(event.node",
+        ("tests/unit/core/test_status.py",),
+    ),
+    _bug(
         "what other robots hold against a node is not heard",
         SCHEDULER,
         "joined((damping.penalties(now), standing.penalties))",

@@ -189,6 +189,12 @@ class Network:
         for name in ours:
             self._set(name, "split", f"in ip saddr {{ {addresses} }} drop", f"out ip daddr {{ {addresses} }} drop")
 
+    def shut(self, name: str, port: int) -> None:
+        """A firewall before one machine lets no packet of this TCP port pass, in or out, whichever end listens."""
+        ways = (f"in iifname {INTERFACE}", f"out oifname {INTERFACE}")
+        rules = (f"{way} tcp {end} {port} drop" for way in ways for end in ("dport", "sport"))
+        self._set(name, "port", *rules)
+
     def lose(self, percent: int, *names: str) -> None:
         """This many of 100 packets that come to each of ``names`` are lost, at random."""
         for name in names:

@@ -67,6 +67,8 @@ class Work:
         """{(machine, task): how often its worker was made active}: one that is again before it has stopped works on."""
         self._absent: Counter[str] = Counter()
         """{machine: how many reasons the workers that somebody else runs there have to be away}."""
+        self._showing: set[tuple[str, int, TaskId]] = set()
+        """(machine, its life, task) of the workers that are ready, whether or not a daemon's loop has heard it yet."""
         self._made_by: dict[tuple[str, TaskId], tuple[str, ...]] = {}
         """{(machine, task): the command of its worker's process}."""
         self.stop_s: tuple[float, ...] = WORKER_STOP_S
@@ -102,6 +104,7 @@ class Work:
 
     def _ready(self, machine: Machine, task: TaskId, life: int) -> None:
         if machine.life == life and task in machine.workers:
+            self._showing.add((machine.key, life, task))
             self._sim.deliver(machine, ev.WorkerChanged(task=task, state=WorkerState.READY))
             for other in tuple(self._sim.machines.values()):
                 self._show_later(machine, task, other)
@@ -157,15 +160,22 @@ class Work:
         """A relay has started: it sees the tokens of all workers that it reaches."""
         for other in tuple(self._sim.machines.values()):
             for task in other.workers:
-                if other.node is not None and other.node.worker_states.get(task) is WorkerState.READY:
+                if (other.key, other.life, task) in self._showing:
                     self._show_later(other, task, machine)
 
     def lose(self, source: Machine, target: Machine, delay_s: float = 0.0) -> None:
         """A link has ended, or the machine at its other end: the tokens behind it go, and come with the next link."""
         for task in source.workers if self._is_watching(target) else ():
-            gone = ev.WorkerShown(node=source.name, task=task, incarnation=str(source.life), is_present=False)
+            gone = ev.WorkerShown(
+                node=source.name, task=task, incarnation=self._incarnation(source, source.life), is_present=False
+            )
             self._sim.later(delay_s + SHOWN_S, self._sim.deliver, target, gone)
             self._show_later(source, task, target)
+
+    @staticmethod
+    def _incarnation(machine: Machine, life: int) -> str:
+        """Of its workers. Of two machines of one name each shows tokens of its own: the end of one ends no other's."""
+        return f"{life}-{machine.key}"
 
     @staticmethod
     def _is_watching(machine: Machine) -> bool:
@@ -181,11 +191,14 @@ class Work:
         if not self._sim.has_streams(machine, target):
             self._sim.later(LOOK_AGAIN_S, self._show, machine, life, task, target, target_life)
             return
-        self._sim.deliver(target, ev.WorkerShown(node=machine.name, task=task, incarnation=str(life)))
+        self._sim.deliver(
+            target, ev.WorkerShown(node=machine.name, task=task, incarnation=self._incarnation(machine, life))
+        )
 
     # --- ends --------------------------------------------------------------------------------------------------------
 
     def _stop(self, machine: Machine, task: TaskId) -> None:
+        self._showing.discard((machine.key, machine.life, task))
         if machine.workers.pop(task, None) is not None:
             self._sim.deliver(machine, ev.WorkerChanged(task=task, state=WorkerState.STOPPED))
 

@@ -799,9 +799,7 @@ def test_an_output_that_no_rule_takes_is_told_to_the_node_once_the_worker_is_the
     heard.undeclare()
 
 
-def test_an_output_that_no_rule_takes_is_told_at_once_where_an_owner_declares_it(
-    relay: Relay, tmp_path: Path
-) -> None:
+def test_an_output_that_no_rule_takes_is_told_at_once_where_an_owner_declares_it(relay: Relay, tmp_path: Path) -> None:
     """A worker that declares an output in its first callback is the owner already: no role comes that would tell."""
     told: list[WorkerTrouble] = []
     heard = relay.session.declare_subscriber(

@@ -674,6 +674,45 @@ def test_a_slot_whose_worker_is_not_seen_is_a_problem_until_it_is() -> None:
     assert build_snapshot(node, 120.0).tasks[0].problems == ()
 
 
+def test_a_ready_worker_that_our_relay_does_not_see_is_told_although_it_owns_nothing() -> None:
+    """edge2's data port is shut: beats and profiles come, and no token."""
+    node = make()
+    learn(node, 1, "edge1")
+    node.handle(ev.SlotReady(task="merge", epoch=1), 100.0)
+    node.handle(ev.SlotFlipped(task="merge", epoch=1), 100.0)
+    node.handle(ev.WorkerShown(node="edge1", task="merge", incarnation="1"), 100.0)
+    told = (
+        "the worker on edge2 is ready, and our relay does not see its token: edge2 gets nothing for this robot; "
+        "`zsched ping edge2` tells whether its data session answers here"
+    )
+
+    def problems(since: int, until: int) -> tuple[str, ...]:
+        for now in range(since, until):
+            for name in EDGES:
+                node.handle(ev.BeatReceived(beat=beat_of(name, incarnation=3, sequence=now)), float(now))
+                workers = (load_of(state=WorkerState.READY),)
+                profile = profile_of(name, incarnation=3, sequence=now, memory_used_mb=100.0, workers=workers)
+                node.handle(ev.ProfileReceived(profile=profile), float(now))
+        return build_snapshot(node, float(until)).tasks[0].problems
+
+    assert problems(101, 109) == ()
+    assert problems(109, 115) == (told,)
+    node.handle(ev.WorkerShown(node="edge2", task="merge", incarnation="1"), 115.0)
+    assert problems(115, 118) == ()
+
+
+def test_a_worker_that_shows_itself_before_we_have_its_document_is_seen_once_we_have() -> None:
+    """edge1 has adopted the document with a new task before this robot."""
+    node = make()
+    node.handle(ev.WorkerShown(node="edge1", task="new", incarnation="1"), 100.0)
+    node.handle(ev.WorkerShown(node="edge9", task="merge", incarnation="1"), 100.0)
+    node.probation.adopt(node.fleet)
+    assert node.probation.sees("edge1", "new")
+    assert node.probation.sees("edge9", "merge")
+    node.handle(ev.WorkerShown(node="edge1", task="new", incarnation="1", is_present=False), 101.0)
+    assert not node.probation.sees("edge1", "new")
+
+
 def lack_of(node: Node, lack: ev.SlotReady) -> str:
     """The words that follow "have waited for edge1 for 3 s"."""
     node.handle(lack, 101.0)

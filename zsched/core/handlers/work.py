@@ -140,9 +140,9 @@ def _on_worker_outdated(node: Stages, event: ev.WorkerOutdated, _todo: ToDo, _no
 
 
 def _on_worker_shown(node: Stages, event: ev.WorkerShown, todo: ToDo, now: float) -> None:
+    node.probation.on_token(event.node, event.task, event.incarnation, is_present=event.is_present, now=now)
     if event.task not in node.executors or not node.membership.is_known(event.node):
         return
-    node.probation.on_token(event.node, event.task, event.incarnation, is_present=event.is_present, now=now)
     if event.is_present and node.is_orphan(node.registers[event.task].value.owner):
         todo.must_decide = True  # this may be the candidate that the task waits for
 
@@ -212,6 +212,7 @@ def _on_relay(node: Stages, event: ev.RelayChanged, _todo: ToDo, now: float) -> 
     node.set_problem("relay", None if event.is_running else f"the relay is down: {event.reason}")
     if not event.is_running:
         node.probation.forget_tokens()
+        node.unseen.forget()
         for name, executor in node.executors.items():
             if executor.routes:
                 untold = ev.SlotReady(task=name, epoch=executor.epoch, is_ready=False)

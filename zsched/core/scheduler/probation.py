@@ -46,13 +46,15 @@ class Probation(Struct):
     """{(node, task): {worker's incarnation: when its token came}} of the tokens that are there."""
 
     def adopt(self, fleet: Fleet) -> None:
-        """Go by ``fleet``; what was known of nodes and tasks that it does not name is forgotten."""
+        """Go by ``fleet``; who was gone and is not in it is forgotten.
+
+        Tokens stay, also of nodes and tasks that it does not name: another node may have adopted a document before us,
+        and its worker shows itself once. Our relay bounds them (`zsched.relay.tokens`).
+        """
         self.fleet = fleet
-        nodes, tasks = {node.name for node in fleet.nodes}, {task.name for task in fleet.tasks}
+        nodes = {node.name for node in fleet.nodes}
         for node in [node for node in self._returns if node not in nodes]:
             del self._returns[node]
-        for node, task in [known for known in self._tokens if known[0] not in nodes or known[1] not in tasks]:
-            del self._tokens[node, task]
 
     def on_gone(self, node: NodeId, now: float) -> None:
         """A peer is gone: what was known of its streams is worth nothing any more."""
@@ -69,12 +71,18 @@ class Probation(Struct):
         tokens = self._tokens.setdefault((node, task), {})
         if is_present:
             tokens[incarnation] = now
-        else:
-            tokens.pop(incarnation, None)
+            return
+        tokens.pop(incarnation, None)
+        if not tokens:
+            del self._tokens[node, task]
 
     def forget_tokens(self) -> None:
         """Our relay is another one: it tells anew what it sees."""
         self._tokens.clear()
+
+    def sees(self, node: NodeId, task: TaskId) -> bool:
+        """Whether our relay sees a token of a worker there."""
+        return bool(self._tokens.get((node, task)))
 
     def doubts(self, spec: TaskSpec, now: float) -> Mapping[NodeId, str]:
         """{candidate: why it may not get the task yet}."""
@@ -93,12 +101,12 @@ class Probation(Struct):
         tokens = self._tokens.get((node, spec.name), {})
         if any(at > known.gone_at for at in tokens.values()):
             return ""
-        has_stood = bool(tokens) or not _shows_token(spec)
+        has_stood = bool(tokens) or not shows_token(spec)
         if has_stood and back_s >= self.fleet.timing.zenoh_lease_s + LEASE_MARGIN_S:
             return ""
         return f"back for {back_s:.1f} s, its streams are not proven yet"
 
 
-def _shows_token(spec: TaskSpec) -> bool:
+def shows_token(spec: TaskSpec) -> bool:
     """Whether a candidate's worker shows itself before it owns the task."""
     return spec.worker.ready_when is ReadyWhen.TOKEN and spec.worker.standby is Standby.WARM

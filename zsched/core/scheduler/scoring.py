@@ -75,6 +75,8 @@ class Doubts(Struct, frozen=True, kw_only=True):
     """Suspect, but not for long enough to tell a lost beat from a lost node: an owner among them counts as alive."""
     unproven: Mapping[NodeId, str] = field(default_factory=dict)
     """{candidate: why it may not get the task} of those that were gone (`zsched.core.scheduler.probation`)."""
+    unseen: AbstractSet[NodeId] = frozenset()
+    """Not reached by this robot's streams, though by its questions (`zsched.core.scheduler.unseen`)."""
     unfit: Mapping[NodeId, str] = field(default_factory=dict)
     """{candidate: why it may not have the task, though it has it} of an exclusive task (`zsched.core.vote.lease`)."""
 
@@ -113,7 +115,7 @@ def score(
             refused.append((candidate, "not heard yet"))  # we may have just started: that says nothing about it
             continue
         is_spared = candidate == allocation.owner and candidate in doubts.in_grace
-        if state is not PeerState.ALIVE and not is_spared:
+        if (state is not PeerState.ALIVE and not is_spared) or candidate in doubts.unseen:
             unreachable.append(candidate)
             continue
         if candidate in doubts.unfit:

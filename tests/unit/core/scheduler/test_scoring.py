@@ -175,6 +175,13 @@ def test_a_candidate_whose_streams_are_not_proven_is_refused_and_the_owner_stays
     assert vector.refused == (("edge3", "back for 1.2 s"),)
 
 
+def test_a_candidate_that_no_stream_reaches_is_not_reached_though_it_is_the_owner() -> None:
+    vector = scored(ROBOT, *EDGES, doubts=Doubts(unseen={"edge1", "edge3"}))
+
+    assert {one.candidate: one.reachable for one in vector.utilities} == {"edge1": False, "edge2": True, "edge3": False}
+    assert values(vector) == {"edge1": 0.0, "edge2": 0.5, "edge3": 0.0}
+
+
 def test_a_node_that_can_hold_no_lease_is_refused_though_it_is_the_owner() -> None:
     vector = scored(ROBOT, *EDGES, doubts=Doubts(unfit={"edge1": "goes by other leases"}))
 

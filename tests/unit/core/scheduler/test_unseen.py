@@ -1,0 +1,117 @@
+"""A candidate whose ready worker no stream of a robot reaches: when that is said, and when it is not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from support.fleets import fleet_of, task_of, tuning_of
+from zsched.core.scheduler.probation import Probation
+from zsched.core.scheduler.unseen import LONGEST_GAP_S, UNSEEN_S, Unseen
+from zsched.core.values.fleet import Standby, TaskSpec, WorkerSpec
+from zsched.core.values.plan import ReadyWhen
+
+TASK = task_of(tuning=tuning_of(cpu=1.0, memory=0.0), worker=WorkerSpec(command=("true",)))
+OTHER = replace(TASK, name="other")
+EDGES = ("edge1", "edge2")
+STEP_S = 1.0
+
+
+class Robot:
+    """One robot's view: it looks once a second."""
+
+    def __init__(self, *seen: str, spec: TaskSpec = TASK) -> None:
+        self.spec, self.now = spec, 100.0
+        self.tokens = Probation(fleet_of(TASK, OTHER, of=TASK.candidates, electors=("edge1",)))
+        self.unseen = Unseen()
+        for name in seen:
+            self.show(name)
+
+    def show(self, name: str, *, is_present: bool = True, task: str = TASK.name) -> None:
+        self.tokens.on_token(name, task, "1", is_present=is_present, now=self.now)
+
+    def look(self, *ready: str) -> set[str]:
+        return set(self.unseen.look(self.spec, ready or EDGES, self.tokens, self.now))
+
+    def pass_time(self, seconds: float, *ready: str) -> set[str]:
+        found, end = self.look(*ready), self.now + seconds
+        while self.now < end:
+            self.now = min(self.now + STEP_S, end)
+            found = self.look(*ready)
+        return found
+
+
+def test_a_ready_worker_that_is_not_seen_beside_one_that_is_is_told_after_its_time() -> None:
+    robot = Robot("edge2")
+    assert robot.pass_time(UNSEEN_S - 0.01) == set()
+    assert robot.pass_time(0.01) == {"edge1"}
+    assert robot.unseen.found == {"merge": {"edge1"}}
+
+
+def test_a_robot_that_sees_nobody_s_worker_blames_nobody() -> None:
+    assert Robot().pass_time(60.0) == set()
+    assert Robot("edge1", "edge2").pass_time(60.0) == set()
+
+
+def test_the_worker_of_another_task_is_no_sight_of_this_one_s() -> None:
+    robot = Robot()
+    robot.show("edge2", task="other")
+    assert robot.pass_time(60.0) == set()
+    robot = Robot("edge2")
+    robot.show("edge1", task="other")
+    assert robot.pass_time(UNSEEN_S) == {"edge1"}
+
+
+def test_a_token_ends_it_at_once_and_its_end_begins_the_time_anew() -> None:
+    robot = Robot("edge2")
+    assert robot.pass_time(UNSEEN_S) == {"edge1"}
+    robot.show("edge1")
+    assert robot.look() == set()
+    robot.show("edge1", is_present=False)
+    assert robot.pass_time(UNSEEN_S - 0.01) == set()
+    assert robot.pass_time(0.01) == {"edge1"}
+
+
+def test_a_worker_that_is_not_ready_has_no_time_running() -> None:
+    robot = Robot("edge2")
+    robot.pass_time(UNSEEN_S - 1.0)
+    assert robot.look("edge2") == set()
+    assert robot.pass_time(UNSEEN_S - 1.0) == set()
+
+
+def test_a_new_relay_tells_its_tokens_anew() -> None:
+    robot = Robot("edge2")
+    robot.pass_time(UNSEEN_S)
+    robot.unseen.forget()
+    assert robot.unseen.found == {}
+    assert robot.pass_time(UNSEEN_S - 0.01) == set()
+
+
+def test_a_robot_that_stood_still_begins_anew() -> None:
+    robot = Robot("edge2")
+    robot.pass_time(UNSEEN_S - 1.0)
+    robot.now += LONGEST_GAP_S + 0.01
+    assert robot.look() == set()
+    assert robot.pass_time(UNSEEN_S) == {"edge1"}
+
+
+@pytest.mark.parametrize(
+    "worker",
+    [
+        WorkerSpec(command=("true",), standby=Standby.COLD),
+        WorkerSpec(command=("true",), ready_when=ReadyWhen.MATCHING),
+    ],
+    ids=["cold", "matching"],
+)
+def test_workers_that_show_no_token_before_they_own_the_task_say_nothing(worker: WorkerSpec) -> None:
+    assert Robot("edge2", spec=replace(TASK, worker=worker)).pass_time(60.0) == set()
+
+
+def test_a_task_that_is_gone_is_forgotten() -> None:
+    robot = Robot("edge2")
+    robot.pass_time(UNSEEN_S)
+    robot.unseen.adopt(frozenset({"other"}))
+    assert robot.unseen.found == {}
+    robot.unseen.adopt(frozenset({"merge"}))
+    assert robot.pass_time(UNSEEN_S - 0.01) == set()

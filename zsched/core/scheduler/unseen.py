@@ -1,0 +1,71 @@
+"""SCHEDULER, the way of the data: candidates whose worker is ready, and which this robot's relay does not see.
+
+Knows: whose worker is ready by its node's profile, which workers' tokens our relay sees. Does not know: who was gone
+(`zsched.core.scheduler.probation`), who is better.
+
+Control and streams travel on ports of their own. Where a firewall lets the one through and not the other, a node beats,
+answers and scores as any other, and no stream reaches its worker. A robot says so when such a worker has been ready and
+unseen for `UNSEEN_S`, while the worker of another candidate is seen: then our own relay's links work, and there is a
+better place. By the task's `reach` such a candidate gets nothing, and an owner is left.
+
+Workers that show no token before they own the task say nothing here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from zsched.core.scheduler.probation import Probation, shows_token
+from zsched.core.values.fleet import TaskSpec
+from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.struct import Struct, field
+
+UNSEEN_S = 10.0
+"""As long as a link may take to come back (`zsched.core.scheduler.probation.LIMIT_S`)."""
+LONGEST_GAP_S = 5.0
+"""Nobody has looked for so long: this node stood still, and its links may be as old."""
+NOBODY: frozenset[NodeId] = frozenset()
+
+
+class Unseen(Struct):
+    """What one robot knows of candidates that no stream of its own reaches."""
+
+    found: dict[TaskId, frozenset[NodeId]] = field(default_factory=dict)
+    """{task: the candidates that were found so when last looked}."""
+    _since: dict[TaskId, dict[NodeId, float]] = field(default_factory=dict)
+    """{task: {candidate: since when its worker is ready and unseen}}."""
+    _looked_at: dict[TaskId, float] = field(default_factory=dict)
+
+    def forget(self) -> None:
+        """Our relay is another one: it tells anew what it sees."""
+        self._since.clear()
+        self.found.clear()
+
+    def adopt(self, tasks: frozenset[TaskId]) -> None:
+        """What was known of other tasks is forgotten."""
+        for task in [task for task in self._looked_at if task not in tasks]:
+            del self._looked_at[task]
+            self._since.pop(task, None)
+            self.found.pop(task, None)
+
+    def look(self, spec: TaskSpec, ready: Iterable[NodeId], tokens: Probation, now: float) -> frozenset[NodeId]:
+        """The candidates that no stream reaches, as far as it can be told.
+
+        Args:
+            spec: the task.
+            ready: other nodes that are candidates, live, and whose fresh profile calls the worker ready.
+            tokens: knows which workers our relay sees.
+            now: monotonic seconds.
+        """
+        if not shows_token(spec):
+            return NOBODY
+        is_seen = {name: tokens.sees(name, spec.name) for name in ready}
+        known = self._since.get(spec.name, {})
+        if now - self._looked_at.get(spec.name, now) > LONGEST_GAP_S:
+            known = {}
+        self._looked_at[spec.name] = now
+        missed = [name for name, seen in is_seen.items() if not seen] if any(is_seen.values()) else []
+        self._since[spec.name] = {name: known.get(name, now) for name in missed}
+        found = frozenset(name for name, since in self._since[spec.name].items() if now - since >= UNSEEN_S) or NOBODY
+        self.found[spec.name] = found
+        return found
