@@ -17,7 +17,7 @@ from zsched.config.reader import Mapping, Node, Scalar, read_yaml
 from zsched.core.values.model import TaskId
 from zsched.core.values.struct import Struct
 
-_BEGIN: Final = re.compile(r"# zsched: task (\S+) goes to cell (\S+);.*")
+_BEGIN: Final = re.compile(r"# zsched: task (\S+) goes to cell (\S+?)(?: by ([0-9a-f]{8}))?;.*")
 _SECTION: Final = "tasks:\n"
 _WORD: Final = re.compile(r"[A-Za-z0-9_-]+")
 
@@ -29,6 +29,8 @@ class Mark(Struct, frozen=True, kw_only=True):
     cell: str
     entry: str
     """Its entry here, a text with the one key ``tasks``."""
+    by: str = ""
+    """Which run of the command takes it there, as eight hexadecimal digits; empty: it is not told."""
 
 
 def marks_of(text: str) -> Iterator[Mark]:
@@ -38,7 +40,7 @@ def marks_of(text: str) -> Iterator[Mark]:
         found = _BEGIN.fullmatch(lines[first])
         assert found is not None
         entry = "".join(f"{line[2:]}\n" for line in lines[first + 1 : last])
-        yield Mark(task=found[1], cell=found[2], entry=_SECTION + entry)
+        yield Mark(task=found[1], cell=found[2], entry=_SECTION + entry, by=found[3] or "")
 
 
 def mark_of(text: str, task: TaskId) -> Mark | None:
@@ -52,18 +54,17 @@ def marked(text: str, mark: Mark) -> str:
     goes_on = f"`zsched task hand {mark.task} {mark.cell}` goes on"
     kept = mark.entry.removeprefix(_SECTION).removesuffix("\n").split("\n")
     body = [f"# {line}" if line else "#" for line in kept]
-    lines = (f"# zsched: task {mark.task} goes to cell {mark.cell}; {goes_on}", *body, _end(mark.task))
+    by = f" by {mark.by}" if mark.by else ""
+    lines = (f"# zsched: task {mark.task} goes to cell {mark.cell}{by}; {goes_on}", *body, _end(mark.task))
     ended = text if not text or text.endswith("\n") else f"{text}\n"
     return ended + "".join(f"{line}\n" for line in lines)
 
 
 def unmarked(text: str, task: TaskId) -> str:
-    """The document without it; all else stays."""
+    """The document without it, however often it stands there; all else stays."""
     lines = text.split("\n")
-    for first, last in _places(lines):
-        if lines[last] == _end(task):
-            return "\n".join((*lines[:first], *lines[last + 1 :]))
-    return text
+    gone = {at for first, last in _places(lines) if lines[last] == _end(task) for at in range(first, last + 1)}
+    return "\n".join(line for at, line in enumerate(lines) if at not in gone)
 
 
 def names_in(entry: str, names: Collection[str]) -> tuple[str, ...]:

@@ -90,6 +90,20 @@ def test_a_second_mark_takes_the_place_of_the_first_and_leaves_others() -> None:
     assert unmarked(unmarked(again, "count"), "sweep") == BLOCK
 
 
+def test_a_mark_that_stands_there_twice_goes_as_a_whole() -> None:
+    """Two documents were put together by hand."""
+    once = marked(BLOCK, Mark(task="count", cell="hall-b", entry=task_entry(BLOCK, "count")))
+    assert unmarked(once + once.removeprefix(BLOCK), "count") == BLOCK
+
+
+def test_a_mark_tells_which_run_of_the_command_it_is_of() -> None:
+    mark = Mark(task="count", cell="hall-b", entry=task_entry(BLOCK, "count"), by="0123abcd")
+    assert mark_of(marked(BLOCK, mark), "count") == mark
+    assert mark_of(marked(BLOCK, mark).replace(" by 0123abcd", ""), "count") == Mark(
+        task="count", cell="hall-b", entry=mark.entry
+    )
+
+
 def test_a_mark_that_somebody_has_cut_is_none() -> None:
     text = marked(BLOCK, Mark(task="count", cell="hall-b", entry=task_entry(BLOCK, "count")))
     cut = text.replace("# zsched: end of task count\n", "seeds: [e1]\n")
