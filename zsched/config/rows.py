@@ -11,9 +11,14 @@ from __future__ import annotations
 import difflib
 import json
 from collections.abc import Iterator
+from typing import Final
 
 from zsched.config.reader import Mapping, Node, Scalar, Sequence
 from zsched.core.values.struct import Struct
+
+
+_BREAKS: Final = {ord(char): f"\\u{ord(char):04x}" for char in "\x85\u2028\u2029"}
+"""To YAML they end a line, of a comment, too; JSON leaves them as they are."""
 
 
 class Row(Struct, frozen=True, kw_only=True):
@@ -69,4 +74,4 @@ def flow(node: Node) -> str:
     if isinstance(node, Sequence):
         return "[" + ", ".join(flow(item) for item in node.items) + "]"
     is_open = node.is_plain and not any(char in node.text for char in ",[]{}") and ": " not in node.text
-    return node.text if is_open else json.dumps(node.text, ensure_ascii=False)
+    return node.text if is_open else json.dumps(node.text, ensure_ascii=False).translate(_BREAKS)

@@ -48,8 +48,11 @@ FLOW = (
 )
 
 
+BREAKS = FLOW.replace("candidates: [e1]", 'worker: {command: [say, "a\\u2028b\\x85c\\u2029: d"]}, candidates: [e1]', 1)
+
+
 @pytest.mark.parametrize(
-    ("text", "task"), [(ANNOTATED, "map_merge"), (BLOCK, "count"), (FLOW, "count"), (BLOCK, "sweep")]
+    ("text", "task"), [(BREAKS, "count"), (ANNOTATED, "map_merge"), (BLOCK, "count"), (FLOW, "count"), (BLOCK, "sweep")]
 )
 def test_an_entry_that_is_kept_and_brought_back_says_the_same(text: str, task: str) -> None:
     entry = task_entry(text, task)
