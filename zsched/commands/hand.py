@@ -9,6 +9,7 @@ Which step is done is asked of both cells: the command can be broken off at any 
 from __future__ import annotations
 
 import os
+import secrets
 from collections.abc import Iterator
 from typing import Final
 
@@ -27,6 +28,7 @@ from zsched.commands.hand_steps import (
     by_file,
     check_steps,
     go_over,
+    take_over,
     task_in,
     tell_end,
     text_with,
@@ -85,7 +87,7 @@ def hand(order: HandOrder) -> int:
         told = f"{order.task} is on its way from {here.name} to {mark.cell}"
         raise CliError(EXIT_USAGE, f"{told}: name that one, or {here.name} to take it back")
     there = _other(text, order, order.cell if mark is None else mark.cell)
-    way = Way(order=order, here=here, there=there, began=monotonic_s())
+    way = Way(order=order, here=here, there=there, began=monotonic_s(), run=secrets.token_hex(4))
     if order.cell == here.name:
         return _asked_back(way)
     seen = _look(way, held, fleet, mark)
@@ -157,6 +159,7 @@ def _checked(way: Way, seen: _Seen) -> Way:
         ConfigError: a document would have faults.
     """
     there = way.there.name
+    way = replace(way, entry="" if seen.here is None else task_entry(seen.text, way.task))
     if seen.mark is None:
         _spec(seen.fleet, way.task)
         for status in (seen.status, seen.status_there):
@@ -262,6 +265,7 @@ def _asked_back(way: Way) -> int:
     code = begin(view, rows, body_of(order, there, here, "planned"), is_change=True)
     if code is not None:
         return code
+    take_over(way)
     bring_back(way)
     owner = told_task(status_of(way.here.door), way.task).get("owner")
     return tell_end(order, there, here, "taken_back", f"{way.task} is a task of {here} as before", owner)

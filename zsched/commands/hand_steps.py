@@ -19,9 +19,10 @@ from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door, close_sessions
 from zsched.commands.common import CliError, Json, print_json, say, warn
 from zsched.commands.document import (
+    OVERTAKEN_S,
     ConflictError,
     ask_all,
-    change_over,
+    change,
     document_text,
     in_force,
     ordered,
@@ -43,12 +44,11 @@ from zsched.core.values.model import TaskId
 from zsched.core.values.quorum import majority
 from zsched.core.values.struct import Struct, replace
 from zsched.errors import AdapterError, ConfigError
-from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT
+from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT
 from zsched.wire.codec import from_plain
 
 SCHEMA: Final = "zsched.task.hand/1"
 PAUSE_S: Final = 0.2
-TRIES: Final = 10
 LONG_S: Final = 3.0
 """Of something missing that is told."""
 BACK_S: Final = 60.0
@@ -72,12 +72,6 @@ class HandOrder(Struct, frozen=True, kw_only=True):
     is_yes: bool = False
     is_json: bool = False
 
-    @property
-    def verb(self) -> str:
-        """The command as it is to be given again."""
-        more = () if self.entry is None else ("--entry", self.entry)
-        return shlex.join(("zsched", "task", "hand", self.task, self.cell, *more))
-
 
 class Side(Struct, frozen=True, kw_only=True):
     """One of the two cells."""
@@ -96,11 +90,21 @@ class Way(Struct, frozen=True, kw_only=True):
     wanted: str = ""
     """Its entry there; empty: the other cell has it already, or it is taken back."""
     is_exclusive: bool = False
+    entry: str = ""
+    """Its entry here when it was looked at; empty: this cell's document is without it."""
+    run: str = ""
+    """What this command's mark says, as `Mark.by`: who begins, goes on or takes it back writes its own first."""
 
     @property
     def task(self) -> TaskId:
         """Its name, in both cells."""
         return self.order.task
+
+    @property
+    def on(self) -> str:
+        """The command that takes it on, given again."""
+        more = () if self.order.entry is None else ("--entry", self.order.entry)
+        return shlex.join(("zsched", "task", "hand", self.task, self.there.name, *more))
 
     @property
     def back(self) -> str:
@@ -119,6 +123,10 @@ class Way(Struct, frozen=True, kw_only=True):
 
 class _RefusedError(CliError):
     """The other cell cannot have the task as it is: waiting does not help."""
+
+
+class _OvertakenError(CliError):
+    """The mark is another command's, or gone: this one may do nothing more."""
 
 
 def task_in(fleet: Fleet, task: TaskId) -> TaskSpec | None:
@@ -149,10 +157,15 @@ def text_with(way: Way, text: str, entry: str) -> str:
         ConfigError: it would have faults.
     """
     longer = add_entries(text, "tasks", entry, f"the entry of {way.task}")
-    result = check_bytes(longer.encode(), f"the document of {way.there.name} with {way.task}")
-    if result.fleet is None:
-        raise ConfigError(f"nothing was changed: {result.report()}\n{by_file(way)}")
+    if faults := _faults(longer, f"the document of {way.there.name} with {way.task}"):
+        raise ConfigError(f"nothing was changed: {faults}\n{by_file(way)}")
     return longer
+
+
+def _faults(text: str, name: str) -> str:
+    """Why no cell could agree on a document; empty: it could."""
+    result = check_bytes(text.encode(), name)
+    return "" if result.fleet is not None else result.report()
 
 
 def body_of(order: HandOrder, here: str, there: str, outcome: str, owner: str | None = None) -> Json:
@@ -175,14 +188,22 @@ def tell_end(order: HandOrder, here: str, there: str, outcome: str, said: str, o
 def go_over(way: Way) -> int:
     """Step by step; what is done already is passed over.
 
+    Its mark is written first, whatever is done: another command that is under way stops then, and what an elector has
+    accepted of one that ended with "unknown" can come about no more.
+
     Raises:
         CliError: a step was not agreed, or the other cell did not get it ready in time.
     """
     task, here, there = way.task, way.here.name, way.there.name
     way = replace(way, began=monotonic_s())
+    again = f"`{way.on}` goes on, `{way.back}` takes it back"
+    if way.wanted and has_task(document_text(in_force(way.there.door)), task):
+        raise CliError(EXIT_FAILED, f"{there} has got a task {task} meanwhile: look at it again with --plan")
+    with _advised(way, again):
+        revision = _agree(way, way.here, lambda text: _begun(way, text))
     works = "nobody does it meanwhile" if way.is_exclusive else f"it works on in {here}"
-    with _advised(way, f"{works}; `{way.order.verb}` goes on, `{way.back}` takes it back"):
-        if way.wanted and (revision := _agree(way, way.here, lambda text: _begun(way, text))) is not None:
+    with _advised(way, f"{works}; {again}"):
+        if way.wanted and revision is not None:
             told = f", without {task}, which" if way.is_exclusive else f": {task}"
             way.tell(f"{here}: revision {revision} is agreed{told} is on its way to {there}")
         lack = _wait(lambda: _not_over(way, way.here), way) if way.is_exclusive and way.wanted else ""
@@ -190,10 +211,10 @@ def go_over(way: Way) -> int:
             lack = _taken(way)
     if lack:
         return _took_back(way, f"{there} has not taken it: {lack}")
-    owner = told_task(status_of(way.there.door), task).get("owner")
-    way.tell(f"{there}: {task} is ready on {owner}")
-    with _advised(way, f"{task} is ready in {there}; `{way.order.verb}` takes it out of {here}"):
-        revision = _agree(way, way.here, lambda text: _ended(text, task))
+    with _advised(way, f"{task} is ready in {there}; `{way.on}` takes it out of {here}"):
+        owner = told_task(status_of(way.there.door), task).get("owner")
+        way.tell(f"{there}: {task} is ready on {owner}")
+        revision = _agree(way, way.here, lambda text: _ended(way, text))
     if revision is not None:
         kept = f"and keeps nothing of {task}" if way.is_exclusive else f"without {task}"
         way.tell(f"{here}: revision {revision} is agreed, {kept}")
@@ -209,6 +230,8 @@ def _advised(way: Way, advice: str) -> Iterator[None]:
     except KeyboardInterrupt:
         warn(f"{way.task}: broken off; {advice}")
         raise
+    except _OvertakenError:
+        raise
     except CliError as error:
         raise CliError(error.code, f"{error}; {advice}") from error
     except (AdapterError, ConfigError) as error:
@@ -216,15 +239,31 @@ def _advised(way: Way, advice: str) -> Iterator[None]:
 
 
 def _begun(way: Way, text: str) -> str:
-    """This cell's document with the mark; without the task, if that is exclusive."""
-    if not has_task(text, way.task):
-        if mark_of(text, way.task) is None:
-            raise CliError(EXIT_FAILED, f"{way.here.name} has no task {way.task} any more")
-        return text
-    entry = task_entry(text, way.task)
-    if way.is_exclusive:
+    """This cell's document with this command's mark; without the task, if that is exclusive.
+
+    Raises:
+        CliError: it is no more as it was looked at.
+    """
+    entry, mark = (task_entry(text, way.task) if has_task(text, way.task) else ""), mark_of(text, way.task)
+    is_elsewhere = mark.cell != way.there.name if mark is not None else not entry
+    if entry != way.entry or is_elsewhere:
+        raise _OvertakenError(
+            EXIT_FAILED, f"{way.task} was changed in {way.here.name} meanwhile: look at it again with --plan"
+        )
+    if entry and way.is_exclusive:
         text = remove_task(text, way.task)
-    return marked(text, Mark(task=way.task, cell=way.there.name, entry=entry))
+    kept = entry if mark is None or entry else mark.entry
+    return marked(text, Mark(task=way.task, cell=way.there.name, entry=kept, by=way.run))
+
+
+def _mark(way: Way, text: str) -> Mark:
+    """This command's mark in the document of this cell. Raises `_OvertakenError`: it is another one's, or gone."""
+    mark = mark_of(text, way.task)
+    if mark is None or (mark.cell, mark.by) != (way.there.name, way.run):
+        told = f"{way.task} is no more on its way from {way.here.name} to {way.there.name} by this command"
+        advice = "somebody else has taken that over, or brought it to its end; `zsched site` tells where it is"
+        raise _OvertakenError(EXIT_FAILED, f"{told}: {advice}")
+    return mark
 
 
 def check_steps(way: Way, text: str) -> None:
@@ -235,25 +274,19 @@ def check_steps(way: Way, text: str) -> None:
     """
     try:
         begun = _begun(way, text)
-        result = check_bytes(_ended(begun, way.task).encode(), f"the document of {way.here.name} without {way.task}")
-        _restored(begun, way.task)
+        _restored(way, begun)
+        texts = begun, _ended(way, begun)
     except ConfigError as error:
         raise ConfigError(f"nothing was changed: {error}") from error
-    if result.fleet is None:
-        raise ConfigError(f"nothing was changed: {result.report()}\nchange it first: zsched edit")
+    for then in texts:
+        if faults := _faults(then, f"the document of {way.here.name} without {way.task}"):
+            raise ConfigError(f"nothing was changed: {faults}\nchange it first: zsched edit")
 
 
-def _ended(text: str, task: TaskId) -> str:
-    """This cell's document without the task, and without the mark.
-
-    Raises:
-        CliError: it has been taken back meanwhile.
-    """
-    if mark_of(text, task) is None:
-        if has_task(text, task):
-            raise CliError(EXIT_FAILED, f"{task} has been taken back meanwhile")
-        return text
-    return unmarked(remove_task(text, task) if has_task(text, task) else text, task)
+def _ended(way: Way, text: str) -> str:
+    """This cell's document without the task, and without the mark. Raises `_OvertakenError`: as of `_mark`."""
+    _mark(way, text)
+    return unmarked(remove_task(text, way.task) if has_task(text, way.task) else text, way.task)
 
 
 def _taken(way: Way) -> str:
@@ -269,7 +302,7 @@ def _not_ready(way: Way) -> str:
     if way.wanted:
         try:
             revision = _agree(way, way.there, lambda text: _given(way, text))
-        except ConflictError:
+        except (ConflictError, _OvertakenError):
             raise
         except (CliError, ConfigError) as error:
             if isinstance(error, CliError) and error.code != EXIT_FAILED:
@@ -284,14 +317,20 @@ def _given(way: Way, text: str) -> str:
     """The other cell's document with the task, if that is still on its way.
 
     Raises:
-        _RefusedError: it has been taken back meanwhile.
+        _OvertakenError: another command has taken it over, or back.
+        _RefusedError: this cell has it again, and it is exclusive.
+        CliError: too few of this cell's electors tell that it is out: the node that was asked may be cut off from them.
     """
     if has_task(text, way.task):
         return text
     longer = text_with(way, text, way.wanted)
     ours = document_text(in_force(way.here.door))
-    if mark_of(ours, way.task) is None or (way.is_exclusive and has_task(ours, way.task)):
-        raise _RefusedError(EXIT_FAILED, f"{way.here.name} has taken it back meanwhile")
+    _mark(way, ours)
+    again = task_in(fleet_of(ours), way.task)
+    if again is not None and (way.is_exclusive or again.exclusive):
+        raise _RefusedError(EXIT_FAILED, f"it is exclusive, and {way.here.name} has it again")
+    if way.is_exclusive and (lack := _knowing(way, way.here)[0]):
+        raise CliError(EXIT_DEGRADED, lack)
     return longer
 
 
@@ -319,6 +358,20 @@ def _not_over(way: Way, side: Side) -> str:
     Raises:
         _RefusedError: the cell has the task again.
     """
+    lack, value, knowing = _knowing(way, side)
+    if lack:
+        return lack
+    time.sleep(hold_s(value.guard_lease_s))
+    way.tell(f"{side.name}: nobody works on {way.task}: {', '.join(knowing)} renew no lease, and the last one is over")
+    return ""
+
+
+def _knowing(way: Way, side: Side) -> tuple[str, FleetValue, list[str]]:
+    """(what keeps a majority from knowing that a cell is without the task, its newest value, the electors that know).
+
+    Raises:
+        _RefusedError: the cell has the task again.
+    """
     told = ask_door(side.door, {"verb": "fleet"})
     value = from_plain(told["value"], FleetValue)
     if value.creation(way.task) is not None:
@@ -327,11 +380,9 @@ def _not_over(way: Way, side: Side) -> str:
     answers = ask_all(side.door, electors, {"verb": "status"})
     knowing = [name for name, answer in answers.items() if _is_rid(answer, value.revision, way.task)]
     needed = majority(len(electors))
-    if len(knowing) < needed:
-        return f"{len(knowing)} of the electors {', '.join(electors)} of {side.name} know that it ends, {needed} needed"
-    time.sleep(hold_s(value.guard_lease_s))
-    way.tell(f"{side.name}: nobody works on {way.task}: {', '.join(knowing)} renew no lease, and the last one is over")
-    return ""
+    names, few = ", ".join(electors), len(knowing) < needed
+    lack = f"{len(knowing)} of the electors {names} of {side.name} know that it ends, {needed} needed" if few else ""
+    return lack, value, knowing
 
 
 def _is_rid(answer: Json | CliError, revision: int, task: TaskId) -> bool:
@@ -354,8 +405,22 @@ def _took_back(way: Way, why: str) -> int:
     raise CliError(EXIT_FAILED, f"{way.task} is a task of {way.here.name} as before, for {why}")
 
 
+def take_over(way: Way) -> None:
+    """Have this command's mark in this cell's document, in place of the one that is there.
+
+    Raises:
+        CliError: it is not agreed, or there is none any more.
+    """
+
+    def ours(text: str) -> str:
+        mark = mark_of(text, way.task)
+        return marked(text, _mark(way, text) if mark is None else replace(mark, by=way.run))
+
+    _agree(way, way.here, ours)
+
+
 def bring_back(way: Way) -> None:
-    """Have the other cell without the task, and this one with it as before.
+    """Have the other cell without the task, and this one with it as before; the mark is this command's.
 
     Raises:
         CliError: a step was not done in time.
@@ -363,20 +428,15 @@ def bring_back(way: Way) -> None:
     task, here, there = way.task, way.here.name, way.there.name
     text = document_text(in_force(way.here.door))
     is_out = not has_task(text, task)
-    if mark_of(text, task) is None:
-        told = f"{task} is no more on its way from {here} to {there}: somebody else has brought that to its end"
-        raise CliError(EXIT_FAILED, f"{told}; `zsched site` tells where it is")
     if is_out:
         works = f"nobody does it in {here}: it may work in {there}"
     else:
         works = f"it works on in {here}, and may work in {there}, too"
-    with _advised(way, f"{works}; `{way.order.verb}` goes on, `{way.back}` takes it back"):
-        lack = _wait(lambda: _not_gone(way), way, BACK_S)
-        if not lack and is_out:
-            lack = _wait(lambda: _not_over(way, way.there), way, BACK_S)
+    with _advised(way, f"{works}; `{way.on}` goes on, `{way.back}` takes it back"):
+        lack = _wait(lambda: _not_there(way, is_out=is_out), way, BACK_S)
         if lack:
             raise CliError(EXIT_TIMED_OUT, f"{task} is not taken back: {lack}")
-        revision = _agree(way, way.here, lambda text: _restored(text, task))
+        revision = _agree(way, way.here, lambda text: _restored(way, text))
     if revision is not None:
         way.tell(f"{here}: revision {revision} is agreed, with {task}")
     lack = _wait(lambda: _lack(way.here.door, task), way, BACK_S) if is_out else ""
@@ -384,21 +444,46 @@ def bring_back(way: Way) -> None:
         raise CliError(EXIT_TIMED_OUT, f"{task} is a task of {here} again, and is not ready: {lack}")
 
 
-def _not_gone(way: Way) -> str:
-    """Nothing, once the other cell's document is without the task."""
-    revision = _agree(way, way.there, lambda text: remove_task(text, way.task) if has_task(text, way.task) else text)
+def _not_there(way: Way, *, is_out: bool) -> str:
+    """Why the other cell may have the task, or get it; empty: it cannot. ``is_out``: this one's document is without it.
+
+    Raises:
+        _OvertakenError: as of `_mark`.
+        _RefusedError: the other cell has it again.
+    """
+    task, there = way.task, way.there
+    _mark(way, document_text(in_force(way.here.door)))
+    revision = _agree(way, there, lambda text: remove_task(text, task) if has_task(text, task) else text)
     if revision is not None:
-        way.tell(f"{way.there.name}: revision {revision} is agreed, without {way.task}")
+        way.tell(f"{there.name}: revision {revision} is agreed, without {task}")
+    if is_out and (lack := _not_over(way, there)):
+        return lack
+    _fence(way)
     return ""
 
 
-def _restored(text: str, task: TaskId) -> str:
-    """This cell's document with the task as it was, and without the mark."""
-    mark = mark_of(text, task)
-    if mark is None:
-        return text
-    text = unmarked(text, task)
-    return text if has_task(text, task) else add_entries(text, "tasks", mark.entry, "what was kept")
+def _fence(way: Way) -> None:
+    """Have the other cell agree twice on something: a line, and no line.
+
+    What was asked of it before can come about no more then, by an elector that has accepted it and was away, or by a
+    command that had looked before: each change names the revision that it is based on.
+    """
+    line = f"# zsched: task {way.task} stays in cell {way.here.name}\n"
+
+    def without(text: str) -> str:
+        if has_task(text, way.task):
+            raise CliError(EXIT_FAILED, f"{way.there.name} has {way.task} again")
+        return text.removeprefix(line)
+
+    _agree(way, way.there, lambda text: line + without(text))
+    _agree(way, way.there, without)
+
+
+def _restored(way: Way, text: str) -> str:
+    """This cell's document with the task as it was, and without the mark. Raises `_OvertakenError`: as of `_mark`."""
+    mark = _mark(way, text)
+    text = unmarked(text, way.task)
+    return text if has_task(text, way.task) else add_entries(text, "tasks", mark.entry, "what was kept")
 
 
 # --- agreeing, and waiting -------------------------------------------------------------------------------------------
@@ -407,33 +492,35 @@ def _restored(text: str, task: TaskId) -> str:
 def _agree(way: Way, side: Side, make: Callable[[str], str]) -> int | None:
     """Have a cell agree what ``make`` makes of its newest document; the revision, ``None``: it is so already.
 
+    Once that is not the newest any more, ``make`` is asked again: what it has looked at may have changed as well.
+
     Raises:
         ConflictError: others change it again and again.
         CliError: it is not agreed, or not settled in time.
         ConfigError: the document would have faults.
     """
-    for left in reversed(range(TRIES)):
+    until = monotonic_s() + OVERTAKEN_S
+    while True:
         held = in_force(side.door)
         text = document_text(held)
         new = make(text)
         if new == text:
             return None
-        result = check_bytes(new.encode(), f"the document of {side.name}")
-        if result.fleet is None:
-            raise ConfigError(result.report())
-        rollouts = list(kept_rollouts(held.rollouts, result.fleet))
+        if faults := _faults(new, f"the document of {side.name}"):
+            raise ConfigError(faults)
+        rollouts = list(kept_rollouts(held.rollouts, fleet_of(new)))
         view = OrderView(door=side.door, reason=way.order.reason)
         what = f"task hand {way.task} {way.order.cell}"
         kept = {"flags": list(held.flags), "rollouts": rollouts}
         try:
-            answer = change_over(side.door, {"text": new, **kept, **ordered(what, view.asked)}, held)
+            base = {"base_revision": held.revision}
+            answer = change(side.door, {"text": new, **kept, **ordered(what, view.asked), **base})
         except ConflictError:
-            if not left:
+            if monotonic_s() > until:
                 raise
             time.sleep(PAUSE_S)
         else:
             return wait_until_settled(side.door, int(answer["revision"])).revision
-    raise AssertionError("it was tried")
 
 
 def _wait(look: Callable[[], str], way: Way, for_s: float | None = None) -> str:
@@ -447,7 +534,7 @@ def _wait(look: Callable[[], str], way: Way, for_s: float | None = None) -> str:
     while True:
         try:
             lack = look()
-        except _RefusedError:
+        except (_RefusedError, _OvertakenError):
             raise
         except (CliError, AdapterError, ConfigError) as error:
             lack = str(error)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import itertools
 import json
 from collections.abc import Iterator
 from functools import cache
@@ -59,7 +60,7 @@ LABELLED = A.replace("{kind: robot}\n    w", "{labels: {arm: a}}\n    w").replac
     "t}\n  robot2", "t, labels: {arm: a}}\n  robot2"
 )
 """Only nodes with a label may have the task, and hall-b has none."""
-AGREED = "change_over"
+AGREED = "change"
 """The call by which a step is agreed."""
 LEASE_S = 0.05
 
@@ -84,6 +85,8 @@ class Hall:
         self.is_whole = self.is_ready = self.answers = True
         self.outcomes: list[str] = []
         """Of the next changes, instead of being made."""
+        self.doubt: tuple[int, str] | None = None
+        """The base and the text of a change that ended with "unknown": one elector has accepted it, and is away."""
         self.asked: list[str] = []
         self.rollouts: list[Json] = []
 
@@ -138,18 +141,31 @@ class Hall:
         return {**body, **told, "text": self.text, "flags": [], "rollouts": self.rollouts, "value": as_plain(value)}
 
     def _change(self, request: Json) -> Json:
-        assert request["base_revision"] == self.revision
+        if request["base_revision"] != self.revision:
+            return {"outcome": "conflict", "detail": "as told", "revision": self.revision}
         if self.outcomes:
+            if self.outcomes[0] == "unknown":
+                self.doubt = self.revision, request["text"]
             return {"outcome": self.outcomes.pop(0), "detail": "as told", "revision": self.revision}
         if not self.is_whole:
             return {"outcome": "no_quorum", "detail": "as told", "revision": self.revision}
-        self.before, self.text = self.text, request["text"]
-        self.revision += 1
+        self._take(request["text"])
         if self.has:
             self.behind.clear()  # the cut has healed
         self.asked.append(f"{request['by']} {request['why']}")
         self.site.look()
         return {"outcome": "ok", "detail": "as told", "revision": self.revision}
+
+    def _take(self, text: str) -> None:
+        self.before, self.text = self.text, text
+        self.revision += 1
+
+    def heal(self) -> None:
+        """The elector is back: what it has accepted comes about, unless something else was agreed since."""
+        doubt, self.doubt = self.doubt, None
+        if doubt is not None and doubt[0] == self.revision:
+            self._take(doubt[1])
+            self.site.look()
 
 
 class Site:
@@ -181,7 +197,9 @@ class Site:
 
     def check(self, *, is_exclusive: bool) -> None:
         """The task was never in neither cell; or, an exclusive one, never in both, nor in the next within a lease."""
-        for (here, there, at), (then_here, then_there, then) in zip(self.seen, self.seen[1:], strict=False):
+        pairs = itertools.pairwise(self.seen)
+        changed = [self.seen[0], *(then for one, then in pairs if then[:2] != one[:2])]
+        for (here, there, at), (then_here, then_there, then) in itertools.pairwise(changed):
             if is_exclusive:
                 assert not (then_here and then_there)
                 is_begun = (then_here, then_there) != (here, there) and (then_here or then_there)
@@ -299,7 +317,7 @@ def test_a_task_that_has_just_become_exclusive_stays_until_all_go_by_it(
 
 @pytest.mark.parametrize("is_exclusive", [False, True])
 @pytest.mark.parametrize("is_after", [False, True])
-@pytest.mark.parametrize(("step", "number"), [("change_over", 0), ("change_over", 1), ("change_over", 2), ("_lack", 0)])
+@pytest.mark.parametrize(("step", "number"), [("change", 0), ("change", 1), ("change", 2), ("_lack", 0)])
 @pytest.mark.parametrize("way", ["on", "back"])
 def test_broken_off_anywhere_it_goes_on_or_is_taken_back(
     site: Site, monkeypatch: pytest.MonkeyPatch, step: str, number: int, is_after: bool, is_exclusive: bool, way: str
@@ -449,7 +467,7 @@ def test_a_task_that_somebody_has_taken_back_meanwhile_is_not_begun_again(
     monkeypatch.setattr(hand_steps, "_given", overtaken)
     refused = run("hall-b", "-y")
     assert refused.exit_code == 1
-    assert "somebody else has brought that to its end" in refused.stderr
+    assert "somebody else has taken that over, or brought it to its end" in refused.stderr
     assert (site.here.text, site.there.text) == (A, B)
 
 
@@ -603,3 +621,201 @@ def test_an_elector_that_has_not_heard_of_the_task_yet_may_still_grant_it_a_leas
     """It learns of its creation before it learns of its end."""
     told = {"fleet_revision": 3, "tasks": []}
     assert [hand_steps._is_rid(told, revision, "echo") for revision in (3, 4)] == [True, False]
+
+
+# --- two commands, and a change that may or may not have been agreed --------------------------------------------------
+
+
+def leave_under_way(site: Site, monkeypatch: pytest.MonkeyPatch, step: str = "_lack") -> None:
+    """Give the command, and break it off at the first call of a step."""
+
+    def broken(*_given: object) -> str:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(hand_steps, step, broken)
+        CliRunner().invoke(app, ["task", "hand", "echo", "hall-b", "-y"])
+    assert mark_of(site.here.text, "echo") is not None
+
+
+@pytest.mark.parametrize("is_exclusive", [False, True])
+def test_a_command_that_slept_before_its_change_there_finds_that_it_was_taken_back(
+    site: Site, monkeypatch: pytest.MonkeyPatch, is_exclusive: bool
+) -> None:
+    """It has seen the mark; meanwhile another operator takes the task back, and then it goes on."""
+    if is_exclusive:
+        site.make_exclusive()
+    first = site.here.text
+    real, done = hand_steps._given, list[Result]()
+
+    def slept(way: Any, text: str) -> str:
+        longer = real(way, text)
+        if not done:
+            done.append(CliRunner().invoke(app, ["task", "hand", "echo", "hall-a", "-y"]))
+        return longer
+
+    monkeypatch.setattr(hand_steps, "_given", slept)
+    refused = run("hall-b", "-y")
+    assert done[0].exit_code == 0, done[0].output
+    site.check(is_exclusive=is_exclusive)
+    assert refused.exit_code == 1
+    assert "somebody else has taken that over, or brought it to its end" in refused.stderr
+    assert (site.has, site.there.text) == ((True, False), B)
+    assert sorted_tasks(site.here.text) == sorted_tasks(first)
+
+
+@pytest.mark.parametrize("is_exclusive", [False, True])
+def test_what_another_command_has_taken_over_is_not_ended_by_the_first(
+    site: Site, monkeypatch: pytest.MonkeyPatch, is_exclusive: bool
+) -> None:
+    """It was taken back meanwhile, and given anew: the other cell is without it again."""
+    if is_exclusive:
+        site.make_exclusive()
+    real, again = hand_steps._lack, list[str]()
+
+    def slept(*given: Any) -> str:
+        lack = real(*given)
+        if not again:
+            again.append("")
+            assert CliRunner().invoke(app, ["task", "hand", "echo", "hall-a", "-y"]).exit_code == 0
+            leave_under_way(site, monkeypatch, "_taken")
+            again.append(site.here.text)
+        return lack
+
+    monkeypatch.setattr(hand_steps, "_lack", slept)
+    refused = run("hall-b", "-y")
+    assert (refused.exit_code, "somebody else has taken that over" in refused.stderr) == (1, True)
+    assert "goes on" not in refused.stderr
+    assert (site.here.text, site.there.text) == (again[1], B)
+    assert run("hall-b", "-y").exit_code == 0
+    check_arrived(site)
+
+
+def test_an_addition_there_that_may_come_about_later_cannot_once_it_is_taken_back(site: Site) -> None:
+    site.make_exclusive()
+    site.there.outcomes = ["unknown"] + ["no_quorum"] * 10_000
+    refused = run("hall-b", "-y", "--deadline", "0.1s")
+    assert (refused.exit_code, site.has) == (5, (False, False)), "nobody can tell that hall-b does not get it"
+    site.there.outcomes = []
+    assert run("hall-a", "-y").exit_code == 0
+    site.there.heal()
+    assert (site.has, site.there.text) == ((True, False), B)
+    site.check(is_exclusive=True)
+
+
+def test_a_return_that_may_come_about_later_cannot_once_it_goes_on(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    site.make_exclusive()
+    leave_under_way(site, monkeypatch, "_taken")
+    restored = hand_steps._restored
+
+    def then_lost(*given: Any) -> str:
+        site.here.outcomes = ["unknown"]
+        return restored(*given)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(hand_steps, "_restored", then_lost)
+        assert run("hall-a", "-y").exit_code == 5
+    assert (site.has, site.here.doubt is None) == ((False, False), False)
+    real = hand_steps._lack
+
+    def healed(*given: Any) -> str:
+        site.here.heal()
+        return real(*given)
+
+    monkeypatch.setattr(hand_steps, "_lack", healed)
+    assert run("hall-b", "-y").exit_code == 0
+    check_arrived(site)
+    site.check(is_exclusive=True)
+
+
+@pytest.mark.parametrize("is_exclusive", [False, True])
+def test_an_end_here_that_may_come_about_later_cannot_once_it_is_taken_back(
+    site: Site, monkeypatch: pytest.MonkeyPatch, is_exclusive: bool
+) -> None:
+    if is_exclusive:
+        site.make_exclusive()
+    real = hand_steps._lack
+
+    def then_lost(*given: Any) -> str:
+        site.here.outcomes = ["unknown"]
+        return real(*given)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(hand_steps, "_lack", then_lost)
+        assert run("hall-b", "-y").exit_code == 5
+    agree = hand_steps._agree
+
+    def healed(way: Any, side: Any, make: Any) -> int | None:
+        revision = agree(way, side, make)
+        if side.name == "hall-b":
+            site.here.heal()
+        return revision
+
+    monkeypatch.setattr(hand_steps, "_agree", healed)
+    assert run("hall-a", "-y").exit_code == 0
+    assert (site.has, site.there.text) == ((True, False), B)
+    assert mark_of(site.here.text, "echo") is None
+
+
+def test_a_task_that_is_ending_here_is_not_taken_out_there(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who takes it back waits for the other cell; meanwhile somebody brings the task to its end."""
+    leave_under_way(site, monkeypatch)
+    name = "bring_back"
+    real = getattr(hand, name)
+
+    def overtaken(way: Any) -> None:
+        monkeypatch.setattr(hand, name, real)
+        assert CliRunner().invoke(app, ["task", "hand", "echo", "hall-b", "-y"]).exit_code == 0
+        real(way)
+
+    monkeypatch.setattr(hand, name, overtaken)
+    refused = run("hall-a", "-y")
+    assert (refused.exit_code, "brought it to its end" in refused.stderr) == (1, True)
+    check_arrived(site)
+
+
+def test_a_node_that_is_cut_off_from_its_cell_does_not_give_an_exclusive_task_away(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It still tells the mark, and the task may have been taken back by the others."""
+    site.make_exclusive()
+    real = hand_steps._given
+
+    def cut(way: Any, text: str) -> str:
+        site.here.behind = {"robot1", "robot2"}
+        return real(way, text)
+
+    monkeypatch.setattr(hand_steps, "_given", cut)
+    refused = run("hall-b", "-y", "--deadline", "0.2s")
+    assert "0 of the electors robot1, robot2 of hall-a know that it ends, 2 needed" in refused.stderr
+    assert site.there.text == B
+
+
+# --- what changes while the question stands, and what could not be taken back -----------------------------------------
+
+
+@pytest.mark.parametrize("what", ["exclusive", "another entry", "its own"])
+def test_what_was_changed_while_the_question_stood_is_looked_at_again(
+    site: Site, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    def agreed(*_given: object, **_more: object) -> None:
+        if what == "exclusive":
+            site.make_exclusive()
+        elif what == "another entry":
+            site.here.text = A.replace("{cpu: 0.5, memory: 0.5}", "{cpu: 1}")
+        else:
+            site.there.text = B + ENTRY
+
+    monkeypatch.setattr(hand, "begin", agreed)
+    refused = run("hall-b", "-y")
+    assert (refused.exit_code, "meanwhile: look at it again with --plan" in refused.stderr) == (1, True)
+    assert len(site.seen) == 1
+
+
+def test_nobody_is_told_that_it_has_stopped_before_it_has(site: Site) -> None:
+    site.make_exclusive()
+    site.here.outcomes = ["no_quorum"]
+    refused = run("hall-b", "-y")
+    assert (refused.exit_code, "nothing was changed" in refused.stderr) == (4, True)
+    assert "nobody does it" not in refused.stderr
+    assert "`zsched task hand echo hall-b` goes on" in refused.stderr
