@@ -433,6 +433,7 @@ def bring_back(way: Way) -> None:
     else:
         works = f"it works on in {here}, and may work in {there}, too"
     with _advised(way, f"{works}; `{way.on}` goes on, `{way.back}` takes it back"):
+        _check_restored(way, text)
         lack = _wait(lambda: _not_there(way, is_out=is_out), way, BACK_S)
         if lack:
             raise CliError(EXIT_TIMED_OUT, f"{task} is not taken back: {lack}")
@@ -442,6 +443,22 @@ def bring_back(way: Way) -> None:
     lack = _wait(lambda: _lack(way.here.door, task), way, BACK_S) if is_out else ""
     if lack:
         raise CliError(EXIT_TIMED_OUT, f"{task} is a task of {here} again, and is not ready: {lack}")
+
+
+def _check_restored(way: Way, text: str) -> None:
+    """Refuse what this cell could not have again, as long as the other one has it.
+
+    Raises:
+        ConfigError: this cell's document with the task would have faults.
+    """
+    where = f"the document of {way.here.name} with {way.task}"
+    advice = f"change the task's entry in the comment at the end of the document of {way.here.name}: zsched edit"
+    try:
+        faults = _faults(_restored(way, text), where)
+    except ConfigError as error:
+        faults = str(error)
+    if faults:
+        raise ConfigError(f"{way.task} is not taken back: {faults}\n{advice}")
 
 
 def _not_there(way: Way, *, is_out: bool) -> str:

@@ -812,6 +812,22 @@ def test_what_was_changed_while_the_question_stood_is_looked_at_again(
     assert len(site.seen) == 1
 
 
+def test_what_this_cell_cannot_have_again_is_not_taken_away_there(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A node that its entry names has left meanwhile."""
+    site.make_exclusive()
+    leave_under_way(site, monkeypatch)
+    site.here.text = site.here.text.replace("#     candidates: {kind: robot}", "#     candidates: [robot9]")
+    refused = run("hall-a", "-y")
+    assert refused.exit_code in (1, 78)
+    told = " ".join(refused.stderr.split())
+    assert "`zsched task hand echo hall-b` goes on, `zsched task hand echo hall-a` takes it back" in told
+    assert "echo is not taken back" in told
+    assert "change the task's entry in the comment at the end of the document of hall-a: zsched edit" in told
+    assert site.has == (False, True)
+    assert run("hall-b", "-y").exit_code == 0
+    check_arrived(site)
+
+
 def test_nobody_is_told_that_it_has_stopped_before_it_has(site: Site) -> None:
     site.make_exclusive()
     site.here.outcomes = ["no_quorum"]
