@@ -37,6 +37,7 @@ from zsched.commands.wait import Condition, missing
 from zsched.config.editing import add_entries, remove_task, task_entry
 from zsched.config.handing import Mark, mark_of, marked, unmarked
 from zsched.config.load import check_bytes
+from zsched.core.values.document import MAX_DOCUMENT_BYTES
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.lease import hold_s
@@ -165,7 +166,10 @@ def text_with(way: Way, text: str, entry: str) -> str:
 def _faults(text: str, name: str) -> str:
     """Why no cell could agree on a document; empty: it could."""
     result = check_bytes(text.encode(), name)
-    return "" if result.fleet is not None else result.report()
+    if result.fleet is None:
+        return result.report()
+    size = len(text.encode())
+    return "" if size <= MAX_DOCUMENT_BYTES else f"{name} would have {size} bytes, at most {MAX_DOCUMENT_BYTES} can be"
 
 
 def body_of(order: HandOrder, here: str, there: str, outcome: str, owner: str | None = None) -> Json:

@@ -24,7 +24,7 @@ from zsched.commands import hand, hand_steps
 from zsched.commands.ask import Door
 from zsched.config.handing import mark_of
 from zsched.config.load import check_bytes
-from zsched.core.values.document import Document, Text
+from zsched.core.values.document import MAX_DOCUMENT_BYTES, Document, Text
 from zsched.core.values.electorate import Creation, Elector
 from zsched.core.values.fleet import Cell, Fleet
 from zsched.wire.codec import as_plain, document_hash
@@ -826,6 +826,21 @@ def test_what_this_cell_cannot_have_again_is_not_taken_away_there(site: Site, mo
     assert site.has == (False, True)
     assert run("hall-b", "-y").exit_code == 0
     check_arrived(site)
+
+
+@pytest.mark.parametrize("is_exclusive", [False, True])
+@pytest.mark.parametrize("name", ["hall-a", "hall-b"])
+def test_a_document_that_would_be_too_large_is_left_alone(site: Site, name: str, is_exclusive: bool) -> None:
+    if is_exclusive:
+        site.make_exclusive()
+    hall = site.here if name == "hall-a" else site.there
+    room = MAX_DOCUMENT_BYTES - len(hall.text.encode())
+    hall.text += "# " + "x" * (room - 3) + "\n"
+    before = site.here.text, site.there.text
+    refused = run("hall-b", "-y")
+    assert (refused.exit_code, "takes it back" in refused.stderr) == (78, False)
+    assert "at most 196608 can be" in refused.stderr
+    assert (site.here.text, site.there.text, len(site.seen)) == (*before, 1)
 
 
 def test_nobody_is_told_that_it_has_stopped_before_it_has(site: Site) -> None:
