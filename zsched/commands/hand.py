@@ -160,6 +160,7 @@ def _checked(way: Way, seen: _Seen) -> Way:
     """
     there = way.there.name
     way = replace(way, entry="" if seen.here is None else task_entry(seen.text, way.task))
+    is_exclusive_here = seen.here is None or seen.here.exclusive  # only an exclusive one is taken out before its end
     if seen.mark is None:
         _spec(seen.fleet, way.task)
         for status in (seen.status, seen.status_there):
@@ -169,7 +170,7 @@ def _checked(way: Way, seen: _Seen) -> Way:
         if seen.mark is None:
             advice = f"take one away by `zsched task remove {way.task}`, here or with --node {there}/GATEWAY"
             raise CliError(EXIT_FAILED, f"nothing was changed: {there} has a task {way.task} of its own; {advice}")
-        is_exclusive = seen.there.exclusive or (seen.here is not None and seen.here.exclusive)
+        is_exclusive = seen.there.exclusive or is_exclusive_here
         if is_exclusive and seen.here is not None:
             told = f"{way.task} is exclusive, and stands in the documents of both cells"
             raise CliError(EXIT_FAILED, f"{told}: `zsched task remove {way.task}` takes it out of one")
@@ -178,7 +179,11 @@ def _checked(way: Way, seen: _Seen) -> Way:
         return replace(way, is_exclusive=is_exclusive)
     wanted = _wanted(way, seen)
     spec = _spec(fleet_of(text_with(way, seen.text_there, wanted)), way.task)
-    is_exclusive = spec.exclusive or (seen.here is not None and seen.here.exclusive)
+    if way.order.entry is not None and spec.exclusive != is_exclusive_here:
+        told = f"nothing was changed: {way.task} is exclusive in one of the two cells, and not in the other"
+        advice = "no lease's end would tell that nobody works on it; change that before or afterwards: zsched edit"
+        raise CliError(EXIT_FAILED, f"{told}: {advice}")
+    is_exclusive = spec.exclusive or is_exclusive_here
     if is_exclusive and seen.here is not None:
         _check_leased(way, seen.status)
     way = replace(way, wanted=wanted, is_exclusive=is_exclusive)

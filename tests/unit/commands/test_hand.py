@@ -812,6 +812,26 @@ def test_what_was_changed_while_the_question_stood_is_looked_at_again(
     assert len(site.seen) == 1
 
 
+@pytest.mark.parametrize("is_under_way", [False, True])
+@pytest.mark.parametrize("is_exclusive", [False, True])
+def test_a_task_is_exclusive_in_both_cells_or_in_none(
+    site: Site, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, is_exclusive: bool, is_under_way: bool
+) -> None:
+    """No lease's end tells of one that is not: its worker may work on wherever it is cut off."""
+    if is_exclusive:
+        site.make_exclusive()
+    if is_under_way:
+        leave_under_way(site, monkeypatch, "_not_over" if is_exclusive else "_taken")
+    before = site.here.text, site.there.text, len(site.seen)
+    file = tmp_path / "echo.yaml"
+    file.write_text(
+        f"tasks:\n  echo: {{exclusive: {str(not is_exclusive).lower()}, candidates: [robot3], weights: {{cpu: 1}}}}\n"
+    )
+    refused = run("hall-b", "-y", "--entry", str(file))
+    assert (refused.exit_code, "echo is exclusive in one of the two cells" in refused.stderr) == (1, True)
+    assert (site.here.text, site.there.text, len(site.seen)) == before
+
+
 def test_what_this_cell_cannot_have_again_is_not_taken_away_there(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     """A node that its entry names has left meanwhile."""
     site.make_exclusive()
