@@ -213,7 +213,7 @@ def _wanted(way: Way, seen: _Seen) -> str:
         if names != (way.task,):
             raise CliError(EXIT_USAGE, f"{file}: it holds {', '.join(names)}, and {way.task} alone is handed over")
         return entry
-    entry = task_entry(seen.text, way.task) if seen.mark is None else seen.mark.entry
+    entry = way.entry or (seen.mark.entry if seen.mark is not None else "")
     theirs = {node.name for node in fleet_of(seen.text_there).nodes}
     foreign = names_in(entry, [node.name for node in seen.fleet.nodes if node.name not in theirs])
     if foreign:

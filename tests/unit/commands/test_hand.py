@@ -832,6 +832,18 @@ def test_a_task_is_exclusive_in_both_cells_or_in_none(
     assert (site.here.text, site.there.text, len(site.seen)) == before
 
 
+def test_an_entry_that_was_changed_while_it_was_on_its_way_goes_as_it_is_now(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    leave_under_way(site, monkeypatch, "_taken")
+    exclusive = "  echo:  # answers\n    exclusive: true\n"
+    site.here.text = site.here.text.replace("  echo:  # answers\n", exclusive, 1)
+    assert run("hall-b", "-y").exit_code == 0
+    check_arrived(site)
+    assert site.there.text == B + ENTRY.replace("  echo:  # answers\n", exclusive)
+    site.check(is_exclusive=True)
+
+
 def test_what_this_cell_cannot_have_again_is_not_taken_away_there(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     """A node that its entry names has left meanwhile."""
     site.make_exclusive()
