@@ -207,13 +207,14 @@ def _wanted(way: Way, seen: _Seen) -> str:
         ConfigError: the file holds something else.
     """
     file = way.order.entry
+    kept = seen.mark.entry if seen.mark is not None else ""
+    entry = read_text(file) if file is not None else way.entry or kept
+    names = names_of(entry, "tasks", file or f"the comment in {way.here.name}'s document")
+    if names != (way.task,):
+        told = f"it holds {', '.join(names)}, and {way.task} alone is handed over"
+        raise CliError(EXIT_USAGE, f"{file or 'the comment at the end of the document'}: {told}")
     if file is not None:
-        entry = read_text(file)
-        names = names_of(entry, "tasks", file)
-        if names != (way.task,):
-            raise CliError(EXIT_USAGE, f"{file}: it holds {', '.join(names)}, and {way.task} alone is handed over")
         return entry
-    entry = way.entry or (seen.mark.entry if seen.mark is not None else "")
     theirs = {node.name for node in fleet_of(seen.text_there).nodes}
     foreign = names_in(entry, [node.name for node in seen.fleet.nodes if node.name not in theirs])
     if foreign:

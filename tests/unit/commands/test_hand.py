@@ -882,3 +882,13 @@ def test_nobody_is_told_that_it_has_stopped_before_it_has(site: Site) -> None:
     assert (refused.exit_code, "nothing was changed" in refused.stderr) == (4, True)
     assert "nobody does it" not in refused.stderr
     assert "`zsched task hand echo hall-b` goes on" in refused.stderr
+
+
+def test_a_mark_that_keeps_another_task_too_gives_nothing_away(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    site.make_exclusive()
+    leave_under_way(site, monkeypatch, "_taken")
+    other = "#   more: {candidates: {kind: robot}, weights: {cpu: 1}}\n# zsched: end of task echo\n"
+    site.here.text = site.here.text.replace("# zsched: end of task echo\n", other)
+    refused = run("hall-b", "-y")
+    assert (refused.exit_code, "it holds echo, more, and echo alone is handed over" in refused.stderr) == (2, True)
+    assert site.there.text == B
