@@ -47,6 +47,16 @@ PauseAfterOption = Annotated[
 ]
 
 
+def where_of(at: tuple[str | None, Path | None, str | None]) -> tuple[str, ...]:
+    """The words that say which daemon is asked; ``at`` are --node, --runtime-dir and --connect."""
+    return tuple(
+        word
+        for option, value in zip(("--node", "--runtime-dir", "--connect"), at, strict=True)
+        if value is not None
+        for word in (option, str(value))
+    )
+
+
 def view_of(
     words: tuple[str, ...],
     *,
@@ -73,12 +83,7 @@ def view_of(
         reason=reason,
         is_data=is_data,
         pause_after=pause_after,
-        where=tuple(
-            word
-            for option, value in zip(("--node", "--runtime-dir", "--connect"), at, strict=True)
-            if value is not None
-            for word in (option, str(value))
-        ),
+        where=where_of(at),
     )
 
 
@@ -230,6 +235,7 @@ def task_hand(
         task=task,
         cell=cell,
         door=find_door(runtime_dir, node, connect=connect),
+        where=where_of((node, runtime_dir, connect)),
         entry=entry,
         deadline_s=duration_s(deadline),
         reason=reason,

@@ -72,6 +72,12 @@ class HandOrder(Struct, frozen=True, kw_only=True):
     is_plan: bool = False
     is_yes: bool = False
     is_json: bool = False
+    where: tuple[str, ...] = ()
+    """The words that say which daemon is asked."""
+
+    def to(self, cell: str, *more: str) -> str:
+        """The command to that cell, as it is to be given again."""
+        return shlex.join(("zsched", "task", "hand", self.task, cell, *more, *self.where))
 
 
 class Side(Struct, frozen=True, kw_only=True):
@@ -105,12 +111,12 @@ class Way(Struct, frozen=True, kw_only=True):
     def on(self) -> str:
         """The command that takes it on, given again."""
         more = () if self.order.entry is None else ("--entry", self.order.entry)
-        return shlex.join(("zsched", "task", "hand", self.task, self.there.name, *more))
+        return self.order.to(self.there.name, *more)
 
     @property
     def back(self) -> str:
         """The command that takes it back."""
-        return shlex.join(("zsched", "task", "hand", self.task, self.here.name))
+        return self.order.to(self.here.name)
 
     def tell(self, text: str) -> None:
         """A step that is done, for people; programs read the end."""
@@ -147,7 +153,7 @@ def told_task(status: Json, task: TaskId) -> Json:
 
 def by_file(way: Way) -> str:
     """What to do where the other cell cannot have the entry as it is here."""
-    again = shlex.join(("zsched", "task", "hand", way.task, way.order.cell, "--entry", "FILE"))
+    again = way.order.to(way.there.name, "--entry", "FILE")
     return f"write the entry as it shall be there, below the one key `tasks`: {again}"
 
 

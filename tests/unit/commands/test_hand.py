@@ -884,6 +884,14 @@ def test_nobody_is_told_that_it_has_stopped_before_it_has(site: Site) -> None:
     assert "`zsched task hand echo hall-b` goes on" in refused.stderr
 
 
+def test_the_command_that_goes_on_names_the_daemon_that_was_asked(site: Site) -> None:
+    """From a machine of the other cell: there, without that word, there would be nothing to do."""
+    site.here.outcomes = ["no_quorum"]
+    refused = run("hall-b", "-y", "--node", "robot1")
+    assert "`zsched task hand echo hall-b --node robot1` goes on" in refused.stderr
+    assert "`zsched task hand echo hall-a --node robot1` takes it back" in refused.stderr
+
+
 def test_a_mark_that_keeps_another_task_too_gives_nothing_away(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     site.make_exclusive()
     leave_under_way(site, monkeypatch, "_taken")
