@@ -479,8 +479,12 @@ def _not_there(way: Way, *, is_out: bool) -> str:
         _RefusedError: the other cell has it again.
     """
     task, there = way.task, way.there
-    _mark(way, document_text(in_force(way.here.door)))
-    revision = _agree(way, there, lambda text: remove_task(text, task) if has_task(text, task) else text)
+
+    def without(text: str) -> str:
+        _mark(way, document_text(in_force(way.here.door)))
+        return remove_task(text, task) if has_task(text, task) else text
+
+    revision = _agree(way, there, without)
     if revision is not None:
         way.tell(f"{there.name}: revision {revision} is agreed, without {task}")
     if is_out and (lack := _not_over(way, there)):

@@ -403,7 +403,7 @@ def test_a_cell_that_does_not_get_it_ready_gives_it_back(site: Site, is_exclusiv
 def test_what_is_missing_is_told_while_it_waits(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hand_steps, "LONG_S", 0.0)
     site.there.is_ready = False
-    refused = run("hall-b", "-y", "--deadline", "0.2s")
+    refused = run("hall-b", "-y", "--deadline", "1s")
     assert refused.stdout.count("echo: waits, for at most ") == 1
     assert refused.stdout.count(": the worker on robot3 is starting") == 1
 
