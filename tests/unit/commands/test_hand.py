@@ -621,6 +621,7 @@ def test_an_elector_that_has_not_heard_of_the_task_yet_may_still_grant_it_a_leas
     """It learns of its creation before it learns of its end."""
     told = {"fleet_revision": 3, "tasks": []}
     assert [hand_steps._is_rid(told, revision, "echo") for revision in (3, 4)] == [True, False]
+    assert not hand_steps._is_rid({**told, "tasks": [{"name": "echo"}]}, 3, "echo")
 
 
 # --- two commands, and a change that may or may not have been agreed --------------------------------------------------
