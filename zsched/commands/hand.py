@@ -126,6 +126,8 @@ def _other(text: str, order: HandOrder, name: str) -> Side:
     if cell is None:
         known = [one.name for one in fleet.cells]
         hint = nearest(name, known) if known else f"; fleet {fleet.name} names no other under `site:`"
+        if mark_of(text, order.task) is not None:
+            hint = f", and {order.task} is on its way there; name it under `site:` again: zsched edit"
         raise CliError(EXIT_USAGE, f"the site has no cell {name!r}{hint}")
     here = None if order.door.endpoint else order.door
     return Side(name=name, door=door_of(cell, fleet.name, here))

@@ -893,6 +893,18 @@ def test_the_command_that_goes_on_names_the_daemon_that_was_asked(site: Site) ->
     assert "`zsched task hand echo hall-a --node robot1` takes it back" in refused.stderr
 
 
+@pytest.mark.parametrize("cell", ["hall-a", "hall-b"])
+def test_a_cell_that_the_site_names_no_more_is_to_be_named_again(
+    site: Site, monkeypatch: pytest.MonkeyPatch, cell: str
+) -> None:
+    leave_under_way(site, monkeypatch)
+    site.here.text = site.here.text.replace("site:\n  hall-b:", "site:\n  hall-c:")
+    refused = run(cell, "-y")
+    told = " ".join(refused.stderr.split())
+    assert refused.exit_code == 2
+    assert "no cell 'hall-b', and echo is on its way there; name it under `site:` again: zsched edit" in told
+
+
 def test_a_mark_that_keeps_another_task_too_gives_nothing_away(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     site.make_exclusive()
     leave_under_way(site, monkeypatch, "_taken")
