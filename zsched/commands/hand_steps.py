@@ -269,7 +269,7 @@ def _begun(way: Way, text: str) -> str:
 def _mark(way: Way, text: str) -> Mark:
     """This command's mark in the document of this cell. Raises `_OvertakenError`: it is another one's, or gone."""
     mark = mark_of(text, way.task)
-    if mark is None or (mark.cell, mark.by) != (way.there.name, way.run):
+    if mark is None or mark.by != way.run:
         told = f"{way.task} is no more on its way from {way.here.name} to {way.there.name} by this command"
         advice = "somebody else has taken that over, or brought it to its end; `zsched site` tells where it is"
         raise _OvertakenError(EXIT_FAILED, f"{told}: {advice}")

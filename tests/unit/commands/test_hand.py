@@ -22,7 +22,8 @@ from zsched.cli import app
 from zsched.clock import monotonic_s
 from zsched.commands import hand, hand_steps
 from zsched.commands.ask import Door
-from zsched.config.handing import mark_of
+from zsched.config.editing import task_entry
+from zsched.config.handing import Mark, mark_of, marked
 from zsched.config.load import check_bytes
 from zsched.core.values.document import MAX_DOCUMENT_BYTES, Document, Text
 from zsched.core.values.electorate import Creation, Elector
@@ -795,7 +796,7 @@ def test_a_node_that_is_cut_off_from_its_cell_does_not_give_an_exclusive_task_aw
 # --- what changes while the question stands, and what could not be taken back -----------------------------------------
 
 
-@pytest.mark.parametrize("what", ["exclusive", "another entry", "its own"])
+@pytest.mark.parametrize("what", ["exclusive", "another entry", "its own", "another cell"])
 def test_what_was_changed_while_the_question_stood_is_looked_at_again(
     site: Site, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
@@ -804,6 +805,8 @@ def test_what_was_changed_while_the_question_stood_is_looked_at_again(
             site.make_exclusive()
         elif what == "another entry":
             site.here.text = A.replace("{cpu: 0.5, memory: 0.5}", "{cpu: 1}")
+        elif what == "another cell":
+            site.here.text = marked(A, Mark(task="echo", cell="hall-c", entry=task_entry(A, "echo"), by="0123abcd"))
         else:
             site.there.text = B + ENTRY
 
