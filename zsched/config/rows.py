@@ -16,7 +16,6 @@ from typing import Final
 from zsched.config.reader import Mapping, Node, Scalar, Sequence
 from zsched.core.values.struct import Struct
 
-
 _BREAKS: Final = {ord(char): f"\\u{ord(char):04x}" for char in "\x85\u2028\u2029"}
 """To YAML they end a line, of a comment, too; JSON leaves them as they are."""
 
