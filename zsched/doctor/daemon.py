@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import Final
 
 from zsched import __version__
+from zsched.config.handing import marks_of
 from zsched.core.scheduler.flags import HANDS_OVER, told_flag
 from zsched.core.values.document import Flag, FlagKind
 from zsched.doctor.model import Json, Result, Scene, failed, joined, passed, skipped, warned
@@ -91,7 +92,7 @@ def _told(name: str, flag: Json) -> str:
 
 
 def tasks_have_owners(scene: Scene) -> Result:
-    """Whether each task has an owner that is alive, and the electors could choose another."""
+    """Whether each task has a living owner, the electors could choose another, and none is between two cells."""
     status, quorum = scene.status, scene.status["quorum"]
     found = []
     if not quorum["ok"]:
@@ -103,6 +104,11 @@ def tasks_have_owners(scene: Scene) -> Result:
             told = f"{task['name']} has no owner" if owner is None else f"{task['name']}: its owner {owner} is {state}"
             fix = f"zsched explain {task['name']} names why each candidate cannot have it"
             found.append(failed(told, fix=fix))
+    for mark in marks_of(scene.text):
+        told = f"{mark.task} is on its way to {mark.cell}, and stays so unless somebody's `zsched task hand` is at work"
+        verb = f"zsched task hand {mark.task}"
+        fix = f"{verb} {mark.cell} goes on, {verb} {status['fleet']} takes it back"
+        found.append(warned(told, fix=fix))
     owners = ", ".join(f"{task['name']} on {task['owner']}" for task in status["tasks"])
     return joined(
         found, passed(f"{owners}; {quorum['alive']} of {quorum['electors']} electors, {quorum['needed']} needed")
