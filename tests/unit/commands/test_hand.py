@@ -150,6 +150,7 @@ class Hall:
             return {"outcome": self.outcomes.pop(0), "detail": "as told", "revision": self.revision}
         if not self.is_whole:
             return {"outcome": "no_quorum", "detail": "as told", "revision": self.revision}
+        assert request["rollouts"] == self.rollouts
         self._take(request["text"])
         if self.has:
             self.behind.clear()  # the cut has healed
@@ -762,17 +763,59 @@ def test_an_end_here_that_may_come_about_later_cannot_once_it_is_taken_back(
 def test_a_task_that_is_ending_here_is_not_taken_out_there(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     """Who takes it back waits for the other cell; meanwhile somebody brings the task to its end."""
     leave_under_way(site, monkeypatch)
-    name = "bring_back"
-    real = getattr(hand, name)
+    real = hand_steps._check_restored
 
-    def overtaken(way: Any) -> None:
-        monkeypatch.setattr(hand, name, real)
+    def overtaken(way: Any, text: str) -> None:
+        real(way, text)
         assert CliRunner().invoke(app, ["task", "hand", "echo", "hall-b", "-y"]).exit_code == 0
-        real(way)
 
-    monkeypatch.setattr(hand, name, overtaken)
+    monkeypatch.setattr(hand_steps, "_check_restored", overtaken)
     refused = run("hall-a", "-y")
     assert (refused.exit_code, "brought it to its end" in refused.stderr) == (1, True)
+    check_arrived(site)
+
+
+@pytest.mark.parametrize("is_exclusive", [False, True])
+def test_a_task_that_this_cell_has_again_and_that_may_not_be_in_both_is_not_given_away(
+    site: Site, monkeypatch: pytest.MonkeyPatch, is_exclusive: bool
+) -> None:
+    """A document was applied that keeps the mark."""
+    if is_exclusive:
+        site.make_exclusive()
+    real = hand_steps._given
+
+    def applied(way: Any, text: str) -> str:
+        tasks = ENTRY if is_exclusive else ""
+        more = "" if is_exclusive else "    exclusive: true\n"
+        site.here.text = site.here.text.replace("tasks:\n", f"tasks:\n{tasks}", 1)
+        site.here.text = site.here.text.replace("  echo:  # answers\n", f"  echo:  # answers\n{more}", 1)
+        return real(way, text)
+
+    monkeypatch.setattr(hand_steps, "_given", applied)
+    refused = run("hall-b", "-y")
+    assert (refused.exit_code, "it is exclusive, and hall-a has it again" in refused.stderr) == (1, True)
+    assert (site.has[0], mark_of(site.here.text, "echo")) == (True, None)
+    assert "echo" not in site.there.text
+
+
+def test_a_task_that_this_cell_has_again_is_not_waited_out(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    site.make_exclusive()
+    real = hand_steps._not_over
+
+    def applied(*given: Any) -> str:
+        site.here.text = site.here.text.replace("tasks:\n", f"tasks:\n{ENTRY}", 1)
+        return real(*given)
+
+    monkeypatch.setattr(hand_steps, "_not_over", applied)
+    refused = run("hall-b", "-y", "--deadline", "20s")
+    assert (refused.exit_code, "hall-a has a task echo again" in refused.stderr) == (1, True)
+    assert site.there.text == B
+
+
+def test_changed_workers_that_wait_for_a_look_go_on_waiting(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hand_steps, "kept_rollouts", lambda held, _fleet: held)
+    site.here.rollouts, site.there.rollouts = [{"task": "other"}], [{"task": "sweep"}]
+    assert run("hall-b", "-y").exit_code == 0  # the stand-ins look for them in each change
     check_arrived(site)
 
 
