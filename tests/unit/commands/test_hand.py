@@ -663,6 +663,8 @@ def test_a_command_that_slept_before_its_change_there_finds_that_it_was_taken_ba
     site.check(is_exclusive=is_exclusive)
     assert refused.exit_code == 1
     assert "somebody else has taken that over, or brought it to its end" in refused.stderr
+    assert "goes on" not in refused.stderr
+    assert "it is taken back" not in refused.stderr
     assert (site.has, site.there.text) == ((True, False), B)
     assert sorted_tasks(site.here.text) == sorted_tasks(first)
 
