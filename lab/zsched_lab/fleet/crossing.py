@@ -13,6 +13,7 @@ from typing import Any, Final
 
 import zenoh
 
+from zsched.guard import guarded
 from zsched_lab.fleet.testbed import SCHEDULING, Json, Testbed, echo_fleet
 
 GIVING, TAKING = "hall-a", "hall-b"
@@ -95,7 +96,7 @@ class Ends:
             while not end.wait(0.02):
                 self.send()
 
-        thread = threading.Thread(target=run)
+        thread = guarded(run, name="sending", is_lasting=False)
         thread.start()
         try:
             yield
