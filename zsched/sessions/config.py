@@ -48,6 +48,14 @@ TX_THREADS: Final = 4
 DEFAULT_TIMING: Final = Timing()
 
 Settings = dict[str, Any]
+_WAIT_BEFORE_CLOSE: Final = "transport/link/tx/queue/congestion_control/block/wait_before_close"
+WAIT_S: Final = 5.0
+"""How long a message that must not be dropped waits for room at a link before zenoh ends it; zenoh's default.
+
+On the control session no longer than a peer may be silent. While one waits, nobody else may use that link's queue, not
+even zenoh to close it, and nobody dials that peer anew (1.10.2): some dozen answers to questions of a peer whose link
+had ended, one after another, kept it away for minutes.
+"""
 DROP_WAIT_S: Final = 0.05
 """How long a put with congestion control DROP waits for room at one link (zenoh's default is 1 ms).
 
@@ -84,6 +92,7 @@ def control_config(
     settings["connect/retry"] = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
     settings["transport/link/tx/lease"] = round(timing.control_lease_s * 1000)
     settings["transport/link/tx/keep_alive"] = CONTROL_KEEP_ALIVE
+    settings[_WAIT_BEFORE_CLOSE] = round(1e6 * min(timing.suspect_s, WAIT_S))
     settings["transport/shared_memory/enabled"] = False
     settings["transport/link/rx/max_message_size"] = CONTROL_MAX_MESSAGE
     _set_gossip(settings, dials=dials_by_gossip)

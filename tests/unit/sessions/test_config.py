@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 import zenoh
 
+from zsched.config.timing import PROFILES
 from zsched.core.values.fleet import Timing, WorkerLink
 from zsched.sessions.config import (
     client_config,
@@ -141,6 +142,15 @@ def test_a_daemon_has_one_pool_with_a_thread_for_every_link() -> None:
 def test_a_relay_reads_the_links_that_it_has_dialled_with_as_many_threads_as_those_that_dial_it() -> None:
     """zenoh gives a socket to the pool that opened it: ``net`` where we dial, ``rx`` where we are dialled."""
     assert relay_pools(7) == "(rx: (worker_threads: 7), tx: (worker_threads: 7), net: (worker_threads: 7))"
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_a_control_message_waits_for_room_no_longer_than_a_peer_may_be_silent(profile: str) -> None:
+    """zenoh ends such a link, and until then nobody else may use its queue, not even to end it."""
+    timing = PROFILES[profile]
+    path = "transport/link/tx/queue/congestion_control/block/wait_before_close"
+    assert read(control_config(listen=(HERE,), connect=(THERE,), timing=timing), path) == round(1e6 * timing.suspect_s)
+    assert read(data_config(listen=(HERE,), connect=(THERE,), timing=timing), path) == 5_000_000
 
 
 def test_control_sessions_that_know_every_address_do_not_dial_by_gossip() -> None:
