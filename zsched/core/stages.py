@@ -275,28 +275,25 @@ class Stages:
 
     def heard_candidates(self, spec: TaskSpec, now: float) -> Mapping[NodeId, Profile]:
         """{candidate: its fresh profile} of the living ones, this node left out, and those that take nothing new."""
-        able = [name for name in spec.candidates if name not in self.flags.closed]
-        living = [name for name in able if self.membership.state(name) is PeerState.ALIVE]
-        profiles = ((name, self.gateway.fresh(name, now)) for name in living if name != self.me)
-        return {name: profile for name, profile in profiles if profile is not None}
+        return {name: profile for name, profile in self._heard(spec, now) if name not in self.flags.closed}
+
+    def _heard(self, spec: TaskSpec, now: float) -> Iterator[tuple[NodeId, Profile]]:
+        """The other living candidates with a fresh profile."""
+        for name in spec.candidates:
+            if name != self.me and self.membership.state(name) is PeerState.ALIVE:
+                profile = self.gateway.fresh(name, now)
+                if profile is not None:
+                    yield name, profile
 
     def _doubts(self, spec: TaskSpec, now: float) -> Doubts:
         in_grace, unproven = self.membership.in_grace(), self.probation.doubts(spec, now)
         unfit = self.agreement.leases.unfit() if self.executors[spec.name].is_leased else {}
-        unseen = self.unseen.look(spec, self._ready(spec, now), self.probation, now)
+        loads = ((name, profile.worker(spec.name)) for name, profile in self._heard(spec, now))
+        ready = (name for name, load in loads if load is not None and load.state is WorkerState.READY)
+        unseen = self.unseen.look(spec, ready, self.probation, now)
         if not in_grace and not unproven and not unfit and not unseen:
             return NO_DOUBTS
         return Doubts(in_grace=in_grace, unproven=unproven, unseen=unseen, unfit=unfit)
-
-    def _ready(self, spec: TaskSpec, now: float) -> Iterator[NodeId]:
-        """The other living candidates whose newest word is that the worker is ready."""
-        for name in spec.candidates:
-            if name == self.me or self.membership.state(name) is not PeerState.ALIVE:
-                continue
-            profile = self.gateway.fresh(name, now)
-            load = None if profile is None else profile.worker(spec.name)
-            if load is not None and load.state is WorkerState.READY:
-                yield name
 
     def set_problem(self, source: str, problem: str | None) -> None:
         """Show a problem in the status, or (``None``) that it is over."""

@@ -88,7 +88,7 @@ def _adopt_nodes(node: Stages, fleet: Fleet) -> None:
         del node.problems[source]  # the next beats say it again, where it is still so
     node.gateway.adopt(fleet)
     node.probation.adopt(fleet)
-    node.unseen.adopt(frozenset(task.name for task in fleet.tasks))
+    node.unseen.adopt({task.name for task in fleet.tasks})
 
 
 def _adopt_choice(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:

@@ -13,7 +13,9 @@ Workers that show no token before they own the task say nothing here.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
+from collections.abc import Set as AbstractSet
 
 from zsched.core.scheduler.probation import Probation, shows_token
 from zsched.core.values.fleet import TaskSpec
@@ -24,7 +26,6 @@ UNSEEN_S = 10.0
 """As long as a link may take to come back (`zsched.core.scheduler.probation.LIMIT_S`)."""
 LONGEST_GAP_S = 5.0
 """Nobody has looked for so long: this node stood still, and its links may be as old."""
-NOBODY: frozenset[NodeId] = frozenset()
 
 
 class Unseen(Struct):
@@ -34,19 +35,19 @@ class Unseen(Struct):
     """{task: the candidates that were found so when last looked}."""
     _since: dict[TaskId, dict[NodeId, float]] = field(default_factory=dict)
     """{task: {candidate: since when its worker is ready and unseen}}."""
-    _looked_at: dict[TaskId, float] = field(default_factory=dict)
+    _looked_at: float = -math.inf
+    """When last, for any task: all are looked at together."""
 
     def forget(self) -> None:
         """Our relay is another one: it tells anew what it sees."""
         self._since.clear()
         self.found.clear()
 
-    def adopt(self, tasks: frozenset[TaskId]) -> None:
+    def adopt(self, tasks: AbstractSet[TaskId]) -> None:
         """What was known of other tasks is forgotten."""
-        for task in [task for task in self._looked_at if task not in tasks]:
-            del self._looked_at[task]
+        for task in [task for task in self.found if task not in tasks]:
+            del self.found[task]
             self._since.pop(task, None)
-            self.found.pop(task, None)
 
     def look(self, spec: TaskSpec, ready: Iterable[NodeId], tokens: Probation, now: float) -> frozenset[NodeId]:
         """The candidates that no stream reaches, as far as it can be told.
@@ -57,15 +58,12 @@ class Unseen(Struct):
             tokens: knows which workers our relay sees.
             now: monotonic seconds.
         """
-        if not shows_token(spec):
-            return NOBODY
-        is_seen = {name: tokens.sees(name, spec.name) for name in ready}
-        known = self._since.get(spec.name, {})
-        if now - self._looked_at.get(spec.name, now) > LONGEST_GAP_S:
-            known = {}
-        self._looked_at[spec.name] = now
+        if now - self._looked_at > LONGEST_GAP_S:
+            self._since.clear()
+        self._looked_at = now
+        is_seen = {name: tokens.sees(name, spec.name) for name in ready} if shows_token(spec) else {}
         missed = [name for name, seen in is_seen.items() if not seen] if any(is_seen.values()) else []
-        self._since[spec.name] = {name: known.get(name, now) for name in missed}
-        found = frozenset(name for name, since in self._since[spec.name].items() if now - since >= UNSEEN_S) or NOBODY
-        self.found[spec.name] = found
+        known = self._since.get(spec.name, {})
+        since = self._since[spec.name] = {name: known.get(name, now) for name in missed}
+        found = self.found[spec.name] = frozenset(name for name, at in since.items() if now - at >= UNSEEN_S)
         return found

@@ -108,6 +108,14 @@ def test_workers_that_show_no_token_before_they_own_the_task_say_nothing(worker:
     assert Robot("edge2", spec=replace(TASK, worker=worker)).pass_time(60.0) == set()
 
 
+def test_nothing_is_told_any_more_of_a_task_whose_workers_show_no_token_from_now_on() -> None:
+    robot = Robot("edge2")
+    robot.pass_time(UNSEEN_S)
+    robot.spec = replace(TASK, worker=WorkerSpec(command=("true",), standby=Standby.COLD))
+    assert robot.look() == set()
+    assert robot.unseen.found == {"merge": set()}
+
+
 def test_a_task_that_is_gone_is_forgotten() -> None:
     robot = Robot("edge2")
     robot.pass_time(UNSEEN_S)
