@@ -11,15 +11,13 @@ from __future__ import annotations
 
 import contextlib
 import subprocess
-import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
 from zsched import paths
 from zsched.clock import monotonic_s
 from zsched.commands.apply import OPEN_NETWORK
-from zsched.commands.ask import Door, ask_door, close_sessions, door_of, find_door, fleet_here
+from zsched.commands.ask import Door, ask_door, door_of, find_door, fleet_here
 from zsched.commands.common import CliError, Json, check_reason, nearest, warn
 from zsched.commands.document import (
     ConflictError,
@@ -35,6 +33,7 @@ from zsched.commands.document import (
 )
 from zsched.commands.entries import HERE
 from zsched.commands.flags import LEAVE, NO_OTHER, DrainOrder, check_drain, drain, undrain
+from zsched.commands.lacks import UselessError, wait_for
 from zsched.commands.leave import (
     DANGERS,
     LeaveOrder,
@@ -73,11 +72,8 @@ from zsched.wire.invitation import Invitation
 
 INVITE: Final = ".invite"
 """The end of an invitation's name, as the advice writes it."""
-PAUSE_S: Final = 0.2
 REACH_S: Final = 60.0
 """How long the next cell is asked by the node's new certificate: its daemons begin again in turns to let it in."""
-LONG_S: Final = 3.0
-"""Of a silence that is told: a cell that lets the node in answers at once, or begins again first."""
 TAKE_S: Final = 60.0
 """How long the next cell may take to count the node, once its daemon runs there; then it goes back."""
 SYSTEMD: Final = Path("/run/systemd/system")
@@ -391,7 +387,7 @@ def _wait_for_the_next(way: Way, going: Change) -> None:
     back = f"{way.me} works on in {going.former}; `zsched leave --to {going.former}` takes back what was begun"
     asked = f"{fleet} is asked to let {way.me} in, for at most {REACH_S:g} s"
     try:
-        lack = _wait(look, REACH_S, lambda lack: way.tell(f"{asked}: {lack}"))
+        lack = wait_for(look, REACH_S, lambda lack, _left_s: way.tell(f"{asked}: {lack}"), is_told_once=True)
     except KeyboardInterrupt:
         warn(f"broken off while {asked}; {back}, and the same command goes on")
         raise
@@ -401,7 +397,7 @@ def _wait_for_the_next(way: Way, going: Change) -> None:
         raise CliError(EXIT_FAILED, f"{fleet} does not let {way.me} in: {lack}{is_old}; {back}")
 
 
-class _TakenError(CliError):
+class _TakenError(UselessError):
     """Another machine has the name in the next cell: waiting does not help."""
 
 
@@ -412,29 +408,6 @@ def _taken(fleet: str, me: NodeId, state: str) -> str:
 def _door_by(fleet: str, addresses: tuple[str, ...], file: Path) -> Door:
     """To a cell, with what this machine keeps of it."""
     return door_of(Cell(name=fleet, gateways=addresses, file=str(file)), fleet, None)
-
-
-def _wait(look: Callable[[], str], for_s: float, tell: Callable[[str], None] | None = None) -> str:
-    """Look again and again until nothing is missing; what is missing still when the time is over.
-
-    ``tell`` is told once what is missing, where it takes long.
-    """
-    began = monotonic_s()
-    until = began + for_s
-    while True:
-        try:
-            lack = look()
-        except _TakenError:
-            raise
-        except (CliError, AdapterError, ConfigError) as error:
-            lack = str(error)
-            close_sessions()
-        if not lack or monotonic_s() > until:
-            return lack
-        if tell is not None and monotonic_s() >= began + LONG_S:
-            tell(lack)
-            tell = None
-        time.sleep(PAUSE_S)
 
 
 # --- from here on the former daemon has ended ------------------------------------------------------------------------
@@ -448,17 +421,17 @@ def _arrive(way: Way, going: Change) -> int:
         way.tell(f"{me}: {len(files)} files of {fleet} are written" if files else f"{me}: the files are {fleet}'s")
         if not _started(way):
             return _go_back(way, going, "its daemon does not start there")
-    lack = _wait(lambda: "" if _runs(way, fleet) else "its daemon does not run", _left_s(way))
+    lack = wait_for(lambda: "" if _runs(way, fleet) else "its daemon does not run", _left_s(way))
     if lack:
         start = "; ".join(how_to_start(me, order.places))
         again = f"then give `{order.verb}` again, or `zsched leave --to {going.former}` to go back"
         raise CliError(EXIT_TIMED_OUT, f"{me}: {lack}: {start}; {again}")
     way.tell(f"{me}: its daemon runs in {fleet}")
-    lack = _wait(lambda: _not_taken(way, fleet), TAKE_S)
+    lack = wait_for(lambda: _not_taken(way, fleet), TAKE_S)
     if lack:
         return _go_back(way, going, f"{fleet} has not taken it: {lack}")
     way.tell(f"{me}: {fleet} counts it, and its streams are settled")
-    lack = _wait(lambda: _not_forgotten(way, going), REACH_S)
+    lack = wait_for(lambda: _not_forgotten(way, going), REACH_S)
     if lack:
         told = f"{me} is ready in {fleet}, and {going.former} still names it: {lack}"
         raise CliError(EXIT_TIMED_OUT, f"{told}; give `{order.verb}` again, or there: zsched node forget {me}")
@@ -569,7 +542,7 @@ def _go_back(way: Way, going: Change, why: str) -> int:
         stop_daemon(there, fleet, f"{me} goes back")
     next_cell.go_back(going, order.places)
     _started(way)
-    lack = _wait(lambda: _not_back(way, going.former), max(_left_s(way), TAKE_S))
+    lack = wait_for(lambda: _not_back(way, going.former), max(_left_s(way), TAKE_S))
     if lack:
         told = f"{me} has its files of {going.former} again: {lack}"
         raise CliError(EXIT_TIMED_OUT, f"{told}; then: zsched undrain {me}")

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from typing import Final
 
 from zsched.clock import monotonic_s
-from zsched.commands.ask import Door, ask_door, close_sessions
+from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, print_json, say, warn
 from zsched.commands.document import (
     OVERTAKEN_S,
@@ -29,6 +29,7 @@ from zsched.commands.document import (
     status_of,
     wait_until_settled,
 )
+from zsched.commands.lacks import UselessError, wait_for
 from zsched.commands.membership import fleet_of
 from zsched.commands.orders import OrderView
 from zsched.commands.page import span
@@ -50,8 +51,6 @@ from zsched.wire.codec import from_plain
 
 SCHEMA: Final = "zsched.task.hand/1"
 PAUSE_S: Final = 0.2
-LONG_S: Final = 3.0
-"""Of something missing that is told."""
 BACK_S: Final = 60.0
 """How long each step of taking it back may take."""
 
@@ -128,11 +127,11 @@ class Way(Struct, frozen=True, kw_only=True):
         return max(self.order.deadline_s - (monotonic_s() - self.began), 0.0)
 
 
-class _RefusedError(CliError):
+class _RefusedError(UselessError):
     """The other cell cannot have the task as it is: waiting does not help."""
 
 
-class _OvertakenError(CliError):
+class _OvertakenError(UselessError):
     """The mark is another command's, or gone: this one may do nothing more."""
 
 
@@ -555,25 +554,9 @@ def _agree(way: Way, side: Side, make: Callable[[str], str]) -> int | None:
 
 
 def _wait(look: Callable[[], str], way: Way, for_s: float | None = None) -> str:
-    """Look again and again until nothing is missing; what is missing still when the time is over.
+    """As `wait_for`; ``for_s``: by default as long as the deadline lets it."""
 
-    What is missing is told where it takes long, and again when it is something else. ``for_s``: by default as long as
-    the deadline lets it.
-    """
-    began, told = monotonic_s(), ""
-    until = began + (way.left_s() if for_s is None else for_s)
-    while True:
-        try:
-            lack = look()
-        except (_RefusedError, _OvertakenError):
-            raise
-        except (CliError, AdapterError, ConfigError) as error:
-            lack = str(error)
-            close_sessions()
-        now = monotonic_s()
-        if not lack or now > until:
-            return lack
-        if now >= began + LONG_S and lack != told:
-            told = lack
-            way.tell(f"{way.task}: waits, for at most {span(until - now)}: {lack}")
-        time.sleep(PAUSE_S)
+    def tell(lack: str, left_s: float) -> None:
+        way.tell(f"{way.task}: waits, for at most {span(left_s)}: {lack}")
+
+    return wait_for(look, way.left_s() if for_s is None else for_s, tell)

@@ -17,7 +17,7 @@ from support.schemas import faults
 from zsched.adapters.host.operator_socket import Json, OperatorSocket
 from zsched.adapters.host.state_file import StateFile, sync_folder
 from zsched.cli import app
-from zsched.commands import change_cell, flags, leave
+from zsched.commands import change_cell, flags, lacks, leave
 from zsched.commands.ask import Door
 from zsched.commands.membership import Guest, invitation_for
 from zsched.config.editing import node_entry
@@ -204,7 +204,7 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
     for name, place in (("CONFIG", "etc/fleet.yaml"), ("STATE_DIR", "state"), ("RUNTIME_DIR", "run")):
         monkeypatch.setenv(f"ZSCHED_{name}", str(tmp_path / place))
     monkeypatch.delenv("ZSCHED_NODE", raising=False)
-    for module in (flags, leave, change_cell):
+    for module in (flags, leave, lacks):
         monkeypatch.setattr(module, "PAUSE_S", 0.001)
     for name in ("REACH_S", "TAKE_S"):
         monkeypatch.setattr(change_cell, name, 0.05)
@@ -544,7 +544,7 @@ def membership_invitation(folder: Path) -> Path:
 def test_a_cell_that_does_not_name_it_any_more_takes_nothing_from_it(
     site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(change_cell, "LONG_S", 0.0)
+    monkeypatch.setattr(lacks, "LONG_S", 0.0)
     monkeypatch.setattr(change_cell, "REACH_S", 2.0)
     there, here = site.cells["hall-b"], site.cells["hall-a"]
     there.text = B.replace("tasks:", f"  {ME}: {{kind: robot}}\ntasks:")
@@ -558,10 +558,10 @@ def test_a_cell_that_does_not_name_it_any_more_takes_nothing_from_it(
     assert refused.stdout.count("hall-b is asked to let robot3 in, for at most ") == 1, "it does not wait in silence"
     assert (here.done, site.running, whose(site.folder / "state")) == ([], "hall-a", ("hall-a", ME))
 
-    def ctrl_c(*_given: object) -> str:
+    def ctrl_c(*_given: object, **_more: object) -> str:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(change_cell, "_wait", ctrl_c)
+    monkeypatch.setattr(change_cell, "wait_for", ctrl_c)
     ended = run("--to", str(invitation), "--yes")
     assert ended.exit_code
     assert "broken off while hall-b is asked to let robot3 in" in ended.stderr

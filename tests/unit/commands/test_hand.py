@@ -6,7 +6,7 @@ import contextlib
 import copy
 import itertools
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from support.schemas import faults
 from zsched.adapters.host.operator_socket import Json, OperatorSocket
 from zsched.cli import app
 from zsched.clock import monotonic_s
-from zsched.commands import hand, hand_steps
+from zsched.commands import hand, hand_steps, lacks
 from zsched.commands.ask import Door
 from zsched.config.editing import task_entry
 from zsched.config.handing import Mark, mark_of, marked
@@ -210,12 +210,36 @@ class Site:
                 assert then_here or then_there
 
 
+def breaking(step: str, number: int = 0, *, is_after: bool = False) -> Callable[..., Any]:
+    """The step, broken off when it is called for the ``number``-th time (from 0), before or behind its work."""
+    real, left = getattr(hand_steps, step), [number]
+
+    def broken(*given: Any, **more: Any) -> Any:
+        left[0] -= 1
+        if left[0] >= 0:
+            return real(*given, **more)
+        if is_after:
+            real(*given, **more)
+        raise KeyboardInterrupt
+
+    return broken
+
+
+def leave_under_way(site: Site, monkeypatch: pytest.MonkeyPatch, step: str = "_lack", *words: str) -> None:
+    """Give the command, and break it off at the first call of a step."""
+    with monkeypatch.context() as patch:
+        patch.setattr(hand_steps, step, breaking(step))
+        CliRunner().invoke(app, ["task", "hand", "echo", "hall-b", "-y", *words])
+    assert mark_of(site.here.text, "echo") is not None
+
+
 @pytest.fixture
 def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
     monkeypatch.setenv("ZSCHED_RUNTIME_DIR", str(tmp_path / "run"))
     monkeypatch.delenv("ZSCHED_NODE", raising=False)
-    for name in ("PAUSE_S", "BACK_S"):
-        monkeypatch.setattr(hand_steps, name, {"PAUSE_S": 0.001, "BACK_S": 0.3}[name])
+    for module in (hand_steps, lacks):
+        monkeypatch.setattr(module, "PAUSE_S", 0.001)
+    monkeypatch.setattr(hand_steps, "BACK_S", 0.3)
     one = Site(tmp_path)
 
     def gate(cell: Cell, _fleet: str, _here: Door | None) -> Door:
@@ -327,18 +351,8 @@ def test_broken_off_anywhere_it_goes_on_or_is_taken_back(
     if is_exclusive:
         site.make_exclusive()
     first = site.here.text
-    real, left = getattr(hand_steps, step), [number]
-
-    def broken(*given: Any, **more: Any) -> Any:
-        left[0] -= 1
-        if left[0] >= 0:
-            return real(*given, **more)
-        if is_after:
-            real(*given, **more)
-        raise KeyboardInterrupt
-
     with monkeypatch.context() as patch:
-        patch.setattr(hand_steps, step, broken)
+        patch.setattr(hand_steps, step, breaking(step, number, is_after=is_after))
         ended = CliRunner().invoke(app, ["task", "hand", "echo", "hall-b", "-y"])
         assert ended.exit_code != 0
         assert "broken off" in ended.stderr
@@ -364,19 +378,9 @@ def test_a_way_back_that_was_broken_off_goes_on_either_way(
 ) -> None:
     if is_exclusive:
         site.make_exclusive()
-    real, left = getattr(hand_steps, AGREED), [2 + number]
     site.there.is_ready = False
-
-    def broken(*given: Any, **more: Any) -> Any:
-        left[0] -= 1
-        if left[0] >= 0:
-            return real(*given, **more)
-        if is_after:
-            real(*given, **more)
-        raise KeyboardInterrupt
-
     with monkeypatch.context() as patch:
-        patch.setattr(hand_steps, AGREED, broken)
+        patch.setattr(hand_steps, AGREED, breaking(AGREED, 2 + number, is_after=is_after))
         assert CliRunner().invoke(app, ["task", "hand", "echo", "hall-b", "-y", "--deadline", "0.1s"]).exit_code != 0
     site.there.is_ready = True
     done = run("hall-b", "-y")
@@ -403,7 +407,7 @@ def test_a_cell_that_does_not_get_it_ready_gives_it_back(site: Site, is_exclusiv
 
 
 def test_what_is_missing_is_told_while_it_waits(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(hand_steps, "LONG_S", 0.0)
+    monkeypatch.setattr(lacks, "LONG_S", 0.0)
     site.there.is_ready = False
     refused = run("hall-b", "-y", "--deadline", "1s")
     assert refused.stdout.count("echo: waits, for at most ") == 1
@@ -481,13 +485,7 @@ def test_its_own_cell_s_name_has_nothing_to_do_for_a_task_that_is_not_on_its_way
 
 def test_a_task_on_its_way_goes_nowhere_else(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     site.here.text = A + "  hall-c: {gateways: [tcp/127.0.0.1:1, tcp/127.0.0.1:2]}\n"
-
-    def broken(*_given: object) -> str:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(hand_steps, "_lack", broken)
-        CliRunner().invoke(app, ["task", "hand", "echo", "hall-b", "-y"])
+    leave_under_way(site, monkeypatch)
     wrong = run("hall-c", "-y")
     assert (wrong.exit_code, "echo is on its way from hall-a to hall-b" in wrong.stderr) == (2, True)
     assert "between hall-a and hall-b" in run("hall-a", "--plan").stdout
@@ -556,13 +554,7 @@ def test_an_entry_for_the_other_cell_comes_from_a_file(
     wrong = run("hall-b", "-y", "--entry", str(file))
     assert (wrong.exit_code, "it holds other, and echo alone is handed over" in wrong.stderr) == (2, True)
     file.write_text("tasks:\n  echo: {candidates: [robot3], weights: {cpu: 1}}\n")
-
-    def broken(*_given: object) -> str:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(hand_steps, "_lack", broken)
-        CliRunner().invoke(app, ["task", "hand", "echo", "hall-b", "-y", "--entry", str(file)])
+    leave_under_way(site, monkeypatch, "_lack", "--entry", str(file))
     other = tmp_path / "other.yaml"
     other.write_text("tasks:\n  echo: {candidates: [robot4], weights: {cpu: 1}}\n")
     refused = run("hall-b", "-y", "--entry", str(other))
@@ -574,13 +566,7 @@ def test_an_entry_for_the_other_cell_comes_from_a_file(
 
 def test_an_exclusive_task_in_both_documents_is_nobody_s_to_hand(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     site.make_exclusive()
-
-    def broken(*_given: object) -> str:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(hand_steps, "_lack", broken)
-        CliRunner().invoke(app, ["task", "hand", "echo", "hall-b", "-y"])
+    leave_under_way(site, monkeypatch)
     site.here.text = site.here.text.replace("tasks:\n", "tasks:\n" + ENTRY, 1)  # an operator applied the old file
     refused = run("hall-b", "-y")
     assert (refused.exit_code, "stands in the documents of both cells" in refused.stderr) == (1, True)
@@ -594,13 +580,7 @@ def test_a_document_that_forgets_what_is_on_its_way_is_a_danger(
         site.make_exclusive()
     file = tmp_path / "old.yaml"
     file.write_text(site.here.text)
-
-    def broken(*_given: object) -> str:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(hand_steps, "_lack", broken)
-        CliRunner().invoke(app, ["task", "hand", "echo", "hall-b", "-y"])
+    leave_under_way(site, monkeypatch)
     on_its_way = site.here.text
     refused = CliRunner().invoke(app, ["apply", str(file), "--yes"])
     told = " ".join(refused.stderr.split())
@@ -627,18 +607,6 @@ def test_an_elector_that_has_not_heard_of_the_task_yet_may_still_grant_it_a_leas
 
 
 # --- two commands, and a change that may or may not have been agreed --------------------------------------------------
-
-
-def leave_under_way(site: Site, monkeypatch: pytest.MonkeyPatch, step: str = "_lack") -> None:
-    """Give the command, and break it off at the first call of a step."""
-
-    def broken(*_given: object) -> str:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(hand_steps, step, broken)
-        CliRunner().invoke(app, ["task", "hand", "echo", "hall-b", "-y"])
-    assert mark_of(site.here.text, "echo") is not None
 
 
 @pytest.mark.parametrize("is_exclusive", [False, True])
