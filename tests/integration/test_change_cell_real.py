@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Iterator
 from functools import partial
@@ -120,13 +119,6 @@ class Site:
     def stop(self) -> None:
         for hall in self.halls.values():
             hall.stop()
-
-
-@pytest.fixture
-def folder() -> Iterator[Path]:
-    """With a short name: of a fleet in each of two folders of ``tmp_path`` a socket's path can be too long (107)."""
-    with tempfile.TemporaryDirectory(prefix="cells-") as name:
-        yield Path(name)
 
 
 @pytest.fixture

@@ -6,9 +6,7 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import Iterator
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -124,13 +122,6 @@ class Site:
     def stop(self) -> None:
         for hall in self.halls.values():
             hall.stop()
-
-
-@pytest.fixture
-def folder() -> Iterator[Path]:
-    """With a short name: of a fleet in each of two folders of ``tmp_path`` a socket's path can be too long (107)."""
-    with tempfile.TemporaryDirectory(prefix="cells-") as name:
-        yield Path(name)
 
 
 def test_a_task_goes_over_while_both_cells_streams_run_and_the_command_is_killed(folder: Path) -> None:

@@ -775,14 +775,21 @@ def test_after_ready_no_input_or_service_is_taken_any_more(relay: Relay, tmp_pat
             worker.serve("{prefix}/ask", lambda _request: b"")
 
 
-def test_an_output_that_no_rule_takes_is_told_to_the_node_once_the_worker_is_the_owner(
-    relay: Relay, tmp_path: Path
-) -> None:
-    told: list[WorkerTrouble] = []
+@pytest.fixture
+def told(relay: Relay) -> Iterator[list[WorkerTrouble]]:
+    """What workers of edge1 tell of their troubles."""
+    found: list[WorkerTrouble] = []
     heard = relay.session.declare_subscriber(
         KEYS.trouble("edge1", "*", "*"),
-        lambda sample: told.append(wire.decode(sample.payload.to_bytes(), WorkerTrouble)),
+        lambda sample: found.append(wire.decode(sample.payload.to_bytes(), WorkerTrouble)),
     )
+    yield found
+    heard.undeclare()
+
+
+def test_an_output_that_no_rule_takes_is_told_to_the_node_once_the_worker_is_the_owner(
+    relay: Relay, told: list[WorkerTrouble], tmp_path: Path
+) -> None:
     env = {**environment(relay, tmp_path), "ZSCHED_OUTPUT_KEYS": '["edge1/t/*/out"]'}
     with Worker.from_env(env, handles_signals=False) as worker:
         worker.publisher("{prefix}/{epoch}/out")
@@ -796,16 +803,12 @@ def test_an_output_that_no_rule_takes_is_told_to_the_node_once_the_worker_is_the
         until(lambda: told, "the mistake")
     text = "puts on edge1/t/out, which no output rule takes: the rules take edge1/t/*/out"
     assert told[0] == WorkerTrouble(task="t", incarnation="3", count=0, text=text)
-    heard.undeclare()
 
 
-def test_an_output_that_no_rule_takes_is_told_at_once_where_an_owner_declares_it(relay: Relay, tmp_path: Path) -> None:
+def test_an_output_that_no_rule_takes_is_told_at_once_where_an_owner_declares_it(
+    relay: Relay, told: list[WorkerTrouble], tmp_path: Path
+) -> None:
     """A worker that declares an output in its first callback is the owner already: no role comes that would tell."""
-    told: list[WorkerTrouble] = []
-    heard = relay.session.declare_subscriber(
-        KEYS.trouble("edge1", "*", "*"),
-        lambda sample: told.append(wire.decode(sample.payload.to_bytes(), WorkerTrouble)),
-    )
     env = {**environment(relay, tmp_path), "ZSCHED_OUTPUT_KEYS": '["edge1/t/*/out"]'}
     with Worker.from_env(env, handles_signals=False) as worker:
         worker.ready()
@@ -817,4 +820,3 @@ def test_an_output_that_no_rule_takes_is_told_at_once_where_an_owner_declares_it
         until(lambda: told, "the mistake")
     text = "puts on edge1/t/{epoch}/uot, which no output rule takes: the rules take edge1/t/*/out"
     assert told[0] == WorkerTrouble(task="t", incarnation="3", count=0, text=text)
-    heard.undeclare()
