@@ -13,6 +13,7 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Iterable
+from functools import lru_cache
 from typing import Final, TypeAlias
 
 from zsched.core.values.struct import Struct, field
@@ -23,6 +24,10 @@ _MAX_DEPTH: Final = 32
 _MAX_SHOWN: Final = 200
 _MAX_COMPARED: Final = 300
 """More names than these are not searched for the nearest one: a long wrong list must not take minutes."""
+_MAX_KEPT: Final = 4
+"""Texts that are parsed once only: a verb that changes a document reads it, and what it becomes, dozens of times."""
+_MAX_KEPT_CHARS: Final = 16 << 10
+"""Longer texts are parsed each time: nodes take twelve times a text's room."""
 _LINE_BREAK: Final = re.compile("\r\n|[\n\r\x85\u2028\u2029]")
 """YAML's own line breaks, so that our lines are its lines."""
 
@@ -276,7 +281,18 @@ def read_yaml(data: bytes) -> tuple[Node | None, Collector]:
         out.error(_end_of(good), f"byte 0x{data[error.start]:02x} is not UTF-8", "save the file as UTF-8")
         return None, out
     out = Collector(_lines(text))
-    return _compose(text, out), out
+    if len(text) > _MAX_KEPT_CHARS:
+        return _compose(text, out), out
+    root = _kept(text)
+    return (root if root is not None else _compose(text, out)), out
+
+
+@lru_cache(maxsize=_MAX_KEPT)
+def _kept(text: str) -> Node | None:
+    """The root node of a text without faults; nodes are immutable, so that all who read the text may share them."""
+    out = Collector(())
+    root = _compose(text, out)
+    return root if out.count == 0 else None
 
 
 def _lines(text: str) -> tuple[str, ...]:
