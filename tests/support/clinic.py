@@ -47,6 +47,11 @@ def scene_of(folder: Path, text: str = FLEET, node: str = OWNER, **options: Any)
     return Scene(file=file, reading=reading, node=node, state_folder=state, **options)
 
 
+def answer(scene: Scene, **changes: Any) -> Scene:
+    """The same machine, whose daemon's answer is changed."""
+    return replace(scene, own={**scene.status, **changes})
+
+
 def make_state(fleet: Fleet, node: str, folder: Path, **changes: Any) -> None:
     """A state of generation 0, with these fields changed."""
     state = blank_state(fleet, node, 0, None, incarnation=7, hardware=hardware_id())

@@ -1,4 +1,4 @@
-"""Checks of the streams of this machine's applications: does anybody publish, and only one.
+"""Checks of the streams of this machine's applications: does one publish, only one, and does anybody listen.
 
 Knows: counters of streams, keys of applications, a tap on the data network. Does not know: what is published.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Final
 
+from zsched.adapters.network.listeners import keys_with_listeners
 from zsched.adapters.network.stream_tap import StreamTap, Tapped
 from zsched.clock import monotonic_s
 from zsched.doctor.model import Result, Scene, counted, failed, joined, passed, skipped, warned
@@ -16,6 +17,9 @@ from zsched.errors import AdapterError
 YOUNG_S: Final = 60.0
 """In a fleet that has just started, streams have not begun."""
 LISTEN_S: Final = 1.5
+LOOK_S: Final = 1.0
+"""In this time a new session knows who subscribes; on one machine it takes some milliseconds."""
+RELAY_FIX: Final = "journalctl -u zsched says what became of the relay"
 
 
 def inputs_have_publishers(scene: Scene) -> Result:
@@ -26,13 +30,44 @@ def inputs_have_publishers(scene: Scene) -> Result:
         return skipped(f"{scene.node} carries no inputs")
     if float(status["up_s"]) < YOUNG_S:
         return skipped(f"the daemon has been up for {status['up_s']:.0f} s only")
-    where = ", ".join(status.get("joins_at") or ()) or "where zsched status says that applications join"
     found = []
     for task, stream in streams:
         if stream["last_seen_s"] is None and task["owner"] is not None:
             told = f"{stream['stream']}: nobody has published {stream['from_expr'] or 'its key'} on {scene.node}"
-            found.append(warned(told, fix=f"the application must put that key, and dial {where}"))
+            found.append(warned(told, fix=f"the application must put that key, and dial {_joins_at(scene)}"))
     return joined(found, passed(f"{counted(len(streams), 'inputs')}, each has had messages"))
+
+
+def outputs_have_listeners(scene: Scene) -> Result:
+    """Whether somebody subscribes to what each output of this machine puts."""
+    outputs = {
+        str(stream["to_expr"]): str(stream["stream"])
+        for task in scene.status["tasks"]
+        for stream in task["streams"]
+        if "/out/" in stream["stream"] and stream["to_expr"]
+    }
+    if not outputs or not scene.sides:
+        return skipped(f"{scene.node} carries no outputs")
+    if scene.me.listen_streams:
+        return skipped("applications of zsched.stream have their answers in their own process")
+    if float(scene.status["up_s"]) < YOUNG_S:
+        return skipped(f"the daemon has been up for {scene.status['up_s']:.0f} s only")
+    try:
+        # applications are on the machine's own side, where it has one
+        heard = keys_with_listeners(scene.sides.get("local", scene.sides["fleet"]), sorted(outputs), LOOK_S)
+    except AdapterError as error:
+        return failed(str(error), fix=RELAY_FIX)
+    fix = f"the application must subscribe to that key, and dial {_joins_at(scene)}"
+    found = [
+        warned(f"{stream}: nobody on {scene.node} subscribes to {key}", fix=fix)
+        for key, stream in sorted(outputs.items())
+        if key not in heard
+    ]
+    return joined(found, passed(f"{counted(len(outputs), 'outputs')}, each has a subscriber"))
+
+
+def _joins_at(scene: Scene) -> str:
+    return ", ".join(scene.status.get("joins_at") or ()) or "where zsched status says that applications join"
 
 
 def keys_have_one_publisher(scene: Scene) -> Result:
@@ -44,7 +79,7 @@ def keys_have_one_publisher(scene: Scene) -> Result:
         with StreamTap(scene.sides, keys) as tap:
             return judged_sources(tap.until(monotonic_s() + LISTEN_S))
     except AdapterError as error:
-        return failed(str(error), fix="journalctl -u zsched says what became of the relay")
+        return failed(str(error), fix=RELAY_FIX)
 
 
 def _keys(scene: Scene) -> Iterable[str]:

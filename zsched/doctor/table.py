@@ -121,6 +121,12 @@ CHECKS: Final[tuple[Check, ...]] = (
         run=streams.keys_have_one_publisher,
         needs=Needs.STATUS,
     ),
+    Check(
+        name="stream.unheard",
+        asks="Does somebody listen to each output?",
+        run=streams.outputs_have_listeners,
+        needs=Needs.STATUS,
+    ),
     Check(name="fleet.answers", asks="Does every node answer?", run=fleet.answer, needs=Needs.FLEET),
     Check(
         name="fleet.addresses",

@@ -1,4 +1,4 @@
-"""Two programs that publish one input, over real sessions."""
+"""Two programs that publish one input, and an output that nobody takes, over real sessions."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from support.clinic import assert_finds, run, scene_of
+from support.clinic import FLEET, answer, assert_finds, run, scene_of
 from zsched.core.route.ros2 import Attachment, encode_attachment
 from zsched.doctor.model import Scene, Verdict
 from zsched.sessions import config as zenoh_config
@@ -44,6 +44,13 @@ class Site:
             self._attachments.append(attachment)
         self._thread.start()
 
+    def subscribe(self, key_expr: str, mode: str) -> None:
+        """One program that joins as a client, or as one peer of others."""
+        config = zenoh.Config.from_json5(self._config)
+        config.insert_json5("mode", json.dumps(mode))
+        self._sessions.append(zenoh.open(config))
+        self._sessions[-1].declare_subscriber(key_expr, lambda _: None)
+
     def _publish(self) -> None:
         while not self._end.wait(0.05):
             for session, attachment in zip(self._sessions, self._attachments, strict=True):
@@ -51,7 +58,7 @@ class Site:
 
     def close(self) -> None:
         self._end.set()
-        if self._sessions:
+        if self._attachments:
             self._thread.join()
         for session in (*self._sessions, self._hub):
             session.close()
@@ -98,3 +105,32 @@ def test_of_publishers_that_do_not_tell_who_they_are_nothing_is_claimed(scene: S
 def test_a_data_network_that_cannot_be_joined_is_found(scene: Scene) -> None:
     away = replace(scene, sides={"fleet": zenoh_config.client_config(connect=("tcp/127.0.0.1:1",))})
     assert_finds(run("stream.twice", away), Verdict.FAIL, "cannot be joined")
+
+
+OUTPUT = {"stream": "merge/out/0", "from_expr": "edge1/robot1/global_map", "to_expr": "robot1/merged"}
+
+
+def with_output(scene: Scene) -> Scene:
+    """The daemon's answer tells of an output, too."""
+    (task,) = scene.status["tasks"]
+    (stream,) = task["streams"]
+    return answer(scene, tasks=[{**task, "streams": [stream, {**stream, **OUTPUT}]}])
+
+
+@pytest.mark.parametrize("mode", ["peer", "client"])
+def test_an_output_that_nobody_takes_is_found(scene: Scene, site: Site, mode: str) -> None:
+    merged = with_output(scene)
+    assert_finds(run("stream.unheard", merged), Verdict.WARN, "nobody on robot1 subscribes to robot1/merged")
+    assert "tcp/127.0.0.1:7458" in run("stream.unheard", merged).fix
+    assert run("stream.unheard", answer(merged, up_s=3.0)).verdict is Verdict.SKIP
+    site.subscribe("robot1/*", mode)
+    assert run("stream.unheard", merged).verdict is Verdict.PASS
+    own = {**site.sides, "local": zenoh_config.client_config(connect=("tcp/127.0.0.1:1",))}
+    assert_finds(run("stream.unheard", replace(merged, sides=own)), Verdict.FAIL, "cannot be joined")
+
+
+def test_who_has_streams_in_its_own_process_is_not_judged(tmp_path: Path, site: Site) -> None:
+    text = FLEET.replace("robot1: {", 'robot1: {listen: {streams: "tcp/127.0.0.1:7459"}, ', 1)
+    scene = replace(scene_of(tmp_path, text, node="robot1"), sides=site.sides)
+    merged = with_output(scene)
+    assert run("stream.unheard", merged).verdict is Verdict.SKIP

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from support.clinic import FLEET, assert_finds, make_state, run, scene_of
+from support.clinic import FLEET, answer, assert_finds, make_state, run, scene_of
 from support.fleet_values import fleet_value_of
 from support.planted_faults import found_in
 from zsched.adapters.host.document_store import DocumentStore
@@ -268,11 +268,6 @@ def test_a_wedged_daemon_is_to_be_restarted(tmp_path: Path) -> None:
     found = run("daemon.answers", replace(scene_of(tmp_path), own=None, refusal=refusal))
     assert_finds(found, FAIL, "is it wedged")
     assert found.fix.startswith("sudo systemctl restart zsched")
-
-
-def answer(scene: Scene, **changes: Any) -> Scene:
-    """The same machine, whose daemon's answer is changed."""
-    return replace(scene, own={**scene.status, **changes})
 
 
 def test_a_daemon_of_another_version_is_found(tmp_path: Path) -> None:
