@@ -95,7 +95,7 @@ def find_door(
     await_beginners(runtime)
     sockets = {path.stem: path for path in places.local_sockets(runtime)}
     if not sockets:
-        raise CliError(EXIT_UNREACHABLE, _no_socket(runtime))
+        raise CliError(EXIT_UNREACHABLE, _no_socket(runtime, places.config_path(None, env)))
     own = places.node_name(None, env)
     if node is not None:
         if node in sockets:
@@ -214,7 +214,7 @@ def _is_fresh(mark: Path) -> bool:
     return False
 
 
-def _no_socket(runtime: Path) -> str:
+def _no_socket(runtime: Path, config: Path) -> str:
     closed = next((path for path in (runtime, places.SYSTEM_RUNTIME) if places.is_closed(path)), None)
     if closed is not None:
         return (
@@ -223,8 +223,13 @@ def _no_socket(runtime: Path) -> str:
         )
     if runtime == places.SYSTEM_RUNTIME and any(unit.exists() for unit in UNITS):
         start = "start it with `sudo systemctl start zsched` (why it does not run: `systemctl status zsched`)"
-    else:
+    elif config.exists():
         start = "start one with `zsched up`"
+    else:
+        return (
+            f"no daemon in {runtime} (no socket there), and no fleet file {config}: make this machine a node with "
+            "`zsched fleet create NAME` or `zsched join INVITATION`, or say where a daemon is with --runtime-dir"
+        )
     return f"no daemon in {runtime} (no socket there); {start}, or say where it is with --runtime-dir"
 
 

@@ -218,17 +218,28 @@ def test_where_systemd_has_the_unit_it_says_how_systemd_starts_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """`zsched up` by hand would leave files of root where the service's user writes."""
-    unit = tmp_path / "zsched.service"
+    unit, file = tmp_path / "zsched.service", tmp_path / "fleet.yaml"
     monkeypatch.setattr(ask, "UNITS", (unit,))
     monkeypatch.setattr(places, "SYSTEM_RUNTIME", tmp_path)
+    env = {**ENV, "ZSCHED_CONFIG": str(file)}
+    file.touch()
     with pytest.raises(CliError, match="start one with `zsched up`"):
-        find_door(tmp_path, None, ENV)
+        find_door(tmp_path, None, env)
     unit.touch()
     with pytest.raises(CliError, match="start it with `sudo systemctl start zsched`"):
-        find_door(tmp_path, None, ENV)
+        find_door(tmp_path, None, env)
     (tmp_path / "mine").mkdir()
     with pytest.raises(CliError, match="start one with `zsched up`"):
-        find_door(tmp_path / "mine", None, ENV)
+        find_door(tmp_path / "mine", None, env)
+
+
+def test_on_a_machine_that_is_no_node_yet_it_says_how_it_becomes_one(tmp_path: Path) -> None:
+    """`zsched up` would only say that its fleet file is missing."""
+    with pytest.raises(CliError) as caught:
+        find_door(tmp_path, None, {**ENV, "ZSCHED_CONFIG": str(tmp_path / "fleet.yaml")})
+    for word in (f"no fleet file {tmp_path}/fleet.yaml", "zsched fleet create NAME", "zsched join INVITATION"):
+        assert word in str(caught.value)
+    assert "zsched up" not in str(caught.value)
 
 
 def test_in_a_secured_cell_a_command_goes_to_the_gateway_that_it_names(
