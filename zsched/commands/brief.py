@@ -22,6 +22,7 @@ from zsched.commands.report import (
 Json = dict[str, Any]
 
 TITLES = ("TASK", "owner", "state", "since", "phase", "in", "out", "dropped")
+NO_TASK = "none yet; `zsched task add FILE` gives the fleet one"
 
 
 def render_brief(status: Json, width: int, color: bool, at: float | None = None) -> str:
@@ -39,6 +40,9 @@ def render_brief(status: Json, width: int, color: bool, at: float | None = None)
 def task_rows(page: Page, status: Json, at: float | None) -> None:
     """Titles and a line per task; ``at``: now, for wall times beside ages."""
     tasks: list[Json] = status["tasks"]
+    if not tasks:
+        page.row((TITLES[0], page.indent - 1, "stage"), (NO_TASK, page.width, "dim"))
+        return
     task_room = min(max([10, *(len(task["name"]) for task in tasks)]), 20)
     names = [len(task["owner"] or "nobody") + len(_marks(task)) for task in tasks]
     owner_room = min(max([6, *names]), 20)

@@ -38,6 +38,12 @@ def test_six_nodes_and_a_task_take_ten_lines() -> None:
     ]
 
 
+def test_a_fleet_without_tasks_says_so_and_how_it_gets_one() -> None:
+    lines = render_brief({**recorded("healthy"), "tasks": []}, 60, color=False).splitlines()
+    assert lines[-1].split()[:3] == ["TASK", "none", "yet;"]
+    assert "`zsched task add FILE`" in lines[-1]
+
+
 @pytest.mark.parametrize("width", [60, 80, 100, 160])
 @pytest.mark.parametrize("name", ["healthy", "edge", "degraded"])
 def test_no_line_is_longer_than_the_terminal(name: str, width: int) -> None:
