@@ -1,13 +1,14 @@
 """What a fleet costs while nothing happens: CPU, wake-ups, threads, memory and packets of all processes of its nodes.
 
-``python -m benchmarks.idle [--nodes 3 6 12] [--seconds 20] [--rounds 3] [--other PATH] [--threads]
-[--packets]``.
+``python -m benchmarks.idle [--nodes 3 6 12] [--seconds 20] [--rounds 3] [--other PATH [--lacks KEY...]]
+[--threads] [--packets]``.
 Half of the nodes are robots, half edges; the echo worker runs on every edge, one of them owns. Every node has a network
 namespace and a control group of its own (root, Linux): a quota of one core makes the group the machine that its daemon
 measures, so that other work is not taken for load, as on a machine of its own.
 
 With ``--other`` (another working tree of zsched) each round measures both trees, one after the other, in turn first:
-what else the machine does then meets both. Daemons, relays and workers of the other tree are its own programs.
+what else the machine does then meets both. Daemons, relays and workers of the other tree are its own programs,
+and its fleet file is without the keys of ``scheduling:`` that it ``--lacks``.
 
 * CPU: percent of one core, the time that the kernel gave the process's threads (``schedstat``); not wall time.
 * wake-ups: voluntary context switches a second, of all threads.
@@ -212,14 +213,18 @@ def measure(bed: Netbed, owner: NodeId, seconds: float) -> tuple[list[Usage], li
 
 
 def one_fleet(
-    nodes: int, tree: Path | None, seconds: float, *, by_kind: bool
+    nodes: int, tree: Path | None, seconds: float, *, lacks: Sequence[str], by_kind: bool
 ) -> tuple[list[Usage], list[Traffic], list[dict[str, float]]]:
-    """Start a fleet of so many nodes, let it come to rest, measure it, and the kinds of its packets after that."""
+    """Start a fleet of so many nodes, let it come to rest, measure it, and the kinds of its packets after that.
+
+    ``lacks``: keys of ``scheduling:`` that the other ``tree`` does not know.
+    """
     edges = nodes // 2
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        TreeBed(Path(folder), echo_fleet(robots=nodes - edges, edges=edges)) as bed,
-    ):
+    fleet = echo_fleet(robots=nodes - edges, edges=edges)
+    for task in fleet["tasks"].values():
+        for key in lacks if tree is not None else ():
+            del task["scheduling"][key]
+    with tempfile.TemporaryDirectory() as folder, TreeBed(Path(folder), fleet) as bed:
         bed.tree = tree
         bed.limits = make_limits(f"zsched-idle-{os.getpid()}", dict.fromkeys(bed.names, CORES), MEMORY_MB)
         try:
@@ -301,6 +306,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--rounds", type=int, default=1)
     parser.add_argument("--other", type=Path)
+    parser.add_argument("--lacks", nargs="*", default=[], metavar="KEY")
     parser.add_argument("--threads", action="store_true")
     parser.add_argument("--packets", action="store_true")
     given = parser.parse_args()
@@ -315,7 +321,9 @@ def main() -> None:
         for number in range(given.rounds):
             for name in sorted(trees, reverse=bool(number % 2)):
                 progress(f"{nodes} nodes, round {number + 1}, {name}")
-                usages, traffic, of_kind = one_fleet(nodes, trees[name], given.seconds, by_kind=given.packets)
+                usages, traffic, of_kind = one_fleet(
+                    nodes, trees[name], given.seconds, lacks=given.lacks, by_kind=given.packets
+                )
                 found[name][0].extend(usages)
                 found[name][1].extend(traffic)
                 kinds[name].extend(of_kind)
