@@ -94,7 +94,7 @@ def shown_on_a_terminal(arguments: list[str], folder: Path) -> str:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["zsched", "status", "--runtime-dir", "nobody"], "make this machine a node"),
+        (["zsched", "status", "--runtime-dir", "nobody"], "or say where"),
         (
             ["zsched", "up", "--config", "fleet.yaml", "--node", "vm", "--state-dir", "s"],
             "say which one this",

@@ -74,11 +74,14 @@ def test_degraded_fleet_is_shown_and_exits_with_4(folder: Path, flags: tuple[str
     assert "echo" in result.stdout
 
 
-def test_status_without_a_daemon_exits_with_3_and_says_where_it_looked(folder: Path) -> None:
+def test_status_without_a_daemon_exits_with_3_and_says_where_it_looked(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ZSCHED_CONFIG", str(folder / "none.yaml"))
     result = run("status", "--json")
     assert (result.exit_code, result.stdout) == (3, "")
     assert str(folder) in result.stderr
-    assert "zsched up" in result.stderr
+    assert "zsched join INVITATION" in result.stderr
 
 
 def test_status_at_a_socket_nobody_listens_on_exits_with_3(folder: Path) -> None:
