@@ -37,7 +37,7 @@ from zsched.core.route.keyexpr import fault, includes, is_wild
 from zsched.core.values.model import MAX_REASON, TaskId
 from zsched.core.values.plan import RoutePhase, RoutePlan
 from zsched.errors import AdapterError
-from zsched.guard import ends_within, guarded
+from zsched.guard import end_within, ends_within, guarded, running
 from zsched.ipc.protocol import DaemonGone, StreamKeys, StreamsTaken
 from zsched.log_limit import limit_library
 from zsched.relay.streams.acks import Acks
@@ -113,6 +113,7 @@ class Streams:
             AdapterError: the session cannot be opened.
         """
         limit_library()
+        self._threads_before = running()
         self.node = link.node
         self._path, self._link = path, link
         self._config = link.session
@@ -229,6 +230,8 @@ class Streams:
         for task in tasks:
             task.end()
         ends_within(APPLICATION_CLOSE_S, self._session.close, name="zsched close")
+        self._acks.stalled.close()  # till now it has ended links that held the session up
+        end_within(JOIN_S, besides=self._threads_before)
 
     def __enter__(self) -> Self:
         return self

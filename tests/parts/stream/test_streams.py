@@ -32,6 +32,7 @@ from zsched.core.values.plan import (
 )
 from zsched.core.values.struct import replace
 from zsched.errors import AdapterError
+from zsched.guard import running
 from zsched.relay.application import Application
 from zsched.relay.streams.inputs import InputStream
 from zsched.relay.streams.lanes import Lane
@@ -139,6 +140,19 @@ def test_what_is_put_is_processed_answered_and_counted_and_the_streams_outlive_t
     assert unaccounted(bench.count()) == 0
     assert bench.count().at_most_lost == 0
     assert bench.taken == [str(number).encode() for number in range(201)]
+
+
+def test_closing_ends_every_thread_for_an_interpreter_that_ends_beside_one_may_abort(bench: Bench) -> None:
+    def ask() -> None:
+        with bench.join() as own:
+            own.subscribe("robot1/out", lambda _answer: None)
+            own.publisher("robot1/front/in").put(b"1")
+
+    ask()  # threads that the relay and the worker of this process begin now stay
+    before = running()
+    ask()
+    left = sorted(thread.name for thread in running() - before)
+    assert [name for name in left if not name.startswith("application")] == []  # that one is the relay's
 
 
 def test_closing_waits_for_what_was_put_and_for_its_answers(bench: Bench) -> None:
