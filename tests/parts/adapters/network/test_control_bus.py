@@ -141,6 +141,8 @@ def stranger(trio: tuple[Peer, Peer, Peer]) -> Iterator[zenoh.Session]:
     session = zenoh.open(zenoh.Config.from_json5(control_config(listen=(listen,), connect=(hub,), timing=TIMING)))
     try:
         until(lambda: all(peer.bus.peers() == 3 for peer in trio), "the stranger is in the mesh")
+        # what a link's other end subscribes to is known before its tokens are; a put goes nowhere before that
+        until(lambda: len(list(session.liveliness().get("@zsched/f/**"))) >= len(trio), "it knows who subscribes")
         yield session
     finally:
         session.close()
