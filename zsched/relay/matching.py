@@ -26,6 +26,7 @@ from zsched.core.values.model import TaskId
 from zsched.core.values.struct import Struct, field
 from zsched.guard import guarded, tolerant
 from zsched.relay.streams.receive import Declared, undeclare
+from zsched.sessions.matching import is_matched
 
 SETTLE_S: Final = 1.5
 """A relay that has just started has no links yet: for this long it does not say that nobody is there."""
@@ -45,12 +46,12 @@ class _Watched(Struct, eq=False):
 
     def look(self) -> WorkerMatched:
         """What zenoh says now."""
-        untaken = next((str(probe.key_expr) for probe in self.inputs if not _is_matching(probe)), "")
-        unserved = next((str(one[0].key_expr) for one in self.services if not any(map(_is_matching, one))), "")
+        untaken = next((str(probe.key_expr) for probe in self.inputs if not is_matched(probe)), "")
+        unserved = next((str(one[0].key_expr) for one in self.services if not any(map(is_matched, one))), "")
         return WorkerMatched(
             task=self.watch.task,
             is_matched=not untaken and not unserved,
-            is_certain=bool(self.inputs or self.services) and not any(map(_is_matching, self.strangers)),
+            is_certain=bool(self.inputs or self.services) and not any(map(is_matched, self.strangers)),
             missing=f"nobody subscribes to {untaken}" if untaken else unserved and f"nobody answers {unserved}",
         )
 
@@ -157,7 +158,3 @@ class Matching:
                 continue
             one.told = seen
             self._report(seen)
-
-
-def _is_matching(probe: zenoh.Publisher | zenoh.Querier) -> bool:
-    return bool(getattr(probe.matching_status, "matching", False))  # the object itself is always true

@@ -45,6 +45,7 @@ from zsched.errors import WireError
 from zsched.guard import guarded, tolerant
 from zsched.hop.acknowledger import Acknowledger
 from zsched.ipc.pipe import encode_end
+from zsched.sessions.matching import is_matched
 from zsched.sessions.stalled_links import StalledLinks
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import AGAIN_CHUNK, END_CHUNK, parse
@@ -116,7 +117,7 @@ class KeptLane(Struct, kw_only=True, eq=False):
         with self.lock:
             relays = self.state.owing()
         for relay in relays:
-            is_reached, now = _matches(self._way(session, relay)), monotonic_s()
+            is_reached, now = is_matched(self._way(session, relay)), monotonic_s()
             with self.lock:
                 owed = self.state.take_owed(relay, now, is_reached=is_reached)
                 skip = None if owed.skip is None else self.state.skip_marker(relay, owed.skip, now)
@@ -131,7 +132,7 @@ class KeptLane(Struct, kw_only=True, eq=False):
             if relay not in self.ways:
                 self._way(session, relay)  # it is known at the next tick whether it matches
                 continue
-            is_there = _matches(self.ways[relay])
+            is_there = is_matched(self.ways[relay])
             with self.lock:
                 self.state.decide(relay, now, is_there=is_there)
 
@@ -368,10 +369,6 @@ def put_end(session: Session, key: str, source_id: zenoh.EntityGlobalId, marker:
         congestion_control=CongestionControl.BLOCK,
         source_info=zenoh.SourceInfo(source_id, serial_of(marker.count)),
     )
-
-
-def _matches(publisher: Any) -> bool:
-    return bool(publisher.matching_status.matching)  # the status itself is always true
 
 
 def _wake(lanes: Iterable[KeptLane]) -> None:

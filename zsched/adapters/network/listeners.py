@@ -5,19 +5,18 @@ Knows: zenoh sessions, publishers and what matches them. Does not know: nodes, s
 
 from __future__ import annotations
 
-import contextlib
 import time
 from collections.abc import Sequence
 from typing import Final
 
 import zenoh
 
+from zsched.adapters.network.stream_tap import CLOSE_S
 from zsched.clock import monotonic_s
 from zsched.errors import AdapterError
 from zsched.guard import ends_within
+from zsched.sessions.matching import is_matched
 
-CLOSE_S: Final = 0.5
-"""As a tap's (`zsched.adapters.network.stream_tap`)."""
 _LOOK_S: Final = 0.02
 
 
@@ -35,8 +34,7 @@ def keys_with_listeners(config: str, keys: Sequence[str], within_s: float) -> fr
         publishers = {key: session.declare_publisher(key) for key in keys}
         end = monotonic_s() + within_s
         while True:
-            # the status itself is always true; in zenoh's stubs it is a bool
-            heard = frozenset(key for key, one in publishers.items() if getattr(one.matching_status, "matching", False))
+            heard = frozenset(key for key, one in publishers.items() if is_matched(one))
             if len(heard) == len(publishers) or monotonic_s() >= end:
                 return heard
             time.sleep(_LOOK_S)
@@ -44,9 +42,4 @@ def keys_with_listeners(config: str, keys: Sequence[str], within_s: float) -> fr
         raise AdapterError(f"the data network cannot be joined: {error}; is the node's relay running?") from error
     finally:
         if session is not None:
-            ends_within(CLOSE_S, _close, session, name="listeners close")
-
-
-def _close(session: zenoh.Session) -> None:
-    with contextlib.suppress(zenoh.ZError):
-        session.close()
+            ends_within(CLOSE_S, session.close, name="listeners close")

@@ -43,6 +43,7 @@ from zsched.guard import guarded, tolerant
 from zsched.relay.services.replies import Replies
 from zsched.relay.streams.counter import StreamCounter
 from zsched.relay.streams.receive import undeclare
+from zsched.sessions.matching import is_matched
 
 LOOK_AGAIN_S: Final = 0.02
 """How often a waiting request looks for an owner; a flip wakes it at once."""
@@ -99,7 +100,7 @@ class _ServiceSlot(Struct, eq=False):
         querier = self.queriers.get(key)
         if querier is None:
             querier = self.queriers[key] = self.session.declare_querier(key)
-        return bool(getattr(querier.matching_status, "matching", False))  # the object itself is always true
+        return is_matched(querier)
 
 
 class ServiceStream:

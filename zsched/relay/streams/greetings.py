@@ -13,10 +13,11 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Final
 
 from zsched.clock import monotonic_s
 from zsched.relay.streams.lanes import Lane
+from zsched.sessions.matching import is_matched
 
 STRANGE_S: Final = 1.0
 FOREIGN_S: Final = 10.0
@@ -91,7 +92,6 @@ class Greetings:
 
 def _is_foreign(lane: Lane, now: float, *, has_others: bool) -> bool:
     """Whether a lane's receiver will not answer any more; ``has_others``: the worker answers for other keys."""
-    publisher: Any = lane.publisher
-    if has_others and not bool(publisher.matching_status.matching):  # the status itself is always true
+    if has_others and not is_matched(lane.publisher):
         return True
     return now - lane.unmet_since > (STRANGE_S if has_others else FOREIGN_S)

@@ -41,6 +41,7 @@ from zsched.relay.streams.lanes import Lane, declare_publisher, put_marker
 from zsched.relay.streams.proofs import LeftOpen
 from zsched.relay.streams.receive import undeclare
 from zsched.relay.streams.tally import Tally
+from zsched.sessions.matching import is_matched
 from zsched.sessions.send_queue import SendQueue
 
 QUEUE_DEPTH: Final = 1024
@@ -143,8 +144,7 @@ class Outlet:
     @property
     def is_matching(self) -> bool:
         """True when somebody subscribes to where this outlet leads (it may be a zombie or a recorder)."""
-        status = self._probe.matching_status
-        return bool(getattr(status, "matching", False))  # the object itself is always true
+        return is_matched(self._probe)
 
     def also_from(self, from_expr: str) -> None:
         """Take samples of another owner, too: its ``from`` captures what fills the wildcards of ``to``.
