@@ -80,9 +80,10 @@ class Fault(Struct, frozen=True, kw_only=True):
 class Collector:
     """The faults and warnings of one file, in the order of their places."""
 
-    def __init__(self, lines: tuple[str, ...]) -> None:
+    def __init__(self, lines: tuple[str, ...], faults: Iterable[Fault] = ()) -> None:
+        """``faults``: what is known already."""
         self._lines = {"": lines}
-        self._faults: list[Fault] = []
+        self._faults = list(faults)
         self._warnings: list[Fault] = []
 
     def add_file(self, file: str, text: str) -> None:
@@ -280,19 +281,17 @@ def read_yaml(data: bytes) -> tuple[Node | None, Collector]:
         out = Collector(_lines(data.decode("utf-8", "replace")))
         out.error(_end_of(good), f"byte 0x{data[error.start]:02x} is not UTF-8", "save the file as UTF-8")
         return None, out
+    root, faults = (_parsed if len(text) > _MAX_KEPT_CHARS else _kept)(text)
+    return root, Collector(_lines(text), faults)
+
+
+def _parsed(text: str) -> tuple[Node | None, tuple[Fault, ...]]:
+    """The root node and its faults; both are immutable, so that all who read the text may share them."""
     out = Collector(_lines(text))
-    if len(text) > _MAX_KEPT_CHARS:
-        return _compose(text, out), out
-    root = _kept(text)
-    return (root if root is not None else _compose(text, out)), out
+    return _compose(text, out), out.faults
 
 
-@lru_cache(maxsize=_MAX_KEPT)
-def _kept(text: str) -> Node | None:
-    """The root node of a text without faults; nodes are immutable, so that all who read the text may share them."""
-    out = Collector(())
-    root = _compose(text, out)
-    return root if out.count == 0 else None
+_kept: Final = lru_cache(maxsize=_MAX_KEPT)(_parsed)
 
 
 def _lines(text: str) -> tuple[str, ...]:
