@@ -1,4 +1,4 @@
-"""Checks of the streams of this machine's applications: does one publish, only one, and does anybody listen.
+"""Checks of the streams of this machine's applications: does somebody publish, only one, and somebody listen?
 
 Knows: counters of streams, keys of applications, a tap on the data network. Does not know: what is published.
 """
@@ -11,7 +11,7 @@ from typing import Final
 from zsched.adapters.network.listeners import keys_with_listeners
 from zsched.adapters.network.stream_tap import StreamTap, Tapped
 from zsched.clock import monotonic_s
-from zsched.doctor.model import Result, Scene, counted, failed, joined, passed, skipped, warned
+from zsched.doctor.model import Json, Result, Scene, counted, failed, joined, passed, skipped, warned
 from zsched.errors import AdapterError
 
 YOUNG_S: Final = 60.0
@@ -24,12 +24,11 @@ RELAY_FIX: Final = "journalctl -u zsched says what became of the relay"
 
 def inputs_have_publishers(scene: Scene) -> Result:
     """Whether each input of this machine has ever had a message."""
-    status = scene.status
-    streams = [(task, stream) for task in status["tasks"] for stream in task["streams"] if "/in/" in stream["stream"]]
+    streams = list(_carried(scene, "/in/"))
     if not streams:
         return skipped(f"{scene.node} carries no inputs")
-    if float(status["up_s"]) < YOUNG_S:
-        return skipped(f"the daemon has been up for {status['up_s']:.0f} s only")
+    if (young := _young(scene)) is not None:
+        return young
     found = []
     for task, stream in streams:
         if stream["last_seen_s"] is None and task["owner"] is not None:
@@ -40,18 +39,14 @@ def inputs_have_publishers(scene: Scene) -> Result:
 
 def outputs_have_listeners(scene: Scene) -> Result:
     """Whether somebody subscribes to what each output of this machine puts."""
-    outputs = {
-        str(stream["to_expr"]): str(stream["stream"])
-        for task in scene.status["tasks"]
-        for stream in task["streams"]
-        if "/out/" in stream["stream"] and stream["to_expr"]
-    }
+    carried = (stream for _, stream in _carried(scene, "/out/"))
+    outputs = {str(stream["to_expr"]): str(stream["stream"]) for stream in carried if stream["to_expr"]}
     if not outputs or not scene.sides:
         return skipped(f"{scene.node} carries no outputs")
     if scene.me.listen_streams:
         return skipped("applications of zsched.stream have their answers in their own process")
-    if float(scene.status["up_s"]) < YOUNG_S:
-        return skipped(f"the daemon has been up for {scene.status['up_s']:.0f} s only")
+    if (young := _young(scene)) is not None:
+        return young
     try:
         # applications are on the machine's own side, where it has one
         heard = keys_with_listeners(scene.sides.get("local", scene.sides["fleet"]), sorted(outputs), LOOK_S)
@@ -64,6 +59,16 @@ def outputs_have_listeners(scene: Scene) -> Result:
         if key not in heard
     ]
     return joined(found, passed(f"{counted(len(outputs), 'outputs')}, each has a subscriber"))
+
+
+def _carried(scene: Scene, way: str) -> Iterable[tuple[Json, Json]]:
+    """(task, stream) of each stream of this machine that goes this ``way``: ``/in/``, ``/out/``."""
+    return ((task, one) for task in scene.status["tasks"] for one in task["streams"] if way in one["stream"])
+
+
+def _young(scene: Scene) -> Result | None:
+    up_s = float(scene.status["up_s"])
+    return skipped(f"the daemon has been up for {up_s:.0f} s only") if up_s < YOUNG_S else None
 
 
 def _joins_at(scene: Scene) -> str:
@@ -84,10 +89,9 @@ def keys_have_one_publisher(scene: Scene) -> Result:
 
 def _keys(scene: Scene) -> Iterable[str]:
     """Where applications put inputs; a wildcard may stand for many publishers by right."""
-    for task in scene.status["tasks"]:
-        for stream in task["streams"]:
-            if "/in/" in stream["stream"] and stream["from_expr"] and "*" not in stream["from_expr"]:
-                yield str(stream["from_expr"])
+    for _, stream in _carried(scene, "/in/"):
+        if stream["from_expr"] and "*" not in stream["from_expr"]:
+            yield str(stream["from_expr"])
 
 
 def judged_sources(samples: Iterable[Tapped]) -> Result:
