@@ -67,7 +67,7 @@ def running() -> frozenset[threading.Thread]:
     return frozenset(thread for thread in threading.enumerate() if isinstance(thread, _Guarded))
 
 
-def end_within(limit_s: float, besides: frozenset[threading.Thread]) -> bool:
+def all_end_within(limit_s: float, besides: frozenset[threading.Thread]) -> bool:
     """Wait until all threads of ours ``besides`` these have ended; whether they have.
 
     An interpreter (CPython 3.11) that ends while one of its threads is inside zenoh aborts: the thread is ended where

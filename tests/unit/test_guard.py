@@ -14,7 +14,7 @@ import pytest
 
 import zsched
 from zsched import guard
-from zsched.guard import end_within, ends_within, guarded, running
+from zsched.guard import all_end_within, ends_within, guarded, running
 from zsched.log_limit import LIBRARY, MAX_PLACES, LogLimit, PlainLines, limit_library
 from zsched.log_limit import LIMIT as SHARED
 
@@ -297,9 +297,9 @@ def test_the_end_of_our_threads_is_awaited_and_of_no_other() -> None:
     ours = guarded(goes.wait, name="ours", is_lasting=False)
     ours.start()
     try:
-        assert not end_within(0.01, besides=known)
+        assert not all_end_within(0.01, besides=known)
         goes.set()
-        assert end_within(10.0, besides=known)
+        assert all_end_within(10.0, besides=known)
         assert not ours.is_alive()
     finally:
         goes.set()

@@ -37,7 +37,7 @@ from zsched.core.route.keyexpr import fault, includes, is_wild
 from zsched.core.values.model import MAX_REASON, TaskId
 from zsched.core.values.plan import RoutePhase, RoutePlan
 from zsched.errors import AdapterError
-from zsched.guard import end_within, ends_within, guarded, running
+from zsched.guard import all_end_within, ends_within, guarded, running
 from zsched.ipc.protocol import DaemonGone, StreamKeys, StreamsTaken
 from zsched.log_limit import limit_library
 from zsched.relay.streams.acks import Acks
@@ -231,7 +231,7 @@ class Streams:
             task.end()
         ends_within(APPLICATION_CLOSE_S, self._session.close, name="zsched close")
         self._acks.stalled.close()  # till now it has ended links that held the session up
-        end_within(JOIN_S, besides=self._threads_before)
+        all_end_within(JOIN_S, besides=self._threads_before)
 
     def __enter__(self) -> Self:
         return self
