@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from zsched import paths as places
 from zsched.adapters.host.operator_client import ask
 from zsched.clock import wall_s
-from zsched.commands.common import CliError, Json, check_name, nearest
+from zsched.commands.common import BECOME_A_NODE, CliError, Json, check_name, nearest
 from zsched.core.values.struct import Struct, replace
 from zsched.core.values.words import NAME
 from zsched.errors import AdapterError, ConfigError, WireError
@@ -227,8 +227,8 @@ def _no_socket(runtime: Path, config: Path) -> str:
         start = "start one with `zsched up`"
     else:
         return (
-            f"no daemon in {runtime} (no socket there), and no fleet file {config}: make this machine a node with "
-            "`zsched fleet create NAME` or `zsched join INVITATION`, or say where a daemon is with --runtime-dir"
+            f"no daemon in {runtime} (no socket there), and no fleet file {config}; {BECOME_A_NODE}, "
+            "or say where a daemon is with --runtime-dir"
         )
     return f"no daemon in {runtime} (no socket there); {start}, or say where it is with --runtime-dir"
 

@@ -44,6 +44,8 @@ ARGUMENT: Final = "argument"
 """As typer calls such a parameter."""
 SCHEMAS: Final = Path(__file__).parents[1] / "schemas"
 """A JSON Schema per kind of output and major version."""
+BECOME_A_NODE: Final = "make this machine a node: zsched fleet create NAME, or zsched join INVITATION"
+"""Advice where the fleet file is missing."""
 
 
 class CliError(ZschedError):

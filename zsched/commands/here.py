@@ -9,7 +9,7 @@ import os
 from pathlib import Path
 
 from zsched import paths as places
-from zsched.commands.common import CliError, check_name
+from zsched.commands.common import BECOME_A_NODE, CliError, check_name
 from zsched.config.reader import MAX_FILE_BYTES
 from zsched.exits import EXIT_CONFIG
 from zsched.files import owner_of, read_regular
@@ -30,10 +30,9 @@ def need_file(file: Path) -> None:
     except PermissionError as error:
         raise CliError(EXIT_CONFIG, f"{file}: cannot be read: {error.strerror}; {owner_of(file)}") from error
     except FileNotFoundError as error:
-        advice = (
-            "name it with --config, or make this machine a node: zsched fleet create NAME, or zsched join INVITATION"
-        )
-        raise CliError(EXIT_CONFIG, f"{file}: cannot be read: {error.strerror}; {advice}") from error
+        raise CliError(
+            EXIT_CONFIG, f"{file}: cannot be read: {error.strerror}; name it with --config, or {BECOME_A_NODE}"
+        ) from error
     except OSError as error:
         raise CliError(
             EXIT_CONFIG, f"{file}: cannot be read: {error.strerror}; name the fleet file with --config or ZSCHED_CONFIG"
