@@ -217,12 +217,12 @@ def one_fleet(
 ) -> tuple[list[Usage], list[Traffic], list[dict[str, float]]]:
     """Start a fleet of so many nodes, let it come to rest, measure it, and the kinds of its packets after that.
 
-    ``lacks``: keys of ``scheduling:`` that the other ``tree`` does not know.
+    ``lacks``: keys of ``scheduling:`` that ``tree`` does not know.
     """
     edges = nodes // 2
     fleet = echo_fleet(robots=nodes - edges, edges=edges)
     for task in fleet["tasks"].values():
-        for key in lacks if tree is not None else ():
+        for key in lacks:
             del task["scheduling"][key]
     with tempfile.TemporaryDirectory() as folder, TreeBed(Path(folder), fleet) as bed:
         bed.tree = tree
@@ -321,9 +321,8 @@ def main() -> None:
         for number in range(given.rounds):
             for name in sorted(trees, reverse=bool(number % 2)):
                 progress(f"{nodes} nodes, round {number + 1}, {name}")
-                usages, traffic, of_kind = one_fleet(
-                    nodes, trees[name], given.seconds, lacks=given.lacks, by_kind=given.packets
-                )
+                tree, lacks = trees[name], given.lacks if trees[name] else ()
+                usages, traffic, of_kind = one_fleet(nodes, tree, given.seconds, lacks=lacks, by_kind=given.packets)
                 found[name][0].extend(usages)
                 found[name][1].extend(traffic)
                 kinds[name].extend(of_kind)

@@ -16,7 +16,7 @@ from zsched.errors import AdapterError, ConfigError
 
 PAUSE_S: Final = 0.2
 LONG_S: Final = 3.0
-"""After this time it is told what is missing."""
+"""After this time the operator is told what is missing."""
 
 
 class UselessError(CliError):
@@ -32,8 +32,8 @@ def wait_for(
 ) -> str:
     """Look until nothing is missing, for ``for_s`` seconds at most; what is missing still.
 
-    What keeps a look from its end is missing, too, and the next look opens its sessions anew. ``tell(lack, left_s)`` is
-    told what is missing, and again when it is something else, unless ``is_told_once``.
+    An error of a look counts as missing, too, and the next look opens its sessions anew. ``tell(lack, left_s)`` is
+    called with what is missing, and again when that is something else, unless ``is_told_once``.
 
     Raises:
         UselessError: a look has raised it.
