@@ -45,10 +45,10 @@ test-cpu: $(VENV)/.dev  ## Tests that only need a processor: unit, paper, simula
 	$(BIN)/python -m pytest -q -m "$(MARK)" -n $(TEST_JOBS) --dist loadfile tests/unit tests/paper tests/sim tests/planted
 
 # Real fleets of the system tests keep real time and fill a machine: they have it to themselves.
-test-real: $(VENV)/.dev  ## Tests with real processes: system, integration, parts, bench (real daemons on localhost)
+test-real: $(VENV)/.dev  ## Tests with real processes (real daemons on localhost, booted machines, bench)
 	$(BIN)/python $(PYTEST_REAL) -q -m "$(MARK)" --durations=10 tests/system
-	$(BIN)/python $(PYTEST_REAL) -q -m "$(MARK)" -n $(REAL_JOBS) --dist loadfile --no-loadscope-reorder --durations=10 tests/integration tests/parts
-	$(if $(MARK),,$(BIN)/python -m pytest -q -n 2 --dist loadfile tests/bench)
+	$(BIN)/python $(PYTEST_REAL) -q -m "$(MARK)" -n $(REAL_JOBS) --dist loadfile --no-loadscope-reorder --durations=10 \
+	  tests/booted tests/integration tests/bench tests/parts
 
 test-quick: $(VENV)/.dev  ## Unit and paper tests only
 	$(BIN)/python -m pytest -q -n $(TEST_JOBS) --dist loadfile tests/unit tests/paper

@@ -12,7 +12,7 @@ Steps (all of them unless some are named), each of which says `ok`, `FAILED` wit
     arm              the package for aarch64: what is in it, and its Python under qemu where that is installed
     image            the container image: built, run, asked, stopped
 
-The verdicts about packages and pip are those of tests/system/test_deb.py. Sizes and times are printed;
+The verdicts about packages and pip are those of tests/booted/test_deb.py. Sizes and times are printed;
 docs/measurements.md has them.
 """
 
@@ -43,7 +43,7 @@ from wheel import BuildError  # noqa: E402 - as above
 from support.debian import PYTHON_IN_SUITE, SUITE  # noqa: E402 - as above
 from support.packages import FAST, another, builder  # noqa: E402 - as above
 
-TEST = REPO / "tests/system/test_deb.py"
+TEST = REPO / "tests/booted/test_deb.py"
 E_MACHINE = {"x86_64": 62, "aarch64": 183}
 """Of ELF files, by machine."""
 RELAYS_CODE = "lib/site-packages/zsched/relay/process.py"

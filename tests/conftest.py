@@ -36,7 +36,7 @@ from support.stalls import Moment, Stalls, now
 MEASURES = ("TooSlowError", "between", "within")
 """Names of `support.waiting` that a module imports whose tests measure times."""
 
-REAL = ("integration", "system", "parts", "bench")
+REAL = ("integration", "system", "booted", "parts", "bench")
 """Folders of tests with real processes."""
 BEGAN = pytest.StashKey[Moment]()
 STALLS = pytest.StashKey[Stalls]()
