@@ -16,7 +16,6 @@ import gc
 import logging
 import os
 import random
-import secrets
 import signal
 import sys
 import time
@@ -37,23 +36,18 @@ from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
 from zsched.clock import SleepWatch, monotonic_s, wall_tenths
 from zsched.config.load import load_fleet, require_node
 from zsched.core import events as ev
-from zsched.core.electorate.numbers import in_force
 from zsched.core.node import Node
 from zsched.core.status import status_line
-from zsched.core.values.document import Flag
-from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet, WorkerLink, dial_endpoint, electorate_hash, fleet_hash
-from zsched.core.values.messages import CommandResult
 from zsched.core.values.model import NodeId, NodeKind
 from zsched.core.values.snapshot import Exposure
-from zsched.core.values.struct import Struct, replace
+from zsched.core.values.struct import Struct
 from zsched.errors import AdapterError, ConfigError, NameTakenError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_LEFT, EXIT_NAME_TAKEN, EXIT_OK
 from zsched.guard import on_failure
 from zsched.heap import Leftovers, give_back, share_heaps
 from zsched.ipc.takeover import Door
 from zsched.log_limit import log_to_stderr
-from zsched.runtime import renewal
 from zsched.runtime import tls as daemon_tls
 from zsched.runtime.access import StreamAccess, joins_at
 from zsched.runtime.access_rules import Side, common_names_of, names_of
@@ -68,11 +62,11 @@ from zsched.runtime.membership import copied_file
 from zsched.runtime.memory import shared_memory_objection
 from zsched.runtime.recipes import Recipes
 from zsched.runtime.reload import Reload
-from zsched.runtime.reopening import Moved, Reopening, first_wait_s, turns
-from zsched.runtime.roaming import Roaming, addresses_towards, gone_from, numeric, places_of
+from zsched.runtime.restoring import Restored, Stored, read_stored, restore
 from zsched.runtime.sampler import Sampler
 from zsched.runtime.sealing import seals_of
 from zsched.runtime.secured import digest_of, require_own
+from zsched.runtime.session_watch import SessionWatch
 from zsched.runtime.sessions import SessionsRead
 from zsched.runtime.shell import Shell
 from zsched.runtime.strikes import Strikes
@@ -85,20 +79,8 @@ CLOSE_WORKERS_S = 0.7
 FINISH_WORKERS_S = 4.0
 """...and where the daemon begins anew: they do what has come, and nobody counts the seconds."""
 LOOP_MAX_WAIT_S = 1.0
-LOOK_S = 30.0
-"""How often the certificate's files are looked at."""
-PLACE_LOOK_S = 1.0
-"""How often a node looks which address it has."""
 SPARE_NODES = 2
 """A relay is carried on while its fleet grows by at most this many nodes."""
-CERTIFICATE = "certificate"
-"""Of the problem that this node's certificate ends soon."""
-SESSIONS = "sessions"
-"""Of the problem that sessions cannot be opened again."""
-TURN = "turn"
-"""Of the problem that this node waits to begin anew, for a task of its would have no owner."""
-ADDRESS = "address"
-"""Of the problem that this machine is not where the others dial it."""
 STDERR = 2
 RESTART_SIGNAL = signal.SIGUSR2
 """As SIGTERM, but the relay stays and carries the streams on for the daemon that follows (`systemctl restart`)."""
@@ -135,25 +117,11 @@ class Daemon:
         self._is_restart = False
         self._has_left = False
         """This machine is in no fleet any more, by `zsched leave`."""
-        self._reopening = Reopening(options.node)
         self._sleeps = SleepWatch()
-        self._lets_in_others = False
-        """Open sessions go by other access rules than the fleet in force."""
-        self._moved, self._left = Moved(), frozenset[NodeId]()
-        """Whom open sessions dial where it is not any more; those of them that are gone from there."""
         self._certificate = ""
         """Digest of the certificate that open sessions listen with."""
-        self._next_look = 0.0
-        self._places: tuple[str, ...] = ()
-        """The addresses towards which this machine looks for its own; none: the fleet file says where it is."""
-        self._roaming = Roaming(began_at=())
-        self._home = ""
-        """The address at which the others dial this machine, if it had it at the start."""
-        self._has_roamed, self._next_place = False, 0.0
         self.begins_anew = False
         """The process is to become another daemon, in place, once this one has ended."""
-        self._has_foreign_state = False
-        self._has_others_state = self._lacks_state_file = False
         self._door = Door(options.runtime_dir, options.node)
         self._is_ready = False
         self._library = Library(
@@ -163,10 +131,6 @@ class Daemon:
             state_dir=options.state_dir,
             post=self._inbox.post,
         )
-        self._stored: dict[str, Fleet] = {}
-        """{hash: what it says} of the documents that the state names."""
-        self._flags: dict[str, tuple[Flag, ...]] = {}
-        """{hash: its flags} of the same documents."""
         self._in_file = fleet_hash(self._fleet)
         self._pools: str | None = None
         """An operator's own ``ZENOH_RUNTIME``."""
@@ -176,50 +140,30 @@ class Daemon:
         """Run until SIGTERM or SIGINT; the exit code."""
         state_file = StateFile(self._options.state_dir, fleet=self._fleet.name, node=self._spec.name)
         with state_file, contextlib.ExitStack() as stack:
-            durable, problem = self._restore(state_file)
-            self._take_document(durable)
+            here = self._options
+            restored = restore(state_file, self._fleet, config=here.config, node=here.node, state_dir=here.state_dir)
+            stored = read_stored(self._library, restored.state)
+            if stored.fleet is not None:
+                self._go_by(stored.fleet)
             # Read once, when zenoh's runtime starts. An operator's own setting wins, and workers inherit it.
             self._pools = os.environ.get("ZENOH_RUNTIME")
             os.environ.setdefault("ZENOH_RUNTIME", zenoh_config.daemon_pools(len(self._fleet.nodes)))
-            incarnation = durable.incarnation if durable is not None else wall_tenths()
+            incarnation = restored.state.incarnation if restored.state is not None else wall_tenths()
             points = endpoints_for(
                 self._fleet, self._spec, functools.partial(self._data_port, stack), is_here, self._protocol
             )
-            if points.data_by_gossip or points.control_by_gossip:
-                self._places = places_of(node.host for node in self._fleet.nodes if node is not self._spec)
-                self._roaming = Roaming(began_at=addresses_towards(self._places))
-            elif self._spec.host and is_here(self._spec.host):
-                self._home = numeric(self._spec.host)
+            self._watch = SessionWatch(
+                self._fleet,
+                self._spec,
+                points,
+                certificate=self._certificate,
+                config=here.config,
+                state_dir=here.state_dir,
+                post=self._inbox.post,
+            )
             self._handle_signals(stack)  # first: a stop that comes while things open is an orderly one, too
             shell = self._build(stack, state_file, incarnation, points)
-            node = Node(
-                fleet=self._fleet,
-                me=self._spec.name,
-                durable=durable,
-                incarnation=incarnation,
-                electorate=electorate_hash(self._fleet),
-                rng=random.Random(f"{self._spec.name}/{incarnation}"),
-                now=monotonic_s(),
-                version=__version__,
-                stored=self._stored,
-                flags=self._flags,
-            )
-            node.solitude.dialled = points.control_connect
-            node.solitude.dialled_at = dial_endpoint(self._spec.listen_control, self._spec.host)
-            node.joins_at = joins_at(self._spec, points.worker_connect[:1])
-            if problem is not None:
-                node.problems["state"] = problem
-            node.has_foreign_state = self._has_foreign_state
-            node.fleet_path = str(self._options.config.absolute())
-            node.by_file = self._in_file
-            node.copied_file = copied_file(self._options.state_dir)
-            node.has_others_state, node.lacks_state_file = self._has_others_state, self._lacks_state_file
-            if self._memory_objection:
-                log.warning("shared_memory off why=%s", self._memory_objection)
-                node.problems["shared_memory"] = f"shared memory is off here: {self._memory_objection}"
-            if plain_text := daemon_tls.plain_text_problem(self._spec, self._protocol):
-                node.problems["tls"] = plain_text
-            node.security = self._exposure(points)
+            node = self._node(restored, stored, incarnation, points)
             gc.freeze()  # what lives until the end need not be looked at again
             give_back()
             self._loop(node, shell)
@@ -227,60 +171,42 @@ class Daemon:
 
     # --- building ----------------------------------------------------------------------------------------------------
 
-    def _restore(self, state_file: StateFile) -> tuple[DurableState | None, str | None]:
-        """The durable state with this start's incarnation on disk, or why there is none."""
-        loaded = state_file.load()
-        self._lacks_state_file = loaded.is_missing
-        if loaded.state is None:
-            self._has_others_state, here = loaded.is_others, self._options
-            command = f"zsched init --config {here.config} --node {here.node} --state-dir {here.state_dir}"
-            advice = "" if loaded.is_others else f" (here: `{command}`)"
-            log.warning("no_state why=%s%s; no elector", loaded.problem, advice)
-            return None, loaded.problem
-        if loaded.state.electorate != electorate_hash(self._fleet) and not _is_agreed(loaded.state):
-            generation = loaded.state.generation + 1
-            self._has_foreign_state = True
-            why = (
-                "the fleet file names another electorate than the state file, which is whole and stays; this node is "
-                f"no elector. If the file is right, give it to all, stop all, `zsched init --generation {generation} "
-                "--force` on each, and start all"
-            )
-            log.warning("other_electorate %s", why)
-            return None, why
-        # Not just one more: a folder that was brought back from a backup must not live one of its lives again.
-        state = replace(
-            loaded.state,
-            incarnation=max(loaded.state.incarnation + 1, wall_tenths()),
-            disk=loaded.state.disk or secrets.token_hex(8),
-        )
-        try:
-            state_file.save(state)
-        except AdapterError as error:
-            return None, str(error)
-        return state, None
+    def _go_by(self, fleet: Fleet) -> None:
+        """An agreed document is in force, not the fleet file."""
+        self._fleet = fleet
+        self._spec = fleet.node(self._options.node)
+        self._read_settings()
 
-    def _take_document(self, durable: DurableState | None) -> None:
-        """Go by the agreed document if the state names one that is stored here, else by the fleet file."""
-        register = None if durable is None else durable.fleet_register
-        value = None if register is None else register.learnt
-        if register is None or value is None:
-            return
-        named = [value.document, "" if register.accepted is None else register.accepted.value.document]
-        self._library.keep(tuple(filter(None, named)))
-        for document in filter(None, named):
-            content = self._library.store.load(document)
-            if content is None:
-                continue
-            try:
-                self._stored[document], self._flags[document] = self._library.read(content), content.flags
-            except ConfigError as error:
-                log.warning("document unusable document=%s why=%s", document, error)
-        fleet = self._stored.get(value.document)
-        if fleet is not None:
-            self._fleet = in_force(fleet, value)
-            self._spec = self._fleet.node(self._options.node)
-            self._read_settings()
-            log.info("document in force revision=%d document=%s", value.revision, value.document)
+    def _node(self, restored: Restored, stored: Stored, incarnation: int, points: Endpoints) -> Node:
+        node = Node(
+            fleet=self._fleet,
+            me=self._spec.name,
+            durable=restored.state,
+            incarnation=incarnation,
+            electorate=electorate_hash(self._fleet),
+            rng=random.Random(f"{self._spec.name}/{incarnation}"),
+            now=monotonic_s(),
+            version=__version__,
+            stored=stored.fleets,
+            flags=stored.flags,
+        )
+        node.solitude.dialled = points.control_connect
+        node.solitude.dialled_at = dial_endpoint(self._spec.listen_control, self._spec.host)
+        node.joins_at = joins_at(self._spec, points.worker_connect[:1])
+        node.has_foreign_state = restored.is_foreign
+        node.has_others_state, node.lacks_state_file = restored.is_others, restored.is_missing
+        node.fleet_path = str(self._options.config.absolute())
+        node.by_file = self._in_file
+        node.copied_file = copied_file(self._options.state_dir)
+        if restored.problem is not None:
+            node.problems["state"] = restored.problem
+        if self._memory_objection:
+            log.warning("shared_memory off why=%s", self._memory_objection)
+            node.problems["shared_memory"] = f"shared memory is off here: {self._memory_objection}"
+        if plain_text := daemon_tls.plain_text_problem(self._spec, self._protocol):
+            node.problems["tls"] = plain_text
+        node.security = self._exposure(points)
+        return node
 
     def _exposure(self, points: Endpoints) -> Exposure:
         listens = (*points.control_listen, *points.data_listen)
@@ -354,7 +280,7 @@ class Daemon:
         stack.callback(bus.close)
         shell = Shell(node=me, inbox=self._inbox, bus=bus, state_file=state_file, desk=desk, fleet=fleet)
         shell.log, shell.library = decisions, self._library
-        shell.take_certificate = self._take_certificate
+        shell.take_certificate = self._watch.take_certificate
         shell.rehearsals = RehearsalStore(self._options.state_dir)
         shell.strikes = Strikes(me, shell.answer_operator)
         self._library.fetch = bus.fetch_document
@@ -386,7 +312,7 @@ class Daemon:
             bus=bus,
             access=access,
             sampler=sampler,
-            compare_sessions=self._note_sessions,
+            compare_sessions=self._watch.note,
             post=self._inbox.post,
         )
         adoption.begin()
@@ -406,7 +332,7 @@ class Daemon:
             door=self._door,
             orphan_s=fleet.relay_orphan_s,
             incarnation=incarnation,
-            digest=" ".join((self._spec.listen_streams, *(() if self._spec.local else self._gossiped(points)))),
+            digest=" ".join((self._spec.listen_streams, *(() if self._spec.local else self._watch.gossiped))),
             listen=points.data_listen[0],
             certificate="" if fleet.security is None else digest_of(fleet.security),
             tasks=tasks,
@@ -431,16 +357,12 @@ class Daemon:
             streams=self._streams(),
         )
 
-    def _gossiped(self, points: Endpoints) -> tuple[str, ...]:
-        """The addresses at which others learn by gossip that this node's data session listens."""
-        return self._roaming.began_at if points.data_by_gossip else ()
-
     def _data_listen(self, points: Endpoints) -> tuple[str, ...]:
         """A relay keeps its process when it roams, and zenoh the addresses of its process: they are named, then.
 
         Without a local side the host's applications join this session at any address, and the process is replaced.
         """
-        gossiped = self._gossiped(points)
+        gossiped = self._watch.gossiped
         if not self._spec.local or not gossiped:
             return points.data_listen
         return tuple(dial_endpoint(points.data_listen[0], host) for host in ("127.0.0.1", *gossiped))
@@ -525,9 +447,9 @@ class Daemon:
                 is_first = leaving.ask(node.owned(), now, begins_anew=self.begins_anew)
                 if is_first and not self.begins_anew:
                     self._notify.stopping()
-            self._look_around(node, now)
-            if self._may_begin_again and leaving.asked_at is None:
-                self._tend_sessions(node, now)
+            self._watch.look_around(node, now)
+            if leaving.asked_at is None and not self.begins_anew and self._watch.is_due(node, now):
+                self._end_to_begin_anew()
             if leaving.asked_at is not None and leaving.is_over(
                 node.owned(), node.movable(now), now, finishing=node.finishing()
             ):
@@ -541,92 +463,15 @@ class Daemon:
                 self._leftovers.tend(now)
                 self._notify.status(status_line(node))
 
-    # --- sessions that are opened again -------------------------------------------------------------------------------
-
-    def _note_sessions(self, lets_in_others: bool, moved: tuple[NodeId, ...]) -> None:
-        self._lets_in_others, self._next_look = lets_in_others, 0.0
-        self._moved.take(moved)
-
-    @property
-    def _may_begin_again(self) -> bool:
-        is_due = self._has_roamed or self._reopening.due_at is not None
-        return is_due or self._fleet.security is not None or self._moved.is_any
-
-    def _look_around(self, node: Node, now: float) -> None:
-        """Whether this machine is where the others know it: by the fleet file, or else by its sessions."""
-        if now < self._next_place:
-            return
-        self._next_place = now + PLACE_LOOK_S
-        if self._places:
-            self._has_roamed = self._roaming.is_elsewhere(addresses_towards(self._places), now)
-        elif self._home:
-            node.set_problem(ADDRESS, None if is_here(self._home) else gone_from(self._home))
-
-    def _take_certificate(self, pem: str) -> CommandResult:
-        result = renewal.take(self._fleet, self._options.state_dir, pem)
-        self._next_look = 0.0
-        return result
-
-    def _tend_sessions(self, node: Node, now: float) -> None:
-        """Begin again when it is this node's turn and what its sessions were opened with holds no more."""
-        if self.begins_anew:
-            return
-        electors, alive = node.fleet.electors, node.membership.alive()
-        lives = {name: node.membership.incarnation(name) for name in alive}
-        left, before = self._moved.left(lives), self._left
-        self._left = left
-        if now >= self._next_look or left != before:
-            self._next_look = now + LOOK_S
-            with contextlib.suppress(ConfigError):  # it is being replaced
-                node.set_problem(CERTIFICATE, renewal.ends_soon(self._fleet, renewal.now_utc()))
-            if self._lets_in_others or left or self._has_another_certificate(node):
-                candidates = [task.candidates for task in node.fleet.tasks]
-                order = turns((*alive, node.me), electors, node.tenure.voters, candidates)
-                self._reopening.want(order, lives, now, first_s=first_wait_s(node.fleet.timing))
-            elif not self._has_roamed:
-                self._reopening.forget()
-        if self._has_roamed:
-            self._reopening.want(((node.me,),), lives, now, first_s=0.0)  # nobody else begins again for it
-        lacks = () if self._reopening.due_at is None else node.lacking(now)
-        awaited = [name for name in electors if name not in left]  # who has left is heard again only afterwards
-        is_due = self._reopening.is_due(awaited, lives, now, lack=[lack.sparing for lack in lacks])
-        texts = [] if is_due else [f"{lack.task}: {lack.why}" for lack in lacks]
-        node.set_problem(TURN, f"it waits to open its sessions anew ({'; '.join(texts)})" if texts else None)
-        if not is_due:
-            return
-        why_not = self._why_not_anew(node)
-        self._inbox.post(ev.ProblemReported(source=SESSIONS, problem=why_not))
-        if why_not is not None:
-            self._reopening.put_off(now)
-            return
+    def _end_to_begin_anew(self) -> None:
         log.info(
             "sessions node=%s are opened anew: others are let in or dialled, or its certificate or address is another",
-            node.me,
+            self._options.node,
         )
         with contextlib.suppress(OSError):  # without it an operator's command says that there is no daemon
-            places.again_path(self._options.runtime_dir, node.me).touch()
+            places.again_path(self._options.runtime_dir, self._options.node).touch()
         self._is_restart = self.begins_anew = True
         self._inbox.post(ev.StopRequested())
-
-    def _has_another_certificate(self, node: Node) -> bool:
-        try:
-            return node.fleet.security is not None and digest_of(node.fleet.security) != self._certificate
-        except ConfigError:
-            return False  # it is being replaced, or cannot be used: the one that is used goes on
-
-    def _why_not_anew(self, node: Node) -> str | None:
-        """What would keep a daemon from starting by the fleet in force; ``None``: nothing."""
-        security = node.fleet.security
-        try:
-            require_node(load_fleet(self._options.config), node.me, self._options.config)
-            if security is not None:
-                require_own(node.fleet, security, node.me)
-                seals_of(node.fleet)
-            for side in Side:
-                daemon_tls.session_text(node.fleet, side)
-        except ConfigError as error:
-            return f"its sessions let in or dial others than the fleet says, and cannot be opened anew: {error}"
-        return None
 
     def _say_goodbye(self, node: Node, last_words: str) -> None:
         if last_words:
@@ -668,12 +513,6 @@ class Daemon:
         self._is_ready = True
         self._notify.ready()
         log.info("ready node=%s fleet=%s incarnation=%d", node.me, self._fleet.name, node.incarnation)
-
-
-def _is_agreed(state: DurableState) -> bool:
-    """Whether a fleet value names the electors, and no longer the file."""
-    value = None if state.fleet_register is None else state.fleet_register.learnt
-    return value is not None and not value.electorate.is_founding
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -1,0 +1,113 @@
+"""What a daemon starts with from its state folder: its durable state in a new life, and the document in force.
+
+Knows: when a state may be used by this fleet file, and how a new life is numbered. Does not know: what the state means.
+"""
+
+from __future__ import annotations
+
+import logging
+import secrets
+from pathlib import Path
+
+from zsched.adapters.host.state_file import StateFile
+from zsched.clock import wall_tenths
+from zsched.core.electorate.numbers import in_force
+from zsched.core.values.document import Flag
+from zsched.core.values.durable import DurableState
+from zsched.core.values.fleet import Fleet, electorate_hash
+from zsched.core.values.model import NodeId
+from zsched.core.values.struct import Struct, field, replace
+from zsched.errors import AdapterError, ConfigError
+from zsched.runtime.library import Library
+
+log = logging.getLogger("zsched.daemon")
+
+
+class Restored(Struct, frozen=True, kw_only=True):
+    """What the state folder gave."""
+
+    state: DurableState | None = None
+    """With this life's incarnation, on the disk already; ``None``: this node is no elector."""
+    problem: str | None = None
+    """Why there is no state."""
+    is_foreign: bool = False
+    """It was made with another electorate than the fleet file names."""
+    is_others: bool = False
+    """It is another node's, or another fleet's."""
+    is_missing: bool = False
+    """There is no state file."""
+
+
+def restore(state_file: StateFile, fleet: Fleet, *, config: Path, node: NodeId, state_dir: Path) -> Restored:
+    """The durable state with this start's incarnation on disk, or why there is none; both are logged.
+
+    ``config``, ``node`` and ``state_dir`` are named in the advice.
+    """
+    loaded = state_file.load()
+    if loaded.state is None:
+        command = f"zsched init --config {config} --node {node} --state-dir {state_dir}"
+        advice = "" if loaded.is_others else f" (here: `{command}`)"
+        log.warning("no_state why=%s%s; no elector", loaded.problem, advice)
+        return Restored(problem=loaded.problem, is_others=loaded.is_others, is_missing=loaded.is_missing)
+    if loaded.state.electorate != electorate_hash(fleet) and not _is_agreed(loaded.state):
+        generation = loaded.state.generation + 1
+        why = (
+            "the fleet file names another electorate than the state file, which is whole and stays; this node is "
+            f"no elector. If the file is right, give it to all, stop all, `zsched init --generation {generation} "
+            "--force` on each, and start all"
+        )
+        log.warning("other_electorate %s", why)
+        return Restored(problem=why, is_foreign=True)
+    # Not just one more: a folder that was brought back from a backup must not live one of its lives again.
+    state = replace(
+        loaded.state,
+        incarnation=max(loaded.state.incarnation + 1, wall_tenths()),
+        disk=loaded.state.disk or secrets.token_hex(8),
+    )
+    try:
+        state_file.save(state)
+    except AdapterError as error:
+        return Restored(problem=str(error))
+    return Restored(state=state)
+
+
+class Stored(Struct):
+    """The documents that a state names, as far as they are stored here and can be used."""
+
+    fleets: dict[str, Fleet] = field(default_factory=dict)
+    """{hash: what it says}."""
+    flags: dict[str, tuple[Flag, ...]] = field(default_factory=dict)
+    """{hash: its flags}."""
+    fleet: Fleet | None = None
+    """By the agreed document; ``None``: the fleet file holds."""
+
+
+def read_stored(library: Library, state: DurableState | None) -> Stored:
+    """The documents that ``state`` names, and the fleet by the one that is agreed; ``library`` keeps them."""
+    stored = Stored()
+    register = None if state is None else state.fleet_register
+    value = None if register is None else register.learnt
+    if register is None or value is None:
+        return stored
+    accepted = "" if register.accepted is None else register.accepted.value.document
+    named = tuple(filter(None, (value.document, accepted)))
+    library.keep(named)
+    for document in named:
+        content = library.store.load(document)
+        if content is None:
+            continue
+        try:
+            stored.fleets[document], stored.flags[document] = library.read(content), content.flags
+        except ConfigError as error:
+            log.warning("document unusable document=%s why=%s", document, error)
+    fleet = stored.fleets.get(value.document)
+    if fleet is not None:
+        stored.fleet = in_force(fleet, value)
+        log.info("document in force revision=%d document=%s", value.revision, value.document)
+    return stored
+
+
+def _is_agreed(state: DurableState) -> bool:
+    """Whether a fleet value names the electors, and no longer the file."""
+    value = None if state.fleet_register is None else state.fleet_register.learnt
+    return value is not None and not value.electorate.is_founding
