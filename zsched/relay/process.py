@@ -41,6 +41,7 @@ from zsched.relay.books import Books
 from zsched.relay.graph import GraphMirror
 from zsched.relay.local_side import LocalSide
 from zsched.relay.matching import Matching
+from zsched.relay.open_streams import OpenStreams
 from zsched.relay.roles import RoleServer
 from zsched.relay.streams.acks import DEFAULT_LEASE_S, Acks
 from zsched.relay.successors import Successor, Successors
@@ -393,11 +394,10 @@ class RelayProcess:
                 name,
                 self._tokens,
                 self._acks,
-                self._own_ids,
                 self._application.report,
                 graph,
+                OpenStreams(self._session, self._own_ids, self._local, self._books.cell),
                 self._local,
-                self._books.cell,
             )
             self._tasks[name] = task
         return task

@@ -18,7 +18,6 @@ from zenoh import Session, Timestamp
 
 from zsched.clock import monotonic_s
 from zsched.core.events import ProblemReported, SlotDrained, SlotFlipped, SlotReady
-from zsched.core.hop.books import added, closed, together
 from zsched.core.relay_protocol import RelayReport, SlotLost
 from zsched.core.values.model import TaskId
 from zsched.core.values.plan import (
@@ -35,11 +34,10 @@ from zsched.core.values.plan import (
 from zsched.core.values.struct import Struct
 from zsched.guard import guarded
 from zsched.relay.graph import GraphMirror
+from zsched.relay.open_streams import OpenStreams
+from zsched.relay.orders import Ended, Finish, Leave, Orphaned, Rejoin, Unowned
 from zsched.relay.services.service import Services
 from zsched.relay.streams.acks import Acks
-from zsched.relay.streams.answer_times import AnswerTimes
-from zsched.relay.streams.inputs import InputStream
-from zsched.relay.streams.outputs import OutputStream
 from zsched.relay.streams.proofs import Stamps
 from zsched.relay.tokens import Tokens
 
@@ -83,54 +81,7 @@ class _OpenSlot(Struct, eq=False):
     """...and since when that is known."""
 
 
-class _Orphaned:
-    """In the queue of plans: those behind it are another daemon's."""
-
-
-class _Leave(Struct, kw_only=True, eq=False):
-    """In the queue of plans: the data session is about to close."""
-
-    has_left: threading.Event
-    began_at: float
-    patience_s: float
-    """When nothing of what is under way has arrived for this long, it is given up..."""
-    at_most_s: float
-    """...and in any case after this time."""
-    under_way: int | None = None
-    moved_at: float = 0.0
-
-    def is_over(self, under_way: int, now: float) -> bool:
-        """Whether to wait no longer for what is under way (a number of samples)."""
-        if self.under_way is None or under_way < self.under_way:
-            self.under_way, self.moved_at = under_way, now
-        return now - self.moved_at >= self.patience_s or now - self.began_at >= self.at_most_s
-
-
-class _Rejoin(Struct, frozen=True, eq=False):
-    """In the queue of plans: another data session is there."""
-
-    session: Session
-    own_ids: frozenset[str]
-
-
-class _Ended:
-    """In the queue of plans: the task left the fleet file, nothing follows."""
-
-
-class _Unowned(Struct, frozen=True):
-    """In the queue of plans: inputs that are taken whether or not there is an owner."""
-
-    routes: tuple[Route, ...]
-
-
-class _Finish(Struct, frozen=True, eq=False):
-    """In the queue of plans: this relay is about to end, its successor goes on with its counters."""
-
-    is_done: threading.Event
-    until: float
-
-
-_Item = RoutePlan | _Finish | _Orphaned | _Unowned | _Leave | _Rejoin | _Ended | None
+_Item = RoutePlan | Finish | Orphaned | Unowned | Leave | Rejoin | Ended | None
 
 
 class TaskRelay:
@@ -142,39 +93,29 @@ class TaskRelay:
         task: TaskId,
         tokens: Tokens,
         acks: Acks,
-        own_ids: frozenset[str],
         report: Callable[[RelayReport], None],
         graph: GraphMirror,
+        streams: OpenStreams,
         local: Session | None = None,
-        cells: Callable[[str], memoryview | None] = lambda _stream: None,
     ) -> None:
         """``session`` is the fleet's, ``local`` the one of the host's own side, if it has one.
 
-        ``cells``: where an input counts what it takes, beside its own counters (`zsched.relay.books`).
+        ``streams`` are opened here by both.
         """
-        self._cells = cells
-        self._session = session
-        self._local = local
         self._graph = graph
         self._task = task
         self._tokens = tokens
         self._acks = acks
-        self._own_ids = own_ids
         self._report = report
         self._queue: queue.SimpleQueue[_Item] = queue.SimpleQueue()
         self._plan: RoutePlan | None = None
         self._slots: dict[int, _OpenSlot] = {}
-        self._inputs: dict[str, InputStream] = {}
-        self._outputs: dict[str, OutputStream] = {}
-        self._closed: dict[str, StreamCount] = {}
-        """What streams have counted that were closed, and may come again by the same name..."""
-        self._changing = threading.Lock()
-        """...which a reader of counters sees in one of both places."""
+        self._streams = streams
+        streams.wake = self.wake
         self._services = Services(session, local)
         self._stamps = Stamps()
-        self._times = AnswerTimes()
         self._flip_by: float | None = None
-        self._leaving: _Leave | None = None
+        self._leaving: Leave | None = None
         self._is_away = False
         """Between two data sessions: what comes waits."""
         self._resume_by: float | None = None
@@ -190,7 +131,7 @@ class TaskRelay:
 
     def listen(self, routes: tuple[Route, ...]) -> None:
         """Take these inputs from now on, so that what comes before the first owner is counted, or kept for it."""
-        self._queue.put(_Unowned(routes))
+        self._queue.put(Unowned(routes))
 
     def wake(self) -> None:
         """Something that readiness or draining hangs on has changed."""
@@ -198,7 +139,7 @@ class TaskRelay:
 
     def lose_daemon(self) -> None:
         """Nobody would tell us of another owner from now on, until the next plan."""
-        self._queue.put(_Orphaned())
+        self._queue.put(Orphaned())
 
     def leave(self, patience_s: float, at_most_s: float) -> threading.Event:
         """Let what is under way arrive, and close all that is on the data session; answers what is set then.
@@ -207,13 +148,13 @@ class TaskRelay:
         is under way is given up, counted.
         """
         has_left = threading.Event()
-        leave = _Leave(has_left=has_left, began_at=monotonic_s(), patience_s=patience_s, at_most_s=at_most_s)
+        leave = Leave(has_left=has_left, began_at=monotonic_s(), patience_s=patience_s, at_most_s=at_most_s)
         self._queue.put(leave)
         return has_left
 
     def rejoin(self, session: Session, own_ids: frozenset[str]) -> None:
         """Carry on by another data session; ``own_ids`` are those of all sessions of this process."""
-        self._queue.put(_Rejoin(session, own_ids))
+        self._queue.put(Rejoin(session, own_ids))
 
     def finish(self, until: float) -> threading.Event:
         """This relay is about to end: take nothing more, let what is under way arrive until then, and close all.
@@ -221,12 +162,12 @@ class TaskRelay:
         The event is set when the counters are the last ones.
         """
         is_done = threading.Event()
-        self._queue.put(_Finish(is_done, until))
+        self._queue.put(Finish(is_done, until))
         return is_done
 
     def end(self) -> None:
         """The task left the fleet file: close everything, and end."""
-        self._queue.put(_Ended())
+        self._queue.put(Ended())
 
     @property
     def misses_its_worker(self) -> bool:
@@ -236,9 +177,7 @@ class TaskRelay:
 
     def counts(self) -> tuple[StreamCount, ...]:
         """The counters of every stream, by name."""
-        with self._changing:
-            counts = added(tuple(stream.count() for stream in self._streams()), self._closed)
-        return tuple(sorted((*counts, *self._services.counts()), key=lambda count: count.stream))
+        return tuple(sorted((*self._streams.counts(), *self._services.counts()), key=lambda count: count.stream))
 
     # --- the thread --------------------------------------------------------------------------------------------------
 
@@ -249,19 +188,19 @@ class TaskRelay:
             except queue.Empty:
                 plan = None
             try:
-                if isinstance(plan, _Ended):
+                if isinstance(plan, Ended):
                     self._close_all()
                     return
-                if isinstance(plan, _Finish):
+                if isinstance(plan, Finish):
                     self._finish(plan)
                     return
-                if isinstance(plan, _Orphaned):
+                if isinstance(plan, Orphaned):
                     self._pause()
-                elif isinstance(plan, _Unowned):
+                elif isinstance(plan, Unowned):
                     self._listen(plan.routes)
-                elif isinstance(plan, _Leave):
+                elif isinstance(plan, Leave):
                     self._leaving = plan
-                elif isinstance(plan, _Rejoin):
+                elif isinstance(plan, Rejoin):
                     self._rejoin(plan.session, plan.own_ids)
                 elif plan is not None:
                     self._take(plan)
@@ -279,7 +218,7 @@ class TaskRelay:
         is_moving = not current.is_ready or self._flip_by is not None or self._draining() is not None
         if is_moving:
             return BUSY_S
-        return CARE_S if self._is_counted() else IDLE_S
+        return CARE_S if self._streams.is_counted else IDLE_S
 
     def _step(self) -> None:
         if self._is_away:
@@ -289,9 +228,9 @@ class TaskRelay:
             self._tell_left(state)
         self._flip_when_due()
         self._drain()
-        for source in self._inputs.values():
+        for source in self._streams.inputs.values():
             source.look_after()
-        for sink in self._outputs.values():
+        for sink in self._streams.outputs.values():
             sink.look_after()
         self._services.look_after()
         stalled = self._acks.stalled
@@ -309,36 +248,32 @@ class TaskRelay:
 
     # --- another data session ----------------------------------------------------------------------------------------
 
-    def _leave_when_still(self, leaving: _Leave) -> None:
-        under_way = sum(source.under_way() for source in self._inputs.values())
+    def _leave_when_still(self, leaving: Leave) -> None:
+        under_way = self._streams.under_way
         is_over = leaving.is_over(under_way, monotonic_s())
         if not is_over and (self._flip_by is not None or self._draining() is not None):
             return  # a handover first
-        for source in self._inputs.values():
+        for source in self._streams.inputs.values():
             source.hold()
         self._services.hold()
-        under_way = sum(source.under_way() for source in self._inputs.values())
+        under_way = self._streams.under_way
         if not is_over and (under_way or not all(self._services.has_ended(epoch) for epoch in self._slots)):
             return
         self._leaving, self._is_away = None, True
-        lost, carrier = sum(source.leave() for source in self._inputs.values()), self._carrier()
+        lost, carrier = sum(source.leave() for source in self._streams.inputs.values()), self._carrier()
         if lost and carrier is not None:
             self._report(SlotLost(task=self._task, epoch=carrier.slot.epoch, owner=carrier.slot.owner, samples=lost))
-        for sink in self._outputs.values():
+        for sink in self._streams.outputs.values():
             sink.leave()
         leaving.has_left.set()
 
     def _rejoin(self, session: Session, own_ids: frozenset[str]) -> None:
-        self._session, self._own_ids = session, own_ids
         self._is_away, self._resume_by = False, monotonic_s() + REJOIN_S
         for state in self._slots.values():
             state.is_ready, state.seen, state.gone_at = False, frozenset(), None
             state.lacks_since = state.lack = None
-        for stream in self._streams():
-            try:
-                stream.rejoin(session, own_ids)
-            except (ValueError, zenoh.ZError) as error:
-                self._problem(f"{stream.route.stream}: {error}")
+        for problem in self._streams.rejoin(session, own_ids):
+            self._problem(problem)
         self._services.rejoin(session, self._slots)
         for state in self._slots.values():
             for route in state.slot.routes:
@@ -353,12 +288,12 @@ class TaskRelay:
         if carrier is not None and not carrier.is_ready and now < until:
             return
         self._resume_by, self._say_again_at = None, now + SAY_AGAIN_S
-        for source in self._inputs.values():
+        for source in self._streams.inputs.values():
             source.resume()
         self._say_again()
 
     def _say_again(self) -> None:
-        for sink in self._outputs.values():
+        for sink in self._streams.outputs.values():
             sink.say_again()
 
     # --- plans -------------------------------------------------------------------------------------------------------
@@ -366,50 +301,38 @@ class TaskRelay:
     def _pause(self) -> None:
         self._is_inherited = True
         if self._plan is not None and self._plan.exclusive:
-            for sink in self._outputs.values():
+            for sink in self._streams.outputs.values():
                 sink.pause()
 
     def _close_all(self) -> None:
         for epoch in sorted(self._slots):
             self._close(epoch)
-        for stream in self._streams():
-            stream.close()
-        self._inputs.clear()
-        self._outputs.clear()
+        self._streams.close()
+        self._streams.inputs.clear()
+        self._streams.outputs.clear()
         self._services.keep(set())
         self._graph.set_routes(self._task, ())
 
-    def _finish(self, finish: _Finish) -> None:
-        """The streams stay in the table: whoever asks now hears their last counts."""
+    def _finish(self, finish: Finish) -> None:
         try:
-            for source in self._inputs.values():
+            for source in self._streams.inputs.values():
                 source.stop()
-            while any(source.under_way() for source in self._inputs.values()) and monotonic_s() < finish.until:
-                for source in self._inputs.values():
+            while self._streams.under_way and monotonic_s() < finish.until:
+                for source in self._streams.inputs.values():
                     source.look_after()
                 sleep(BUSY_S)
-            for stream in self._streams():
-                stream.close()
+            self._streams.close()
         finally:
             finish.is_done.set()
 
     def _listen(self, routes: tuple[Route, ...]) -> None:
         for route in routes:
-            if route.stream in self._inputs:
+            if route.stream in self._streams.inputs:
                 continue
             try:
-                self._inputs[route.stream] = self._take_input(route)
+                self._streams.input_of(route)
             except (ValueError, zenoh.ZError) as error:
                 self._problem(f"{route.stream}: {route.from_expr}: {error}")
-
-    def _take_input(self, route: Route) -> InputStream:
-        cell = self._cells(route.stream)
-        if cell is not None and route.stream not in self._closed:
-            cell[0] = 0  # of a task by this name that has left the fleet
-        return InputStream(self._session, route, self._own_ids, self._local, self._times, cell=cell)
-
-    def _take_output(self, route: Route) -> OutputStream:
-        return OutputStream(self._session, route, self._own_ids, self.wake, self._local, self._times)
 
     def _take(self, plan: RoutePlan) -> None:
         self._plan = plan
@@ -442,7 +365,7 @@ class TaskRelay:
             current.lack = None  # the same
         if current is not None and plan.phase is RoutePhase.FLIP and current.is_flipped:
             self._report(SlotFlipped(task=self._task, epoch=current.slot.epoch, replayed=0))  # for another daemon
-        for sink in self._outputs.values():
+        for sink in self._streams.outputs.values():
             sink.resume(0 if plan.current is None else plan.current.epoch)
         self._forget_streams()
         self._graph.set_routes(
@@ -475,9 +398,9 @@ class TaskRelay:
             if before.get(stream) != route:
                 self._try_route(slot, route, is_from_start=False)
         if state.is_flipped:  # those that ran on are there already
-            for sink in self._outputs.values():
+            for sink in self._streams.outputs.values():
                 sink.flip(epoch, drops_held=False)
-            for source in self._inputs.values():
+            for source in self._streams.inputs.values():
                 source.flip(epoch, has_answer=self._has_answer)
             self._services.flip(epoch)
 
@@ -486,9 +409,9 @@ class TaskRelay:
         if route.direction is Direction.SERVICE:
             self._services.close_stream(epoch, route.stream)
             return 0
-        if route.stream in self._outputs:
-            self._outputs[route.stream].close_slot(epoch)
-        source = self._inputs.get(route.stream)
+        if route.stream in self._streams.outputs:
+            self._streams.outputs[route.stream].close_slot(epoch)
+        source = self._streams.inputs.get(route.stream)
         return 0 if source is None else source.take_left(epoch) + source.close_slot(epoch, has_answer=self._has_answer)
 
     def _try_route(self, slot: Slot, route: Route, *, is_from_start: bool) -> None:
@@ -505,16 +428,10 @@ class TaskRelay:
             self._services.open(epoch, route)
             return
         if route.direction is Direction.INPUT:
-            source = self._inputs.get(route.stream)
-            if source is None or (source.route.from_expr, source.route.settings) != (route.from_expr, route.settings):
-                self._end_input(route.stream)
-                source = self._inputs[route.stream] = self._take_input(route)
+            source = self._streams.input_of(route)
             source.open(epoch, route, acks, self._stamps if _replays(slot) else None)
             return
-        sink = self._outputs.get(route.stream)
-        if sink is None or (sink.route.to_expr, sink.route.settings) != (route.to_expr, route.settings):
-            self._end_output(route.stream)
-            sink = self._outputs[route.stream] = self._take_output(route)
+        sink = self._streams.output_of(route)
         sink.know(route.from_expr, notes_stamps=_replays(slot))
         sink.open(epoch, route, acks, is_from_start=is_from_start)
 
@@ -522,18 +439,18 @@ class TaskRelay:
         state = self._slots.pop(epoch, None)
         lost = (0 if state is None else state.left) + sum(
             source.take_left(epoch) + source.close_slot(epoch, has_answer=self._has_answer)
-            for source in self._inputs.values()
+            for source in self._streams.inputs.values()
         )
         if lost and state is not None:
             self._report(SlotLost(task=self._task, epoch=epoch, owner=state.slot.owner, samples=lost))
-        for sink in self._outputs.values():
+        for sink in self._streams.outputs.values():
             sink.close_slot(epoch)
         self._services.close_slot(epoch)
 
     def _tell_left(self, state: _OpenSlot) -> None:
         """Report, once for each death, what a worker has left open that restarted in place."""
         now = monotonic_s()
-        left = sum(source.take_left(state.slot.epoch) for source in self._inputs.values())
+        left = sum(source.take_left(state.slot.epoch) for source in self._streams.inputs.values())
         if left:
             state.left, state.left_at = state.left + left, state.left_at or now
         if state.left_at is None or now - state.left_at < GATHER_S:
@@ -547,31 +464,8 @@ class TaskRelay:
         names = {route.stream for state in self._slots.values() for route in state.slot.routes}
         if not names:
             return
-        for stream in tuple(self._inputs):
-            if stream not in names:
-                self._end_input(stream)
-        for stream in tuple(self._outputs):
-            if stream not in names:
-                self._end_output(stream)
+        self._streams.keep(names)
         self._services.keep(names)
-
-    def _end_input(self, stream: str) -> None:
-        source = self._inputs.get(stream)
-        if source is not None:
-            source.close()
-            with self._changing:
-                self._keep_counts(self._inputs.pop(stream).count())
-
-    def _end_output(self, stream: str) -> None:
-        sink = self._outputs.get(stream)
-        if sink is not None:
-            sink.close()
-            with self._changing:
-                self._keep_counts(self._outputs.pop(stream).count())
-
-    def _keep_counts(self, count: StreamCount) -> None:
-        before = self._closed.get(count.stream)
-        self._closed[count.stream] = closed(count) if before is None else together(before, closed(count))
 
     # --- readiness and warm-up ---------------------------------------------------------------------------------------
 
@@ -587,7 +481,7 @@ class TaskRelay:
         is_new = is_ready and ((not state.is_ready and not is_rejoining) or bool(tokens - state.tokens))
         if needs_token and tokens != state.seen:
             state.seen = tokens
-            for source in self._inputs.values():
+            for source in self._streams.inputs.values():
                 source.part(slot.epoch, is_parted=not tokens)
         has_changed = is_ready != state.is_ready
         state.is_ready = is_ready
@@ -626,12 +520,12 @@ class TaskRelay:
             route.to_expr
             for route in slot.routes
             if route.direction is Direction.INPUT
-            and route.stream in self._inputs
-            and not self._inputs[route.stream].is_matching(slot.epoch)
+            and route.stream in self._streams.inputs
+            and not self._streams.inputs[route.stream].is_matching(slot.epoch)
         )
 
     def _warm_up(self, epoch: int) -> None:
-        for source in self._inputs.values():
+        for source in self._streams.inputs.values():
             source.warm_up(epoch)
 
     # --- flip and drain ----------------------------------------------------------------------------------------------
@@ -654,14 +548,15 @@ class TaskRelay:
         if state.is_flipped:
             return
         epoch = state.slot.epoch
-        is_behind = any(source.is_behind(epoch) for source in self._inputs.values())
-        for sink in self._outputs.values():
+        is_behind = any(source.is_behind(epoch) for source in self._streams.inputs.values())
+        for sink in self._streams.outputs.values():
             sink.flip(epoch, drops_held=is_behind)
         olds = self._before(epoch)
         carrier = self._carrier()
         is_old_dead = carrier is not None and carrier.gone_at is not None
         replayed = sum(
-            source.flip(epoch, is_old_dead=is_old_dead, has_answer=self._has_answer) for source in self._inputs.values()
+            source.flip(epoch, is_old_dead=is_old_dead, has_answer=self._has_answer)
+            for source in self._streams.inputs.values()
         )
         self._services.flip(epoch)
         state.is_flipped = True
@@ -678,14 +573,14 @@ class TaskRelay:
         Those are the ones of class ``reliable``, as for the worker's acknowledgements; where there are none, all. They
         are in order key by key only, so what has passed on an output of many keys says nothing of an earlier input.
         """
-        sinks = tuple(self._outputs.values())
+        sinks = tuple(self._streams.outputs.values())
         counted = [one for one in sinks if one.route.settings.stream_class is StreamClass.RELIABLE] or sinks
         is_proof = bool(counted) and not any("*" in sink.route.from_expr for sink in counted)
         return is_proof and self._stamps.is_alone(stamp) and all(sink.has_passed(stamp) for sink in counted)
 
     def _send_ends(self, epochs: list[int]) -> None:
         for epoch in epochs:
-            for source in tuple(self._inputs.values()):
+            for source in tuple(self._streams.inputs.values()):
                 try:
                     source.send_end(epoch)
                 except (zenoh.ZError, RuntimeError) as error:  # the slot was closed meanwhile
@@ -697,13 +592,13 @@ class TaskRelay:
             return
         epoch = state.slot.epoch
         is_gone = state.gone_at is not None and monotonic_s() - state.gone_at > GONE_GRACE_S
-        ended = [is_gone or sink.has_ended(epoch) for sink in self._outputs.values()]
-        for sink, has_ended in zip(tuple(self._outputs.values()), ended, strict=True):
+        ended = [is_gone or sink.has_ended(epoch) for sink in self._streams.outputs.values()]
+        for sink, has_ended in zip(tuple(self._streams.outputs.values()), ended, strict=True):
             if has_ended:
                 sink.close_slot(epoch)
         if all(ended) and (is_gone or (self._services.has_ended(epoch) and self._has_settled(state))):
             state.is_drained = True
-            for source in self._inputs.values():
+            for source in self._streams.inputs.values():
                 source.end_slot(epoch, has_answer=self._has_answer)
             self._report(SlotDrained(task=self._task, epoch=epoch))
 
@@ -712,7 +607,7 @@ class TaskRelay:
         now = monotonic_s()
         state.ended_at = state.ended_at or now
         is_over = now - state.ended_at > SETTLE_S
-        return is_over or all(source.has_settled(state.slot.epoch) for source in self._inputs.values())
+        return is_over or all(source.has_settled(state.slot.epoch) for source in self._streams.inputs.values())
 
     def _draining(self) -> _OpenSlot | None:
         """The oldest slot that is left and has not drained: with `HandoverRule.ALL` the later ones wait for it."""
@@ -736,16 +631,9 @@ class TaskRelay:
         """The open slots of older epochs, the oldest first."""
         return [self._slots[old] for old in sorted(self._slots) if old < epoch]
 
-    def _streams(self) -> list[InputStream | OutputStream]:
-        return [*self._inputs.values(), *self._outputs.values()]
-
     def _is_still(self) -> bool:
         """Whether no stream has carried anything for a while."""
-        return all(stream.is_still for stream in self._streams()) and self._services.is_still
-
-    def _is_counted(self) -> bool:
-        """True when something may have to be sent (again) without a sample coming in."""
-        return any(stream.route.settings.stream_class is not StreamClass.BEST_EFFORT for stream in self._streams())
+        return self._streams.is_still and self._services.is_still
 
 
 def _replays(slot: Slot) -> bool:

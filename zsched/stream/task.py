@@ -19,6 +19,7 @@ from zsched.core.route.keyexpr import includes
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.plan import Route, RoutePlan
 from zsched.relay.graph import GraphMirror
+from zsched.relay.open_streams import OpenStreams
 from zsched.relay.streams.acks import Acks
 from zsched.relay.streams.inputs import InputStream
 from zsched.relay.streams.outputs import OutputStream
@@ -37,6 +38,27 @@ class NoGraph(GraphMirror):
         """Nothing."""
 
 
+class OwnStreams(OpenStreams):
+    """Streams that begin and end in this process."""
+
+    def __init__(self, session: Session, deliver: Callable[[Received], None]) -> None:
+        """``deliver`` gets every answer, in a thread for each output."""
+        super().__init__(session, frozenset({str(session.zid())}))
+        self._deliver = deliver
+        self._hands: dict[str, Hand] = {}
+
+    def has_handed(self) -> bool:
+        """Whether the callbacks have returned for every answer that has come."""
+        return all(hand.is_empty for hand in tuple(self._hands.values()))
+
+    def _take_input(self, route: Route) -> InputStream:
+        return InputStream(self._session, route, self._own_ids, None, self._times, is_ours=True)
+
+    def _take_output(self, route: Route) -> OutputStream:
+        way = self._hands[route.stream] = Hand(route, self._deliver)
+        return OutputStream(self._session, route, self._own_ids, self.wake, None, self._times, way)
+
+
 class OwnTask(TaskRelay):
     """One task's streams in this process."""
 
@@ -51,20 +73,18 @@ class OwnTask(TaskRelay):
         deliver: Callable[[Received], None],
     ) -> None:
         """``deliver`` gets every answer, in a thread for each output."""
-        self._deliver = deliver
         self._has_owner = False
-        self._hands: dict[str, Hand] = {}
+        self._own = OwnStreams(session, deliver)
         self._ends: list[threading.Event] = []
-        own_ids = frozenset({str(session.zid())})
-        super().__init__(session, task, tokens, acks, own_ids, report, NoGraph(session, None, node))
+        super().__init__(session, task, tokens, acks, report, NoGraph(session, None, node), self._own)
 
     def input(self, stream: str) -> InputStream | None:
         """An input by its stream's name, as it is now."""
-        return self._inputs.get(stream)
+        return self._own.inputs.get(stream)
 
     def input_of(self, key: str) -> str | None:
         """The name of the input stream that takes a key."""
-        return next((name for name, one in tuple(self._inputs.items()) if includes(one.route.from_expr, key)), None)
+        return next((name for name, one in tuple(self._own.inputs.items()) if includes(one.route.from_expr, key)), None)
 
     def wait_fed(self, stream: str, timeout_s: float) -> None:
         """Wait until what is put into an input goes to the owner, where the task has one."""
@@ -86,23 +106,16 @@ class OwnTask(TaskRelay):
 
     def under_way(self) -> int:
         """How many samples have been taken and not processed, as far as is known."""
-        return sum(source.under_way() for source in tuple(self._inputs.values()))
+        return sum(source.under_way() for source in tuple(self._own.inputs.values()))
 
     def has_handed(self) -> bool:
         """Whether the callbacks have returned for every answer that has come."""
-        return all(hand.is_empty for hand in tuple(self._hands.values()))
+        return self._own.has_handed()
 
     def end_inputs(self) -> None:
         """Nothing more will be put."""
-        self._ends = [source.end() for source in tuple(self._inputs.values())]
+        self._ends = [source.end() for source in tuple(self._own.inputs.values())]
 
     def has_ended(self) -> bool:
         """Whether the ends of all inputs have been put: a worker that misses one waits for it at the next move."""
         return all(end.is_set() for end in self._ends)
-
-    def _take_input(self, route: Route) -> InputStream:
-        return InputStream(self._session, route, self._own_ids, None, self._times, is_ours=True)
-
-    def _take_output(self, route: Route) -> OutputStream:
-        way = self._hands[route.stream] = Hand(route, self._deliver)
-        return OutputStream(self._session, route, self._own_ids, self.wake, None, self._times, way)

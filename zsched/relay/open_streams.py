@@ -1,0 +1,136 @@
+"""The streams of one task on this node that are open, and what each of them has counted, closed ones included.
+
+Knows: by which sessions a stream is opened, when another key or class makes it another stream. Does not know: slots.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Collection, Iterator
+
+import zenoh
+from zenoh import Session
+
+from zsched.core.hop.books import added, closed, together
+from zsched.core.values.plan import Route, StreamClass, StreamCount
+from zsched.relay.streams.answer_times import AnswerTimes
+from zsched.relay.streams.inputs import InputStream
+from zsched.relay.streams.outputs import OutputStream
+
+Cells = Callable[[str], memoryview | None]
+"""Where an input counts what it takes, by its name, beside its own counters (`zsched.relay.books`)."""
+
+
+class OpenStreams:
+    """Changed by the task's thread alone; `counts` may be read by any."""
+
+    def __init__(
+        self,
+        session: Session,
+        own_ids: frozenset[str],
+        local: Session | None = None,
+        cells: Cells = lambda _stream: None,
+    ) -> None:
+        """``session`` is the fleet's, ``local`` the one of the host's own side, if it has one.
+
+        ``own_ids`` are those of all sessions of this process.
+        """
+        self._session, self._local, self._own_ids = session, local, own_ids
+        self._cells = cells
+        self._times = AnswerTimes()
+        self.wake: Callable[[], None] = lambda: None
+        """Called, in any thread, when the end of an output has come."""
+        self.inputs: dict[str, InputStream] = {}
+        self.outputs: dict[str, OutputStream] = {}
+        self._closed: dict[str, StreamCount] = {}
+        """What streams have counted that were closed, and may come again by the same name..."""
+        self._changing = threading.Lock()
+        """...which a reader of counters sees in one of both places."""
+
+    def all(self) -> list[InputStream | OutputStream]:
+        """Inputs, then outputs."""
+        return [*self.inputs.values(), *self.outputs.values()]
+
+    def input_of(self, route: Route) -> InputStream:
+        """The open input of a route; one of the same name that takes another key, or otherwise, is closed first.
+
+        Raises:
+            ValueError, zenoh.ZError: it cannot be opened.
+        """
+        source = self.inputs.get(route.stream)
+        if source is None or (source.route.from_expr, source.route.settings) != (route.from_expr, route.settings):
+            self._end(self.inputs, route.stream)
+            source = self.inputs[route.stream] = self._take_input(route)
+        return source
+
+    def output_of(self, route: Route) -> OutputStream:
+        """The open output of a route; one of the same name that puts out elsewhere, or otherwise, is closed first.
+
+        Raises:
+            ValueError, zenoh.ZError: it cannot be opened.
+        """
+        sink = self.outputs.get(route.stream)
+        if sink is None or (sink.route.to_expr, sink.route.settings) != (route.to_expr, route.settings):
+            self._end(self.outputs, route.stream)
+            sink = self.outputs[route.stream] = self._take_output(route)
+        return sink
+
+    def keep(self, names: Collection[str]) -> None:
+        """Close all others."""
+        for streams in (self.inputs, self.outputs):
+            for stream in tuple(streams):
+                if stream not in names:
+                    self._end(streams, stream)
+
+    def close(self) -> None:
+        """Close all; they stay in the table, and whoever asks now hears their last counts."""
+        for stream in self.all():
+            stream.close()
+
+    def rejoin(self, session: Session, own_ids: frozenset[str]) -> Iterator[str]:
+        """Open all by another data session; a problem of each that could not be."""
+        self._session, self._own_ids = session, own_ids
+        for stream in self.all():
+            try:
+                stream.rejoin(session, own_ids)
+            except (ValueError, zenoh.ZError) as error:
+                yield f"{stream.route.stream}: {error}"
+
+    def counts(self) -> tuple[StreamCount, ...]:
+        """The counters of every stream."""
+        with self._changing:
+            return added(tuple(stream.count() for stream in self.all()), self._closed)
+
+    @property
+    def under_way(self) -> int:
+        """Samples that have no acknowledgement yet."""
+        return sum(source.under_way() for source in self.inputs.values())
+
+    @property
+    def is_still(self) -> bool:
+        """Whether none has carried anything for a while."""
+        return all(stream.is_still for stream in self.all())
+
+    @property
+    def is_counted(self) -> bool:
+        """True when something may have to be sent (again) without a sample coming in."""
+        return any(stream.route.settings.stream_class is not StreamClass.BEST_EFFORT for stream in self.all())
+
+    def _take_input(self, route: Route) -> InputStream:
+        cell = self._cells(route.stream)
+        if cell is not None and route.stream not in self._closed:
+            cell[0] = 0  # of a task by this name that has left the fleet
+        return InputStream(self._session, route, self._own_ids, self._local, self._times, cell=cell)
+
+    def _take_output(self, route: Route) -> OutputStream:
+        return OutputStream(self._session, route, self._own_ids, self.wake, self._local, self._times)
+
+    def _end(self, streams: dict[str, InputStream] | dict[str, OutputStream], stream: str) -> None:
+        one = streams.get(stream)
+        if one is None:
+            return
+        one.close()
+        with self._changing:
+            del streams[stream]
+            count, before = closed(one.count()), self._closed.get(stream)
+            self._closed[stream] = count if before is None else together(before, count)
