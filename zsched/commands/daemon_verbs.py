@@ -13,8 +13,8 @@ import typer
 
 from zsched.commands.common import CliError
 from zsched.commands.example import Example, give_example
-from zsched.commands.fleet_verbs import AcceptOption, PlanOption, YesOption
-from zsched.commands.options import ConfigOption, NameOption, RuntimeOption, StateOption
+from zsched.commands.fleet_verbs import AcceptOption
+from zsched.commands.options import ConfigOption, NameOption, PlanOption, RuntimeOption, StateOption, YesOption
 from zsched.exits import EXIT_USAGE
 
 

@@ -13,12 +13,18 @@ import typer
 from zsched.commands.fleet_verbs import (
     AcceptOption,
     PauseAfterOption,
-    PlanOption,
     ReasonOption,
     RevisionOption,
+)
+from zsched.commands.options import (
+    AskedOption,
+    ConfigOption,
+    ConnectOption,
+    JsonOption,
+    PlanOption,
+    RuntimeOption,
     YesOption,
 )
-from zsched.commands.options import AskedOption, ConfigOption, ConnectOption, JsonOption, RuntimeOption
 
 
 def check(

@@ -10,9 +10,9 @@ from typing import Annotated
 import typer
 
 from zsched.commands.common import CliError
-from zsched.commands.fleet_verbs import AcceptOption, PlanOption, RevisionOption
-from zsched.commands.options import AskedOption, ConnectOption, JsonOption, RuntimeOption
-from zsched.commands.order_verbs import ForOption, ReasonOption, YesOption, order_view
+from zsched.commands.fleet_verbs import AcceptOption, RevisionOption
+from zsched.commands.options import AskedOption, ConnectOption, JsonOption, PlanOption, RuntimeOption, YesOption
+from zsched.commands.order_verbs import ForOption, ReasonOption, order_view
 from zsched.exits import EXIT_USAGE
 
 NodesArgument = Annotated[list[str] | None, typer.Argument(metavar="[NODE]...", help="Nodes of the fleet.")]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from zsched.commands.common import Verb, Verbs
-from zsched.commands.options import AskedOption, ConnectOption, JsonOption, RuntimeOption
+from zsched.commands.options import AskedOption, ConnectOption, JsonOption, PlanOption, RuntimeOption, YesOption
 
 if TYPE_CHECKING:
     from zsched.commands.apply import ApplyView
@@ -26,8 +26,6 @@ fleet_app = _group("fleet", "The document that all nodes of the fleet go by.")
 task_app = _group("task", "Tasks that come and go while the fleet runs.")
 node_app = _group("node", "Machines that come and go while the fleet runs.")
 
-PlanOption = Annotated[bool, typer.Option("--plan", help="Only show what would change; 10: something would.")]
-YesOption = Annotated[bool, typer.Option("--yes", help="Do not ask; off a terminal it takes this.")]
 RevisionOption = Annotated[
     int | None, typer.Option("--revision", min=0, metavar="N", help="Only if this is still the fleet's revision.")
 ]
@@ -211,10 +209,8 @@ def task_hand(
     deadline: Annotated[
         str, typer.Option("--deadline", metavar="DURATION", help="How long it may take to be ready there: 90s, 10m.")
     ] = "2m",
-    plan: Annotated[
-        bool, typer.Option("--plan", "--dry-run", help="Only show what would change; exits with 10.")
-    ] = False,
-    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask; off a terminal it takes this.")] = False,
+    plan: PlanOption = False,
+    yes: YesOption = False,
     reason: ReasonOption = "",
     json_: JsonOption = False,
     node: AskedOption = None,

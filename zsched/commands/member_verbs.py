@@ -17,14 +17,21 @@ import typer
 from zsched.commands.common import CliError, Verb
 from zsched.commands.fleet_verbs import (
     AcceptOption,
-    PlanOption,
     ReasonOption,
     RevisionOption,
-    YesOption,
     fleet_app,
     view_of,
 )
-from zsched.commands.options import AskedOption, ConfigOption, ConnectOption, JsonOption, RuntimeOption, StateOption
+from zsched.commands.options import (
+    AskedOption,
+    ConfigOption,
+    ConnectOption,
+    JsonOption,
+    PlanOption,
+    RuntimeOption,
+    StateOption,
+    YesOption,
+)
 
 if TYPE_CHECKING:
     from zsched.runtime.membership import Places
@@ -46,9 +53,6 @@ class Profile(StrEnum):
 
 
 AddressHelp = "HOST or HOST:PORT of its control session; its data session has the next port."
-OnlyPlanOption = Annotated[
-    bool, typer.Option("--plan", "--dry-run", help="Only show what would be written; exits with 10.")
-]
 
 
 def _places(config: Path | None, state_dir: Path | None) -> Places:
@@ -81,7 +85,7 @@ def fleet_create(
         bool, typer.Option("--passphrase", help="Lock its key. [ZSCHED_AUTHORITY_PASSPHRASE, else it asks]")
     ] = False,
     accept: AcceptOption = None,
-    plan: OnlyPlanOption = False,
+    plan: PlanOption = False,
     json_: JsonOption = False,
     config: ConfigOption = None,
     state_dir: StateOption = None,
@@ -184,7 +188,7 @@ def join(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FILE", help="With --request: where it goes. [./NAME.csr]")
     ] = None,
-    plan: OnlyPlanOption = False,
+    plan: PlanOption = False,
     json_: JsonOption = False,
     config: ConfigOption = None,
     state_dir: StateOption = None,
@@ -223,7 +227,7 @@ def leave(
     ] = "10m",
     accept: AcceptOption = None,
     reason: ReasonOption = "",
-    plan: OnlyPlanOption = False,
+    plan: PlanOption = False,
     yes: YesOption = False,
     json_: JsonOption = False,
     config: ConfigOption = None,

@@ -38,3 +38,7 @@ ConnectOption = Annotated[
     typer.Option("--connect", metavar="ENDPOINT", help="No daemon here: ask at this node's control endpoint."),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="JSON, with its schema; --json=1: of that version.")]
+PlanOption = Annotated[
+    bool, typer.Option("--plan", "--dry-run", help="Only show what would change; exits with 10 if anything.")
+]
+YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask; off a terminal it takes this.")]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from zsched.commands.common import CliError
-from zsched.commands.options import AskedOption, ConnectOption, JsonOption, RuntimeOption
+from zsched.commands.options import AskedOption, ConnectOption, JsonOption, PlanOption, RuntimeOption, YesOption
 from zsched.exits import EXIT_USAGE
 
 if TYPE_CHECKING:
@@ -22,8 +22,6 @@ TasksArgument = Annotated[list[str] | None, typer.Argument(metavar="[TASK]...", 
 ReasonOption = Annotated[
     str, typer.Option("--reason", "-m", metavar="TEXT", help="Why; status and history of every node show it.")
 ]
-YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask; needed where there is no terminal.")]
-PlanOption = Annotated[bool, typer.Option("--plan", help="Only show it: exit 10 when something would change, else 0.")]
 RevisionOption = Annotated[
     int | None, typer.Option("--revision", min=0, metavar="N", help="Only if this is still the task's revision.")
 ]

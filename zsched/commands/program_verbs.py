@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from zsched.commands.options import JsonOption
+from zsched.commands.options import JsonOption, PlanOption
 
 
 def version(json_: JsonOption = False) -> None:
@@ -55,12 +55,7 @@ RootOption = Annotated[
 ]
 
 
-PlanOnlyOption = Annotated[
-    bool, typer.Option("--plan", "--dry-run", help="Only show what would be done; exits with 10 if anything.")
-]
-
-
-def install(plan: PlanOnlyOption = False, root: RootOption = Path("/")) -> None:
+def install(plan: PlanOption = False, root: RootOption = Path("/")) -> None:
     """Let the system find a zsched that pip installed: units, the user, completion, manual pages, the program.
 
     It links or copies, says each step, and starts and enables nothing. Once more, it renews what is old.
@@ -70,7 +65,7 @@ def install(plan: PlanOnlyOption = False, root: RootOption = Path("/")) -> None:
     raise typer.Exit(do(root.absolute(), is_plan=plan))
 
 
-def uninstall(plan: PlanOnlyOption = False, root: RootOption = Path("/")) -> None:
+def uninstall(plan: PlanOption = False, root: RootOption = Path("/")) -> None:
     """Stop the services and take away what `zsched install` made. Fleet file, state and the program stay."""
     from zsched.commands.install import uninstall as do  # noqa: PLC0415 - each verb imports what it needs
 

@@ -11,8 +11,8 @@ from typing import Annotated
 import typer
 
 from zsched.commands.common import CliError
-from zsched.commands.options import AskedOption, JsonOption, RuntimeOption
-from zsched.commands.order_verbs import PlanOption, ReasonOption, RevisionOption, YesOption
+from zsched.commands.options import AskedOption, JsonOption, PlanOption, RuntimeOption, YesOption
+from zsched.commands.order_verbs import ReasonOption, RevisionOption
 from zsched.exits import EXIT_USAGE
 
 
