@@ -133,7 +133,7 @@ def _adopt_work(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
         executor.start(todo)
         value = values[executor.spec.name]
         if value.revision > 0:
-            reason = "known from before the task left the fleet file"
+            reason = "placed before the task came into this node's fleet"
             carry_out(node, value, reason, todo, now, is_known=True)
 
 
