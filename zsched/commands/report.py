@@ -12,7 +12,7 @@ from typing import Any, Final
 from zsched.commands.page import Cell, Page, cut, memory, none_for, since_drop, size, span
 from zsched.commands.weight_words import shares
 from zsched.core.values.gauges import BY_NAME
-from zsched.core.values.words import NEVER_INITIALISED, RESTARTING, WAS_READY, told_of_worker
+from zsched.core.values.words import NEVER_INITIALISED, RESTARTING, WAS_READY, has_lost_its_worker, told_of_worker
 
 Json = dict[str, Any]
 
@@ -58,13 +58,13 @@ def _lack_of_worker(status: Json, task: Json) -> str | None:
     """Why the owner does no work, in the words of the daemon's own problems; ``None`` when it does, or will soon."""
     owner = task["owner"]
     workers = (worker for node in status["nodes"] if node["name"] == owner for worker in node["workers"])
-    state, why = next(((one["state"], one.get("reason")) for one in workers if one["task"] == task["name"]), ("", ""))
-    was_ready = state == "starting" and (why or "").startswith(WAS_READY)
-    if state not in ("failed", "stopped") and not was_ready:
+    loads = ((one["state"], one.get("reason") or "") for one in workers if one["task"] == task["name"])
+    state, why = next(loads, ("", ""))
+    if not has_lost_its_worker(state, why):
         return None
     because = f": {why}" if why else ""
     if state != "failed":
-        return f"the worker on {owner} {told_of_worker(state, why or '')}"
+        return f"the worker on {owner} {told_of_worker(state, why)}"
     return f"the worker on {owner} failed{because}; mend it, then `zsched retry {task['name']} {owner}`"
 
 

@@ -5,12 +5,14 @@ Knows: the status of one node. Does not know: what other nodes say.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Final
 
 from zsched import __version__
 from zsched.config.handing import marks_of
 from zsched.core.scheduler.flags import HANDS_OVER, told_flag
 from zsched.core.values.document import Flag, FlagKind
+from zsched.core.values.words import has_lost_its_worker, told_of_worker
 from zsched.doctor.model import Json, Result, Scene, failed, joined, passed, skipped, warned
 from zsched.ipc.takeover import code_digest
 
@@ -104,12 +106,23 @@ def tasks_have_owners(scene: Scene) -> Result:
             told = f"{task['name']} has no owner" if owner is None else f"{task['name']}: its owner {owner} is {state}"
             fix = f"zsched explain {task['name']} names why each candidate cannot have it"
             found.append(failed(told, fix=fix))
+        found += _lost_workers(status, task)
     for mark in marks_of(scene.text):
         told = f"{mark.task} is on its way to {mark.cell}, and stays so unless somebody's `zsched task hand` is at work"
         verb = f"zsched task hand {mark.task}"
         fix = f"{verb} {mark.cell} goes on, {verb} {status['fleet']} takes it back"
         found.append(warned(told, fix=fix))
-    owners = ", ".join(f"{task['name']} on {task['owner']}" for task in status["tasks"])
+    owners = ", ".join(f"{task['name']} on {task['owner']}" for task in status["tasks"]) or "no tasks"
     return joined(
         found, passed(f"{owners}; {quorum['alive']} of {quorum['electors']} electors, {quorum['needed']} needed")
     )
+
+
+def _lost_workers(status: Json, task: Json) -> Iterator[Result]:
+    """That the owner of a task does no work, as far as this node knows."""
+    for node in status["nodes"]:
+        for load in node["workers"] if node["name"] == task["owner"] else ():
+            state, reason = str(load["state"]), str(load.get("reason") or "")
+            if load["task"] == task["name"] and has_lost_its_worker(state, reason):
+                told = f"{task['name']}: the worker of its owner {task['owner']} {told_of_worker(state, reason)}"
+                yield failed(told, fix=f"zsched logs {task['name']} --node {task['owner']} shows what it printed")

@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import Final
 
 from zsched.core.values.fleet import TaskSpec, runs_worker
-from zsched.doctor.model import Result, Scene, failed, joined, passed, skipped, warned
+from zsched.core.values.words import RESTARTING, has_lost_its_worker, told_of_worker
+from zsched.doctor.model import Json, Result, Scene, failed, joined, passed, skipped, warned
 from zsched.drivers import container, ros2_lifecycle, systemd
 from zsched.drivers.engine import Look
 
@@ -141,11 +142,13 @@ def run_well(scene: Scene) -> Result:
     return joined(found, skipped("this machine has no workers"))
 
 
-def _worker(node: str, load: dict[str, str]) -> Result:
-    task, state = load["task"], load["state"]
-    told = f"the worker of {task} is {state}" + (f": {load['reason']}" if load.get("reason") else "")
+def _worker(node: str, load: Json) -> Result:
+    task, state, reason = str(load["task"]), str(load["state"]), str(load.get("reason") or "")
+    told = f"the worker of {task} {told_of_worker(state, reason)}"
     if state == "failed":
         return failed(told, fix=f"mend its cause, then: zsched retry {task} {node}")
-    if state == "restarting" or (state == "ready" and load.get("reason")):
-        return warned(told, fix="journalctl -u zsched shows what it printed")
+    if has_lost_its_worker(state, reason) and state != "stopped":
+        return failed(told, fix=f"zsched logs {task}; zsched restart {task} starts it anew")
+    if reason.startswith(RESTARTING) or (state == "ready" and reason):
+        return warned(told, fix=f"zsched logs {task} shows what it printed")
     return passed(told)

@@ -366,6 +366,23 @@ def test_a_worker_that_failed_is_found(tmp_path: Path) -> None:
     assert "zsched retry merge edge1" in run("worker.state", broken).fix
 
 
+def test_an_owner_whose_worker_hangs_is_found_by_its_node_and_by_the_others(tmp_path: Path) -> None:
+    scene = scene_of(tmp_path)
+    why = "was ready until 12:00:00 UTC, its token went: it may hang"
+    load = {"task": "merge", "state": "starting", "reason": why}
+    hung = answer(scene, nodes=[{"name": "edge1", "workers": [load]}])
+    assert_finds(run("worker.state", hung), FAIL, f"the worker of merge {why}")
+    assert_finds(run("task.owners", hung), FAIL, f"merge: the worker of its owner edge1 {why}")
+    first = answer(scene, nodes=[{"name": "edge1", "workers": [{**load, "reason": ""}]}])
+    assert run("worker.state", first).verdict is PASS, "it starts"
+    assert run("task.owners", first).verdict is PASS
+
+
+def test_a_fleet_without_tasks_is_said_to_have_none(tmp_path: Path) -> None:
+    (told,) = run("task.owners", answer(scene_of(tmp_path), tasks=[])).evidence
+    assert told.startswith("no tasks; ")
+
+
 def test_an_input_that_nobody_publishes_is_found(tmp_path: Path) -> None:
     scene = scene_of(tmp_path, node="robot1")
     assert run("stream.silent", scene).verdict is PASS

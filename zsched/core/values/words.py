@@ -42,6 +42,14 @@ def told_of_worker(state: str, reason: str) -> str:
     return f"is {state}{': ' if reason else ''}{reason}"
 
 
+def has_lost_its_worker(state: str, reason: str) -> bool:
+    """Whether an owner with such a worker does no work, and will not soon: it failed, stopped, or was ready and is not.
+
+    ``state`` is a `zsched.core.values.profile.WorkerState`. One that starts for the first time is not among them.
+    """
+    return state in ("failed", "stopped") or (state == "starting" and reason.startswith(WAS_READY))
+
+
 def check_range(field: str, value: float | None, low: float, high: float) -> None:
     """Raise `ValueError` unless ``low <= value <= high`` (``None``, "not measured", passes; NaN does not)."""
     if value is not None and not low <= value <= high:
