@@ -315,7 +315,7 @@ def _move_line(move: Json) -> str:
         camps.setdefault(choice, []).append(voter)
     votes = "; ".join(f"{', '.join(voters)} for {choice}" for choice, voters in camps.items())
     switched = "" if move["switched_s"] is None else f", streams switched in {millis(move['switched_s'])}"
-    switched += "" if move["gap_s"] is None else f", no answer for {millis(move['gap_s'])}"
+    switched += "" if move["gap_s"] is None else f", answers {millis(move['gap_s'])} apart"
     head = f"{span(move['age_s']):>6} ago  {move['at']}  {move['task']} epoch {move['epoch']}  {where_of(move)}"
     return f"{head}: {move['reason']}{f' ({votes})' if votes else ''}{switched}"
 

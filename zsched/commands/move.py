@@ -167,6 +167,6 @@ def _tell_move(
         say("the move stands; `zsched status` on such a node names what it waits for")
     else:
         took = "" if switched_s is None else f", streams switched in {millis(switched_s)}"
-        took += "" if gap_s is None else f", no answer for at most {millis(gap_s)}"
+        took += "" if gap_s is None else f", answers at most {millis(gap_s)} apart"
         say(f"{order.task}: settled on {order.node}{took}, lost {more['lost']}, doubled {more['doubled']}")
     return EXIT_TIMED_OUT if lacks else EXIT_OK

@@ -114,7 +114,7 @@ def test_moves_are_told_with_age_wall_time_votes_and_how_long_the_streams_took(
     assert capsys.readouterr().out.splitlines() == [
         (
             " 1m30s ago  2026-09-21T14:11:50.000Z  merge epoch 2  edge1 -> edge2: edge1 is gone "
-            "(robot1, robot2 for edge2; robot3 for edge1), streams switched in 86 ms, no answer for 300 ms"
+            "(robot1, robot2 for edge2; robot3 for edge1), streams switched in 86 ms, answers 300 ms apart"
         ),
         " 1m00s ago  2026-09-21T14:12:20.000Z  other epoch 2  nobody -> edge2: edge1 is gone",
     ]
@@ -126,7 +126,7 @@ def test_on_a_terminal_of_80_columns_no_line_is_longer(capsys: pytest.CaptureFix
     assert capsys.readouterr().out.splitlines() == [
         " 1m30s ago  2026-09-21T14:11:50.000Z  merge epoch 2  edge1 -> edge2: edge1 is",
         "            gone (robot1, robot2 for edge2; robot3 for edge1), streams switched",
-        "            in 86 ms, no answer for 300 ms",
+        "            in 86 ms, answers 300 ms apart",
     ]
 
 
