@@ -509,8 +509,7 @@ def _route(page: Page, status: Json, task: Json) -> None:
     prefix, parts = f"{task['name']}/", []
     for stream in task["streams"]:
         name, drops = stream["stream"].removeprefix(prefix), stream["drops"]
-        seen = _awaited(status, stream) if stream["last_seen_s"] is None else f"last {span(stream['last_seen_s'])} ago"
-        text = f"{name} {stream['messages']} msg{rate(stream)} {size(stream['bytes'])}, {seen}"
+        text = f"{name} {stream['messages']} msg{rate(stream)} {size(stream['bytes'])}, {_last(status, stream)}"
         told = {
             "in flight": stream.get("in_flight"),
             "lost": stream.get("lost"),
@@ -527,7 +526,7 @@ def _route(page: Page, status: Json, task: Json) -> None:
             text += since_drop(stream)
         parts.append((text, "yellow" if drops and not since_drop(stream) else ""))
     parts += [(hint, "yellow") for hint in _unanswered(task)]
-    unheard = [one for one in task["streams"] if one["last_seen_s"] is None and f"{prefix}in/" in one["stream"]]
+    unheard = [one for one in task["streams"] if not one["messages"] and f"{prefix}in/" in one["stream"]]
     first = next((one["name"] for one in status["tasks"] if one["streams"]), None)
     if first is None and status["kind"] == "robot":  # no counts yet: an application may join all the same
         first = status["tasks"][0]["name"]
@@ -535,6 +534,12 @@ def _route(page: Page, status: Json, task: Json) -> None:
         parts.append((f"applications here join at {', '.join(status['joins_at'])} (mode client)", "dim"))
     has_streams = bool(task["streams"])
     page.block("ROUTE", *([] if has_streams else [("no streams here", "dim")]), *parts)
+
+
+def _last(status: Json, stream: Json) -> str:
+    if stream["last_seen_s"] is not None:
+        return f"last {span(stream['last_seen_s'])} ago"
+    return "none since the relay's start" if stream["messages"] else _awaited(status, stream)
 
 
 def _awaited(status: Json, stream: Json) -> str:

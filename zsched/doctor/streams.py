@@ -31,7 +31,7 @@ def inputs_have_publishers(scene: Scene) -> Result:
         return young
     found = []
     for task, stream in streams:
-        if stream["last_seen_s"] is None and task["owner"] is not None:
+        if not stream["messages"] and task["owner"] is not None:
             told = f"{stream['stream']}: nobody has published {stream['from_expr'] or 'its key'} on {scene.node}"
             found.append(warned(told, fix=f"the application must put that key, and dial {_joins_at(scene)}"))
     return joined(found, passed(f"{counted(len(streams), 'inputs')}, each has had messages"))

@@ -18,6 +18,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
+from zsched.clock import monotonic_s
 from zsched.core.events import ProblemReported, SlotDrained, StreamsCounted
 from zsched.core.relay_protocol import RelayReport, TaskEnded
 from zsched.core.route.shares import Shares, Told
@@ -95,6 +96,8 @@ class Application:
         self._here = StreamsHere(fleet=fleet, node=node)
         self._path, self._listen = path, listen
         self._report = report
+        self.counts: Callable[[], tuple[StreamCount, ...]] = tuple
+        """What the relay's own streams have counted by now."""
         self._lock = threading.Lock()
         self._shares = Shares()
         self._link: _Link | None = None
@@ -157,6 +160,11 @@ class Application:
                 return
         self._report(word)
 
+    def apart(self, counts: tuple[StreamCount, ...]) -> tuple[StreamCount, ...]:
+        """Our own counters, without answers that an application has had itself; `settled` and `added` take these."""
+        with self._lock:
+            return self._shares.apart(counts)
+
     def settled(self, counts: tuple[StreamCount, ...]) -> tuple[StreamCount, ...]:
         """Our own counters with those of applications that have gone."""
         with self._lock:
@@ -165,7 +173,7 @@ class Application:
     def added(self, counts: tuple[StreamCount, ...]) -> tuple[StreamCount, ...]:
         """Our own counters with the application's."""
         with self._lock:
-            return self._shares.added(counts)
+            return self._shares.added(counts, monotonic_s())
 
     def _tell(self, told: tuple[Told, ...]) -> None:
         for one in told:
@@ -212,10 +220,12 @@ class Application:
                 self._let_go(link)
 
     def _let_in(self, connection: socket.socket, first: StreamKeys) -> _Link | None:
+        counts = self.counts()  # not below our lock: streams have locks of their own
         with self._lock:
+            self._shares.apart(counts)
             other = self._link
             if other is not None:
-                reason = f"the process {other.pid} has streams of {self._here.node} itself, and one at a time may"
+                reason = f"the process {other.pid} has streams of {self._here.node} itself; one may at a time"
                 write_frame(connection.fileno(), wire.encode(RelayRefused(reason=reason)))
                 return None
             link = self._link = _Link(connection, first.pid)
@@ -248,7 +258,7 @@ class Application:
 
     def _let_go(self, link: _Link) -> None:
         with self._lock:
-            heard = self._shares.go()
+            heard = self._shares.go(monotonic_s())
             self._link = None
         link.close()
         for one in heard:

@@ -30,7 +30,7 @@ from zsched.core.events import FrameDropped, ProblemReported, RoleEnded, Streams
 from zsched.core.membership.relink import Introductions
 from zsched.core.relay_protocol import RelayReport, RelayStarted, RelayStop, TaskEnded, WorkerSeen, WorkerWatch
 from zsched.core.values.model import NodeId, TaskId
-from zsched.core.values.plan import Role, Route, RoutePlan
+from zsched.core.values.plan import Role, Route, RoutePlan, StreamCount
 from zsched.errors import WireError
 from zsched.guard import ends_within, guarded, on_failure
 from zsched.heap import give_back
@@ -175,6 +175,7 @@ class RelayProcess:
         """
         self._books = books or Books(None)
         self._application = application or Application(fleet, node, None, "", reporter.report)
+        self._application.counts = self._own_counts
         self._session, self._fleet = session, fleet
         self._counting, self._refused = threading.Lock(), Counter[Refusal]()
         self._expulsion = self._expel_from(session, members)
@@ -432,8 +433,11 @@ class RelayProcess:
             if introductions.is_due(awake_s(), is_missing=is_missing) and self._introducer is not None:
                 self._introducer.introduce()
 
+    def _own_counts(self) -> tuple[StreamCount, ...]:
+        return tuple(count for task in tuple(self._tasks.values()) for count in task.counts())
+
     def _tell_counts(self, *, is_last: bool = False) -> None:
-        own = tuple(count for task in tuple(self._tasks.values()) for count in task.counts())
+        own = self._application.apart(self._own_counts())
         counts = self._books.added(own)
         self._books.write(own, self._application.settled(own), is_last=is_last)
         self._reporter.report(StreamsCounted(counts=self._application.added(counts)))

@@ -222,7 +222,7 @@ def test_an_application_that_has_ended_is_not_waited_for_when_the_task_moves(ben
 def test_an_application_is_told_why_it_cannot_have_a_stream(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(streams, "KNOWN_S", 0.3)
     with bench.join() as own:
-        with pytest.raises(AdapterError, match="has streams of robot1 itself, and one at a time may"):
+        with pytest.raises(AdapterError, match="has streams of robot1 itself; one may at a time"):
             bench.join()
         with pytest.raises(ValueError, match="no input rule takes 'robot1/other' on robot1"):
             own.publisher("robot1/other")

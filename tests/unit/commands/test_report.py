@@ -304,10 +304,19 @@ def test_an_input_that_never_saw_a_message_says_what_it_waits_for(from_expr: str
     status = recorded("healthy")
     status["joins_at"] = joins
     for stream in status["tasks"][0]["streams"]:
-        stream["from_expr"], stream["last_seen_s"] = from_expr, None
+        stream["from_expr"], stream["last_seen_s"], stream["messages"] = from_expr, None, 0
     text = " ".join(render_status(status, 100, color=False).split())
     assert told in text
     assert text.count("waits for") == (1 if from_expr else 0), "an output waits for nobody's application"
+
+
+def test_an_input_that_had_messages_before_its_relays_start_waits_for_no_first_one() -> None:
+    status = recorded("healthy")
+    for stream in status["tasks"][0]["streams"]:
+        stream["last_seen_s"] = None
+    text = " ".join(render_status(status, 100, color=False).split())
+    assert "none since the relay's start" in text
+    assert "nothing yet" not in text
 
 
 def test_an_input_that_has_seen_messages_waits_for_nothing() -> None:

@@ -387,7 +387,9 @@ def test_an_input_that_nobody_publishes_is_found(tmp_path: Path) -> None:
     scene = scene_of(tmp_path, node="robot1")
     assert run("stream.silent", scene).verdict is PASS
     (task,) = scene.status["tasks"]
-    silent = answer(scene, tasks=[{**task, "streams": [{**task["streams"][0], "last_seen_s": None}]}])
+    quiet = {**task["streams"][0], "last_seen_s": None}
+    silent = answer(scene, tasks=[{**task, "streams": [{**quiet, "messages": 0}]}])
+    assert run("stream.silent", answer(scene, tasks=[{**task, "streams": [quiet]}])).verdict is PASS, "by its counter"
     result = run("stream.silent", silent)
     assert_finds(result, WARN, "nobody has published robot1/map")
     assert "tcp/127.0.0.1:7458" in result.fix

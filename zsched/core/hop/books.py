@@ -84,6 +84,17 @@ def together(first: StreamCount, other: StreamCount) -> StreamCount:
     )
 
 
+def without(count: StreamCount, part: StreamCount) -> StreamCount:
+    """The counters of a stream without ``part`` of what they have counted; times stay."""
+    drops, less = dict(count.drops), dict(part.drops)
+    left = {reason: number - less.get(reason, 0) for reason, number in drops.items()}
+    return replace(
+        count,
+        **{name: getattr(count, name) - getattr(part, name) for name in _SUMS},
+        drops=tuple(sorted((reason, number) for reason, number in left.items() if number)),
+    )
+
+
 def added(counts: tuple[StreamCount, ...], more: Mapping[str, StreamCount]) -> tuple[StreamCount, ...]:
     """Counters with those of others, by stream; of a stream that has gone nobody is told."""
     if not more:

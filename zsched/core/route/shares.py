@@ -4,6 +4,8 @@ Knows: which routes of a plan an application has itself (by the keys that it nam
 the relay and the application say so, how the counters of both add up. Does not know: sockets, zenoh, how a stream is
 carried. An application that goes takes what it had in flight with it: that is counted as at most lost from then on.
 
+The answers that an application has itself come to the relay, too. They are counted once: by the application.
+
 What it says is believed of its own routes only: it can hold up the end of a slot for the slot's drain time, and raise
 counters.
 """
@@ -13,7 +15,7 @@ from __future__ import annotations
 from typing import Final
 
 from zsched.core.events import SlotDrained
-from zsched.core.hop.books import added, closed, together
+from zsched.core.hop.books import added, closed, together, without
 from zsched.core.relay_protocol import SlotLost, WorkerWatch
 from zsched.core.route.keyexpr import includes
 from zsched.core.values.model import TaskId
@@ -54,12 +56,21 @@ class Shares(Struct, eq=False):
     """What applications that have gone have counted, by stream."""
     counted: dict[str, StreamCount] = field(default_factory=dict)
     """What the one that is there has counted."""
+    newest: dict[str, float] = field(default_factory=dict)
+    """When applications that have gone last had a sample of a stream (monotonic seconds)."""
+    relays: dict[str, StreamCount] = field(default_factory=dict)
+    """What the relay itself has counted..."""
+    began: dict[str, StreamCount] = field(default_factory=dict)
+    """...when the application took an output..."""
+    copies: dict[str, StreamCount] = field(default_factory=dict)
+    """...and of outputs while applications that have gone had them."""
 
     # --- plans -------------------------------------------------------------------------------------------------------
 
     def note_plan(self, plan: RoutePlan) -> tuple[Told, ...]:
         """The newest plan of a task; answers what the application is told."""
         self.plans[plan.task] = plan
+        self._begin_outputs()
         slots = {slot.epoch for slot in (plan.current, *plan.predecessors) if slot is not None}
         self.drained = {place for place in self.drained if place[0] != plan.task or place[1] in slots}
         self.held = {place: word for place, word in self.held.items() if place[0] != plan.task or place[1] in slots}
@@ -78,11 +89,15 @@ class Shares(Struct, eq=False):
         is_known = task in self.told
         self.told.discard(task)
         self.parts.pop(task, None)
+        for table in (self.past, self.counted, self.newest, self.relays, self.began, self.copies):
+            for stream in [stream for stream in table if stream.startswith(f"{task}/")]:
+                del table[stream]
         return is_known
 
     def name(self, keys: tuple[str, ...]) -> tuple[Told, ...]:
         """The application names its keys, all of them; answers what it is told."""
         self.keys = keys
+        self._begin_outputs()
         found = [one for task in sorted(self.unowned) for one in self._of_unowned(task)]
         return (*found, *(one for task in sorted(self.plans) for one in self._of_plan(self.plans[task])))
 
@@ -148,8 +163,11 @@ class Shares(Struct, eq=False):
         slots = () if plan is None else _slots(plan)
         return any(slot.epoch == place[1] and self._own(slot.routes) for slot in slots)
 
-    def go(self) -> tuple[Word, ...]:
-        """The application has gone; answers what the daemon hears: what was in flight, and what waited for its word."""
+    def go(self, now: float) -> tuple[Word, ...]:
+        """The application has gone; answers what the daemon hears: what was in flight, and what waited for its word.
+
+        ``now``: monotonic seconds.
+        """
         words: list[Word] = []
         for task, plan in sorted(self.plans.items()):
             slot = plan.current
@@ -159,10 +177,15 @@ class Shares(Struct, eq=False):
                 words.append(SlotLost(task=task, epoch=slot.epoch, owner=slot.owner, samples=lost))
         words += self.held.values()
         for stream, count in self.counted.items():
-            gone = closed(count)
-            self.past[stream] = together(self.past[stream], gone) if stream in self.past else gone
+            if count.last_seen_s is not None:
+                self.newest[stream] = now - count.last_seen_s
+            _add(self.past, closed(count))
+        for stream, first in self.began.items():
+            if stream in self.relays:
+                _add(self.copies, closed(without(self.relays[stream], first)))
         self.keys = ()
-        self.told, self.parts, self.drained, self.held, self.counted = set(), {}, set(), {}, {}
+        self.told, self.parts, self.drained, self.held = set(), {}, set(), {}
+        self.counted, self.began = {}, {}
         return tuple(words)
 
     # --- counters ----------------------------------------------------------------------------------------------------
@@ -176,13 +199,44 @@ class Shares(Struct, eq=False):
             if count.stream in own:
                 self.counted[count.stream] = count
 
+    def apart(self, counts: tuple[StreamCount, ...]) -> tuple[StreamCount, ...]:
+        """The relay's own counters, without answers that an application has had itself."""
+        self.relays = {count.stream: count for count in counts}
+        return tuple(self._apart(count) for count in counts)
+
     def settled(self, counts: tuple[StreamCount, ...]) -> tuple[StreamCount, ...]:
         """The relay's counters with those of applications that have gone; the one that is there keeps its own."""
         return added(counts, self.past)
 
-    def added(self, counts: tuple[StreamCount, ...]) -> tuple[StreamCount, ...]:
-        """The relay's counters with those of applications."""
-        return added(self.settled(counts), self.counted)
+    def added(self, counts: tuple[StreamCount, ...], now: float) -> tuple[StreamCount, ...]:
+        """The relay's counters with those of applications; ``now``: monotonic seconds."""
+        total = added(self.settled(counts), self.counted)
+        return tuple(self._seen(count, now) for count in total)
+
+    def _seen(self, count: StreamCount, now: float) -> StreamCount:
+        at = self.newest.get(count.stream)
+        if at is None:
+            return count
+        age_s = round(max(0.0, now - at), 3)
+        return replace(count, last_seen_s=age_s if count.last_seen_s is None else min(age_s, count.last_seen_s))
+
+    def _apart(self, count: StreamCount) -> StreamCount:
+        stream = count.stream
+        if stream in self.began:
+            count = without(count, without(count, self.began[stream]))
+        return without(count, self.copies[stream]) if stream in self.copies else count
+
+    def _begin_outputs(self) -> None:
+        """Note what the relay has counted of outputs that are the application's from now on."""
+        routes = {route.stream: route for plan in self.plans.values() for one in _slots(plan) for route in one.routes}
+        for stream, route in routes.items():
+            if route.direction is Direction.OUTPUT and takes(route, self.keys):
+                self.began.setdefault(stream, self.relays.get(stream) or StreamCount(stream=stream))
+
+
+def _add(table: dict[str, StreamCount], count: StreamCount) -> None:
+    before = table.get(count.stream)
+    table[count.stream] = count if before is None else together(before, count)
 
 
 def _slots(plan: RoutePlan) -> tuple[Slot, ...]:

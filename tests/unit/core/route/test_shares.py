@@ -20,6 +20,7 @@ from zsched.core.values.plan import (
     StreamSettings,
 )
 
+NOW = 100.0
 RELIABLE = StreamSettings(stream_class=StreamClass.RELIABLE)
 
 
@@ -101,12 +102,12 @@ def test_a_word_that_waits_is_said_when_the_application_goes_and_not_behind_the_
     word = SlotDrained(task="t", epoch=1)
     made = shares("robot1/jobs")
     made.relay_drained(word)
-    assert made.go() == (word,)
+    assert made.go(NOW) == (word,)
     made = shares("robot1/jobs")
     made.relay_drained(word)
     made.note_plan(plan(*ALL, epoch=2))
     assert made.heard(word) == ()
-    assert made.go() == ()
+    assert made.go(NOW) == ()
 
 
 def test_what_it_left_open_is_heard_behind_the_slots_end_and_of_its_own_slots_only() -> None:
@@ -124,22 +125,22 @@ def count(messages: int, acknowledged: int, in_flight: int, stream: str = "t/in/
 
 def test_counters_add_up_and_the_books_balance_also_when_an_application_dies() -> None:
     made, relays = shares("robot1/jobs"), (count(10, 8, 2), StreamCount(stream="t/out/0", messages=5))
-    assert made.added(relays) == relays
+    assert made.added(relays, NOW) == relays
     made.note_counts((count(100, 90, 7, lost=1, drops=(("overflow", 2),)),))
-    total = made.added(relays)[0]
+    total = made.added(relays, NOW)[0]
     assert (total.messages, total.acknowledged, total.in_flight, total.lost) == (110, 98, 9, 1)
     assert total.drops == (("overflow", 2),)
     assert unaccounted(total) == 0
-    assert made.go() == (SlotLost(task="t", epoch=1, owner="edge1", samples=7),)
-    total = made.added(relays)[0]
+    assert made.go(NOW) == (SlotLost(task="t", epoch=1, owner="edge1", samples=7),)
+    total = made.added(relays, NOW)[0]
     assert (total.messages, total.in_flight, total.at_most_lost) == (110, 2, 7)
     assert unaccounted(total) == 0
     made.name(("robot1/jobs",))
     made.note_counts((count(3, 3, 0),))
-    made.go()
+    made.go(NOW)
     made.name(("robot1/jobs",))
     made.note_counts((count(1, 0, 1),))
-    total = made.added(relays)[0]
+    total = made.added(relays, NOW)[0]
     assert (total.messages, total.acknowledged, total.in_flight, total.at_most_lost) == (114, 101, 3, 7)
     assert unaccounted(total) == 0
 
@@ -148,4 +149,47 @@ def test_counters_of_streams_that_are_not_its_own_are_not_taken() -> None:
     made = shares("robot1/jobs")
     made.note_counts((count(5, 5, 0, stream="t/in/1"), count(5, 5, 0, stream="u/in/0")))
     relays = (count(1, 1, 0, stream="t/in/1"),)
-    assert made.added(relays) == relays
+    assert made.added(relays, NOW) == relays
+
+
+def test_the_last_sample_of_an_application_is_remembered_when_it_has_gone() -> None:
+    made, relays = shares("robot1/jobs"), (count(0, 0, 0),)
+    made.note_counts((count(10, 10, 0, last_seen_s=0.5),))
+    made.go(NOW)
+    assert made.added(relays, NOW + 60.0)[0].last_seen_s == 60.5
+    later = (count(1, 1, 0, last_seen_s=2.0),)
+    assert made.added(later, NOW + 60.0)[0].last_seen_s == 2.0, "the newest"
+    made.end("t")
+    assert made.added(relays, NOW + 60.0) == relays
+
+
+def answers(messages: int, **more: Any) -> StreamCount:
+    return StreamCount(stream="t/out/0", messages=messages, **more)
+
+
+def test_an_answer_that_the_application_has_itself_is_counted_once() -> None:
+    """The relay has it, too, or misses it: it was not there, and the worker does not keep it for ever."""
+    made = Shares()
+    made.note_plan(plan(*ALL))
+
+    def told(relay: StreamCount) -> tuple[int, int]:
+        (total,) = made.added(made.apart((relay,)), NOW)
+        return total.messages, total.lost
+
+    assert told(answers(5, lost=1)) == (5, 1), "before the application came"
+    made.name(("robot1/plan",))
+    made.note_counts((answers(20),))
+    assert told(answers(25, lost=30)) == (25, 1), "both had the 20, and the relay alone lost 29"
+    made.go(NOW)
+    assert told(answers(25, lost=30)) == (25, 1)
+    assert told(answers(28, lost=31)) == (28, 2), "the relay's own again"
+    made.name(("robot1/plan",))
+    made.note_counts((answers(2),))
+    assert told(answers(30, lost=31)) == (30, 2)
+
+
+def test_an_output_that_the_application_does_not_have_is_the_relays() -> None:
+    made = shares("robot1/jobs")
+    made.note_counts((count(3, 3, 0),))
+    relays = (answers(5, lost=2),)
+    assert made.added(made.apart(relays), NOW) == relays
