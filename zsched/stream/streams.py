@@ -65,6 +65,8 @@ FREED_S: Final = 1.0
 """An application that has just ended is gone from its place within this time."""
 FINISH_S: Final = 2.0
 """What was put is processed within this time of `Streams.close`, or counted as at most lost."""
+ALIVE_S: Final = 1.0
+"""Who waits for the thread that closes looks this often whether there is one: not in a process that was forked off."""
 LOOK_S: Final = 0.01
 JOIN_S: Final = 0.3
 
@@ -130,15 +132,22 @@ class Streams:
         self._tasks: dict[TaskId, OwnTask] = {}
         self._drained: deque[SlotDrained] = deque(maxlen=64)
         """Said again to the next relay, which would wait for it."""
-        self._closing = threading.Event()
+        self._closing, self._closed = threading.Event(), threading.Event()
         keyspace = Keyspace(link.fleet)
         self._acks = Acks(
             self._session, keyspace, link.node, self._has_worker, lease_s(link.session), is_application=True
         )
         self._tokens = Tokens(self._session, keyspace, lambda _seen: None, lambda _node, _ended: None, self._wake)
+        self._here = threading.local()
+        """Says of a thread whether it is in a callback of the application."""
+        self._is_hasty = False
+        """Closing waits for nothing any more."""
         self._thread = guarded(self._run, name="zsched streams")
         self._thread.start()
         guarded(self._count, name="zsched counters").start()
+        self._closer = guarded(self._end, name="zsched close", is_lasting=False)
+        self._closer.daemon = False  # no interpreter ends in the middle of it
+        self._closer.start()
 
     @classmethod
     def join(
@@ -213,25 +222,22 @@ class Streams:
         )
 
     def close(self) -> None:
-        """Put the ends behind what was put, wait for it to be processed (`FINISH_S`), and close the session."""
-        if self._closing.is_set():
-            return
+        """Put the ends behind what was put, wait for it to be processed (`FINISH_S`), and close the session.
+
+        Any thread, and more than once: each waits until they are closed. A callback does not wait, since it is waited
+        for: they are closed behind it. Ctrl-C ends the wait, and they close at once. In a process that was forked off
+        nothing is closed: the streams are its parent's.
+        """
         self._closing.set()
-        tasks = tuple(self._tasks.values())
-        for task in tasks:
-            task.end_inputs()
-        until = monotonic_s() + FINISH_S
-        while not all(_is_over(task) for task in tasks) and monotonic_s() < until:
-            time.sleep(LOOK_S)
-        self._acks.flush()
-        self._say_counts()
-        self._link.hang_up()
-        self._thread.join(JOIN_S)
-        for task in tasks:
-            task.end()
-        ends_within(APPLICATION_CLOSE_S, self._session.close, name="zsched close")
-        self._acks.stalled.close()  # till now it has ended links that held the session up
-        all_end_within(JOIN_S, besides=self._threads_before)
+        if getattr(self._here, "is_callback", False):
+            return
+        try:
+            # no join: one that is interrupted takes the thread for ended (CPython 3.11)
+            while self._closer.is_alive() and not self._closed.wait(ALIVE_S):
+                continue
+        except BaseException:
+            self._is_hasty = True
+            raise
 
     def __enter__(self) -> Self:
         return self
@@ -255,7 +261,30 @@ class Streams:
             self._keys = tuple(one for one in self._keys if one != key)
         self._link.say(StreamKeys(keys=self._keys, pid=os.getpid()))
 
+    def _end(self) -> None:
+        """Close when we are told to: in a thread of its own, which no signal interrupts."""
+        self._closing.wait()
+        tasks = tuple(self._tasks.values())
+        try:
+            for task in tasks:
+                task.end_inputs()
+            until = monotonic_s() + FINISH_S
+            while not all(_is_over(task) for task in tasks) and monotonic_s() < until and not self._is_hasty:
+                time.sleep(LOOK_S)
+            self._acks.flush()
+            self._say_counts()
+        finally:
+            self._link.hang_up()
+            self._thread.join(JOIN_S)
+            for task in tasks:
+                task.end()
+            ends_within(APPLICATION_CLOSE_S, self._session.close, name="zsched session")
+            self._acks.stalled.close()  # till now it has ended links that held the session up
+            all_end_within(JOIN_S, besides=self._threads_before)
+            self._closed.set()
+
     def _deliver(self, received: Received) -> None:
+        self._here.is_callback = True
         for key_expr, on_sample in self._callbacks:
             if includes(key_expr, received.key):
                 on_sample(received)

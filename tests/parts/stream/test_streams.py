@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -153,6 +156,65 @@ def test_closing_ends_every_thread_for_an_interpreter_that_ends_beside_one_may_a
     ask()
     left = sorted(thread.name for thread in running() - before)
     assert [name for name in left if not name.startswith("application")] == []  # that one is the relay's
+
+
+ENDS = """
+import os, signal, sys, threading, time
+from pathlib import Path
+from zsched.stream import Streams
+
+with Streams.join(runtime_dir=Path(sys.argv[1])) as streams:
+    answered, is_over = threading.Event(), []
+
+    def take(answer):
+        answered.set()
+        {in_callback}
+
+    streams.subscribe("robot1/out", take)
+    publisher = streams.publisher("robot1/front/in")
+    for number in range(20):
+        publisher.put(str(number))
+    answered.wait(20)
+    {at_last}
+"""
+INTERRUPTS = "threading.Timer({}, lambda: os.kill(os.getpid(), signal.SIGINT)).start()"
+INTERRUPTED = (1, -signal.SIGINT)
+"""How Python ends behind `KeyboardInterrupt`."""
+
+
+@pytest.mark.parametrize(
+    ("in_callback", "at_last", "codes"),
+    [
+        ("streams.close()", "", (0,)),
+        ("time.sleep(0.1)", INTERRUPTS.format(0.0) + "; time.sleep(1.0)", INTERRUPTED),
+        ("time.sleep(0.1)", INTERRUPTS.format(0.4), INTERRUPTED),
+        ("", "if os.fork() == 0: sys.exit(0)\n    assert os.wait()[1] == 0", (0,)),
+    ],
+    ids=["closed in a callback while the program ends", "Ctrl-C", "Ctrl-C while it closes", "a fork that ends"],
+)
+def test_a_program_ends_in_order_whatever_ends_it(
+    bench: Bench, in_callback: str, at_last: str, codes: tuple[int, ...]
+) -> None:
+    text = ENDS.format(in_callback=in_callback, at_last=at_last)
+    done = subprocess.run([sys.executable, "-c", text, str(bench.folder)], capture_output=True, timeout=30, check=False)
+    assert done.returncode in codes, done.stderr
+    assert b"FATAL" not in done.stderr
+    until(lambda: bench.application._link is None, "it has gone")
+    assert (bench.count().messages, unaccounted(bench.count())) == (20, 0)
+    assert bench.count().acknowledged == 20
+
+
+def test_a_second_one_who_closes_waits_until_they_are_closed(bench: Bench) -> None:
+    own = bench.join()
+    own.subscribe("robot1/out", lambda _answer: time.sleep(0.3))
+    own.publisher("robot1/front/in").put("0")
+    first = threading.Thread(target=own.close)
+    first.start()
+    until(own._closing.is_set, "the first one closes")
+    own.close()
+    assert not own._thread.is_alive()
+    first.join(10)
+    assert not first.is_alive()
 
 
 def test_closing_waits_for_what_was_put_and_for_its_answers(bench: Bench) -> None:
