@@ -28,6 +28,9 @@ CALM_S: Final = 60.0
 NAME_BYTES: Final = 15
 """The kernel keeps this much of a thread's name."""
 
+CALLS_BACK: Final = "(pyo3-closure)"
+"""So ends the name that Python gives a thread in which zenoh (1.10) calls back; it ends behind its session."""
+
 T = TypeVar("T")
 
 _log = logging.getLogger("zsched.guard")
@@ -63,8 +66,8 @@ class _Guarded(threading.Thread):
 
 
 def running() -> frozenset[threading.Thread]:
-    """Threads of ours that run now."""
-    return frozenset(thread for thread in threading.enumerate() if isinstance(thread, _Guarded))
+    """Threads of ours that run now, and zenoh's that call back."""
+    return frozenset(one for one in threading.enumerate() if isinstance(one, _Guarded) or one.name.endswith(CALLS_BACK))
 
 
 def all_end_within(limit_s: float, besides: frozenset[threading.Thread]) -> bool:

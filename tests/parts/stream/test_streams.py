@@ -35,7 +35,7 @@ from zsched.core.values.plan import (
 )
 from zsched.core.values.struct import replace
 from zsched.errors import AdapterError
-from zsched.guard import running
+from zsched.guard import all_end_within, running
 from zsched.relay.application import Application
 from zsched.relay.streams.inputs import InputStream
 from zsched.relay.streams.lanes import Lane
@@ -156,6 +156,28 @@ def test_closing_ends_every_thread_for_an_interpreter_that_ends_beside_one_may_a
     ask()
     left = sorted(thread.name for thread in running() - before)
     assert [name for name in left if not name.startswith("application")] == []  # that one is the relay's
+
+
+def test_closing_waits_for_the_threads_in_which_zenoh_calls_back_too() -> None:
+    may_return, has_come, before = threading.Event(), threading.Event(), running()
+
+    def take(_sample: zenoh.Sample) -> None:
+        has_come.set()
+        may_return.wait(10.0)
+
+    config = data_config(listen=(free_endpoint(),), connect=(), shared_memory=False)
+    session = zenoh.open(zenoh.Config.from_json5(config))
+    try:
+        session.declare_subscriber("a/key", take)
+        session.put("a/key", b"")
+        assert has_come.wait(10.0)
+        assert not all_end_within(0.01, besides=before)
+        may_return.set()
+        session.close()
+        assert all_end_within(10.0, besides=before)
+    finally:
+        may_return.set()
+        session.close()
 
 
 ENDS = """
