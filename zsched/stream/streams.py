@@ -287,7 +287,10 @@ class Streams:
         self._here.is_callback = True
         for key_expr, on_sample in self._callbacks:
             if includes(key_expr, received.key):
-                on_sample(received)
+                try:
+                    on_sample(received)
+                except (Exception, SystemExit) as error:  # noqa: BLE001 - no answer and no other callback misses theirs
+                    _log.warning("the callback of %s raised %s: %s", key_expr, type(error).__name__, error)
 
     # --- the relay's words -------------------------------------------------------------------------------------------
 

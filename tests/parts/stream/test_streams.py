@@ -367,3 +367,22 @@ def test_a_flip_does_not_wait_for_a_put_that_waits_for_its_link(bench: Bench, mo
     stream.close()
     for one in kept:
         one.undeclare()
+
+
+@pytest.mark.parametrize("error", [ValueError("no plan"), SystemExit(3)])
+def test_what_a_callback_raises_takes_no_answer_from_another_one(
+    bench: Bench, error: BaseException, caplog: pytest.LogCaptureFixture
+) -> None:
+    back: list[bytes] = []
+
+    def fail(_answer: Received) -> None:
+        raise error
+
+    with bench.join() as own:
+        own.subscribe("robot1/out", fail)
+        own.subscribe("robot1/out", lambda answer: back.append(answer.payload.to_bytes()))
+        publisher = own.publisher("robot1/front/in")
+        for number in range(5):
+            publisher.put(str(number))
+    assert back == [str(number).encode() for number in range(5)]
+    assert f"the callback of robot1/out raised {type(error).__name__}: {error}" in caplog.text
