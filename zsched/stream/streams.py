@@ -101,8 +101,7 @@ class Publisher:
         given = Given(
             self.key, _bytes(payload), encoding, None if attachment is None else _bytes(attachment), timestamp
         )
-        stream.give(cast("Sample", given))
-        return True
+        return stream.give(cast("Sample", given))
 
 
 class Streams:

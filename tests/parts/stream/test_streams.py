@@ -386,3 +386,37 @@ def test_what_a_callback_raises_takes_no_answer_from_another_one(
             publisher.put(str(number))
     assert back == [str(number).encode() for number in range(5)]
     assert f"the callback of robot1/out raised {type(error).__name__}: {error}" in caplog.text
+
+
+def test_what_comes_too_late_to_be_put_is_told_to_the_one_who_puts_it(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It waited behind a put that held its link up, while another thread closed."""
+    gate, began, put = threading.Event(), threading.Event(), Lane.put
+    monkeypatch.setattr(streams, "FINISH_S", 0.3)
+
+    def slow(lane: Lane, sample: zenoh.Sample, stamp: zenoh.Timestamp | None) -> None:
+        began.set()
+        gate.wait(10)
+        put(lane, sample, stamp)
+
+    own = bench.join()
+    publisher = own.publisher("robot1/front/in")
+    publisher.put("0")
+    until(lambda: bench.taken == [b"0"], "the worker is greeted, and nothing waits")
+    until(lambda: not own._tasks["t"].under_way(), "it is acknowledged")
+    monkeypatch.setattr(Lane, "put", slow)
+    took: list[bool] = []
+    givers = [threading.Thread(target=lambda: took.append(publisher.put("1"))) for _ in range(3)]
+    givers[0].start()
+    assert began.wait(5)
+    for one in givers[1:]:
+        one.start()
+    closer = threading.Thread(target=own.close)
+    closer.start()
+    until(lambda: bench.application._link is None, "the relay has heard the last counters")
+    gate.set()
+    for one in (*givers, closer):
+        one.join(10)
+        assert not one.is_alive()
+    assert (bench.count().messages, sorted(took)) == (2, [False, False, True])

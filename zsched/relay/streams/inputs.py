@@ -131,6 +131,8 @@ class InputStream:
         self._giving = threading.Lock()
         self._in_hand: Outlet | None = None
         """Where the sample that is given goes, if its put is left to the giver (`_giving` and our lock guard it)."""
+        self._has_end = self._is_late = False
+        """The end marker is on its way; what is given comes behind that (guarded likewise)."""
         self._receiver: Receiver | None = None if is_ours else self._subscribe(side)
 
     def _subscribe(self, side: Session) -> Receiver:
@@ -144,16 +146,18 @@ class InputStream:
             origin=zenoh.Locality.ANY,
         )
 
-    def give(self, sample: Sample) -> None:
+    def give(self, sample: Sample) -> bool:
         """Carry a sample of this process; it is put in this thread where nothing waits before it (`is_ours`).
 
-        What a full queue or link holds up is this thread, and nobody else: a flip does not wait for it.
+        What a full queue or link holds up is this thread, and nobody else: a flip does not wait for it. ``False``: it
+        came behind `end`, and went nowhere.
         """
         with self._giving:
             self._carry(sample, is_given=True)
             outlet, self._in_hand = self._in_hand, None
             if outlet is not None:
                 outlet.put_claimed()
+            return not self._is_late
 
     def open(self, epoch: int, route: Route, acks: WorkerAcks | None = None, stamps: Stamps | None = None) -> None:
         """Declare the publishers of a slot; it carries nothing yet. With ``acks`` its worker counts what it gets.
@@ -235,13 +239,13 @@ class InputStream:
             self._end_hold_behind(slot, has_answer)
 
     def end(self) -> threading.Event:
-        """Nothing more will be given (`is_ours`): put the end marker of the slot that is fed behind its last sample.
+        """Take nothing more (`is_ours`), and put the end marker of the slot that is fed behind its last sample.
 
         The event is set when it has been put.
         """
         ended = threading.Event()
         with self._lock:
-            slot = self._active
+            self._has_end, slot = True, self._active
         if slot is None:
             ended.set()
         else:
@@ -487,6 +491,9 @@ class InputStream:
         if active is not None and self._is_patient and not self._is_paused:
             active.outlet.wait_for_room(size)
         with self._lock:
+            if self._has_end:
+                self._is_late = True
+                return
             self._counter.seen(size)
             if self._loop_ids and _is_own(sample, self._loop_ids):
                 self._counter.dropped("loop")
