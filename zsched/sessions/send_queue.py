@@ -158,7 +158,13 @@ class SendQueue:
         action, self._claimed = self._claimed, None
         if action is None:
             return
-        self._do(action)
+        try:
+            self._do(action)
+        finally:  # also of a thread that Ctrl-C takes out of its put
+            self._release()
+
+    def _release(self) -> None:
+        """What was claimed is done."""
         with self._lock:
             self._in_hand, self._is_taken = None, False
             is_awaited = (self._items or self._is_kicked or self._is_closed) and (self._wants_item or self._wants_kick)

@@ -420,3 +420,24 @@ def test_what_comes_too_late_to_be_put_is_told_to_the_one_who_puts_it(
         one.join(10)
         assert not one.is_alive()
     assert (bench.count().messages, sorted(took)) == (2, [False, False, True])
+
+
+def test_ctrl_c_in_a_put_costs_no_other_sample(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    put = Lane.put
+
+    def interrupted(lane: Lane, sample: zenoh.Sample, stamp: zenoh.Timestamp | None) -> None:
+        put(lane, sample, stamp)
+        raise KeyboardInterrupt
+
+    with bench.join() as own:
+        publisher = own.publisher("robot1/front/in")
+        publisher.put("0")
+        until(lambda: bench.taken == [b"0"] and not own._tasks["t"].under_way(), "nothing waits")
+        monkeypatch.setattr(Lane, "put", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            publisher.put("1")
+        monkeypatch.setattr(Lane, "put", put)
+        assert publisher.put("2")
+    assert bench.taken == [b"0", b"1", b"2"]
+    count = bench.count()
+    assert (count.messages, count.acknowledged, count.at_most_lost, count.doubled) == (3, 3, 0, 0)

@@ -219,3 +219,21 @@ def test_the_last_thing_waits_for_what_is_claimed() -> None:
     assert receiver.got == []
     queue.do_claimed()
     until(lambda: receiver.got == [0, "last"], "behind it")
+
+
+def test_a_put_that_ctrl_c_ends_holds_nothing_up() -> None:
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    receiver = Receiver()
+    queue = SendQueue("t", depth=10, sheds=False)
+    assert queue.claim(interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        queue.do_claimed()
+    assert queue.is_empty
+    queue.send("a", receiver.take(1), 1)
+    until(lambda: receiver.got == [1], "what follows")
+    assert queue.claim(receiver.take(2))
+    queue.do_claimed()
+    assert receiver.got == [1, 2]
+    queue.close()

@@ -153,10 +153,12 @@ class InputStream:
         came behind `end`, and went nowhere.
         """
         with self._giving:
-            self._carry(sample, is_given=True)
-            outlet, self._in_hand = self._in_hand, None
-            if outlet is not None:
-                outlet.put_claimed()
+            try:
+                self._carry(sample, is_given=True)
+            finally:  # also behind Ctrl-C: what is claimed holds up all that follows
+                outlet, self._in_hand = self._in_hand, None
+                if outlet is not None:
+                    outlet.put_claimed()
             return not self._is_late
 
     def open(self, epoch: int, route: Route, acks: WorkerAcks | None = None, stamps: Stamps | None = None) -> None:
@@ -543,15 +545,20 @@ class InputStream:
         if self._active is not None:
             if self._times is not None:
                 self._times.sent(stamp or sample.timestamp)
-            if is_given and self._active.outlet.claim(sample, stamp):
-                self._in_hand = self._active.outlet
-            else:
+            if not is_given or not self._claim(self._active.outlet, sample, stamp):
                 reason, dropped = self._active.outlet.send(sample, stamp, size)
                 if dropped:
                     self._counter.dropped(reason, dropped)
         if self._mirror is not None:
             self._counter.repeated += 1
             self._counter.dropped(*self._mirror.outlet.send(sample, stamp, size))
+
+    def _claim(self, outlet: Outlet, sample: Sample, stamp: Timestamp | None) -> bool:
+        self._in_hand = outlet  # first: Ctrl-C may come in between
+        if outlet.claim(sample, stamp):
+            return True
+        self._in_hand = None
+        return False
 
     def _stamp(self, sample: Sample) -> Timestamp | None:
         """With `OnCrash.REPLAY` every sample has a timestamp, by which its answers are known."""

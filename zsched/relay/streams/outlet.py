@@ -461,6 +461,12 @@ class Outlet:
                 self.tally.errors += 1
                 self._left += 1
             raise
+        except BaseException:  # Ctrl-C in its giver's thread: it may have gone, and then its number is taken
+            self._note_put(lane, sample, stamp, size, began)
+            raise
+        self._note_put(lane, sample, stamp, size, began)
+
+    def _note_put(self, lane: Lane, sample: Sample, stamp: Timestamp | None, size: int, began: float) -> None:
         with self._lock:
             self._left += 1
             if self._acks is None:
