@@ -281,7 +281,12 @@ def read_yaml(data: bytes) -> tuple[Node | None, Collector]:
         out = Collector(_lines(data.decode("utf-8", "replace")))
         out.error(_end_of(good), f"byte 0x{data[error.start]:02x} is not UTF-8", "save the file as UTF-8")
         return None, out
-    root, faults = (_parsed if len(text) > _MAX_KEPT_CHARS else _kept)(text)
+    try:
+        root, faults = (_parsed if len(text) > _MAX_KEPT_CHARS else _kept)(text)
+    except RecursionError:  # of this caller's stack, which is not kept with the text
+        out = Collector(_lines(text))
+        out.error(NOWHERE, "not valid YAML: nested too deeply")
+        return None, out
     return root, Collector(_lines(text), faults)
 
 
@@ -320,8 +325,6 @@ def _compose(text: str, out: Collector) -> Node | None:
     except ReaderError as error:
         before = text[: error.position] if isinstance(error.position, int) else ""
         out.error(_end_of(before), "not valid YAML: a control character", "delete it")
-    except RecursionError:
-        out.error(NOWHERE, "not valid YAML: nested too deeply")
     except (YAMLError, ValueError, ArithmeticError, AttributeError, TypeError, LookupError, AssertionError) as error:
         # the library's own slips on hostile input; an operator still gets a sentence, not a traceback
         out.error(NOWHERE, f"not valid YAML: {str(error).split(chr(10), 1)[0] or type(error).__name__}")

@@ -1,5 +1,7 @@
 """Reading a YAML text: what is kept of a text that is read again."""
 
+import sys
+
 import pytest
 
 from zsched.config import reader
@@ -26,3 +28,20 @@ def test_a_faulty_text_tells_its_faults_each_time(text: bytes) -> None:
 def test_a_long_text_is_not_kept() -> None:
     text = b"".join(b"key%d: value\n" % number for number in range(2000))
     assert read_yaml(text)[0] is not read_yaml(text)[0]
+
+
+def test_a_stack_that_was_too_deep_for_a_text_says_nothing_of_the_text_later() -> None:
+    text = b"a: {b: {c: [1, {d: [2]}]}}  # read from far down"
+
+    def read_at(depth: int) -> int:
+        """How many faults it has there."""
+        return read_at(depth - 1) if depth else len(read_yaml(text)[1].faults)
+
+    def tried(depth: int) -> int:
+        try:
+            return read_at(depth)
+        except RecursionError:
+            return 0
+
+    assert any(tried(depth) for depth in range(sys.getrecursionlimit(), 0, -1))
+    assert not read_at(0)
