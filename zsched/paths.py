@@ -39,7 +39,15 @@ def config_path(given: Path | None, env: Mapping[str, str]) -> Path:
     if "ZSCHED_CONFIG" in env:
         return Path(env["ZSCHED_CONFIG"])
     user = Path(env.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "zsched" / "fleet.yaml"
-    return user if user.exists() and not SYSTEM_CONFIG.exists() else SYSTEM_CONFIG
+    return user if is_there(user) and not is_there(SYSTEM_CONFIG) else SYSTEM_CONFIG
+
+
+def is_there(file: Path) -> bool:
+    """Whether a file exists, or is in a folder into which we may not look: there it is told when it is read."""
+    try:
+        return file.exists()
+    except PermissionError:
+        return True
 
 
 def state_folder(given: Path | None, env: Mapping[str, str]) -> Path:
@@ -108,8 +116,11 @@ def again_path(runtime: Path, node: NodeId) -> Path:
 
 
 def local_marks(runtime: Path) -> tuple[Path, ...]:
-    """Every such mark in the runtime folder, sorted."""
-    return tuple(sorted(runtime.glob("*.again")))
+    """Every such mark in the runtime folder, sorted; none where we may not look into it."""
+    try:
+        return tuple(sorted(runtime.glob("*.again")))
+    except PermissionError:
+        return ()
 
 
 def local_sockets(runtime: Path) -> tuple[Path, ...]:

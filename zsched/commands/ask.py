@@ -223,7 +223,7 @@ def _no_socket(runtime: Path, config: Path) -> str:
         )
     if runtime == places.SYSTEM_RUNTIME and any(unit.exists() for unit in UNITS):
         start = "start it with `sudo systemctl start zsched` (why it does not run: `systemctl status zsched`)"
-    elif config.exists():
+    elif places.is_there(config):
         start = "start one with `zsched up`"
     else:
         return (

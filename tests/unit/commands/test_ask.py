@@ -242,6 +242,19 @@ def test_on_a_machine_that_is_no_node_yet_it_says_how_it_becomes_one(tmp_path: P
     assert "zsched up" not in str(caught.value)
 
 
+def test_folders_that_are_closed_to_who_asks_are_no_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(path: Path, *_: Any) -> Any:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    env = {**ENV, "ZSCHED_CONFIG": str(tmp_path / "closed" / "fleet.yaml")}
+    for method in ("exists", "glob"):
+        with monkeypatch.context() as patch:
+            patch.setattr(Path, method, refuse)
+            patch.setattr(ask, "UNITS", ())
+            with pytest.raises(CliError, match="no daemon in"):
+                find_door(tmp_path, None, env)
+
+
 def test_in_a_secured_cell_a_command_goes_to_the_gateway_that_it_names(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
