@@ -286,16 +286,22 @@ def wants_color(is_refused: bool, env: Mapping[str, str] = os.environ) -> bool:
 
 @contextlib.contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Ctrl-C does nothing meanwhile: for files that belong together, which are written in a part of a second."""
-    with _at_ctrl_c(_too_late):
+    """Ctrl-C, a terminal that closes and SIGTERM do nothing meanwhile.
+
+    For files that belong together, which are written in a part of a second.
+    """
+    with _at_signals(dict.fromkeys(_ENDS, _too_late)):
         yield
 
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
-    """Ctrl-C works as ever meanwhile: while somebody is asked, within `uninterrupted`."""
-    with _at_ctrl_c(signal.default_int_handler):
+    """They work as ever meanwhile: while somebody is asked, within `uninterrupted`."""
+    with _at_signals({**dict.fromkeys(_ENDS, signal.SIG_DFL), signal.SIGINT: signal.default_int_handler}):
         yield
+
+
+_ENDS: Final = (signal.SIGINT, signal.SIGHUP, signal.SIGTERM)
 
 
 def _too_late(_number: int, _frame: FrameType | None) -> None:
@@ -303,12 +309,15 @@ def _too_late(_number: int, _frame: FrameType | None) -> None:
 
 
 @contextlib.contextmanager
-def _at_ctrl_c(handler: Any) -> Iterator[None]:
+def _at_signals(handlers: Mapping[signal.Signals, Any]) -> Iterator[None]:
+    """Handle signals so meanwhile, but those that are ignored (`nohup`)."""
     if threading.current_thread() is not threading.main_thread():  # only that one may say what a signal does
         yield
         return
-    before = signal.signal(signal.SIGINT, handler)
+    ours = {number: handler for number, handler in handlers.items() if signal.getsignal(number) is not signal.SIG_IGN}
+    before = {number: signal.signal(number, handler) for number, handler in ours.items()}
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)

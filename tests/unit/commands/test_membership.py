@@ -252,24 +252,33 @@ def test_a_fleet_that_cannot_be_written_leaves_no_authority(tmp_path: Path, auth
     assert not authority.exists()
 
 
-def test_ctrl_c_while_a_fleet_is_founded_leaves_no_half_of_it(
-    tmp_path: Path, authority: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP, signal.SIGTERM])
+def test_a_signal_while_a_fleet_is_founded_leaves_no_half_of_it(
+    tmp_path: Path,
+    authority: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    request: pytest.FixtureRequest,
+    number: signal.Signals,
 ) -> None:
     """An authority, or a fleet file, without a state would be in the way of the next try."""
 
     def interrupted(*words: Any, **more: Any) -> Any:
         begun = begin_for(*words, **more)
-        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(number)
         return begun
 
+    def ended(*_: Any) -> None:
+        pytest.fail("the signal ends the verb")
+
     monkeypatch.setattr(papers, "begin_for", interrupted)
-    before = signal.getsignal(signal.SIGINT)
+    before = signal.signal(number, ended)
+    request.addfinalizer(lambda: signal.signal(number, before))
     result = run("fleet", "create", "hall", "--node", "robot1", "--address", "127.0.0.1", *here(tmp_path))
     assert result.exit_code == 0, result.stderr
     assert (tmp_path / "fleet.yaml").exists()
     assert StateFile(tmp_path / "state", fleet="hall", node="robot1").load().state is not None
     assert authority.exists()
-    assert signal.getsignal(signal.SIGINT) is before
+    assert signal.getsignal(number) is ended
 
 
 def test_ctrl_c_at_the_question_for_the_passphrase_founds_nothing(
