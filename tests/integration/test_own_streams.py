@@ -206,6 +206,24 @@ def test_streams_run_on_while_the_relay_is_replaced(tmp_path: Path) -> None:
         assert own.back == list(range(own.sent))
 
 
+def test_what_was_put_without_a_relay_is_counted_by_the_next_one_though_the_application_closes(tmp_path: Path) -> None:
+    with own_rig(tmp_path) as rig:
+        rig.start_worker("edge1")
+        rig.move(slot(1, "edge1", RELIABLE, 1))
+        with rig.join() as streams:
+            own = Own(streams)
+            own.put()
+            until(lambda: len(own.back) == 1, "the first answer")
+            counted(rig, 1)
+            pid = rig.relays[ROBOT].pid
+            assert pid is not None
+            subprocess.run(["kill", "-KILL", str(pid)], check=True)
+            for _ in range(20):
+                own.put()
+            until(lambda: len(own.back) == 21, "answers meanwhile")
+        assert counted(rig, 21).acknowledged == 21
+
+
 def test_an_application_that_is_killed_takes_only_what_it_had_in_flight(tmp_path: Path) -> None:
     with own_rig(tmp_path) as rig:
         for node in ("edge1", "edge2"):

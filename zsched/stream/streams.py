@@ -141,6 +141,10 @@ class Streams:
         """Says of a thread whether it is in a callback of the application."""
         self._is_hasty = False
         """Closing waits for nothing any more."""
+        self._left = threading.Event()
+        """The last counters are told: no relay is looked for any more."""
+        self._is_counted = True
+        """The relay that is there knows our streams, and takes their counters."""
         self._thread = guarded(self._run, name="zsched streams")
         self._thread.start()
         guarded(self._count, name="zsched counters").start()
@@ -268,19 +272,25 @@ class Streams:
             for task in tasks:
                 task.end_inputs()
             until = monotonic_s() + FINISH_S
-            while not all(_is_over(task) for task in tasks) and monotonic_s() < until and not self._is_hasty:
+            while not self._is_over(tasks) and monotonic_s() < until and not self._is_hasty:
                 time.sleep(LOOK_S)
             self._acks.flush()
             self._say_counts()
         finally:
+            self._left.set()
             self._link.hang_up()
             self._thread.join(JOIN_S)
-            for task in tasks:
+            for task in tuple(self._tasks.values()):
                 task.end()
             ends_within(APPLICATION_CLOSE_S, self._session.close, name="zsched session")
             self._acks.stalled.close()  # till now it has ended links that held the session up
             all_end_within(JOIN_S, besides=self._threads_before)
             self._closed.set()
+
+    def _is_over(self, tasks: tuple[OwnTask, ...]) -> bool:
+        return self._is_counted and all(
+            task.has_ended() and not task.under_way() and task.has_handed() for task in tasks
+        )
 
     def _deliver(self, received: Received) -> None:
         self._here.is_callback = True
@@ -294,11 +304,11 @@ class Streams:
     # --- the relay's words -------------------------------------------------------------------------------------------
 
     def _run(self) -> None:
-        while not self._closing.is_set():
+        while not self._left.is_set():
             while (word := self._link.read()) is not None:
                 self._take(word)
             self._link.close()
-            if not self._closing.is_set():
+            if not self._left.is_set():
                 self._come_again()
         self._link.close()
 
@@ -306,6 +316,7 @@ class Streams:
         if isinstance(word, StreamsTaken):
             with self._changed:
                 self._taken = frozenset(word.keys)
+                self._is_counted |= self._taken.issuperset(self._keys)
                 self._changed.notify_all()
         elif isinstance(word, DaemonGone):
             self._lose_daemon()
@@ -331,9 +342,10 @@ class Streams:
     def _come_again(self) -> None:
         """The relay is gone: look for the next one, and end what nobody tells us of for too long."""
         self._lose_daemon()
+        self._is_counted = not self._keys
         alone_since: float | None = monotonic_s()
         _log.warning("the relay of %s is gone: its plans hold for %g s", self.node, ALONE_S)
-        while not self._closing.wait(AGAIN_S):
+        while not self._left.wait(AGAIN_S):
             try:
                 self._link = Link(self._path, self._keys)
             except AdapterError as error:
@@ -349,7 +361,7 @@ class Streams:
             for drained in tuple(self._drained):
                 self._link.say(drained)
             _log.warning("the relay of %s is there again", self.node)
-            if self._closing.is_set():
+            if self._left.is_set():
                 self._link.hang_up()
             return
 
@@ -386,7 +398,3 @@ class Streams:
 
 def _bytes(payload: Payload) -> zenoh.ZBytes:
     return payload if isinstance(payload, zenoh.ZBytes) else zenoh.ZBytes(payload)
-
-
-def _is_over(task: OwnTask) -> bool:
-    return task.has_ended() and not task.under_way() and task.has_handed()
