@@ -186,18 +186,21 @@ class Streams:
 
         Raises:
             ValueError: it is no key without wildcards, or no input rule of this robot takes it.
+            AdapterError: the streams are closed.
         """
+        self._check_open()
         if (wrong := fault(key)) is not None or is_wild(key):
             raise ValueError(f"{key!r} is no key that can be published: {wrong or 'it has wildcards'}")
         self._name(key)
         until = monotonic_s() + KNOWN_S
-        while monotonic_s() < until:
+        while monotonic_s() < until and not self._closing.is_set():
             is_told = key in self._taken  # behind the plans
             for task in tuple(self._tasks.values()) if is_told else ():
                 if (stream := task.input_of(key)) is not None:
                     task.wait_fed(stream, FED_S)
                     return Publisher(key, task, stream, self._closing)
             time.sleep(LOOK_S)
+        self._check_open()
         self._forget(key)
         raise ValueError(f"no input rule takes {key!r} on {self.node}: see `inputs` of the fleet file's tasks (`from`)")
 
@@ -209,7 +212,9 @@ class Streams:
 
         Raises:
             ValueError: it is no key expression, or no output rule of this robot has it.
+            AdapterError: the streams are closed.
         """
+        self._check_open()
         if (wrong := fault(key_expr)) is not None:
             raise ValueError(f"{key_expr!r} is no key expression: {wrong}")
         with self._lock:
@@ -251,6 +256,10 @@ class Streams:
         self.close()
 
     # --- keys --------------------------------------------------------------------------------------------------------
+
+    def _check_open(self) -> None:
+        if self._closing.is_set():
+            raise AdapterError(f"the streams of {self.node} are closed")
 
     def _name(self, key: str) -> None:
         with self._lock:

@@ -314,6 +314,9 @@ def test_an_application_is_told_why_it_cannot_have_a_stream(bench: Bench, monkey
             own.publisher("robot1/*/in")
         with pytest.raises(ValueError, match="no output rule has 'robot1/none' on robot1"):
             own.subscribe("robot1/none", lambda _answer: None)
+    for ask in (own.publisher, lambda key: own.subscribe(key, lambda _answer: None)):
+        with pytest.raises(AdapterError, match="the streams of robot1 are closed"):
+            ask("robot1/front/in")
     with pytest.raises(AdapterError, match="no relay lets applications have their streams themselves in"):
         Streams.join(runtime_dir=bench.folder / "elsewhere", wait_s=0.0)
 
