@@ -31,6 +31,7 @@ class Hand:
         settings = route.settings
         is_reliable = settings.stream_class is StreamClass.RELIABLE
         self._deliver = deliver
+        self._missed = 0
         self._rewriting, self._to = Rewriting(route.from_expr, route.to_expr), route.to_expr
         self._queue = SendQueue(
             f"to {route.to_expr}",
@@ -76,8 +77,15 @@ class Hand:
         """Nothing waits for a time."""
 
     def take_missed(self) -> int:
-        """There is one receiver, and what it does not take is counted when it comes."""
-        return 0
+        """Answers that were given up, since the last call; what does not fit is counted when it comes."""
+        missed, self._missed = self._missed, 0
+        return missed
+
+    def give_up(self) -> int:
+        """Hand nothing over any more; how many answers still waited."""
+        left = self._queue.close()
+        self._missed += left
+        return left
 
     def undeclare(self) -> None:
         """End the thread behind the answer that it has in hand."""

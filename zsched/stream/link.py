@@ -23,6 +23,7 @@ from zsched.wire import codec as wire
 ANSWERS_S: Final = 2.0
 """A relay answers the first word within this time, and reads each later one."""
 
+NEEDS: Final = "the robot needs `listen: {streams: ...}` in the fleet file and a running daemon"
 NO_LIMIT: Final = bytes(16)
 """Of a socket's time to read, as setsockopt(2) takes it."""
 
@@ -43,8 +44,8 @@ def place_of(runtime_dir: Path | None, node: str, env: Mapping[str, str]) -> Pat
         names = ", ".join(path.stem for path in found)
         raise AdapterError(f"{folder} has several nodes: {names}; say which (Streams.join(node=...), ZSCHED_NODE)")
     raise AdapterError(
-        f"no relay lets applications have their streams themselves in {folder}: the robot needs "
-        "`listen: {streams: ...}` in the fleet file and a running daemon, and the folder must be readable"
+        f"no relay lets applications have their streams themselves in {folder}: {NEEDS}, and the folder must be "
+        "readable"
     )
 
 
@@ -66,6 +67,9 @@ class Link:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
             answer, text = self._greet(path, keys)
+        except FileNotFoundError as error:
+            self._socket.close()
+            raise AdapterError(f"no relay answers at {path}: {NEEDS}") from error
         except (OSError, WireError) as error:
             self._socket.close()
             raise AdapterError(f"no relay answers at {path}: {error}") from error

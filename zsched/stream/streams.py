@@ -68,6 +68,7 @@ FINISH_S: Final = 2.0
 ALIVE_S: Final = 1.0
 """Who waits for the thread that closes looks this often whether there is one: not in a process that was forked off."""
 LOOK_S: Final = 0.01
+MAX_KINDS: Final = 32
 JOIN_S: Final = 0.3
 
 _log = logging.getLogger("zsched.streams")
@@ -139,6 +140,7 @@ class Streams:
         self._tokens = Tokens(self._session, keyspace, lambda _seen: None, lambda _node, _ended: None, self._wake)
         self._here = threading.local()
         """Says of a thread whether it is in a callback of the application."""
+        self._raised: set[tuple[str, str]] = set()
         self._is_hasty = False
         """Closing waits for nothing any more."""
         self._left = threading.Event()
@@ -283,6 +285,8 @@ class Streams:
             until = monotonic_s() + FINISH_S
             while not self._is_over(tasks) and monotonic_s() < until and not self._is_hasty:
                 time.sleep(LOOK_S)
+            for stream, left in [one for task in tasks for one in task.give_up_answers().items()]:
+                _log.warning("%s: %d answers had not been handed over when the streams closed", stream, left)
             self._acks.flush()
             self._say_counts()
         finally:
@@ -308,7 +312,15 @@ class Streams:
                 try:
                     on_sample(received)
                 except (Exception, SystemExit) as error:  # noqa: BLE001 - no answer and no other callback misses theirs
-                    _log.warning("the callback of %s raised %s: %s", key_expr, type(error).__name__, error)
+                    self._note_raised(key_expr, error)
+
+    def _note_raised(self, key_expr: str, error: BaseException) -> None:
+        """Log it, with its traceback when the first of its kind: it may be the same for every answer."""
+        kind = (key_expr, type(error).__name__)
+        is_new = kind not in self._raised and len(self._raised) < MAX_KINDS
+        if is_new:
+            self._raised.add(kind)
+        _log.warning("the callback of %s raised %s: %s", *kind, error, exc_info=error if is_new else None)
 
     # --- the relay's words -------------------------------------------------------------------------------------------
 
@@ -383,8 +395,8 @@ class Streams:
         if isinstance(word, SlotDrained | SlotLost | ProblemReported):
             self._link.say(word)
         elif isinstance(word, SlotReady) and word.has_token is not None and not word.is_ready:
-            text = f"{word.task}: the owner's worker has no link to the application"
-            _log.warning("%s (does it dial our `listen: {streams}`?)", text)
+            text = f"{word.task}: the application does not see the owner's worker"
+            _log.warning("%s: it hangs or has ended (`zsched status`), or does not dial our `listen: {streams}`", text)
             self._link.say(ProblemReported(source="", problem=text[:MAX_REASON]))
         elif isinstance(word, SlotReady) and word.is_ready:
             self._link.say(ProblemReported(source="", problem=None))

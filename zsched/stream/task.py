@@ -51,6 +51,10 @@ class OwnStreams(OpenStreams):
         """Whether the callbacks have returned for every answer that has come."""
         return all(hand.is_empty for hand in tuple(self._hands.values()))
 
+    def give_up(self) -> dict[str, int]:
+        """Hand no answer over any more; {output stream: how many still waited for its callback}."""
+        return {stream: left for stream, hand in tuple(self._hands.items()) if (left := hand.give_up())}
+
     def _take_input(self, route: Route) -> InputStream:
         return InputStream(self._session, route, self._own_ids, None, self._times, is_ours=True)
 
@@ -111,6 +115,10 @@ class OwnTask(TaskRelay):
     def has_handed(self) -> bool:
         """Whether the callbacks have returned for every answer that has come."""
         return self._own.has_handed()
+
+    def give_up_answers(self) -> dict[str, int]:
+        """Hand no answer over any more; {output stream: how many still waited for its callback}, which are counted."""
+        return self._own.give_up()
 
     def end_inputs(self) -> None:
         """Nothing more will be put."""

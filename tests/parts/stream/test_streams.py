@@ -317,6 +317,10 @@ def test_an_application_is_told_why_it_cannot_have_a_stream(bench: Bench, monkey
     for ask in (own.publisher, lambda key: own.subscribe(key, lambda _answer: None)):
         with pytest.raises(AdapterError, match="the streams of robot1 are closed"):
             ask("robot1/front/in")
+    with pytest.raises(
+        AdapterError, match=r"no relay answers at .*/robot7\.streams: the robot needs `listen: {streams"
+    ):
+        Streams.join(node="robot7", runtime_dir=bench.folder, wait_s=0.0)
     with pytest.raises(AdapterError, match="no relay lets applications have their streams themselves in"):
         Streams.join(runtime_dir=bench.folder / "elsewhere", wait_s=0.0)
 
@@ -388,7 +392,34 @@ def test_what_a_callback_raises_takes_no_answer_from_another_one(
         for number in range(5):
             publisher.put(str(number))
     assert back == [str(number).encode() for number in range(5)]
-    assert f"the callback of robot1/out raised {type(error).__name__}: {error}" in caplog.text
+    assert caplog.text.count(f"the callback of robot1/out raised {type(error).__name__}: {error}") == 5
+    assert caplog.text.count("Traceback") == 1, "the same error again says nothing new"
+
+
+def test_answers_that_closing_does_not_wait_for_are_counted_and_told(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(streams, "FINISH_S", 0.3)
+    had: list[bytes] = []
+    gate = threading.Event()
+
+    def slow(answer: Received) -> None:
+        had.append(answer.payload.to_bytes())
+        gate.wait(10)
+
+    own = bench.join()
+    own.subscribe("robot1/out", slow)
+    publisher = own.publisher("robot1/front/in")
+    for number in range(6):
+        publisher.put(str(number))
+    until(lambda: own._tasks["t"].counts()[1].messages == 6, "all have come")
+    threading.Timer(1.0, gate.set).start()
+    own.close()
+    until(lambda: bench.application._link is None, "the relay has heard the last counters")
+    out = bench.application.added(NONE)[1]
+    assert had == [b"0"]
+    assert (out.messages, out.drops) == (6, (("slow_reader", 5),))
+    assert "t/out/0: 5 answers had not been handed over when the streams closed" in caplog.text
 
 
 def test_what_comes_too_late_to_be_put_is_told_to_the_one_who_puts_it(
