@@ -21,7 +21,7 @@ from zsched.commands.example import APPLICATION
 from zsched.commands.report import render_status
 from zsched.config.load import load_fleet
 from zsched.core.route.route import routes_for
-from zsched.core.values.fleet import Fleet, TaskSpec
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec
 from zsched.core.values.model import NodeId, NodeKind, TaskId
 from zsched.core.values.plan import Direction
 from zsched.core.values.struct import Struct
@@ -146,12 +146,13 @@ def _addresses(fleet: Fleet, stack: ExitStack) -> dict[NodeId, Addresses]:
         stack.callback(claim.close)
         return f"tcp/127.0.0.1:{claim.port}"
 
-    return {
-        node.name: Addresses(control=free(), data=joins(node.name))
-        if node.local is None
-        else Addresses(control=free(), data=free(), local=joins(node.name))
-        for node in fleet.nodes
-    }
+    def here(node: NodeSpec) -> Addresses:
+        streams = free() if node.listen_streams else ""
+        if node.local is None:
+            return Addresses(control=free(), data=joins(node.name), streams=streams)
+        return Addresses(control=free(), data=free(), local=joins(node.name), streams=streams)
+
+    return {node.name: here(node) for node in fleet.nodes}
 
 
 # --- what is printed -------------------------------------------------------------------------------------------------
@@ -184,6 +185,8 @@ def _introduce(
     enter.write_text(entrance(nodes, robot), encoding="utf-8")
     _say("zsched asks this fleet in a terminal that begins with:")
     _say_to_copy(f"source {shlex.quote(str(enter))}")
+    for name in (node.name for node in fleet.nodes if node.listen_streams and node.kind is NodeKind.ROBOT):
+        _say(f'there an application has its streams itself by `Streams.join(node="{name}")` of zsched.stream')
     _say(f"in others: `zsched status --runtime-dir {nodes.folder} --node {robot}`")
 
 
