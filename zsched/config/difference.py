@@ -305,13 +305,18 @@ def _access(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
         yield _restart(EVERY_DAEMON, "security", _plain(before), _plain(after))
     elif before != after:
         yield _set(anew, "security", _plain(before), _plain(after))
-    names, tasks = ({node.name for node in old.nodes}, {task.name: (task.rules, task.candidates) for task in old.tasks})
-    for node in new.nodes:
-        if node.name not in names:
-            yield replace(anew, paths=(f"nodes.{node.name}",))
-    for task in new.tasks:
-        if tasks.get(task.name) != (task.rules, task.candidates):
-            yield replace(anew, paths=(f"tasks.{task.name}",))
+    nodes, others = ({node.name: (node.kind, node.local is None) for node in fleet.nodes} for fleet in (old, new))
+    for name in dict.fromkeys((*others, *nodes)):
+        if name not in nodes or name not in others:
+            yield replace(anew, paths=(f"nodes.{name}",))
+        elif nodes[name] != others[name]:
+            yield replace(anew, paths=(f"nodes.{name}.kind", f"nodes.{name}.local"))
+    speaking, then = (
+        {task.name: (task.rules, task.candidates) for task in fleet.tasks if task.rules} for fleet in (old, new)
+    )
+    for name in dict.fromkeys((*then, *speaking)):
+        if speaking.get(name) != then.get(name):
+            yield replace(anew, paths=(f"tasks.{name}",))
 
 
 def _nameless(security: Security) -> Security:

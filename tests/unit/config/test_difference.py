@@ -15,7 +15,7 @@ from zsched.config.load import check_bytes
 from zsched.core.values.fleet import Cell, Fleet, LinkSpec, LocalSide, NodeSpec, TaskSpec
 from zsched.core.values.model import NodeKind, Weights
 from zsched.core.values.profile import LinkSource
-from zsched.runtime.restarts import restarts
+from zsched.runtime.restarts import opens_anew, restarts
 
 TEXT = (Path(__file__).parents[3] / "configs" / "fleet.yaml").read_text()
 RULES = "tasks.map_merge.scheduling"
@@ -261,8 +261,34 @@ def test_what_a_secured_fleet_lets_in_follows_when_its_daemons_begin_anew() -> N
     assert any(anew in one[3] for one in told(node, secured) if one[0] == "nodes.robot9")
     without = node.replace("\nsecurity: {}\n", "\n")
     assert not any("begin again" in one[3] for one in told(without, plain))
-    task = secured.replace("tasks:\n", f"tasks:\n{EXCLUSIVE}", 1)
-    assert any("begin again" in one[3] for one in told(task, secured) if one[0] == "tasks.pick")
+
+
+SECURED = f"{TEXT.replace('tcp/', 'tls/')}\nsecurity: {{}}\n"
+SPEAKING = EXCLUSIVE + '    inputs: [{from: "{robot}/box", to: "{target}/pick/{robot}/box"}]\n'
+ROBOT1 = "  robot1: {kind: robot, wifi: wlan0}"
+LISTENS = 'local: {mode: peer, listen: ["tcp/127.0.0.1:7460"]}'
+
+
+@pytest.mark.parametrize(
+    ("other", "path", "is_anew"),
+    [
+        (SECURED.replace("tasks:\n", f"tasks:\n{SPEAKING}", 1), "tasks.pick", True),
+        (SECURED.replace("tasks:\n", f"tasks:\n{EXCLUSIVE}", 1), "tasks.pick", False),
+        (with_(ROBOT1, f"{ROBOT1}\n  robot9: {{kind: robot}}", SECURED), "nodes.robot9", True),
+        (with_(ROBOT1, f"{ROBOT1[:-1]}, {LISTENS}}}", SECURED), "nodes.robot1.local", True),
+        (with_(ROBOT1, f"{ROBOT1[:-1]}, labels: {{arm: left}}}}", SECURED), "nodes.robot1.labels", False),
+    ],
+    ids=["a task with streams", "one without", "a node", "a local side", "a label"],
+)
+def test_daemons_are_said_to_begin_again_where_they_do_when_it_comes_and_when_it_goes(
+    other: str, path: str, is_anew: bool
+) -> None:
+    """A change that only takes rights away is told, too: open sessions let in more than the file says."""
+    for new, old in ((other, SECURED), (SECURED, other)):
+        assert opens_anew(fleet_of(old), fleet_of(new)) is is_anew
+        there = [one[3] for one in told(new, old) if one[0] == path]
+        assert there
+        assert any("begin again in turns" in text for text in there) is is_anew
 
 
 def test_what_comes_later_is_not_told_together_with_at_once() -> None:
