@@ -275,7 +275,8 @@ def how_to_start(node: NodeId, where: Places) -> tuple[str, ...]:
     is_named = node == places.node_name(None, {})
     if (where.config, where.state) == by_default:
         lines = () if is_named else (f"write `[Service] Environment=ZSCHED_NODE={node}`: `sudo systemctl edit zsched`",)
-        return (*lines, "sudo systemctl enable --now zsched (or in the foreground: sudo zsched up)")
+        up = "sudo zsched up" if is_named else f"sudo zsched up --node {node}"
+        return (*lines, f"sudo systemctl enable --now zsched (or in the foreground: {up})")
     words = ["zsched", "up", "--config", str(where.config), "--node", node, "--state-dir", str(where.state)]
     return (shlex.join(words),)
 

@@ -22,7 +22,7 @@ from zsched.adapters.host.state_file import StateFile
 from zsched.cli import app
 from zsched.commands import membership, papers
 from zsched.commands.common import CliError
-from zsched.commands.membership import Address, address_of, dial_order, own_address
+from zsched.commands.membership import Address, address_of, dial_order, how_to_start, own_address
 from zsched.commands.pki import begin_for
 from zsched.config.load import check_bytes, load_fleet
 from zsched.core.values.certificates import Role
@@ -30,6 +30,7 @@ from zsched.core.values.document import Document, Rollout, Text
 from zsched.core.values.struct import replace
 from zsched.errors import ConfigError
 from zsched.pki.authority import create
+from zsched.runtime.membership import Places
 from zsched.runtime.secured import require_own
 from zsched.wire.codec import as_plain, document_hash, from_plain
 from zsched.wire.invitation import decode_invitation, encode_invitation
@@ -757,3 +758,15 @@ def test_a_file_on_stdout_with_a_key_is_for_its_owner_only(
         membership._write(membership.invitation_for(find_door(None, None), guest, b""), guest, None)
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
     assert decode_invitation(file.read_bytes()).papers is not None
+
+
+def test_how_to_start_names_a_node_that_its_host_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where this shell has ZSCHED_NODE: `sudo` and systemd do not pass it on."""
+    monkeypatch.setattr("socket.gethostname", lambda: "Robot1.local")
+    monkeypatch.setenv("ZSCHED_NODE", "foo")
+    where = Places(config=Path("/etc/zsched/fleet.yaml"), state=Path("/var/lib/zsched"))
+    unit = "sudo systemctl enable --now zsched (or in the foreground: sudo zsched up{})"
+    assert how_to_start("robot1", where) == (unit.format(""),)
+    told = how_to_start("foo", where)
+    assert "Environment=ZSCHED_NODE=foo" in told[0]
+    assert told[1:] == (unit.format(" --node foo"),)
