@@ -283,11 +283,14 @@ def _electors(agreed: tuple[NodeId, ...], wanted: tuple[NodeId, ...]) -> _Verdic
 
 def _sessions(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
     """Workers dial every robot that has an address: a new one takes a new session."""
-    known, tasks = set(_addresses(old).values()), {task.name for task in old.tasks}
-    come = [name for name, address in _addresses(new).items() if address not in known]
+    before, tasks = _addresses(old), {task.name for task in old.tasks}
+    known = {address for addresses in before.values() for address in addresses}
+    come = [name for name, addresses in _addresses(new).items() if addresses - known]
     for name in come:
+        node = f"nodes.{name}"
+        paths = (f"{node}.listen", f"{node}.host") if name in before else (node,)
         for verdict in (_renewed(task) for task in new.tasks if task.name in tasks):
-            yield replace(verdict, text=f"{verdict.text}, to dial {name}", paths=(f"nodes.{name}",))
+            yield replace(verdict, text=f"{verdict.text}, to dial {name}", paths=paths)
 
 
 def _access(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
@@ -324,12 +327,13 @@ def _nameless(security: Security) -> Security:
     return replace(security, operators=(), guests=(), revoked=())
 
 
-def _addresses(fleet: Fleet) -> dict[NodeId, str]:
-    """{robot: where others dial its data session}, of robots that have an address."""
-    found = {
-        node.name: dial_endpoint(node.listen_data, node.host) for node in fleet.nodes if node.kind is NodeKind.ROBOT
+def _addresses(fleet: Fleet) -> dict[NodeId, set[str]]:
+    """{robot: where workers dial its data session, and an application of its that has its streams itself}."""
+    return {
+        node.name: {dial_endpoint(end, node.host) for end in (node.listen_data, node.listen_streams)} - {""}
+        for node in fleet.nodes
+        if node.kind is NodeKind.ROBOT
     }
-    return {name: address for name, address in found.items() if address}
 
 
 def _nodes(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
