@@ -19,12 +19,13 @@ from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 ROOT = Path(__file__).parents[2]
 QUESTIONS = [f"question {number}" for number in range(10)]
 README_TASK = """
-shout:
-  candidates: {kind: edge}
-  weights: {cpu: 0.5, memory: 0.5, network: 0}
-  worker: {command: [python, /opt/shout/shout.py]}
-  inputs: [{from: "{robot}/question", to: "{target}/shout/{robot}/question", class: reliable}]
-  outputs: [{from: "{target}/shout/{epoch}/answer", to: "{robot}/answer", class: reliable, handover: all}]
+tasks:
+  shout:
+    candidates: {kind: edge}
+    weights: {cpu: 0.5, memory: 0.5, network: 0}
+    worker: {command: [python, /opt/shout/shout.py]}
+    inputs: [{from: "{robot}/question", to: "{target}/shout/{robot}/question", class: reliable}]
+    outputs: [{from: "{target}/shout/{epoch}/answer", to: "{robot}/answer", class: reliable, handover: all}]
 """
 
 
@@ -45,7 +46,7 @@ def fleet_of(folder: Path, program: str, task: str) -> dict[str, Any]:
     (folder / "shout.py").write_text(program)
     tree = echo_fleet(robots=1, edges=1, timing="wired")
     del tree["tasks"][TASK]
-    tree["tasks"] = YAML(typ="safe").load(task.replace("/opt/shout", str(folder)))
+    tree |= YAML(typ="safe").load(task.replace("/opt/shout", str(folder)))
     return tree
 
 

@@ -4,6 +4,9 @@ import re
 from dataclasses import fields
 from pathlib import Path
 
+import pytest
+
+from zsched.config.editing import add_entries
 from zsched.config.load import check_bytes
 from zsched.config.schema import LINK_LIMITS, SCHEDULING, reference
 from zsched.config.timing import _RELATIONS
@@ -62,3 +65,24 @@ def test_whole_fleet_files_of_the_guide_have_no_fault_and_no_warning() -> None:
     assert examples
     for text in examples:
         assert check_bytes(text.encode(), "fleet-file.md").report() == ""
+
+
+LISTEN = "listen: {control: tcp/0.0.0.0:7457, data: tcp/0.0.0.0:7458}"
+HALL = f"""
+fleet: hall-a
+nodes: {{robot1: {{kind: robot}}, edge1: {{kind: edge, host: 192.0.2.11, {LISTEN}}}}}
+tasks: {{}}
+"""
+BLOCKS = [
+    pytest.param(text, id=f"{page.name} {number}")
+    for page in sorted(GUIDE.glob("*.md"))
+    for number, text in enumerate(re.findall(r"^```yaml\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL), 1)
+    if "candidates:" in text and not text.startswith("fleet:")
+]
+
+
+@pytest.mark.parametrize("text", BLOCKS)
+def test_a_task_of_the_guide_is_taken_as_it_stands(text: str) -> None:
+    """By `zsched task add`, and without a fault in a fleet with a robot and an edge."""
+    result = check_bytes(add_entries(HALL, "tasks", text).encode())
+    assert result.fleet is not None, result.report()
