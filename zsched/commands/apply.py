@@ -41,7 +41,7 @@ from zsched.core.values.struct import Struct, replace
 from zsched.errors import ConfigError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE, EXIT_WOULD_CHANGE
 from zsched.files import read_regular
-from zsched.runtime.restarts import restarts
+from zsched.runtime.restarts import opens_anew, restarts
 
 SCHEMA = "zsched.apply/1"
 OTHER_FILES = "other-files"
@@ -100,6 +100,8 @@ class Plan(Struct, frozen=True, kw_only=True):
     """(name, what is accepted with it)."""
     restarts: tuple[tuple[str, str], ...] = ()
     """(nodes, what of it their daemons go by after a restart only)."""
+    begins_again: bool = False
+    """Daemons begin again by themselves for it: such a restart is no work for anybody."""
     warnings: str = ""
     note: str = ""
     """One line above the table."""
@@ -232,6 +234,7 @@ def make_plan(
         changes=changes,
         dangers=tuple(dangers),
         restarts=_restarts(old, fleet),
+        begins_again=opens_anew(old, fleet),
         warnings=warnings,
         note=note,
         rollouts=tuple(sorted(rollouts, key=lambda one: str(one["task"]))),
@@ -311,8 +314,15 @@ def table(plan: Plan) -> str:
     for one, value in zip(plan.changes, values, strict=True):
         danger = f" [{one.danger}]" if one.danger is not None else ""
         lines.append(f"  {cut(one.path, room):{room}}  {value:{wide}}  {one.consequence}{danger}")
-    lines += [f"until {names} restarts: {why}" for names, why in plan.restarts]
+    lines += [f"until {names} {_until(names, plan.begins_again)}: {why}" for names, why in plan.restarts]
     return "\n".join(lines)
+
+
+def _until(names: str, is_by_itself: bool) -> str:
+    """What the daemons of ``names`` do before they go by all of it."""
+    if "," in names:
+        return "begin again, by themselves" if is_by_itself else "restart"
+    return "begins again, by itself" if is_by_itself else "restarts"
 
 
 def _values(one: Change) -> str:
@@ -345,7 +355,8 @@ def _body(plan: Plan, outcome: str, revision: int) -> Json:
     ]
     dangers = [{"name": name, "means": means} for name, means in plan.dangers]
     body = {"schema": SCHEMA, "fleet": plan.held.fleet, "outcome": outcome, "revision_before": plan.held.revision}
-    waiting = [{"nodes": names.split(", "), "why": why} for names, why in plan.restarts]
+    by_itself = plan.begins_again
+    waiting = [{"nodes": names.split(", "), "why": why, "by_itself": by_itself} for names, why in plan.restarts]
     told = {"changes": changes, "dangers": dangers, "restarts": waiting}
     return {**body, "revision": revision, "is_first": plan.is_first, **told}
 

@@ -23,7 +23,7 @@ from zsched.runtime.access_rules import names_of
 from zsched.runtime.crew import Crew
 from zsched.runtime.endpoints import Endpoints, endpoints_for
 from zsched.runtime.recipes import Recipes
-from zsched.runtime.restarts import moved, opens_anew, restarts
+from zsched.runtime.restarts import moved, opens_anew, restarts, waits_for
 from zsched.runtime.sampler import Sampler
 
 SOURCE = "restart"
@@ -80,10 +80,10 @@ class Adoption(Struct, kw_only=True):
         if is_exclusive:
             self.bus.hear_all_at_once()
         self._tell_watches(fleet)
-        self.compare_sessions(opens_anew(self.started_with, fleet), moved(self.started_with, fleet, self.me))
+        begins_again = opens_anew(self.started_with, fleet)
+        self.compare_sessions(begins_again, moved(self.started_with, fleet, self.me))
         needs = restarts(self.started_with, fleet, self.me, is_agreed=is_agreed)
-        text = f"until this daemon is restarted: {'; '.join(needs)}" if needs else None
-        self.post(ev.ProblemReported(source=SOURCE, problem=text))
+        self.post(ev.ProblemReported(source=SOURCE, problem=waits_for(needs, begins_again)))
 
     def _tell_watches(self, fleet: Fleet) -> None:
         found = {task.name: watch_for(fleet, task, self.me) for task in fleet.tasks}

@@ -52,6 +52,15 @@ def opens_anew(old: Fleet, new: Fleet) -> bool:
     return any(access_control(old, before, side) != access_control(new, after, side) for side in Side)
 
 
+def waits_for(needs: tuple[str, ...], begins_again: bool) -> str | None:
+    """The problem of a daemon that cannot take ``needs`` over yet (`restarts`); ``None``: there is none.
+
+    ``begins_again``: it does so by itself (`opens_anew`), and nobody has to restart it.
+    """
+    until = "begins again, by itself in its turn" if begins_again else "is restarted"
+    return f"until this daemon {until}: {'; '.join(needs)}" if needs else None
+
+
 def moved(old: Fleet, new: Fleet, me: NodeId) -> tuple[NodeId, ...]:
     """The nodes of both files that ``me`` would dial elsewhere by ``new`` than its open sessions do.
 

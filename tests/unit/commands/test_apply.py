@@ -198,14 +198,27 @@ def test_what_a_daemon_cannot_take_over_while_it_runs_is_told_with_its_nodes(nod
     result = run("apply", file, "--plan")
     assert "shared_memory  off -> auto  every daemon must be restarted" in result.stdout
     assert result.stdout.splitlines()[-1].startswith(
-        "until edge1, robot1, robot2 restarts: `shared_memory`: its sessions"
+        "until edge1, robot1, robot2 restart: `shared_memory`: its sessions"
     )
     body = json.loads(run("apply", file, "--plan", "--json").stdout)
     assert faults(body) == []
-    assert [one["nodes"] for one in body["restarts"]] == [["edge1", "robot1", "robot2"]]
+    assert [(one["nodes"], one["by_itself"]) for one in body["restarts"]] == [(["edge1", "robot1", "robot2"], False)]
     electors = changed(tmp_path, "electorate: [robot1, robot2, edge1]", "electorate: [robot1, edge1]")
     assert json.loads(run("apply", electors, "--plan", "--json").stdout)["restarts"] == [], "they are agreed"
     assert node.changes == []
+
+
+def test_a_restart_that_comes_by_itself_is_nobody_s_work(node: Node, tmp_path: Path) -> None:
+    node.text = TEXT.replace("tcp/", "tls/") + "security: {}\n"
+    come = node.text.replace("  edge1: {", "  robot3: {kind: robot}\n  edge1: {")
+    file = tmp_path / "fleet.yaml"
+    file.write_text(come.replace("fleet: hall", "shared_memory: auto\nfleet: hall"))
+    told = run("apply", str(file), "--plan").stdout
+    assert "daemons begin again in turns" in told
+    assert "until edge1, robot1, robot2 begin again, by themselves: `shared_memory`" in told
+    body = json.loads(run("apply", str(file), "--plan", "--json").stdout)
+    assert faults(body) == []
+    assert [one["by_itself"] for one in body["restarts"]] == [True]
 
 
 def test_the_document_in_force_changes_nothing_and_another_comment_is_told(node: Node, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 from support.fleets import fleet_of, node_of, task_of
 from zsched.core.values.fleet import Fleet, NodeSpec, Security, SharedMemory
 from zsched.core.values.model import NodeKind
-from zsched.runtime.restarts import moved, opens_anew, restarts
+from zsched.runtime.restarts import moved, opens_anew, restarts, waits_for
 
 
 def addressed(name: str, host: str = "") -> NodeSpec:
@@ -82,6 +82,12 @@ def test_who_is_let_in_by_other_names_begins_anew_by_itself() -> None:
         assert not opens_anew(secured, other), "who is secured otherwise does not meet the others"
         assert any("`security`" in one for one in restarts(secured, other, "robot1"))
     assert not opens_anew(OLD, with_node(addressed("robot9", NodeKind.ROBOT))), "nobody is kept out"
+
+
+def test_a_daemon_that_begins_again_by_itself_asks_nobody_to_restart_it() -> None:
+    assert waits_for((), True) is waits_for((), False) is None
+    assert waits_for(("one", "two"), False) == "until this daemon is restarted: one; two"
+    assert waits_for(("one",), True) == "until this daemon begins again, by itself in its turn: one"
 
 
 def test_agreed_electors_need_no_generation() -> None:
