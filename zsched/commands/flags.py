@@ -101,12 +101,13 @@ def drain(view: OrderView, order: DrainOrder) -> int:
     before = {name: _counts(found, name) for name in _owned(status, nodes)}
     revision = _commit(view, held, after, f"{order.kind} {', '.join(nodes)}")
     had = "; ".join(f"{row[0]}: {row[2]}" for row in rows if row[1] == order.kind)
-    what = f"It is agreed{_endless(held.flags, after)}" if is_change else f"It is so already ({had})"
+    what = f"It is agreed{_endless(held.flags, after)}" if is_change else f"Nothing would change ({had})"
     watch = ". Ctrl-C ends the watching, not the drain"
     if order.kind == LEAVE:  # this command does the rest, once the node is empty
         watch = f". After Ctrl-C the same command goes on, and `zsched undrain {' '.join(nodes)}` takes it back"
     watch = "" if order.is_detached else watch
-    tell(view, "agreed", f"{what}{watch}.", after_s=0.0, nodes=nodes, revision=revision)
+    event = "agreed" if is_change else "unchanged"
+    tell(view, event, f"{what}{watch}.", after_s=0.0, nodes=nodes, revision=revision)
     if order.is_detached:
         return EXIT_OK
     watching = _Watch(view=view, began=monotonic_s(), owners=_owned(status, nodes), before=before, kind=order.kind)
@@ -290,7 +291,8 @@ def _with(view: OrderView, held: InForce, kind: str, nodes: Sequence[str]) -> tu
     flags = list(held.flags)
     for name in nodes:
         known = next((flag for flag in flags if (flag["kind"], flag["subject"]) == (kind, name)), None)
-        if known is not None and not view.reason and view.for_s is None and known.get("for_s") is None:
+        says_same = known is not None and view.reason in ("", known.get("reason", ""))
+        if known is not None and says_same and view.for_s is None and known.get("for_s") is None:
             continue
         flags = [flag for flag in flags if flag is not known]
         said = {"kind": kind, "subject": name, **view.asked, "for_s": view.for_s, "revision": held.revision + 1}

@@ -63,7 +63,7 @@ def hold(view: OrderView, order: HoldOrder, names: Sequence[str], *, is_all: boo
     if view.revision is not None and len(chosen) > 1:
         raise CliError(EXIT_USAGE, "--revision goes with one task")
     rows = [_hold_row(view, order, known[name]) for name in chosen]
-    changing = [row[0] for row in rows if row[2] != row[3]]
+    changing = [name for name in chosen if _is_change(view, order, known[name])]
     plans = [
         {**_held(known[row[0]]), "outcome": "planned" if row[0] in changing else "unchanged", "detail": row[3]}
         for row in rows
@@ -128,24 +128,60 @@ def _give_hold(view: OrderView, order: HoldOrder, task: Json) -> Json:
         "for_s": view.for_s,
         "base_revision": task["revision"] if view.revision is None else view.revision,
         **view.asked,
+        "reason": _reason(view, order, task),
     }
     return ask_door(view.door, request)
 
 
+def _kind(order: HoldOrder) -> str:
+    return "pause" if order.hold in ("pause", "resume") else "pin"
+
+
+def _ends(order: HoldOrder) -> bool:
+    return order.hold in ("resume", "unpin")
+
+
+def _known(order: HoldOrder, task: Json) -> Json | None:
+    """The order in force that this one gives again, whoever has given it: the same pause, or pin to the same place."""
+    held: Json | None = task.get(_kind(order))
+    if held is None or order.hold == "pause":
+        return held
+    wanted = (order.node or task["owner"], order.is_hard)
+    return held if (held["node"], held["is_hard"]) == wanted else None
+
+
+def _reason(view: OrderView, order: HoldOrder, task: Json) -> str:
+    """Why; an order that is given again without a reason keeps the one that it had."""
+    known = None if _ends(order) or view.reason else _known(order, task)
+    return view.reason if known is None else str(known["reason"])
+
+
+def _is_change(view: OrderView, order: HoldOrder, task: Json) -> bool:
+    """Whether it changes anything: a time that is given again begins anew (`zsched.commands.flags` judges so, too)."""
+    if _ends(order):
+        return task.get(_kind(order)) is not None
+    known = _known(order, task)
+    if known is None or view.for_s is not None or known["for_s"] is not None:
+        return True
+    return bool(known["reason"] != _reason(view, order, task))
+
+
 def _hold_row(view: OrderView, order: HoldOrder, task: Json) -> Row:
-    kind = "pause" if order.hold in ("pause", "resume") else "pin"
+    kind = _kind(order)
     before = _told(kind, task.get(kind))
-    if order.hold in ("resume", "unpin"):
+    if _ends(order):
         after = NOTHING
-    else:
+    elif _is_change(view, order, task):
         wanted = {
             "node": (order.node or task["owner"]) if kind == "pin" else None,
             "is_hard": order.is_hard,
             "by": view.asked["by"],
-            "reason": view.reason,
+            "reason": _reason(view, order, task),
             "for_s": view.for_s,
         }
         after = _told(kind, wanted)
+    else:
+        after = before
     return str(task["name"]), kind, before, after
 
 

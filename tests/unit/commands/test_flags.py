@@ -134,7 +134,7 @@ def test_a_drain_without_a_time_ends_by_hand_only_also_where_one_had_a_time(daem
     assert "edge1: empty, and gets nothing new until `zsched undrain edge1`" in again.stdout
     (flag,) = daemon.flags
     assert (flag["for_s"], flag["reason"]) == (None, "new fan")
-    assert "It is so already" in run("drain", "edge1", "--yes").stdout
+    assert "Nothing would change" in run("drain", "edge1", "--yes").stdout
     assert run("undrain", "edge1", "--yes").exit_code == 0
     run("eligible", "edge2", "off", "--for", "30s", "--yes")
     assert "ends by hand only (edge2, was for 30s)." in run("eligible", "edge2", "off", "--yes").stdout
@@ -207,8 +207,20 @@ def test_it_is_watched_until_the_node_is_empty_and_every_move_is_told(daemon: Da
     ]
     daemon.own("echo", "edge1")
     again = run("drain", "edge1", "--yes", "--deadline", "0s")
-    assert re.search(r"It is so already \(edge1: drained, \S+@robot1\)\. Ctrl-C ends the watching", again.stdout)
+    assert re.search(r"Nothing would change \(edge1: drained, \S+@robot1\)\. Ctrl-C ends the watching", again.stdout)
     assert len(daemon.changes) == 1, "who gives it again only watches"
+
+
+def test_a_drain_that_is_given_again_changes_nothing_but_for_another_reason(daemon: Daemon) -> None:
+    for more, event, reason in (
+        (("-m", "fan"), "agreed", "fan"),
+        (("-m", "fan"), "unchanged", "fan"),
+        ((), "unchanged", "fan"),
+        (("-m", "new lens"), "agreed", "new lens"),
+    ):
+        assert [one["event"] for one in events("drain", "edge1", "--yes", "--detach", *more)] == [event]
+        assert daemon.flags[0]["reason"] == reason
+    assert len(daemon.changes) == 2
 
 
 def test_at_the_deadline_it_says_what_is_missing_and_the_drain_stays(

@@ -135,6 +135,29 @@ def test_a_pause_carries_who_why_and_how_long_and_is_listed(daemon: Daemon) -> N
     assert faults(json.loads(run("maint", "--json").stdout)) == []
 
 
+@pytest.mark.parametrize("words", [("pause", "echo"), ("pin", "echo", "edge1")])
+def test_an_order_that_is_given_again_changes_nothing_but_for_another_reason_or_a_time(
+    daemon: Daemon, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
+) -> None:
+    """As a drain: also where somebody else gives it; without a reason it keeps the one that it had."""
+    for user, more, orders, reason in (
+        ("ada", ("-m", "lens"), 1, "lens"),
+        ("bob", ("-m", "lens"), 1, "lens"),
+        ("bob", (), 1, "lens"),
+        ("bob", ("--for", "2h"), 2, "lens"),
+        ("bob", ("--for", "2h"), 3, "lens"),
+        ("bob", (), 4, "lens"),
+        ("bob", ("-m", "fan"), 5, "fan"),
+    ):
+        monkeypatch.setattr("zsched.commands.orders.user_name", lambda user=user: user)
+        before = len(daemon.orders)
+        said = run(*words, *more, "--yes").stdout
+        assert ("Nothing would change." in said) is (before == orders)
+        assert (len(daemon.orders), daemon.status["tasks"][0][words[0]]["reason"]) == (orders, reason)
+    run("pin", "echo", "edge2", "--yes")
+    assert daemon.status["tasks"][0]["pin"]["reason"] == "", "a pin to another node is another order"
+
+
 def test_a_pause_that_waits_ends_when_every_node_knows_it(daemon: Daemon) -> None:
     late = {"edge2": 3}
 
