@@ -46,6 +46,8 @@ UNITS = tuple(
 AGAIN_S, LOOK_S = 30.0, 0.05
 """A daemon that begins again is waited for this long from when it said so, with a look this often."""
 CONNECT_S = 3.0
+SAYS_WHICH = "with --node or ZSCHED_NODE"
+"""By what an operator says which of several daemons on this machine is meant."""
 ONLY_THERE = frozenset({"access", "leave", "log"})
 """What a daemon answers on its own machine only."""
 READS = frozenset({"access", "explain", "fleet", "history", "lines", "log", "rehearsals", "status"})
@@ -72,7 +74,12 @@ class Door(Struct, frozen=True, kw_only=True):
 
 
 def find_door(
-    runtime_dir: Path | None, node: str | None, env: Mapping[str, str] = os.environ, *, connect: str | None = None
+    runtime_dir: Path | None,
+    node: str | None,
+    env: Mapping[str, str] = os.environ,
+    *,
+    connect: str | None = None,
+    says_which: str = SAYS_WHICH,
 ) -> Door:
     """The socket that is meant: ``node``'s own, else any other that passes the question on.
 
@@ -80,7 +87,7 @@ def find_door(
 
     With ``connect`` no socket of this machine: the node at that endpoint is asked, and passes the question on.
     Without ``node``: this node's own (``ZSCHED_NODE``, host name). Where nothing but the host name says which is this
-    node, the only one there is.
+    node, the only one there is. ``says_which``: what can say it where there are several.
 
     Raises:
         CliError: there is no daemon, not the one that is meant (3), or there are several and none is meant (2).
@@ -113,7 +120,7 @@ def find_door(
         raise CliError(EXIT_UNREACHABLE, _no_daemon(own, runtime, sockets))
     if is_told:
         raise CliError(EXIT_USAGE, f"ZSCHED_NODE: fleet {fleet} has no node {own!r}{nearest(own, names)}")
-    raise CliError(EXIT_USAGE, f"several daemons in {runtime}: {here}; say which one with --node or ZSCHED_NODE")
+    raise CliError(EXIT_USAGE, f"several daemons in {runtime}: {here}; say which one {says_which}")
 
 
 def _door_of_cell(runtime_dir: Path | None, word: str, env: Mapping[str, str]) -> Door:
@@ -126,7 +133,7 @@ def _door_of_cell(runtime_dir: Path | None, word: str, env: Mapping[str, str]) -
     name, _, node = word.partition("/")
     if not (NAME.fullmatch(name) and NAME.fullmatch(node)):
         raise CliError(EXIT_USAGE, f"--node: {word!r} is neither a node's name nor CELL/NODE")
-    here = door_here(runtime_dir, None, env)
+    here = door_here(runtime_dir, None, env, says_which=f"asks {name}: with ZSCHED_NODE")
     fleet = fleet_here(here, places.config_path(None, env))
     if name == fleet.name:
         return find_door(runtime_dir, node, env)
@@ -138,14 +145,16 @@ def _door_of_cell(runtime_dir: Path | None, word: str, env: Mapping[str, str]) -
     return door_of(cell, fleet.name, here, node)
 
 
-def door_here(runtime_dir: Path | None, node: str | None, env: Mapping[str, str] = os.environ) -> Door | None:
+def door_here(
+    runtime_dir: Path | None, node: str | None, env: Mapping[str, str] = os.environ, *, says_which: str = SAYS_WHICH
+) -> Door | None:
     """As `find_door`; ``None`` on a machine without a daemon, which goes by its fleet file.
 
     Raises:
         CliError: there are several daemons, and none is meant (2).
     """
     try:
-        return find_door(runtime_dir, node, env)
+        return find_door(runtime_dir, node, env, says_which=says_which)
     except CliError as error:
         if error.code != EXIT_UNREACHABLE:
             raise
@@ -251,7 +260,7 @@ def name_here(given: str | None, runtime_dir: Path | None, env: Mapping[str, str
     if len(sockets) == 1:
         return next(iter(sockets))
     here = ", ".join(sockets)
-    raise CliError(EXIT_USAGE, f"several daemons in {runtime}: {here}; say which one with --node or ZSCHED_NODE")
+    raise CliError(EXIT_USAGE, f"several daemons in {runtime}: {here}; say which one {SAYS_WHICH}")
 
 
 def _their_fleet(sockets: Iterable[Path]) -> tuple[str, tuple[str, ...]]:

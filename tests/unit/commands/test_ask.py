@@ -173,6 +173,19 @@ def test_a_name_that_a_cell_has_not_is_refused_with_those_it_has(monkeypatch: py
     assert caught.value.code == EXIT_UNREACHABLE
 
 
+def test_which_of_several_daemons_asks_another_cell_is_said_by_the_environment_alone(tmp_path: Path) -> None:
+    """There `--node` is the node of the other cell."""
+    doors = [OperatorSocket(socket_path(tmp_path, name), lambda _request: {"error": "no"}) for name in ("ra", "rb")]
+    for door in doors:
+        door.open()
+    for node, way in ((None, "with --node or ZSCHED_NODE"), ("hall-b/rb", "asks hall-b: with ZSCHED_NODE")):
+        with pytest.raises(CliError, match=f": ra, rb; say which one {way}$") as caught:
+            find_door(tmp_path, node, {})
+        assert caught.value.code == EXIT_USAGE
+    for door in doors:
+        door.close()
+
+
 def test_nobody_at_a_plain_endpoint_may_be_a_secured_fleet(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ask, "CONNECT_S", 0.2)
     with pytest.raises(CliError, match=r"; a secured fleet is asked at tls/127\.0\.0\.1:1$") as caught:
