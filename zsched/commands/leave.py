@@ -127,7 +127,7 @@ def leave(order: LeaveOrder) -> int:
     if code != EXIT_OK:
         return code
     stop_daemon(way, fleet, f"{me} has left {fleet}")
-    return _end(order, fleet, me, files)
+    return _end(order, fleet, me, files, is_last=[str(one["name"]) for one in status["nodes"]] == [me])
 
 
 def own_door(order: LeaveOrder, me: str) -> Door:
@@ -370,19 +370,25 @@ def stop_daemon(way: Way, fleet: str, done: str) -> None:
             return
 
 
-def _end(order: LeaveOrder, fleet: str, me: str, files: tuple[Written, ...]) -> int:
-    """Put the files away."""
+def _end(order: LeaveOrder, fleet: str, me: str, files: tuple[Written, ...], *, is_last: bool = False) -> int:
+    """Put the files away; ``is_last``: the fleet had no other node."""
     if order.is_plan:
         _told(order, fleet, me, files, "planned", f"{me} would leave {fleet}")
         return EXIT_WOULD_CHANGE
     done = put_away(fleet, me, order.places, is_purged=order.is_purged)
-    _told(order, fleet, me, done, "left", f"{me} has left {fleet}")
+    back = f"it comes back by `zsched invite {me}` on another node"
+    if is_last:
+        back = f"{fleet} has no node any more; `zsched fleet create NAME` makes a new fleet"
+    _told(order, fleet, me, done, "left", f"{me} has left {fleet}", back)
     return EXIT_OK
 
 
-def _told(order: LeaveOrder, fleet: str, me: str, files: tuple[Written, ...], outcome: str, said: str) -> None:
+def _told(
+    order: LeaveOrder, fleet: str, me: str, files: tuple[Written, ...], outcome: str, said: str, back: str = ""
+) -> None:
+    """The end of it; ``back``: how the machine becomes a node again."""
     is_service = order.places.config == paths.SYSTEM_CONFIG
     service = ("sudo systemctl disable zsched: it would find no fleet at the next boot",) if is_service else ()
-    more = () if order.is_plan else (*service, f"it comes back by `zsched invite {me}` on another node")
+    more = () if order.is_plan else (*service, back)
     told = Told(fleet=fleet, node=me, outcome=outcome, said=said, files=files, next=more)
     told.tell(is_json=order.is_json, is_line=True)

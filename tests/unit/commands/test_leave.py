@@ -72,7 +72,7 @@ class Hall:
                 "workers": [{**STATUS["nodes"][0]["workers"][0], "task": "merge", "state": "ready"}],
             }
             for name in ("robot1", "robot2", "robot3")
-            if f"  {name}:" in TEXT
+            if f"  {name}:" in (ALONE if self.text == ALONE else TEXT)
         ]
         names = [str(node["name"]) for node in nodes]
         task = {**copy.deepcopy(STATUS["tasks"][0]), "name": "merge", "owner": self.owner, "candidates": names}
@@ -280,7 +280,9 @@ def test_what_cannot_be_agreed_takes_a_danger_by_name(hall: Hall, danger: str, m
     assert f"if this may be, --accept {danger}: " in refused.stderr
     assert means in refused.stderr
     assert run("--plan").exit_code == 10
-    assert run("--yes", "--accept", danger).exit_code == 0
+    done = run("--yes", "--accept", danger)
+    assert done.exit_code == 0
+    assert ("on another node" in done.stdout) is (danger != "last-node"), "there is none"
     assert (hall.asked, left(hall.folder)) == (["leave"], RENAMED), "nobody was asked to agree"
     assert "there is no danger 'last-nod'; did you mean last-node?" in run("--accept", "last-nod").stderr
 
