@@ -26,6 +26,7 @@ from zsched.core.values.model import NodeId, NodeKind
 from zsched.core.values.struct import Struct
 from zsched.errors import ConfigError
 from zsched.files import owner_of, read_regular
+from zsched.paths import SYSTEM_CONFIG
 
 __all__ = ["CheckResult", "Fault", "check_bytes", "check_file", "load_fleet", "require_node"]
 
@@ -101,8 +102,9 @@ def _unread_hint(file: Path, error: OSError | ValueError) -> str:
     if number == errno.EFBIG:
         return "a rule stands for every robot and candidate: write {robot} and {target} in place of their names"
     if number == errno.ENOENT:
+        advice = "name the fleet file" if file == SYSTEM_CONFIG else "check the path"  # else somebody has named it
         return (
-            "name the fleet file; `zsched fleet create NAME` and `zsched join INVITATION` write this machine's, "
+            f"{advice}; `zsched fleet create NAME` and `zsched join INVITATION` write this machine's, "
             "`zsched init --example python` one to try"
         )
     return "give the path of a fleet file"

@@ -577,6 +577,15 @@ def test_missing_file_is_a_fault_not_an_exception(tmp_path: Path) -> None:
     assert check_file("a\0b").fleet is None
 
 
+def test_whoever_has_named_a_file_that_is_not_there_is_not_told_to_name_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("zsched.config.load.SYSTEM_CONFIG", tmp_path / "fleet.yaml")
+    for name, advice in (("nosuch.yaml", "check the path"), ("fleet.yaml", "name the fleet file")):
+        report = check_file(tmp_path / name).report()
+        assert f"hint: {advice}; `zsched fleet create NAME` and" in report
+
+
 @pytest.mark.parametrize(("given", "hint"), [("20", "a share: 20 % is 0.2"), ("1.2", ""), ("200", "")])
 def test_a_percentage_in_place_of_a_share_is_told_as_one(given: str, hint: str) -> None:
     weights = "    weights: {cpu: 1, memory: 0, network: 0}\n"
