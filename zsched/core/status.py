@@ -6,7 +6,7 @@ Knows: which figure stands where. Does not know: how it is shown.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 from zsched.core.executor.handover import Executor, Phase
 from zsched.core.executor.rollouts import waiting
@@ -159,18 +159,25 @@ def _problems(node: Stages, quorum: QuorumStatus, now: float) -> tuple[str, ...]
     # Who has just started knows nothing of an owner that it never heard: only a vote replaces that one.
     never_heard = f"; one that was never heard, once they are away for {node.fleet.away_s:g} s"
     never_heard = never_heard if node.agreement.document_hash else ""
+    told = ", ".join(_as_heard(node, silent))
     if quorum.ok and not voters:
         problems.append("nobody votes: the fleet has no robot, so no task gets an owner; `zsched invite` brings one")
     elif quorum.ok and len(voters) - len(silent) < needed:
         problems.append(
             f"no planned moves: {len(voters) - len(silent)} of {len(voters)} robots can vote, {needed} needed; "
-            f"not {', '.join(silent)}. An owner that is gone, drains or fails is still replaced{never_heard}"
+            f"not {told}. An owner that is gone, drains or fails is still replaced{never_heard}"
         )
     if not has_enough and not node.has_others_state:
         problems.append(_nothing_agreed(node, quorum, fresh))
     if not node.has_state and not node.has_foreign_state and not node.has_others_state:
         problems.append("no valid state file: this node is no elector (see `zsched init --help`)")
     return tuple(problems)
+
+
+def _as_heard(node: Stages, names: Iterable[NodeId]) -> Iterator[str]:
+    """Names of nodes that are away, and of those that have never been heard that they were not."""
+    for name in names:
+        yield f"{name} (not heard yet)" if node.membership.state(name) is PeerState.UNKNOWN else name
 
 
 def _no_quorum(node: Stages, quorum: QuorumStatus, now: float, *, is_left_behind: bool) -> str:

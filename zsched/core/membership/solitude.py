@@ -55,8 +55,12 @@ class Solitude(Struct):
     def problem(self, secured: str = "") -> str:
         """What to tell an operator of a node that is alone; ``secured``: its name, where certificates let nodes in."""
         if not self.dialled:
-            way = f"the others dial it at {self.dialled_at}" if self.dialled_at else "nobody has an address to dial"
-            return f"heard nobody since the start: this node dials nobody, {way}. {CHECK}"
+            if not self.dialled_at:
+                return f"heard nobody since the start: this node dials nobody, nobody has an address to dial. {CHECK}"
+            return (
+                f"no other node has come since the start: they dial this one at {self.dialled_at} once they have "
+                f"joined and zsched runs there. If it does: {CHECK[0].lower()}{CHECK[1:]}"
+            )
         causes = dict(self._found)
         told = [f"{one} ({causes[one]})" if causes.get(one) else one for one in self.dialled[:ADDRESSES_SHOWN]]
         if len(self.dialled) > ADDRESSES_SHOWN:
