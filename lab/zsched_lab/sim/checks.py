@@ -297,6 +297,7 @@ class Invariants:
             is_leased=lease is not None,
             is_late=lease is not None and lease <= machine.late_until,
             has_forgotten=lease is None and self._has_forgotten(machine, role.task),
+            is_shared=lease is None and self._is_shared(machine, role.task),
         )
         self.take(work)
 
@@ -304,6 +305,13 @@ class Invariants:
         """Whether a machine knew a later revision in an earlier life than it knows now."""
         assert machine.node is not None
         return machine.node.registers[task].value.revision < self.newest.get((machine.key, task), 0)
+
+    @staticmethod
+    def _is_shared(machine: Machine, task: TaskId) -> bool:
+        """Whether a machine has learnt a value of a task by which nobody needs a lease."""
+        assert machine.node is not None
+        value = machine.node.registers[task].value
+        return value.revision > 0 and not value.leased
 
     # --- the loop ----------------------------------------------------------------------------------------------------
 

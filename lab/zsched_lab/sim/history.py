@@ -95,6 +95,9 @@ class Worked:
     """By a lease from before its machine stood still, clock and all: nothing there can know that it has ended."""
     has_forgotten: bool = False
     """Without a lease, from a state that was lost or brought back: nothing there can know what was agreed since."""
+    is_shared: bool = False
+    """Without a lease, for the task is agreed to be exclusive no more. What an earlier life of the same node still has
+    of its last lease is nobody's promise then. Others are held off all the same, by those who granted it."""
 
 
 Record = Started | Learnt | Stored | Routed | Admitted | Worked
@@ -232,6 +235,7 @@ class Checker:
             and (other.is_leased or new.is_leased)
             and min(other.until, new.until) - max(other.at, new.at) > self.slack_s
             and not any(work.is_late or work.has_forgotten for work in (other, new))
+            and not (node == new.node and new.is_shared)
         ]
         mine[new.node, new.life] = new
         return found

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from math import inf
 from pathlib import Path
 
 import pytest
@@ -24,6 +26,7 @@ GOOD: list[list[Record]] = [
     [learnt(1, "r1", 1, 1, detail="cpu=1"), learnt(2, "r2", 1, 1)],
     [learnt(1, "r1", 4, 2), learnt(2, "r1", 2**32, 2**32, None), learnt(3, "r1", 2**32 + 1, 2**32 + 1)],
     [worked(1, "e1", 2.0), worked(1.5, "e1", 3.0), worked(3.0, "e2", 4.0)],
+    [worked(1, "e1", 5.0), replace(worked(2, "e1", inf), life=1, is_leased=False, is_shared=True)],
     [
         Routed(at=1, node="r1", task="merge", epoch=1, owner="e1"),
         Routed(at=2, node="r1", task="m2", epoch=0, owner="x"),
@@ -38,6 +41,8 @@ BAD: list[tuple[str, list[Record]]] = [
     ("unlearnt", [learnt(1, "r1", 2, 1), learnt(2, "r1", 1, 1)]),
     ("unlearnt", [learnt(1, "r1", 2, 2, "e2"), Started(at=2, node="r1"), learnt(3, "r1", 1, 1)]),
     ("both work", [worked(1, "e1", 2.0), worked(1.9, "e2", 3.0)]),
+    ("both work", [worked(1, "e1", 5.0), replace(worked(2, "e1", inf), life=1, is_leased=False)]),
+    ("both work", [worked(1, "e1", 5.0), replace(worked(2, "e2", inf), is_leased=False, is_shared=True)]),
     ("older epoch moves", [Routed(at=t, node="r1", task="merge", epoch=e, owner="e1") for t, e in ((1, 2), (2, 1))]),
     ("admits an older", [Admitted(at=t, node="r1", task="merge", epoch=e, owner="e1") for t, e in ((1, 2), (2, 1))]),
 ]
