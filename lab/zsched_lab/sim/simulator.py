@@ -52,6 +52,8 @@ TOKEN_DELAY_S = 0.005
 RESTART_S = 0.3
 """A node that crashed in the middle of a batch comes back this much later."""
 WALL_MS = 1_700_000_000_000
+STARTS = 4
+"""Numbers for each millisecond: two for a machine that is started just behind `zsched init`, two for its twin."""
 """The wall clock when a simulation begins, in milliseconds since 1970 (plus the simulation's own)."""
 QUESTIONS_KEPT = 4000
 
@@ -128,7 +130,7 @@ class Simulator(Links):
 
         Finer than a tenth of a second: these machines can be wiped and started more often than any real one.
         """
-        return WALL_MS + int(self.now * 1000)
+        return (WALL_MS + int(self.now * 1000)) * STARTS
 
     @property
     def learnt(self) -> dict[tuple[TaskId, int], Allocation]:
@@ -221,7 +223,7 @@ class Simulator(Links):
             state = None
         fleet, stored, flags = self.documents.at_start(machine, state)
         # No two machines' clocks agree to the millisecond, not even where power comes back to all of them at once.
-        wall_count = self.wall_count + (machine.key != machine.name)
+        wall_count = self.wall_count + (0 if machine.key == machine.name else STARTS // 2)
         if state is not None:
             state = replace(state, incarnation=max(state.incarnation + 1, wall_count))
             machine.disk.write(state)
