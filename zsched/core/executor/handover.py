@@ -164,7 +164,7 @@ class Executor:
         self.spec, self.is_leased = spec, spec.exclusive or is_agreed_leased
         if spec == before and self.is_leased is was_leased:
             return
-        if self.is_local and spec.on_isolation is not OnIsolation.LOCAL:
+        if spec.on_isolation is not OnIsolation.LOCAL:
             self.rejoin(todo)
         self._adopt_worker(before, todo, had_worker=kept_worker)
         if self.is_leased is not was_leased:

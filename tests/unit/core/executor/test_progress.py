@@ -97,6 +97,14 @@ def test_an_answer_of_long_ago_says_nothing() -> None:
     assert robot.run(1, inputs=0) == ()
 
 
+def test_whatever_the_deadline_an_answer_counts_for_two_counts_of_the_relay() -> None:
+    """One count may be late."""
+    robot = Robot(replace(SPEC, worker=WorkerSpec(command=("merge",), output_deadline_s=0.1)))
+    assert robot.run(3, outputs=1) == (SERVED,)
+    assert robot.run(2 * COUNT_S, inputs=0) == (SERVED,)
+    assert robot.run(COUNT_S, inputs=0) == ()
+
+
 def test_a_handover_a_new_epoch_and_a_new_relay_start_anew() -> None:
     robot = Robot()
     robot.run(10)

@@ -13,6 +13,7 @@ from support.beats import beat_of
 from support.fleets import tuning_of
 from support.profiles import load_of, profile_of
 from support.proposals import proposal_of
+from support.states import state_of
 from zsched.core.events import (
     FleetReadAsked,
     HistoryAsked,
@@ -281,3 +282,9 @@ def test_a_rehearsal_keeps_within_its_bounds() -> None:
         replace(keep, told="x" * 401)
     with pytest.raises(ValueError, match="surrogates not allowed"):  # JSON may hold one; it cannot be written down
         replace(keep, body=Text("\ud800"))
+
+
+def test_a_state_follows_a_generation_by_its_id_only() -> None:
+    assert state_of("robot1", joins="ab12").joins == "ab12"
+    with pytest.raises(ValueError, match=r"state\.joins: 'generation 2' is not an id"):
+        state_of("robot1", joins="generation 2")
