@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from random import Random
@@ -12,6 +13,7 @@ import pytest
 from zsched.core.membership.beat_room import MAX_BEAT_BYTES, most_bytes
 from zsched.core.register.register import Register
 from zsched.core.todo import ToDo
+from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import Prepare, Promise, Refused
 from zsched.core.vote.belief import GENERATION_STEP
 from zsched.errors import InvariantError
@@ -303,6 +305,60 @@ def test_every_change_of_a_fleet_file_makes_another_fleet_file(name: str) -> Non
         assert [task.name for task in changed.tasks] == sorted(task.name for task in changed.tasks)
     # What is drawn may be what was there, and an exclusive task is never given to robots that work alone.
     assert differing == 20 or (name in MAY_STAY and differing > 5), differing
+
+
+def _shorter_leases(fleet: Fleet) -> Fleet:
+    return replace(fleet, timing=replace(fleet.timing, lease_s=fleet.timing.lease_s / 2))
+
+
+@pytest.mark.parametrize(
+    ("change", "is_restarted"),
+    [
+        (_shorter_leases, True),
+        (lambda fleet: replace(fleet, electors=fleet.electors[1:]), True),
+        (lambda fleet: CHANGES["limits"](Random(1), fleet), False),
+    ],
+    ids=["leases", "electors", "limits"],
+)
+def test_what_a_reload_cannot_change_the_operator_changes_by_a_restart_when_the_faults_end(
+    change: Callable[[Fleet], Fleet], is_restarted: bool
+) -> None:
+    fleet = plan(3).fleet
+    changed = change(fleet)
+    assert changed != fleet
+    stage = Stage(Plan(seed=1, fleet=fleet, faults=()))
+    stage.scene.done["rollout of exclusive"] = 1  # every node comes back
+    stage.sim.start()
+    stage.sim.run(2.0)
+    stage.scene.fleet = changed
+    for machine in stage.sim.machines.values():
+        stage.scene.reload(machine, changed)
+    stage.sim.run(2.0)
+    stage.calm()
+    stage.sim.run(1.0)
+    assert {machine.life > 1 for machine in stage.sim.machines.values()} == {is_restarted}
+    assert {stage.sim.node(name).fleet for name in stage.sim.running()} == {changed}
+
+
+def test_nodes_with_leases_of_two_lengths_are_not_at_rest_until_the_last_one_is_restarted() -> None:
+    """Found by seed 200007594: the operator of the schedule left a node by the leases that it was started with."""
+    fleet = plan(3).fleet
+    fleet = replace(fleet, tasks=(replace(fleet.tasks[0], candidates=fleet.voters),))
+    stage = Stage(Plan(seed=1, fleet=fleet, faults=()))
+    sim = stage.sim
+    stage.scene.done["rollout of exclusive"] = 1  # every node comes back
+    sim.start()
+    assert sim.run_until(lambda: not sim.unsettled(), AT_MOST_S[fleet.timing.name])
+    owner = sim.agreed(fleet.tasks[0].name)
+    stage.scene.fleet = _shorter_leases(fleet)
+    for machine in sim.machines.values():
+        take = stage.scene.reload if machine.name == owner else stage.scene.restart
+        take(machine, stage.scene.fleet)
+    sim.run(3.0)  # what was granted before is over
+    assert not sim.run_until(lambda: not sim.unsettled(), 60.0), "it ends by itself"
+    assert "has no lease" in sim.unsettled()
+    stage.calm()
+    assert sim.run_until(lambda: not sim.unsettled(), AT_MOST_S[fleet.timing.name]), sim.unsettled()
 
 
 def test_pending_faults_are_played_only_when_asked_for(capsys: pytest.CaptureFixture[str]) -> None:

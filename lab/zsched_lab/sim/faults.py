@@ -14,6 +14,7 @@ from random import Random
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
+from zsched.core.values.fleet import lease_terms
 from zsched.core.values.messages import CommandOutcome, SetWeights
 from zsched.core.values.model import NodeId
 from zsched.core.values.quorum import majority
@@ -209,8 +210,12 @@ class Stage:
 
     @staticmethod
     def _needs_restart(machine: Machine) -> bool:
-        """Whether it runs with other electors than its file names: a reload does not change them, and it says so."""
-        return machine.node is not None and machine.node.fleet.electors != machine.fleet.electors
+        """Whether it runs with other electors, or by another length of leases, than its file says.
+
+        A reload changes neither. The daemon says so and asks for the restart (`zsched.runtime.restarts`): until then an
+        owner and electors of two lengths grant each other nothing.
+        """
+        return machine.node is not None and lease_terms(machine.node.fleet) != lease_terms(machine.fleet)
 
     @staticmethod
     def _is_stopping(machine: Machine) -> bool:
