@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from support.fleets import fleet_of, task_of, tuning_of
 from zsched.core.status import build_snapshot
-from zsched.core.values.fleet import WorkerSpec
+from zsched.core.values.fleet import Fleet, WorkerSpec
 from zsched.core.values.plan import ReadyWhen
+from zsched.core.values.struct import replace
 from zsched_lab.sim.simulator import Simulator
 from zsched_lab.sim.swarm import plan
 
@@ -51,6 +52,73 @@ def test_an_owner_whose_worker_is_away_is_left_at_its_deadline_and_not_before() 
     assert sim.run_until(lambda: not sim.unsettled(), 3), sim.unsettled()
     sim.run(10)
     assert sim.agreed("merge") != owner, "nobody goes back to where no worker is"
+
+
+def take_over(sim: Simulator, fleet: Fleet) -> None:
+    """Every node that runs takes another file over."""
+    sim.fleet = fleet
+    for machine in sim.machines.values():
+        machine.fleet = fleet
+        sim.reload(machine)
+
+
+def rest(sim: Simulator) -> None:
+    assert sim.run_until(lambda: not sim.unsettled(), 15), sim.unsettled()
+
+
+def with_extra(fleet: Fleet) -> Fleet:
+    return replace(fleet, tasks=(replace(fleet.tasks[0], name="extra"), *fleet.tasks))
+
+
+def test_a_task_that_comes_to_running_nodes_finds_its_workers() -> None:
+    sim = fleet()
+    sim.start()
+    rest(sim)
+    take_over(sim, with_extra(sim.fleet))
+    rest(sim)
+    assert sim.agreed("extra") in EDGES
+
+
+def test_a_task_that_comes_to_running_nodes_without_a_worker_has_no_owner_and_no_rest() -> None:
+    sim = fleet()
+    sim.start()
+    rest(sim)
+    for edge in EDGES:
+        sim.work.leave(sim.machines[edge])
+    take_over(sim, with_extra(sim.fleet))
+    sim.run(15)
+    assert sim.agreed("extra") is None
+    assert sim.unsettled() == "extra: owner None is not alive", "a real stand-still is found"
+    sim.work.come(sim.machines["edge2"])
+    rest(sim)
+    assert sim.agreed("extra") == "edge2"
+
+
+def test_a_worker_that_ran_on_while_its_task_was_away_is_found_again() -> None:
+    sim = fleet()
+    before = sim.fleet
+    sim.start()
+    take_over(sim, with_extra(before))
+    rest(sim)
+    take_over(sim, before)
+    rest(sim)
+    take_over(sim, with_extra(before))
+    rest(sim)
+    assert sim.agreed("extra") in EDGES
+
+
+def test_a_worker_that_ended_while_its_task_was_away_is_not_found_again() -> None:
+    sim = fleet()
+    before = sim.fleet
+    sim.start()
+    take_over(sim, with_extra(before))
+    rest(sim)
+    take_over(sim, before)
+    rest(sim)
+    sim.work.leave(sim.machines["edge1"])
+    take_over(sim, with_extra(before))
+    rest(sim)
+    assert sim.agreed("extra") == "edge2"
 
 
 def test_random_schedules_have_such_workers_too() -> None:

@@ -85,6 +85,8 @@ class Work:
                 self._renew(machine, task)
             case do.AdoptFleet(fleet=fleet):
                 self._compare(machine, fleet)
+                self._look_again(machine)
+                self.meet(machine)
             case do.EndTask(task=task):
                 self.plans.pop((machine.name, task), None)
             case do.ApplyRoutes(plan=plan):
@@ -130,18 +132,29 @@ class Work:
             self._sim.deliver(machine, ev.RecipeCompared(task=task, is_old=False))
 
     def meet(self, machine: Machine) -> None:
-        """A daemon has started beside workers that somebody else runs."""
+        """A daemon has started beside workers that somebody else runs, or its file has got tasks with such workers."""
         states = {} if machine.node is None else machine.node.worker_states
         for task in machine.fleet.tasks if not self._absent[machine.key] else ():
             if not task.worker.command and task.name in states:
                 self._start(machine, task.name)
 
-    def leave(self, machine: Machine) -> None:
-        """The workers that somebody else runs on a machine end."""
-        self._absent[machine.key] += 1
+    def _look_again(self, machine: Machine) -> None:
+        """A relay that is told to watch for a worker tells what it sees: one that ran on while nobody asked is there.
+
+        The node has forgotten it with the task, or with its own place among the candidates (`zsched.relay.matching`).
+        """
+        states = {} if machine.node is None else machine.node.worker_states
         for task in machine.fleet.tasks:
-            if not task.worker.command:
-                self._stop(machine, task.name)
+            is_there = (machine.key, machine.life, task.name) in self._showing
+            if not task.worker.command and is_there and states.get(task.name) is WorkerState.STOPPED:
+                self._sim.deliver(machine, ev.WorkerChanged(task=task.name, state=WorkerState.READY))
+
+    def leave(self, machine: Machine) -> None:
+        """The workers that somebody else runs on a machine end, also those of tasks that its file names no more."""
+        self._absent[machine.key] += 1
+        for task in tuple(machine.workers):
+            if not self._made_by[machine.key, task] and not self._command(machine.fleet, task):
+                self._stop(machine, task)
 
     def come(self, machine: Machine) -> None:
         """They are back, unless there is another reason for them to be away."""
