@@ -11,10 +11,14 @@ from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
+import pytest
+import zenoh
+
 from support.operators import Stream
 from support.sessions import matches
 from zsched.core.executor.renewing import SAME_FILE_S
 from zsched.core.hop.books import unaccounted
+from zsched.wire.keyspace import Keyspace
 from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 
 Tree = dict[str, Any]
@@ -134,3 +138,39 @@ def test_what_needs_a_restart_is_told_and_a_wrong_file_changes_nothing(tmp_path:
 def told(bed: Testbed, text: str) -> bool:
     time.sleep(0.01)
     return any(text in problem for problem in bed.status("robot1")["problems"])
+
+
+@pytest.mark.parametrize("ready", ["matching", "token"])
+def test_a_worker_that_somebody_else_runs_is_found_when_its_task_comes_later(tmp_path: Path, ready: str) -> None:
+    """It is there before the task is, and runs on while the task is away."""
+    worker: Tree = {"ready": "matching"} if ready == "matching" else {}
+    tree = echo_fleet(robots=1, edges=1, task={"worker": worker})
+    tree["tasks"][TASK]["outputs"][0]["from"] = "{target}/echo/{robot}/out"  # it knows no epoch
+    more = deepcopy(tree)
+    more["tasks"]["second"] = deepcopy(tree["tasks"][TASK])
+    more["tasks"]["second"]["inputs"][0] |= {"from": "{robot}/in2", "to": "{target}/second/{robot}/in"}
+    more["tasks"]["second"]["outputs"][0] |= {"from": "{target}/second/{robot}/out", "to": "{robot}/out2"}
+    with Testbed(tmp_path, tree) as bed:
+
+        def states() -> Tree:
+            (edge,) = (one for one in bed.status("edge1")["nodes"] if one["name"] == "edge1")
+            return {one["task"]: one["state"] for one in edge["workers"]}
+
+        bed.init()
+        bed.start()
+        bed.wait(lambda: bed.status("edge1"), 60, "edge1's daemon")
+        config = zenoh.Config.from_file(str(bed.folder / f"edge1-{TASK}.zenoh.json5"))
+        with zenoh.open(config) as session:
+            kept: list[Any]
+            if ready == "matching":
+                kept = [session.declare_subscriber(f"edge1/{at}/*/in", lambda _: None) for at in (TASK, "second")]
+            else:
+                keys = [Keyspace("testbed").worker("edge1", task, "7") for task in (TASK, "second")]
+                kept = [session.liveliness().declare_token(key) for key in keys]
+            bed.wait(lambda: states() == {TASK: "ready"}, 60, "the worker of the first task")
+            for _ in range(2):
+                reload(bed, more)
+                bed.wait(lambda: states() == {TASK: "ready", "second": "ready"}, 60, "the worker of the task that came")
+                reload(bed, tree)
+                bed.wait(lambda: states() == {TASK: "ready"}, 60, "the task is away")
+            assert len(kept) == 2

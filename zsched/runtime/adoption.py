@@ -73,6 +73,7 @@ class Adoption(Struct, kw_only=True):
         self.recipes.adopt(fleet, connect, dials_by_gossip=points.worker_by_gossip)
         self.crew.adopt(fleet, self.recipes.paths)
         self.supervisor.adopt(self.recipes.specs)
+        self.crew.keep(self.recipes.specs)
         self.access.adopt(fleet)
         is_exclusive = any(task.exclusive for task in fleet.tasks)
         self.sampler.adopt(fleet.node(self.me), fleet.timing.sample_s, is_watched=is_exclusive)

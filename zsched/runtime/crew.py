@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import math
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Final
 
@@ -52,6 +52,10 @@ class Crew:
         self._lives: dict[TaskId, int] = {}
         """{task: the running process's incarnation}, 0 once it has ended; none for somebody else's worker."""
         self._matches: dict[TaskId, WorkerMatched] = {}
+        self._tokens: dict[TaskId, set[int]] = {}
+        """{task: the incarnations of the tokens here}, also of tasks that have no worker here by the file."""
+        self._kept: frozenset[TaskId] = frozenset()
+        """The tasks whose worker the supervisor was told to keep."""
         self._strays: dict[TaskId, str] = {}
         """{task: the incarnation of a token here that is not the running process's}."""
         self._seen: set[TaskId] = set()
@@ -80,6 +84,19 @@ class Crew:
         self.sessions = sessions
         self._say_missing(self._foreign - self._matching - known)
 
+    def keep(self, tasks: Iterable[TaskId]) -> None:
+        """Know that the supervisor was told to keep these workers; say which of the new ones are there already.
+
+        A worker that somebody else starts may run on while its task, or this node's place in it, is away: its token
+        comes once, and was no news then. Of one that is seen by matching the relay tells when it is asked again.
+        """
+        with self._lock:
+            new, self._kept = frozenset(tasks) - self._kept, frozenset(tasks)
+            for task in sorted((new & self._foreign) - self._matching - self._lives.keys()):
+                for life in sorted(self._tokens.get(task, ())):
+                    if self.supervisor is not None:
+                        self._tell(self.supervisor, task, life, is_ready=True, reason="its token")
+
     def life_of(self, task: TaskId) -> int:
         """The running process's incarnation, 0 when none runs."""
         with self._lock:
@@ -105,6 +122,7 @@ class Crew:
 
     def begin(self) -> None:
         """Say what is missing of the workers that somebody else starts; the relay says it of those seen by matching."""
+        self._kept = frozenset(self.sessions)
         self._say_missing(self._foreign - self._matching)
 
     def _say_missing(self, tasks: frozenset[TaskId]) -> None:
@@ -120,14 +138,22 @@ class Crew:
         """A relay runs: workers that join it in the next moments may have been there before it."""
         self._relay_at = monotonic_s()
 
+    def on_relay_ended(self) -> None:
+        """No relay runs: the next one tells anew which tokens it sees, some of them before it says that it runs."""
+        with self._lock:
+            self._tokens.clear()
+
     def on_token(self, seen: WorkerSeen) -> None:
         """A token of a worker here; one of a process that has ended says nothing (its end was reported)."""
         task, is_present = seen.task, seen.is_present
-        supervisor = self._supervisor_of(task)
         life = counter(seen.incarnation)
-        if supervisor is None or life is None or task in self._matching:
+        if life is None:
             return
         with self._lock:
+            self._note(task, life, is_present=is_present)
+            supervisor = self._supervisor_of(task)
+            if supervisor is None or task in self._matching:
+                return
             current = self._lives.get(task)
             if current is None or life == current:
                 reason = "its token" if is_present else "its token went"
@@ -136,6 +162,12 @@ class Crew:
                 self._strays[task] = seen.incarnation
             elif self._strays.get(task) == seen.incarnation:
                 del self._strays[task]
+
+    def _note(self, task: TaskId, life: int, *, is_present: bool) -> None:
+        lives = self._tokens.setdefault(task, set())
+        (lives.add if is_present else lives.discard)(life)
+        if not lives:
+            del self._tokens[task]
 
     def on_matched(self, match: WorkerMatched) -> None:
         """Somebody takes what goes to a worker here, or nobody does."""
@@ -165,8 +197,13 @@ class Crew:
             return current is None or str(current) == jobs.incarnation
 
     def _supervisor_of(self, task: TaskId) -> WorkerSupervisor | None:
+        """The supervisor, if it has a worker of the task, or will have one as soon as its thread has heard of it.
+
+        Its thread may hear of a new task later than the relay, which tells once what it sees.
+        """
         supervisor = self.supervisor
-        return supervisor if supervisor is not None and task in supervisor.states() else None
+        is_known = supervisor is not None and (task in self._kept or task in supervisor.states())
+        return supervisor if is_known else None
 
     def _doubt(self, match: WorkerMatched) -> None:
         """Say that nothing is certain where no process of ours would show a worker's end either."""
@@ -185,7 +222,7 @@ class Crew:
         is_ours = task in self._lives
         if is_ours and (again := self._why_again(task)):
             reason = again if reason in again else f"{again}; now {reason}"
-        if task in self._seen and not (is_ours and supervisor.states()[task] is WorkerState.STOPPED):
+        if task in self._seen and not (is_ours and supervisor.states().get(task) is WorkerState.STOPPED):
             reason = self._lost.setdefault(task, self._not_any_more(task, reason))
         elif task in self._foreign:
             reason = f"{reason}: {self._start_it(task)}"

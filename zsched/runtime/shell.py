@@ -298,6 +298,8 @@ class Shell:
         if isinstance(report, RelayStarted):
             self.crew.on_relay_started()
             return
+        if isinstance(report, ev.RelayChanged) and not report.is_running:
+            self.crew.on_relay_ended()
         if isinstance(report, SlotLost):
             text = f"{report.owner} left {report.samples} samples unacknowledged: at most so many had no result"
             self._tell(do.RecordStory(stage="route", text=text, task=report.task, epoch=report.epoch))

@@ -284,3 +284,72 @@ def test_who_has_to_start_a_worker_with_a_token_is_told_its_key(house: House) ->
     assert "worker/edge1/alone/NUMBER" in house.reasons("alone")[0]
     assert "start it on edge1 (the task has no `command`) with the session edge1-alone" in house.reasons("alone")[0]
     assert house.reasons("others") == house.reasons("node") == house.reasons("token") == []
+
+
+# --- a changed fleet file --------------------------------------------------------------------------------------------
+
+
+def adopt(house: House, *tasks: str) -> None:
+    """Go by a file that has these tasks only, as `zsched.runtime.adoption` does."""
+    specs = {name: SPECS[name] for name in tasks}
+    house.crew.adopt(replace(FLEET, tasks=tuple(one for one in FLEET.tasks if one.name in tasks)), {})
+    house.supervisor.adopt(specs)
+    house.crew.keep(specs)
+
+
+def test_a_token_that_stayed_while_its_task_was_away_is_told_when_it_is_back(house: House) -> None:
+    seen = WorkerSeen(node="edge1", task="alone", incarnation="7", is_present=True)
+    house.crew.on_token(seen)
+    until(lambda: house.supervisor.states()["alone"] is WorkerState.READY, "the supervisor knows")
+    adopt(house, "others")
+    until(lambda: "alone" not in house.supervisor.states(), "the task is away")
+    adopt(house, "others", "alone")
+    assert house.states("alone")[-1] is WorkerState.READY
+    until(lambda: house.supervisor.states().get("alone") is WorkerState.READY, "the supervisor knows again")
+
+
+def test_a_token_that_came_before_its_task_is_told_with_it(house: House) -> None:
+    adopt(house, "others")
+    until(lambda: "alone" not in house.supervisor.states(), "the task is away")
+    house.crew.on_token(WorkerSeen(node="edge1", task="alone", incarnation="7", is_present=True))
+    assert house.states("alone") == [], "nobody asks for it yet"
+    adopt(house, "others", "alone")
+    assert house.states("alone")[-1] is WorkerState.READY
+
+
+def test_a_token_that_went_while_its_task_was_away_is_not_told(house: House) -> None:
+    seen = WorkerSeen(node="edge1", task="alone", incarnation="7", is_present=True)
+    house.crew.on_token(seen)
+    adopt(house, "others")
+    until(lambda: "alone" not in house.supervisor.states(), "the task is away")
+    house.crew.on_token(replace(seen, is_present=False))
+    told = len(house.states("alone"))
+    adopt(house, "others", "alone")
+    assert WorkerState.READY not in house.states("alone")[told:]
+
+
+def test_a_new_relay_tells_anew_which_tokens_are_there(house: House) -> None:
+    seen = WorkerSeen(node="edge1", task="alone", incarnation="7", is_present=True)
+    house.crew.on_token(seen)
+    adopt(house, "others")
+    until(lambda: "alone" not in house.supervisor.states(), "the task is away")
+    house.crew.on_relay_ended()
+    told = len(house.states("alone"))
+    adopt(house, "others", "alone")
+    assert WorkerState.READY not in house.states("alone")[told:]
+    adopt(house, "others")
+    house.crew.on_token(seen)
+    house.crew.on_relay_started()
+    adopt(house, "others", "alone")
+    assert house.states("alone")[-1] is WorkerState.READY, "it may tell so before it says that it runs"
+
+
+def test_a_match_that_comes_before_the_supervisor_has_heard_of_the_task_counts(house: House) -> None:
+    """The relay tells it once, and may be quicker than the supervisor's thread."""
+    adopt(house, "alone")
+    until(lambda: "others" not in house.supervisor.states(), "the task is away")
+    house.crew.adopt(FLEET, {})
+    house.crew.keep(SPECS)
+    house.match("others")
+    house.supervisor.adopt(SPECS)
+    assert house.states("others") == [WorkerState.READY]
