@@ -76,6 +76,7 @@ def site(tmp_path: Path) -> Iterator[dict[str, Cell]]:
         yield cells
 
 
+@pytest.mark.long
 def test_a_node_of_one_cell_asks_and_commands_the_other_while_its_gateways_die(site: dict[str, Cell]) -> None:
     here, there = site[A], site[B]
     for node in ("robot1", "edge1", "edge2"):

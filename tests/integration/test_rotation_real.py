@@ -35,6 +35,7 @@ def trust_what_the_authority_says(hall: Hall) -> None:
     until(lambda: are_together(hall), "both, begun anew")
 
 
+@pytest.mark.long
 def test_a_locked_authority_is_replaced_and_the_end_waits_for_every_node(
     hall: Hall, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -83,6 +83,7 @@ def run(tmp_path: Path) -> Iterator[Callable[[float], Run]]:
         one.process.wait()
 
 
+@pytest.mark.long
 def test_the_demo_moves_the_task_and_merges_the_map(run: Callable[[float], Run]) -> None:
     demo = run(45.0)
     demo.wait_for(lambda: bool(demo.tokens), 60.0)
