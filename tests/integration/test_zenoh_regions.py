@@ -13,7 +13,7 @@ import pytest
 from support.regions import GATEWAYS, ROBOTS, Site, in_some_trial, kept_inside
 from support.waiting import until
 
-pytestmark = pytest.mark.timeout(240)
+pytestmark = [pytest.mark.long, pytest.mark.timeout(240)]
 ALL = sorted((*ROBOTS, *GATEWAYS))
 MODES = ("peer", "router")
 CARRIES, RESTS = "ga2", "ga1"

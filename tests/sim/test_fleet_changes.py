@@ -164,7 +164,7 @@ def test_an_elector_without_the_document_accepts_nothing_until_it_has_fetched_it
 # --- schedules -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("block", range(3))
+@pytest.mark.parametrize("block", [0, *(pytest.param(block, marks=pytest.mark.long) for block in (1, 2))])
 def test_no_schedule_of_changes_under_faults_breaks_what_must_hold(block: int) -> None:
     assert [found for seed in range(5 * block, 5 * block + 5) if (found := fleets.play(seed)[0])] == []
 

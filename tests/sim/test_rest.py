@@ -16,6 +16,7 @@ def test_every_profile_has_its_bounds_and_those_of_a_batch_are_the_narrower_ones
         assert bounds[90] < bounds[99] < AT_MOST_S[name]
 
 
+@pytest.mark.long
 def test_fleets_keep_the_bound_of_most_schedules_and_three_times_as_long_would_not() -> None:
     seeds = [seed for seed in range(7000, 7200) if plan(seed).fleet.timing.name == "wifi"][: FEWEST[90]]
     results = [play(plan(seed)) for seed in seeds]
