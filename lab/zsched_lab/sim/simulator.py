@@ -52,9 +52,9 @@ TOKEN_DELAY_S = 0.005
 RESTART_S = 0.3
 """A node that crashed in the middle of a batch comes back this much later."""
 WALL_MS = 1_700_000_000_000
+"""The wall clock when a simulation begins, in milliseconds since 1970 (plus the simulation's own)."""
 STARTS = 4
 """Numbers for each millisecond: two for a machine that is started just behind `zsched init`, two for its twin."""
-"""The wall clock when a simulation begins, in milliseconds since 1970 (plus the simulation's own)."""
 QUESTIONS_KEPT = 4000
 
 
