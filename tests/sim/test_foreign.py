@@ -94,29 +94,28 @@ def test_a_task_that_comes_to_running_nodes_without_a_worker_has_no_owner_and_no
     assert sim.agreed("extra") == "edge2"
 
 
-def test_a_worker_that_ran_on_while_its_task_was_away_is_found_again() -> None:
+def without_extra() -> tuple[Simulator, Fleet]:
+    """A fleet that had the task and has it no more, and the file with it."""
     sim = fleet()
-    before = sim.fleet
+    before, after = sim.fleet, with_extra(sim.fleet)
     sim.start()
-    take_over(sim, with_extra(before))
-    rest(sim)
-    take_over(sim, before)
-    rest(sim)
-    take_over(sim, with_extra(before))
+    for file in (after, before):
+        take_over(sim, file)
+        rest(sim)
+    return sim, after
+
+
+def test_a_worker_that_ran_on_while_its_task_was_away_is_found_again() -> None:
+    sim, after = without_extra()
+    take_over(sim, after)
     rest(sim)
     assert sim.agreed("extra") in EDGES
 
 
 def test_a_worker_that_ended_while_its_task_was_away_is_not_found_again() -> None:
-    sim = fleet()
-    before = sim.fleet
-    sim.start()
-    take_over(sim, with_extra(before))
-    rest(sim)
-    take_over(sim, before)
-    rest(sim)
+    sim, after = without_extra()
     sim.work.leave(sim.machines["edge1"])
-    take_over(sim, with_extra(before))
+    take_over(sim, after)
     rest(sim)
     assert sim.agreed("extra") == "edge2"
 
