@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Collection, Iterator
+from typing import TypeVar
 
 import zenoh
 from zenoh import Session
@@ -17,12 +18,13 @@ from zsched.relay.streams.answer_times import AnswerTimes
 from zsched.relay.streams.inputs import InputStream
 from zsched.relay.streams.outputs import OutputStream
 
+_Stream = TypeVar("_Stream", InputStream, OutputStream)
 Cells = Callable[[str], memoryview | None]
 """Where an input counts what it takes, by its name, beside its own counters (`zsched.relay.books`)."""
 
 
 class OpenStreams:
-    """Changed by the task's thread alone; `counts` may be read by any."""
+    """Changed by the task's thread alone; `counts` and `under_way` may be read by any."""
 
     def __init__(
         self,
@@ -57,11 +59,7 @@ class OpenStreams:
         Raises:
             ValueError, zenoh.ZError: it cannot be opened.
         """
-        source = self.inputs.get(route.stream)
-        if source is None or (source.route.from_expr, source.route.settings) != (route.from_expr, route.settings):
-            self._end(self.inputs, route.stream)
-            source = self.inputs[route.stream] = self._take_input(route)
-        return source
+        return self._of(self.inputs, route, self._take_input)
 
     def output_of(self, route: Route) -> OutputStream:
         """The open output of a route; one of the same name that puts out elsewhere, or otherwise, is closed first.
@@ -69,11 +67,7 @@ class OpenStreams:
         Raises:
             ValueError, zenoh.ZError: it cannot be opened.
         """
-        sink = self.outputs.get(route.stream)
-        if sink is None or (sink.route.to_expr, sink.route.settings) != (route.to_expr, route.settings):
-            self._end(self.outputs, route.stream)
-            sink = self.outputs[route.stream] = self._take_output(route)
-        return sink
+        return self._of(self.outputs, route, self._take_output)
 
     def keep(self, names: Collection[str]) -> None:
         """Close all others."""
@@ -104,7 +98,7 @@ class OpenStreams:
     @property
     def under_way(self) -> int:
         """Samples that have no acknowledgement yet."""
-        return sum(source.under_way() for source in self.inputs.values())
+        return sum(source.under_way() for source in tuple(self.inputs.values()))
 
     @property
     def is_still(self) -> bool:
@@ -124,6 +118,13 @@ class OpenStreams:
 
     def _take_output(self, route: Route) -> OutputStream:
         return OutputStream(self._session, route, self._own_ids, self.wake, self._local, self._times)
+
+    def _of(self, streams: dict[str, _Stream], route: Route, take: Callable[[Route], _Stream]) -> _Stream:
+        one = streams.get(route.stream)
+        if one is None or (one.route.near, one.route.settings) != (route.near, route.settings):
+            self._end(streams, route.stream)
+            one = streams[route.stream] = take(route)
+        return one
 
     def _end(self, streams: dict[str, InputStream] | dict[str, OutputStream], stream: str) -> None:
         one = streams.get(stream)

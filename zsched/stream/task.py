@@ -110,7 +110,7 @@ class OwnTask(TaskRelay):
 
     def under_way(self) -> int:
         """How many samples have been taken and not processed, as far as is known."""
-        return sum(source.under_way() for source in tuple(self._own.inputs.values()))
+        return self._own.under_way
 
     def has_handed(self) -> bool:
         """Whether the callbacks have returned for every answer that has come."""

@@ -33,8 +33,7 @@ def takes(route: Route, keys: tuple[str, ...]) -> bool:
     """Whether an application that names these keys has the route's stream itself."""
     if route.direction is Direction.SERVICE:
         return False
-    own = route.from_expr if route.direction is Direction.INPUT else route.to_expr
-    return any(includes(own, key) for key in keys)
+    return any(includes(route.near, key) for key in keys)
 
 
 class Shares(Struct, eq=False):
@@ -103,8 +102,7 @@ class Shares(Struct, eq=False):
 
     def taken(self) -> tuple[str, ...]:
         """The named keys that are a stream's, by the plans of now."""
-        routes = [route for found in self.unowned.values() for route in found]
-        routes += [route for plan in self.plans.values() for slot in _slots(plan) for route in slot.routes]
+        routes = self._routes()
         return tuple(key for key in self.keys if any(takes(route, (key,)) for route in routes))
 
     def _of_unowned(self, task: TaskId) -> tuple[Told, ...]:
@@ -133,6 +131,11 @@ class Shares(Struct, eq=False):
 
     def _part(self, slot: Slot) -> Slot:
         return replace(slot, routes=self._own(slot.routes))
+
+    def _routes(self) -> tuple[Route, ...]:
+        """Of all tasks, by the plans of now."""
+        of_plans = (slot.routes for plan in self.plans.values() for slot in _slots(plan))
+        return tuple(route for routes in (*self.unowned.values(), *of_plans) for route in routes)
 
     def _own(self, routes: tuple[Route, ...]) -> tuple[Route, ...]:
         return tuple(route for route in routes if takes(route, self.keys))
@@ -192,9 +195,7 @@ class Shares(Struct, eq=False):
 
     def note_counts(self, counts: tuple[StreamCount, ...]) -> None:
         """What the application has counted; of streams that are not its own nothing is taken."""
-        routes = [route for plan in self.plans.values() for slot in _slots(plan) for route in slot.routes]
-        routes += [route for found in self.unowned.values() for route in found]
-        own = {route.stream for route in self._own(tuple(routes))} | set(self.counted)
+        own = {route.stream for route in self._own(self._routes())} | set(self.counted)
         for count in counts:
             if count.stream in own:
                 self.counted[count.stream] = count
@@ -228,10 +229,10 @@ class Shares(Struct, eq=False):
 
     def _begin_outputs(self) -> None:
         """Note what the relay has counted of outputs that are the application's from now on."""
-        routes = {route.stream: route for plan in self.plans.values() for one in _slots(plan) for route in one.routes}
-        for stream, route in routes.items():
-            if route.direction is Direction.OUTPUT and takes(route, self.keys):
-                self.began.setdefault(stream, self.relays.get(stream) or StreamCount(stream=stream))
+        for route in self._own(self._routes()):
+            if route.direction is Direction.OUTPUT:
+                none = StreamCount(stream=route.stream)
+                self.began.setdefault(route.stream, self.relays.get(route.stream, none))
 
 
 def _add(table: dict[str, StreamCount], count: StreamCount) -> None:

@@ -116,6 +116,11 @@ class Route(Struct, frozen=True, kw_only=True):
     service: ServiceSettings = ServiceSettings()
     """Services only."""
 
+    @property
+    def near(self) -> str:
+        """The robot's end of an input or an output: the key that its applications know."""
+        return self.from_expr if self.direction is Direction.INPUT else self.to_expr
+
 
 class Slot(Struct, frozen=True, kw_only=True):
     """The routes of one task towards one owner in one epoch."""
