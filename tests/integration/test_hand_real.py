@@ -114,6 +114,11 @@ class Site:
         tasks: list[Any] = self.halls[cell].status(STAYS[cell]).get("tasks", [])
         return any(task["name"] == "echo" and task["owner"] == STAYS[cell] for task in tasks)
 
+    def tells(self) -> bool:
+        """Whether the first cell's status says that the task is on its way."""
+        problems: list[str] = self.halls[A].status(STAYS[A]).get("problems", [])
+        return any(problem.startswith(f"echo is on its way to {B}") for problem in problems)
+
     def session(self, cell: str) -> zenoh.Session:
         """Of an application of the cell's robot."""
         end = f"tcp/127.0.0.1:{self.port + 10 * (cell == B) + 1}"
@@ -139,6 +144,7 @@ def test_a_task_goes_over_while_both_cells_streams_run_and_the_command_is_killed
             going.wait(10)
             assert mark_of(site.text(A), "echo") is not None, site.told()
             assert site.works(A), "until it is ready there"
+            until(site.tells, "status tells of it")
             begun = time.monotonic()
             done = site.hand(B)
             took_s = time.monotonic() - begun
@@ -146,6 +152,7 @@ def test_a_task_goes_over_while_both_cells_streams_run_and_the_command_is_killed
             reached = len(there.back)
             until(lambda: len(there.back) > reached + 50, "it flows in hall-b", 30.0)
             until(lambda: not site.works(A), "hall-a has it no more")
+            until(lambda: not site.tells(), "there is nothing to tell any more")
             ended = here.sent
             here.end()
             there.end()
@@ -192,6 +199,7 @@ def test_an_exclusive_task_works_never_in_both(folder: Path) -> None:
             until(lambda: not site.works(A), "it stops first")
             assert mark_of(site.text(A), "echo") is not None, site.told()
             assert not site.works(B)
+            until(site.tells, "status tells of a task that nobody has")
             going = site.begun(B)
             assert going.wait(90) == 0, site.told()
             until(lambda: len(came[B]) > 50, "it flows in hall-b", 30.0)

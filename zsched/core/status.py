@@ -36,7 +36,7 @@ from zsched.core.values.snapshot import (
     VoteStatus,
 )
 from zsched.core.values.struct import replace
-from zsched.core.values.words import NEVER_INITIALISED, RESTARTING, TAKEN_OUT, told_of_worker
+from zsched.core.values.words import NEVER_INITIALISED, RESTARTING, TAKEN_OUT, told_of_hand, told_of_worker
 from zsched.core.vote.generations import way_out
 from zsched.core.vote.voting import Voting
 
@@ -171,6 +171,7 @@ def _problems(node: Stages, quorum: QuorumStatus, now: float) -> tuple[str, ...]
         problems.append(_nothing_agreed(node, quorum, fresh))
     if not node.has_state and not node.has_foreign_state and not node.has_others_state:
         problems.append("no valid state file: this node is no elector (see `zsched init --help`)")
+    problems += [told_of_hand(task, cell, node.fleet.name) for task, cell in node.fleet.handed]
     return tuple(problems)
 
 

@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from typing import Final
 
 from zsched import __version__
-from zsched.config.handing import marks_of
 from zsched.core.scheduler.flags import HANDS_OVER, told_flag
 from zsched.core.values.document import Flag, FlagKind
 from zsched.core.values.words import has_lost_its_worker, told_of_worker
@@ -94,7 +93,7 @@ def _told(name: str, flag: Json) -> str:
 
 
 def tasks_have_owners(scene: Scene) -> Result:
-    """Whether each task has a living owner, the electors could choose another, and none is between two cells."""
+    """Whether each task has a living owner, and the electors could choose another."""
     status, quorum = scene.status, scene.status["quorum"]
     found = []
     if not quorum["ok"]:
@@ -107,11 +106,6 @@ def tasks_have_owners(scene: Scene) -> Result:
             fix = f"zsched explain {task['name']} names why each candidate cannot have it"
             found.append(failed(told, fix=fix))
         found += _lost_workers(status, task)
-    for mark in marks_of(scene.text):
-        told = f"{mark.task} is on its way to {mark.cell}, and stays so unless somebody's `zsched task hand` is at work"
-        verb = f"zsched task hand {mark.task}"
-        fix = f"{verb} {mark.cell} goes on, {verb} {status['fleet']} takes it back"
-        found.append(warned(told, fix=fix))
     owners = ", ".join(f"{task['name']} on {task['owner']}" for task in status["tasks"]) or "no tasks"
     return joined(
         found, passed(f"{owners}; {quorum['alive']} of {quorum['electors']} electors, {quorum['needed']} needed")

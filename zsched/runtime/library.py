@@ -14,6 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from zsched.adapters.host.document_store import DocumentStore
+from zsched.config.handing import marks_of
 from zsched.config.load import check_bytes
 from zsched.config.reader import render_all
 from zsched.core import events as ev
@@ -162,7 +163,8 @@ def read_document(content: Document, fleet: str, node: NodeId, config: Path) -> 
     if all(one.name != node for one in result.fleet.nodes):
         advice = f"{TAKEN_OUT}, and goes on by its last one until `zsched leave`"
         raise ConfigError(f"the document names no node {node!r}: {advice}")
-    return with_rollouts(result.fleet, content.rollouts)
+    handed = tuple((mark.task, mark.cell) for mark in marks_of(content.text))
+    return replace(with_rollouts(result.fleet, content.rollouts), handed=handed)
 
 
 def with_rollouts(fleet: Fleet, rollouts: tuple[Rollout, ...]) -> Fleet:

@@ -20,7 +20,6 @@ from zsched.adapters.host.document_store import DocumentStore
 from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.adapters.radio.nl80211 import GenericNetlink, Interface
 from zsched.clock import ClockWatch, Drift
-from zsched.config.handing import Mark, marked
 from zsched.config.load import check_file, load_fleet
 from zsched.core.values.document import Document, Text
 from zsched.core.values.electorate import Elector, FleetValue
@@ -332,15 +331,6 @@ def test_a_task_without_an_owner_and_a_lost_quorum_are_found(tmp_path: Path) -> 
     nobody = run("task.owners", answer(scene, tasks=[{**task, "owner": None}]))
     assert nobody.fix.startswith("zsched explain merge"), "which says why each candidate cannot have it"
     assert_finds(run("task.owners", answer(scene, tasks=[{**task, "owner_state": "gone"}])), FAIL, "edge1 is gone")
-
-
-def test_a_task_that_is_left_between_two_cells_is_told(tmp_path: Path) -> None:
-    """An exclusive one is no task of this fleet then, and no status has it."""
-    scene = scene_of(tmp_path)
-    text = marked("fleet: hall\n", Mark(task="count", cell="hall-b", entry="tasks:\n  count: {}\n"))
-    result = run("task.owners", replace(scene, text=text))
-    assert_finds(result, WARN, "count is on its way to hall-b")
-    assert result.fix.startswith("zsched task hand count hall-b goes on, zsched task hand count ")
 
 
 def test_a_node_that_gets_nothing_new_is_told_and_a_task_without_a_candidate_is_a_fault(tmp_path: Path) -> None:

@@ -43,7 +43,10 @@ def adopt(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
     """
     before, values = node.fleet, node.values()
     is_new = any(_is_of_before(executor, values[name]) for name, executor in node.executors.items() if name in values)
-    if _is_refused(node, fleet) or (fleet == before and not is_new):
+    if _is_refused(node, fleet):
+        return
+    if fleet == before and not is_new:
+        node.fleet = fleet  # what it says beside its entries may differ (`Fleet.handed`)
         return
     node.fleet, node.fleet_file, node.text_hash = fleet, fleet_hash(fleet), file_hash(fleet)
     _adopt_nodes(node, fleet)

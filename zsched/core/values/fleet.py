@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 from enum import StrEnum
 from functools import lru_cache
 from typing import Any
@@ -413,6 +413,8 @@ class Fleet:
         SharedMemory.OFF, "Large payloads within a machine; `auto`: where the node finds it fit."
     )
     """Fit is its /dev/shm (`zsched.adapters.machine.shared_memory`)."""
+    handed: tuple[tuple[TaskId, str], ...] = field(default=(), compare=False)
+    """(a task, the cell that it is on its way to), as the document says beside its entries: they order nothing."""
 
     @property
     def voters(self) -> tuple[NodeId, ...]:
@@ -506,12 +508,12 @@ def _canonical(value: object) -> Iterable[bytes]:
     if is_dataclass(value) and not isinstance(value, type):
         kind = type(value).__name__
         yield kind.encode()
-        for field in fields(value):
-            held = getattr(value, field.name)
-            if (kind, field.name) in _LATER and held == field.default:
+        for one in fields(value):
+            held = getattr(value, one.name)
+            if not one.compare or ((kind, one.name) in _LATER and held == one.default):
                 continue
-            yield field.name.encode()
-            yield from _canonical(held.rpartition("/")[2] if (kind, field.name) in _PATHS else held)
+            yield one.name.encode()
+            yield from _canonical(held.rpartition("/")[2] if (kind, one.name) in _PATHS else held)
         return
     if isinstance(value, tuple):
         yield b"%d" % len(value)
