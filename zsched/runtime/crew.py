@@ -66,6 +66,8 @@ class Crew:
         """{task: the file with the session that its worker opens}."""
         self.sessions_read: SessionsRead | None = None
         self._outdated: set[TaskId] = set()
+        self._doubted: frozenset[TaskId] = frozenset()
+        """Of which a problem says that matching does not tell whether the worker is there."""
         self._relay_at = -math.inf
         self._lock = threading.Lock()  # an end and a token's end come from two threads
 
@@ -81,6 +83,7 @@ class Crew:
             for task in self._foreign - known:
                 self._lives.pop(task, None)  # lives of ours mean nothing any more
             self._outdated &= self._foreign
+            self._doubt_only(self._doubted & self._foreign & self._matching)
         self.sessions = sessions
         self._say_missing(self._foreign - self._matching - known)
 
@@ -92,6 +95,7 @@ class Crew:
         """
         with self._lock:
             new, self._kept = frozenset(tasks) - self._kept, frozenset(tasks)
+            self._doubt_only(self._doubted & self._kept)
             for task in sorted((new & self._foreign) - self._matching - self._lives.keys()):
                 for life in sorted(self._tokens.get(task, ())):
                     if self.supervisor is not None:
@@ -208,7 +212,13 @@ class Crew:
     def _doubt(self, match: WorkerMatched) -> None:
         """Say that nothing is certain where no process of ours would show a worker's end either."""
         is_unknown = match.is_matched and not match.is_certain and match.task in self._foreign
-        self._post(ev.ProblemReported(source=f"worker/{match.task}", problem=OTHERS if is_unknown else None))
+        self._doubt_only(self._doubted | {match.task} if is_unknown else self._doubted - {match.task})
+
+    def _doubt_only(self, tasks: frozenset[TaskId]) -> None:
+        """Tell of these that nothing is certain, and of no others any more."""
+        before, self._doubted = self._doubted, tasks
+        for task in sorted(before ^ tasks):
+            self._post(ev.ProblemReported(source=f"worker/{task}", problem=OTHERS if task in tasks else None))
 
     def _tell(self, supervisor: WorkerSupervisor, task: TaskId, life: int, *, is_ready: bool, reason: str) -> None:
         (supervisor.mark_ready if is_ready else supervisor.mark_gone)(task, life)

@@ -60,6 +60,9 @@ class House:
     def reasons(self, task: str) -> list[str]:
         return [one.reason for one in tuple(self.events) if isinstance(one, ev.WorkerChanged) and one.task == task]
 
+    def problems(self) -> list[tuple[str, str | None]]:
+        return [(one.source, one.problem) for one in tuple(self.events) if isinstance(one, ev.ProblemReported)]
+
     def match(self, task: str, *, is_matched: bool = True, is_certain: bool = True) -> None:
         missing = "" if is_matched else "nobody subscribes to a/key"
         self.crew.on_matched(WorkerMatched(task=task, is_matched=is_matched, is_certain=is_certain, missing=missing))
@@ -173,10 +176,23 @@ def test_a_token_says_nothing_of_a_worker_that_is_known_by_matching(house: House
 
 def test_who_listens_to_everything_is_told_where_no_process_would_show_the_end(house: House) -> None:
     house.match("others", is_certain=False)
+    house.match("others", is_certain=False)
     house.match("others")
     house.match("node", is_certain=False)
-    problems = [one.problem for one in house.events if isinstance(one, ev.ProblemReported)]
-    assert problems == [OTHERS, None, None]
+    assert house.problems() == [("worker/others", OTHERS), ("worker/others", None)]
+
+
+def test_nobody_is_told_of_a_worker_that_this_node_keeps_no_more(house: House) -> None:
+    house.match("others", is_certain=False)
+    adopt(house)
+    assert house.problems() == [("worker/others", OTHERS), ("worker/others", None)]
+
+
+def test_nor_of_one_that_this_node_starts_from_now_on(house: House) -> None:
+    house.match("others", is_certain=False)
+    worker = WorkerSpec(command=("work",), ready_when=ReadyWhen.MATCHING)
+    house.crew.adopt(fleet_of(task_of("others", ("edge1",), worker=worker), of=["edge1"], electors=["edge1"]), {})
+    assert house.problems() == [("worker/others", OTHERS), ("worker/others", None)]
 
 
 def outdated(house: House) -> list[str]:
