@@ -34,7 +34,8 @@ from zsched.core.values.fleet import (
 from zsched.core.values.model import NodeId, NodeKind, TaskId, Weights
 from zsched.core.values.struct import Struct, replace
 
-EVERY_DAEMON: Final = "every daemon must be restarted"
+MUST_RESTART: Final = "must be restarted"
+EVERY_DAEMON: Final = f"every daemon {MUST_RESTART}"
 OPENED_ANEW: Final = "daemons begin again in turns: a robot's streams stop for that moment"
 
 
@@ -157,7 +158,7 @@ def difference(
     agreed = tuple(sorted(electors)) or old.electors
     wanted = wanted_electors(agreed, new, texts[1])
     elections = (_electors(agreed, wanted),) if agreed != wanted else ()
-    verdicts = (*_verdicts(old, new, owners or {}), *elections)
+    verdicts = (*_in_turns(tuple(_verdicts(old, new, owners or {}))), *elections)
     changes: list[Change] = []
     told: set[_Verdict] = set()
     for row in rows(before, after):
@@ -306,7 +307,8 @@ def _access(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
         return
     if _nameless(before) != _nameless(after):
         yield _restart(EVERY_DAEMON, "security", _plain(before), _plain(after))
-    elif before != after:
+        return
+    if before != after:
         yield _set(anew, "security", _plain(before), _plain(after))
     nodes, others = ({node.name: (node.kind, node.local is None) for node in fleet.nodes} for fleet in (old, new))
     for name in dict.fromkeys((*others, *nodes)):
@@ -320,6 +322,20 @@ def _access(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
     for name in dict.fromkeys((*then, *speaking)):
         if speaking.get(name) != then.get(name):
             yield replace(anew, paths=(f"tasks.{name}",))
+
+
+def _in_turns(verdicts: tuple[_Verdict, ...]) -> Iterator[_Verdict]:
+    """Where daemons begin again by themselves, nobody has to restart one; not one that becomes of another kind."""
+    begins_again = any(one.text == OPENED_ANEW for one in verdicts)
+    for one in verdicts:
+        is_followed = begins_again and not one.paths[0].endswith(".kind")
+        if is_followed and one.text == EVERY_DAEMON:
+            yield replace(one, text=OPENED_ANEW, effect=Effect.STREAMS)
+        elif is_followed and one.text.endswith(MUST_RESTART):
+            text = f"{one.text.removesuffix(MUST_RESTART)}begins again, by itself in its turn"
+            yield replace(one, text=text, effect=Effect.STREAMS)
+        else:
+            yield one
 
 
 def _nameless(security: Security) -> Security:
@@ -350,7 +366,7 @@ def _nodes(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
 
 def _node(old: NodeSpec, new: NodeSpec) -> Iterator[_Verdict]:
     path = f"nodes.{old.name}"
-    restart = f"the daemon of {old.name} must be restarted"
+    restart = f"the daemon of {old.name} {MUST_RESTART}"
     if old.kind is not new.kind:
         yield _restart(restart, f"{path}.kind", old.kind, new.kind)
     if old.host != new.host:

@@ -214,7 +214,8 @@ def test_a_restart_that_comes_by_itself_is_nobody_s_work(node: Node, tmp_path: P
     file = tmp_path / "fleet.yaml"
     file.write_text(come.replace("fleet: hall", "shared_memory: auto\nfleet: hall"))
     told = run("apply", str(file), "--plan").stdout
-    assert "daemons begin again in turns" in told
+    assert "shared_memory off -> auto daemons begin again in turns" in " ".join(told.split())
+    assert "must be restarted" not in told
     assert "until edge1, robot1, robot2 begin again, by themselves: `shared_memory`" in told
     body = json.loads(run("apply", str(file), "--plan", "--json").stdout)
     assert faults(body) == []

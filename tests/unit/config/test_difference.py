@@ -297,6 +297,19 @@ def test_daemons_are_said_to_begin_again_where_they_do_when_it_comes_and_when_it
         assert any("begin again in turns" in text for text in there) is is_anew
 
 
+def test_nobody_has_to_restart_a_daemon_that_begins_again_by_itself() -> None:
+    """One of another kind does not: the file names another node than it is."""
+    before = with_(ROBOT1, f"{ROBOT1}\n  robot9: {{kind: robot}}", SECURED)
+    after = with_("  robot9: {kind: robot}", "  robot8: {kind: robot}", f"shared_memory: auto\n{before}")
+    after = with_(ROBOT1, f"{ROBOT1[:-1]}, {LISTENS}}}", after)
+    said = {one[0]: one[3] for one in told(after, before)}
+    assert said["shared_memory"] == "daemons begin again in turns: a robot's streams stop for that moment"
+    assert said["nodes.robot1.local"].startswith("the daemon of robot1 begins again, by itself in its turn")
+    assert not any("must be restarted" in text for text in said.values()), said
+    edge = with_("  robot9: {kind: robot}", "  robot9: {kind: edge, host: 192.0.2.9}", before)
+    assert any("the daemon of robot9 must be restarted" in one[3] for one in told(edge, before))
+
+
 def test_what_comes_later_is_not_told_together_with_at_once() -> None:
     """A new candidate counts at once, and is let in only once the daemons have begun anew: the later one is told."""
     secured = f"{TEXT.replace('tcp/', 'tls/')}\nsecurity: {{}}\n"
