@@ -224,8 +224,8 @@ class Source(Struct):
         end = first + replayed if first <= self.arrived and replayed <= MAX_REPLAYED else 0
         end, before = (one if one > self.arrived else 0 for one in (end, self.replay_end))
         is_less = end < before or (self.is_whole is True and not is_whole)
-        self._doubts = self._doubts + 1 if is_less else 0
-        if is_less and self._doubts < RETURN:
+        if is_less and self._doubts + 1 < RETURN:
+            self._doubts += 1
             is_whole, end = is_whole or self.is_whole is True, max(end, before)
         else:
             self._doubts = 0
