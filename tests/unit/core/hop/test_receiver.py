@@ -6,7 +6,7 @@ from random import Random
 
 import pytest
 
-from zsched.core.hop.receiver import GIVE_UP_S, MAX_AHEAD, STEP_S, RunningTime, Source
+from zsched.core.hop.receiver import GIVE_UP_S, MAX_AHEAD, RETURN, STEP_S, RunningTime, Source
 from zsched.core.hop.serial import SPAN, serial_of
 
 
@@ -73,7 +73,34 @@ def test_late_ones_in_a_row_take_a_jump_back_as_if_a_stranger_had_made_it() -> N
     source = Source.at(0)
     assert heard(source, 0, 4, in_turn=False) == [True, True]
     assert heard(source, 1, 2, 3, 4, in_turn=False) == [False, False, True, True]
-    assert (source.arrived, source.lost) == (5, 2)
+    assert (source.first, source.arrived, source.lost) == (0, 5, 2)
+
+
+def test_a_beginning_that_nothing_has_confirmed_is_taken_back_with_its_jump() -> None:
+    """A start marker said that nothing before 5 would come; what comes in a row then says where the stream began."""
+    source = Source.at(0)
+    assert (source.skip(5), source.first) == (0, 5)
+    assert heard(source, 0, 1, 2, 3) == [False, False, True, True]
+    assert (source.first, source.arrived, source.lost) == (0, 4, 2)
+
+
+def test_a_jump_that_nothing_follows_proves_nothing() -> None:
+    """Anybody can put one number, and with it would call the end markers of the publisher too old."""
+    source = Source.at(0)
+    assert (heard(source, 0, in_turn=False), source.proven) == ([True], 1)
+    assert (heard(source, 5, in_turn=False), source.proven) == ([True], 1)
+    assert (heard(source, 6, in_turn=False), source.proven) == ([True], 7)
+
+
+def test_less_is_believed_of_a_stream_when_enough_start_markers_in_a_row_say_so() -> None:
+    source = Source.at(0)
+    for _ in range(2):
+        source.note_start(0, is_whole=True, replayed=4)
+        for _ in range(RETURN - 1):
+            source.note_start(0, is_whole=False, replayed=1)
+            assert (source.is_whole, source.ack(7).replays) == (True, 4), "one that says more begins the row anew"
+    source.note_start(0, is_whole=False, replayed=1)
+    assert (source.is_whole, source.ack(7).replays) == (False, 1)
 
 
 @pytest.mark.parametrize("seed", range(200))
