@@ -6,7 +6,19 @@ import math
 
 import pytest
 
-from zsched.core.hop.room import AHEAD_S, BACKLOG_S, LARGE, MAX_PAUSE_S, OWN, PAUSE_S, SLOW_TIMES, SMALL, Account, Room
+from zsched.core.hop.room import (
+    AHEAD_S,
+    BACKLOG_S,
+    LARGE,
+    MAX_PAUSE_S,
+    OWN,
+    PAUSE_S,
+    SLOW_TIMES,
+    SMALL,
+    STALE_S,
+    Account,
+    Room,
+)
 
 LOOK_S = 0.05
 MBIT = 1e6 / 8
@@ -164,6 +176,37 @@ def test_a_long_way_gets_a_buffer_for_what_is_under_way() -> None:
     link.put(1 << 30)
     link.run(20.0)
     assert link.room.size == OWN
+
+
+@pytest.mark.parametrize(("later_s", "expected"), [(0.0, SMALL), (0.001, 2 * SMALL)])
+def test_what_was_between_two_looks_is_known_for_so_long_and_two_round_trips(later_s: float, expected: int) -> None:
+    """A buffer that was never empty tells how fast its link is; else the link is at least so fast."""
+    room, round_trip_s = Room(), 0.25
+    room.look(Account(acked=0, held=SMALL, round_trip_s=round_trip_s), 0.0)
+    seen = Account(acked=2 * SMALL, held=SMALL, round_trip_s=round_trip_s)
+    assert room.look(seen, STALE_S + 2 * round_trip_s + later_s) == expected
+
+
+def test_a_slow_look_makes_no_buffer_smaller_but_so_many_in_succession_do_each_time_anew() -> None:
+    room, seen, now = Room(), Account(acked=0, held=LARGE, round_trip_s=0.0), 0.0
+    room.look(seen, now)
+
+    def took(size: int) -> int:
+        """The size after a look at a buffer that was full, on a link for which ``size`` is the right one."""
+        nonlocal seen, now
+        now += LOOK_S
+        seen = Account(acked=seen.acked + int(1.01 * size * LOOK_S / AHEAD_S), held=LARGE, round_trip_s=0.0)
+        return room.look(seen, now)
+
+    assert took(LARGE) == LARGE, "it grows at once"
+    for _ in range(2):
+        assert took(LARGE) == LARGE
+        for _ in range(SLOW_TIMES - 1):
+            assert took(2 * SMALL) == LARGE
+    assert took(2 * SMALL) == 2 * SMALL
+    for _ in range(SLOW_TIMES - 1):
+        assert took(SMALL) == 2 * SMALL
+    assert took(SMALL) == SMALL
 
 
 def test_after_it_shrank_it_grows_later_each_time_and_soon_again_once_the_link_was_fast() -> None:
