@@ -12,6 +12,7 @@ from zsched.core.hop.shared import (
     FORGET_S,
     LOOK_S,
     MAX_PAUSE_S,
+    MAX_RECEIVERS,
     NEWCOMERS_S,
     STALLED_S,
     TICK_S,
@@ -80,6 +81,29 @@ def test_late_ones_are_put_again_with_more_patience_each_time_until_there_is_pro
     ack(books, "a", 2, now)
     books.look_after(now + RESEND_S + 0.01)
     assert books.owing() == ("a",)
+
+
+def test_what_was_put_a_moment_ago_is_not_late_however_long_there_was_nothing_to_put() -> None:
+    books = sender(1)
+    ack(books, "a", 1, 1.0)
+    books.look_after(8.0)
+    books.note_put(None, None, 10, 9.0)
+    books.look_after(8.99 + RESEND_S)
+    assert books.owing() == ()
+    books.look_after(9.01 + RESEND_S)
+    assert books.owing() == ("a",)
+
+
+def test_beyond_so_many_receivers_the_longest_silent_one_that_was_never_reached_goes() -> None:
+    books = sender(3)
+    for number in range(MAX_RECEIVERS):
+        ack(books, f"a{number}", 1, 1.0 + number, has_gap=True)
+    assert (len(books.receivers), books.crowded_out) == (MAX_RECEIVERS, 0)
+    owed(books, "a0", 1000.0)
+    ack(books, "b", 1, 1001.0)
+    assert (len(books.receivers), books.crowded_out) == (MAX_RECEIVERS, 1)
+    assert {"a0", "b"} <= books.receivers.keys()
+    assert "a1" not in books.receivers
 
 
 def test_much_goes_in_parts_and_progress_brings_the_next() -> None:
