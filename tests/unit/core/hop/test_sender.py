@@ -7,7 +7,7 @@ import itertools
 import pytest
 
 from zsched.core.hop.kept import NOTHING, RESEND_S, Owed
-from zsched.core.hop.sender import GREET_S, KEPT_BYTES_LATEST, MAX_GREET_S, MAX_RESEND_S, Sender, near
+from zsched.core.hop.sender import GREET_S, KEPT_BYTES_LATEST, MAX_GREET_S, MAX_RESEND_S, Sender, Sums, near
 from zsched.core.hop.serial import SPAN, serial_of
 from zsched.core.relay_protocol import StreamAck
 from zsched.relay.streams.tally import Tally
@@ -25,6 +25,21 @@ def sent(books: Sender, *, at: float, size: int = 100, took_s: float = 0.0) -> N
 
 def acknowledged(books: Sender, arrived: int, now: float) -> None:
     books.acknowledge(StreamAck(eid=1, first=0, arrived=arrived, processed=arrived), "1", now)
+
+
+def test_what_nobody_acknowledges_is_counted_and_not_kept() -> None:
+    """A plain subscriber takes the stream; a worker that comes later goes on with the next number."""
+    books = lane()
+    for _ in range(2):
+        sent(books, at=10.0)
+    acknowledged(books, 1, 10.1)
+    books.is_foreign = True
+    ended = [books.note_put(None, None, 100, at=10.2) for _ in range(3)]
+    assert ended == [Sums(1, 0, 0, 0, at_most_lost=1), Sums(0, 0, 0, 0), Sums(0, 0, 0, 0)]
+    assert (books.count, books.in_flight, len(books.kept)) == (5, 0, 0)
+    acknowledged(books, 5, 10.3)
+    sent(books, at=10.4)
+    assert (books.count, books.in_flight, [one.number for one in books.kept]) == (6, 1, [5])
 
 
 def test_nothing_is_late_while_acknowledgements_come() -> None:
