@@ -14,6 +14,7 @@ from zsched.core.values import messages
 from zsched.core.values.messages import (
     Accept,
     Accepted,
+    FleetAnswer,
     Learnt,
     Prepare,
     Promise,
@@ -21,6 +22,7 @@ from zsched.core.values.messages import (
     Refused,
     SetWeights,
     Utilities,
+    votes_of,
 )
 from zsched.core.values.model import NO_BALLOT, Acceptance, Ballot
 from zsched.core.values.struct import Struct
@@ -28,6 +30,9 @@ from zsched.core.values.struct import Struct
 BALLOT = Ballot(counter=1, node="r1", incarnation=1)
 VALUE = allocation_of(owner="e1")
 ACCEPTANCE = Acceptance(ballot=BALLOT, value=VALUE)
+PROMISE = Promise(elector="r2", task="merge", ballot=BALLOT)
+ACCEPTED = Accepted(elector="r2", task="merge", ballot=BALLOT)
+REFUSED = Refused(elector="r2", task="merge", ballot=BALLOT, refusal=Refusal.BALLOT, promised=BALLOT)
 BAD_NAMES = ("", "Robot", "a/b", "-a", "é", "a" * 64, "*", "a\n")
 
 BUILDERS: dict[str, Callable[[str], object]] = {
@@ -62,6 +67,16 @@ def test_message_with_a_good_name_is_a_frozen_value(field: str) -> None:
 def test_accept_of_another_tasks_value_is_refused() -> None:
     with pytest.raises(ValueError, match="accept: value of 'other' for task 'merge'"):
         Accept(task="merge", acceptance=replace(ACCEPTANCE, value=replace(VALUE, task="other")), electorate="x")
+
+
+@pytest.mark.parametrize("answers", [[PROMISE], [ACCEPTED], [REFUSED], [PROMISE, ACCEPTED, REFUSED]])
+def test_votes_are_those_of_the_elector_that_answers(answers: list[Promise | Accepted | Refused]) -> None:
+    votes = votes_of(answers)
+    assert (votes.elector, votes.answers) == ("r2", tuple(answers))
+    ahead = votes_of([], FleetAnswer(accepted=replace(ACCEPTED, task="fleet")))
+    assert (ahead.elector, ahead.answers) == ("r2", ())
+    with pytest.raises(ValueError, match="the answers of one elector"):
+        votes_of([*answers, replace(PROMISE, elector="r1")])
 
 
 def test_ballots_are_ordered_by_counter_then_node_then_incarnation() -> None:
