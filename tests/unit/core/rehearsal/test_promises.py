@@ -50,6 +50,17 @@ def test_the_limits_are_those_of_the_timing_page() -> None:
     assert wired[Step.LINK].gap_s < found[Step.LINK].gap_s
 
 
+@pytest.mark.parametrize(("confirm_s", "beat_s", "later_s"), [(0.5, 0.2, 0.2), (0.3, 0.3, 0.15)])
+def test_a_dead_daemon_is_gone_by_the_slower_of_both_ways_to_know_it(
+    confirm_s: float, beat_s: float, later_s: float
+) -> None:
+    """It may refute for ``confirm_s``; in a small fleet a lost token counts after one and a half beats."""
+    usual, timing = PROFILES["wifi"], replace(PROFILES["wifi"], confirm_s=confirm_s, beat_s=beat_s)
+    before, after = (of(replace(FLEET, timing=one))[Step.DAEMON].decide_s for one in (usual, timing))
+    assert before is not None
+    assert after == pytest.approx(before + later_s)
+
+
 def test_an_exclusive_task_waits_for_its_lease_and_a_cold_one_for_its_worker() -> None:
     plain, leased = of()[Step.DAEMON], of(task=replace(TASK, exclusive=True))[Step.DAEMON]
     assert leased.gap_s == pytest.approx(plain.gap_s + FLEET.timing.lease_s)
