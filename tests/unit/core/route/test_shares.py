@@ -110,6 +110,14 @@ def test_a_word_that_waits_is_said_when_the_application_goes_and_not_behind_the_
     assert made.go(NOW) == ()
 
 
+def test_an_application_that_has_gone_has_no_streams_and_nobody_waits_for_its_word() -> None:
+    made, word = shares("robot1/jobs"), SlotDrained(task="t", epoch=1)
+    made.go(NOW)
+    assert made.taken() == ()
+    assert made.note_plan(plan(*ALL)) == ()
+    assert made.relay_drained(word) == word
+
+
 def test_what_it_left_open_is_heard_behind_the_slots_end_and_of_its_own_slots_only() -> None:
     made = shares("robot1/jobs")
     made.note_plan(plan(*ALL, epoch=2))
