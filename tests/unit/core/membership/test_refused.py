@@ -58,3 +58,12 @@ def test_a_few_keys_are_kept_and_the_newest_ones_come_once_others_are_over() -> 
     assert len(keys.told(fleet_of(), 100.0)) == REFUSED_KEPT
     keys.on_refused("robot2", 161.0)
     assert len(keys.told(fleet_of(), 161.0)) == 1
+
+
+def test_who_dials_on_stays_on_a_list_that_is_full() -> None:
+    keys = RefusedKeys()
+    for number in range(REFUSED_KEPT):
+        keys.on_refused(f"robot{number + 3}", 100.0)
+    keys.on_refused("robot3", 150.0)
+    (line,) = keys.told(fleet_of(), 161.0)
+    assert line.startswith("robot3 dials")
