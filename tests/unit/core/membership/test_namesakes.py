@@ -61,9 +61,11 @@ def test_slow_beats_take_so_many_of_them() -> None:
 
 def test_without_a_second_token_beats_say_nothing() -> None:
     """Anybody can put beats, and what a daemon's earlier life has left in the air comes without a token, too."""
-    namesakes = two(tokens=(7,))
-    assert both(namesakes, 100.0, 10.0) == []
-    assert namesakes.problems(110.0) == ()
+    namesakes, left = two(tokens=(7,)), two()
+    left.on_token("edge2", 8, is_present=False)
+    for one in (namesakes, left):
+        assert both(one, 100.0, 10.0) == []
+        assert one.problems(110.0) == ()
 
 
 def test_beats_of_a_life_that_has_no_token_are_no_twin_beside_a_token_that_lingers() -> None:
