@@ -92,3 +92,14 @@ def test_a_learnt_value_forgets_all_but_a_commit_that_the_register_has() -> None
         assert (voting.proposals, voting.awaited_until) == ({}, -math.inf)
     voting.end_commit()
     assert voting.commit is None
+
+
+def test_who_commits_a_move_is_called_to_no_other_vote_until_that_has_ended() -> None:
+    voting = Voting(FLEET, "robot1")
+    for voter in ROBOTS[:2]:
+        voting.absorb(paper(voter), VALUE, 10.0)
+    assert voting.count(VALUE, ALL, 10.0) is not None
+    late = 10.1 + VOTE_S
+    assert not voting.absorb(paper("robot3", "edge3"), VALUE, late)
+    voting.end_commit()
+    assert voting.absorb(paper("robot3", "edge3"), VALUE, late)
