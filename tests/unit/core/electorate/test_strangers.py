@@ -172,11 +172,13 @@ def test_a_question_of_another_generation_gets_no_answer() -> None:
     )
     event = ev.PrepareAsked(request=1, asker="robot3", prepare=question)
     assert not [one for one in agreed(one.acceptor.on_prepare, event, 100.1).send if isinstance(one, do.AnswerElection)]
+    assert one.counters["prepare_stranger"] == 1
     ours = replace(question, generation_id=LEFT.generation_id)
     for name in ROBOTS[1:]:
         one.witness.on_answer(Learnt(node=name, values=()))
     event = ev.PrepareAsked(request=2, asker="robot3", prepare=ours)
     assert [one for one in agreed(one.acceptor.on_prepare, event, 101.0).send if isinstance(one, do.AnswerElection)]
+    assert one.counters["prepare_stranger"] == 1
 
 
 def test_a_stranger_is_no_peer_and_its_other_frames_do_not_count() -> None:
