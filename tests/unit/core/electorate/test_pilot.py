@@ -504,4 +504,6 @@ def test_robots_are_marked_on_an_unsettled_value_too() -> None:
 
 
 def test_nobody_is_marked_before_a_document_is_agreed() -> None:
-    assert SetAway(base_revision=7, away=("b",)).fault(value("a", document="")) == "no document is agreed yet"
+    by_file, mark = value("a", document=""), SetAway(base_revision=7, away=("b",))
+    assert mark.fault(by_file) == "no document is agreed yet"
+    assert mark.apply(by_file) == by_file
