@@ -15,6 +15,7 @@ from support.profiles import load_of, profile_of
 from support.proposals import proposal_of
 from support.states import state_of
 from zsched.core.events import (
+    CertificateSent,
     FleetReadAsked,
     HistoryAsked,
     LinesAsked,
@@ -47,6 +48,7 @@ from zsched.core.values.messages import (
     RestartTask,
     RetryTask,
     SetWeights,
+    TakeCertificate,
     WorkerLines,
 )
 from zsched.core.values.model import MAX_COUNTER, Asked, ScoreForm, Utility, UtilityVector
@@ -266,6 +268,8 @@ def test_each_command_is_its_own_event() -> None:
     assert commanded(9, keep) == RehearsalKept(request=9, command=keep)
     assert commanded(9, ReadRehearsals()) == RehearsalsAsked(request=9, command=ReadRehearsals())
     assert commanded(9, ReadFleet()) == FleetReadAsked(request=9, command=ReadFleet())
+    sent = TakeCertificate(certificate=Text("-----BEGIN CERTIFICATE-----"))
+    assert commanded(9, sent) == CertificateSent(request=9, command=sent)
 
 
 def test_a_rehearsal_keeps_within_its_bounds() -> None:
