@@ -275,6 +275,9 @@ def test_one_elector_on_which_init_was_forgotten_is_told_with_the_command() -> N
     assert any(one.startswith("no state file on robot1: ") for one in build_snapshot(mine, 100.0).problems)
     (sent,) = (one.beat for one in mine.handle(ev.DeadlineReached(), 101.0) if isinstance(one, do.PublishBeat))
     assert (sent.has_lost_state, sent.lacks_state_file) == (True, True)
+    for well in (make("robot1"), forgotten("edge1", stateless=())):
+        (sent,) = (one.beat for one in well.handle(ev.DeadlineReached(), 101.0) if isinstance(one, do.PublishBeat))
+        assert (sent.has_lost_state, sent.lacks_state_file) == (False, False), "a node that is no elector needs none"
     node.handle(ev.BeatReceived(beat=beat_of("robot2", 3, incarnation=3)), 100.4)
     assert build_snapshot(node, 100.4).problems == ()
 
