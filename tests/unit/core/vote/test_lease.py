@@ -308,3 +308,10 @@ def test_an_elector_that_never_knew_of_long_leases_waits_for_them_too() -> None:
     one.adopt(WITHOUT, {"other": None}, 20.0)
     one.adopt(FLEET, {"guard": None, "other": None}, 20.0)
     assert one.may_accept("guard", "r3", 20.0 + HOLD_S), "a guard time was waited for meanwhile"
+
+
+def test_a_task_that_stays_in_the_fleet_waits_for_no_lease_again() -> None:
+    one = elector()
+    assert one.may_accept("guard", "r3", 100.0)
+    one.adopt(FLEET, {"guard": None}, 100.0)
+    assert one.may_accept("guard", "r3", 100.0)
