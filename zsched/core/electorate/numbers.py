@@ -284,8 +284,9 @@ class Numbers:
     def is_news(self, value: FleetValue) -> bool:
         """Whether a fleet value is of this generation, and newer than the learnt one."""
         ours = self.value
-        is_ours = ours is not None and (value.fleet, value.generation_id) == (ours.fleet, ours.generation_id)
-        return is_ours and ours is not None and value.revision > ours.revision
+        if ours is None or (value.fleet, value.generation_id) != (ours.fleet, ours.generation_id):
+            return False
+        return value.revision > ours.revision
 
     def _readable(self, answer: Refused, todo: ToDo, now: float) -> Refused:
         """A refusal without its fleet value if that one's document is still to be fetched."""
