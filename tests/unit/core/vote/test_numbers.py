@@ -31,6 +31,7 @@ from zsched.core.values.model import NO_BALLOT, Acceptance, Ballot, RegisterStat
 from zsched.core.vote.agreement import Agreement
 from zsched.core.vote.belief import GENERATION_STEP
 from zsched.core.vote.lease import Leases
+from zsched.core.vote.questions import ASK_LEARNT_EVERY_S
 from zsched.wire.codec import decode_state, encode_state
 
 T = TypeVar("T")
@@ -52,6 +53,7 @@ def make(
     has_state: bool = True,
     registers: tuple[RegisterState, ...] = (),
     stored: Mapping[str, Fleet] = MappingProxyType({"0d": FLEET}),
+    seed: int = 1,
 ) -> Agreement:
     held = None if fleet_value is None else RegisterState(task=FLEET.name, learnt=fleet_value)
     state = state_of(me, *registers, generation=GENERATION, hardware="h", disk="d1", fleet_register=held)
@@ -61,7 +63,7 @@ def make(
         durable=state if has_state else None,
         incarnation=7,
         electorate="e",
-        rng=Random(1),
+        rng=Random(seed),
         now=100.0,
         stored=stored,
     )
@@ -238,6 +240,24 @@ def test_a_fleet_value_counts_once_its_document_is_on_disk() -> None:
     assert not agreement.acceptor.is_elector
 
 
+def test_the_document_of_a_value_that_is_older_than_the_learnt_one_is_not_fetched() -> None:
+    agreement = make(WITH_EDGE)
+    older = Learnt(node="robot2", values=(), generation=GENERATION, fleet=replace(ADOPTED, document="0c"))
+    todo = agreed(agreement.on_learnt, ev.LearntReceived(learnt=older, is_answer=True), 100.1)
+    assert of(todo, do.FetchDocument) == []
+    newer = replace(older, fleet=replace(WITHOUT_ROBOT1, revision=WITH_EDGE.revision + 1, document="0c"))
+    todo = agreed(agreement.on_learnt, ev.LearntReceived(learnt=newer, is_answer=True), 100.2)
+    assert [one.document for one in of(todo, do.FetchDocument)] == ["0c"]
+
+
+@pytest.mark.parametrize("value", [None, WITH_EDGE])
+def test_everybody_is_told_the_same_value_again_after_a_while_only(value: FleetValue | None) -> None:
+    agreement = make(value)
+    assert agreement.word(100.0) == agreement.learnt()
+    assert agreement.word(100.0 + 0.9 * ASK_LEARNT_EVERY_S) is None
+    assert agreement.word(100.0 + ASK_LEARNT_EVERY_S) == agreement.learnt()
+
+
 def test_what_is_told_unasked_leads_to_a_question_only() -> None:
     agreement = make()
     told = Learnt(node="robot2", values=(), generation=GENERATION, fleet=WITH_EDGE)
@@ -271,6 +291,19 @@ def test_an_elector_whose_name_is_disputed_answers_nobody_under_any_number() -> 
     assert answer.refusal is Refusal.NOT_ELECTOR
 
 
+def test_an_elector_whose_name_is_disputed_takes_nobody_for_gone() -> None:
+    """Its own seat, which names no disk, among them: it has no opinion, as any node that does not elect."""
+    agreement = make(ADOPTED)
+    agreement.dispute("two daemons", ToDo())
+    assert agreement.helm.opinion(agreement.disk, 100.0) == ((), ())
+
+
+def test_electors_that_start_unsettled_ask_after_a_while_that_differs() -> None:
+    begun = {seed: make(ADOPTED, seed=seed).next_deadline() - 100.0 for seed in range(4)}
+    assert all(0.5 <= after_s / FLEET.timing.stagger_s < 1.5 for after_s in begun.values())
+    assert len(set(begun.values())) == len(begun)
+
+
 def test_ballots_of_today_s_fleets_carry_no_disk() -> None:
     assert proposed(make()).ballot == Ballot(counter=1, node="robot1", incarnation=7)
 
@@ -295,6 +328,7 @@ def test_an_elector_without_its_document_remembers_the_tasks_that_its_file_lacks
     )
     elector = make(value, registers=states, stored={})
     assert (elector.is_elector, tuple(elector.registers)) == (True, ("merge",))
+    assert elector.document_hash == "", "it goes by its file"
     written = elector.to_persist(100.0)
     assert written is not None
     assert written.registers == states
@@ -302,6 +336,7 @@ def test_an_elector_without_its_document_remembers_the_tasks_that_its_file_lacks
     elector.on_stored(ev.DocumentStored(document="0d", fleet=document), todo, 100.1)
     elector.adopt(document, todo, 100.1)
     assert tuple(register.state for register in elector.registers.values()) == states
+    assert elector.document_hash == "0d"
     again = elector.to_persist(100.2)
     assert again is not None
     assert again.registers == states
