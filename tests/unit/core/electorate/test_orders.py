@@ -39,7 +39,7 @@ from zsched.core.values.messages import (
 from zsched.core.values.model import Acceptance, Asked, Ballot, RegisterState
 from zsched.core.values.words import MAX_ASKED, MAX_ASKER
 from zsched.core.vote import commands
-from zsched.core.vote.agreement import Agreement
+from zsched.core.vote.agreement import SETTLE_AFTER_START_S, Agreement
 
 T = TypeVar("T")
 NAMES = ("edge1", "robot1", "robot2", "robot3")
@@ -244,6 +244,24 @@ def test_a_learnt_value_is_followed_once_its_document_is_stored_and_asked_for_un
     assert of(agreed(agreement.tick, 103.2), do.FetchDocument) == [fetch]
     todo = agreed(agreement.on_stored, ev.DocumentStored(document="0d", fleet=SAID), 104.0)
     assert (agreement.fleet_value, todo.must_persist, todo.in_force) == (value, True, in_force(SAID, value))
+
+
+def test_a_node_that_has_come_by_the_file_is_asked_for_documents_too() -> None:
+    agreement = make()
+    agreement.adopt(fleet_of(TASK, of=(*NAMES, "robot4"), electors=ROBOTS), ToDo(), 100.0)
+    told = Learnt(node="robot3", values=(), fleet=ADOPT.apply(FIRST))
+    todo = agreed(agreement.on_learnt, ev.LearntReceived(learnt=told, is_answer=True), 100.1)
+    assert [one.peers for one in of(todo, do.FetchDocument)] == [("robot3", "robot2", "edge1", "robot4")]
+
+
+def test_an_elector_that_starts_again_asks_what_became_of_a_value_that_it_has_accepted() -> None:
+    agreement = make(stored={"0d": FLEET})
+    asked(agreement, prepare_of())
+    asked(agreement, accept_of(ADOPTED))
+    state = agreement.to_persist(100.2)
+    again = Agreement(fleet=FLEET, me="robot1", durable=state, incarnation=8, electorate="e", rng=Random(1), now=200.0)
+    todo = agreed(again.tick, 200.0 + SETTLE_AFTER_START_S)
+    assert [type(one.question) for one in of(todo, do.AskElectors)] == [Prepare]
 
 
 def test_what_is_known_here_is_kept_on_disk_and_older_ones_go() -> None:
