@@ -96,7 +96,16 @@ def test_two_sides_swap_at_once_is_no_change_there_is(change: FleetChange) -> No
     assert (after.number, after.settled) == ((4, False) if change in CHANGES[:3] else (3, True))
 
 
-@pytest.mark.parametrize("change", CHANGES[:3])
+RELET = SetDocument(base_revision=7, document="e", tasks=(("t1", False),), lease_s=0.5)
+
+
+def test_a_document_with_another_length_of_leases_raises_the_number() -> None:
+    after = RELET.apply(VALUE)
+    assert (after.revision, after.number, after.settled, after.document) == (8, 4, False, "e")
+    assert (after.lease_s, after.guard_lease_s) == (0.5, 2.0), "longer ones may run"
+
+
+@pytest.mark.parametrize("change", [*CHANGES[:3], RELET])
 def test_a_change_that_raises_the_number_waits_until_the_one_before_is_settled(change: FleetChange) -> None:
     unsettled = replace(VALUE, settled=False)
     assert change.fault(unsettled) == "number 3 is not settled"
