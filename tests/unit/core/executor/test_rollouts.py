@@ -120,7 +120,9 @@ def test_a_node_tells_its_runtime_and_its_operators() -> None:
     (status,) = shown.tasks
     assert status.rollout is not None
     assert (status.rollout.first, status.rollout.waiting, status.rollout.known_s) == (("edge2",), ("edge1",), 4.0)
-    assert any("`zsched task promote merge` goes on" in problem for problem in status.problems)
+    assert any(
+        "edge1 waits with that of before: `zsched task promote merge` goes on" in problem for problem in status.problems
+    )
     assert shown.fleet_file == file_hash(held), "who compares files sees no other file"
     node.handle(ev.FleetChanged(fleet=fleet(None)), 106.0)
     assert build_snapshot(node, 107.0).tasks[0].rollout is None
