@@ -311,7 +311,19 @@ def test_an_owner_that_was_there_before_the_start_is_told_as_known_and_the_next_
     assert moves_in(node.handle(learnt_from("robot2", allocation_of(5, "edge2", 3)), 100.0)) == [
         ("edge1", "edge2", 3, False)
     ]
+    assert moves_in(node.handle(learnt_from("robot2", allocation_of(6, "edge2", 3)), 100.0)) == [], "the same owner"
     assert moves_in(make("robot1", learnt=allocation_of(1, None, 0)).start(100.0)) == [], "nobody has it"
+
+
+def test_who_has_not_committed_a_move_tells_the_reason_of_one_that_wanted_it() -> None:
+    node = make("robot1", learnt=allocation_of(4, "edge1", 2))
+    node.start(100.0)
+    for voter, candidate in (("robot2", "edge1"), ("robot3", "edge2")):
+        paper = proposal_of(voter, candidate, base_revision=4, reason=f"{candidate} is idle")
+        node.handle(ev.ProposalReceived(proposal=paper), 100.0)
+    batch = node.handle(learnt_from("robot2", allocation_of(5, "edge2", 3)), 100.1)
+    (move,) = [one.move for one in of(batch, do.RecordStory) if one.move]
+    assert (move.reason, move.votes) == ("edge2 is idle", (("robot2", "edge1"), ("robot3", "edge2")))
 
 
 @pytest.mark.parametrize(("epoch", "is_known"), [(1, False), (2, True), (CREATION_STEP + 1, False)])
