@@ -51,8 +51,8 @@ def wanted_retune(event: ev.WeightsCommanded, registers: Mapping[TaskId, TaskReg
 
 
 def refuse_gone(ended: Ended, todo: ToDo) -> None:
-    """A change has ended whose task has left the fleet."""
-    if isinstance(ended.change, Retune) and ended.change.request is not None:
+    """A change has ended whose task has left the fleet: tell the operator who waits for it."""
+    if not isinstance(ended.change, SetLeased) and ended.change.request is not None:
         _refuse(ended.change.request, CommandOutcome.INVALID, f"{ended.task} has left the fleet", todo)
 
 

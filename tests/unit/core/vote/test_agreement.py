@@ -11,7 +11,7 @@ import pytest
 from support.allocations import allocation_of
 from support.ballots import ballot_of
 from support.beats import beat_of
-from support.fleets import fleet_of, task_of
+from support.fleets import fleet_of, task_of, tuning_of
 from support.states import state_of
 from support.todos import agreed
 from zsched.core import events as ev
@@ -19,7 +19,7 @@ from zsched.core import instructions as do
 from zsched.core.electorate.founding import founded
 from zsched.core.todo import ToDo
 from zsched.core.values.beat import Beat
-from zsched.core.values.change import MoveOwner
+from zsched.core.values.change import MoveOwner, Retune, SetHold, SetLeased
 from zsched.core.values.messages import (
     Accept,
     Accepted,
@@ -32,7 +32,7 @@ from zsched.core.values.messages import (
     Refused,
     SetWeights,
 )
-from zsched.core.values.model import NO_BALLOT, Acceptance, Allocation, RegisterState
+from zsched.core.values.model import NO_BALLOT, Acceptance, Allocation, Asked, Pause, RegisterState
 from zsched.core.vote.agreement import SETTLE_AFTER_START_S, Agreement
 from zsched.core.vote.belief import GENERATION_STEP, MAX_AHEAD, MAX_GENERATION
 from zsched.core.vote.questions import ASK_AT_ONCE_S, ASK_LEARNT_EVERY_S, READ_EVERY_S
@@ -44,6 +44,7 @@ FLEET = fleet_of(
     of=("edge1", *ROBOTS),
     electors=ROBOTS,
 )
+ADA = Asked(by="ada@robot1")
 
 
 def make(*registers: RegisterState, me: str = "robot1", has_state: bool = True) -> Agreement:
@@ -190,6 +191,31 @@ def test_command_whose_accept_left_and_was_not_answered_ends_as_unknown() -> Non
     effects = promises(agreement, agreed(agreement.retune, command(), 100.0))
     assert of(effects, do.SendAccept)
     assert run_dry(agreement, effects).outcome is CommandOutcome.UNKNOWN
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        MoveOwner(base_revision=0, owner="edge1", reason="moved", request=42),
+        Retune(base_revision=0, tuning=tuning_of(bonus=0.3), request=42),
+        SetHold(base_revision=0, pause=Pause(asked=ADA, revision=1), pin=None, reason="paused", request=42),
+    ],
+    ids=["move", "retune", "hold"],
+)
+def test_a_command_whose_task_leaves_the_fleet_meanwhile_is_answered(change: MoveOwner | Retune | SetHold) -> None:
+    agreement = make()
+    assert told(agreed(agreement.propose, "merge", change, 100.0)) is None
+    result = told(agreed(agreement.adopt, replace(FLEET, tasks=FLEET.tasks[1:]), 100.1))
+    assert result == CommandResult(outcome=CommandOutcome.INVALID, detail="merge has left the fleet")
+
+
+@pytest.mark.parametrize(
+    "change", [MoveOwner(base_revision=0, owner="edge1", reason="voted"), SetLeased(base_revision=0, leased=True)]
+)
+def test_nobody_waits_for_the_end_of_a_change_that_nobody_has_ordered(change: MoveOwner | SetLeased) -> None:
+    agreement = make()
+    agreed(agreement.propose, "merge", change, 100.0)
+    assert told(agreed(agreement.adopt, replace(FLEET, tasks=FLEET.tasks[1:]), 100.1)) is None
 
 
 def test_answers_of_strangers_are_counted_and_complete_no_majority() -> None:
