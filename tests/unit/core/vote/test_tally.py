@@ -105,6 +105,12 @@ def test_an_escape_never_goes_without_any_proposal_and_never_needs_more_than_the
     assert counted(*papers, voters=FIVE).outcome is VoteOutcome.WON
 
 
+def test_one_robot_that_flees_makes_the_vote_an_escape() -> None:
+    papers = paper("r1", "edge2", escape=True), paper("r2", "edge2")
+    result = counted(*papers, voters=FIVE, present=THREE, is_over=True)
+    assert (result.outcome, result.winner, result.is_escape) == (VoteOutcome.WON, "edge2", True)
+
+
 def test_gone_robots_lower_the_quorum_for_escapes_only() -> None:
     assert counted(paper("r1", "edge2"), present=("r1",), is_over=True).outcome is VoteOutcome.NO_QUORUM
 
