@@ -51,6 +51,12 @@ def test_who_is_let_in_by_now_and_who_has_stopped_is_not_told_of() -> None:
     assert told("robot2", fleet=fleet_of(TEXT.replace("robot2, ", ""))) == ()
 
 
+def test_a_label_that_is_none_and_a_fleet_without_security_are_not_told_of() -> None:
+    assert told("robot2.king") == ()
+    plain = TEXT.partition("security:")[0].replace("tls/", "tcp/")
+    assert told("robot2", fleet=fleet_of(plain)) == ()
+
+
 def test_a_few_keys_are_kept_and_the_newest_ones_come_once_others_are_over() -> None:
     keys = RefusedKeys()
     for number in range(REFUSED_KEPT + 5):
