@@ -65,18 +65,22 @@ def test_one_elector_counts_once_and_a_stranger_never() -> None:
     assert did(proposer.on_answer, promise, 0.0) == Step()
     stranger = Promise(elector="e1", task="merge", ballot=asked.ballot)
     assert did(proposer.on_answer, stranger, 0.0) == Step()
+    for name in ("e1", "e2"):
+        no = Refused(elector=name, task="merge", ballot=asked.ballot, refusal=Refusal.NUMBER, promised=asked.ballot)
+        did(proposer.on_answer, no, 0.0)
+    assert did(proposer.on_answer, promised(make("r3"), asked)[1], 0.0).accept is not None, "nor did their noes"
 
 
 def test_answers_to_an_older_ballot_change_nothing() -> None:
-    proposer, other = make("r1"), make("r2")
+    proposer, others = make("r1"), (make("r2"), make("r3"))
     old = did(proposer.propose, FIRST, 0.0).prepare
     assert old is not None
-    _, late = promised(other, old)
+    late = [promised(other, old)[1] for other in others]
     did(proposer.tick, BALLOT_S)
     again = did(proposer.tick, proposer.next_deadline()).prepare
     assert again is not None
     assert again.ballot > old.ballot
-    assert did(proposer.on_answer, late, 1.0) == Step()
+    assert [did(proposer.on_answer, one, 1.0) for one in late] == [Step(), Step()]
 
 
 def test_move_raises_epoch_and_revision_retune_only_the_revision() -> None:
