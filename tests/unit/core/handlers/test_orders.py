@@ -276,6 +276,32 @@ def test_every_node_writes_down_who_has_ordered_what_it_learns() -> None:
     assert [one.by for one in lone.done if isinstance(one, do.RecordStory) and one.by] == ["ada@robot1"]
 
 
+def test_a_node_that_has_not_agreed_an_order_tells_it_from_the_value_alone() -> None:
+    lone = Lone()
+    other = Node(
+        fleet=FLEET,
+        me="edge3",
+        durable=state_of("edge3"),
+        incarnation=7,
+        electorate=electorate_hash(FLEET),
+        rng=Random(1),
+        now=100.0,
+    )
+    other.start(100.0)
+    for hold in (None, Hold.PAUSE, Hold.PIN, Hold.RESUME, Hold.UNPIN):
+        if hold is not None:
+            lone.hold(hold)
+        learnt = Learnt(node="robot1", values=(lone.value(),))
+        other.handle(ev.LearntReceived(learnt=learnt, is_answer=True), 101.0)
+    who = "by ada@robot1 (new battery)"
+    assert [past.reason for past in other.history["merge"]][1:] == [
+        f"paused {who}",
+        f"pinned to edge1 {who}",
+        f"changed {who}",
+        f"changed {who}",
+    ]
+
+
 # --- flags -----------------------------------------------------------------------------------------------------------
 
 
