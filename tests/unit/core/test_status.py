@@ -405,7 +405,8 @@ def test_the_way_there_and_back_is_told_of_a_task_with_a_deadline(deadline_ms: f
 
 def test_an_explanation_says_whether_jobs_are_known_that_a_deadline_needs() -> None:
     node = make()
-    assert build_explanation(node, "merge", 100.0).knows_jobs is False
+    never = build_explanation(node, "merge", 100.0)
+    assert (never.knows_jobs, never.age_s) == (False, 0.0), "it was never judged"
     load = load_of("merge", cpu_cores=0.5, jobs=Jobs(time_s=0.1, cpu_s=0.05, done_hz=5.0, wanted_hz=5.0))
     owner = profile_of("edge1", memory_mb=100.0, memory_used_mb=1.0, cpu_used_cores=0.5, workers=(load,))
     for second in range(60):
@@ -764,9 +765,10 @@ def test_drops_have_an_age_and_an_input_its_way_in() -> None:
     node.joins_at = ("tcp/127.0.0.1:7458",)
     for now, dropped in ((100.0, 3), (110.0, 3), (120.0, 4), (190.0, 4)):
         count = StreamCount(stream="merge/in/0", drops=(("overflow", dropped),))
-        node.handle(ev.StreamsCounted(counts=(count, StreamCount(stream="merge/in/1"))), now)
+        once = StreamCount(stream="merge/in/2", drops=(("no_route", 1),))
+        node.handle(ev.StreamsCounted(counts=(count, StreamCount(stream="merge/in/1"), once)), now)
     snapshot = build_snapshot(node, 190.0)
-    assert [count.dropped_s for count in snapshot.tasks[0].streams] == [70.0, None]
+    assert [count.dropped_s for count in snapshot.tasks[0].streams] == [70.0, None, 90.0]
     text = render_status(snapshot_json(snapshot), 100, color=False)
     assert "dropped 4 overflow (none in the last minute, last 1m" in text
     assert "applications here join at tcp/127.0.0.1:7458 (mode client)" in text
@@ -853,6 +855,7 @@ def test_a_decision_and_a_vote_have_an_age() -> None:
     decision = build_snapshot(node, judged_at + 1.5).tasks[0].decision
     assert decision is not None
     assert decision.age_s == pytest.approx(1.5)
+    assert build_explanation(node, "merge", judged_at + 0.5).age_s == pytest.approx(0.5)
 
 
 def test_nodes_never_heard_are_listed_without_figures() -> None:
