@@ -774,6 +774,23 @@ def test_a_retry_resets_the_worker_that_is_meant_and_forgives_its_node() -> None
         assert of(batch, do.AnswerCommand)[0].result.detail == said
 
 
+def test_a_worker_that_runs_by_an_old_recipe_is_started_again_once() -> None:
+    edge = started("edge1")
+    edge.handle(ev.WorkerChanged(task="merge", state=WorkerState.READY), 100.0)
+    assert of(edge.handle(ev.DeadlineReached(), 100.1), do.RenewWorker) == []
+    batch = edge.handle(ev.RecipeCompared(task="merge", is_old=True), 100.2)
+    assert of(batch, do.RenewWorker) == [do.RenewWorker(task="merge")]
+    assert of(edge.handle(ev.DeadlineReached(), 100.3), do.RenewWorker) == []
+
+
+def test_what_a_worker_complains_of_is_in_the_next_profile() -> None:
+    edge = started("edge1")
+    edge.handle(ev.WorkerChanged(task="merge", state=WorkerState.READY), 100.0)
+    edge.handle(ev.WorkerTroubled(task="merge", count=2, text="ValueError: x"), 100.1)
+    (told,) = of(edge.handle(ev.ProfileSampled(device=SAMPLE), 102.0), do.PublishProfile)
+    assert told.profile.workers[0].reason == "callback raised 2 times: ValueError: x"
+
+
 def test_a_restart_is_for_a_worker_that_runs_here_and_is_no_failure() -> None:
     edge = make("edge1")
     for state in (WorkerState.STARTING, WorkerState.READY):
