@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from random import Random
 
 import pytest
 
 from support.beats import beat_of
 from support.fleets import fleet_of, node_of, task_of
+from support.states import state_of
 from zsched.config.load import check_bytes
+from zsched.core import events as ev
+from zsched.core import instructions as do
 from zsched.core.membership.beat_room import FRAME_BYTES, MAX_BEAT_BYTES, BeatRoom, beat_bytes, most_bytes
+from zsched.core.node import Node
 from zsched.core.values.beat import Beat, Grant
 from zsched.core.values.fleet import Fleet, WorkerSpec
 from zsched.core.values.model import MAX_COUNTER
@@ -190,6 +195,25 @@ def test_electors_of_more_exclusive_tasks_than_a_beat_has_room_for_stay_alive_an
     node = sim.node(ROBOTS[0])
     assert node.counters["beat_parts_left_out"] > 0
     assert "no room in a beat" in node.problems["beat"]
+
+
+def test_a_node_whose_beats_have_no_room_says_so_until_they_have() -> None:
+    node = Node(
+        fleet=fleet(200, 63),
+        me=ROBOTS[0],
+        durable=state_of(ROBOTS[0]),
+        incarnation=7,
+        electorate="e",
+        rng=Random(1),
+        now=100.0,
+    )
+    batch = *node.start(100.0), *node.handle(ev.DeadlineReached(), 100.2)
+    left_out = [200 - len(one.beat.learnt) for one in batch if isinstance(one, do.PublishBeat)]
+    assert node.counters["beat_parts_left_out"] == sum(left_out) > 0
+    assert node.problems["beat"].startswith(f"{left_out[-1]} parts have no room in a beat")
+    node.handle(ev.FleetChanged(fleet=fleet(20, 63)), 100.3)
+    node.handle(ev.DeadlineReached(), 100.5)
+    assert "beat" not in node.problems
 
 
 TEXT = """
