@@ -45,7 +45,7 @@ from zsched.core.values.messages import (
     Utilities,
 )
 from zsched.core.values.model import Acceptance, Allocation, Ballot, PeerState, RegisterState
-from zsched.core.values.plan import Direction, ReadyWhen, RoutePhase, WorkerRole
+from zsched.core.values.plan import Direction, ReadyWhen, RoutePhase, StreamCount, WorkerRole
 from zsched.core.values.profile import Echo, WorkerState
 
 T = TypeVar("T")
@@ -724,6 +724,29 @@ def test_beats_in_turn_are_no_news() -> None:
     ]
     assert told
     assert not any(one.is_news for one in told[1:])
+
+
+@pytest.mark.parametrize(
+    ("news", "is_calm"),
+    [
+        (ev.ProblemReported(source="disk", problem="slow"), True),
+        (ev.ProblemReported(source="fleet/document", problem="it is fetched"), False),
+        (ev.StreamsCounted(counts=(StreamCount(stream="merge/in/0", in_flight=1),)), False),
+        (accept(5, "robot2", allocation_of(5, "edge2", 3)), False),
+    ],
+    ids=["at rest", "a problem of the fleet", "a sample under way", "a value that is not learnt yet"],
+)
+def test_beats_say_that_a_node_is_calm_while_nothing_goes_on_there(news: ev.Event, *, is_calm: bool) -> None:
+    node, sent = started(learnt=allocation_of(4, "edge1", 2)), False
+    node.handle(news, 100.0)
+    for number in range(2, 35):
+        now = 100.0 + 0.2 * number
+        while node.next_deadline() < now:
+            for told in of(node.handle(ev.DeadlineReached(), node.next_deadline()), do.PublishBeat):
+                sent = told.beat.calm
+        for name in ("robot2", "robot3", *EDGES):
+            node.handle(ev.BeatReceived(beat=beat(name, number)), now)
+    assert sent is is_calm
 
 
 def test_after_a_stall_nobody_is_accused_whose_beat_waits() -> None:
