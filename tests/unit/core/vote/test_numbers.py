@@ -164,6 +164,30 @@ def test_a_lower_number_is_refused_and_told_a_higher_one_is_asked() -> None:
     assert [one.peer for one in of(todo, do.AskLearnt)] == ["robot2"]
 
 
+def test_an_accept_that_waits_for_a_lease_is_refused_when_its_task_leaves_the_fleet() -> None:
+    held = RegisterState(task="merge", creation=GENERATION, learnt=HELD)
+    value, bare = replace(ADOPTED, settled=True), fleet_of(of=NAMES, electors=ROBOTS, tasks=())
+    agreement = make(value, registers=(held,), stored={"0d": FLEET, "0e": bare})
+    ballot = Ballot(counter=9, node="robot3", incarnation=3, disk="d3")
+    accept = Accept(
+        task="merge",
+        acceptance=Acceptance(ballot=ballot, value=replace(HELD, revision=8, epoch=4, owner="robot3")),
+        electorate="e",
+        creation=GENERATION,
+        generation_id=value.generation_id,
+        number=value.number,
+    )
+    event = ev.AcceptAsked(request=4, asker="robot3", accept=accept)
+    assert of(agreed(agreement.acceptor.on_accept, event, 100.1), do.AnswerElection) == []
+    after = SetDocument(base_revision=value.revision, document="0e", tasks=()).apply(value)
+    told = Learnt(node="robot2", values=(), generation=GENERATION, fleet=after)
+    todo = agreed(agreement.on_learnt, ev.LearntReceived(learnt=told, is_answer=True), 100.2)
+    (answer,) = of(todo, do.AnswerElection)
+    assert isinstance(answer.answer, Refused)
+    assert (answer.request, answer.answer.refusal, answer.answer.ballot) == (4, Refusal.NUMBER, ballot)
+    assert not agreement.acceptor.has_parked
+
+
 def test_an_accept_under_a_lower_number_is_refused_too() -> None:
     agreement = make(WITH_EDGE)
     prepare = proposed(make())
