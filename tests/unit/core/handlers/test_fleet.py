@@ -10,14 +10,16 @@ import pytest
 
 from support.ballots import ballot_of
 from support.fleets import fleet_of, task_of, tuning_of
+from support.profiles import SAMPLE
 from support.states import state_of
 from support.storm import ELECTORATE, FLEET, ROBOTS, Storm, some_fleet
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.node import Node
 from zsched.core.status import build_snapshot
-from zsched.core.values.fleet import Fleet
+from zsched.core.values.fleet import Fleet, WorkerSpec
 from zsched.core.values.messages import Learnt, Prepare
+from zsched.core.values.profile import Renewal, WorkerState
 
 START = 100.0
 
@@ -158,6 +160,22 @@ def test_a_task_that_goes_ends_and_comes_back_with_what_it_had_promised() -> Non
     assert [one.task for one in states[0].registers] == ["other", "merge"], "what was promised stays on disk"
     adopt(node, fleet_of(task_of("merge"), task_of("other"), of=("edge1", "edge2", *ROBOTS)), START + 52)
     assert node.registers["merge"].state.promised == promised
+
+
+def test_the_worker_of_a_task_that_comes_back_is_not_taken_for_the_old_one() -> None:
+    task = task_of("merge", worker=WorkerSpec(command=("merge",)))
+    fleet, without = fleet_of(task), fleet_of(task_of("other"))
+    node = node_of(fleet, "edge1")
+    node.start(START)
+    node.handle(ev.WorkerChanged(task="merge", state=WorkerState.STARTING), START)
+    node.handle(ev.RecipeCompared(task="merge", is_old=True), START)
+    told = []
+    for second, there in enumerate((fleet, without, fleet), start=1):
+        now = START + 2 * second
+        batch = *adopt(node, there, now), *node.handle(ev.ProfileSampled(device=SAMPLE), now + 1)
+        *_, profile = (one.profile for one in batch if isinstance(one, do.PublishProfile))
+        told.append([load.renewal for load in profile.workers])
+    assert told == [[Renewal.DUE], [Renewal.NONE], [Renewal.NONE]]
 
 
 def test_a_changed_tuning_becomes_a_change_of_the_agreed_one() -> None:
