@@ -322,6 +322,35 @@ def test_a_fleet_value_that_this_elector_has_not_accepted_is_asked_for_and_not_l
     assert [it.peer for it in todo.send if isinstance(it, do.AskLearnt)] == ["robot2"], "once, for all questions"
 
 
+def asked_along_with(agreement: Agreement, fleet: FleetValue) -> ToDo:
+    """Questions under the number of `AGREED`, and a fleet value with them."""
+    prepares = tuple(replace(prepare(name), generation_id=AGREED.generation_id, number=AGREED.number) for name in TASKS)
+    ballots = Ballots(prepares=prepares, fleet=fleet)
+    return agreed(agreement.on_ballots, ev.BallotsAsked(request=9, asker="robot2", ballots=ballots), 100.0)
+
+
+@pytest.mark.parametrize(
+    ("told", "is_asked"),
+    [
+        (CHANGED, True),
+        (AGREED, False),
+        (replace(CHANGED, generation_id="77"), False),
+        (replace(CHANGED, fleet="other"), False),
+    ],
+    ids=["news", "known", "another generation's", "another fleet's"],
+)
+def test_only_a_newer_fleet_value_of_the_own_generation_is_asked_for(told: FleetValue, *, is_asked: bool) -> None:
+    todo = asked_along_with(elector_of_a_change(has_accepted=False), told)
+    assert any(isinstance(it, do.AskLearnt) for it in todo.send) is is_asked
+
+
+def test_a_node_that_knows_no_generation_asks_nobody_for_a_fleet_value() -> None:
+    blank = Agreement(
+        fleet=FLEET, me="robot1", durable=None, incarnation=7, electorate="e", rng=Random(1), now=100.0, stored={}
+    )
+    assert not any(isinstance(it, do.AskLearnt) for it in asked_along_with(blank, CHANGED).send)
+
+
 def test_the_word_of_a_change_is_proof_only_to_who_has_accepted_it() -> None:
     said = ev.LearntReceived(learnt=Learnt(node="robot3", values=(), fleet=CHANGED))
     one = elector_of_a_change()

@@ -264,11 +264,12 @@ def test_a_fleet_value_counts_once_its_document_is_on_disk() -> None:
     assert not agreement.acceptor.is_elector
 
 
-def test_the_document_of_a_value_that_is_older_than_the_learnt_one_is_not_fetched() -> None:
+def test_the_document_of_a_value_that_is_no_newer_than_the_learnt_one_is_not_fetched() -> None:
     agreement = make(WITH_EDGE)
-    older = Learnt(node="robot2", values=(), generation=GENERATION, fleet=replace(ADOPTED, document="0c"))
-    todo = agreed(agreement.on_learnt, ev.LearntReceived(learnt=older, is_answer=True), 100.1)
-    assert of(todo, do.FetchDocument) == []
+    for value in (ADOPTED, WITH_EDGE):
+        older = Learnt(node="robot2", values=(), generation=GENERATION, fleet=replace(value, document="0c"))
+        todo = agreed(agreement.on_learnt, ev.LearntReceived(learnt=older, is_answer=True), 100.1)
+        assert of(todo, do.FetchDocument) == []
     newer = replace(older, fleet=replace(WITHOUT_ROBOT1, revision=WITH_EDGE.revision + 1, document="0c"))
     todo = agreed(agreement.on_learnt, ev.LearntReceived(learnt=newer, is_answer=True), 100.2)
     assert [one.document for one in of(todo, do.FetchDocument)] == ["0c"]
