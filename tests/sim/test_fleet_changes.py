@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 
 from support.plays import FLEET, ROBOTS, TASK, Play
+from support.slices import slices
 from zsched.core.electorate.documents import Documents
 from zsched.core.values.electorate import CREATION_STEP
 from zsched.core.values.messages import ChangeFleet, CommandOutcome
@@ -164,7 +165,7 @@ def test_an_elector_without_the_document_accepts_nothing_until_it_has_fetched_it
 # --- schedules -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("block", [0, *(pytest.param(block, marks=pytest.mark.long) for block in (1, 2))])
+@pytest.mark.parametrize("block", slices(3))
 def test_no_schedule_of_changes_under_faults_breaks_what_must_hold(block: int) -> None:
     assert [found for seed in range(5 * block, 5 * block + 5) if (found := fleets.play(seed)[0])] == []
 

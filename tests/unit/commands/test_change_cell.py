@@ -14,6 +14,7 @@ from typer.testing import CliRunner, Result
 
 from support.fleet_values import fleet_value_of
 from support.schemas import faults
+from support.slices import slices
 from zsched.adapters.host.operator_socket import Json, OperatorSocket
 from zsched.adapters.host.state_file import StateFile, sync_folder
 from zsched.cli import app
@@ -393,7 +394,7 @@ def test_nobody_starts_it_and_the_operator_takes_it_back(site: Site, monkeypatch
     assert site.cells["hall-a"].flags == []
 
 
-@pytest.mark.parametrize("number", range(9))
+@pytest.mark.parametrize("number", slices(9))
 @pytest.mark.parametrize("call", ["_put_one_away", "_put"])
 def test_files_that_were_changed_in_part_are_changed_to_the_end(
     site: Site, monkeypatch: pytest.MonkeyPatch, call: str, number: int
@@ -415,7 +416,7 @@ def test_files_that_were_changed_in_part_are_changed_to_the_end(
     check_arrived(site)
 
 
-@pytest.mark.parametrize("number", range(9))
+@pytest.mark.parametrize("number", slices(9))
 def test_a_way_back_that_was_broken_off_goes_on_either_way(
     site: Site, monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
@@ -440,7 +441,7 @@ def test_a_way_back_that_was_broken_off_goes_on_either_way(
     check_arrived(site)
 
 
-@pytest.mark.parametrize("number", range(12))
+@pytest.mark.parametrize("number", slices(12))
 def test_a_way_back_that_was_broken_off_between_two_files_goes_on(
     site: Site, monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:

@@ -15,6 +15,7 @@ import pytest
 from support.allocations import allocation_of
 from support.ballots import ballot_of
 from support.fleets import fleet_of, task_of, tuning_of
+from support.slices import slices
 from support.states import state_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
@@ -31,7 +32,6 @@ from zsched_lab.sim.simulator import Simulator
 TASK = "merge"
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
 APPLIED = (do.ApplyRoutes, do.SetRole, do.StartWorker, do.StopWorker, do.RecordStory)
-SLICES = range(4)
 
 
 def fleet(*, exclusive: bool = False) -> Fleet:
@@ -191,7 +191,7 @@ def test_an_uncut_schedule_persists_promises_acceptances_and_learnt_values() -> 
     assert base_run() == dirty, "not deterministic: the sweep would cut other batches than it counts"
 
 
-@pytest.mark.parametrize("part", range(4))
+@pytest.mark.parametrize("part", slices(4))
 def test_every_prefix_of_every_dirty_batch_of_a_move_is_safe(part: int) -> None:
     """Exhaustive: one schedule per (dirty batch, prefix); the node crashes there and comes back from its disk."""
     points = [(at, keep) for at, length in enumerate(base_run()) for keep in range(length + 1)]
@@ -201,7 +201,7 @@ def test_every_prefix_of_every_dirty_batch_of_a_move_is_safe(part: int) -> None:
         assert watch.cuts == 1, (at, keep)
 
 
-@pytest.mark.parametrize("part", range(2))
+@pytest.mark.parametrize("part", slices(2))
 def test_crashes_in_the_middle_of_any_batch_never_let_two_owners_work(part: int) -> None:
     """An exclusive task: its leases live in memory, and a restart must not forget that it granted one."""
     for seed in range(part * 10, part * 10 + 10):
@@ -210,7 +210,7 @@ def test_crashes_in_the_middle_of_any_batch_never_let_two_owners_work(part: int)
         run(Watch(sim, rng=rng))
 
 
-@pytest.mark.parametrize("part", SLICES)
+@pytest.mark.parametrize("part", slices(4))
 def test_crashes_in_the_middle_of_any_batch_never_break_agreement(part: int) -> None:
     """By seed: up to six nodes crash within a batch, at once or one after the other, with and without loss."""
     for seed in range(part * 10, part * 10 + 10):
