@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from zsched.core.hop.books import added, closed, together, unaccounted
+from zsched.core.hop.books import added, closed, together, unaccounted, without
 from zsched.core.values.plan import StreamCount
 
 WHOLE = StreamCount(
@@ -66,3 +66,15 @@ def test_counters_of_a_stream_that_has_gone_are_nobodys() -> None:
     other = replace(WHOLE, stream="other/in/0")
     assert added((WHOLE,), {"other/in/0": other}) == (WHOLE,)
     assert added((WHOLE, other), {"other/in/0": other}) == (WHOLE, together(other, other))
+
+
+def test_what_only_one_of_two_has_counted_is_the_sum() -> None:
+    known, unknown = StreamCount(stream="merge/in/0", acknowledged=7, in_flight=2), StreamCount(stream="merge/in/0")
+    for both in (together(known, unknown), together(unknown, known)):
+        assert (both.acknowledged, both.in_flight) == (7, 2)
+    assert together(unknown, unknown).acknowledged is None
+
+
+def test_a_reason_for_which_nothing_is_left_is_not_named() -> None:
+    part = StreamCount(stream="merge/in/0", drops=(("overflow", 4), ("no_route", 1)))
+    assert without(WHOLE, part).drops == (("no_route", 5),)
