@@ -236,3 +236,41 @@ def test_another_node_cannot_hold_back_the_inputs_of_a_relay_by_standing_still()
     say(books, "a", "robot2", 0, 1.0)
     assert books.settled("a", 1.5) == 0
     assert books.settled("a", 1.0 + STALLED_S + 0.1) == 6
+
+
+def test_who_had_everything_and_stands_still_from_then_on_stops_the_inputs_of_others_no_longer() -> None:
+    books = sender(2)
+    for name in ("a", "b"):
+        ack(books, name, 2, 1.0)
+    books.note_put(None, None, 10, 2.0)
+    books.look_after(2.0)
+    ack(books, "b", 3, 2.1)
+    assert books.settled("b", 2.0 + STALLED_S) == 2
+    assert books.settled("b", 2.1 + STALLED_S) == 3
+
+
+def test_an_end_marker_that_was_put_a_moment_ago_is_not_put_again() -> None:
+    books = sender(2)
+    ack(books, "a", 2, 1.0)
+    books.note_end(EndMarker(epoch=1, count=2), 5.0)
+    books.look_after(4.99 + RESEND_S)
+    assert books.owing() == ()
+    books.look_after(5.01 + RESEND_S)
+    assert books.owing() == ("a",)
+
+
+def test_a_receiver_that_comes_before_the_first_sample_is_owed_nothing() -> None:
+    books = sender()
+    ack(books, "a", 0, 1.0)
+    assert (books.owing(), books.next_deadline(1.0)) == ((), None)
+    assert books.skip_marker("a", 0, 1.0) == EndMarker(epoch=0, count=0)
+
+
+def test_a_new_life_has_had_what_its_own_node_has_acknowledged_and_no_other() -> None:
+    books = sender(6)
+    say(books, "a", "robot1", 5, 1.0)
+    say(books, "b", "robot2", 3, 1.0)
+    say(books, "c", "robot1", 0, 2.0)
+    say(books, "d", "robot2", 0, 2.0)
+    say(books, "e", "robot3", 0, 2.0)
+    assert [books.skip_marker(name, 6, 2.0).had for name in ("c", "d", "e")] == [5, 3, None]
