@@ -240,3 +240,14 @@ def test_after_it_shrank_it_grows_later_each_time_and_soon_again_once_the_link_w
         room.look(Account(acked=acked, held=0, round_trip_s=0.0), now)
     shrink()
     assert until_it_grows() < 2 * PAUSE_S
+
+
+@pytest.mark.parametrize(("later_s", "expected"), [(-0.01, LARGE), (0.01, SMALL)])
+def test_a_long_way_that_takes_nothing_is_given_two_round_trips_more(later_s: float, expected: int) -> None:
+    room, round_trip_s = Room(), 0.25
+    for now, acked in ((0.0, 0), (0.5, LARGE), (1.0, LARGE)):
+        room.look(Account(acked=acked, held=LARGE, round_trip_s=round_trip_s), now)
+    full_since = 0.5
+    assert room.size == LARGE
+    seen = Account(acked=LARGE, held=LARGE, round_trip_s=round_trip_s)
+    assert room.look(seen, full_since + BACKLOG_S + 2 * round_trip_s + later_s) == expected
