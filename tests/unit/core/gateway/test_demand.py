@@ -250,7 +250,8 @@ def test_a_task_that_gets_less_than_its_machine_s_figures_say_is_remembered_ther
     demands, pinned = Demands(), told(9.0, got=0.5, used=2.0)
     demands.learn("merge", pinned, 0.0)
     assert demands.experience("merge", pinned) == (1.0, 1.0), "it has just come"
-    demands.learn("merge", pinned, EVERY_S)
+    assert demands.learn("merge", pinned, EVERY_S), "its need is the same, and it is scored anew all the same"
+    assert not demands.learn("merge", pinned, EVERY_S)
     share, stretch = demands.experience("merge", pinned)
     assert share == pytest.approx(5 / 9)
     assert stretch == pytest.approx(2.0)
@@ -258,6 +259,7 @@ def test_a_task_that_gets_less_than_its_machine_s_figures_say_is_remembered_ther
     assert demands.experience("merge", left) == (share, stretch), "it does not look better once the task has left"
     assert demands.experience("merge", profile(0.0, cpu=1.0)) == (1.0, 1.0), "another load may be another story"
     assert demands.experience("merge", profile(0.0, cpu=1.5, node="edge2")) == (1.0, 1.0)
+    assert demands.experience("merge", profile(0.0, cpu=None)) == (1.0, 1.0), "nobody knows what others use"
     demands.learn("merge", told(9.0, used=2.0), 2 * EVERY_S)
     assert demands.experience("merge", pinned) == (1.0, 1.0), "it gets all again"
 
@@ -317,3 +319,26 @@ def test_a_job_of_several_threads_takes_elsewhere_what_it_takes_here() -> None:
     demands = Demands()
     demands.learn("merge", profile(2.0, jobs=Jobs(time_s=0.5, cpu_s=1.5, done_hz=2.0, wanted_hz=2.0)), 0.0)
     assert getattr(demands.job("merge"), "work_s", 0.0) == 0.5
+
+
+def test_jobs_that_take_longer_than_foreseen_are_remembered_though_all_of_them_are_done() -> None:
+    demands, slow = Demands(), told(2.0, got=2 / 3, used=1.0)
+    for now in (0.0, EVERY_S):
+        demands.learn("merge", slow, now)
+    assert demands.experience("merge", slow) == (1.0, pytest.approx(1.5))
+
+
+@pytest.mark.parametrize(
+    "jobs",
+    [
+        pytest.param(Jobs(time_s=0.1, cpu_s=0.1, done_hz=4.0, wanted_hz=8.0), id="undone, and no word of why"),
+        pytest.param(Jobs(time_s=0.1, cpu_s=0.1, wait_s=0.0, done_hz=4.0, wanted_hz=4.0), id="all done"),
+    ],
+)
+def test_who_needed_more_before_and_does_not_say_that_it_lacks_a_cpu_gets_its_share(jobs: Jobs) -> None:
+    demands, before = Demands(), profile(0.6, cpu=1.0)
+    now_on_full = profile(0.4, cpu=STARVED_CPU_RATIO * before.cpu_cores, jobs=jobs)
+    for number, word in enumerate((before, before, now_on_full, now_on_full)):
+        demands.learn("merge", word, number * EVERY_S)
+    assert demands.at(TASK, now_on_full).cpu_cores == 0.6
+    assert demands.experience("merge", now_on_full)[0] == 1.0
