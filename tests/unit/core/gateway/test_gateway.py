@@ -134,3 +134,19 @@ def test_an_owner_without_a_fresh_profile_or_worker_is_not_learnt_from() -> None
 
     gateway.learn_demand("merge", "edge1", TTL_S)
     assert gateway.demand(TASK, profile()) == Demand(cpu_cores=1.5, memory_mb=600.0)
+
+
+def test_profiles_are_fresh_together_until_the_first_of_them_is_not() -> None:
+    gateway = gateway_with(profile(0))
+    assert gateway.absorb(profile(0, node="edge2"), 1.0) is None
+    assert gateway.fresh_until(1.0) == TTL_S
+    assert gateway.fresh_until(TTL_S + 0.5) == TTL_S + 1.0
+
+
+def test_a_changed_fleet_keeps_the_profiles_of_the_nodes_that_stay() -> None:
+    gateway = gateway_with(profile(5), profile(5, node="edge2"))
+    gateway.adopt(fleet_of(task_of(candidates=("edge1",)), of=("edge1", "robot1"), electors=("robot1",)))
+    assert gateway.fresh("edge1", 1.0) == profile(5)
+    assert gateway.absorb(profile(4), 1.0) == "stale"
+    assert gateway.newest("edge2", 1.0) is None
+    assert gateway.absorb(profile(6, node="edge2"), 1.0) == "foreign"
