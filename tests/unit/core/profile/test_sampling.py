@@ -64,6 +64,11 @@ def test_ticks_are_no_change() -> None:
     assert next_s(pace, replace(IDLE, cpu_used_cores=0.4, memory_used_mb=1010.0), 101.0) == REST_S
 
 
+def test_a_worker_whose_use_was_not_measured_is_not_at_work() -> None:
+    unknown = replace(IDLE, workers=(replace(IDLE.workers[0], cpu_cores=None),))
+    assert next_s(at_rest(), unknown, 101.0) == REST_S
+
+
 def test_a_load_that_creeps_is_one_in_the_end() -> None:
     pace = at_rest()
     found = [next_s(pace, replace(IDLE, cpu_used_cores=0.1 + 0.15 * n), 100.0 + n) for n in range(1, 4)]
