@@ -1,0 +1,37 @@
+"""Which threads of a worker would use a whole core: by looks at how long each of them has run and waited."""
+
+from __future__ import annotations
+
+import pytest
+
+from zsched.core.profile.appetite import APPETITE_S, Appetite, Thread
+
+HUNGRY, CALM, NEW = (7, "hungry"), (7, "calm"), (7, "new")
+
+
+def looked(seconds: int, *, with_new: bool = False) -> Appetite:
+    """Threads that were looked at once a second: one runs half of the time and waits for the rest, one runs seldom."""
+    appetite = Appetite()
+    for now in range(1, seconds + 1):
+        known: dict[Thread, tuple[float, float]] = {HUNGRY: (0.5 * now, 0.5 * now), CALM: (0.1 * now, 0.0)}
+        appetite.look({NEW: (0.0, 0.0), **known} if with_new and now == seconds else known, float(now))
+    return appetite
+
+
+def test_a_thread_that_runs_or_waits_all_the_time_wants_a_core_and_the_others_what_they_use() -> None:
+    assert looked(20).wanted_cores() == pytest.approx(1.1, abs=0.01)
+
+
+def test_a_thread_that_has_been_busy_for_a_moment_wants_no_core_yet() -> None:
+    assert looked(1).wanted_cores() is None
+    assert looked(1 + round(APPETITE_S)).wanted_cores() is None
+
+
+def test_a_thread_that_has_just_begun_hides_no_older_one() -> None:
+    assert looked(20, with_new=True).wanted_cores() == pytest.approx(1.1, abs=0.01)
+
+
+def test_a_look_at_the_same_moment_changes_nothing() -> None:
+    appetite = looked(20)
+    appetite.look({HUNGRY: (1e6, 1e6)}, 20.0)
+    assert appetite.wanted_cores() == looked(20).wanted_cores()
