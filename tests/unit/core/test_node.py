@@ -1010,3 +1010,26 @@ def test_a_peer_that_comes_hears_of_this_machine_soon(life: int) -> None:
     node.handle(ev.BeatReceived(beat=beat("edge1", 2, incarnation=life)), came)
     soon = [came + 0.1 * step for step in range(1, 4)]
     assert [at for at in soon for _ in of(node.handle(ev.DeadlineReached(), at), do.PublishProfile)]
+
+
+def test_a_gap_at_a_move_is_in_the_story_of_its_task_once() -> None:
+    node = make("robot1", learnt=allocation_of(2, "edge1", 2))
+    node.start(100.0)
+    gap = StreamCount(stream="merge/out/0", move_gap_s=0.25, move_epoch=2)
+    foreign = replace(gap, stream="gone/out/0")
+    batches = [node.handle(ev.StreamsCounted(counts=(gap, foreign)), now) for now in (101.0, 102.0)]
+    told = [one for batch in batches for one in of(batch, do.RecordStory) if one.gap_s is not None]
+    assert [(one.stage, one.task, one.epoch, one.gap_s) for one in told] == [("route", "merge", 2, 0.25)]
+    assert told[0].text.startswith("merge/out/0: 250 ms")
+
+
+@pytest.mark.parametrize(("epoch", "waits"), [(1, False), (2, True)])
+def test_streams_wait_for_a_new_owner_from_its_own_lack_on(epoch: int, *, waits: bool) -> None:
+    """What a relay misses of a slot that has been left is no word about the newest."""
+    node = started(learnt=allocation_of(1, "edge1"))
+    node.handle(learnt_from("robot2", allocation_of(2, "edge2", 2)), 101.0)
+    for event in (ev.SlotReady(task="merge", epoch=2), ev.SlotFlipped(task="merge", epoch=2)):
+        node.handle(event, 102.0)
+    node.handle(ev.SlotReady(task="merge", epoch=epoch, is_ready=False), 103.0)
+    told = [one for one in build_snapshot(node, 113.0).tasks[0].problems if "streams have waited" in one]
+    assert [one.partition(": ")[0] for one in told] == ["this robot's streams have waited for edge2 for 10 s"] * waits
