@@ -238,8 +238,9 @@ def test_a_worker_that_was_never_measured_has_no_figure() -> None:
     profiler.absorb(device(2.0, 1000.0, load(None, None)), (), now=0.0)
     profiler.absorb(device(2.0, 1000.0, load(None, None)), (), now=0.2)
 
-    own = taken(profiler, 0.2).worker("merge")
-    assert own == load(None, None)
+    profile = taken(profiler, 0.2)
+    assert profile.worker("merge") == load(None, None)
+    assert profile.cores_of("merge") == 0.0
 
 
 def test_states_come_from_the_node_not_from_the_sample() -> None:
@@ -252,6 +253,7 @@ def test_states_come_from_the_node_not_from_the_sample() -> None:
         ("merge", WorkerState.FAILED),
     ]
     assert profile.worker("merge") == load(0.5, 100.0, WorkerState.FAILED)
+    assert [profile.cores_of(task) for task in ("merge", "alpha", "other")] == [0.5, 0.0, 0.0]
 
 
 # --- when it is sent -----------------------------------------------------------------------------------------------
