@@ -157,3 +157,23 @@ def test_time_runs_on_while_somebody_looks() -> None:
     assert [time.at(now) for now in (5.0, 5.2, 5.4)] == pytest.approx([5.0, 5.2, 5.4])
     assert time.at(9.4) == pytest.approx(5.4 + STEP_S)
     assert time.at(9.5) == pytest.approx(5.5 + STEP_S)
+
+
+def test_a_jump_is_taken_back_to_numbers_within_it_only() -> None:
+    source = Source.at(0)
+    heard(source, 0, 1, 2, 8, in_turn=False)
+    before = (source.arrived, source.lost)
+    assert not source.go_back(2), "it has come before the jump"
+    assert (source.arrived, source.lost) == before
+    assert source.go_back(3)
+    assert (source.arrived, source.lost) == (4, 0)
+    assert not source.go_back(3), "there is none any more"
+
+
+def test_an_acknowledgement_says_up_to_where_something_is_missing_while_it_is() -> None:
+    source = Source.at(0)
+    heard(source, 0, 4, now=1.0)
+    source.until = 4
+    assert (source.ack(7).has_gap, source.ack(7).until) == (True, 4)
+    heard(source, 1, now=1.1)
+    assert (source.ack(7).has_gap, source.ack(7).until) == (False, 0)
