@@ -274,3 +274,23 @@ def test_class_latest_asks_how_far_the_receiver_is_before_it_puts_anything_again
     books.take_owed()
     books.hear(ack(0, 6, lost=4), "1", 20.1)
     assert books.take_owed() is NOTHING, "a newer one is on its way, behind which nothing older is wanted"
+
+
+def test_a_lane_is_full_only_for_a_worker_that_acknowledges() -> None:
+    books = lane()
+    for _ in range(16):
+        sent(books, at=10.0)
+    assert not books.is_full(), "nobody may ever acknowledge"
+    acknowledged(books, 0, 10.1)
+    assert books.is_full()
+    acknowledged(books, 1, 10.2)
+    assert not books.is_full()
+
+
+def test_a_lane_is_full_of_few_large_samples_too() -> None:
+    books = lane()
+    acknowledged(books, 0, 10.0)
+    sent(books, at=10.0, size=KEPT_BYTES_LATEST - 1)
+    assert not books.is_full()
+    sent(books, at=10.0, size=1)
+    assert books.is_full()
