@@ -153,6 +153,12 @@ def test_counters_add_up_and_the_books_balance_also_when_an_application_dies() -
     assert unaccounted(total) == 0
 
 
+def test_an_application_that_goes_with_answers_only_has_lost_none_that_are_known() -> None:
+    made = shares("robot1/plan")
+    made.note_counts((StreamCount(stream="t/out/0", messages=5),))
+    assert made.go(NOW) == ()
+
+
 def test_counters_of_streams_that_are_not_its_own_are_not_taken() -> None:
     made = shares("robot1/jobs")
     made.note_counts((count(5, 5, 0, stream="t/in/1"), count(5, 5, 0, stream="u/in/0")))
