@@ -774,6 +774,9 @@ def test_drops_have_an_age_and_an_input_its_way_in() -> None:
     assert "applications here join at tcp/127.0.0.1:7458 (mode client)" in text
     node.handle(ev.StreamsCounted(counts=(StreamCount(stream="merge/in/0", drops=(("overflow", 5),)),)), 191.0)
     assert "(none in" not in render_status(snapshot_json(build_snapshot(node, 191.0)), 100, color=False)
+    node.handle(ev.StreamsCounted(counts=(StreamCount(stream="merge/in/0"),)), 192.0)
+    (count,) = build_snapshot(node, 193.0).tasks[0].streams
+    assert count.dropped_s is None, "another relay counts, and has dropped nothing"
 
 
 # --- the line --------------------------------------------------------------------------------------------------------
