@@ -325,7 +325,7 @@ def test_jobs_that_take_longer_than_foreseen_are_remembered_though_all_of_them_a
     demands, slow = Demands(), told(2.0, got=2 / 3, used=1.0)
     for now in (0.0, EVERY_S):
         demands.learn("merge", slow, now)
-    assert demands.experience("merge", slow) == (1.0, pytest.approx(1.5))
+    assert demands.experience("merge", slow) == pytest.approx((1.0, 1.5))
 
 
 @pytest.mark.parametrize(
