@@ -17,8 +17,9 @@ from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.node import Node
 from zsched.core.status import build_snapshot
-from zsched.core.values.fleet import Fleet, WorkerSpec
+from zsched.core.values.fleet import Fleet, StreamRule, WorkerSpec
 from zsched.core.values.messages import Learnt, Prepare
+from zsched.core.values.plan import Direction, StreamCount
 from zsched.core.values.profile import Renewal, WorkerState
 
 START = 100.0
@@ -176,6 +177,20 @@ def test_the_worker_of_a_task_that_comes_back_is_not_taken_for_the_old_one() -> 
         *_, profile = (one.profile for one in batch if isinstance(one, do.PublishProfile))
         told.append([load.renewal for load in profile.workers])
     assert told == [[Renewal.DUE], [Renewal.NONE], [Renewal.NONE]]
+
+
+def test_what_a_task_dropped_before_it_left_the_fleet_is_forgotten_when_it_comes_back() -> None:
+    rule = StreamRule(direction=Direction.INPUT, from_template="{robot}/map", to_template="{target}/merge/{robot}/map")
+    fleet, without = fleet_of(task_of("merge", rules=(rule,))), fleet_of(task_of("other"))
+    node = node_of(fleet)
+    node.start(START)
+    dropped = ev.StreamsCounted(counts=(StreamCount(stream="merge/in/0", drops=(("overflow", 3),)),))
+    node.handle(dropped, START + 1)
+    for second, there in enumerate((without, fleet), start=2):
+        adopt(node, there, START + second)
+    node.handle(dropped, START + 10)
+    (count,) = build_snapshot(node, START + 15).tasks[0].streams
+    assert count.dropped_s == 5.0
 
 
 def test_a_changed_tuning_becomes_a_change_of_the_agreed_one() -> None:
