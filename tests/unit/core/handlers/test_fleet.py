@@ -8,6 +8,7 @@ from random import Random
 
 import pytest
 
+from support.allocations import allocation_of
 from support.ballots import ballot_of
 from support.fleets import fleet_of, task_of, tuning_of
 from support.profiles import SAMPLE
@@ -180,17 +181,30 @@ def test_the_worker_of_a_task_that_comes_back_is_not_taken_for_the_old_one() -> 
 
 
 def test_what_a_task_dropped_before_it_left_the_fleet_is_forgotten_when_it_comes_back() -> None:
-    rule = StreamRule(direction=Direction.INPUT, from_template="{robot}/map", to_template="{target}/merge/{robot}/map")
-    fleet, without = fleet_of(task_of("merge", rules=(rule,))), fleet_of(task_of("other"))
+    rule = StreamRule(direction=Direction.INPUT, from_template="{robot}/map", to_template="{target}/{task}/{robot}/map")
+    stays, goes = (task_of(name, rules=(rule,)) for name in ("other", "merge"))
+    node = node_of(fleet_of(goes, stays))
+    node.start(START)
+    counts = tuple(StreamCount(stream=f"{name}/in/0", drops=(("overflow", 3),)) for name in ("merge", "other"))
+    node.handle(ev.StreamsCounted(counts=counts), START + 1)
+    for second, there in enumerate((fleet_of(stays), fleet_of(goes, stays)), start=2):
+        adopt(node, there, START + second)
+    node.handle(ev.StreamsCounted(counts=counts), START + 10)
+    ages = {task.name: task.streams[0].dropped_s for task in build_snapshot(node, START + 15).tasks}
+    assert ages == {"merge": 5.0, "other": 14.0}
+
+
+def test_a_task_that_comes_back_has_the_first_owner_that_it_had() -> None:
+    fleet, without = fleet_of(task_of("merge"), task_of("other")), fleet_of(task_of("other"))
     node = node_of(fleet)
     node.start(START)
-    dropped = ev.StreamsCounted(counts=(StreamCount(stream="merge/in/0", drops=(("overflow", 3),)),))
-    node.handle(dropped, START + 1)
-    for second, there in enumerate((without, fleet), start=2):
-        adopt(node, there, START + second)
-    node.handle(dropped, START + 10)
-    (count,) = build_snapshot(node, START + 15).tasks[0].streams
-    assert count.dropped_s == 5.0
+    value = allocation_of(1, "edge1")
+    node.handle(ev.LearntReceived(learnt=Learnt(node="robot2", values=(value,)), is_answer=True), START)
+    adopt(node, without, START + 1)
+    adopt(node, fleet, START + 2)
+    owners = {task.name: task.owner for task in build_snapshot(node, START + 2).tasks}
+    assert owners == {"merge": "edge1", "other": None}
+    assert node.executors["merge"].owner == "edge1", "its streams go there"
 
 
 def test_a_changed_tuning_becomes_a_change_of_the_agreed_one() -> None:
