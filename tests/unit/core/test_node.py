@@ -387,6 +387,7 @@ def test_a_candidate_that_begins_anew_is_not_ready_by_the_word_of_its_former_lif
     node = make("edge1", learnt=allocation_of(1, "edge1"))
     node.start(100.0)
     node.handle(ev.BeatReceived(beat=beat("edge2")), 100.0)
+    assert [one.sparing for one in node.lacking(100.0)] == [Sparing.STARTING], "no profile of it has come"
     ready = profile_of("edge2", incarnation=3, workers=(load_of("merge", WorkerState.READY),))
     node.handle(ev.ProfileReceived(profile=ready), 100.0)
     assert node.lacking(100.0) == ()
@@ -1033,3 +1034,11 @@ def test_streams_wait_for_a_new_owner_from_its_own_lack_on(epoch: int, *, waits:
     node.handle(ev.SlotReady(task="merge", epoch=epoch, is_ready=False), 103.0)
     told = [one for one in build_snapshot(node, 113.0).tasks[0].problems if "streams have waited" in one]
     assert [one.partition(": ")[0] for one in told] == ["this robot's streams have waited for edge2 for 10 s"] * waits
+
+
+@pytest.mark.parametrize(("voter", "late"), [("robot2", 1), ("edge1", 0)])
+def test_utilities_of_who_has_no_vote_are_nothing_that_comes_late(voter: str, late: int) -> None:
+    """Edges hear the question, too."""
+    node = started()
+    node.handle(ev.UtilityReceived(gather=77, utilities=Utilities(voter=voter, vectors=())), 100.0)
+    assert node.counters["utility_late"] == late
