@@ -12,11 +12,22 @@ from support.allocations import allocation_of
 from support.decisions import figures_of
 from support.fleets import task_of, tuning_of
 from zsched.core.scheduler.decision import decide_again, verdict_of
-from zsched.core.scheduler.explain import Explained, explained, judged_again, owner_cpu_below, utility_of, without
+from zsched.core.scheduler.explain import (
+    Explained,
+    explained,
+    judged_again,
+    owner_cpu_below,
+    seen_by,
+    utility_of,
+    without,
+)
 from zsched.core.scheduler.scoring import pick
 from zsched.core.values.decision import DampingMemory, Decision, Need
 from zsched.core.values.model import (
     Aggregate,
+    Allocation,
+    Asked,
+    Pin,
     ScoreForm,
     Tuning,
     Utility,
@@ -120,6 +131,43 @@ def test_a_candidate_that_lacks_worth_moves_the_task_when_it_has_it() -> None:
         assert pick({**totals, best.node: needed - best.penalty + change}, "edge1") == winner
 
 
+def test_the_worth_that_is_named_lies_above_the_middle_between_two_steps() -> None:
+    """An owner's total is a step of 1/256 here, and half a step above it rounds to the next one: 0.5 + 1/512."""
+    decision = decision_of(replace(TUNING, bonus=0.0))
+    worth = {"edge1": 0.5, "edge2": 0.4, "edge3": 0.3}
+    vectors = tuple(
+        replace(vector, utilities=tuple(replace(one, value=worth[one.candidate]) for one in vector.utilities))
+        for vector in decision.figures.vectors
+    )
+    told = explained(judged_again(decision, replace(decision.figures, vectors=vectors)))
+    assert told.changes[0] == "edge2 would have to be worth 0.5020 instead of 0.4000 (+0.1020)"
+    assert [pick({"edge1": 0.5, "edge2": one}, "edge1") for one in (0.5019, 0.5020)] == ["edge1", "edge2"]
+
+
+def test_a_robot_that_does_not_know_the_owner_s_cpu_term_goes_on_as_it_does() -> None:
+    decision = decision_of()
+    told = explained(decision)
+    owner, rival = told.candidates[0], told.candidates[1]
+    assert rival.total is not None
+    standing = decide_again(decision.figures).standing
+
+    def level(*knowing: str) -> float | None:
+        vectors = [
+            vector
+            if vector.voter in knowing
+            else replace(vector, utilities=tuple(replace(one, cpu=None) for one in vector.utilities))
+            for vector in standing.vectors
+        ]
+        assert rival.total is not None
+        return owner_cpu_below(decision.figures, replace(standing, vectors=tuple(vectors)), owner, rival.total)
+
+    of_all, of_two = level(*ROBOTS), level("robot1", "robot2")
+    assert of_all is not None
+    assert of_two is not None
+    assert of_two < of_all, "two terms must make up for what the third does not lose"
+    assert level() is None
+
+
 def test_the_level_of_the_owner_s_cpu_that_is_named_is_the_one_at_which_another_leads() -> None:
     decision = decision_of()
     told = explained(decision)
@@ -195,6 +243,59 @@ def test_an_operator_s_flags_stand_beside_the_sums() -> None:
         "edge2 cannot have it: drained by ada",
         "edge3 cannot have it: drained by ada",
     )
+
+
+ADA = Asked(by="ada@robot1", reason="new battery")
+
+
+def held(*, is_hard: bool = False, is_paused: bool = False, is_pinned: bool = True) -> Allocation:
+    pin = Pin(node="edge1", asked=ADA, revision=4, is_hard=is_hard) if is_pinned else None
+    return allocation_of(4, "edge1", 3, tuning=TUNING, pinned=is_pinned, pin=pin, paused=is_paused)
+
+
+@pytest.mark.parametrize(
+    ("allocation", "is_left", "word"),
+    [
+        (held(is_pinned=False), False, None),
+        (held(is_paused=True, is_pinned=False), False, "paused"),
+        (held(is_paused=True, is_pinned=False), True, "paused"),
+        (held(is_paused=True), False, "paused"),
+        (held(), False, "pinned"),
+        (held(), True, None),
+        (held(is_hard=True), False, "pinned"),
+        (held(is_hard=True), True, "pinned"),
+    ],
+)
+def test_an_order_that_holds_a_task_is_named_and_only_a_hard_pin_holds_one_that_must_leave(
+    allocation: Allocation, is_left: bool, word: str | None
+) -> None:
+    """Too few electors are heard, so that no move is proposed at all."""
+    drained = "drained by ada" if is_left else ""
+    told = explained(decision_of(allocation=allocation, drained=drained, electors_heard=("robot1",)))
+    named = [text for text in told.changes if text.startswith("an operator must end")]
+    assert named == ([] if word is None else [f"an operator must end that the task is {word}"])
+
+
+# --- what one robot sees ---------------------------------------------------------------------------------------------
+
+
+def test_a_sight_names_who_is_heard_and_who_is_not() -> None:
+    """The voters are not the electors here: the one that went may be another than the one that is silent."""
+    decision = decision_of(
+        present=("robot1", "robot3"), electors=("edge1", "edge2", "robot1"), electors_heard=("edge1", "robot1")
+    )
+    sight = seen_by(decision, "robot1", "robot3")
+    assert (sight.robots, sight.gone) == (("robot1", "robot3"), ("robot2",))
+    assert (sight.electors, sight.electors_silent) == (("edge1", "robot1"), ("edge2",))
+    assert (sight.best, sight.is_heard, sight.is_own) == ("edge1", True, False)
+    assert seen_by(decision, "robot3", "robot3").is_own
+
+
+def test_a_robot_that_is_not_heard_sees_nobody_as_the_best() -> None:
+    decision = decision_of()
+    fewer = judged_again(decision, replace(decision.figures, vectors=decision.figures.vectors[:2]))
+    sight = seen_by(fewer, "robot3", "robot1")
+    assert (sight.best, sight.is_heard) == (None, False)
 
 
 # --- gauges ----------------------------------------------------------------------------------------------------------
