@@ -479,6 +479,43 @@ def test_a_worker_that_was_told_to_stop_at_once_has_nothing_to_hear() -> None:
     assert not one.may_work_unleased(1.0)
 
 
+def adopted(one: Executor, spec: TaskSpec) -> list[Instruction]:
+    todo = ToDo()
+    one.adopt(spec, todo, is_agreed_leased=False)
+    return list(todo.apply)
+
+
+@pytest.mark.parametrize(
+    ("standby", "moves", "command", "expected"),
+    [
+        (Standby.WARM, [], ("other",), [StartWorker]),
+        (Standby.COLD, [], ("other",), [StopWorker]),
+        (Standby.COLD, ["edge1"], ("other",), [StartWorker]),
+        (Standby.COLD, ["edge1", "edge2"], ("other",), [StartWorker]),  # it drains
+        (Standby.WARM, ["edge1"], (), [StopWorker]),
+        (Standby.COLD, ["edge1"], (), [StopWorker]),
+        (Standby.WARM, ["edge1"], SPEC.worker.command, []),
+    ],
+    ids=["warm", "cold", "cold owner", "cold draining", "foreign from now on", "cold foreign", "as before"],
+)
+def test_another_command_stops_nobody_who_works_and_a_foreign_worker_is_no_longer_ours(
+    standby: Standby, moves: list[str], command: tuple[str, ...], expected: list[type[Instruction]]
+) -> None:
+    spec = replace(SPEC, worker=replace(SPEC.worker, standby=standby))
+    one = edge(spec=spec)
+    for epoch, owner in enumerate(moves, 1):
+        done(one.execute, allocation_of(epoch, owner), 0.0)
+    later = replace(spec, worker=replace(spec.worker, command=command))
+    assert [type(step) for step in adopted(one, later)] == expected
+
+
+def test_a_worker_that_was_foreign_is_started_where_it_is_to_run_and_stays_foreign_otherwise() -> None:
+    for spec, expected in ((SPEC, [StartWorker]), (COLD, [StopWorker])):
+        assert [type(step) for step in adopted(edge(spec=FOREIGN), spec)] == expected
+    still = replace(FOREIGN, worker=replace(FOREIGN.worker, standby=Standby.COLD))
+    assert adopted(edge(spec=FOREIGN), still) == []
+
+
 @pytest.mark.parametrize("later", OnIsolation)
 def test_who_works_alone_does_so_while_its_file_lets_it(later: OnIsolation) -> None:
     spec = replace(SPEC, on_isolation=OnIsolation.LOCAL)

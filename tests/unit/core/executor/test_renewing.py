@@ -116,6 +116,21 @@ def test_nobody_acts_before_all_go_by_the_same_file_or_for_too_long() -> None:
     assert renewed(tend(stuck, OTHER_FILE_S, *others)), "a node that never gets the file holds nobody up for ever"
 
 
+def test_what_was_heard_for_an_earlier_change_says_nothing_of_a_later_one() -> None:
+    """A file that comes back has the same hash; whether the others have gone back with it, only new beats tell."""
+    renewing, others = Renewing("edge1"), (seen("edge2", DUE), seen("edge3"))
+    renewing.on_compared("merge", is_old=True)
+    for name in ("edge2", "edge3"):
+        renewing.hear(name, FILE, 10.0)
+    assert renewed(tend(renewing, 10.0 + SAME_FILE_S, *others))
+    renewing.on_compared("merge", is_old=False)
+    renewing.on_compared("merge", is_old=True)
+    assert not renewed(tend(renewing, 60.0, *others)), "no beat was heard since"
+    for name in ("edge2", "edge3"):
+        renewing.hear(name, FILE, 61.0)
+    assert renewed(tend(renewing, 61.0 + SAME_FILE_S, *others))
+
+
 def test_an_owner_gives_the_task_away_and_starts_in_place_when_nobody_takes_it() -> None:
     renewing = Renewing("edge2")
     renewing.on_compared("merge", is_old=True)
