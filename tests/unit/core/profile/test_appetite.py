@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
-from zsched.core.profile.appetite import APPETITE_S, Appetite, Thread
+from zsched.core.profile.appetite import ALWAYS, APPETITE_S, Appetite, Thread
 
 HUNGRY, CALM, NEW = (7, "hungry"), (7, "calm"), (7, "new")
 
@@ -35,3 +37,20 @@ def test_a_look_at_the_same_moment_changes_nothing() -> None:
     appetite = looked(20)
     appetite.look({HUNGRY: (1e6, 1e6)}, 20.0)
     assert appetite.wanted_cores() == looked(20).wanted_cores()
+
+
+def look(appetite: Appetite, half_s: float, now: float) -> float | None:
+    """A thread runs and waits for so long each, and never rests."""
+    appetite.look({HUNGRY: (half_s, half_s)}, now)
+    return appetite.wanted_cores()
+
+
+@pytest.mark.parametrize("every_s", [0.05, 0.25, 0.4])
+def test_a_thread_that_never_rests_is_known_at_the_first_look_after_its_time(every_s: float) -> None:
+    """Its share rises from nothing: to 0.9 in 2.3 time constants."""
+    appetite, number = Appetite(), 0
+    needed = math.ceil(-APPETITE_S * math.log(1.0 - ALWAYS) / every_s)
+    while look(appetite, 0.5 * every_s * number, 100.0 + every_s * number) is None:
+        number += 1
+        assert number <= needed
+    assert number == needed

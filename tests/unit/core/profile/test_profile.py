@@ -493,6 +493,24 @@ def test_gauges_are_smoothed_by_two_seconds_and_absent_ones_are_absent_at_once()
     assert gauges_of(profiler, 105.0) == {}
 
 
+@pytest.mark.parametrize(
+    ("timing", "shown"),
+    [
+        (TIMING, 1 - math.exp(-1.0)),
+        (replace(TIMING, decide_s=0.9), 1 - math.exp(-1.0)),
+        (replace(TIMING, smoothing_s=0.4), 1.0),
+        (replace(TIMING, sample_s=0.5), 1.0),
+    ],
+    ids=["the same", "another time", "another time constant", "another period"],
+)
+def test_a_mean_begins_anew_with_other_times_of_its_samples_only(timing: Timing, shown: float) -> None:
+    profiler = make_profiler()
+    gauges_of(profiler, 100.0, ("gpu", 0.0))
+    profiler.adopt(timing)
+    found = gauges_of(profiler, 100.0 + GAUGE_SMOOTHING_S, ("gpu", 1.0))
+    assert found["gpu"] == pytest.approx(shown, abs=1e-3)
+
+
 def test_impossible_and_unknown_readings_are_no_readings_and_old_ones_neither() -> None:
     profiler = make_profiler()
     assert gauges_of(profiler, 100.0, ("battery", 1.2), ("temperature_c", math.nan), ("wind", 3.0)) == {}

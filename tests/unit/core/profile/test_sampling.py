@@ -75,6 +75,12 @@ def test_a_load_that_creeps_is_one_in_the_end() -> None:
     assert found == [REST_S, REST_S, PERIOD_S]
 
 
+def test_a_load_that_nobody_measures_is_no_change() -> None:
+    blind, pace = replace(IDLE, cpu_used_cores=None), Sampling(period_s=PERIOD_S)
+    assert next_s(pace, blind, 100.0) == PERIOD_S
+    assert next_s(pace, blind, 100.0 + CHANGING_S) == REST_S
+
+
 def test_work_that_is_told_begins_the_quick_pace() -> None:
     pace = at_rest()
     pace.hurry(101.0)
