@@ -127,7 +127,7 @@ class Demands:
         if load.jobs is not None:
             found = replace(found, job=_job(load.jobs, speed_of(profile), known.job))
         self._known[task] = found
-        is_seen = load.jobs is not None and not is_new and self._note_shortfall(task, profile, load, found)
+        is_seen = not is_new and self._note_shortfall(task, profile, load, found)
         return is_seen or (found.work, found.memory_mb, found.job) != (known.work, known.memory_mb, known.job)
 
     def _note_shortfall(self, task: TaskId, profile: Profile, load: WorkerLoad, found: _Known) -> bool:

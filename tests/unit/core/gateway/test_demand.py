@@ -204,6 +204,9 @@ def test_what_several_threads_leave_undone_counts_where_they_always_want_to_run(
     assert learnt(profile(2.0, cpu=4.0, wanted=8.0, jobs=jobs)).cpu_cores == pytest.approx(4.0)
     assert learnt(profile(2.0, cpu=4.0, wanted=3.0, jobs=jobs)).cpu_cores == pytest.approx(3.0)
     assert learnt(profile(2.0, cpu=2.0, jobs=jobs)).cpu_cores == pytest.approx(2.0), "they wait for something else"
+    assert learnt(profile(0.6, cpu=4.0, wanted=0.0, jobs=jobs)).cpu_cores == pytest.approx(0.6), "they want no CPU"
+    catches_up = replace(jobs, done_hz=4.0, wanted_hz=2.0)
+    assert learnt(profile(2.0, cpu=4.0, wanted=8.0, jobs=catches_up)).cpu_cores == pytest.approx(2.0)
 
 
 def test_a_worker_that_catches_up_needs_less_than_it_uses() -> None:
@@ -291,6 +294,35 @@ def test_who_gets_less_than_its_threads_want_is_short() -> None:
     assert is_short(load(None, 1.0))
 
 
+@pytest.mark.parametrize(("done_hz", "expected"), [(8.9, True), (10 * SHORT_RATIO, False), (10.0, False)])
+def test_who_leaves_a_tenth_of_its_jobs_undone_is_short(done_hz: float, expected: bool) -> None:
+    jobs = Jobs(time_s=0.1, cpu_s=0.1, done_hz=done_hz, wanted_hz=10.0)
+    assert is_short(load_of(cpu_cores=0.9, jobs=jobs)) is expected
+
+
+def test_a_worker_that_tells_its_jobs_no_more_is_known_by_what_it_told() -> None:
+    """A restart with an older kit, for one."""
+    demands, pinned = Demands(), told(9.0, got=0.5, used=2.0)
+    for number in range(2):
+        demands.learn("merge", pinned, number * EVERY_S)
+    seen, job = demands.experience("merge", pinned), demands.job("merge")
+    demands.learn("merge", profile(0.5, cpu=2.0), 2 * EVERY_S)
+    assert demands.experience("merge", pinned) == seen != (1.0, 1.0)
+    assert demands.job("merge") == job is not None
+
+
+def test_a_job_without_cpu_time_bounds_nothing() -> None:
+    """Its worker may use CPU outside of its jobs."""
+    demands = Demands()
+    for other_s in (0.0, 0.1):
+        jobs = Jobs(time_s=other_s, cpu_s=0.0, wait_s=0.0, age_s=other_s, done_hz=3.0, wanted_hz=3.0)
+        for number in range(2):
+            demands.learn("merge", profile(0.5, cpu=2.0, jobs=jobs), number * EVERY_S)
+        job = demands.job("merge")
+        assert job is not None
+        assert job.most_cores(1.0) is None
+
+
 def test_a_worker_that_does_not_tell_its_jobs_ages_is_judged_by_how_long_they_take() -> None:
     """Class latest: what waits gives way, so that a job is as old as it takes."""
     pinned = told(9.0, got=0.5, used=2.0)
@@ -318,7 +350,10 @@ def test_a_job_of_several_threads_takes_elsewhere_what_it_takes_here() -> None:
     """How its threads share the work is not told, so all of its time is taken for work."""
     demands = Demands()
     demands.learn("merge", profile(2.0, jobs=Jobs(time_s=0.5, cpu_s=1.5, done_hz=2.0, wanted_hz=2.0)), 0.0)
-    assert getattr(demands.job("merge"), "work_s", 0.0) == 0.5
+    job = demands.job("merge")
+    assert job is not None
+    assert job.work_s == 0.5
+    assert job.most_cores(1.0) is None, "it may use any number of cores"
 
 
 def test_jobs_that_take_longer_than_foreseen_are_remembered_though_all_of_them_are_done() -> None:
