@@ -20,7 +20,7 @@ from zsched.core.scheduler.judge import (
     escape_ahead,
     escape_reason,
 )
-from zsched.core.scheduler.patience import FORGIVEN_IN_S
+from zsched.core.scheduler.patience import FIRST_PATIENCE, FORGIVEN_IN_S
 from zsched.core.scheduler.scoring import Standing, compare
 from zsched.core.values.fleet import TaskSpec, WorkerSpec
 from zsched.core.values.model import Allocation, Asked, Pause, PeerState, Pin
@@ -138,6 +138,17 @@ def test_after_a_reset_staying_has_cost_nothing() -> None:
     assert judge.not_ready_since == 0.0, "a lost vote does not make the owner's worker ready"
     assert judged(judge, BETTER, 3.0).outcome is Outcome.WAIT
     assert judged(judge, BETTER, 3.95).outcome is Outcome.PROPOSE
+
+
+def test_a_judge_that_is_told_what_to_remember_forgets_what_it_has_learnt() -> None:
+    """Figures of a task with a fixed patience hold nothing learnt."""
+    judge = Judge(spec=replace(SPEC, learns_patience=True))
+    fresh = replace(judge.memory(), players=(), watched_at=None)
+    for step in range(400):  # a lead of a second in every 20 s: whoever follows it moves back soon
+        judged(judge, {"edge1": 0.5, "edge2": 0.9 if step % 80 < 4 else 0.1}, 0.25 * step)
+    assert judge.patience > FIRST_PATIENCE
+    judge.recall(fresh)
+    assert judge.patience == FIRST_PATIENCE
 
 
 def test_a_new_owner_has_its_own_start_up_time() -> None:

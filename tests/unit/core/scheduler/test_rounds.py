@@ -349,6 +349,23 @@ def test_suspect_owner_is_left_only_when_another_robot_calls_an_escape() -> None
     assert proposed(robot.round(edge1=0.0)) == ["edge2"]
 
 
+@pytest.mark.parametrize(
+    ("calls", "is_escape"),
+    [((False,), False), ((True,), True), ((True, False), True), ((False, True), True)],
+)
+def test_one_robot_that_calls_an_escape_from_a_silent_owner_is_believed_whoever_calls_besides(
+    calls: tuple[bool, ...], is_escape: bool
+) -> None:
+    robot = Robot()
+    robot.states["edge1"] = PeerState.SUSPECT
+    robot.round()
+    for voter, flees in zip(("robot2", "robot3"), calls, strict=False):
+        robot.paper(voter, "edge2", is_escape=flees)
+    out = robot.round()
+    papers = [(one.proposal.candidate, one.proposal.is_escape) for one in of(out, PublishProposal)]
+    assert papers == [("edge2", is_escape)]
+
+
 # --- called votes ----------------------------------------------------------------------------------------------------
 
 
