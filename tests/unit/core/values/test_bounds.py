@@ -10,20 +10,26 @@ import pytest
 from support.allocations import allocation_of
 from support.ballots import ballot_of
 from support.beats import beat_of
+from support.fleet_values import fleet_value_of
 from support.fleets import tuning_of
 from support.profiles import load_of, profile_of
 from support.proposals import proposal_of
 from support.states import state_of
 from zsched.core.events import (
     CertificateSent,
+    ExplanationAsked,
+    FleetCommanded,
     FleetReadAsked,
     HistoryAsked,
+    HoldCommanded,
     LinesAsked,
+    MoveCommanded,
     RehearsalKept,
     RehearsalsAsked,
     RestartCommanded,
     RetryCommanded,
     StrikeCommanded,
+    TuneCommanded,
     WeightsCommanded,
     WorkerJobs,
     commanded,
@@ -31,13 +37,23 @@ from zsched.core.events import (
 from zsched.core.relay_protocol import EndMarker, SnapshotChunk, StreamAck, WorkerTrouble
 from zsched.core.values import model
 from zsched.core.values.beat import Grant
-from zsched.core.values.document import Text
+from zsched.core.values.change import SetHold, SetLeased
+from zsched.core.values.document import MAX_DOCUMENT_BYTES, MAX_FLAGS, Document, Flag, FlagKind, Text
+from zsched.core.values.electorate import Creation, Elector
 from zsched.core.values.fleet import Demand
 from zsched.core.values.messages import (
+    Accept,
     Accepted,
+    ChangeFleet,
+    ExplainTask,
+    FleetAnswer,
+    FleetQuestion,
     FleetTold,
     HistoryTold,
+    Hold,
+    HoldTask,
     Learnt,
+    MoveTask,
     Prepare,
     Promise,
     ReadFleet,
@@ -49,9 +65,21 @@ from zsched.core.values.messages import (
     RetryTask,
     SetWeights,
     TakeCertificate,
+    TuneTask,
     WorkerLines,
+    asked_at,
 )
-from zsched.core.values.model import MAX_COUNTER, Asked, ScoreForm, Utility, UtilityVector
+from zsched.core.values.model import (
+    MAX_ASKED,
+    MAX_ASKER,
+    MAX_COUNTER,
+    Acceptance,
+    Asked,
+    Pause,
+    ScoreForm,
+    Utility,
+    UtilityVector,
+)
 from zsched.core.values.plan import ServiceSettings, StreamSettings
 from zsched.core.values.profile import (
     MAX_BITRATE_MBPS,
@@ -94,6 +122,8 @@ REFUSED = Refused(elector="r1", task="merge", ballot=BALLOT, refusal=Refusal.BAL
 TROUBLE = WorkerTrouble(task="merge", incarnation="1", count=1, text="")
 WORD = WorkerJobs(task="merge", incarnation="1", at_s=1.0, done=1)
 JOBS = Jobs(time_s=0.1, cpu_s=0.1)
+ADA = Asked(by="ada@robot1")
+SEAT = Elector(name="r1", disk="01", joining=1)
 ECHO = Echo(node="r1", incarnation=1, sequence=1, held_s=0.1)
 END = EndMarker(epoch=1, count=1)
 PIECE = SnapshotChunk(index=0, count=1, size=1, checksum="")
@@ -270,6 +300,111 @@ def test_each_command_is_its_own_event() -> None:
     assert commanded(9, ReadFleet()) == FleetReadAsked(request=9, command=ReadFleet())
     sent = TakeCertificate(certificate=Text("-----BEGIN CERTIFICATE-----"))
     assert commanded(9, sent) == CertificateSent(request=9, command=sent)
+    explain = ExplainTask(task="merge")
+    assert commanded(9, explain) == ExplanationAsked(request=9, command=explain)
+    move = MoveTask(task="merge", node="e1", asked=ADA)
+    assert commanded(9, move) == MoveCommanded(request=9, command=move)
+    hold = HoldTask(task="merge", hold=Hold.PAUSE, asked=ADA)
+    assert commanded(9, hold) == HoldCommanded(request=9, command=hold)
+    tune = TuneTask(task="merge", tuning=TUNING, base_revision=1, asked=ADA)
+    assert commanded(9, tune) == TuneCommanded(request=9, command=tune)
+    change = ChangeFleet(remove_elector="r1", asked=ADA)
+    assert commanded(9, change) == FleetCommanded(request=9, command=change)
+
+
+def test_a_program_names_its_user_and_neither_an_operator_nor_another_node() -> None:
+    """The name of an order as this node passes it on."""
+    pause = HoldTask(task="merge", hold=Hold.PAUSE, asked=ADA)
+
+    def by(who: str) -> str:
+        passed = asked_at("r1", replace(pause, asked=Asked(by=who, reason="new fan")))
+        assert isinstance(passed, HoldTask)
+        assert passed.asked.reason == "new fan"
+        return passed.asked.by
+
+    assert by("ada@r1") == "ada@r1"
+    assert by("ada@hall-b/r1") == "ada@hall-b/r1", "a user of another cell"
+    assert by("ada@r2") == by("ada") == "ada@r1"
+    assert by("ada@r11") == "ada@r1", "that ends with this node's name, and is another node"
+    assert by("a" * MAX_ASKER) == f"{'a' * (MAX_ASKER - 3)}@r1", "as long as a name may be"
+    nobody = asked_at("r1", SetWeights(task="merge", cpu=1.0, memory=0.0, network=0.0))
+    assert isinstance(nobody, SetWeights)
+    assert nobody.asked == Asked(by="r1")
+    assert asked_at("r1", ReadFleet()) == ReadFleet(), "a question is nobody's order"
+
+
+def test_an_operator_s_words_have_a_length() -> None:
+    assert Asked(by="a" * MAX_ASKER, reason="x" * MAX_ASKED)
+    with pytest.raises(ValueError, match=r"asked\.by: 97 characters, at most 96"):
+        Asked(by="a" * (MAX_ASKER + 1))
+    with pytest.raises(ValueError, match=r"asked\.reason: 201 characters, at most 200"):
+        Asked(by="a", reason="x" * (MAX_ASKED + 1))
+    with pytest.raises(ValueError, match=r"profile\.relay: 401 characters, at most 400"):
+        replace(PROFILE, relay="x" * (model.MAX_REASON + 1))
+    flag = Flag(kind=FlagKind.DRAIN, subject="e1", reason="x" * model.MAX_REASON, by="a" * model.MAX_REASON)
+    for field in ("reason", "by"):
+        with pytest.raises(ValueError, match=rf"flag\.{field}: longer than 400 characters"):
+            replace(flag, **{field: "x" * (model.MAX_REASON + 1)})
+
+
+def test_a_document_keeps_within_its_bounds() -> None:
+    flag = Flag(kind=FlagKind.DRAIN, subject="e1")
+    assert Document(text=Text("x" * MAX_DOCUMENT_BYTES), flags=(flag,) * MAX_FLAGS)
+    with pytest.raises(ValueError, match=r"document\.text: larger than"):
+        Document(text=Text("x" * (MAX_DOCUMENT_BYTES + 1)))
+    with pytest.raises(ValueError, match=r"document\.text: larger than"):
+        Document(text=Text("\u00e9" * (MAX_DOCUMENT_BYTES // 2 + 1)))
+    with pytest.raises(ValueError, match=r"document\.flags: more than"):
+        Document(text=Text(""), flags=(flag,) * (MAX_FLAGS + 1))
+
+
+@pytest.mark.parametrize(
+    ("changed", "why"),
+    [
+        ({"electors": ()}, r"fleet\.electors: a fleet has at least one elector"),
+        ({"electors": (SEAT, SEAT)}, r"fleet\.electors: not sorted by name, or a name stands twice"),
+        ({"electors": (SEAT, replace(SEAT, name="e1"))}, r"fleet\.electors: not sorted"),
+        ({"electors": (replace(SEAT, joining=2),)}, r"fleet\.electors: an elector joined under a later number"),
+        ({"creations": 0}, r"fleet\.tasks: a task has a number that no creation has had"),
+        ({"away": ("r2", "r1")}, r"fleet\.away: not sorted"),
+    ],
+)
+def test_a_fleet_value_does_not_contradict_itself(changed: dict[str, Any], why: str) -> None:
+    task = Creation(task="merge", number=1, exclusive=False)
+    value = fleet_value_of(1, SEAT, number=1, creations=1, tasks=(task,), away=("r1", "r2"))
+    with pytest.raises(ValueError, match=why):
+        replace(value, **changed)
+
+
+def test_a_message_of_the_fleet_s_register_says_one_thing() -> None:
+    prepare = Prepare(task="hall", ballot=BALLOT, electorate="x")
+    accept = Accept(task="hall", acceptance=Acceptance(ballot=BALLOT, value=fleet_value_of(1)), electorate="x")
+    assert FleetQuestion(prepare=prepare).content == prepare
+    assert FleetQuestion(accept=accept).content == accept
+    for both in ((None, None), (prepare, accept)):
+        with pytest.raises(ValueError, match="fleet_question: expected a prepare or an accept"):
+            FleetQuestion(prepare=both[0], accept=both[1])
+    for said in ({}, {"accepted": ACCEPTED, "refused": REFUSED}):
+        with pytest.raises(ValueError, match="fleet_answer: expected a promise, an acceptance or a refusal"):
+            FleetAnswer(**said)
+    for wanted in ({}, {"add_elector": "r1", "disk": "01", "remove_elector": "r2"}):
+        with pytest.raises(ValueError, match="fleet: expected one of document, add_elector and remove_elector"):
+            ChangeFleet(**wanted)
+    with pytest.raises(ValueError, match=r"fleet\.disk: r1 needs the id of its disk"):
+        ChangeFleet(add_elector="r1")
+
+
+def test_a_change_to_what_is_there_already_changes_nothing() -> None:
+    """Such a round ends without a new revision."""
+    pause = Pause(asked=ADA, revision=1)
+    paused = replace(VALUE, paused=True, pause=pause)
+    assert SetHold(base_revision=1, pause=pause, pin=None, reason="").apply(paused) == paused
+    ended = SetHold(base_revision=1, pause=None, pin=None, reason="").apply(paused)
+    assert (ended.revision, ended.paused, ended.pause) == (VALUE.revision + 1, False, None)
+    for leased in (False, True):
+        value = replace(VALUE, leased=leased)
+        assert SetLeased(base_revision=1, leased=leased).apply(value) == value
+        assert SetLeased(base_revision=1, leased=not leased).apply(value).leased is not leased
 
 
 def test_a_rehearsal_keeps_within_its_bounds() -> None:
