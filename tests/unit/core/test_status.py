@@ -469,6 +469,8 @@ def test_a_node_that_reaches_nobody_says_whom_it_dials_and_what_becomes_of_it() 
     both = "tcp/nowhere.invalid:47457, tcp/127.0.0.1:47477"
     check = "Check host, port, firewall, and that every node has the same `fleet:`"
     assert build_snapshot(node, 103.1).problems[0] == f"heard nobody since the start: dialled {both}. {check}"
+    many = tuple(f"tcp/192.0.2.{number}:7457" for number in range(10))
+    assert "tcp/192.0.2.7:7457, 2 more. Check" in replace(node.solitude, dialled=many).problem()
     found = (("tcp/nowhere.invalid:47457", "name unknown"), ("tcp/127.0.0.1:47477", "refused"))
     node.handle(ev.AddressesTried(found=found), 104.0)
     told = build_snapshot(node, 104.0).problems

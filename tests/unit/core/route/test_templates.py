@@ -162,6 +162,7 @@ def test_wildcards_stay_in_routes_and_widened_templates_stay_canonical() -> None
     (route,) = routes_for(task_of(rule(IN, "{robot}/s/**", "{target}/t/{robot}/**")), "robot1", "edge1", 3)
     assert (route.from_expr, route.to_expr) == ("robot1/s/**", "edge1/t/robot1/**")
     assert widened("{target}/**/{robot}", target="edge1") == "edge1/*/**"
+    assert widened("in{robot}{target}/map") == "in$*/map", "two open names in one chunk are one wildcard"
 
 
 def test_fill_without_a_name_raises() -> None:

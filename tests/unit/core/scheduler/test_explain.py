@@ -200,6 +200,46 @@ def test_a_leader_that_waits_is_told_how_long_by_its_lead() -> None:
     assert told.changes[2].endswith(f"in {0.15 / lead:.1f} s by this lead")
 
 
+@pytest.mark.parametrize(
+    ("held_by", "told_of"),
+    [
+        ({"first": "count"}, "until count has moved"),
+        ({"electors_heard": ("robot1",)}, "until 2 of 3 electors are heard (1 are)"),
+        (
+            {"damping": DampingMemory(moves=((990.0, False),) * 30)},
+            "until fewer than {most} moves lie in the last minute",
+        ),
+    ],
+    ids=["another task", "silent electors", "many moves"],
+)
+def test_a_leader_is_told_what_else_it_waits_for(held_by: dict[str, object], told_of: str) -> None:
+    decision = decision_of(owner="edge3", settled_for_s=60.0, **held_by)
+    changes = explained(decision).changes
+    assert told_of.format(most=decision.figures.rules.max_moves_per_minute) in changes
+    assert not any(text.startswith("until the cool-down") for text in changes)
+    free = explained(decision_of(owner="edge3", settled_for_s=60.0)).changes
+    assert not any(text.startswith("until") and "staying has cost" not in text for text in free)
+
+
+def test_who_refuses_a_candidate_is_told_with_why() -> None:
+    decision = decision_of()
+    first = decision.figures.vectors[0]
+    others = tuple(one for one in first.utilities if one.candidate != "edge2")
+    refusing = replace(first, utilities=others, refused=(("edge2", "its worker failed"),))
+    vectors = (refusing, *decision.figures.vectors[1:])
+    told = explained(judged_again(decision, replace(decision.figures, vectors=vectors)))
+    (edge2,) = (one for one in told.candidates if one.node == "edge2")
+    assert [(view.robot, view.refused) for view in edge2.robots if view.refused] == [("robot1", "its worker failed")]
+
+
+def test_without_any_cpu_an_owner_that_nobody_beats_stays() -> None:
+    """A rival without worth leads at no level."""
+    decision = decision_of()
+    owner = explained(decision).candidates[0]
+    standing = decide_again(decision.figures).standing
+    assert owner_cpu_below(decision.figures, standing, owner, rival_total=0.0) is None
+
+
 def test_without_the_owner_the_best_of_the_others_gets_the_task() -> None:
     decision = decision_of()
     again = judged_again(decision, without(decision.figures, "edge1"))

@@ -59,6 +59,13 @@ def test_only_the_order_whose_time_is_over_ends() -> None:
     assert expiry.next_deadline() == 300.0
 
 
+def test_the_orders_of_a_task_that_has_left_the_fleet_are_forgotten() -> None:
+    expiry = Expiry(rank=0)
+    expiry.note(held(pause_s=60.0), 100.0)
+    assert expiry.due({}, 160.0) == []
+    assert expiry.next_deadline() == math.inf
+
+
 def test_a_node_that_was_restarted_counts_anew() -> None:
     expiry, value = Expiry(rank=0), held(pause_s=60.0)
     expiry.note(value, 100.0)
