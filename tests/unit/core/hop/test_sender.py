@@ -120,6 +120,34 @@ def test_each_life_of_a_worker_answers_for_its_own_numbers() -> None:
     assert (books.acknowledged, books.lost, books.in_flight) == (1, 0, 0)
 
 
+def test_where_work_is_kept_the_next_life_gets_what_the_former_one_had_not_finished() -> None:
+    books = lane()
+    books.keeps_work = True
+    for _ in range(6):
+        sent(books, at=10.0)
+    books.acknowledge(StreamAck(eid=1, first=0, arrived=5, processed=2), "1", 10.1)
+    ended = books.hear(StreamAck(eid=1, first=0, arrived=0, processed=0), "2", 10.2)
+    assert ended == Sums(2, 0, 0, 0, at_most_lost=0)
+    assert (books.base, books.lowest, [one.number for one in books.kept]) == (2, 2, [2, 3, 4, 5])
+    assert books.replay_end == 6, "all of it may be known to it already"
+
+
+def test_who_is_met_behind_a_plain_subscriber_is_not_blamed_for_what_was_lost_then() -> None:
+    """What it tells as lost at its greeting was the subscriber's, and is counted as at most lost."""
+    books = lane()
+    for _ in range(3):
+        sent(books, at=10.0)
+    books.pass_on()
+    books.part(10.1)
+    books.greeted_at = 10.2
+    books.hear(ack(0, 4, lost=3), "1", 10.3)
+    assert books.meet(10.3)
+    assert (books.was_foreign, books.forgiven, books.lost) == (False, 3, 0)
+    sent(books, at=10.4)
+    books.hear(ack(0, 5, lost=4), "1", 10.5)
+    assert (books.acknowledged, books.lost) == (0, 1)
+
+
 def test_a_lane_is_met_by_the_answer_to_its_greeting_alone() -> None:
     books = lane()
     books.part(10.0)

@@ -106,6 +106,34 @@ def test_beyond_so_many_receivers_the_longest_silent_one_that_was_never_reached_
     assert "a1" not in books.receivers
 
 
+def test_of_receivers_that_have_gone_only_the_last_ones_are_remembered() -> None:
+    books = sender(3)
+    books.forget("nobody")
+    assert books.had == {}
+    for number in range(MAX_RECEIVERS + 1):
+        ack(books, f"a{number}", 1, 1.0)
+        books.forget(f"a{number}")
+    assert list(books.had) == [f"a{number}" for number in range(1, MAX_RECEIVERS + 1)]
+
+
+def test_who_comes_back_knows_what_it_had_and_a_new_one_on_its_node_does_not() -> None:
+    books = sender(6)
+    ack(books, "a", 4, 1.0)
+    books.forget("a")
+    ack(books, "a", 5, 2.0)
+    assert (books.receivers["a"].had, books.had) == (None, {})
+    books.hear("next", "node-a", StreamAck(eid=1, first=0, arrived=0, processed=0), 3.0)
+    assert books.receivers["next"].had == 5
+
+
+def test_an_input_waits_for_so_many_that_never_spoke_and_for_no_more() -> None:
+    """Names come from other machines: a peer that makes them up fills no memory, and holds up no input."""
+    books = sender(3)
+    assert {books.settled(f"a{number}", 1.0) for number in range(MAX_RECEIVERS)} == {0}
+    assert books.settled("b", 1.0) == 3
+    assert len(books.expected) == MAX_RECEIVERS
+
+
 def test_much_goes_in_parts_and_progress_brings_the_next() -> None:
     books = sender(2 * BATCH + 1, limit=4 * BATCH)
     ack(books, "a", 0, 1.0, has_gap=True)
