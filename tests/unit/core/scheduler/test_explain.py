@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import statistics
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -212,7 +213,7 @@ def test_a_leader_that_waits_is_told_how_long_by_its_lead() -> None:
     ],
     ids=["another task", "silent electors", "many moves"],
 )
-def test_a_leader_is_told_what_else_it_waits_for(held_by: dict[str, object], told_of: str) -> None:
+def test_a_leader_is_told_what_else_it_waits_for(held_by: dict[str, Any], told_of: str) -> None:
     decision = decision_of(owner="edge3", settled_for_s=60.0, **held_by)
     changes = explained(decision).changes
     assert told_of.format(most=decision.figures.rules.max_moves_per_minute) in changes
