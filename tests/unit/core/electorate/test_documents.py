@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from support.fleet_values import fleet_value_of
 from zsched.core import instructions as do
-from zsched.core.electorate.documents import MAX_WANTED, Documents
+from zsched.core.electorate.documents import FETCH_EVERY_S, MAX_WANTED, Documents
 from zsched.core.todo import ToDo
 from zsched.core.values.struct import replace
 
@@ -34,3 +34,11 @@ def test_refused_documents_do_not_fill_the_memory() -> None:
     for name in names:
         documents.on_refused(name, "an unknown key")
     assert list(documents.refused) == names[2:]
+
+
+def test_of_more_wanted_documents_than_a_node_remembers_the_oldest_are_asked_for_no_more() -> None:
+    documents = Documents("robot1", {})
+    names = [f"d{number}" for number in range(MAX_WANTED + 2)]
+    assert asked(documents, *names) == names
+    documents.tick(todo := ToDo(), FETCH_EVERY_S)
+    assert [one.document for one in todo.send if isinstance(one, do.FetchDocument)] == names[2:]

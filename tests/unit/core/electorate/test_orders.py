@@ -14,7 +14,7 @@ from support.todos import agreed
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.electorate import orders
-from zsched.core.electorate.changes import AdoptDocument
+from zsched.core.electorate.changes import AdoptDocument, SetDocument
 from zsched.core.electorate.documents import RECENT
 from zsched.core.electorate.founding import founded
 from zsched.core.electorate.numbers import in_force
@@ -173,6 +173,37 @@ def test_a_ballot_that_is_not_its_asker_s_is_counted_and_not_answered(asker: str
     agreement = make()
     assert asked(agreement, prepare_of(), asker)[1] is None
     assert agreement.counters["fleet_foreign"] == 1
+
+
+def test_fleet_questions_are_rate_limited_as_all_prepares_are() -> None:
+    """Each promise costs an fsync."""
+    agreement = make()
+    answers = [asked(agreement, prepare_of(replace(BALLOT, counter=number + 1)))[1] for number in range(60)]
+    refused = [one.refused.refusal for one in answers if one is not None and one.refused is not None]
+    assert refused == [Refusal.RATE] * agreement.counters["prepare_rate"]
+    assert 0 < len(refused) < 60
+
+
+def test_a_value_of_another_generation_than_its_question_is_not_accepted() -> None:
+    agreement = make(stored={"0d": SAID})
+    asked(agreement, prepare_of())
+    todo, answer = asked(agreement, accept_of(replace(ADOPT.apply(FIRST), generation_id="77")))
+    assert answer is None
+    assert not todo.must_persist
+    _, answer = asked(agreement, accept_of(ADOPT.apply(FIRST)))
+    assert answer is not None
+    assert answer.accepted is not None
+
+
+def test_an_answer_of_no_node_of_the_fleet_is_counted_and_completes_no_majority() -> None:
+    agreement = make(ADOPTED, {"0d": FLEET})
+    (ask,) = of(commanded(agreement, ChangeFleet(remove_elector="robot2")), do.AskElectors)
+    assert isinstance(ask.question, Prepare)
+    for name in ("ghost", "ghost2"):
+        promise: Promise[FleetValue] = Promise(elector=name, task=FLEET.name, ballot=ask.question.ballot)
+        event = ev.FleetAnswered(answer=FleetAnswer(promise=promise))
+        assert agreed(agreement.on_fleet_answer, event, 100.3) == ToDo()
+    assert agreement.counters["answer_foreign"] == 2
 
 
 def test_another_electorate_of_a_file_is_refused() -> None:
@@ -381,6 +412,27 @@ def test_each_end_of_a_change_has_its_answer() -> None:
         assert told(todo)[0] is kind
         agreement.orders.on_ended(change, outcome, again := ToDo())
         assert of(again, do.AnswerCommand) == []
+
+
+def test_a_command_that_another_change_has_made_impossible_is_told_why() -> None:
+    """A round that finds nothing to change ends as unchanged: then the value that is in force says why."""
+    agreement = make(ADOPTED, {"0d": FLEET})
+    commanded(agreement, ChangeFleet(remove_elector="robot2"))
+    ((change, *_),) = agreement.orders._running
+    gone = replace(ADOPTED, electors=(ADOPTED.electors[0], ADOPTED.electors[2]), number=3, revision=3)
+    answer = Learnt(node="robot3", values=(), fleet=gone)
+    agreed(agreement.on_learnt, ev.LearntReceived(learnt=answer, is_answer=True), 100.2)
+    agreement.orders.on_ended(change, RoundOutcome.UNCHANGED, todo := ToDo())
+    assert told(todo) == (CommandOutcome.INVALID, "robot2 is no elector")
+
+
+def test_a_change_to_a_document_that_this_node_cannot_take_over_is_not_proposed() -> None:
+    foreign = replace(SAID, name="other")
+    agreement = make(ADOPTED, {"0d": FLEET, "0e": foreign})
+    for document, why in (("0e", "the file is of fleet 'other'"), ("0f", "the document 0f is not stored here")):
+        change = SetDocument(base_revision=ADOPTED.revision, document=document, tasks=())
+        assert agreement.change_fleet(change, todo := ToDo(), 100.1).startswith(why)
+        assert todo.send == []
 
 
 def test_a_refusal_s_fleet_value_waits_for_its_document() -> None:

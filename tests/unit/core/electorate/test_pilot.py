@@ -77,6 +77,14 @@ class Ear:
 # --- gone ------------------------------------------------------------------------------------------------------------
 
 
+def test_nothing_is_changed_while_the_fleet_goes_by_its_files() -> None:
+    ear = Ear(value("abc", document=""))
+    ear.hear("bc", 20.0)
+    ear.hear("b", T)
+    assert ear.gone() == ("c",)
+    assert ear.wish == "no document is agreed yet"
+
+
 def test_gone_is_an_elector_that_was_not_heard_with_its_name_and_disk_for_the_silence() -> None:
     ear = Ear(value("abc"))
     ear.hear("bc", 20.0)

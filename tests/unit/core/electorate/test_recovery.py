@@ -190,6 +190,12 @@ def test_old_electors_must_be_off_and_states_that_are_not_given_may_be_newer() -
     assert "no states of robot2, robot3 are given" in told[Danger.LOST]
 
 
+def test_who_was_the_only_elector_needs_nobody_to_be_off() -> None:
+    alone = replace(ADOPTED, electors=ADOPTED.electors[:1])
+    lost = replace(state_of("robot1", alone), lost="older than peers remember")
+    assert set(dangers(found(own=lost))) == {Danger.LOST}
+
+
 def test_states_of_a_majority_hold_all_that_was_agreed() -> None:
     assert set(dangers(found(state_of("robot2"), own=state_of("robot1")))) == {Danger.OFF}
 
@@ -297,6 +303,12 @@ def test_the_side_is_named_or_the_only_other_one(values: list[FleetValue], wante
     answers = [answer_of(name, value) for name, value in zip(ROBOTS[1:], values, strict=False)]
     side = choose_side(FLEET, state_of("robot1"), sides_of(answers), wanted)
     assert expected in (side if isinstance(side, str) else side.generation_id)
+
+
+def test_a_node_that_knows_no_generation_is_on_no_side() -> None:
+    waits = answer_of("robot3", replace(LEFT, generation_id=""))
+    (side,) = sides_of([answer_of("robot2", LEFT), waits])
+    assert (side.generation_id, side.nodes) == (LEFT.generation_id, ("robot2",))
 
 
 def test_who_would_hear_nobody_of_the_other_side_does_not_change_to_it() -> None:

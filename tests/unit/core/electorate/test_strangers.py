@@ -17,7 +17,7 @@ from zsched.core import instructions as do
 from zsched.core.electorate.changes import AdoptDocument
 from zsched.core.electorate.founding import founded, recovered
 from zsched.core.electorate.recovery import MOVED, Found, Recovery, consider, rejoined, sides_of
-from zsched.core.electorate.strangers import SHOWN_S, Strangers
+from zsched.core.electorate.strangers import KEPT, SHOWN_S, Strangers
 from zsched.core.membership.knocking import SHOWN_AFTER_S
 from zsched.core.node import Node
 from zsched.core.status import build_snapshot
@@ -26,8 +26,8 @@ from zsched.core.values.beat import Beat, Grant
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet
-from zsched.core.values.messages import Learnt, Prepare
-from zsched.core.values.model import Allocation, Ballot, PeerState, Proposal, RegisterState
+from zsched.core.values.messages import Accept, Learnt, Prepare
+from zsched.core.values.model import Acceptance, Allocation, Ballot, PeerState, Proposal, RegisterState
 from zsched.core.vote.agreement import Agreement
 
 NAMES = ("edge1", "robot1", "robot2", "robot3")
@@ -173,6 +173,17 @@ def test_a_question_of_another_generation_gets_no_answer() -> None:
     event = ev.PrepareAsked(request=1, asker="robot3", prepare=question)
     assert not [one for one in agreed(one.acceptor.on_prepare, event, 100.1).send if isinstance(one, do.AnswerElection)]
     assert one.counters["prepare_stranger"] == 1
+    accept = Accept(
+        task="merge",
+        acceptance=Acceptance(ballot=question.ballot, value=ALLOCATION),
+        electorate="e",
+        creation=question.creation,
+        generation_id=question.generation_id,
+        number=question.number,
+    )
+    accepted = ev.AcceptAsked(request=1, asker="robot3", accept=accept)
+    assert agreed(one.acceptor.on_accept, accepted, 100.1) == ToDo()
+    assert one.counters["accept_stranger"] == 1
     ours = replace(question, generation_id=LEFT.generation_id)
     for name in ROBOTS[1:]:
         one.witness.on_answer(Learnt(node=name, values=()))
@@ -208,6 +219,16 @@ def test_one_forged_beat_makes_no_stranger_of_a_peer() -> None:
     assert one.hear(beat(RIGHT), LEFT.generation_id, is_named=True, now=100.1)
     assert not one.is_one("robot3", 100.2)
     assert one.is_one("robot3", 101.3)
+
+
+def test_forged_generations_do_not_fill_the_memory() -> None:
+    """Of those that come when it is full nothing is remembered: they are asked about again."""
+    one = Strangers(fleet=FLEET.name, silence_s=1.2)
+    for number in range(KEPT + 1):
+        value = replace(RIGHT, generation_id=f"{number:032x}"[::-1])
+        assert one.on_learnt(Learnt(node="robot3", values=(), fleet=value), LEFT, is_named=True)
+        one.hear(beat(value), LEFT.generation_id, is_named=True, now=100.0)
+        assert one.must_ask("robot3", 100.0 + number) is (number == KEPT)
 
 
 def granted(one: Agreement, value: FleetValue, now: float) -> tuple[Grant, ...]:

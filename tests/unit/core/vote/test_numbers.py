@@ -26,7 +26,7 @@ from zsched.core.values.change import MoveOwner
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.lease import hold_s
-from zsched.core.values.messages import Accept, Accepted, Learnt, Prepare, Promise, Refusal, Refused
+from zsched.core.values.messages import Accept, Accepted, FleetAnswer, Learnt, Prepare, Promise, Refusal, Refused
 from zsched.core.values.model import NO_BALLOT, Acceptance, Ballot, RegisterState
 from zsched.core.vote.agreement import Agreement
 from zsched.core.vote.belief import GENERATION_STEP
@@ -298,6 +298,65 @@ def test_another_generation_s_fleet_value_changes_nothing() -> None:
     assert agreement.number == 0
 
 
+def test_another_fleet_s_value_changes_nothing_though_it_tells_the_same_generation() -> None:
+    agreement = make()
+    told = Learnt(node="robot2", values=(), generation=GENERATION, fleet=replace(WITH_EDGE, fleet="other"))
+    todo = agreed(agreement.on_learnt, ev.LearntReceived(learnt=told, is_answer=True), 100.1)
+    assert (agreement.fleet_value, todo.must_persist) == (FIRST, False)
+
+
+def test_a_state_that_tells_no_fleet_value_is_refused() -> None:
+    state = state_of("robot1", hardware="h", disk="d1", fleet_register=RegisterState(task=FLEET.name))
+    with pytest.raises(ValueError, match="none is learnt"):
+        Agreement(fleet=FLEET, me="robot1", durable=state, incarnation=7, electorate="e", rng=Random(1), now=100.0)
+
+
+def test_a_value_that_names_no_document_leaves_the_node_with_the_fleet_that_it_goes_by() -> None:
+    agreement = make()
+    told = Learnt(node="robot2", values=(), generation=GENERATION, fleet=replace(WITH_EDGE, document=""))
+    todo = agreed(agreement.on_learnt, ev.LearntReceived(learnt=told, is_answer=True), 100.1)
+    assert (agreement.number, todo.in_force) == (3, None)
+    newer = replace(told, fleet=replace(WITH_EDGE, document="0e", revision=4))
+    todo = agreed(agreement.on_learnt, ev.LearntReceived(learnt=newer, is_answer=True), 100.2)
+    assert [one.peers for one in of(todo, do.FetchDocument)] == [("robot2", "edge1", "robot3")], "the file's nodes"
+
+
+def test_a_node_that_knows_no_generation_heeds_no_fleet_value_and_proposes_nothing() -> None:
+    agreement = make(has_state=False)
+    refused = Refused(
+        elector="robot2",
+        task=FLEET.name,
+        ballot=Ballot(counter=1, node="robot1", incarnation=7),
+        refusal=Refusal.NUMBER,
+        promised=NO_BALLOT,
+        number=3,
+        fleet=WITH_EDGE,
+    )
+    event = ev.FleetAnswered(answer=FleetAnswer(refused=refused))
+    assert agreed(agreement.on_fleet_answer, event, 100.1) == ToDo()
+    assert agreed(agreement.on_stored, ev.DocumentStored(document="0e", fleet=FLEET), 100.1).in_force is None
+    assert (agreement.fleet_value, agreement.number) == (None, 0)
+    change = SetLease(base_revision=1, lease_s=2.0)
+    assert agreement.change_fleet(change, todo := ToDo(), 100.1) == "this node does not know the fleet's generation yet"
+    assert todo.send == []
+
+
+def test_an_accepted_value_whose_document_is_gone_at_a_start_is_followed_once_it_is_fetched() -> None:
+    value = ADOPTED
+    accepted = Acceptance(ballot=Ballot(counter=5, node="robot2", incarnation=9), value=value)
+    held = RegisterState(task=FLEET.name, learnt=FIRST, promised=accepted.ballot, accepted=accepted)
+    state = state_of("robot1", generation=GENERATION, hardware="h", disk="d1", fleet_register=held)
+    agreement = Agreement(
+        fleet=FLEET, me="robot1", durable=state, incarnation=7, electorate="e", rng=Random(1), now=100.0
+    )
+    told = Learnt(node="robot2", values=(), generation=GENERATION, fleet=value)
+    todo = agreed(agreement.on_learnt, ev.LearntReceived(learnt=told, is_answer=False), 100.1)
+    assert [one.document for one in of(todo, do.FetchDocument)] == ["0d"]
+    assert agreement.fleet_value == FIRST
+    agreed(agreement.on_stored, ev.DocumentStored(document="0d", fleet=FLEET), 100.2)
+    assert agreement.fleet_value == value
+
+
 def test_a_node_without_a_state_founds_the_value_of_the_generation_that_it_hears_of() -> None:
     agreement = make(has_state=False)
     told = Learnt(node="robot2", values=(), generation=GENERATION, incarnation=1)
@@ -486,6 +545,16 @@ def test_change_leaves_the_owner_alone() -> None:
     one.on_sent(6, 10.2)
     for name in ("robot2", "robot3"):
         one.on_beat(replace(beat(2, name, 6), echoes=echoes(name, "robot1", 6)), {}, 10.3)
+    assert one.until("merge") == 10.2 + L
+
+
+def test_an_owner_that_has_sent_no_beat_yet_holds_from_its_first_one_on() -> None:
+    one = leases()
+    one.begin("merge", 3, 5)
+    renumbered(one)
+    one.on_sent(5, 10.2)
+    for name in ("robot2", "robot3"):
+        one.on_beat(replace(beat(2, name), echoes=echoes(name, "robot1", 5)), {}, 10.3)
     assert one.until("merge") == 10.2 + L
 
 
