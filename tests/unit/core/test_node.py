@@ -852,6 +852,17 @@ def test_a_restart_of_what_does_not_run_is_refused(name: str, task: str, state: 
     assert (result.outcome, result.detail) == (CommandOutcome.INVALID, said)
 
 
+def test_a_worker_that_somebody_else_starts_is_not_restarted_here() -> None:
+    fleet, state = fleet_of(task_of(candidates=EDGES)), durable("edge1")
+    edge = Node(fleet=fleet, me="edge1", durable=state, incarnation=7, electorate="e", rng=Random(1), now=100.0)
+    edge.handle(ev.WorkerChanged(task="merge", state=WorkerState.READY), 100.0)
+    batch = edge.handle(ev.RestartCommanded(request=7, command=RestartTask(task="merge")), 100.0)
+    assert of(batch, do.RenewWorker) == []
+    result = of(batch, do.AnswerCommand)[0].result
+    assert result.outcome is CommandOutcome.INVALID
+    assert result.detail.startswith("somebody else starts it")
+
+
 def test_a_certificate_is_handed_on_whoever_has_sent_it() -> None:
     event = ev.CertificateSent(request=7, command=TakeCertificate(certificate=Text("pem")))
     assert of(make("edge1").handle(event, 100.0), do.TakeCertificate) == [

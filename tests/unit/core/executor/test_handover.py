@@ -516,6 +516,15 @@ def test_a_worker_that_was_foreign_is_started_where_it_is_to_run_and_stays_forei
     assert adopted(edge(spec=FOREIGN), still) == []
 
 
+def test_a_node_that_was_chosen_by_a_newer_file_works_once_it_has_that_file() -> None:
+    """By its own file it is no candidate yet, so it runs no worker."""
+    one = edge(spec=replace(SPEC, candidates=("edge2", "edge3")))
+    assert roles(done(one.execute, allocation_of(1, "edge1"), 0.0)) == []
+    steps = adopted(one, SPEC)
+    assert roles(tuple(steps)) == [(WorkerRole.ACTIVE, 1)]
+    assert of(tuple(steps), StartWorker)
+
+
 @pytest.mark.parametrize("later", OnIsolation)
 def test_who_works_alone_does_so_while_its_file_lets_it(later: OnIsolation) -> None:
     spec = replace(SPEC, on_isolation=OnIsolation.LOCAL)

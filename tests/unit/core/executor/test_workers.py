@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from support.fleets import fleet_of, task_of
 from zsched.core import events as ev
 from zsched.core.executor.workers import TROUBLE_S, Workers
 from zsched.core.values.model import MAX_REASON
@@ -77,3 +78,13 @@ def test_a_worker_that_should_be_started_again_and_starts_is_not_told_of() -> No
     assert workers.told(0.0) == {"merge": "its file has changed"}
     workers.on_changed(ev.WorkerChanged(task="merge", state=WorkerState.STARTING))
     assert workers.told(0.0) == {}
+
+
+def test_a_worker_that_is_kept_no_more_is_told_of_until_it_has_stopped() -> None:
+    workers = Workers.of(fleet_of(task_of()), "edge1")
+    workers.on_changed(changed(WorkerState.READY))
+    workers.adopt(fleet_of(tasks=()), "edge1", {"merge"})
+    workers.on_changed(changed(WorkerState.STARTING, "pid 7"))
+    assert (workers.states, workers.told(0.0)) == ({"merge": WorkerState.STARTING}, {"merge": "pid 7"})
+    workers.on_changed(changed(WorkerState.STOPPED, "signal 15"))
+    assert (workers.states, workers.told(0.0)) == ({}, {})
