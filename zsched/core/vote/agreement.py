@@ -787,10 +787,7 @@ class Agreement:
         if now >= self._settle_at:
             self._numbers.settle(todo, now)
         if now >= self._numbers.next_deadline():
-            before = self._numbers.value
             self._numbers.tick(todo, now)
-            if self._numbers.value is not before:
-                self._count_anew(todo)
         for register in tuple(self.registers.values()):
             if now >= self._settle_at:
                 register.settle(todo, now)
