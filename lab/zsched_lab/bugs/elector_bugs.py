@@ -45,7 +45,7 @@ ELECTOR_BUGS: tuple[Bug, ...] = (
     _fleet_bug(
         "documents of changes that are under way go",
         NUMBERS,
-        ("named = (*state, *self.roll.proposed)", "named = state"),
+        ("named = (*state, *roll.proposed)", "named = state"),
         has_schedules=False,
     ),
     _bug(

@@ -151,10 +151,8 @@ class Numbers:
     @property
     def state(self) -> RegisterState[FleetValue] | None:
         """What goes to disk."""
-        if self.roll is None:
-            return None
-        state = self.roll.state
-        has_voted = state.promised != NO_BALLOT or state.accepted is not None
+        state = None if self.roll is None else self.roll.state
+        has_voted = state is not None and (state.promised != NO_BALLOT or state.accepted is not None)
         return state if self.changed is not None or has_voted else None
 
     @property
@@ -241,7 +239,7 @@ class Numbers:
         if isinstance(answer, Refused) and answer.refusal is Refusal.DOCUMENT and not isinstance(question, Prepare):
             self._want(question.acceptance.value, (asker,), todo, now)
         if isinstance(answer, Accepted):
-            self._keep(todo)
+            self._keep(self.roll, todo)
         self._carry(todo)
         return answer
 
@@ -333,15 +331,15 @@ class Numbers:
 
     def _after(self, before: FleetValue | None, todo: ToDo) -> None:
         """A fleet value may have been learnt: keep its document, and let the stages go by it."""
-        value = self.value
-        if value is not before and value is not None and before is not None:
+        roll = self.roll
+        if roll is not None and before is not None and (value := roll.value) is not before:
             if value.document != before.document:
                 self._before = before.document
             if self._held_for is not None and self._held_for.revision <= value.revision:
                 self._held_for = None
             if self.documents.holds(value):
                 self.documents.refused.clear()
-            self._keep(todo)
+            self._keep(roll, todo)
             self._adopt(todo)
         self._carry(todo)
 
@@ -350,13 +348,12 @@ class Numbers:
         if fleet is not None:
             self._fleet = todo.in_force = fleet
 
-    def _keep(self, todo: ToDo) -> None:
+    def _keep(self, roll: Roll, todo: ToDo) -> None:
         """The state's documents, the one before, and those of our own changes: others may go."""
-        if self.roll is not None:
-            accepted = self.roll.state.accepted
-            state = (self.roll.value.document, self._before, "" if accepted is None else accepted.value.document)
-            named = (*state, *self.roll.proposed)
-            self.documents.keep(tuple(dict.fromkeys(filter(None, named))), todo)
+        accepted = roll.state.accepted
+        state = (roll.value.document, self._before, "" if accepted is None else accepted.value.document)
+        named = (*state, *roll.proposed)
+        self.documents.keep(tuple(dict.fromkeys(filter(None, named))), todo)
 
     # --- proposer ----------------------------------------------------------------------------------------------------
 
@@ -391,7 +388,7 @@ class Numbers:
         fault = self.fault(change)
         if not fault and self.roll is not None:
             self.roll.propose(change, todo, now)
-            self._keep(todo)
+            self._keep(self.roll, todo)
             self._carry(todo)
         return fault
 

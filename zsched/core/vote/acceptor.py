@@ -71,12 +71,11 @@ class Acceptor:
 
     def refuse_gone(self, todo: ToDo) -> None:
         """Registers count by another number: what waits for a task that has gone is refused."""
+        roll = self._numbers.roll
         for key, (event, _) in tuple(self._parked.items()):
-            if key[0] not in self.registers:
+            if roll is not None and key[0] not in self.registers:
                 del self._parked[key]
-                refused = None if self._numbers.roll is None else self._numbers.roll.refused(event.accept)
-                if refused is not None:
-                    todo.add(do.AnswerElection(request=event.request, answer=refused))
+                todo.add(do.AnswerElection(request=event.request, answer=roll.refused(event.accept)))
 
     def on_prepare(self, event: ev.PrepareAsked, todo: ToDo, now: float, *, may_ask: bool | None = None) -> None:
         """A proposer asks for a promise: only for its own ballots, at a bounded rate (each promise costs an fsync).
