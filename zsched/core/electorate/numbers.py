@@ -262,6 +262,8 @@ class Numbers:
             self.roll.on_answer(answer, todo, now)
             if self.roll.lacking is not None:
                 self._want(self.roll.lacking, self.electors, todo, now)
+            if not self.documents.holds(self.roll.value):  # it went while the round that has chosen the value ran
+                self._want(self.roll.value, self.electors, todo, now)
             self._after(before, todo)
         return self.value is not before
 

@@ -14,7 +14,7 @@ from support.todos import agreed
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.electorate import orders
-from zsched.core.electorate.changes import AdoptDocument, SetDocument
+from zsched.core.electorate.changes import AdoptDocument, SetDocument, SetLease
 from zsched.core.electorate.documents import RECENT
 from zsched.core.electorate.founding import founded
 from zsched.core.electorate.numbers import in_force
@@ -26,6 +26,7 @@ from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import (
     Accept,
+    Accepted,
     ChangeFleet,
     CommandOutcome,
     FleetAnswer,
@@ -295,6 +296,32 @@ def test_an_elector_that_starts_again_asks_what_became_of_a_value_that_it_has_ac
     assert [type(one.question) for one in of(todo, do.AskElectors)] == [Prepare]
 
 
+def test_a_value_whose_document_goes_while_its_round_runs_is_followed_once_that_is_fetched_again() -> None:
+    """Another node's value, which this round hands on: no change of this node's keeps its document here."""
+    agreement = make(ADOPTED, {"0d": FLEET})
+    agreed(agreement.on_stored, ev.DocumentStored(document="0e", fleet=SAID), 100.0)
+    agreement.change_fleet(SetLease(base_revision=2, lease_s=2.0), todo := ToDo(), 100.1)
+    (ask,) = of(todo, do.AskElectors)
+    assert isinstance(ask.question, Prepare)
+    value = replace(ADOPTED, document="0e", revision=3)
+    todo = ToDo()
+    for name in ROBOTS[1:]:
+        held = Acceptance(ballot=BALLOT, value=value)
+        promise = Promise(elector=name, task=FLEET.name, ballot=ask.question.ballot, accepted=held)
+        agreement.on_fleet_answer(ev.FleetAnswered(answer=FleetAnswer(promise=promise)), todo, 100.2)
+    for number in range(RECENT + 1):
+        agreed(agreement.on_stored, ev.DocumentStored(document=f"a{number}", fleet=SAID), 100.3)
+    todo = ToDo()
+    for name in ROBOTS[1:]:
+        accepted = Accepted(elector=name, task=FLEET.name, ballot=ask.question.ballot)
+        agreement.on_fleet_answer(ev.FleetAnswered(answer=FleetAnswer(accepted=accepted)), todo, 100.4)
+    assert (agreement.fleet_value, todo.in_force) == (value, None)
+    assert "this node asks its peers" in agreement.problems["fleet/document"]
+    assert [one.document for one in of(todo, do.FetchDocument)] == ["0e"]
+    todo = agreed(agreement.on_stored, ev.DocumentStored(document="0e", fleet=SAID), 100.5)
+    assert (todo.in_force, agreement.problems) == (in_force(SAID, value), {})
+
+
 def test_what_is_known_here_is_kept_on_disk_and_older_ones_go() -> None:
     """A document that comes back is known, so it is not fetched: then it must still be on the disk."""
     agreement = make(ADOPTED, {"0d": FLEET})
@@ -431,7 +458,8 @@ def test_a_change_to_a_document_that_this_node_cannot_take_over_is_not_proposed(
     agreement = make(ADOPTED, {"0d": FLEET, "0e": foreign})
     for document, why in (("0e", "the file is of fleet 'other'"), ("0f", "the document 0f is not stored here")):
         change = SetDocument(base_revision=ADOPTED.revision, document=document, tasks=())
-        assert agreement.change_fleet(change, todo := ToDo(), 100.1).startswith(why)
+        fault = agreement.change_fleet(change, todo := ToDo(), 100.1)
+        assert fault.startswith(why)
         assert todo.send == []
 
 

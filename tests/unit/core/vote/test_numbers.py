@@ -337,7 +337,8 @@ def test_a_node_that_knows_no_generation_heeds_no_fleet_value_and_proposes_nothi
     assert agreed(agreement.on_stored, ev.DocumentStored(document="0e", fleet=FLEET), 100.1).in_force is None
     assert (agreement.fleet_value, agreement.number) == (None, 0)
     change = SetLease(base_revision=1, lease_s=2.0)
-    assert agreement.change_fleet(change, todo := ToDo(), 100.1) == "this node does not know the fleet's generation yet"
+    fault = agreement.change_fleet(change, todo := ToDo(), 100.1)
+    assert fault == "this node does not know the fleet's generation yet"
     assert todo.send == []
 
 
