@@ -34,8 +34,7 @@ from zsched.core.values.fleet import (
 from zsched.core.values.model import NodeId, NodeKind, TaskId, Weights
 from zsched.core.values.struct import Struct, replace
 
-MUST_RESTART: Final = "must be restarted"
-EVERY_DAEMON: Final = f"every daemon {MUST_RESTART}"
+EVERY_DAEMON: Final = "every daemon must be restarted"
 OPENED_ANEW: Final = "daemons begin again in turns: a robot's streams stop for that moment"
 
 
@@ -104,6 +103,8 @@ class _Verdict(Struct, frozen=True, kw_only=True):
     after: str | None = None
     danger: Danger | None = None
     about: str = ""
+    in_turns: str = ""
+    """What follows instead where daemons begin again by themselves; empty: the same."""
 
 
 NOTHING: Final = _Verdict(effect=Effect.NOTHING, text="nothing notices")
@@ -230,9 +231,9 @@ def _verdicts(old: Fleet, new: Fleet, owners: Mapping[TaskId, NodeId | None]) ->
     yield from _access(old, new)
     before, after = (fleet.zenoh_config.rpartition("/")[2] for fleet in (old, new))
     if before != after:
-        yield _restart(EVERY_DAEMON, "zenoh", before, after)
+        yield _restart_all("zenoh", before, after)
     if old.relay_orphan_s != new.relay_orphan_s:
-        yield _restart(EVERY_DAEMON, "relay_orphan_s", old.relay_orphan_s, new.relay_orphan_s)
+        yield _restart_all("relay_orphan_s", old.relay_orphan_s, new.relay_orphan_s)
     for name in ("replace_s", "away_s"):
         if getattr(old, name) != getattr(new, name):
             yield _set(AT_ONCE, name, getattr(old, name), getattr(new, name))
@@ -243,7 +244,7 @@ def _verdicts(old: Fleet, new: Fleet, owners: Mapping[TaskId, NodeId | None]) ->
         words = ["auto" if fleet.is_auto else "named" for fleet in (old, new)]
         yield _set(replace(AT_ONCE, text=text), "electorate", *words)
     if old.shared_memory is not new.shared_memory:
-        yield _restart(EVERY_DAEMON, "shared_memory", old.shared_memory, new.shared_memory)
+        yield _restart_all("shared_memory", old.shared_memory, new.shared_memory)
 
 
 def _cells(fleet: Fleet) -> list[Cell]:
@@ -263,7 +264,7 @@ def _timing(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
         if one.name == "name" or before == after:
             continue
         if one.name == "zenoh_lease_s":
-            yield _restart(EVERY_DAEMON, "timing.zenoh_lease_s", before, after)
+            yield _restart_all("timing.zenoh_lease_s", before, after)
         else:
             yield _set(AT_ONCE, f"timing.{one.name}", before, after)
 
@@ -303,10 +304,10 @@ def _access(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
     anew = _Verdict(effect=Effect.STREAMS, text=OPENED_ANEW)
     if before is None or after is None:
         if before is not after:
-            yield _restart(EVERY_DAEMON, "security", _plain(before), _plain(after))
+            yield _restart_all("security", _plain(before), _plain(after))
         return
     if _nameless(before) != _nameless(after):
-        yield _restart(EVERY_DAEMON, "security", _plain(before), _plain(after))
+        yield _restart_all("security", _plain(before), _plain(after))
         return
     if before != after:
         yield _set(anew, "security", _plain(before), _plain(after))
@@ -325,17 +326,11 @@ def _access(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
 
 
 def _in_turns(verdicts: tuple[_Verdict, ...]) -> Iterator[_Verdict]:
-    """Where daemons begin again by themselves, nobody has to restart one; not one that becomes of another kind."""
+    """Where daemons begin again by themselves, nobody has to restart one."""
     begins_again = any(one.text == OPENED_ANEW for one in verdicts)
     for one in verdicts:
-        is_followed = begins_again and not one.paths[0].endswith(".kind")
-        if is_followed and one.text == EVERY_DAEMON:
-            yield replace(one, text=OPENED_ANEW, effect=Effect.STREAMS)
-        elif is_followed and one.text.endswith(MUST_RESTART):
-            text = f"{one.text.removesuffix(MUST_RESTART)}begins again, by itself in its turn"
-            yield replace(one, text=text, effect=Effect.STREAMS)
-        else:
-            yield one
+        is_other = begins_again and one.in_turns
+        yield replace(one, text=one.in_turns, effect=Effect.STREAMS) if is_other else one
 
 
 def _nameless(security: Security) -> Security:
@@ -366,18 +361,19 @@ def _nodes(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
 
 def _node(old: NodeSpec, new: NodeSpec) -> Iterator[_Verdict]:
     path = f"nodes.{old.name}"
-    restart = f"the daemon of {old.name} {MUST_RESTART}"
+    restart = f"the daemon of {old.name} must be restarted"
+    again = f"the daemon of {old.name} begins again, by itself in its turn"
     if old.kind is not new.kind:
-        yield _restart(restart, f"{path}.kind", old.kind, new.kind)
+        yield _restart(restart, f"{path}.kind", old.kind, new.kind)  # by itself it does not go by the file
     if old.host != new.host:
         text = f"the others dial {old.name} there once it is gone from where it was"
         yield _restart(text, f"{path}.host", old.host, new.host)
     for name in ("control", "data", "streams"):
         before, after = getattr(old, f"listen_{name}"), getattr(new, f"listen_{name}")
         if before != after:
-            yield _restart(restart, f"{path}.listen.{name}", before, after)
+            yield _restart(restart, f"{path}.listen.{name}", before, after, again)
     if old.local != new.local:
-        yield _restart(restart, f"{path}.local", _plain(old.local), _plain(new.local))
+        yield _restart(restart, f"{path}.local", _plain(old.local), _plain(new.local), again)
     if old.labels != new.labels:
         yield _set(AT_ONCE, f"{path}.labels", old.labels, new.labels)
     if old.links != new.links:
@@ -509,8 +505,12 @@ def _set(verdict: _Verdict, path: str, before: object, after: object) -> _Verdic
     return replace(verdict, paths=(path,), before=_text(before), after=_text(after))
 
 
-def _restart(text: str, path: str, before: object, after: object) -> _Verdict:
-    return _set(_Verdict(effect=Effect.RESTART, text=text), path, before, after)
+def _restart(text: str, path: str, before: object, after: object, in_turns: str = "") -> _Verdict:
+    return _set(_Verdict(effect=Effect.RESTART, text=text, in_turns=in_turns), path, before, after)
+
+
+def _restart_all(path: str, before: object, after: object) -> _Verdict:
+    return _restart(EVERY_DAEMON, path, before, after, OPENED_ANEW)
 
 
 def _plain(value: Any) -> Any:
