@@ -711,6 +711,12 @@ def test_a_ready_worker_that_our_relay_does_not_see_is_told_although_it_owns_not
     assert problems(109, 115) == (told,)
     node.handle(ev.WorkerShown(node="edge2", task="merge", incarnation="1"), 115.0)
     assert problems(115, 118) == ()
+    node.handle(ev.WorkerShown(node="edge1", task="merge", incarnation="1", is_present=False), 118.0)
+    node.handle(ev.SlotReady(task="merge", epoch=1, is_ready=False, has_token=False), 118.0)
+    (of_owner,) = problems(118, 128)
+    assert of_owner == (
+        f"this robot's streams have waited for edge1 for 10 s: our relay does not see its worker's token{LOOK}"
+    ), "the owner's is told once, by the wait"
 
 
 def test_a_worker_that_shows_itself_before_we_have_its_document_is_seen_once_we_have() -> None:
@@ -746,6 +752,8 @@ def test_a_key_that_nobody_subscribes_to_is_named_with_what_to_do() -> None:
     assert told == f"our relay does not see its worker's token{LOOK}"
     told = lack_of(node, ev.SlotReady(task="merge", epoch=0, is_ready=False, has_token=True, untaken=keys))
     assert told == f"our relay does not see its worker's token, or its subscriptions{LOOK}", "that was another slot"
+    told = lack_of(node, ev.SlotReady(task="merge", epoch=1, is_ready=False, has_token=True))
+    assert told == "our relay has just seen its worker's subscriptions"
     node.handle(ev.SlotReady(task="merge", epoch=1), 104.0)
     assert build_snapshot(node, 110.0).tasks[0].problems == ()
 

@@ -20,6 +20,7 @@ from zsched.core.node import Node
 from zsched.core.status import build_snapshot
 from zsched.core.values.fleet import Fleet, StreamRule, WorkerSpec
 from zsched.core.values.messages import Learnt, Prepare
+from zsched.core.values.model import NodeKind
 from zsched.core.values.plan import Direction, StreamCount
 from zsched.core.values.profile import Renewal, WorkerState
 
@@ -131,6 +132,15 @@ def test_electors_and_leases_stay_until_they_are_agreed() -> None:
     [
         (replace(FLEET, name="other"), "of fleet 'other'"),
         (fleet_of(*FLEET.tasks, of=("edge1", "edge2", "robot2", "robot3")), "no node 'robot1'"),
+        (
+            replace(
+                FLEET,
+                nodes=tuple(
+                    replace(node, kind=NodeKind.EDGE) if node.name == "robot1" else node for node in FLEET.nodes
+                ),
+            ),
+            "makes 'robot1' a node of kind edge",
+        ),
     ],
 )
 def test_a_file_of_somebody_else_is_refused_and_told(changed: Fleet, why: str) -> None:
