@@ -52,6 +52,12 @@ class JobMeter:
         self._undone = 0
         self._means: dict[str, Ewma] = {}
 
+    def retune(self, tau_s: float) -> None:
+        """Go on with another time constant."""
+        self._tau_s = tau_s
+        for mean in self._means.values():
+            mean.tau_s = tau_s
+
     def absorb(self, report: WorkerJobs, now: float) -> bool:
         """Take a worker's report in; whether it is possible after the one before."""
         newest = self._newest

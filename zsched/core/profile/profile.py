@@ -86,6 +86,12 @@ class SignalFilter:
             self._mean.value = self._mean_of_means.value = None
         return self._mean.value
 
+    def retune(self, tau_s: float) -> None:
+        """Go on with another time constant; the trend begins anew, for it is told from how far both means lag."""
+        if tau_s != self._mean.tau_s:
+            self._mean.tau_s = self._mean_of_means.tau_s = tau_s
+            self._mean_of_means.value = self._mean.value
+
     @property
     def trend_db_s(self) -> float | None:
         """How fast the smoothed signal changes, in dB per second (Brown 1956); ``None`` without a signal.
@@ -135,14 +141,20 @@ class Profiler:
         self._sequence = 0
 
     def adopt(self, timing: Timing) -> None:
-        """Go by other times; with another time constant all means begin anew, with the next sample."""
-        before, self._timing = self._timing, timing
-        if (before.smoothing_s, before.sample_s) == (timing.smoothing_s, timing.sample_s):
-            return
-        for mean in (self._cpu, self._memory, self._pressure, self._runnable):
+        """Go by other times: every mean goes on from where it is, with the time constant that is its own now.
+
+        None begins anew: until a worker's share had risen again, the worker would look like other programs' load.
+        """
+        self._timing = timing
+        shares = (*self._worker_cpu.values(), *self._worker_memory.values())
+        for mean in (self._cpu, self._memory, self._pressure, self._runnable, *shares):
             mean.tau_s = timing.smoothing_s
-        for known in (self._gauges, self._signals, self._worker_cpu, self._worker_memory, self._jobs):
-            known.clear()
+        for mean in self._gauges.values():
+            mean.tau_s = _gauge_tau_s(timing)
+        for signal in self._signals.values():
+            signal.retune(_signal_tau_s(timing))
+        for meter in self._jobs.values():
+            meter.retune(_job_tau_s(timing))
 
     def absorb(self, device: DeviceSample, links: tuple[LinkSample, ...], now: float) -> None:
         """Take one reading of the machine and its links in."""
@@ -161,16 +173,13 @@ class Profiler:
 
     def _absorb_gauges(self, readings: Readings, now: float) -> None:
         """Smooth each reading; a gauge without one has no mean, too."""
-        self._gauges = {
-            name: self._gauges.get(name) or Ewma(max(self._timing.smoothing_s, GAUGE_SMOOTHING_S))
-            for name, _ in readings
-        }
+        self._gauges = {name: self._gauges.get(name) or Ewma(_gauge_tau_s(self._timing)) for name, _ in readings}
         for name, reading in readings:
             self._gauges[name].update(reading, now)
 
     def note_jobs(self, report: WorkerJobs, now: float) -> bool:
         """Take a worker's report of its jobs in; whether it is possible."""
-        meter = self._jobs.setdefault(report.task, JobMeter(max(self._timing.smoothing_s, JOB_SMOOTHING_S)))
+        meter = self._jobs.setdefault(report.task, JobMeter(_job_tau_s(self._timing)))
         return meter.absorb(report, now)
 
     def _link(self, sample: LinkSample, now: float) -> Link:
@@ -299,6 +308,14 @@ class Profiler:
         """The means of all gauges, in as many digits as tell something."""
         means = ((name, mean.value) for name, mean in self._gauges.items())
         return tuple((name, round(value, 3)) for name, value in means if value is not None)
+
+
+def _gauge_tau_s(timing: Timing) -> float:
+    return max(timing.smoothing_s, GAUGE_SMOOTHING_S)
+
+
+def _job_tau_s(timing: Timing) -> float:
+    return max(timing.smoothing_s, JOB_SMOOTHING_S)
 
 
 def _signal_tau_s(timing: Timing) -> float:

@@ -493,22 +493,60 @@ def test_gauges_are_smoothed_by_two_seconds_and_absent_ones_are_absent_at_once()
     assert gauges_of(profiler, 105.0) == {}
 
 
-@pytest.mark.parametrize(
-    ("timing", "shown"),
-    [
-        (TIMING, 1 - math.exp(-1.0)),
-        (replace(TIMING, decide_s=0.9), 1 - math.exp(-1.0)),
-        (replace(TIMING, smoothing_s=0.4), 1.0),
-        (replace(TIMING, sample_s=0.5), 1.0),
-    ],
-    ids=["the same", "another time", "another time constant", "another period"],
-)
-def test_a_mean_begins_anew_with_other_times_of_its_samples_only(timing: Timing, shown: float) -> None:
+@pytest.mark.parametrize("smoothing_s", [TIMING.smoothing_s, 4.0])
+def test_a_mean_goes_on_by_another_time_constant_from_where_it_is(smoothing_s: float) -> None:
     profiler = make_profiler()
+    timing = replace(TIMING, smoothing_s=smoothing_s, sample_s=0.5)
     gauges_of(profiler, 100.0, ("gpu", 0.0))
     profiler.adopt(timing)
     found = gauges_of(profiler, 100.0 + GAUGE_SMOOTHING_S, ("gpu", 1.0))
-    assert found["gpu"] == pytest.approx(shown, abs=1e-3)
+    lag = GAUGE_SMOOTHING_S / max(smoothing_s, GAUGE_SMOOTHING_S)
+    assert found["gpu"] == pytest.approx(1 - math.exp(-lag), abs=1e-3)
+
+
+@pytest.mark.parametrize("smoothing_s", [0.0, 0.1, TIMING.smoothing_s, 4.0])
+def test_a_worker_does_not_look_like_other_load_after_another_time_constant(smoothing_s: float) -> None:
+    """Its share began anew, from nothing, and the machine's mean did not: a task left its owner because of itself."""
+    profiler = make_profiler()
+    for step in range(50):
+        profiler.absorb(device(2.0, 1000.0, load(1.5, 400.0)), (), 100.0 + 0.2 * step)
+    profiler.adopt(replace(TIMING, smoothing_s=smoothing_s))
+    profiler.absorb(device(2.0, 1000.0, load(1.5, 400.0)), (), 110.0)
+    profile = taken(profiler, 110.0)
+    (worker,) = profile.workers
+    assert (profile.cpu_used_cores, worker.cpu_cores) == pytest.approx((2.0, 1.5))
+    assert (profile.memory_used_mb, worker.memory_mb) == pytest.approx((1000.0, 400.0))
+
+
+def test_what_a_worker_tells_of_its_jobs_stands_with_another_time_constant() -> None:
+    profiler = make_profiler()
+    for step in range(60):
+        if step == 50:
+            profiler.adopt(replace(TIMING, smoothing_s=4.0))
+        now, done = 0.2 * step, step
+        word = WorkerJobs(task="merge", incarnation="1", at_s=now, done=done, time_s=0.05 * done)
+        assert profiler.note_jobs(word, now)
+        profiler.absorb(device(1.0, 1000.0, load(0.1)), (), now)
+    (worker,) = taken(profiler, 12.0).workers
+    assert worker.jobs is not None
+    assert worker.jobs.done_hz == pytest.approx(5.0, rel=0.01)
+    assert worker.jobs.time_s == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize("tau_s", [0.5, 4.0])
+def test_a_signal_goes_on_by_another_time_constant_and_its_trend_begins_anew(tau_s: float) -> None:
+    signal = SignalFilter(1.0)
+    for step in range(400):
+        signal.update(-30.0 - 0.05 * step, now=0.05 * step)
+    before = signal.update(None, now=20.0)
+    assert signal.trend_db_s == pytest.approx(-1.0, abs=0.05)
+    signal.retune(1.0)
+    assert signal.trend_db_s == pytest.approx(-1.0, abs=0.05), "nothing has changed"
+    signal.retune(tau_s)
+    assert (signal.update(None, now=20.0), signal.trend_db_s) == (before, 0.0)
+    for step in range(400, 400 + round(200 * tau_s)):
+        signal.update(-50.0 + 0.02 * (step - 400), now=0.05 * step)
+    assert signal.trend_db_s == pytest.approx(0.4, abs=0.06)
 
 
 def test_impossible_and_unknown_readings_are_no_readings_and_old_ones_neither() -> None:
