@@ -8,6 +8,7 @@ The sums are not taken from the verdict. They are made again from the robots' te
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Iterator
 
@@ -24,6 +25,8 @@ from zsched.core.values.words import Readings
 
 _TIE = 1 / 512
 """Totals are compared to 1/256: so far above the owner's rounded one another total counts as higher."""
+_SHOWN = 10_000
+"""A worth is shown to four digits: one that is needed is rounded up, so that it is enough."""
 _HALVINGS = 40
 
 
@@ -294,11 +297,16 @@ def _leads(figures: Figures, again: Decided, owner: CandidateSum, others: list[C
         assert one.total is not None
         assert one.joint is not None
         if rounded(one.total) <= rounded(owner.total):
-            lack = needed - one.total
-            yield f"{one.node} would have to be worth {one.joint + lack:.4f} instead of {one.joint:.4f} ({lack:+.4f})"
+            worth = math.ceil((one.joint + needed - one.total) * _SHOWN) / _SHOWN
+            lack, way = worth - one.joint, "or the"
+            if worth <= 1.0:
+                yield f"{one.node} would have to be worth {worth:.4f} instead of {one.joint:.4f} ({lack:+.4f})"
+            else:
+                way, most = "the", f"{owner.node} has {owner.total:.4f} with its bonus"
+                yield f"{one.node} cannot lead while {most}: no worth is enough"
             level = None if number else owner_cpu_below(figures, again.standing, owner, one.total)
             if level is not None:
-                yield f"or the cpu term of {owner.node} would have to fall below {level:.4f} at every robot"
+                yield f"{way} cpu term of {owner.node} would have to fall below {level:.4f} at every robot"
         elif not number:
             yield from _times(figures, again, one.node, one.total - owner.total)
 

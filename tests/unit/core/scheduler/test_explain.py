@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import statistics
+from collections.abc import Mapping
 from dataclasses import replace
+from random import Random
 from typing import Any
 
 import pytest
@@ -23,7 +25,7 @@ from zsched.core.scheduler.explain import (
     without,
 )
 from zsched.core.scheduler.scoring import pick
-from zsched.core.values.decision import DampingMemory, Decision, Need
+from zsched.core.values.decision import DampingMemory, Decision, JudgeMemory, Need
 from zsched.core.values.model import (
     Aggregate,
     Allocation,
@@ -69,6 +71,16 @@ def decision_of(tuning: Tuning = TUNING, *, owner: str | None = "edge1", **chang
     figures = figures_of(task_of(candidates=EDGES, patience=0.15), *ROBOTS, **{**given, **changes})
     needs = (Need(candidate="edge1", cpu_cores=0.4, memory_mb=250.0),)
     return Decision(figures=figures, verdict=verdict_of(decide_again(figures).judgement), needs=needs)
+
+
+def decision_worth(worth: Mapping[str, float], *, bonus: float = 0.0) -> Decision:
+    """Three robots that agree on what each edge is worth; edge1 owns the task, nobody has a penalty."""
+    decision = decision_of(replace(TUNING, bonus=bonus))
+    vectors = tuple(
+        replace(vector, utilities=tuple(replace(one, value=worth[one.candidate]) for one in vector.utilities))
+        for vector in decision.figures.vectors
+    )
+    return judged_again(decision, replace(decision.figures, vectors=vectors, damping=DampingMemory()))
 
 
 def check_sums(told: Explained, decision: Decision) -> None:
@@ -128,21 +140,36 @@ def test_a_candidate_that_lacks_worth_moves_the_task_when_it_has_it() -> None:
     text = next(text for text in told.changes if text.startswith(f"{best.node} would have to be worth"))
     needed = float(text.split("worth ")[1].split(" ")[0])
     totals = {one.node: one.total for one in told.candidates if one.total is not None}
-    for change, winner in ((1e-4, best.node), (-1e-4, "edge1")):
+    for change, winner in ((0.0, best.node), (-1e-4, "edge1")):
         assert pick({**totals, best.node: needed - best.penalty + change}, "edge1") == winner
 
 
 def test_the_worth_that_is_named_lies_above_the_middle_between_two_steps() -> None:
     """An owner's total is a step of 1/256 here, and half a step above it rounds to the next one: 0.5 + 1/512."""
-    decision = decision_of(replace(TUNING, bonus=0.0))
-    worth = {"edge1": 0.5, "edge2": 0.4, "edge3": 0.3}
-    vectors = tuple(
-        replace(vector, utilities=tuple(replace(one, value=worth[one.candidate]) for one in vector.utilities))
-        for vector in decision.figures.vectors
-    )
-    told = explained(judged_again(decision, replace(decision.figures, vectors=vectors)))
+    told = explained(decision_worth({"edge1": 0.5, "edge2": 0.4, "edge3": 0.3}))
     assert told.changes[0] == "edge2 would have to be worth 0.5020 instead of 0.4000 (+0.1020)"
     assert [pick({"edge1": 0.5, "edge2": one}, "edge1") for one in (0.5019, 0.5020)] == ["edge1", "edge2"]
+
+
+@pytest.mark.parametrize("seed", range(50))
+def test_the_worth_that_is_named_is_enough_whatever_the_owner_s_is(seed: int) -> None:
+    worth = dict(
+        zip(EDGES, sorted((Random(seed + k / 3).uniform(0.2, 0.9) for k in range(3)), reverse=True), strict=True)
+    )
+    told = explained(decision_worth(worth))
+    needed = float(told.changes[0].split("worth ")[1].split(" ")[0])
+    again = explained(decision_worth({**worth, "edge2": needed}))
+    assert again.changes[0].startswith("edge2 leads by")
+
+
+def test_a_rival_that_no_worth_would_make_the_leader_is_told_so() -> None:
+    told = explained(decision_worth({"edge1": 0.98, "edge2": 0.4, "edge3": 0.3}, bonus=0.05))
+    told_of_edge2, way_out, told_of_edge3 = told.changes
+    assert told_of_edge2 == "edge2 cannot lead while edge1 has 1.0300 with its bonus: no worth is enough"
+    assert way_out.startswith("the cpu term of edge1 would have to fall below")
+    assert told_of_edge3.startswith("edge3 cannot lead")
+    again = explained(decision_worth({"edge1": 0.98, "edge2": 1.0, "edge3": 1.0}, bonus=0.05))
+    assert again.outcome == "stay"
 
 
 def test_a_robot_that_does_not_know_the_owner_s_cpu_term_goes_on_as_it_does() -> None:
@@ -220,6 +247,13 @@ def test_a_leader_is_told_what_else_it_waits_for(held_by: dict[str, Any], told_o
     assert not any(text.startswith("until the cool-down") for text in changes)
     free = explained(decision_of(owner="edge3", settled_for_s=60.0)).changes
     assert not any(text.startswith("until") and "staying has cost" not in text for text in free)
+
+
+def test_a_leader_whose_patience_is_spent_waits_for_the_cool_down_alone() -> None:
+    decision = decision_of(owner="edge3", settled_for_s=0.5, judge=JudgeMemory(spent=0.15))
+    leads, *waits = explained(decision).changes
+    assert leads.endswith("and must go on leading:")
+    assert waits == ["until the cool-down ends, in 1.5 s"]
 
 
 def test_who_refuses_a_candidate_is_told_with_why() -> None:
