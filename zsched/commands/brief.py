@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from zsched.commands.page import DROPS_OVER_S, Cell, Page, clock_time, span
+from zsched.commands.page import DROPS_OVER_S, Cell, Page, clock_time, missed_of, span
 from zsched.commands.report import (
     STATE_STYLES,
     flag_rows,
@@ -21,7 +21,7 @@ from zsched.commands.report import (
 
 Json = dict[str, Any]
 
-TITLES = ("TASK", "owner", "state", "since", "phase", "in", "out", "dropped")
+TITLES = ("TASK", "owner", "state", "since", "phase", "in", "out", "missed")
 NO_TASK = "none yet; `zsched task add FILE` gives the fleet one"
 
 
@@ -64,7 +64,7 @@ def _pin_rows(page: Page, status: Json) -> None:
 def _cells(task: Json, at: float | None) -> list[Cell]:
     owner, since_s, state = task["owner"], task["since_s"], task["owner_state"]
     since = span(since_s) + ("" if at is None or since_s is None else f" {clock_time(at - since_s, at)}")
-    dropped, is_new = _dropped(task)
+    missed, is_new = _missed(task)
     return [
         (task["name"], "bold"),
         ((owner or "nobody") + _marks(task), "bold" if owner else "red"),
@@ -73,7 +73,7 @@ def _cells(task: Json, at: float | None) -> list[Cell]:
         (str(task["phase"]), "" if task["phase"] in ("idle", "settled") else "yellow"),
         (_flow(task, "in"), ""),
         (_flow(task, "out"), ""),
-        (dropped, "yellow" if is_new else "dim"),
+        (missed, "yellow" if is_new else "dim"),
     ]
 
 
@@ -89,12 +89,11 @@ def _flow(task: Json, way: str) -> str:
     return per_second(sum(known)) if known else "-"
 
 
-def _dropped(task: Json) -> tuple[str, bool]:
-    """How many samples were dropped, when that is over, and whether it is not."""
-    losers = [stream for stream in task["streams"] if stream["drops"]]
+def _missed(task: Json) -> tuple[str, bool]:
+    """How many samples somebody may miss, when that is over, and whether it is not."""
+    losers = [stream for stream in task["streams"] if missed_of(stream)]
     if not losers:
         return "-", False
-    count = sum(sum(stream["drops"].values()) for stream in losers)
     ages = [stream["dropped_s"] for stream in losers if stream.get("dropped_s") is not None]
     is_over = bool(ages) and min(ages) > DROPS_OVER_S
-    return f"{count}{' (none in the last minute)' if is_over else ''}", not is_over
+    return f"{sum(map(missed_of, losers))}{' (none in the last minute)' if is_over else ''}", not is_over

@@ -32,6 +32,8 @@ COUNTED: Final = {
     "reordered": "Samples that came behind newer ones and were dropped.",
     "replayed": "Samples that were sent again.",
     "at_most_lost": "Samples that were in flight to workers that died.",
+    "repeated": "Samples of an input that were given to one more receiver: kept values and mirrors.",
+    "unsent": "Values of class latest that came while there was no owner.",
     "unconfirmed": "Samples sent to a worker that acknowledges nothing.",
 }
 

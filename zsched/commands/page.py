@@ -9,6 +9,8 @@ import textwrap
 import time
 from typing import Any, TypeAlias
 
+from zsched.core.values.words import INTENDED
+
 STYLES = {"bold": "1", "dim": "2", "red": "31", "green": "32", "yellow": "33", "stage": "1;36", "alarm": "1;31"}
 
 DROPS_OVER_S = 60.0
@@ -102,6 +104,12 @@ def clock_time(then: float, now: float) -> str:
 def none_for(age_s: float | None) -> str:
     """Behind a number of drops: that they are over, once none has come for a minute."""
     return f" (none in the last minute, last {span(age_s)} ago)" if age_s is not None and age_s > DROPS_OVER_S else ""
+
+
+def missed_of(stream: dict[str, Any]) -> int:
+    """How many of a stream's samples somebody may miss (`zsched.core.values.plan.StreamCount.missed`)."""
+    unintended = sum(count for reason, count in stream["drops"].items() if reason not in INTENDED)
+    return int(unintended) + int(stream.get("lost") or 0) + int(stream.get("at_most_lost") or 0)
 
 
 def since_drop(stream: dict[str, Any]) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Final
 
-from zsched.commands.page import Cell, Page, cut, memory, none_for, since_drop, size, span
+from zsched.commands.page import Cell, Page, cut, memory, missed_of, none_for, since_drop, size, span
 from zsched.commands.weight_words import shares
 from zsched.core.values.gauges import BY_NAME
 from zsched.core.values.words import NEVER_INITIALISED, RESTARTING, WAS_READY, has_lost_its_worker, told_of_worker
@@ -516,6 +516,8 @@ def _route(page: Page, status: Json, task: Json) -> None:
             "doubled": stream.get("doubled"),
             "out of order": stream.get("reordered"),
             "at most lost": stream.get("at_most_lost"),
+            "repeated": stream.get("repeated"),
+            "unsent": stream.get("unsent"),
             "unconfirmed": stream.get("unconfirmed"),
         }
         answer_s = stream.get("answer_s")  # a later field of the schema's major version
@@ -524,7 +526,7 @@ def _route(page: Page, status: Json, task: Json) -> None:
         if drops:
             text += ", dropped " + " ".join(f"{count} {reason}" for reason, count in drops.items())
             text += since_drop(stream)
-        parts.append((text, "yellow" if drops and not since_drop(stream) else ""))
+        parts.append((text, "yellow" if missed_of(stream) and not since_drop(stream) else ""))
     parts += [(hint, "yellow") for hint in _unanswered(task)]
     unheard = [one for one in task["streams"] if not one["messages"] and f"{prefix}in/" in one["stream"]]
     first = next((one["name"] for one in status["tasks"] if one["streams"]), None)

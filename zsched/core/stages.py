@@ -193,8 +193,8 @@ class Stages:
         self.hangs = HangWatch(fleet)
         self.tenure = Tenure(fleet, me, self.agreement.leases, self.executors)
         self.sealing = Sealing(fleet, me, self.executors, self.agreement.leases.over_at)
-        self.dropped: dict[str, tuple[int, float]] = {}
-        """{stream: (how many samples it has dropped, when that last rose)}."""
+        self.missed: dict[str, tuple[int, float]] = {}
+        """{stream: (how many of its samples somebody may miss, when that last rose)}."""
         self.rates = StreamRates()
         self.gaps = StreamGaps()
         self.killed_at: dict[TaskId, float] = {}

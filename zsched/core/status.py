@@ -373,7 +373,7 @@ def _task_status(node: Stages, spec: TaskSpec, now: float) -> TaskStatus:
         switched_s=executor.switched_s,
         gap_s=_move_gap(node, executor),
         streams=tuple(
-            _with_flow(_with_keys(_with_age(count, node.dropped, now), routes.get(count.stream)), node, now)
+            _with_flow(_with_keys(_with_age(count, node.missed, now), routes.get(count.stream)), node, now)
             for count in node.stream_counts
             if count.stream.startswith(prefix)
         ),
@@ -522,10 +522,8 @@ def _untaken(task: TaskSpec, executor: Executor, known: Unready | None) -> str:
     return f"our relay sees nobody take {', '.join(keys) or 'them'}{newer}"
 
 
-def _with_age(count: StreamCount, dropped: dict[str, tuple[int, float]], now: float) -> StreamCount:
-    return (
-        replace(count, dropped_s=now - dropped[count.stream][1]) if count.drops and count.stream in dropped else count
-    )
+def _with_age(count: StreamCount, missed: dict[str, tuple[int, float]], now: float) -> StreamCount:
+    return replace(count, dropped_s=now - missed[count.stream][1]) if count.missed and count.stream in missed else count
 
 
 def _with_keys(count: StreamCount, route: Route | None) -> StreamCount:

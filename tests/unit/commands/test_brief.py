@@ -64,13 +64,15 @@ def test_a_task_s_rates_are_sums_over_its_streams_and_unknown_without_counts() -
     assert last_row(status).split()[-3:] == ["50.0/s", "0/s", "-"]
 
 
-def test_drops_that_are_over_say_so() -> None:
+def test_missed_samples_are_counted_whatever_became_of_them_and_what_a_rule_wants_is_none() -> None:
     status = recorded("healthy")
     stream = status["tasks"][0]["streams"][0]
-    stream |= {"drops": {"overflow": 3, "loop": 1}, "dropped_s": 59.0}
-    assert last_row(status).endswith(" 4")
+    stream["drops"] = dict.fromkeys(("cut", "loop", "retried", "superseded", "thinned", "uncounted"), 9)
+    assert last_row(status).endswith(" -")
+    stream |= {"drops": {"overflow": 3, "thinned": 9}, "lost": 2, "at_most_lost": 100, "dropped_s": 59.0}
+    assert last_row(status).endswith(" 105")
     stream["dropped_s"] = 185.0
-    assert last_row(status).endswith(" 4 (none in the last minute)")
+    assert last_row(status).endswith(" 105 (none in the last minute)")
 
 
 def test_wall_times_stand_beside_ages_where_the_clock_is_given() -> None:

@@ -770,6 +770,21 @@ def test_how_long_streams_wait_does_not_begin_again_when_the_relay_says_why() ->
     )
 
 
+def test_what_was_missed_has_an_age_and_what_a_rule_wants_has_none() -> None:
+    node = make()
+    for now, (thinned, lost, at_most) in (
+        (100.0, (5, 0, 0)),
+        (110.0, (9, 2, 0)),
+        (120.0, (12, 2, 0)),
+        (130.0, (12, 2, 7)),
+    ):
+        wanted = StreamCount(stream="merge/in/0", drops=(("thinned", thinned),))
+        missed = StreamCount(stream="merge/in/1", lost=lost, at_most_lost=at_most)
+        node.handle(ev.StreamsCounted(counts=(wanted, missed)), now)
+        ages = [count.dropped_s for count in build_snapshot(node, now + 5.0).tasks[0].streams]
+        assert ages == [None, None if not lost else {110.0: 5.0, 120.0: 15.0, 130.0: 5.0}[now]]
+
+
 def test_drops_have_an_age_and_an_input_its_way_in() -> None:
     node = make()
     node.joins_at = ("tcp/127.0.0.1:7458",)

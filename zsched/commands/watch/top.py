@@ -14,7 +14,7 @@ from typing import Final
 
 from zsched.commands.brief import task_rows
 from zsched.commands.common import Json
-from zsched.commands.page import Cell, Page, clock_time, cut, size, span
+from zsched.commands.page import Cell, Page, clock_time, cut, missed_of, size, span
 from zsched.commands.report import header, millis, node_rows, per_second, printable, troubles
 from zsched.commands.watch.past import Past, Point
 from zsched.core.values.struct import Struct
@@ -226,8 +226,8 @@ def _streams(task: Json, frame: Frame) -> list[str]:
         told += [] if speed is None else [f"{size(round(speed))}/s"]
         told += [f"{stream['in_flight']} in flight"] if stream.get("in_flight") else []
         told += [] if answer_s is None else [f"{millis(answer_s)} behind its input"]
-        drops = sum(stream["drops"].values())
-        told += [f"{drops} dropped"] if drops else []
+        missed = missed_of(stream)
+        told += [f"{missed} missed"] if missed else []
         ends = f"{stream.get('from_expr', '')} -> {stream.get('to_expr', '')}" if stream.get("from_expr") else ""
         name = stream["stream"].removeprefix(prefix)
         page.row(("", 1, ""), (name, 6, ""), (" · ".join(told) or "nothing yet", 44, ""), (ends, frame.width, "dim"))

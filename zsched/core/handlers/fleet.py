@@ -130,8 +130,8 @@ def _adopt_work(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
     for name in kept:
         node.unready.pop(name, None)
         node.renewing.forget(name)
-    for stream in [stream for stream in node.dropped if stream.partition("/")[0] in kept]:
-        del node.dropped[stream]
+    for stream in [stream for stream in node.missed if stream.partition("/")[0] in kept]:
+        del node.missed[stream]
     for executor in come:
         executor.start(todo)
         value = values[executor.spec.name]

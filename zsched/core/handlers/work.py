@@ -188,9 +188,8 @@ def _on_role_ended(node: Stages, event: ev.RoleEnded, todo: ToDo, _now: float) -
 def _on_counted(node: Stages, event: ev.StreamsCounted, todo: ToDo, now: float) -> None:
     node.stream_counts = event.counts
     for count in event.counts:
-        dropped = sum(number for _, number in count.drops)
-        if dropped and node.dropped.get(count.stream, (0, 0.0))[0] != dropped:
-            node.dropped[count.stream] = (dropped, now)
+        if count.missed and node.missed.get(count.stream, (0, 0.0))[0] != count.missed:
+            node.missed[count.stream] = (count.missed, now)
     node.rates.absorb(event.counts, now)
     for count in node.gaps.absorb(event.counts, now):
         _tell_gap(node, count, todo)

@@ -162,7 +162,7 @@ class WorkerSpec:
         "Ready within this time, or the start has failed. The worker of an owner may be away for this time.",
         SECONDS,
     )
-    stop_grace_s: float = key(2.0, "Between SIGINT, SIGTERM and SIGKILL.", SECONDS)
+    stop_grace_s: float = key(2.0, "Between SIGINT, SIGTERM and SIGKILL; at the daemon's own end 0.35 s.", SECONDS)
     output_deadline_s: float | None = key(
         None, "No output for this long while inputs flow counts as hung.", SECONDS, shown="not watched"
     )

@@ -11,6 +11,7 @@ from enum import StrEnum
 from zsched.core.values.limits import Range, check_ranges, key
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.struct import Struct
+from zsched.core.values.words import INTENDED
 
 
 class Direction(StrEnum):
@@ -192,7 +193,7 @@ class StreamCount(Struct, frozen=True, kw_only=True):
     drops: tuple[tuple[str, int], ...] = ()
     """(reason, count): ``overflow``, ``no_route``, ``stale_epoch``, ``loop``, ``stalled``..."""
     dropped_s: float | None = None
-    """Filled in by the status: seconds since the drops last rose."""
+    """Filled in by the status: seconds since `missed` last rose; ``None``: nothing was missed so far."""
     last_seen_s: float | None = None
     """Seconds since the newest message, ``None`` before the first."""
     acknowledged: int | None = None
@@ -232,6 +233,12 @@ class StreamCount(Struct, frozen=True, kw_only=True):
     hz: float | None = None
     """Filled in by the status: messages per second over the last seconds, ``None`` while that is not known."""
     bytes_per_s: float | None = None
+
+    @property
+    def missed(self) -> int:
+        """Samples that somebody may miss: dropped for no rule's sake, lost on the way, at most lost with an owner."""
+        unintended = sum(number for reason, number in self.drops if reason not in INTENDED)
+        return unintended + self.lost + self.at_most_lost
 
     @property
     def is_still(self) -> bool:

@@ -22,6 +22,9 @@ MAX_ASKER, MAX_ASKED = 96, 200
 PAPER_METRICS = ("cpu", "memory", "network")
 """The metrics of Eq. 1 to 3; the others are gauges."""
 
+INTENDED = frozenset({"cut", "loop", "retried", "superseded", "thinned", "uncounted"})
+"""Reasons of drops by which nobody misses a sample: a rule wants them, or the sample came by another way."""
+
 NEVER_INITIALISED = "never initialised"
 """First words of the problem that no elector has a state, and no node remembers one."""
 TAKEN_OUT = "this machine was taken out"
