@@ -16,7 +16,7 @@ from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import CommandOutcome, CommandResult
 from zsched.errors import ConfigError
 from zsched.pki.files import PUBLIC, make_folder, write_whole
-from zsched.runtime.secured import bytes_of, files_of, identity_of, renewed_in
+from zsched.runtime.secured import CERTIFICATE, bytes_of, files_of, identity_of, renewed_in
 from zsched.sessions.certificate import ders_of, parts_of, pem_of
 
 SOON: Final = timedelta(days=7)
@@ -75,13 +75,20 @@ def ends_soon(fleet: Fleet, now: datetime) -> str | None:
     """
     if fleet.security is None:
         return None
-    ends = identity_of(fleet, fleet.security).ends
-    if now < ends - SOON:
+    own = identity_of(fleet, fleet.security)
+    day = f"{own.ends:%Y-%m-%d %H:%M} UTC"
+    if now < own.ends - SOON:
         return None
-    has = "has ended" if now > ends else "ends"
+    if now <= own.ends:
+        return (
+            f"this node's certificate ends on {day}, and its links with it: `zsched pki renew --deliver` where the "
+            "fleet's authority is, or is this machine's clock wrong?"
+        )
+    name = own.holder.name
     return (
-        f"this node's certificate {has} on {ends:%Y-%m-%d %H:%M} UTC, and its links with it: "
-        "`zsched pki renew --deliver` where the fleet's authority is, or is this machine's clock wrong?"
+        f"this node's certificate has ended on {day}, and its links with it, so nothing can be sent here: "
+        f"`zsched pki renew {name}` where the fleet's authority is, and bring {name}/{CERTIFICATE} to "
+        f"{fleet.security.folder} here; or is this machine's clock wrong?"
     )
 
 

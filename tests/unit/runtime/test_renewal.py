@@ -123,6 +123,16 @@ def test_a_state_folder_that_cannot_be_written_is_told(fleet: Fleet, authority: 
 def test_a_certificate_that_nobody_renews_is_told_of_a_week_before_its_end(fleet: Fleet) -> None:
     assert ends_soon(fleet, NOW) is None
     assert ends_soon(fleet, NOW + timedelta(days=12)) is None
-    assert "certificate ends on" in (ends_soon(fleet, NOW + timedelta(days=14)) or "")
-    assert "has ended on" in (ends_soon(fleet, NOW + timedelta(days=21)) or "")
+    soon = ends_soon(fleet, NOW + timedelta(days=14)) or ""
+    assert "certificate ends on" in soon
+    assert "`zsched pki renew --deliver`" in soon
     assert ends_soon(replace(fleet, security=None), NOW + timedelta(days=99)) is None
+
+
+def test_a_certificate_that_has_ended_is_told_to_be_brought_for_nothing_can_be_sent(fleet: Fleet) -> None:
+    told = ends_soon(fleet, NOW + timedelta(days=21)) or ""
+    assert "has ended on" in told
+    assert "--deliver" not in told
+    assert fleet.security is not None
+    assert "`zsched pki renew robot1`" in told
+    assert f"bring robot1/certificate.pem to {fleet.security.folder} here" in told
