@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Final
 
 from zsched import paths as places
 from zsched.adapters.machine import core_speed
@@ -17,6 +18,13 @@ from zsched.core.vote.belief import MAX_GENERATION
 from zsched.errors import ConfigError
 from zsched.exits import EXIT_USAGE
 from zsched.runtime.init import Heard, begin_anew, check_blank, init_state, settle_dispute, standing_state
+
+_LOST: Final = (
+    "if {name} was in {fleet} before and has lost its state, {file} may be older than {fleet} is now, and name fewer: "
+    "then do not start it; take {state} away, bring here what `zsched fleet export` writes on another node, and give "
+    "`zsched init` again"
+)
+"""Of a secured fleet, whose files `fleet create` and `join` wrote, together with a state."""
 
 
 def create_state(
@@ -70,6 +78,8 @@ def create_state(
     side = heard.side
     path = init_state(fleet, name, state, generation) if side is None else begin_anew(fleet, name, state, side)
     warn(_heard(heard, name, generation, is_elector=name in fleet.electors))
+    if fleet.security is not None and not heard.answers:
+        warn(_LOST.format(name=name, fleet=fleet.name, file=file, state=path))
     say(f"a core of this machine has speed {core_speed.kept_or_new(state):.2f}")
     if side is not None:
         text = "the others know it as an elector with another disk: it is a new member, and no elector until"

@@ -12,6 +12,7 @@ import pytest
 import typer.main
 from typer.testing import CliRunner, Result
 
+from support.authorities import install, make_authority
 from zsched import __version__
 from zsched.adapters.machine import core_speed
 from zsched.adapters.network.node_ping import Pinged
@@ -269,6 +270,16 @@ def test_init_says_whom_it_asked(tmp_path: Path) -> None:
     assert first.stderr == "no other node has an address in the fleet file: nobody was asked\n"
     second = run("init", "--config", file, "--node", "robot2", "--state-dir", tmp_path / "two")
     assert second.stderr == "asked 1 other node: none answered, so nobody could say whether robot2 has voted\n"
+
+
+def test_init_of_a_secured_fleet_that_nobody_answers_for_warns_of_an_old_file(tmp_path: Path) -> None:
+    """The file that `fleet create` wrote names the founder alone: whoever lost its state would be a fleet of one."""
+    file = tmp_path / "fleet.yaml"
+    install(make_authority(tmp_path / "authority", "hall"), tmp_path / "pki", "robot1")
+    file.write_text("fleet: hall\nsecurity: {}\nnodes:\n  robot1: {kind: robot}\ntasks: {}\n")
+    told = run("init", "--config", file, "--node", "robot1", "--state-dir", tmp_path / "state")
+    assert told.exit_code == 0
+    assert f"take {tmp_path / 'state' / 'state'} away, bring here what `zsched fleet export` writes" in told.stderr
 
 
 @pytest.mark.parametrize("more", [(), ("--generation", 1)], ids=["plain", "as the old advice had it"])
