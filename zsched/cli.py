@@ -40,7 +40,8 @@ from zsched.exits import EXIT_FAILED
 
 EPILOG = (
     "Exit codes: 0 fine, 1 failed, 2 usage, 3 daemon not reachable, 4 reachable but degraded, 5 timed out, "
-    "10 something would change (--plan), 75 the name is taken by another machine (up), 78 bad fleet file."
+    "10 something would change (--plan), 75 the name is taken by another machine (up), 78 bad fleet file, "
+    "79 ended by `zsched leave` (up)."
 )
 
 app = typer.Typer(

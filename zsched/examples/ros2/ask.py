@@ -1,6 +1,7 @@
 """A ROS 2 node on robot1: asks twice a second and prints the answers. It knows nothing of zsched.
 
 ``/usr/bin/python3 ask.py [ENDPOINT]``; without one it joins where a robot's relay listens for its own host.
+In a secured fleet that is the robot's local side, as ``zsched status -v`` names it (``tcp/127.0.0.1:7460``).
 """
 
 import itertools
