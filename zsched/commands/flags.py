@@ -433,8 +433,8 @@ def _look(watch: _Watch, nodes: Sequence[str], revision: int) -> list[str]:
 
 def _until(status: Json, name: str) -> str:
     """When a drained node gets tasks again."""
-    node = next(node for node in status["nodes"] if node["name"] == name)
-    flag = next((flag for flag in node.get("flags", ()) if flag["kind"] == DRAIN), None)
+    flags = next((node.get("flags", ()) for node in status["nodes"] if node["name"] == name), ())
+    flag = next((flag for flag in flags if flag["kind"] == DRAIN), None)
     if flag is None or flag["for_s"] is None:
         return f" until `zsched undrain {name}`"
     return f" for {span(max(flag['for_s'] - flag['known_s'], 0.0))}, or until `zsched undrain {name}`"
@@ -488,8 +488,8 @@ def _tell_stays(watch: _Watch, found: Mapping[str, Json]) -> None:
 def _why_it_stays(name: str, found: Mapping[str, Json]) -> str:
     """The last judgement of some robot, with what keeps the other candidates from the task."""
     for status in found.values():
-        task = next(one for one in status["tasks"] if one["name"] == name)
-        if task["decision"] is not None:
+        task = next((one for one in status["tasks"] if one["name"] == name), None)
+        if task is not None and task["decision"] is not None:
             vetoed = task["decision"]["vetoed"]
             why = "; ".join(f"{other}: {veto}" for other, veto in vetoed.items() if other != task["owner"])
             return f"{task['decision']['reason']}{f' ({why})' if why else ''}"

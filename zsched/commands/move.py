@@ -96,10 +96,10 @@ def _watch(door: Door, order: MoveOrder, revision: int) -> tuple[dict[str, Json]
         first = status_of(door)
         found = _robots(door, first)
         now = monotonic_s()
-        task = next(task for task in first["tasks"] if task["name"] == order.task)
+        task = next((task for task in first["tasks"] if task["name"] == order.task), None)
         statuses = {str(first["node"]): first, **found}
         lacks = missing(Condition(kind="settled", task=order.task), statuses)
-        if task["revision"] < revision:
+        if task is not None and task["revision"] < revision:
             lacks.append(f"{order.task}: {first['node']} has not learnt revision {revision}")
         settled_at = (settled_at or now) if not lacks else None
         is_measured = settled_at is not None and (not unmeasured(found, order.task) or now - settled_at >= GAP_S)
@@ -112,7 +112,9 @@ def unmeasured(statuses: Mapping[str, Json], name: str) -> list[str]:
     """The robots at which answers flow, and the new owner's first one is not told yet."""
     found = []
     for node, status in statuses.items():
-        task = next(one for one in status["tasks"] if one["name"] == name)
+        task = next((one for one in status["tasks"] if one["name"] == name), None)
+        if task is None:
+            continue
         flows = [stream for stream in task["streams"] if stream.get("gap_s") is not None]
         if flows and task.get("gap_s") is None:
             found.append(node)

@@ -283,8 +283,9 @@ class Stage:
         self._view, self._order = view, order
         self._sockets = {path.stem: path for path in places.local_sockets(runtime)} if runtime.is_dir() else {}
         self.first = self._status(view.door)
-        names = [str(task["name"]) for task in self.first["tasks"]]
-        if order.task not in names:
+        task = self._task(self.first)
+        if task is None:
+            names = [str(one["name"]) for one in self.first["tasks"]]
             text = f"fleet {self.first['fleet']} has no task {order.task!r}{nearest(order.task, names)}"
             raise CliError(EXIT_USAGE, text)
         self.at = wall_s()
@@ -301,7 +302,6 @@ class Stage:
         if Step.LINK in order.steps and not silent_s < self.cut_s <= MAX_CUT_S:
             text = f"--cut: more than {silent_s:.1f} s (before that nobody misses the owner), at most {MAX_CUT_S:g} s"
             raise CliError(EXIT_USAGE, text)
-        task = self._task(self.first)
         self._base = _Base(
             alive=frozenset(str(node["name"]) for node in self.first["nodes"] if node["state"] == "alive"),
             ready=frozenset(_ready(self.first, order.task)),
@@ -326,9 +326,9 @@ class Stage:
     def _status(self, door: Door) -> Json:
         return ask_door(door, {"verb": "status"})
 
-    def _task(self, status: Json) -> Json:
-        task: Json = next(one for one in status["tasks"] if one["name"] == self._order.task)
-        return task
+    def _task(self, status: Json) -> Json | None:
+        """What a node tells of the task; ``None``: it does not know it."""
+        return next((one for one in status["tasks"] if one["name"] == self._order.task), None)
 
     def look(self) -> Look:
         """What the robots tell now; what cannot be asked is something that the task lacks."""
@@ -343,10 +343,12 @@ class Stage:
                 silent.append(f"{robot} does not answer: {error}")
         if not statuses:
             return Look(now=now, owner=None, epoch=-1, lacks=tuple(silent))
-        tasks = {robot: self._task(status) for robot, status in statuses.items()}
         first = next(iter(statuses.values()))
-        task = max(tasks.values(), key=lambda one: int(one["epoch"]))
         lacks = [*silent, *self._lacks(statuses, first)]
+        tasks = {robot: task for robot, status in statuses.items() if (task := self._task(status)) is not None}
+        if not tasks:
+            return Look(now=now, owner=None, epoch=-1, lacks=tuple(lacks))
+        task = max(tasks.values(), key=lambda one: int(one["epoch"]))
         switched = [one["switched_s"] for one in tasks.values() if one["epoch"] == task["epoch"]]
         return Look(
             now=now,
@@ -372,9 +374,9 @@ class Stage:
         for observer, status in statuses.items():
             states = {str(node["name"]): str(node["state"]) for node in status["nodes"]}
             lacks += [
-                f"{name} is {states[name]} to {observer}"
+                f"{name} is {states.get(name, 'not known')} to {observer}"
                 for name in sorted(self._base.alive)
-                if states[name] != "alive"
+                if states.get(name) != "alive"
             ]
         ready = _ready(first, self._order.task)
         lacks += [f"the worker on {name} is not ready" for name in sorted(self._base.ready - ready)]

@@ -68,6 +68,8 @@ def missing(condition: Condition, statuses: Mapping[str, Json]) -> list[str]:
     """
     first = next(iter(statuses.values()))
     tasks = {str(task["name"]): task for task in first["tasks"]}
+    if condition.task and condition.task not in tasks:  # it was taken out meanwhile, or this node is behind
+        return [f"{condition.task}: {next(iter(statuses))} does not know it"]
     if condition.kind == "healthy":
         return all_problems(first)
     if condition.kind == "quorum":
@@ -96,7 +98,11 @@ def _under_way(statuses: Mapping[str, Json], name: str, why: str) -> list[str]:
     """The nodes whose handover of a task is not over, or that know another owner than the first of them."""
     found, owner = [], None
     for node, status in statuses.items():
-        task = next(one for one in status["tasks"] if one["name"] == name)
+        task = next((one for one in status["tasks"] if one["name"] == name), None)
+        if task is None:
+            if not why:  # who does not know a task has no stream of it, so none to an old owner either
+                found.append(f"{name}: {node} has not learnt of it yet")
+            continue
         owner = owner or task["owner"]
         if task["phase"] not in RESTING:
             found.append(f"{name}: {why}{node} is {task['phase']}")

@@ -244,6 +244,38 @@ def test_a_move_waits_for_the_profile_of_a_node_that_lives(daemon: Daemon, monke
     assert "no fresh profile" in result.stderr
 
 
+def test_a_move_waits_for_a_robot_that_does_not_know_the_task_yet(daemon: Daemon) -> None:
+    """Nodes fetch a document that adds a task one after the other."""
+    daemon.status["nodes"].append(living("robot2", "robot", "echo"))
+    behind = 3
+
+    def answer(request: Json) -> Json:
+        nonlocal behind
+        told = Daemon.answer(daemon, request)
+        if request.get("node") == "robot2" and behind:
+            behind -= 1
+            told |= {"node": "robot2", "tasks": []}
+        return told
+
+    daemon.answers = answer
+    done = run("move", "echo", "edge2", "--yes")
+    assert (done.exit_code, behind) == (0, 0), done.output
+    assert "echo: settled on edge2" in done.stdout
+    behind = 10**9
+    late = run("move", "echo", "edge1", "--yes", "--timeout", "0")
+    assert (late.exit_code, "  echo: robot2 has not learnt of it yet" in late.stdout) == (5, True), late.output
+
+
+def test_a_move_of_a_task_that_is_taken_out_meanwhile_says_so(daemon: Daemon) -> None:
+    def answer(request: Json) -> Json:
+        told = Daemon.answer(daemon, request)
+        return {**told, "tasks": []} if request["verb"] == "status" and daemon.orders else told
+
+    daemon.answers = answer
+    late = run("move", "echo", "edge2", "--yes", "--timeout", "0")
+    assert (late.exit_code, "  echo: robot1 does not know it" in late.stdout) == (5, True), late.output
+
+
 def test_a_move_that_does_not_settle_in_time_exits_with_5(daemon: Daemon) -> None:
     daemon.status["tasks"][0]["phase"] = "preparing"
     result = run("move", "echo", "edge2", "--timeout", "0", "--yes")

@@ -205,6 +205,17 @@ def test_a_drain_is_ours_ends_by_itself_and_is_lifted_without_touching_others(da
     assert [one["verb"] for one in daemon.done] == ["change", "change"]
 
 
+def test_a_robot_that_does_not_know_the_task_or_a_node_is_something_that_it_lacks(daemon: Daemon, stage: Stage) -> None:
+    """A document that was changed meanwhile reaches one node after the other."""
+    assert stage.look().lacks == ()
+    gone = daemon.status["nodes"].pop(1)
+    assert "edge2 is not known to robot1" in stage.look().lacks
+    daemon.status["nodes"].insert(1, gone)
+    daemon.status["tasks"] = []
+    look = stage.look()
+    assert (look.owner, look.lacks) == (None, ("echo: robot1 does not know it",))
+
+
 def test_an_owner_with_an_order_is_not_drained(daemon: Daemon, stage: Stage) -> None:
     daemon.flags = [{"kind": "drain", "subject": "edge1", "by": "eve", "reason": "", "for_s": None, "revision": 2}]
     assert stage.act(DRAIN)[1] == "edge1 has an order already; see `zsched maint`"

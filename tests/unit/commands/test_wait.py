@@ -96,17 +96,32 @@ def test_empty_needs_no_task_and_no_slot_that_drains() -> None:
     assert lacks("empty=edge2", first, other) == ["echo: the old owner may be in use: 1 is draining"]
 
 
+def test_a_node_that_does_not_know_the_task_is_named_and_uses_no_old_owner() -> None:
+    """A document that adds or removes a task reaches one node after the other."""
+    first, other = recorded(), {**recorded(), "tasks": []}
+    assert lacks("settled=echo", first, other) == ["echo: 1 has not learnt of it yet"]
+    assert lacks("settled=echo", other, first) == ["echo: 0 does not know it"]
+    assert lacks("owner=echo@edge1", other) == ["echo: 0 does not know it"]
+    assert lacks("empty=edge2", first, other) == []
+
+
 # --- the verb --------------------------------------------------------------------------------------------------------
 
 
 class Daemon:
     def __init__(self, folder: Path) -> None:
         self.status, self.asked = recorded(), list[Json]()
+        self.behind = 0
+        """Looks at robot2 until it knows the tasks."""
         self.socket = OperatorSocket(folder / "robot1.sock", self.answer)
 
     def answer(self, request: Json) -> Json:
         self.asked.append(request)
-        return {**copy.deepcopy(self.status), "node": request.get("node", "robot1")}
+        told = {**copy.deepcopy(self.status), "node": request.get("node", "robot1")}
+        if told["node"] == "robot2" and self.behind:
+            self.behind -= 1
+            told["tasks"] = []
+        return told
 
 
 @pytest.fixture
@@ -161,6 +176,14 @@ def test_settled_asks_every_robot_that_is_alive(daemon: Daemon) -> None:
     daemon.status["nodes"][-1]["state"] = "gone"
     assert run("--for", "settled=echo", "--timeout", "0").exit_code == 0
     assert [request.get("node") for request in daemon.asked] == [None, "robot2"]
+
+
+def test_a_robot_that_does_not_know_a_new_task_yet_is_asked_until_it_does(daemon: Daemon) -> None:
+    daemon.behind = 1
+    late = run("--for", "settled=echo", "--timeout", "0")
+    assert (late.exit_code, late.stdout.splitlines()[1:]) == (5, ["  echo: robot2 has not learnt of it yet"])
+    daemon.behind = 1
+    assert (run("--for", "settled=echo", "--timeout", "60").exit_code, daemon.behind) == (0, 0)
 
 
 @pytest.mark.parametrize(
