@@ -148,7 +148,7 @@ def _worker(node: str, load: Json) -> Result:
     if state == "failed":
         return failed(told, fix=f"mend its cause, then: zsched retry {task} {node}")
     if has_lost_its_worker(state, reason) and state != "stopped":
-        return failed(told, fix=f"zsched logs {task}; zsched restart {task} starts it anew")
+        return failed(told, fix=f"zsched logs {task} {node}; zsched restart {task} {node} starts it anew")
     if reason.startswith(RESTARTING) or (state == "ready" and reason):
-        return warned(told, fix=f"zsched logs {task} shows what it printed")
+        return warned(told, fix=f"zsched logs {task} {node} shows what it printed")
     return passed(told)

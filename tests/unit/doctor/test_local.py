@@ -356,6 +356,27 @@ def test_a_worker_that_failed_is_found(tmp_path: Path) -> None:
     assert "zsched retry merge edge1" in run("worker.state", broken).fix
 
 
+@pytest.mark.parametrize(
+    ("load", "verdict", "fix"),
+    [
+        (
+            {"state": "starting", "reason": "was ready until 12:00:00 UTC, its token went: it may hang"},
+            FAIL,
+            "zsched logs merge edge1; zsched restart merge edge1 starts it anew",
+        ),
+        ({"state": "ready", "reason": "raises: no model file"}, WARN, "zsched logs merge edge1 shows what it printed"),
+    ],
+)
+def test_advice_for_a_worker_names_its_node_for_the_owner_s_may_be_well(
+    tmp_path: Path, load: dict[str, str], verdict: Verdict, fix: str
+) -> None:
+    scene = scene_of(tmp_path)
+    (task,) = scene.status["tasks"]
+    nodes = [{"name": "edge1", "workers": [{"task": "merge", **load}]}]
+    result = run("worker.state", answer(scene, nodes=nodes, tasks=[{**task, "owner": "robot1"}]))
+    assert (result.verdict, result.fix) == (verdict, fix)
+
+
 def test_an_owner_whose_worker_hangs_is_found_by_its_node_and_by_the_others(tmp_path: Path) -> None:
     scene = scene_of(tmp_path)
     why = "was ready until 12:00:00 UTC, its token went: it may hang"
