@@ -16,7 +16,16 @@ from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, nearest, print_json, say
 from zsched.commands.document import InForce, change_over, document_text, in_force, ordered
-from zsched.commands.orders import OrderView, Row, begin, check_said
+from zsched.commands.orders import (
+    OrderView,
+    Row,
+    begin,
+    check_said,
+    lost_since,
+    statuses_of,
+    tell_uncounted,
+    told_losses,
+)
 from zsched.commands.page import span
 from zsched.commands.report import millis, told_flag
 from zsched.commands.wait import Condition, missing
@@ -65,7 +74,8 @@ class _Watch(Struct):
     began: float
     owners: dict[str, str]
     """{task: the node that it is to leave}, of those that have not settled elsewhere yet."""
-    before: dict[str, Mapping[str, int]]
+    before: Mapping[str, Json]
+    """{node: its status before the drain}."""
     stays: dict[str, str] = field(default_factory=dict)
     """{task: why it stays, as it was told last}."""
     empty: set[str] = field(default_factory=set)
@@ -97,8 +107,8 @@ def drain(view: OrderView, order: DrainOrder) -> int:
         code = begin(view, [*rows, *order.more_rows], plan, is_change=is_change, titles=TITLES, is_line=True)
         if code is not None:
             return code
-    found = {} if order.is_detached else _statuses(view.door, status, nodes)
-    before = {name: _counts(found, name) for name in _owned(status, nodes)}
+    before, silent = ({}, {}) if order.is_detached else _statuses(view.door, status, nodes)
+    tell_uncounted(silent)
     revision = _commit(view, held, after, f"{order.kind} {', '.join(nodes)}")
     had = "; ".join(f"{row[0]}: {row[2]}" for row in rows if row[1] == order.kind)
     what = f"It is agreed{_endless(held.flags, after)}" if is_change else f"Nothing would change ({had})"
@@ -387,13 +397,6 @@ def _owned(status: Json, nodes: Sequence[str]) -> dict[str, str]:
     return {str(task["name"]): str(task["owner"]) for task in status["tasks"] if task["owner"] in nodes}
 
 
-def _counts(found: Mapping[str, Json], name: str) -> Mapping[str, int]:
-    """What hops of a task's streams have lost and doubled so far, over all nodes that were asked."""
-    tasks = [task for status in found.values() for task in status["tasks"] if task["name"] == name]
-    streams = [stream for task in tasks for stream in task["streams"]]
-    return {key: sum(int(stream[key]) for stream in streams) for key in ("lost", "doubled")}
-
-
 def _watch(watch: _Watch, nodes: Sequence[str], revision: int, deadline_s: float | None) -> int:
     """Look again and again until the nodes are empty, or the deadline has come."""
     while True:
@@ -413,9 +416,11 @@ def _look(watch: _Watch, nodes: Sequence[str], revision: int) -> list[str]:
     """Tell what is new, and say what is missing yet; a node that does not answer now is asked again."""
     try:
         first = _status(watch.view.door)
-        found = _statuses(watch.view.door, first, nodes)
     except CliError as error:
         return [str(error)]
+    found, silent = _statuses(watch.view.door, first, nodes)
+    if silent:
+        return list(silent.values())
     if int(first["fleet_revision"]) < revision:
         return [f"{first['node']} has not learnt revision {revision} yet"]
     _tell_moves(watch, found)
@@ -440,18 +445,14 @@ def _until(status: Json, name: str) -> str:
     return f" for {span(max(flag['for_s'] - flag['known_s'], 0.0))}, or until `zsched undrain {name}`"
 
 
-def _statuses(door: Door, first: Json, nodes: Sequence[str]) -> dict[str, Json]:
-    """The statuses of all robots and of the drained nodes that are alive; the first one is of the node at the door."""
+def _statuses(door: Door, first: Json, nodes: Sequence[str]) -> tuple[dict[str, Json], dict[str, str]]:
+    """As `statuses_of`, of all robots and the drained nodes that are alive; the first one is the node at the door."""
     wanted = [
         str(node["name"])
         for node in first["nodes"]
         if node["state"] == "alive" and (node["kind"] == "robot" or node["name"] in nodes)
     ]
-    found = {str(first["node"]): first}
-    for name in wanted:
-        if name not in found:
-            found[name] = _status(door.to(name))
-    return found
+    return statuses_of(door, first, list(dict.fromkeys((str(first["node"]), *wanted))))
 
 
 def _tell_moves(watch: _Watch, found: Mapping[str, Json]) -> None:
@@ -466,10 +467,9 @@ def _tell_moves(watch: _Watch, found: Mapping[str, Json]) -> None:
         spans = [one["switched_s"] for status in found.values() for one in status["tasks"] if one["name"] == name]
         switched_s = max((one for one in spans if one is not None), default=None)
         took = "" if switched_s is None else f", streams switched in {millis(switched_s)}"
-        before, now = watch.before.get(name, {}), _counts(found, name)
-        more: Json = {key: max(now[key] - before.get(key, 0), 0) for key in now}
-        text = f"{name}: {left} -> {task['owner']}{took}, lost {more['lost']}, doubled {more['doubled']}"
-        watch.tell("moved", text, node=left, task=name, to=task["owner"], switched_s=switched_s, **more)
+        losses = lost_since(watch.before, found, name)
+        text = f"{name}: {left} -> {task['owner']}{took}{told_losses(losses)}"
+        watch.tell("moved", text, node=left, task=name, to=task["owner"], switched_s=switched_s, **losses)
 
 
 def _tell_stays(watch: _Watch, found: Mapping[str, Json]) -> None:

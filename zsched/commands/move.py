@@ -7,12 +7,24 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from typing import Final
 
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door
-from zsched.commands.common import Json, print_json, say
-from zsched.commands.orders import PAUSE_S, OrderView, begin, check_name, check_said, refused, status_of
+from zsched.commands.common import CliError, Json, print_json, say
+from zsched.commands.orders import (
+    PAUSE_S,
+    OrderView,
+    begin,
+    check_name,
+    check_said,
+    lost_since,
+    refused,
+    status_of,
+    statuses_of,
+    tell_uncounted,
+    told_losses,
+)
 from zsched.commands.page import span
 from zsched.commands.report import millis
 from zsched.commands.wait import Condition, missing
@@ -66,7 +78,8 @@ def move(view: OrderView, order: MoveOrder) -> int:
     code = begin(view, [row], {**body, "missing": []}, is_change=plan["outcome"] == "ok")
     if code is not None:
         return code
-    before = _counts(_robots(view.door, status), order.task)
+    before, silent = _robots(view.door, status)
+    tell_uncounted(silent)
     result = ask_door(view.door, request)
     if result["outcome"] not in ("ok", "unchanged"):
         raise refused(order.task, result)
@@ -93,19 +106,27 @@ def _watch(door: Door, order: MoveOrder, revision: int) -> tuple[dict[str, Json]
     """Every robot's status once the move is over, and what is missing when it is not in time."""
     began, settled_at = monotonic_s(), None
     while True:
-        first = status_of(door)
-        found = _robots(door, first)
+        found, lacks = _look(door, order, revision)
         now = monotonic_s()
-        task = next((task for task in first["tasks"] if task["name"] == order.task), None)
-        statuses = {str(first["node"]): first, **found}
-        lacks = missing(Condition(kind="settled", task=order.task), statuses)
-        if task is not None and task["revision"] < revision:
-            lacks.append(f"{order.task}: {first['node']} has not learnt revision {revision}")
         settled_at = (settled_at or now) if not lacks else None
         is_measured = settled_at is not None and (not unmeasured(found, order.task) or now - settled_at >= GAP_S)
         if is_measured or now - began >= order.timeout_s:
             return found, lacks
         time.sleep(PAUSE_S)
+
+
+def _look(door: Door, order: MoveOrder, revision: int) -> tuple[dict[str, Json], list[str]]:
+    """The robots' statuses, and what is missing yet; a node that does not answer now is asked again."""
+    try:
+        first = status_of(door)
+    except CliError as error:
+        return {}, [str(error)]
+    found, silent = _robots(door, first)
+    lacks = missing(Condition(kind="settled", task=order.task), {str(first["node"]): first, **found})
+    task = next((task for task in first["tasks"] if task["name"] == order.task), None)
+    if task is not None and task["revision"] < revision:
+        lacks.append(f"{order.task}: {first['node']} has not learnt revision {revision}")
+    return found, [*lacks, *silent.values()]
 
 
 def unmeasured(statuses: Mapping[str, Json], name: str) -> list[str]:
@@ -121,22 +142,10 @@ def unmeasured(statuses: Mapping[str, Json], name: str) -> list[str]:
     return found
 
 
-def _robots(door: Door, status: Json) -> dict[str, Json]:
-    """The statuses of all robots that are alive."""
+def _robots(door: Door, status: Json) -> tuple[dict[str, Json], dict[str, str]]:
+    """As `statuses_of`, of all robots that are alive."""
     alive = [str(node["name"]) for node in status["nodes"] if node["kind"] == "robot" and node["state"] == "alive"]
-    return {name: status if name == status["node"] else status_of(door.to(name)) for name in alive}
-
-
-def _counts(statuses: Mapping[str, Json], name: str) -> dict[str, int]:
-    """What hops of the task's streams have lost and doubled so far, over all robots."""
-    streams = [
-        stream
-        for status in statuses.values()
-        for task in status["tasks"]
-        if task["name"] == name
-        for stream in task["streams"]
-    ]
-    return {key: sum(int(stream[key]) for stream in streams) for key in ("lost", "doubled")}
+    return statuses_of(door, status, alive)
 
 
 def _tell_move(
@@ -144,7 +153,7 @@ def _tell_move(
     order: MoveOrder,
     left: str,
     result: Json,
-    before: Mapping[str, int],
+    before: Mapping[str, Json],
     found: Mapping[str, Json],
     lacks: Sequence[str],
 ) -> int:
@@ -152,23 +161,22 @@ def _tell_move(
     switched = [task["switched_s"] for task in tasks if task.get("switched_s") is not None]
     switched_s = max(switched, default=None)
     gap_s = max([task["gap_s"] for task in tasks if task.get("gap_s") is not None], default=None)
-    after = _counts(found, order.task)
-    more: dict[str, Any] = {key: max(after[key] - before[key], 0) if found else None for key in before}
+    losses = lost_since(before, found, order.task)
     epoch = max([int(task["epoch"]) for task in tasks], default=None)
     if view.is_json:
         body = {"schema": MOVE_SCHEMA, "task": order.task, "from": left or None, "to": order.node, "epoch": epoch}
         body |= {"revision": result["revision"], "settled": bool(found) and not lacks, "switched_s": switched_s}
         body |= {"gap_s": gap_s}
-        print_json({**body, **more, "missing": list(lacks)})
-    elif not found:
-        say(f"{order.task}: revision {result['revision']} is agreed; `zsched wait --for settled={order.task}`")
+        print_json({**body, **losses, "missing": list(lacks)})
     elif lacks:
         say(f"{order.task}: not settled after {span(order.timeout_s)}")
         for lack in lacks:
             say(f"  {lack}", indent=4)
         say("the move stands; `zsched status` on such a node names what it waits for")
+    elif not found:
+        say(f"{order.task}: revision {result['revision']} is agreed; `zsched wait --for settled={order.task}`")
     else:
         took = "" if switched_s is None else f", streams switched in {millis(switched_s)}"
         took += "" if gap_s is None else f", answers at most {millis(gap_s)} apart"
-        say(f"{order.task}: settled on {order.node}{took}, lost {more['lost']}, doubled {more['doubled']}")
+        say(f"{order.task}: settled on {order.node}{took}{told_losses(losses)}")
     return EXIT_TIMED_OUT if lacks else EXIT_OK

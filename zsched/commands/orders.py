@@ -15,7 +15,8 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 from zsched.commands.ask import Door, ask_door, operator_at
-from zsched.commands.common import CliError, Json, check_reason, nearest, print_json, say, says_yes
+from zsched.commands.common import CliError, Json, check_reason, nearest, print_json, say, says_yes, warn
+from zsched.commands.document import ask_all
 from zsched.commands.page import span
 from zsched.core.values.model import MAX_FOR_S
 from zsched.core.values.struct import Struct
@@ -100,6 +101,47 @@ def check_said(view: OrderView) -> None:
 def status_of(door: Door) -> Json:
     """What a daemon says of the fleet. Raises `CliError`: nobody answers."""
     return ask_door(door, {"verb": "status"})
+
+
+def statuses_of(door: Door, first: Json, names: Sequence[str]) -> tuple[dict[str, Json], dict[str, str]]:
+    """({node: its status}, {node: that it does not answer, and why}) of the nodes in ``names``.
+
+    ``first`` is the status of the node at the door.
+    """
+    answers = ask_all(door, [name for name in names if name != first["node"]], {"verb": "status"})
+    found: dict[str, Json] = {}
+    silent: dict[str, str] = {}
+    for name in names:
+        answer = answers.get(name, first)
+        if isinstance(answer, CliError):
+            silent[name] = f"{name} does not answer: {answer}"
+        else:
+            found[name] = answer
+    return found, silent
+
+
+def tell_uncounted(silent: Mapping[str, str]) -> None:
+    """Say that nodes had no figures before the order: so nobody takes what is told afterwards for all of it."""
+    if silent:
+        warn(f"{', '.join(silent)}: no answer before the order, so what is lost there is not counted")
+
+
+def lost_since(before: Mapping[str, Json], now: Mapping[str, Json], task: str) -> dict[str, int | None]:
+    """What hops of a task's streams have lost and doubled meanwhile, over the nodes in both; ``None``: no node is."""
+    nodes = [name for name in now if name in before]
+    both = [_counts([status[name] for name in nodes], task) for status in (before, now)]
+    return {key: max(both[1][key] - both[0][key], 0) if nodes else None for key in both[0]}
+
+
+def _counts(statuses: Sequence[Json], name: str) -> dict[str, int]:
+    tasks = [task for status in statuses for task in status["tasks"] if task["name"] == name]
+    streams = [stream for task in tasks for stream in task["streams"]]
+    return {key: sum(int(stream[key]) for stream in streams) for key in ("lost", "doubled")}
+
+
+def told_losses(losses: Mapping[str, int | None]) -> str:
+    """What was lost and doubled, as the end of a line; empty: nobody has counted."""
+    return "" if losses["lost"] is None else f", lost {losses['lost']}, doubled {losses['doubled']}"
 
 
 def check_name(status: Json, kind: str, name: str, known: Sequence[str]) -> None:

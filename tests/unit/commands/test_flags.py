@@ -53,11 +53,16 @@ class Daemon:
         """Changes that the fleet's own new electors come before."""
         self.behind: set[str] = set()
         """Nodes that do not know the tasks yet."""
+        self.silent: dict[str, int] = {}
+        """{node: questions for its status that it does not answer}."""
         self.step: Callable[[], None] = lambda: None
 
     def answer(self, request: Json) -> Json:
         if request["verb"] == "status":
             body, name = copy.deepcopy(self.status), request.get("node", "robot1")
+            if self.silent.get(name, 0):
+                self.silent[name] -= 1
+                return {"error": f"{name} did not answer within 3 s; is it up and reachable?"}
             if name == "robot1":
                 self.step()
             return {**body, "node": name, **({"tasks": []} if name in self.behind else {})}
@@ -253,6 +258,25 @@ def test_a_node_that_does_not_know_a_new_task_yet_breaks_no_drain(
 
     daemon.step = step
     assert [one["event"] for one in events("drain", "edge1", "--yes")] == ["unchanged", "empty"]
+
+
+def test_a_node_that_is_silent_for_a_moment_refuses_and_ends_no_drain(daemon: Daemon) -> None:
+    """Nodes are drained just when some are not well; what such a one has lost cannot be counted."""
+    daemon.status["tasks"][0]["streams"] = [{**STATUS["tasks"][0]["streams"][0], "lost": 7, "doubled": 0}]
+    daemon.own("merge", "edge2")
+    daemon.silent = {"edge1": 2}
+    looks = iter(range(10))
+
+    def step() -> None:
+        if daemon.changes and next(looks, 10) == 1:
+            daemon.status["tasks"][0]["streams"][0]["lost"] = 9
+            daemon.own("echo", "edge2")
+
+    daemon.step = step
+    done = run("drain", "edge1", "--yes")
+    assert (done.exit_code, daemon.silent) == (0, {"edge1": 0}), done.output
+    assert done.stderr == "edge1: no answer before the order, so what is lost there is not counted\n"
+    assert "echo: edge1 -> edge2, streams switched in 86 ms, lost 2, doubled 0" in done.stdout
 
 
 def test_with_force_the_deadline_does_not_count(daemon: Daemon) -> None:

@@ -266,6 +266,42 @@ def test_a_move_waits_for_a_robot_that_does_not_know_the_task_yet(daemon: Daemon
     assert (late.exit_code, "  echo: robot2 has not learnt of it yet" in late.stdout) == (5, True), late.output
 
 
+def test_a_move_that_is_agreed_is_watched_on_while_a_node_is_silent(daemon: Daemon) -> None:
+    daemon.status["nodes"].append(living("robot2", "robot", "echo"))
+    for one in daemon.status["tasks"]:
+        one["streams"] = [{**STATUS["tasks"][0]["streams"][0], "lost": 5, "doubled": 0, "gap_s": None}]
+    silent = {"robot2": 0, "robot1": 0}
+
+    def answer(request: Json) -> Json:
+        name = request.get("node", "robot1")
+        if request["verb"] == "status" and (daemon.orders or name == "robot2") and silent[name]:
+            silent[name] -= 1
+            return {"error": f"{name} did not answer within 3 s; is it up and reachable?"}
+        return {**Daemon.answer(daemon, request), "node": name}
+
+    daemon.answers = answer
+    for name, count in (("robot2", 2), ("robot1", 1)):
+        daemon.orders.clear()
+        silent[name] = count
+        done = run("move", "echo", "edge2", "--yes", "--json")
+        body = json.loads(done.stdout)
+        assert (done.exit_code, silent[name], faults(body)) == (0, 0, []), done.output
+        assert (body["settled"], body["lost"], body["missing"]) == (True, 0, []), "what was lost before does not count"
+        told = "robot2: no answer before the order, so what is lost there is not counted\n"
+        assert done.stderr == (told if name == "robot2" else "")
+        daemon.status["tasks"][0]["owner"] = "edge1"
+    silent["robot2"] = 10**9
+    late = run("move", "echo", "edge2", "--yes", "--timeout", "0")
+    assert (late.exit_code, "  robot2 does not answer: " in late.stdout) == (5, True), late.output
+    silent |= {"robot1": 10**9, "robot2": 0}
+    daemon.orders.clear()
+    daemon.status["tasks"][0]["owner"] = "edge1"
+    gone = run("move", "echo", "edge2", "--yes", "--timeout", "0", "--json")
+    body = json.loads(gone.stdout)
+    assert (gone.exit_code, faults(body), body["settled"], body["lost"]) == (5, [], False, None)
+    assert "robot1 did not answer within 3 s" in body["missing"][0]
+
+
 def test_a_move_of_a_task_that_is_taken_out_meanwhile_says_so(daemon: Daemon) -> None:
     def answer(request: Json) -> Json:
         told = Daemon.answer(daemon, request)
