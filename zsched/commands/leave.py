@@ -9,6 +9,7 @@ Each step is agreed before the next one begins, so the command can be broken off
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import time
 from pathlib import Path
@@ -33,7 +34,7 @@ from zsched.core.values.struct import Struct
 from zsched.core.values.words import TAKEN_OUT
 from zsched.errors import AdapterError, ConfigError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_UNREACHABLE, EXIT_USAGE, EXIT_WOULD_CHANGE
-from zsched.runtime.membership import Places, Written, belongings, check_ended, put_away, whose
+from zsched.runtime.membership import Places, Written, belongings, check_ended, is_out, note_out, put_away, whose
 from zsched.wire.codec import from_plain
 
 LAST: Final = "last-node"
@@ -116,7 +117,10 @@ def leave(order: LeaveOrder) -> int:
     except CliError as error:
         if error.code != EXIT_UNREACHABLE:
             raise
-        _accept(order, NOT_TOLD, f"{error}. The others are not told: `zsched node forget {me}` tells them")
+        if not is_out(fleet, me, order.places.state):
+            _accept(order, NOT_TOLD, f"{error}. The others are not told: `zsched node forget {me}` tells them")
+        elif not order.is_json:
+            say(f"{me} is no node of {fleet} any more, and its daemon has ended")
         return _end(order, fleet, me, files)
     if (status["fleet"], status["node"]) != (fleet, me):
         other = f"{status['node']} of fleet {status['fleet']}"
@@ -162,7 +166,10 @@ def _take_leave(way: Way, status: Json) -> int:
     order, me = way.order, way.me
     if any(TAKEN_OUT in str(problem) for problem in status["problems"]):  # the others may not answer it any more
         way.tell(f"{me} is no node of {status['fleet']} any more: it was taken out")
-        return _planned(way, str(status["fleet"])) if order.is_plan else EXIT_OK
+        if order.is_plan:
+            return _planned(way, str(status["fleet"]))
+        _note(way, str(status["fleet"]), int(status["fleet_revision"]) + 1)
+        return EXIT_OK
     held = _newest(way, status)
     members = members_of(held, status)
     danger = _danger(way, status, held, members)
@@ -171,7 +178,11 @@ def _take_leave(way: Way, status: Json) -> int:
     if me not in members:
         way.tell(f"{me} is no node of {held.fleet} since revision {held.revision}")
     if danger is not None or me not in members:
-        return _planned(way, held.fleet) if order.is_plan else EXIT_OK
+        if order.is_plan:
+            return _planned(way, held.fleet)
+        if me not in members:
+            _note(way, held.fleet, held.revision)
+        return EXIT_OK
     without(document_text(held), me)  # its faults come before anything is done
     rows: tuple[Row, ...] = ((me, "member", held.fleet, "-"),)
     if any(name == me for name, _ in held.electors):
@@ -189,8 +200,14 @@ def _take_leave(way: Way, status: Json) -> int:
     if order.is_plan or code != EXIT_OK:
         return EXIT_WOULD_CHANGE if order.is_plan and code == EXIT_OK else code
     give_up_the_seat(way)
-    _go_out(way)
+    _note(way, held.fleet, _go_out(way))
     return EXIT_OK
+
+
+def _note(way: Way, fleet: str, revision: int) -> None:
+    """Keep that the fleet is without this node, so that the command goes on when it is broken off after the daemon."""
+    with contextlib.suppress(AdapterError):  # a full disk keeps nobody from leaving
+        note_out(fleet, way.me, revision, way.order.places.state)
 
 
 def _planned(way: Way, fleet: str) -> int:
@@ -292,8 +309,8 @@ def _ask_for_the_seat(way: Way, held: InForce) -> str:
     return "it is removed"
 
 
-def _go_out(way: Way) -> None:
-    """Have this node taken out of the document, and wait until the others know.
+def _go_out(way: Way) -> int:
+    """Have this node taken out of the document, and wait until the others know; the revision without it.
 
     One of them proposes it: this node would not store a document that does not name it.
     """
@@ -312,6 +329,7 @@ def _go_out(way: Way) -> None:
     revision = int(answer["revision"])
     way.tell(f"{held.fleet}: revision {revision} is agreed, and {way.me} is no node of it")
     _wait_until_known(way, revision)
+    return revision
 
 
 def _alive(way: Way) -> list[str]:

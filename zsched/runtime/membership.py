@@ -36,6 +36,7 @@ from zsched.config.schema import PKI_FOLDER
 from zsched.core.electorate.founding import created
 from zsched.core.values.certificates import Role, parse_common_name
 from zsched.core.values.document import Document, Text
+from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet, fleet_hash
 from zsched.core.values.model import NodeId, RegisterState
@@ -55,6 +56,8 @@ LEFT: Final = ".left"
 """Behind the names of files of a fleet that this machine has left."""
 COPY_NAME: Final = "copied"
 """In the state folder: the hash of the fleet file that was written as a copy of the document."""
+OUT_NAME: Final = "out"
+"""In the state folder, from before the daemon ends for good until its files are put away: see `note_out`."""
 NEXT_CELL: Final = "next-cell"
 """In the state folder, while the machine changes cells: private keys are in it, and only its owner may read it."""
 LOGS: Final = decision_log.NAMES
@@ -353,16 +356,20 @@ def whose(folder: Path) -> tuple[str, NodeId]:
     Raises:
         AdapterError: it has no state, or none that can be read.
     """
+    state = _state_of(folder)
+    return state.fleet, state.node
+
+
+def _state_of(folder: Path) -> DurableState:
     path = folder / STATE_NAME
     try:
-        state = decode_state(read_regular(path, MAX_STATE_BYTES))
+        return decode_state(read_regular(path, MAX_STATE_BYTES))
     except FileNotFoundError:
         raise AdapterError(f"{path} is not there: this machine is in no fleet, or give --state-dir") from None
     except OSError as error:
         raise AdapterError(f"{path}: cannot be read: {error.strerror}; run this as root") from error
     except WireError as error:
         raise AdapterError(f"{path} is damaged ({error}); move the folder {folder} away") from error
-    return state.fleet, state.node
 
 
 def belongings(places: Places, *, is_purged: bool) -> tuple[Written, ...]:
@@ -388,6 +395,34 @@ def check_ended(fleet: str, node: NodeId, places: Places) -> None:
         pass
 
 
+def note_out(fleet: str, node: NodeId, revision: int, state: Path) -> None:
+    """Keep that the fleet is without this node from ``revision`` on: once its daemon has ended, nobody here knows it.
+
+    Raises:
+        AdapterError: it cannot be written.
+    """
+    _put(state / OUT_NAME, f"{fleet} {node} {revision}\n".encode(), PRIVATE_MODE)
+
+
+def is_out(fleet: str, node: NodeId, state: Path) -> bool:
+    """Whether `note_out` was called for this node, and its state does not tell that it was taken in again since.
+
+    Raises:
+        AdapterError: the state cannot be read.
+    """
+    try:
+        noted, kept = read_regular(state / OUT_NAME, 256).decode("ascii", "replace").split(), _state_of(state)
+    except OSError:
+        return False
+    if noted[:2] != [fleet, node] or not noted[-1].isdigit():
+        return False
+    value = None if kept.fleet_register is None else kept.fleet_register.learnt
+    if value is None or value.revision < int(noted[-1]):
+        return True
+    content = DocumentStore(state).load(value.document)  # a node stores no document that does not name it
+    return content is None
+
+
 def put_away(
     fleet: str, node: NodeId, places: Places, *, is_purged: bool, comes_back: bool = False
 ) -> tuple[Written, ...]:
@@ -403,6 +438,8 @@ def put_away(
         there = tuple(_belongings(places, is_purged=is_purged))
         for one in there:
             _put_one_away(one.path, is_deleted=is_purged or (one.path.name == COPY_NAME and not comes_back))
+        with contextlib.suppress(OSError):
+            (places.state / OUT_NAME).unlink(missing_ok=True)
     return tuple(Written(path=one.path, what=_fate(one, is_purged=is_purged)) for one in there)
 
 

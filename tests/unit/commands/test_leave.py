@@ -325,8 +325,32 @@ def test_a_daemon_that_does_not_end_keeps_its_files(hall: Hall, monkeypatch: pyt
     monkeypatch.setattr(leave, "STOP_S", 0.0)
     with StateFile(hall.folder / "state", fleet="hall", node="robot3"):
         late = run("--yes")
-    assert (late.exit_code, left(hall.folder)) == (5, UNTOUCHED)
+    assert (late.exit_code, left(hall.folder)) == (5, sorted([*UNTOUCHED, "out"]))
     assert "robot3 has left hall, and its daemon does not end" in late.stderr
+    hall.door.close()
+    again = run("--yes")
+    assert (again.exit_code, again.stderr, left(hall.folder)) == (0, "", RENAMED), "it was stopped, and all were told"
+    assert "robot3 is no node of hall any more, and its daemon has ended" in again.stdout
+
+
+@pytest.mark.parametrize("way", ["taken out", "told so"])
+def test_broken_off_behind_the_daemon_it_goes_on_also_where_another_node_took_it_out(
+    hall: Hall, monkeypatch: pytest.MonkeyPatch, way: str
+) -> None:
+    if way == "told so":
+        hall.problems = ["fleet/document: the document names no node 'robot3': this machine was taken out, and goes on"]
+    else:
+        hall.is_told_gone, hall.text = True, TEXT.replace("  robot3: {kind: robot}\n", "")
+
+    def broken_off(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(leave, "check_ended", broken_off)
+        assert run("--yes").exit_code != 0
+    assert (hall.asked, left(hall.folder)) == (["leave"], sorted([*UNTOUCHED, "out"]))
+    hall.door.close()
+    assert (run("--plan").exit_code, run("--yes").exit_code, left(hall.folder)) == (10, 0, RENAMED)
 
 
 def test_another_machine_s_daemon_is_left_alone(hall: Hall) -> None:

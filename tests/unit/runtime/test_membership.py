@@ -29,7 +29,9 @@ from zsched.runtime.membership import (
     copied_file,
     found,
     is_joined,
+    is_out,
     join,
+    note_out,
     put_away,
 )
 from zsched.wire.codec import document_hash
@@ -73,6 +75,25 @@ def invitation(first: Places) -> Invitation:
     found(TEXT, "robot1", first, is_plan=False)
     value, content = value_at(first, "robot1")
     return Invitation(node="robot2", value=value, document=content)
+
+
+def test_a_note_that_a_machine_is_out_ends_when_it_is_taken_in_again(first: Places) -> None:
+    """Else a later leave would tell nobody."""
+    assert not is_out("hall", "robot1", first.state)
+    found(TEXT, "robot1", first, is_plan=False)
+    assert not is_out("hall", "robot1", first.state), "there is no note"
+    value, _ = value_at(first, "robot1")
+    note_out("hall", "robot1", value.revision + 1, first.state)
+    assert is_out("hall", "robot1", first.state), "its daemon ended before it learnt that"
+    assert not is_out("hall", "robot2", first.state)
+    note_out("hall", "robot1", value.revision, first.state)
+    assert not is_out("hall", "robot1", first.state), "it has the document of that revision, so that names it"
+    (first.state / "documents" / value.document).unlink()
+    assert is_out("hall", "robot1", first.state), "a document that does not name it is not stored"
+    (first.state / "out").write_text("hall robot1\n")
+    assert not is_out("hall", "robot1", first.state)
+    put_away("hall", "robot1", first, is_purged=False)
+    assert not (first.state / "out").exists()
 
 
 def test_the_first_machine_is_the_only_elector_and_each_task_has_a_creation(first: Places) -> None:
