@@ -5,6 +5,7 @@ Knows: which nodes tell what they go by, how an editor is started. Does not know
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shlex
 import subprocess
@@ -16,10 +17,10 @@ from typing import Any
 
 from zsched.commands.apply import ApplyView, apply, read_text
 from zsched.commands.ask import PASSES_ON, Door
-from zsched.commands.common import CliError, Json, print_json, say
+from zsched.commands.common import CliError, Json, print_json, say, warn
 from zsched.commands.document import QUESTION, InForce, ask_all, document_text, in_force, status_of
 from zsched.errors import ConfigError
-from zsched.exits import EXIT_FAILED, EXIT_OK
+from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_WOULD_CHANGE
 from zsched.files import write_regular
 
 SCHEMA = "zsched.fleet.show/1"
@@ -100,28 +101,48 @@ def export(door: Door, file: Path | None) -> int:
 def edit(door: Door, view: ApplyView, env: Mapping[str, str] = os.environ) -> int:
     """Open the document in the operator's editor and apply what comes of it; the exit code.
 
+    What was typed and is not agreed stays in a file, which is named; Ctrl-C is no exception.
+
     Raises:
         CliError: the editor failed, or as of `apply`.
-        ConfigError: the text has faults; it stays in a file that the message names.
+        ConfigError: the text has faults.
     """
-    kept: list[Path] = []
+    drafts: dict[Path, str] = {}
 
     def make(held: InForce) -> str:
-        path = _draft(held.fleet, document_text(held))
-        kept.append(path)
+        text = document_text(held)
+        path = _draft(held.fleet, text)
+        drafts[path] = text
         _open_editor(path, env)
         return read_text(str(path))
 
     try:
         code = apply(door, view, make, "the edited document")
+    except KeyboardInterrupt:
+        if (path := _edited(drafts)) is not None:
+            warn(f"\nbroken off; your text is in {path}: zsched apply {shlex.quote(str(path))}")
+        raise
     except (CliError, ConfigError) as error:
-        if not kept:
+        if (path := _edited(drafts)) is None:
             raise
-        text = f"{error}\nyour text is in {kept[0]}: mend it there, then zsched apply {shlex.quote(str(kept[0]))}"
+        text = f"{error}\nyour text is in {path}: mend it there, then zsched apply {shlex.quote(str(path))}"
         raise _like(error, text) from error
-    for path in kept:
+    if code == EXIT_WOULD_CHANGE and (path := _edited(drafts)) is not None:
+        warn(f"your text is in {path}; to have it agreed: zsched apply {shlex.quote(str(path))}")
+        return code
+    for path in drafts:
         path.unlink(missing_ok=True)
     return code
+
+
+def _edited(drafts: Mapping[Path, str]) -> Path | None:
+    """The draft that says something else than the document; one that does not is deleted."""
+    for path, text in drafts.items():
+        with contextlib.suppress(OSError):
+            if path.read_bytes() != text.encode():
+                return path
+            path.unlink()
+    return None
 
 
 def _like(error: Any, text: str) -> CliError | ConfigError:

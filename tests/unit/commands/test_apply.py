@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +15,10 @@ from support.schemas import faults
 from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.cli import app
 from zsched.commands import document, fleet
-from zsched.commands.ask import PASSES_ON
+from zsched.commands.apply import ApplyView
+from zsched.commands.ask import PASSES_ON, Door
 from zsched.commands.common import CliError
+from zsched.commands.document import InForce, in_force
 from zsched.commands.entries import DOCUMENT
 from zsched.config.editing import add_entries
 from zsched.config.load import check_bytes
@@ -511,10 +513,40 @@ def test_edit_applies_what_the_editor_leaves_and_keeps_what_is_refused(
     assert f"your text is in {kept}" in faulty.stderr
     assert "robot9" in kept.read_text()
     assert kept.stat().st_mode & 0o077 == 0
+    kept.unlink()
     monkeypatch.setenv("EDITOR", "false")
     assert "ended with 1; nothing was changed" in run("edit", "--yes").stderr
     monkeypatch.setenv("EDITOR", os.fspath(tmp_path / "absent"))
     assert "cannot be started" in run("edit", "--yes").stderr
+    assert list(tmp_path.glob("*.yaml")) == [], "nobody has typed anything"
+
+
+def test_edit_keeps_what_was_typed_where_it_only_plans_or_is_broken_off(
+    node: Node, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    monkeypatch.setenv("EDITOR", "sed -i s/0.5,.memory:.0.5/1/")
+    monkeypatch.delenv("VISUAL", raising=False)
+    plan = run("edit", "--plan")
+    (kept,) = tmp_path.glob("*.yaml")
+    assert (plan.exit_code, node.changes, "{cpu: 1}" in kept.read_text()) == (10, [], True), plan.output
+    assert plan.stderr.endswith(f"your text is in {kept}; to have it agreed: zsched apply {kept}\n")
+    kept.unlink()
+
+    def broken_off(door: Door, _view: ApplyView, make: Callable[[InForce], str], _file: str) -> int:
+        make(in_force(door))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(fleet, "apply", broken_off)
+    off = run("edit")
+    (kept,) = tmp_path.glob("*.yaml")
+    assert (off.exit_code != 0, "{cpu: 1}" in kept.read_text()) == (True, True)
+    assert f"your text is in {kept}: zsched apply {kept}" in off.stderr
+    kept.unlink()
+    monkeypatch.setenv("EDITOR", "true")
+    assert "your text" not in run("edit").stderr
+    assert list(tmp_path.glob("*.yaml")) == []
 
 
 def test_show_names_the_electors_and_who_goes_by_something_else(node: Node) -> None:
