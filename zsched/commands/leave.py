@@ -239,7 +239,11 @@ def members_of(held: InForce, status: Json) -> tuple[str, ...]:
     """The nodes of the document, or of the file by which each machine goes."""
     if not held.document:
         return tuple(str(node["name"]) for node in status["nodes"])
-    fleet = check_bytes(document_text(held).encode(), DOCUMENT).fleet
+    return _nodes_of(document_text(held))
+
+
+def _nodes_of(text: str) -> tuple[str, ...]:
+    fleet = check_bytes(text.encode(), DOCUMENT).fleet
     if fleet is None:
         advice = "update zsched here; `zsched fleet export` shows the document"
         raise CliError(EXIT_FAILED, f"the document in force has faults for this version of zsched; {advice}")
@@ -318,18 +322,29 @@ def _go_out(way: Way) -> int:
         others = _alive(way)
         try:
             held = in_force(way.door.to(others[count % len(others)]) if others else way.door)
-            flags = [flag for flag in held.flags if flag["subject"] != way.me]
-            text = {"text": without(document_text(held), way.me), "flags": flags, "rollouts": list(held.rollouts)}
-            answer = change(way.door.to(held.node), {**text, "base_revision": held.revision, **_ordered(way)})
+            revision = _left_out(way, held)
         except CliError as error:
             way.check_time(str(error))
             time.sleep(PAUSE_S)
         else:
             break
-    revision = int(answer["revision"])
     way.tell(f"{held.fleet}: revision {revision} is agreed, and {way.me} is no node of it")
     _wait_until_known(way, revision)
     return revision
+
+
+def _left_out(way: Way, held: InForce) -> int:
+    """Have the node that told ``held`` propose it without this one; the revision that is without it.
+
+    It may be so already: the answer of the try before was lost, or somebody else was first.
+    """
+    text = document_text(held)
+    if way.me not in _nodes_of(text):
+        return held.revision
+    flags = [flag for flag in held.flags if flag["subject"] != way.me]
+    what = {"text": without(text, way.me), "flags": flags, "rollouts": list(held.rollouts)}
+    answer = change(way.door.to(held.node), {**what, "base_revision": held.revision, **_ordered(way)})
+    return int(answer["revision"])
 
 
 def _alive(way: Way) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -46,7 +46,8 @@ class Hall:
         self.looks_of_robot2, self.fetches_after = 0, 0
         self.asked: list[str] = []
         self.problems: list[str] = []
-        self.step: Callable[[], None] = lambda: None
+        self.loses_an_answer = False
+        """The next document is agreed, and its answer is lost."""
         self.door = OperatorSocket(folder / "run" / "robot3.sock", self.answer)
 
     def answer(self, request: Json) -> Json:
@@ -125,6 +126,9 @@ class Hall:
             self.asked.append(f"{who} writes")
             self.text, self.flags = request["text"], request["flags"]
         self.revision += 1
+        if self.loses_an_answer and "robot3" not in self.text:
+            self.loses_an_answer = False
+            return {"error": f"{who} did not answer within 3 s; is it up and reachable?"}
         return {"outcome": "ok", "detail": "as told", "revision": self.revision}
 
 
@@ -205,6 +209,14 @@ def test_it_stays_until_the_others_have_the_new_document(hall: Hall) -> None:
     hall.fetches_after = 3
     done = run("--yes")
     assert (done.exit_code, done.stderr, hall.looks_of_robot2) == (0, "", 4)
+
+
+def test_it_goes_on_where_the_change_is_agreed_and_its_answer_was_lost(hall: Hall) -> None:
+    hall.loses_an_answer = True
+    done = run("--yes")
+    assert (done.exit_code, done.stderr, left(hall.folder)) == (0, "", RENAMED)
+    assert hall.asked == ["robot3 flags leave", "robot1 writes", "leave"]
+    assert "revision 9 is agreed, and robot3 is no node of it" in done.stdout
 
 
 def test_one_that_does_not_fetch_it_in_time_is_told(hall: Hall, monkeypatch: pytest.MonkeyPatch) -> None:
