@@ -169,7 +169,8 @@ def _all(fleet: Fleet | None, asker: NodeId, door: Path | None) -> _Asked:
                     took |= {name: seconds} if name != asker else {}
         for name in [name for name, seconds in took.items() if seconds > fleet.timing.gather_s]:
             # asked together they wait for one another
-            took[name] = min(took[name], *(seconds for _ in range(TRIES) if (seconds := _through(door, name)[1])))
+            again = [_through(door, name) for _ in range(TRIES)]
+            took[name] = min([took[name], *(seconds for status, seconds in again if status is not None)])
     for status in _directly(fleet, asker, [name for name in names if name not in statuses]):
         statuses.setdefault(str(status["node"]), status)
     return _Asked(statuses=statuses, answered_s=took)

@@ -24,6 +24,7 @@ from zsched.config.load import check_file, load_fleet
 from zsched.core.values.document import Document, Text
 from zsched.core.values.electorate import Elector, FleetValue
 from zsched.core.values.model import RegisterState
+from zsched.doctor import look as looking
 from zsched.doctor import machine, state
 from zsched.doctor.look import Machine, look
 from zsched.doctor.model import Check, Scene, Verdict
@@ -267,6 +268,24 @@ def test_a_wedged_daemon_is_to_be_restarted(tmp_path: Path) -> None:
     found = run("daemon.answers", replace(scene_of(tmp_path), own=None, refusal=refusal))
     assert_finds(found, FAIL, "is it wedged")
     assert found.fix.startswith("sudo systemctl restart zsched")
+
+
+def test_a_daemon_that_goes_away_while_a_slow_answer_is_asked_for_again_ends_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = scene_of(tmp_path)
+    own, asked = scene.status, list[str]()
+
+    def through(_door: Path, node: str) -> tuple[dict[str, Any] | None, float]:
+        asked.append(node)
+        return ({**own, "node": node}, 9.0) if asked.count(node) == 1 else (None, 0.0)
+
+    fleet = scene.reading.fleet
+    assert fleet is not None
+    monkeypatch.setattr(looking, "_through", through)
+    found = looking._all(fleet, "robot1", tmp_path / "robot1.sock")
+    assert found.answered_s == {node.name: 9.0 for node in fleet.nodes if node.name != "robot1"}
+    assert len(asked) > len(fleet.nodes)
 
 
 def test_a_daemon_of_another_version_is_found(tmp_path: Path) -> None:
