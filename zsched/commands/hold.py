@@ -77,7 +77,10 @@ def hold(view: OrderView, order: HoldOrder, names: Sequence[str], *, is_all: boo
     lacks = _wait_known(view, results) if order.is_waiting else []
     late = EXIT_TIMED_OUT if lacks else EXIT_OK
     if view.is_json:
-        tasks = [{**_held(after[name]), **results.get(name, {"outcome": "unchanged", "detail": ""})} for name in chosen]
+        # one that was taken out of the document meanwhile is told as it was
+        now = [after.get(name, known[name]) for name in chosen]
+        unchanged = {"outcome": "unchanged", "detail": ""}
+        tasks = [{**_held(task), **results.get(str(task["name"]), unchanged)} for task in now]
         print_json({"schema": TASK_SCHEMA, "tasks": tasks, "missing": lacks})
         return max([late, *[CODES.get(str(result["outcome"]), EXIT_FAILED) for result in results.values()]])
     code = tell_results(results)

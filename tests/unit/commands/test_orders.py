@@ -190,6 +190,19 @@ def test_a_pause_that_some_node_never_learns_says_which(daemon: Daemon, monkeypa
     assert result.stdout.splitlines()[-1] == "  edge2 has not learnt revision 8 of echo"
 
 
+def test_a_task_that_is_taken_out_right_after_its_pause_is_told_as_it_was(daemon: Daemon) -> None:
+    def answer(request: Json) -> Json:
+        told = Daemon.answer(daemon, request)
+        return {**told, "tasks": told["tasks"][1:]} if request["verb"] == "status" and daemon.orders else told
+
+    daemon.answers = answer
+    result = run("pause", "echo", "--yes", "--json")
+    body = json.loads(result.stdout)
+    (told,) = body["tasks"]
+    assert (result.exit_code, faults(body)) == (0, [])
+    assert (told["task"], told["outcome"], told["revision"], told["owner"]) == ("echo", "ok", 8, "edge1")
+
+
 def test_all_pauses_every_task_and_resume_ends_it(daemon: Daemon) -> None:
     assert run("pause", "--all", "--yes").exit_code == 0
     assert [order["task"] for order in daemon.orders] == ["echo", "merge"]
