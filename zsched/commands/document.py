@@ -20,6 +20,8 @@ from zsched.commands.common import CliError, Json, warn
 from zsched.core.values.struct import Struct
 from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_TIMED_OUT
 
+UNKNOWING = "it does not know the fleet's generation yet"
+"""Of a node that tells no revision: its daemon has just begun."""
 QUESTION: Json = {"verb": "fleet", "with_document": False}
 """What a node goes by, without its document."""
 AT_ONCE = 8

@@ -20,6 +20,7 @@ from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, print_json, say, warn
 from zsched.commands.document import (
     OVERTAKEN_S,
+    UNKNOWING,
     ConflictError,
     ask_all,
     change,
@@ -380,8 +381,11 @@ def _knowing(way: Way, side: Side) -> tuple[str, FleetValue, list[str]]:
 
     Raises:
         _RefusedError: the cell has the task again.
+        CliError: the node that was asked knows no value yet.
     """
     told = ask_door(side.door, {"verb": "fleet"})
+    if told["revision"] is None:
+        raise CliError(EXIT_DEGRADED, f"{told['node']} of {side.name}: {UNKNOWING}")
     value = from_plain(told["value"], FleetValue)
     if value.creation(way.task) is not None:
         raise _RefusedError(EXIT_FAILED, f"{side.name} has a task {way.task} again")

@@ -19,7 +19,16 @@ from zsched import paths
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door, find_door
 from zsched.commands.common import CliError, Json, check_reason, nearest, say, warn
-from zsched.commands.document import QUESTION, InForce, ask_all, change, document_text, in_force, ordered
+from zsched.commands.document import (
+    QUESTION,
+    UNKNOWING,
+    InForce,
+    ask_all,
+    change,
+    document_text,
+    in_force,
+    ordered,
+)
 from zsched.commands.entries import DOCUMENT, HERE
 from zsched.commands.flags import LEAVE, NO_OTHER, DrainOrder, drain
 from zsched.commands.membership import Told
@@ -287,12 +296,15 @@ def give_up_the_seat(way: Way) -> None:
     told = ""
     while True:
         told_now = ask_door(way.door, {"verb": "fleet"})
-        value = from_plain(told_now["value"], FleetValue)
-        if may_go(value, way.me):
-            if told:
-                way.tell(f"{way.me}: no elector any more; electors: {', '.join(value.electorate.names)}")
-            return
-        why = _ask_for_the_seat(way, in_force(way.door))
+        if told_now["revision"] is None:  # its daemon has begun anew
+            why = UNKNOWING
+        else:
+            value = from_plain(told_now["value"], FleetValue)
+            if may_go(value, way.me):
+                if told:
+                    way.tell(f"{way.me}: no elector any more; electors: {', '.join(value.electorate.names)}")
+                return
+            why = _ask_for_the_seat(way, in_force(way.door))
         if why != told:
             told = why
             way.tell(f"{way.me} is an elector still: {why}")

@@ -21,7 +21,7 @@ from zsched.adapters.host.operator_socket import Json, OperatorSocket
 from zsched.cli import app
 from zsched.clock import monotonic_s
 from zsched.commands import hand, hand_steps, lacks
-from zsched.commands.ask import Door
+from zsched.commands.ask import Door, ask_door
 from zsched.config.editing import task_entry
 from zsched.config.handing import Mark, mark_of, marked
 from zsched.config.load import check_bytes
@@ -310,6 +310,17 @@ def test_an_exclusive_task_stops_here_before_it_begins_there(site: Site) -> None
     assert done.stdout.index("hall-a: nobody works on echo: robot1, robot2 renew no lease") < done.stdout.index(
         "hall-b: revision 8 is agreed, with echo"
     )
+
+
+def test_a_node_that_begins_anew_meanwhile_and_knows_no_value_yet_is_waited_for(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    site.make_exclusive()
+    begun: list[Json] = [{"node": "robot1", "revision": None}]
+    monkeypatch.setattr(hand_steps, "ask_door", lambda *given: begun.pop() if begun else ask_door(*given))
+    done = run("hall-b", "-y")
+    assert (done.exit_code, begun) == (0, []), done.stderr
+    check_arrived(site)
 
 
 def test_an_exclusive_task_of_which_a_lease_may_go_on_is_not_begun_there(site: Site) -> None:

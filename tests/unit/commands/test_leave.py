@@ -46,6 +46,8 @@ class Hall:
         self.looks_of_robot2, self.fetches_after = 0, 0
         self.asked: list[str] = []
         self.problems: list[str] = []
+        self.unknowing = 0
+        """Looks at robot3, once it is flagged, at which its daemon has just begun."""
         self.loses_an_answer = False
         """The next document is agreed, and its answer is lost."""
         self.door = OperatorSocket(folder / "run" / "robot3.sock", self.answer)
@@ -91,6 +93,9 @@ class Hall:
 
     def _fleet(self, who: str) -> Json:
         if who == "robot3" and any(flag["kind"] == "leave" for flag in self.flags):
+            if self.unknowing:
+                self.unknowing -= 1
+                return {"node": who, "fleet_file": "cd" * 16, "disk": "01", "revision": None}
             self.seat_goes_after -= 1
             if self.seat_goes_after <= 0 and "electorate:" not in self.text:
                 self._remove_elector()
@@ -209,6 +214,13 @@ def test_it_stays_until_the_others_have_the_new_document(hall: Hall) -> None:
     hall.fetches_after = 3
     done = run("--yes")
     assert (done.exit_code, done.stderr, hall.looks_of_robot2) == (0, "", 4)
+
+
+def test_it_waits_for_a_daemon_that_begins_anew_meanwhile(hall: Hall) -> None:
+    hall.unknowing = 1
+    done = run("--yes")
+    assert (done.exit_code, done.stderr, hall.unknowing) == (0, "", 0)
+    assert "robot3 is an elector still: it does not know the fleet's generation yet" in done.stdout
 
 
 def test_it_goes_on_where_the_change_is_agreed_and_its_answer_was_lost(hall: Hall) -> None:
