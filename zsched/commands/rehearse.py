@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Final, TypeVar
 
 from zsched import paths as places
 from zsched.clock import monotonic_s, wall_s
@@ -33,6 +33,7 @@ from zsched.core.values.struct import Struct, field, replace
 from zsched.core.values.words import MAX_ASKED
 from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE
 from zsched.screen import screen_width
+from zsched.wire.codec import from_plain
 
 LOOK_S: Final = 0.2
 """Between two looks at the fleet."""
@@ -296,7 +297,9 @@ class Stage:
         if "outcome" in told:
             raise CliError(EXIT_FAILED, str(told["detail"]))
         self.timing = str(told["timing"])
-        self.promised = {Step(step): _promised(one) for step, one in told["promised"].items()}
+        known = {step.value: step for step in Step}  # a newer daemon may promise more
+        promised = {known[step]: one for step, one in told["promised"].items() if step in known}
+        self.promised = {step: from_plain(one, Promised) for step, one in promised.items()}
         silent_s = self.promised[Step.LINK].decide_s or 0.0
         self.cut_s = order.cut_s if order.cut_s is not None else min(silent_s + CUT_MORE_S, MAX_CUT_S)
         if Step.LINK in order.steps and not silent_s < self.cut_s <= MAX_CUT_S:
@@ -557,11 +560,6 @@ def _told(body: Json) -> str:
     done = sum(1 for one in body["steps_done"] if not one["left_out"])
     word = "every promise was kept" if body["is_kept"] else str(body["why"])
     return f"{counted(done, 'step')}, {word}; `zsched rehearse --show {body['id']}`"
-
-
-def _promised(one: Json) -> Promised:
-    fields: dict[str, Any] = {**one, "step": Step(one["step"]), "whole": tuple(one.get("whole", ()))}
-    return Promised(**fields)
 
 
 def _ready(status: Json, task: str) -> set[str]:

@@ -216,6 +216,14 @@ def test_a_robot_that_does_not_know_the_task_or_a_node_is_something_that_it_lack
     assert (look.owner, look.lacks) == (None, ("echo: robot1 does not know it",))
 
 
+def test_what_a_newer_daemon_promises_more_is_passed_over(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
+    more = {**PROMISED, "move": {**PROMISED["move"], "jitter_s": 0.1}, "quake": {"step": "quake", "gap_s": 9.0}}
+    monkeypatch.setitem(globals(), "PROMISED", more)
+    result = run("echo", "--plan", "--json", "--steps", "move")
+    assert (result.exit_code, json.loads(result.stdout)["plan"]) == (10, [{"step": "move", "left_out": None}])
+    assert daemon.done == []
+
+
 def test_an_owner_with_an_order_is_not_drained(daemon: Daemon, stage: Stage) -> None:
     daemon.flags = [{"kind": "drain", "subject": "edge1", "by": "eve", "reason": "", "for_s": None, "revision": 2}]
     assert stage.act(DRAIN)[1] == "edge1 has an order already; see `zsched maint`"
