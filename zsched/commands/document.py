@@ -178,20 +178,23 @@ def wait_until_settled(door: Door, revision: int) -> InForce:
     """Wait until the node at the door knows a settled value of at least ``revision``, and has its document.
 
     Raises:
-        CliError: it does not in time (5), or nobody answers.
+        CliError: it does not in time, or does not answer (5); the change is agreed all the same.
     """
     start = monotonic_s()
     is_told = False
     while True:
-        held = in_force(door)
-        if held.revision >= revision and held.is_settled and (held.text or not held.document):
-            return held
+        try:
+            held = in_force(door)
+        except CliError as error:
+            lack = str(error)
+        else:
+            if held.revision >= revision and held.is_settled and (held.text or not held.document):
+                return held
+            why = "has not fetched its document" if held.is_settled else f"number {held.number} is not settled"
+            lack = f"{held.node} {why} yet"
         if not is_told and monotonic_s() > start + TELL_S:
             is_told = True
             warn(f"revision {revision} is agreed, and is being settled; Ctrl-C takes nothing back")
         if monotonic_s() > start + IN_FORCE_S:
-            why = "has not fetched its document" if held.is_settled else f"number {held.number} is not settled"
-            raise CliError(
-                EXIT_TIMED_OUT, f"revision {revision} is agreed, but {held.node} {why} yet; see `zsched fleet show`"
-            )
+            raise CliError(EXIT_TIMED_OUT, f"revision {revision} is agreed, but {lack}; see `zsched fleet show`")
         time.sleep(PAUSE_S)

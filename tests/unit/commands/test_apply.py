@@ -55,6 +55,8 @@ class Node:
         self.is_fetching = False
         self.drained: list[str] = []
         self.rollouts: list[Json] = []
+        self.silent = 0
+        """Questions by which document it goes, after a change, that it does not answer."""
         self.refused = "nothing"
         """The kind of change that another operator has overtaken."""
         self.meanwhile: list[tuple[str, list[str]]] = []
@@ -72,6 +74,9 @@ class Node:
             digest = self.files.get(node, digest_of(self.text))
             tasks = [{"name": "merge", "owner": self.owner}]
             return {"fleet": "hall", "nodes": nodes, "tasks": tasks, "fleet_file": digest, "schema": "zsched.status/1"}
+        if verb == "fleet" and self.changes and self.silent:
+            self.silent -= 1
+            return {"error": f"{node} is on its way down"}
         if verb == "fleet":
             electors = [{"name": name, "disk": f"d{name}"} for name in self.electors]
             body = {"node": node, "fleet": "hall", "revision": self.revision, "number": 2, "settled": True}
@@ -479,6 +484,24 @@ def test_a_node_that_is_gone_is_forgotten(node: Node) -> None:
     result = run("node", "forget", "edge1", "--yes", "--accept", "remove-node")
     assert result.exit_code == 0, result.stderr
     assert node.text == text.replace("  edge1: {kind: edge}\n", "")
+
+
+def test_a_node_that_is_silent_once_the_change_is_agreed_is_waited_for(
+    node: Node, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It may begin anew for that very change."""
+    file = tmp_path / "new.yaml"
+    file.write_text(node.text.replace("timing: wifi", "timing: wired").replace("cpu: 0.5, memory: 0.5", "cpu: 1"))
+    node.silent = 2
+    done = run("apply", file, "--yes")
+    assert (done.exit_code, node.silent) == (0, 0), done.stderr
+    assert "revision 8 is agreed" in done.stdout
+    monkeypatch.setattr(document, "IN_FORCE_S", 0.2)
+    file.write_text(TEXT)
+    node.changes, node.silent = [], 10**9
+    late = run("apply", file, "--yes")
+    assert late.exit_code == 5
+    assert "revision 9 is agreed, but robot1 is on its way down; see `zsched fleet show`" in late.stderr
 
 
 # --- export, edit, show ----------------------------------------------------------------------------------------------
