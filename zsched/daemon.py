@@ -148,6 +148,8 @@ class Daemon:
             # Read once, when zenoh's runtime starts. An operator's own setting wins, and workers inherit it.
             self._pools = os.environ.get("ZENOH_RUNTIME")
             os.environ.setdefault("ZENOH_RUNTIME", zenoh_config.daemon_pools(len(self._fleet.nodes)))
+            if self._pools is None:  # the daemon that this process may become must not take ours for an operator's
+                stack.callback(os.environ.pop, "ZENOH_RUNTIME", None)
             incarnation = restored.state.incarnation if restored.state is not None else wall_tenths()
             points = endpoints_for(
                 self._fleet, self._spec, functools.partial(self._data_port, stack), is_here, self._protocol

@@ -368,6 +368,16 @@ def test_a_node_hears_of_a_sleep_before_what_is_judged_by_the_time_after_it(monk
 
 # --- the process -----------------------------------------------------------------------------------------------------
 
+NOT_ITS_OWN = frozenset({"JOURNAL_STREAM", "ZENOH_RUNTIME", "NOTIFY_SOCKET", "WATCHDOG_USEC"})
+FIRST_LIFE = """
+import os, signal, sys
+from zsched import daemon
+if "BEGUN" not in os.environ:
+    from zsched.runtime.session_watch import SessionWatch
+    os.environ["BEGUN"], SessionWatch.is_due = "1", lambda *_: True
+    sys.exit(daemon.main(sys.argv[1:]))
+"""
+
 
 class Place:
     """A fleet file and folders of its own; runs the daemon's command line in a process."""
@@ -488,6 +498,33 @@ def test_journal_stamps_its_own_times_and_an_early_stop_is_an_orderly_one(place:
     assert process.returncode == EXIT_OK, error
     assert not socket_path(place.folder, "edge1").exists()
     assert {line.split()[0] for line in error.splitlines()} <= {"DEBUG", "INFO", "WARNING"}, error
+
+
+def begin_anew(place: Place, second_life: str, env: Mapping[str, str] | None = None) -> Any:
+    """A daemon whose turn it is at once; what its process becomes runs ``second_life`` in place of a daemon's start."""
+    place.file.write_text(json.dumps(json.loads(place.file.read_text()) | {"relay_orphan_s": 0}))
+    places = ["--state-dir", str(place.folder / "state"), "--runtime-dir", str(place.folder)]
+    process = subprocess.Popen(
+        [sys.executable, "-c", FIRST_LIFE + second_life, "--config", str(place.file), "--node", "edge1", *places],
+        stderr=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**{name: value for name, value in os.environ.items() if name not in NOT_ITS_OWN}, **(env or {})},
+    )
+    place.processes.append(process)
+    return process
+
+
+@pytest.mark.parametrize("of_operator", [None, "(rx: (worker_threads: 5))"])
+def test_the_daemon_that_follows_in_the_process_sizes_zenoh_s_pools_itself(
+    place: Place, of_operator: str | None
+) -> None:
+    """It took those of the one before for an operator's, and gave them to all of its workers."""
+    env = {} if of_operator is None else {"ZENOH_RUNTIME": of_operator}
+    process = begin_anew(place, "print('begun with', os.environ.get('ZENOH_RUNTIME'), file=sys.stderr)", env)
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == EXIT_OK, error
+    assert error.splitlines()[-1] == f"begun with {of_operator}"
 
 
 def test_daemon_and_relay_limit_what_they_log(place: Place) -> None:
