@@ -282,6 +282,8 @@ class Crew:
     def on_started(self, task: TaskId, pid: int, incarnation: int) -> None:
         """The supervisor: a worker process runs; it is not ready yet."""
         with self._lock:
+            if task in self._foreign:
+                return  # the supervisor has not heard yet that its `command` went, and is about to
             self._lives[task] = incarnation
             self._forget(task)
             again = self._why_again(task)

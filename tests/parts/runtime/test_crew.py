@@ -369,3 +369,14 @@ def test_a_match_that_comes_before_the_supervisor_has_heard_of_the_task_counts(h
     house.match("others")
     house.supervisor.adopt(SPECS)
     assert house.states("others") == [WorkerState.READY]
+
+
+def test_a_late_start_of_ours_hides_no_worker_that_somebody_else_starts_now(house: House) -> None:
+    """The supervisor's thread hears later than the crew that the task has no `command` any more."""
+    tasks = tuple(replace(one, worker=WorkerSpec()) if one.name == "token" else one for one in FLEET.tasks)
+    house.crew.adopt(replace(FLEET, tasks=tasks), {})
+    house.crew.on_started("token", 7, 100001)
+    house.crew.on_exited("token", 100001, -2, "stopped by SIGINT")
+    assert house.states("token") == []
+    house.crew.on_token(WorkerSeen(node="edge1", task="token", incarnation="7", is_present=True))
+    assert house.states("token") == [WorkerState.READY]

@@ -326,10 +326,10 @@ class WorkerSupervisor:
         for task, worker in kept.items():
             has_changed = worker.spec != specs[task]
             worker.spec, worker.is_kept = specs[task], True
-            if not worker.spec.command and worker.process is not None:
-                self._on_stop(task)
             if has_changed and worker.phase in {_Phase.FAILED, _Phase.BACKOFF}:
                 self._on_reset(task)
+            if not worker.spec.command:
+                self._on_stop(task)
         for worker in self._workers.values():
             self._compare(worker)
 

@@ -556,3 +556,13 @@ def test_a_mended_command_is_tried_although_the_one_before_has_failed_for_good()
         recorder.wait("failed")
         supervisor.adopt({"merge": python(SLEEP)})
         recorder.wait("started", 2)
+
+
+def test_a_failed_worker_whose_command_goes_is_not_started_without_one() -> None:
+    with supervised(python("raise SystemExit(78)")) as (supervisor, recorder):
+        supervisor.start("merge")
+        recorder.wait("failed")
+        supervisor.adopt({"merge": WorkerSpec()})
+        recorder.wait("reset")
+        wait_until(lambda: supervisor.states() == {"merge": WorkerState.STOPPED})
+        assert len([call for call in recorder.calls if call[0] == "started"]) == 1
