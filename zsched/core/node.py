@@ -131,6 +131,7 @@ class Node(Stages):
         first: tuple[do.Instruction, ...] = () if state is None else (do.PersistState(state=state),)
         if todo.send:
             todo.send = joined(todo.send, self.agreement.unsettled)
+        self.behind_write = tuple(todo.apply) if first else ()
         return (*first, *todo.send, *todo.apply)
 
     def _next_deadline(self, now: float) -> float:

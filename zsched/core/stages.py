@@ -13,6 +13,7 @@ from random import Random
 from types import MappingProxyType
 from typing import Any
 
+from zsched.core import instructions as do
 from zsched.core.electorate.numbers import known_at_start
 from zsched.core.events import SlotReady
 from zsched.core.executor.handover import Executor
@@ -115,6 +116,8 @@ class Stages:
     # what the door (`zsched.core.node`) keeps from one event to the next
     _promised = math.inf
     """The deadline that the last batch was given out with."""
+    behind_write: tuple[do.Instruction, ...] = ()
+    """What the last batch had for this machine behind its write, if it had one: a refused write cuts it off."""
 
     def __init__(
         self,

@@ -130,17 +130,6 @@ class Executor:
         """The streams of the newest slot."""
         return () if self._current is None else self._current.routes
 
-    def again(self, todo: ToDo) -> None:
-        """Repeat the newest worker state, role and plan after a batch that carried them was cut off."""
-        if self.runs_worker:
-            self.start(todo)
-            self._wake_worker(self.role, todo)
-            todo.add(SetRole(role=self.role))
-            if self.spec.worker.standby is Standby.COLD and self.role.role is WorkerRole.IDLE:
-                todo.add(StopWorker(task=self.spec.name))
-        if self._current is not None:
-            todo.add(ApplyRoutes(plan=self._plan(self._current, self._plan_phase)))
-
     def next_deadline(self) -> float:
         """When `tick` may have something to do; infinity when never."""
         if not self._old:

@@ -220,10 +220,9 @@ def _on_relay(node: Stages, event: ev.RelayChanged, _todo: ToDo, now: float) -> 
 
 
 def _on_persist_failed(node: Stages, event: ev.PersistFailed, todo: ToDo, _now: float) -> None:
-    """The disk refused. Routes and workers go on: the cut-off instructions are given again."""
+    """The disk refused. What happens on this machine goes on: these of the cut-off instructions are given again."""
     node.agreement.on_persist_failed(event.reason)
-    for executor in node.executors.values():
-        executor.again(todo)
+    todo.add(*node.behind_write)
 
 
 HANDLERS: Final[Mapping[type[Any], Handler]] = {

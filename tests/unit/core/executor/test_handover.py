@@ -207,9 +207,8 @@ def test_only_so_many_slots_drain_at_once() -> None:
     for epoch in range(2, 9):
         done(one.execute, allocation_of(epoch, f"edge{1 + epoch % 2}"), 0.0)
         done(one.on_ready, epoch)
-        out = done(one.on_flipped, epoch, 0, 0.0)
-    assert plan(out) is None
-    assert plan(done(one.again)) == ("flip", 8, *range(8 - MAX_OLD, 8))
+        assert plan(done(one.on_flipped, epoch, 0, 0.0)) is None
+    assert plan(done(one.execute, allocation_of(9, "edge2"), 0.0)) == ("prepare", 9, *range(9 - MAX_OLD, 9))
 
 
 def test_there_and_back_ends_on_the_first_owner_with_its_own_old_slot_to_drain() -> None:
@@ -250,7 +249,7 @@ def test_idle_executor_ignores_reports_and_needs_no_time() -> None:
     for act in EVENTS.values():
         assert act(one, 0) == ()
     assert done(one.on_gone, "edge1") == ()
-    assert (one.phase, one.next_deadline(), done(one.again)) == (Phase.IDLE, math.inf, ())
+    assert (one.phase, one.next_deadline()) == (Phase.IDLE, math.inf)
 
 
 @pytest.mark.parametrize("late", [allocation_of(1, "edge3"), allocation_of(2, "edge3"), allocation_of(3, None)])
@@ -269,10 +268,13 @@ def test_older_equal_and_empty_allocations_are_not_carried_out(late: Allocation)
         (Phase.SETTLED, ("close", 1, None)),
     ],
 )
-def test_again_repeats_the_plan_that_stands(phase: Phase, expected: tuple[str, int, int | None]) -> None:
-    one, twin = at(phase), at(phase)
-    assert plan(done(one.again)) == expected
-    assert one == twin
+def test_a_changed_file_gives_the_plan_that_stands_with_its_streams(
+    phase: Phase, expected: tuple[str, int, int | None]
+) -> None:
+    one = at(phase)
+    later = replace(SPEC, rules=(replace(SPEC.rules[0], from_template="{robot}/scan"),))
+    assert plan(tuple(adopted(one, later))) == expected
+    assert one.phase is phase
 
 
 def test_every_step_says_what_it_did() -> None:
@@ -377,30 +379,6 @@ def test_robot_that_is_candidate_and_has_streams_gets_both() -> None:
     one = Executor(spec=spec, me="robot1", has_streams=True)
     out = done(one.execute, allocation_of(1, "robot1"), 0.0)
     assert [type(step) for step in out] == [StartWorker, SetRole, ApplyRoutes, RecordStory]
-
-
-@pytest.mark.parametrize(
-    ("spec", "moves", "expected"),
-    [
-        (SPEC, [], [StartWorker, SetRole]),
-        (SPEC, ["edge1"], [StartWorker, StartWorker, SetRole]),
-        (COLD, [], [SetRole, StopWorker]),
-        (COLD, ["edge1"], [StartWorker, SetRole]),
-        (COLD, ["edge1", "edge2"], [SetRole]),  # it drains
-        (FOREIGN, ["edge1"], [SetRole]),
-    ],
-    ids=["warm", "warm owner", "cold", "cold owner", "cold draining", "foreign"],
-)
-def test_again_repeats_the_workers_wish_and_role(
-    spec: TaskSpec, moves: list[str], expected: list[type[Instruction]]
-) -> None:
-    """A batch that was cut off may have held any of them; each may be given twice."""
-    one = edge(spec=spec)
-    for epoch, owner in enumerate(moves, 1):
-        done(one.execute, allocation_of(epoch, owner), 0.0)
-    out = done(one.again)
-    assert [type(step) for step in out] == expected
-    assert roles(out) == [(one.role.role, one.role.epoch)]
 
 
 def test_an_owner_that_went_stays_gone_whoever_goes_next() -> None:

@@ -174,6 +174,31 @@ def test_a_task_that_goes_ends_and_comes_back_with_what_it_had_promised() -> Non
     assert node.registers["merge"].state.promised == promised
 
 
+def test_what_a_refused_write_cuts_off_of_a_change_is_given_again() -> None:
+    """The runtime went by the file before: what left the fleet ran on, and what came was never started."""
+    stays = task_of("other")
+    goes, comes = (task_of(name, ("robot1",), worker=WorkerSpec(command=(name,))) for name in ("merge", "count"))
+    fleet, changed = (fleet_of(one, stays, of=("edge1", "edge2", *ROBOTS)) for one in (goes, comes))
+    node = node_of(fleet)
+    node.start(START)
+    for name in ("robot2", "robot3"):
+        node.handle(ev.LearntReceived(learnt=Learnt(node=name, values=()), is_answer=True), START)
+    asked = Prepare(task="other", ballot=ballot_of(5, "robot2"), electorate=ELECTORATE)
+    node.absorb(ev.PrepareAsked(request=1, asker="robot2", prepare=asked), START + 1)
+    batch = adopt(node, changed, START + 1)
+    assert isinstance(batch[0], do.PersistState)
+    again = node.handle(ev.PersistFailed(reason="no space left on device"), START + 1)
+    orders: tuple[do.Instruction, ...] = (
+        do.AdoptFleet(fleet=changed),
+        do.StopWorker(task="merge"),
+        do.EndTask(task="merge"),
+        do.StartWorker(task="count"),
+    )
+    for given in (batch, again):
+        assert tuple(one for one in given if one in orders) == orders
+    assert not kinds(node.handle(ev.PersistFailed(reason="again"), START + 1)) & {do.AdoptFleet, do.EndTask}
+
+
 def test_the_worker_of_a_task_that_comes_back_is_not_taken_for_the_old_one() -> None:
     task = task_of("merge", worker=WorkerSpec(command=("merge",)))
     fleet, without = fleet_of(task), fleet_of(task_of("other"))
