@@ -53,6 +53,8 @@ class Recipes:
         self._me, self._folder, self.read = me, folder, read
         self._shared_memory, self._operator_json5, self._pools = shared_memory, operator_json5, pools
         self._made = _Made(specs={}, sessions={}, environments={})
+        self._written: dict[TaskId, str] = {}
+        """{task: the session in its file}, of another fleet than the recipes where one could not be written."""
 
     @property
     def specs(self) -> Mapping[TaskId, WorkerSpec]:
@@ -81,7 +83,7 @@ class Recipes:
             dials_by_gossip: whether they dial robots without an address, too.
 
         Raises:
-            AdapterError: a file cannot be written; the recipes stay as they are.
+            AdapterError: a file cannot be written; it and the recipes stay as they are.
         """
         kind = fleet.node(self._me).kind
         mine = [task for task in fleet.tasks if runs_worker(task, self._me, kind)]
@@ -98,7 +100,7 @@ class Recipes:
             for task in mine
         }
         for name, text in sessions.items():
-            if text != self._made.sessions.get(name):
+            if text != self._written.get(name):
                 self._write(name, text)
         for name in [name for name in self._made.specs if name not in sessions]:
             self._remove(name)
@@ -121,6 +123,7 @@ class Recipes:
 
     def _remove(self, task: TaskId) -> None:
         path = self._path(task)
+        self._written.pop(task, None)
         for one in (path, beside_session(path, ENVIRONMENT_SUFFIX), beside_session(path, PID_SUFFIX)):
             one.unlink(missing_ok=True)
 
@@ -129,10 +132,13 @@ class Recipes:
 
     def _write(self, task: TaskId, text: str) -> None:
         path = self._path(task)
+        new = path.with_name(f"{path.name}.new")  # where there is no room, the worker's next start needs the one before
         try:
-            write_regular(path, text.encode())
+            write_regular(new, text.encode())
+            new.replace(path)
         except OSError as error:
             raise AdapterError(f"cannot write {path}: {error.strerror}; check --runtime-dir") from error
+        self._written[task] = text
 
     def _environment(self, task: TaskSpec, pools: str) -> dict[str, str]:
         path = str(self._path(task.name))

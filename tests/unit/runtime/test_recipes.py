@@ -1,0 +1,90 @@
+"""What workers are made with: their session files, also where one cannot be written."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from support.fleets import fleet_of, task_of
+from zsched.core.values.fleet import WorkerLink, WorkerSpec
+from zsched.errors import AdapterError
+from zsched.runtime import recipes as recipes_module
+from zsched.runtime.recipes import Recipes
+from zsched.runtime.sessions import SessionsRead
+
+HERE, THERE = ("tcp/127.0.0.1:7458",), ("tcp/127.0.0.1:7458", "tcp/192.0.2.1:7458")
+MERGE, PLAN = (task_of(name, worker=WorkerSpec(command=("work",))) for name in ("merge", "plan"))
+
+
+@dataclass
+class Disk:
+    """Files are written until it is full: then an open one takes half of what it is to hold, as a real disk's may."""
+
+    is_full: bool = False
+
+    def write(self, path: Path, content: bytes) -> None:
+        path.write_bytes(content[: len(content) // 2] if self.is_full else content)
+        if self.is_full:
+            path.unlink()
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.fixture
+def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
+    made = Disk()
+    monkeypatch.setattr(recipes_module, "write_regular", made.write)
+    return made
+
+
+@pytest.fixture
+def recipes(tmp_path: Path) -> Iterator[Recipes]:
+    made = Recipes(
+        "edge1",
+        tmp_path,
+        SessionsRead(tmp_path / "state"),
+        shared_memory=False,
+        operator_json5=dict.fromkeys(WorkerLink, ""),
+        pools=None,
+    )
+    yield made
+    made.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_session_in_use_stays_whole_when_the_next_one_cannot_be_written(recipes: Recipes, disk: Disk) -> None:
+    recipes.adopt(fleet_of(MERGE), HERE, dials_by_gossip=False)
+    path, before = recipes.paths["merge"], recipes.session("merge")
+    disk.is_full = True
+    with pytest.raises(AdapterError, match=r"cannot write \S+edge1-merge.zenoh.json5: No space left on device"):
+        recipes.adopt(fleet_of(MERGE, PLAN), THERE, dials_by_gossip=False)
+    assert (path.read_text(), recipes.session("merge"), set(recipes.specs)) == (before, before, {"merge"})
+    disk.is_full = False
+    recipes.adopt(fleet_of(MERGE, PLAN), THERE, dials_by_gossip=False)
+    for task in ("merge", "plan"):
+        assert "192.0.2.1" in recipes.session(task)
+        assert recipes.paths[task].read_text() == recipes.session(task)
+
+
+def test_a_change_that_is_taken_back_after_half_of_its_sessions_were_written_takes_those_back(
+    recipes: Recipes, disk: Disk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fleet = fleet_of(MERGE, PLAN)
+    recipes.adopt(fleet, HERE, dials_by_gossip=False)
+    before = recipes.session("merge")
+
+    def full_after_one(path: Path, content: bytes) -> None:
+        disk.write(path, content)
+        disk.is_full = True
+
+    monkeypatch.setattr(recipes_module, "write_regular", full_after_one)
+    with pytest.raises(AdapterError):
+        recipes.adopt(fleet, THERE, dials_by_gossip=False)
+    assert "192.0.2.1" in recipes.paths["merge"].read_text(), "the first one was written"
+    monkeypatch.undo()
+    recipes.adopt(fleet, HERE, dials_by_gossip=False)
+    assert recipes.paths["merge"].read_text() == before
