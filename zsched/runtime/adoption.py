@@ -64,13 +64,13 @@ class Adoption(Struct, kw_only=True):
             is_agreed: it is an agreed document, with the electors in force.
 
         Raises:
-            AdapterError: a worker's session cannot be written; workers stay as they are.
+            AdapterError: a worker's session cannot be written; all adapters stay as they are.
         """
-        _log.info("fleet_file node=%s: adapters follow another one", self.me)
         listen = self.points.data_listen[0]
         points = endpoints_for(fleet, fleet.node(self.me), lambda: _port(listen), protocol=self.protocol)
         connect = (self.points.worker_connect[0], *points.worker_connect[1:])
         self.recipes.adopt(fleet, connect, dials_by_gossip=points.worker_by_gossip)
+        _log.info("fleet_file node=%s: adapters follow another one", self.me)
         self.crew.adopt(fleet, self.recipes.paths)
         self.supervisor.adopt(self.recipes.specs)
         self.crew.keep(self.recipes.specs)

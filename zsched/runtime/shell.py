@@ -1,7 +1,8 @@
 """Carries a node's instructions out: one line per instruction, in order, and the failure of one is an event.
 
 Only a failed `PersistState` cuts its batch off: nothing after it may happen unless the state is on disk. Any other
-failure is shown in the status until the same instruction works again, at most `PROBLEM_TTL_S`.
+failure is shown in the status until the same instruction works again, at most `PROBLEM_TTL_S`. `AdoptFleet` is tried
+until it works.
 
 Knows: which adapter an instruction is for. Does not know: why it was given.
 """
@@ -51,6 +52,8 @@ from zsched.runtime.inbox import Inbox
 from zsched.runtime.library import Library
 from zsched.runtime.strikes import Strikes
 
+FOLLOW_AGAIN_S = 10.0
+"""So often the adapters are told again to follow a fleet that they could not follow; what else would tell them?"""
 PROBLEM_TTL_S = 60.0
 """An instruction that failed and was never tried again is no problem any more after this time."""
 
@@ -98,11 +101,19 @@ class Shell:
         self.stand_down = ""
         """Why this daemon must end, for its name is taken; empty: it need not."""
         self._failed_at: dict[str, float] = {}
+        self._unfollowed: do.AdoptFleet | None = None
+        """The fleet that the adapters could not follow; nothing but another change would bring this order again."""
+        self._follow_at = 0.0
 
     # --- instructions ------------------------------------------------------------------------------------------------
 
     def carry_out(self, batch: tuple[do.Instruction, ...]) -> None:
-        """Carry a batch out in order; a failed write drops the rest, any other failure is only reported."""
+        """Carry a batch out in order; a failed write drops the rest, any other failure is only reported.
+
+        Call it at least once a second: a fleet that could not be followed is tried again, in front of the batch.
+        """
+        if self._unfollowed is not None and monotonic_s() >= self._follow_at:
+            batch = (self._unfollowed, *batch)
         for instruction in batch:
             kind = type(instruction).__name__
             try:
@@ -192,7 +203,9 @@ class Shell:
             case do.ApplyRoutes(plan=plan):
                 self._streams().apply(plan)
             case do.AdoptFleet(fleet=fleet, is_agreed=is_agreed):
+                self._unfollowed, self._follow_at = instruction, monotonic_s() + FOLLOW_AGAIN_S
                 self.follow(fleet, is_agreed)
+                self._unfollowed = None
             case do.EndTask(task=task):
                 self._streams().end(task)
             case do.SetRole(role=role):

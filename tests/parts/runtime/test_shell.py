@@ -15,6 +15,7 @@ import pytest
 from support.allocations import allocation_of
 from support.ballots import ballot_of
 from support.beats import beat_of
+from support.fleets import fleet_of
 from support.profiles import profile_of
 from support.proposals import proposal_of
 from support.states import state_of
@@ -31,7 +32,7 @@ from zsched.core.relay_protocol import RelayStarted, WorkerSeen
 from zsched.core.values.decision import Explanation, Move
 from zsched.core.values.document import Document, Flag, FlagKind, Text
 from zsched.core.values.durable import DurableState
-from zsched.core.values.fleet import WorkerSpec
+from zsched.core.values.fleet import Fleet, WorkerSpec
 from zsched.core.values.messages import (
     Accept,
     Accepted,
@@ -59,7 +60,7 @@ from zsched.runtime import shell as shell_module
 from zsched.runtime.desk import LOCAL_REQUESTS_FROM, Desk, command_of
 from zsched.runtime.inbox import INBOX_LIMIT, WAITING_LIMIT, Inbox
 from zsched.runtime.library import Library
-from zsched.runtime.shell import PROBLEM_TTL_S, Shell
+from zsched.runtime.shell import FOLLOW_AGAIN_S, PROBLEM_TTL_S, Shell
 from zsched.wire.codec import document_hash
 
 BALLOT = ballot_of()
@@ -231,6 +232,38 @@ def test_problem_of_an_instruction_that_never_comes_again_ends_by_its_age(
     now += 2
     house.shell.carry_out((do.PublishBeat(beat=BEAT),))
     assert house.events() == [ev.ProblemReported(source="AnswerCommand", problem=None)]
+
+
+def test_a_fleet_that_could_not_be_followed_is_tried_and_told_until_it_works(
+    house: House, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing else brings the order again: the problem vanished, and the adapters went by the fleet before."""
+    now, full = 100.0, AdapterError("cannot write a session: no space left on device")
+    monkeypatch.setattr(shell_module, "monotonic_s", lambda: now)
+    tried: list[tuple[Fleet, bool]] = []
+
+    def follow(fleet: Fleet, is_agreed: bool) -> None:
+        tried.append((fleet, is_agreed))
+        if is_full:
+            raise full
+
+    house.shell.follow, is_full = follow, True
+    first, second = (do.AdoptFleet(fleet=fleet_of(name=name), is_agreed=True) for name in ("first", "second"))
+    house.shell.carry_out((first, do.StartWorker(task="merge")))
+    assert house.calls == [("start", "merge")]
+    until_s = now + PROBLEM_TTL_S + 2 * FOLLOW_AGAIN_S
+    while now < until_s:
+        now += 1.0
+        house.shell.carry_out((do.PublishBeat(beat=BEAT),))
+    assert tried == [(first.fleet, True)] * (1 + int((PROBLEM_TTL_S + 2 * FOLLOW_AGAIN_S) / FOLLOW_AGAIN_S))
+    assert set(house.events()) == {ev.ProblemReported(source="AdoptFleet", problem=str(full))}
+    now, is_full = now + FOLLOW_AGAIN_S, False
+    del tried[:]
+    for batch in ((second,), (), ()):
+        house.shell.carry_out(batch)
+        now += FOLLOW_AGAIN_S
+    assert [fleet for fleet, _ in tried] == [first.fleet, second.fleet], "the newer one is the last"
+    assert house.events() == [ev.ProblemReported(source="AdoptFleet", problem=None)]
 
 
 def test_inbox_is_bounded_and_always_takes_a_stop() -> None:

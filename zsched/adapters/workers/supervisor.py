@@ -193,6 +193,8 @@ class WorkerSupervisor:
         self._workers = {
             task: _Worker(task=task, spec=spec, logger=log.getChild(task)) for task, spec in sorted(specs.items())
         }
+        self._early: set[TaskId] = set()
+        """What is wanted and not known yet: those who adopt another fleet failed with it, and will try again."""
         self._context, self._events, self._environment = context, events, environment
         self._rng, self._policy = rng or random.Random(), policy or RestartPolicy()
         self._why_not_ready, self._session = why_not_ready, session
@@ -209,7 +211,10 @@ class WorkerSupervisor:
     # --- what the daemon says ---
 
     def start(self, task: TaskId) -> None:
-        """Want ``task``'s worker running (nothing happens while it is failed, or when it runs already)."""
+        """Want ``task``'s worker running (nothing happens while it is failed, or when it runs already).
+
+        One that is not known yet, or has no command, starts once `adopt` brings both.
+        """
         self._command(self._on_start, task)
 
     def stop(self, task: TaskId) -> None:
@@ -330,6 +335,9 @@ class WorkerSupervisor:
                 self._on_reset(task)
             if not worker.spec.command:
                 self._on_stop(task)
+            elif task in self._early:
+                self._early.discard(task)
+                self._on_start(task)
         for worker in self._workers.values():
             self._compare(worker)
 
@@ -353,10 +361,13 @@ class WorkerSupervisor:
 
     def _on_start(self, task: TaskId) -> None:
         worker = self._workers.get(task)
-        if worker is not None:
-            worker.is_wanted = bool(worker.spec.command) and worker.is_kept and self._close_by_s is None
+        if worker is None or not (worker.is_kept and worker.spec.command):
+            self._early.add(task)
+        else:
+            worker.is_wanted = self._close_by_s is None
 
     def _on_stop(self, task: TaskId) -> None:
+        self._early.discard(task)
         worker = self._workers.get(task)
         if worker is None:
             return

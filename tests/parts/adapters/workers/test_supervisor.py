@@ -566,3 +566,19 @@ def test_a_failed_worker_whose_command_goes_is_not_started_without_one() -> None
         recorder.wait("reset")
         wait_until(lambda: supervisor.states() == {"merge": WorkerState.STOPPED})
         assert len([call for call in recorder.calls if call[0] == "started"]) == 1
+
+
+def test_a_worker_that_is_wanted_before_it_is_known_starts_with_the_file() -> None:
+    """The file is followed later than it is gone by where a session could not be written at once."""
+    with supervised(python(SLEEP)) as (supervisor, recorder):
+        for task in ("early", "stopped"):
+            supervisor.start(task)
+        supervisor.stop("stopped")
+        supervisor.adopt({task: python(SLEEP) for task in ("early", "merge", "stopped")})
+        assert recorder.wait("started")[1] == "early"
+        wait_until(lambda: len(supervisor.states()) == 3)
+        supervisor.stop("early")
+        recorder.wait("exited")
+        supervisor.adopt({task: python(SLEEP) for task in ("early", "merge", "stopped")})
+        supervisor.start("stopped")
+        assert recorder.wait("started", 2)[1] == "stopped", "once told, the wish is not kept"
