@@ -38,8 +38,12 @@ class Leaving(Struct):
     def ask(self, owned: Collection[TaskId], now: float, *, begins_anew: bool = False) -> bool:
         """Somebody asks to stop; whether that is the first time. The second time means: at once.
 
-        ``begins_anew``: the process goes on, so a move and its worker have more time.
+        ``begins_anew``: the process goes on, so a move and its worker have more time. Who is told to stop meanwhile is
+        told so for the first time.
         """
+        if self._begins_anew and not begins_anew:
+            self.asked_at, self._begins_anew = now, False
+            return True
         if self.asked_at is None:
             self.asked_at, self._begins_anew = now, begins_anew
             if not owned:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from zsched.runtime.leaving import ANEW_S, FINISH_S, HAND_OVER_S, LEAVE_S, NOBODY_S, TWICE_S, Leaving
 
 OWNED = ("map", "plan")
@@ -61,6 +63,21 @@ def test_a_daemon_that_begins_anew_lets_its_worker_finish() -> None:
     leaving.ask(OWNED, 100.0, begins_anew=True)
     assert not leaving.is_over((), (), 101.0, finishing=OWNED)
     assert leaving.is_over((), (), 101.0 + LEAVE_S), "it has finished"
+
+
+@pytest.mark.parametrize("after_s", [TWICE_S / 3, 2.0])
+def test_a_daemon_that_is_stopped_while_it_begins_anew_is_told_so_for_the_first_time(after_s: float) -> None:
+    """It went at once, or waited for longer than systemd does."""
+    leaving, told_at = Leaving(), 100.0 + after_s
+    assert leaving.ask(OWNED, 100.0, begins_anew=True)
+    assert leaving.ask(OWNED, told_at)
+    assert not leaving.is_over(OWNED, OWNED, told_at + HAND_OVER_S - 0.01)
+    assert leaving.is_over(OWNED, OWNED, told_at + HAND_OVER_S)
+    assert "after 3.0 s (map, plan): nobody has taken over" in leaving.last_words(OWNED, told_at + HAND_OVER_S)
+    assert not leaving.is_over((), (), told_at + 1.0, finishing=OWNED)
+    assert leaving.is_over((), (), told_at + 1.0 + LEAVE_S, finishing=OWNED), "its worker has no more time than that"
+    assert not leaving.ask(OWNED, told_at + TWICE_S + 0.01)
+    assert leaving.is_over(OWNED, OWNED, told_at + TWICE_S + 0.01), "now it was told twice"
 
 
 def test_what_is_left_behind_is_named() -> None:
