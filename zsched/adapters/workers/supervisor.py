@@ -427,6 +427,8 @@ class WorkerSupervisor:
             worker.is_wanted = False
             if worker.process is not None:
                 self._begin_stop(worker, within_s * 0.5, next_grace_s=within_s * 0.3)
+            elif worker.phase is _Phase.BACKOFF:
+                worker.phase, worker.deadline_s = _Phase.IDLE, None
 
     # --- one worker's next step ---
 

@@ -365,6 +365,31 @@ def test_close_ends_a_stubborn_worker_in_time() -> None:
         supervisor.start("merge")  # after the end: no error, no worker
 
 
+def test_a_worker_whose_restart_is_due_while_another_one_ends_is_not_started_any_more() -> None:
+    """Nobody would have stopped it: the end took longer, and the log blamed the kernel."""
+    stubborn = (
+        "import signal, time; [signal.signal(n, signal.SIG_IGN) for n in (2, 15)]; print('up')\nwhile 1: time.sleep(9)"
+    )
+    recorder = Recorder()
+    supervisor = WorkerSupervisor(
+        specs={"crashes": python("raise SystemExit(1)", max_failures=1000), "stubborn": python(stubborn)},
+        context=WorkerContext(fleet="hall", node="edge1", incarnation=7),
+        events=recorder,
+        policy=RestartPolicy(first_s=0.6, most_s=0.6, jitter_ratio=0.0),
+    )
+    try:
+        supervisor.start("stubborn")
+        output = supervisor.output("stubborn")
+        assert output is not None
+        wait_until(lambda: bool(output.behind(0)[0]))
+        supervisor.start("crashes")
+        assert recorder.wait("exited")[1] == "crashes"
+    finally:
+        supervisor.close(within_s=1.5)
+    assert [call[1] for call in recorder.calls if call[0] == "started"] == ["stubborn", "crashes"]
+    assert not supervisor.pids()
+
+
 def test_handler_that_raises_does_not_stop_the_supervisor(caplog: pytest.LogCaptureFixture) -> None:
     class Broken(Recorder):
         def on_started(self, task: str, pid: int, incarnation: int) -> None:
