@@ -207,7 +207,7 @@ class Expulsion:
     def _begin(self) -> None:
         with self._lock:
             if self._thread is None:
-                self._thread = guarded(self._run, name="expulsion", is_lasting=False)
+                self._thread = guarded(self._run, name="expulsion")
                 self._thread.start()
 
     def _put(self, is_meant: Callable[[zenoh.Link], bool] | None) -> None:

@@ -35,8 +35,14 @@ class LinkRetries:
             self._new.append(ends)
 
     def look(self) -> None:
-        """See to the links that are new since the last call; costs nothing while there are none."""
+        """See to the links that are new since the last call; costs nothing while there are none.
+
+        While this process has no descriptor left they wait for the next one.
+        """
         found = set()
         while self._new:
             found.add(self._new.popleft())
-        retry_steadily(found)
+        try:
+            retry_steadily(found)
+        except OSError:
+            self._new.extend(found)

@@ -181,11 +181,12 @@ class LinkSockets:
         self._known = {ends: fd for ends, fd in self._known.items() if ends in wanted}
         if wanted == self._known.keys():
             return
-        for path in Path("/proc/self/fd").iterdir():
-            with contextlib.suppress(OSError), _borrowed(int(path.name)) as held:
-                ends = _ends_of(held)
-                if ends in wanted:
-                    self._known[ends] = int(path.name)
+        with contextlib.suppress(OSError):  # no descriptor is left to list them with: the next call finds them
+            for path in Path("/proc/self/fd").iterdir():
+                with contextlib.suppress(OSError), _borrowed(int(path.name)) as held:
+                    ends = _ends_of(held)
+                    if ends in wanted:
+                        self._known[ends] = int(path.name)
 
 
 def opened(config: str) -> Session:
@@ -203,6 +204,9 @@ def retry_steadily(wanted: Iterable[Ends]) -> int:
     """Let TCP send again what was lost on these links of few packets after equal waits; how many links do so now.
 
     Their congestion control becomes one that allows it. Links that carry streams keep theirs (`LinkSocket`).
+
+    Raises:
+        OSError: no descriptor is left to list them with.
     """
     count, left = 0, set(wanted)
     for path in Path("/proc/self/fd").iterdir() if left else ():

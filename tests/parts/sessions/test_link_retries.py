@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import resource
 import socket
 from collections.abc import Iterator
+from pathlib import Path
 
 import zenoh
 
@@ -54,6 +57,36 @@ def test_links_from_before_and_from_now_on_have_equal_waits() -> None:
                 return settings(session) == [(1, "reno")]
 
             until(has_equal_waits, "equal waits")
+
+
+@contextlib.contextmanager
+def no_descriptor_left() -> Iterator[None]:
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    taken: list[int] = []
+    highest = max(int(path.name) for path in Path("/proc/self/fd").iterdir())
+    resource.setrlimit(resource.RLIMIT_NOFILE, (highest + 2, before[1]))
+    try:
+        with contextlib.suppress(OSError):
+            while True:
+                taken.append(os.open("/dev/null", os.O_RDONLY))
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
+        for descriptor in taken:
+            os.close(descriptor)
+
+
+def test_a_link_that_takes_the_last_descriptor_is_found_once_there_are_others() -> None:
+    """The decision loop looks, and so does the thread that ends strangers' links: neither may end by it."""
+    with pair() as (there, _here):
+        retries, sockets = LinkRetries(there), LinkSockets(there)
+        until(lambda: bool(retries._new), "word of the link")
+        with no_descriptor_left():
+            retries.look()
+            assert sockets.links() == ()
+        assert len(sockets.links()) == 1
+        retries.look()
+        assert settings(there) == [(1, "reno")]
 
 
 def test_a_link_that_carries_streams_keeps_its_congestion_control() -> None:
