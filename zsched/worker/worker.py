@@ -23,6 +23,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import queue
 import signal
 import threading
 import time
@@ -105,6 +106,8 @@ class Worker:
         self._early_end = 0
         """The newest epoch whose inputs have ended although our role in it has not, or has not come yet."""
         self._stop = threading.Event()
+        self._ended: queue.SimpleQueue[None] = queue.SimpleQueue()
+        """Holds something once it was told to stop. A signal's handler may put into it, whatever it has interrupted."""
         self._signals = 0
         """How often it was told to stop."""
         self._outputs: list[Output] = []
@@ -311,7 +314,12 @@ class Worker:
 
     def wait(self, timeout_s: float | None = None) -> bool:
         """Sleep at most this long; ``False`` as soon as the worker is asked to end."""
-        return not self._stop.wait(timeout_s)
+        try:
+            self._ended.get(timeout=None if timeout_s is None else max(timeout_s, 0.0))
+        except queue.Empty:
+            return not (self._stop.is_set() or self._signals)
+        self._ended.put(None)  # for whoever else waits, or will
+        return False
 
     def job(self, *, skipped: int = 0, came_s: float | None = None) -> Job:
         """A piece of work that is not done in a callback: ``with worker.job(): ...``, in whatever thread does it.
@@ -333,13 +341,14 @@ class Worker:
     def stop(self) -> None:
         """Let `wait` answer ``False`` (any thread)."""
         self._stop.set()
+        self._ended.put(None)
 
     def close(self) -> None:
         """Do what has come, then close the session within a second.
 
         After a signal: the process ends here when zenoh would hold it longer. Without one nothing is finished.
         """
-        self._stop.set()
+        self.stop()
         if self._signals:
             self._finish()
         has_alarm = self._signals > 0 and threading.current_thread() is threading.main_thread()
@@ -380,7 +389,7 @@ class Worker:
 
     def _on_signal(self, _signal: int, _frame: FrameType | None) -> None:
         self._signals += 1
-        self._stop.set()
+        self._ended.put(None)  # and not the event: its lock may be held by what this signal has interrupted
 
     def _finish(self) -> None:
         """Take the token back, so that relays keep what is to come for the next worker, and do what has come."""

@@ -293,6 +293,27 @@ def test_a_signalled_worker_is_gone_within_a_second(tmp_path: Path, is_relay_sto
             peer.stdout.close()
 
 
+STORM = """
+import os, signal, time
+from zsched.worker import Worker
+worker = Worker.from_env({}, standalone="t")
+signal.signal(signal.SIGALRM, worker._on_signal)
+until_s = time.monotonic() + 1.0
+signal.setitimer(signal.ITIMER_REAL, 2e-4, 2e-4)
+while time.monotonic() < until_s:
+    worker.wait(0)
+signal.setitimer(signal.ITIMER_REAL, 0.0)
+print(worker._signals > 1, worker.wait(), worker.wait(60), flush=True)
+os._exit(0)
+"""
+
+
+def test_a_signal_that_comes_while_the_worker_waits_is_not_waited_for() -> None:
+    """Its handler took the lock that the wait which it had interrupted held: only SIGKILL ended that."""
+    found = subprocess.run([sys.executable, "-c", STORM], timeout=60, capture_output=True, text=True, check=False)
+    assert (found.returncode, found.stdout) == (0, "True False False\n"), found.stderr
+
+
 def test_who_is_told_to_stop_takes_its_token_back_and_does_what_has_come(relay: Relay, tmp_path: Path) -> None:
     """Relays keep what is to come once the token went; what is here already is nobody else's."""
     count, is_gone = 20, threading.Event()
