@@ -131,14 +131,22 @@ class Service:
             try:
                 given = self._handler(request)
             except Exception as error:  # noqa: BLE001 - the asker must hear of it, whatever it is
-                self._troubles.note(request.key, error)
-                query.reply_err(f"failed: {type(error).__name__}: {error}"[:400], encoding=ERROR_ENCODING)
+                self._fail(query, request, error)
                 return
             finally:
                 self._timer.end(came_s)
             answer = given if isinstance(given, Answer) else Answer(payload=given)
             key = self._key_expr if is_wild(request.key) else request.key
-            query.reply(key, answer.payload, attachment=answer.attachment, encoding=answer.encoding)
+            try:
+                query.reply(key, answer.payload, attachment=answer.attachment, encoding=answer.encoding)
+            except zenoh.ZError:
+                raise
+            except Exception as error:  # noqa: BLE001 - what the handler has returned is no answer
+                self._fail(query, request, error)
+
+    def _fail(self, query: zenoh.Query, request: Request, error: Exception) -> None:
+        self._troubles.note(request.key, error)
+        query.reply_err(f"failed: {type(error).__name__}: {error}"[:400], encoding=ERROR_ENCODING)
 
     def _may_work(self) -> bool:
         until = monotonic_s() + ROLE_WAIT_S

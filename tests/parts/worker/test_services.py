@@ -1,0 +1,52 @@
+"""A worker's service by itself: what its asker and its node hear of a handler's faults."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import zenoh
+
+from support.waiting import until
+from zsched.core.relay_protocol import ERROR_ENCODING
+from zsched.sessions.config import data_config
+from zsched.worker.jobs import JobBook
+from zsched.worker.services import Request, Service
+from zsched.worker.troubles import Troubles
+
+KEY = "edge1/t/robot1/job"
+
+
+def test_what_is_no_answer_is_the_handler_s_failure_and_the_next_request_is_answered() -> None:
+    """The thread ended by it and began again, later each time; the asker heard nothing, and neither did the node."""
+    told: list[tuple[int, str]] = []
+    given: list[Any] = [{}, b"done"]
+
+    def handle(_request: Request) -> bytes:
+        answer: bytes = given.pop(0)
+        return answer
+
+    troubles = Troubles(lambda count, text: told.append((count, text)))
+    jobs = JobBook("t", "1", lambda _jobs: None, None)
+    with zenoh.open(zenoh.Config.from_json5(data_config(listen=(), connect=()))) as session:
+        service = Service(
+            session,
+            KEY,
+            handle,
+            is_owner=lambda: True,
+            later=lambda call: call(),
+            troubles=troubles,
+            jobs=jobs,
+            depth=2,
+        )
+        (failed,) = session.get(KEY, timeout=20.0)
+        assert failed.err is not None
+        assert failed.err.payload.to_string().startswith("failed: TypeError: ")
+        assert str(failed.err.encoding) == ERROR_ENCODING
+        until(lambda: told, "the node hears of it")
+        assert told[0][0] == 1
+        (answered,) = session.get(KEY, timeout=20.0)
+        assert answered.ok is not None
+        assert answered.ok.payload.to_bytes() == b"done"
+        service.undeclare()
+    troubles.close()
+    jobs.close()
