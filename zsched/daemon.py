@@ -86,6 +86,8 @@ RESTART_SIGNAL = signal.SIGUSR2
 """As SIGTERM, but the relay stays and carries the streams on for the daemon that follows (`systemctl restart`)."""
 RELOAD_SIGNAL = signal.SIGHUP
 """Read the fleet file again and go by it (`systemctl reload`)."""
+SIGNALS = (signal.SIGTERM, signal.SIGINT, RESTART_SIGNAL, RELOAD_SIGNAL)
+"""What a daemon is told by."""
 ALERT_S, ALERT_WAIT_S = 1.0, 0.01
 """After a token went, beats are looked at this often and for this long: they tell whether its node lives."""
 
@@ -418,8 +420,9 @@ class Daemon:
         hung_up = stop if os.isatty(0) else lambda _number, _frame: reload.ask()
         previous = signal.signal(RELOAD_SIGNAL, hung_up)
         stack.callback(signal.signal, RELOAD_SIGNAL, previous)
-        # `zsched up` has held them back since before we loaded: an early Ctrl-C is an orderly stop, and no traceback
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGTERM, signal.SIGINT))
+        # `zsched up`, or the daemon before us in this process, has held them back since before we loaded: an early
+        # Ctrl-C is an orderly stop, and no traceback
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
 
     def _leave(self) -> None:
         """An operator has taken this machine out of its fleet; called by the operator socket's threads."""
@@ -563,7 +566,8 @@ def _begin_anew() -> None:
     """Become the next daemon: the same process, so that its supervisor starts no second one."""
     sys.stdout.flush()
     sys.stderr.flush()
-    signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGTERM, signal.SIGINT))  # it takes what comes while it loads
+    signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)  # it takes what comes while it loads
+    Notifier().watchdog()  # no loop turns from the end of ours to the beginning of its own: seconds, on a small machine
     os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])  # noqa: S606 - no shell is wanted
 
 

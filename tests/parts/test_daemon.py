@@ -523,6 +523,31 @@ def test_the_daemon_that_follows_in_the_process_sizes_zenoh_s_pools_itself(
     assert error.splitlines()[-1] == f"begun with {of_operator}"
 
 
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGUSR2], ids=["reload", "restart"])
+def test_a_signal_that_comes_while_the_next_daemon_of_the_process_loads_is_taken_by_it(
+    place: Place, number: signal.Signals
+) -> None:
+    """It ended the process; also: systemd is told in time that it lives."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        name = f"zsched-test-{os.getpid()}"
+        systemd.bind(f"\0{name}")
+        told_twice = f"""
+for number in ({int(number)}, signal.SIGTERM):
+    os.kill(os.getpid(), number)
+sys.exit(daemon.main(sys.argv[1:]))
+"""
+        process = begin_anew(place, told_twice, {"NOTIFY_SOCKET": f"@{name}"})
+        _, error = process.communicate(timeout=60)
+        assert process.returncode == EXIT_OK, error
+        assert error.count("INFO zsched.daemon stopping node=edge1") == 2, error
+        systemd.setblocking(False)
+        heard = []
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                heard.append(systemd.recv(4096))
+    assert heard.count(b"WATCHDOG=1") == 1, "nobody has asked the loop for it"
+
+
 def test_daemon_and_relay_limit_what_they_log(place: Place) -> None:
     """1000 lines that a library prints in it, 1000 bad acknowledgements: a burst, and how many were left out."""
     process = place.start(env={"RUST_LOG": ""})

@@ -2,7 +2,8 @@
 
 The protocol is sd_notify(3): newline-separated fields in one datagram to the socket that NOTIFY_SOCKET names. Without
 that variable nothing happens. The watchdog must be fed from the decision loop itself: a daemon whose loop is wedged
-still has living threads (zenoh's keep-alives go on), so any other place would lie.
+still has living threads (zenoh's keep-alives go on), so any other place would lie. A daemon that begins anew feeds it
+once between two loops.
 
 Knows: NOTIFY_SOCKET, WATCHDOG_USEC, WATCHDOG_PID. Does not know: what ready means, or when to stop.
 """
