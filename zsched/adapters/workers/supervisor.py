@@ -457,14 +457,18 @@ class WorkerSupervisor:
     def _spawn(self, worker: _Worker, now: float) -> None:
         self._started += 1
         worker.incarnation = self._context.incarnation * INCARNATIONS_PER_DAEMON + self._started
+        process: WorkerProcess | None = None
         try:
             worker.made_by = self._recipe_of(worker)
             process = WorkerProcess(worker.spec.command, self._environment_of(worker), worker.logger, worker.kept)
+            self._guard.add(process.pid)
         except Exception as error:  # noqa: BLE001 - whatever stops a start is that worker's failure, never the daemon's
+            if process is not None:
+                self._guard.discard(process.pid)
+                process.finish(now)
             reason = f"cannot start: {error}"
             self._after_failure(worker, reason, now, is_last=self._count_failure(worker, reason, None, now))
             return
-        self._guard.add(process.pid)
         worker.process, worker.phase, worker.has_been_ready = process, _Phase.STARTING, False
         worker.deadline_s = now + worker.spec.start_deadline_s
         self._watch.add(process)

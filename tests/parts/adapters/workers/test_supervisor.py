@@ -17,7 +17,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from zsched.adapters.workers.process import LINES_BURST
+from zsched.adapters.workers.process import LINES_BURST, WorkerGuard
 from zsched.adapters.workers.supervisor import RestartPolicy, WorkerContext, WorkerSupervisor
 from zsched.core.values.fleet import WorkerSpec
 from zsched.core.values.profile import WorkerState
@@ -498,6 +498,23 @@ def test_environment_that_cannot_be_made_is_a_failure_of_that_worker() -> None:
     assert recorder.wait("failed") == ("failed", "merge", "cannot start: no folder for merge")
     assert [call[0] for call in recorder.calls] == ["failed"]
     supervisor.close()
+
+
+def test_a_worker_that_could_outlive_its_daemon_is_ended_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It was started and not known, and another one was started every 0.1 to 5 s."""
+    pids: list[int] = []
+
+    def refused(_self: WorkerGuard, group: int) -> None:
+        pids.append(group)
+        raise OSError(11, "Resource temporarily unavailable")
+
+    monkeypatch.setattr(WorkerGuard, "add", refused)
+    with supervised(python(SLEEP, max_failures=2)) as (supervisor, recorder):
+        supervisor.start("merge")
+        assert recorder.wait("failed")[2] == "cannot start: [Errno 11] Resource temporarily unavailable"
+        assert len(pids) == 2
+        assert not [pid for pid in pids if is_running(pid)]
+        assert not supervisor.pids()
 
 
 def test_kernel_without_pidfd_is_polled(monkeypatch: pytest.MonkeyPatch) -> None:
