@@ -253,6 +253,10 @@ class Numbers:
             self._after(before, todo)
         return self.value is not before
 
+    def is_possible(self, answer: Promise[FleetValue] | Accepted | Refused) -> bool:
+        """Whether an elector of the fleet register can have accepted what it tells."""
+        return self.roll is None or self.roll.is_possible(answer)
+
     def on_answer(self, answer: Promise[FleetValue] | Accepted | Refused, todo: ToDo, now: float) -> bool:
         """An elector answered our question to its fleet register; whether this node counts by another value now."""
         before = self.value

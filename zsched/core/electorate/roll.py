@@ -326,6 +326,10 @@ class Roll:
         """Run an identity round: learn whatever was accepted before."""
         self._register.settle(todo, now)
 
+    def is_possible(self, answer: Promise[FleetValue] | Accepted | Refused) -> bool:
+        """Whether an elector can have accepted what its promise tells."""
+        return self._register.is_possible(answer)
+
     def on_answer(self, answer: Promise[FleetValue] | Accepted | Refused, todo: ToDo, now: float) -> None:
         """An elector answered a question of the fleet register."""
         before = self.value

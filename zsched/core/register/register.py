@@ -442,10 +442,20 @@ class Register(ABC, Generic[V]):
         assert self._round is not None
         return self._round
 
+    def is_possible(self, answer: Promise[V] | Accepted | Refused) -> bool:
+        """Whether an elector can have accepted what its promise tells: a value of this register, not too far ahead.
+
+        No elector accepts another one, so such a promise is forged: no change and no question could be made of it.
+        """
+        held = answer.accepted if isinstance(answer, Promise) else None
+        return held is None or (held.value.task == self.state.task and self._highest(held.value) <= MAX_REVISION)
+
     def on_answer(self, answer: Promise[V] | Accepted | Refused, todo: ToDo, now: float) -> None:
-        """An elector answered; answers to older ballots, and from strangers, change nothing."""
+        """An elector answered; answers to older ballots, from strangers, and impossible ones change nothing."""
         running = self._round
         if running is None or answer.ballot != running.ballot or answer.elector not in self._count.names:
+            return
+        if not self.is_possible(answer):
             return
         if isinstance(answer, Refused):
             self._on_refused(running, answer, todo, now)

@@ -405,6 +405,8 @@ class Agreement:
         answer = event.answer.content
         if answer.elector not in self._nodes:
             self.counters["answer_foreign"] += 1
+        elif not self._numbers.is_possible(answer):
+            self.counters["answer_unfit"] += 1
         elif self._numbers.on_answer(answer, todo, now):
             self._count_anew(todo)
 
@@ -436,6 +438,8 @@ class Agreement:
         register = self.registers.get(answer.task)
         if register is None or answer.elector not in self.electors:
             self.counters["answer_foreign"] += 1
+        elif not register.is_possible(answer):
+            self.counters["answer_unfit"] += 1
         else:
             register.on_answer(answer, todo, now)
 

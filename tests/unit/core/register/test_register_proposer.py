@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 
+from support.allocations import allocation_of
 from support.registers import (
     BALLOT_S,
     BLANK,
@@ -28,7 +29,7 @@ from support.registers import (
     promise_all,
     promised,
 )
-from zsched.core.register.register import FROM_A_PEER
+from zsched.core.register.register import FROM_A_PEER, MAX_REVISION
 from zsched.core.register.task_register import TaskRegister
 from zsched.core.values.change import MoveOwner, Retune, RoundOutcome
 from zsched.core.values.electorate import Elector, Electorate
@@ -69,6 +70,34 @@ def test_one_elector_counts_once_and_a_stranger_never() -> None:
         no = Refused(elector=name, task="merge", ballot=asked.ballot, refusal=Refusal.NUMBER, promised=asked.ballot)
         did(proposer.on_answer, no, 0.0)
     assert did(proposer.on_answer, promised(make("r3"), asked)[1], 0.0).accept is not None, "nor did their noes"
+
+
+@pytest.mark.parametrize(
+    "value",
+    [allocation_of(1, task="plan"), allocation(MAX_REVISION + 1), allocation_of(1, epoch=MAX_REVISION + 1)],
+    ids=["another task's", "no later revision", "no later epoch"],
+)
+def test_a_promise_of_what_no_elector_accepts_leaves_the_round_as_it_was(value: Allocation) -> None:
+    """A question about such a value, or the next one after it, cannot even be made."""
+    proposer, other = make("r1"), make("r2")
+    step = did(proposer.propose, FIRST, 0.0)
+    assert step.prepare is not None
+    for name in ("r2", "r3"):
+        held = Acceptance(ballot=ballot(1), value=value)
+        forged = Promise(elector=name, task="merge", ballot=step.prepare.ballot, accepted=held)
+        assert did(proposer.on_answer, forged, 0.0) == Step()
+    assert commit(proposer, step, [proposer, other]).finished == (FIRST, RoundOutcome.COMMITTED)
+
+
+def test_a_promise_of_the_last_revision_that_can_be_counts() -> None:
+    proposer = make("r1")
+    asked = did(proposer.settle, 0.0).prepare
+    assert asked is not None
+    held = Acceptance(ballot=ballot(1), value=allocation(MAX_REVISION))
+    answers = [Promise(elector=name, task="merge", ballot=asked.ballot, accepted=held) for name in ("r2", "r3")]
+    read = last(did(proposer.on_answer, one, 0.0) for one in answers)
+    assert read.accept is not None
+    assert read.accept.acceptance.value == held.value
 
 
 def test_answers_to_an_older_ballot_change_nothing() -> None:

@@ -227,6 +227,13 @@ def test_answers_of_strangers_are_counted_and_complete_no_majority() -> None:
     assert agreement.counters == {"answer_foreign": 3}
 
 
+def test_promises_of_another_task_s_value_are_counted_and_complete_no_majority() -> None:
+    agreement = make()
+    held = Acceptance(ballot=ballot_of(5, "robot3"), value=allocation_of(4, task="plan"))
+    assert promises(agreement, agreed(agreement.retune, command(), 100.0), held=held) == ToDo()
+    assert agreement.counters == {"answer_unfit": 2}
+
+
 # --- asking and telling ----------------------------------------------------------------------------------------------
 
 

@@ -7,11 +7,12 @@ from collections.abc import Mapping
 from dataclasses import replace
 from random import Random
 from types import MappingProxyType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import pytest
 
 from support.allocations import allocation_of
+from support.ballots import ballot_of
 from support.beats import beat_of
 from support.fleets import fleet_of, task_of
 from support.states import state_of
@@ -20,13 +21,24 @@ from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.electorate.changes import AddElector, AdoptDocument, RemoveElector, SetDocument, SetLease
 from zsched.core.electorate.founding import founded
+from zsched.core.register.register import MAX_REVISION
 from zsched.core.todo import ToDo
 from zsched.core.values.beat import Beat, Grant
 from zsched.core.values.change import MoveOwner
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.lease import hold_s
-from zsched.core.values.messages import Accept, Accepted, FleetAnswer, Learnt, Prepare, Promise, Refusal, Refused
+from zsched.core.values.messages import (
+    Accept,
+    Accepted,
+    FleetAnswer,
+    Learnt,
+    Prepare,
+    Promise,
+    Refusal,
+    Refused,
+    fleet_answer,
+)
 from zsched.core.values.model import NO_BALLOT, Acceptance, Ballot, RegisterState
 from zsched.core.vote.agreement import Agreement
 from zsched.core.vote.belief import GENERATION_STEP
@@ -147,6 +159,25 @@ def test_the_first_document_keeps_the_registers_and_raises_the_number() -> None:
     agreed(before.on_learnt, ev.LearntReceived(learnt=told, is_answer=True), 100.1)
     assert before.registers["merge"] is register
     assert register.value == learnt
+
+
+# --- forged ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("change", [{"fleet": "other"}, {"revision": MAX_REVISION + 1}, {"number": MAX_REVISION + 1}])
+def test_promises_of_a_fleet_value_that_cannot_be_are_counted_and_complete_no_majority(change: dict[str, Any]) -> None:
+    """A question about such a value, or the next one after it, cannot even be made."""
+    agreement = make(replace(ADOPTED, settled=True))
+    todo = ToDo()
+    assert agreement.change_fleet(AddElector(base_revision=2, name="edge1", disk="ed"), todo, 100.0) == ""
+    (ask,) = of(todo, do.AskElectors)
+    assert isinstance(ask.question, Prepare)
+    held = Acceptance(ballot=ballot_of(1, "robot3"), value=replace(WITH_EDGE, **change))
+    for name in ROBOTS[:2]:
+        promise = Promise(elector=name, task=FLEET.name, ballot=ask.question.ballot, accepted=held)
+        forged = ev.FleetAnswered(answer=fleet_answer(promise))
+        assert agreed(agreement.on_fleet_answer, forged, 100.1) == ToDo()
+    assert agreement.counters == {"answer_unfit": 2}
 
 
 # --- learnt ----------------------------------------------------------------------------------------------------------
