@@ -229,6 +229,8 @@ class Roll:
 
         ``refusal``: a reason outside the register, for which a question that is admitted gets a no.
         """
+        if question.task != self.value.task:
+            return None  # what it brings is no value of this register, and nothing could follow it
         admission = self.admission(question, asker, todo)
         if admission is Admission.SILENT:
             return None

@@ -32,6 +32,7 @@ from zsched.core.values.messages import (
     Accept,
     Accepted,
     FleetAnswer,
+    FleetQuestion,
     Learnt,
     Prepare,
     Promise,
@@ -54,6 +55,7 @@ FLEET = fleet_of(TASK, of=NAMES, electors=ROBOTS)
 GENERATION = 2
 FIRST = founded(FLEET.name, GENERATION, ROBOTS)
 ADOPTED = AdoptDocument(base_revision=1, document="0d", tasks=(("merge", True),), lease_s=1.0).apply(FIRST)
+NEXT = replace(FIRST, revision=2)
 WITH_EDGE = AddElector(base_revision=2, name="edge1", disk="ed").apply(replace(ADOPTED, settled=True))
 WITHOUT_ROBOT1 = RemoveElector(base_revision=2, name="robot1").apply(replace(ADOPTED, settled=True))
 
@@ -178,6 +180,24 @@ def test_promises_of_a_fleet_value_that_cannot_be_are_counted_and_complete_no_ma
         forged = ev.FleetAnswered(answer=fleet_answer(promise))
         assert agreed(agreement.on_fleet_answer, forged, 100.1) == ToDo()
     assert agreement.counters == {"answer_unfit": 2}
+
+
+def test_a_fleet_value_of_another_name_is_not_accepted() -> None:
+    """What an elector has accepted every later round would have to ask about, and could not."""
+    agreement = make()
+    accept = Accept(
+        task="merge",
+        acceptance=Acceptance(ballot=ballot_of(9, "robot2"), value=replace(FIRST, fleet="merge", revision=2)),
+        electorate=agreement.electorate,
+        generation_id=FIRST.generation_id,
+        number=1,
+    )
+    answers = []
+    for forged in (accept, replace(accept, task=FLEET.name, acceptance=replace(accept.acceptance, value=NEXT))):
+        event = ev.FleetAsked(request=1, asker="robot2", question=FleetQuestion(accept=forged))
+        answers.append(of(agreed(agreement.acceptor.on_fleet_asked, event, 100.1), do.AnswerFleet))
+    assert answers[0] == []
+    assert isinstance(answers[1][0].answer.content, Accepted), "all else about it was right"
 
 
 # --- learnt ----------------------------------------------------------------------------------------------------------
