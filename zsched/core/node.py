@@ -191,7 +191,8 @@ class Node(Stages):
                 self.agreement.propose(task, retune, todo, now)
         if now >= self.expiry.next_deadline():
             for task, ending in self.expiry.due(self.values(), now):
-                self.agreement.propose(task, ending, todo, now)
+                if not self.registers[task].is_busy:
+                    self.agreement.propose(task, ending, todo, now)
         if now >= self.flags.next_deadline():
             self.agreement.orders.end_flags(self.flags.due(now), todo)
         if now >= self.agreement.next_deadline():

@@ -39,6 +39,8 @@ FROM_A_PEER = "learnt from a peer"
 """Why a value came about that another node committed."""
 MAX_REVISION = 2**52  # half of what a counter may be: a value so far ahead is refused, for nothing could follow it
 MAX_JUMP = 2**32  # no honest counter is so far ahead; one hostile frame must not use them all up
+MAX_QUEUED = 16
+"""Changes that may wait for the round under way; one more ends as a conflict, for those before it come first."""
 
 
 class _Phase(StrEnum):
@@ -364,6 +366,9 @@ class Register(ABC, Generic[V]):
 
     def propose(self, change: Rewrite[V], todo: ToDo, now: float) -> None:
         """Try to commit a change; its end appears in `ToDo.ended`, of this or a later call."""
+        if len(self._queue) >= MAX_QUEUED:
+            self._end(change, RoundOutcome.CONFLICT, todo)
+            return
         self._queue.append(change)
         if self._round is not None and self._round.is_ahead:
             self._round = None  # those promises are for another change
@@ -402,11 +407,15 @@ class Register(ABC, Generic[V]):
             self._prepare(todo, now)
 
     def _start_next(self, todo: ToDo, now: float) -> None:
-        if not self._queue:
-            return
-        change = self._queue.pop(0)
-        self._round = _Round(change=change, give_up_at=now + 6 * self._ballot_s)
-        self._begin(todo, now)
+        """Begin with the next change that is not outdated; those before it end."""
+        while self._queue and self._round is None:
+            change = self._queue.pop(0)
+            self._round = _Round(change=change, give_up_at=now + 6 * self._ballot_s)
+            if self._outcome_by(self.value) is None:
+                self._prepare(todo, now)
+            else:
+                self._end(change, RoundOutcome.CONFLICT, todo)
+                self._round = None
 
     def _begin(self, todo: ToDo, now: float) -> None:
         """Prepare, unless the change is outdated; read a newer base than ours first."""

@@ -35,6 +35,7 @@ from zsched.core.values.messages import (
 from zsched.core.values.model import Acceptance, Allocation, Asked, RegisterState
 from zsched.core.values.profile import WorkerState
 from zsched.core.values.snapshot import FlagStatus
+from zsched.core.vote.expiry import AGAIN_S
 
 ADA = Asked(by="ada@robot1", reason="new battery")
 EDGES = ("edge1", "edge2", "edge3")
@@ -216,6 +217,17 @@ def test_a_pause_ends_by_itself_when_its_time_is_over() -> None:
     lone.wait(10.0)
     assert not lone.value().paused
     assert lone.node.history["merge"][-1].reason == "the time of its pause is over"
+
+
+def test_an_end_that_is_under_way_is_not_proposed_once_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where electors are slow a round takes longer than `AGAIN_S`, and what waits behind it must not pile up."""
+    lone = Lone()
+    lone.hold(Hold.PAUSE, for_s=60.0)
+    register = lone.node.registers["merge"]
+    monkeypatch.setattr(register, "_ballot_s", 3.0)
+    monkeypatch.setattr(lone, "_carry", lambda _batch: None)
+    lone.wait(60.0 + 2.5 * AGAIN_S)
+    assert [one.reason for one in register.wanted] == ["the time of its pause is over"]
 
 
 def test_a_pin_is_to_the_owner_or_to_a_candidate_and_a_move_elsewhere_is_refused() -> None:

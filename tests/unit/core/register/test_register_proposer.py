@@ -29,7 +29,7 @@ from support.registers import (
     promise_all,
     promised,
 )
-from zsched.core.register.register import FROM_A_PEER, MAX_REVISION
+from zsched.core.register.register import FROM_A_PEER, MAX_QUEUED, MAX_REVISION
 from zsched.core.register.task_register import TaskRegister
 from zsched.core.values.change import MoveOwner, Retune, RoundOutcome
 from zsched.core.values.electorate import Elector, Electorate
@@ -192,6 +192,27 @@ def test_every_queued_change_reports_its_own_end() -> None:
         (changes[2], RoundOutcome.CONFLICT),
     )
     assert not electors[0].is_busy
+
+
+def test_however_many_outdated_changes_wait_all_end_and_the_next_one_begins(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each begins the next one as it ends: a thousand of them must not be calls within calls."""
+    monkeypatch.setattr("zsched.core.register.register.MAX_QUEUED", 1001)
+    register, current = make(), replace(FIRST, base_revision=1)
+    did(register.propose, FIRST, 0.0)
+    waiting = [did(register.propose, change, 0.0) for change in (*[FIRST] * 1000, current)]
+    assert waiting == [Step()] * 1001
+    step = did(register.learn, allocation(1, "e2"), 0.1)
+    assert step.ends == ((FIRST, RoundOutcome.CONFLICT),) * 1001
+    assert step.prepare is not None
+    assert register.wanted == (current,)
+
+
+def test_a_change_that_finds_too_many_before_it_ends_at_once() -> None:
+    register = make()
+    did(register.propose, FIRST, 0.0)
+    steps = [did(register.propose, FIRST, 0.0) for _ in range(MAX_QUEUED + 2)]
+    assert steps == [*[Step()] * MAX_QUEUED, *[Step(ends=((FIRST, RoundOutcome.CONFLICT),))] * 2]
+    assert len(register.wanted) == 1 + MAX_QUEUED
 
 
 def test_learning_a_newer_value_ends_a_change_that_has_not_been_sent() -> None:
