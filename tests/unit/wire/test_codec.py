@@ -309,6 +309,8 @@ def test_bytes_that_are_no_frame(frame: bytes, reason: str) -> None:
         ("loop_lag_s", math.nan, "type"),
         ("loop_lag_s", math.inf, "type"),
         ("loop_lag_s", -0.1, "range"),
+        ("disk", "no hex", "range"),
+        ("disk", "0" * 33, "range"),
         ("loop_lag_s", "0", "type"),
         ("learnt", [["merge", 1]], "type"),
         ("learnt", [["merge", 1, 2, 3]], "type"),
