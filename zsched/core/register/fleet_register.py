@@ -12,7 +12,7 @@ from zsched.core.instructions import AskElectors
 from zsched.core.register.register import Register
 from zsched.core.todo import ToDo
 from zsched.core.values.change import Rewrite, RoundOutcome
-from zsched.core.values.electorate import Electorate, FleetValue
+from zsched.core.values.electorate import CREATION_STEP, Electorate, FleetValue
 from zsched.core.values.messages import Accept, Prepare
 
 
@@ -34,7 +34,7 @@ class FleetRegister(Register[FleetValue]):
         super().count_with(count, is_elector=is_elector, is_blank=is_blank, now=now)
 
     def _highest(self, value: FleetValue) -> int:
-        return max(value.revision, value.number, value.creations)
+        return max(value.revision, value.number, value.creations * CREATION_STEP)
 
     def _prevails(self, value: FleetValue) -> bool:
         del value

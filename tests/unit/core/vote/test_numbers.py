@@ -25,7 +25,7 @@ from zsched.core.register.register import MAX_REVISION
 from zsched.core.todo import ToDo
 from zsched.core.values.beat import Beat, Grant
 from zsched.core.values.change import MoveOwner
-from zsched.core.values.electorate import FleetValue
+from zsched.core.values.electorate import CREATION_STEP, Creation, FleetValue
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.lease import hold_s
 from zsched.core.values.messages import (
@@ -332,6 +332,19 @@ def test_everybody_is_told_the_same_value_again_after_a_while_only(value: FleetV
     assert agreement.word(100.0) == agreement.learnt()
     assert agreement.word(100.0 + 0.9 * ASK_LEARNT_EVERY_S) is None
     assert agreement.word(100.0 + ASK_LEARNT_EVERY_S) == agreement.learnt()
+
+
+def test_a_fleet_value_whose_tasks_could_have_no_register_is_not_learnt() -> None:
+    """Registers begin at the task's number times `CREATION_STEP`, which must leave room to count."""
+    last = MAX_REVISION // CREATION_STEP
+    for number, is_learnt in ((last + 1, False), (2**30, False), (last, True)):
+        agreement = make()
+        tasks = (Creation(task="merge", number=number, exclusive=True),)
+        told = replace(WITH_EDGE, creations=number, tasks=tasks)
+        said = Learnt(node="robot2", values=(), generation=GENERATION, fleet=told)
+        agreed(agreement.on_learnt, ev.LearntReceived(learnt=said, is_answer=True), 100.1)
+        assert (agreement.number == 3) is is_learnt
+        assert ("fleet/register" in agreement.problems) is not is_learnt
 
 
 def test_what_is_told_unasked_leads_to_a_question_only() -> None:
