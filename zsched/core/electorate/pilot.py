@@ -34,7 +34,7 @@ from zsched.core.electorate.changes import AddElector, FleetChange, RemoveElecto
 from zsched.core.values.electorate import Elector, FleetValue
 from zsched.core.values.model import NodeId, NodeKind
 from zsched.core.values.quorum import majority
-from zsched.core.values.struct import Struct
+from zsched.core.values.struct import Struct, replace
 
 TARGET = 5
 """How many electors a fleet has at most by itself."""
@@ -188,9 +188,10 @@ class Pilot:
             is_busy: a change of this node's is under way.
         """
         self.advice = self.advise(value, course, now)
-        wish = self.advice.change
-        if wish is None or is_busy or wish != self._wish:
-            self._wish, self._due = wish, now + self.stagger_s * self._rank(value, course, now)
+        wish, before = self.advice.change, self._wish
+        self._wish = wish
+        if wish is None or is_busy or not _is_same(wish, before):
+            self._due = now + self.stagger_s * self._rank(value, course, now)
         if wish is None or is_busy or now < self._due:
             return None
         self._due = now + self.stagger_s * (1 + len(value.electors))  # it may have been lost: once more
@@ -325,6 +326,11 @@ class Pilot:
 def may_go(value: FleetValue, me: NodeId) -> bool:
     """Whether a node that leaves may stop: the electors are settled without it."""
     return value.settled and value.electorate.seat(me) is None
+
+
+def _is_same(change: FleetChange, other: FleetChange | None) -> bool:
+    """Whether two changes differ at most in their reasons: those tell how long, and of whom, and both go on."""
+    return other is not None and replace(change, reason=other.reason) == other
 
 
 def _answers(seat: Elector, word: Word) -> bool:

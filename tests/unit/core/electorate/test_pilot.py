@@ -429,6 +429,32 @@ def test_electors_take_turns_and_a_change_that_was_lost_is_proposed_again() -> N
     assert sorted(waits) == [0, 1, 2]
 
 
+@pytest.mark.parametrize(("revision", "rank"), [(9, 0), (7, 1), (8, 2)])
+def test_who_has_a_later_turn_adds_an_elector_in_its_turn(revision: int, rank: int) -> None:
+    """The advice tells for how long the candidate was heard: its words change every second, and it is the same."""
+    ear = Ear(value("abc", revision=revision))
+    ear.pilot.stagger_s = 2.0
+    proposed = None
+    while proposed is None and ear.now < 10 * STEADY * T:
+        ear.hear("bcxy", 1.0)
+        proposed = ear.pilot.tick(ear.value, ear.course, ear.now, is_busy=False)
+    assert ear.now == 1.0 + STEADY * T + 2.0 * rank
+    assert isinstance(proposed, AddElector)
+    assert proposed.reason == f"x becomes an elector: heard without a break for {STEADY * T + 2.0 * rank:.0f} s"
+
+
+def test_another_change_waits_for_its_turn_anew() -> None:
+    ear = Ear(value("abc", revision=8))
+    ear.hear("bcxy", STEADY * T + 1.0)
+    turns = []
+    for course in (COURSE, replace(COURSE, leaving=("c",))):
+        ear.course = course
+        turns.append([ear.pilot.tick(ear.value, course, ear.now + step / 2, is_busy=False) for step in range(4)])
+        ear.now += 2.0
+    assert turns == [[None] * 4] * 2, "two turns of others come before it"
+    assert isinstance(ear.pilot.tick(ear.value, ear.course, ear.now, is_busy=False), RemoveElector)
+
+
 def test_nothing_is_proposed_while_a_change_is_under_way() -> None:
     ear = Ear(value("abc", revision=9), replace(COURSE, leaving=("c",)))
     ear.hear("bc", 2.0)
