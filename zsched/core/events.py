@@ -201,6 +201,8 @@ class DocumentRefused(Struct, frozen=True, kw_only=True):
     reason: str
     request: int | None = None
     """Of `StoreDocument`; ``None``: it was fetched from a peer."""
+    is_of_disk: bool = False
+    """It may be valid here: the disk refused it, and may take it another time."""
 
 
 # --- membership ------------------------------------------------------------------------------------------------------

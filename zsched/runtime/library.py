@@ -134,7 +134,10 @@ class Library:
         except (ConfigError, AdapterError, WireError) as error:
             reason = str(error)
             log.warning("document refused document=%s why=%s", name, reason)
-            self._post(ev.DocumentRefused(document=name, reason=reason[:MAX_FAULT], request=request))
+            is_of_disk = isinstance(error, AdapterError)
+            self._post(
+                ev.DocumentRefused(document=name, reason=reason[:MAX_FAULT], request=request, is_of_disk=is_of_disk)
+            )
             return
         if name in self._recent:  # one that comes again takes no other's place
             self._recent.remove(name)

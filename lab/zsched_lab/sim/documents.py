@@ -148,7 +148,10 @@ class Documents:
         if machine.life != life or machine.node is None:
             return
         if machine.disk.is_broken or (machine.key, document) in self.unfit:
-            refused = ev.DocumentRefused(document=document, reason="not valid here", request=request)
+            is_of_disk = (machine.key, document) not in self.unfit
+            refused = ev.DocumentRefused(
+                document=document, reason="not valid here", request=request, is_of_disk=is_of_disk
+            )
             self._sim.deliver(machine, refused)
             return
         if document not in machine.disk.documents:

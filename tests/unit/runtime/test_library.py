@@ -117,7 +117,7 @@ def test_a_document_that_is_not_valid_here_is_refused_and_not_stored(desk: Desk,
     desk.library.order(do.StoreDocument(request=3, content=document(text=text)))
     event = desk.next()
     assert isinstance(event, ev.DocumentRefused)
-    assert event.request == 3
+    assert (event.request, event.is_of_disk) == (3, False)
     assert why in event.reason
     assert desk.store.load(event.document) is None
 
@@ -127,6 +127,7 @@ def test_a_full_disk_refuses_a_document(desk: Desk, tmp_path: Path) -> None:
     desk.library.order(do.StoreDocument(request=3, content=document()))
     event = desk.next()
     assert isinstance(event, ev.DocumentRefused)
+    assert event.is_of_disk
     assert "cannot write" in event.reason
 
 

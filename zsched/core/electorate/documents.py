@@ -4,7 +4,8 @@ Knows: hashes, what the stored texts say. Does not know: bytes, disks, how a doc
 (`zsched.runtime.library`), which fleet value is in force (`zsched.core.electorate.numbers`).
 
 A fleet value is neither accepted nor learnt before its document is stored here. A document that is not valid here is
-not asked for again: the node goes on by its last one, and says so.
+not asked for again: the node goes on by its last one, and says so. One that the disk refuses is asked for again, for
+the disk may take it later.
 """
 
 from __future__ import annotations
@@ -52,6 +53,8 @@ class Documents:
         """What the disk was told to keep: every document that is known here, or one that comes back is not on it."""
         self.refused: dict[str, str] = {}
         """{hash: why it is not valid here}, the newest last."""
+        self.unwritten: dict[str, str] = {}
+        """{hash: why the disk has refused it} of those that are wanted still."""
 
     def holds(self, value: FleetValue) -> bool:
         """Whether the document of a fleet value is stored here; a value without one needs none."""
@@ -100,6 +103,7 @@ class Documents:
     def _forget(self, document: str) -> None:
         self._wanted.pop(document, None)
         self._ask_at.pop(document, None)
+        self.unwritten.pop(document, None)
 
     def on_stored(self, document: str, fleet: Fleet, todo: ToDo, flags: tuple[Flag, ...] = ()) -> None:
         """A document is on disk, and valid."""
@@ -109,8 +113,16 @@ class Documents:
         self._fleets[document], self._flags[document] = fleet, flags
         self._drop_old(todo)
 
-    def on_refused(self, document: str, reason: str) -> None:
-        """A document that a peer sent is not valid here: it is not asked for again."""
+    def on_refused(self, document: str, reason: str, *, is_of_disk: bool = False) -> None:
+        """A document that a peer sent is not valid here: it is not asked for again, unless only the disk refuses it.
+
+        One that nobody is asked for is this node's own draft, which is not agreed.
+        """
+        if document not in self._wanted:
+            return
+        if is_of_disk:
+            self.unwritten[document] = reason
+            return
         self._forget(document)
         self.refused.pop(document, None)
         self.refused[document] = reason

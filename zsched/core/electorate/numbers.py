@@ -194,6 +194,9 @@ class Numbers:
                 f"the agreed document {document[:8]} cannot be used here, this node goes on by its last one: {reason}"
             )
             found["fleet/document"] = text
+        for document, reason in self.documents.unwritten.items():
+            text = f"the document {document[:8]} cannot be stored here, this node tries again in some seconds: {reason}"
+            found["fleet/document"] = text
         if "fleet/document" not in found and self.roll is not None and not self.documents.holds(self.roll.value):
             document = self.roll.value.document[:8]
             found["fleet/document"] = f"the agreed document {document} is not on this disk: this node asks its peers"

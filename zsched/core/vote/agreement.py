@@ -423,7 +423,7 @@ class Agreement:
         """A document cannot be used here."""
         self.counters["document_refused"] += 1
         if event.request is None:
-            self._numbers.documents.on_refused(event.document, event.reason)
+            self._numbers.documents.on_refused(event.document, event.reason, is_of_disk=event.is_of_disk)
         self.orders.on_refused(event, todo)
 
     def change_fleet(self, change: FleetChange, todo: ToDo, now: float) -> str:

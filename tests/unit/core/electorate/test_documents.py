@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
+
 from support.fleet_values import fleet_value_of
+from support.fleets import fleet_of
 from zsched.core import instructions as do
 from zsched.core.electorate.documents import FETCH_EVERY_S, MAX_WANTED, Documents
 from zsched.core.todo import ToDo
@@ -28,10 +31,42 @@ def test_documents_that_are_not_valid_here_are_asked_for_once_each() -> None:
     assert list(documents.refused.values())[-1] == "another one", "the newest is shown"
 
 
+def test_a_document_that_the_disk_has_refused_is_asked_for_again_until_it_is_stored() -> None:
+    documents = Documents("robot1", {})
+    assert asked(documents, "a") == ["a"]
+    documents.on_refused("a", "the disk is full", is_of_disk=True)
+    assert (documents.refused, documents.unwritten) == ({}, {"a": "the disk is full"})
+    assert documents.next_deadline() == FETCH_EVERY_S
+    todo = ToDo()
+    documents.tick(todo, FETCH_EVERY_S)
+    assert [one.document for one in todo.send if isinstance(one, do.FetchDocument)] == ["a"]
+    documents.on_stored("a", fleet_of(of=("robot1",)), todo)
+    assert (documents.unwritten, documents.next_deadline()) == ({}, math.inf)
+
+
+def test_a_refused_document_that_no_peer_was_asked_for_is_no_agreed_one() -> None:
+    """It is an agreed document that was written once more without the flags whose time is over."""
+    documents = Documents("robot1", {})
+    documents.on_refused("a", "the disk is full", is_of_disk=True)
+    documents.on_refused("b", "an unknown key")
+    assert (documents.refused, documents.unwritten) == ({}, {})
+    assert asked(documents, "a", "b") == ["a", "b"], "another node may agree it"
+
+
+def test_documents_that_the_disk_refuses_do_not_fill_the_memory() -> None:
+    documents = Documents("robot1", {})
+    names = [f"d{number}" for number in range(MAX_WANTED + 2)]
+    for name in names:
+        asked(documents, name)
+        documents.on_refused(name, "the disk is full", is_of_disk=True)
+    assert list(documents.unwritten) == names[2:]
+
+
 def test_refused_documents_do_not_fill_the_memory() -> None:
     documents = Documents("robot1", {})
     names = [f"d{number}" for number in range(MAX_WANTED + 2)]
     for name in names:
+        asked(documents, name)
         documents.on_refused(name, "an unknown key")
     assert list(documents.refused) == names[2:]
 

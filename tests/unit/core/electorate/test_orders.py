@@ -264,6 +264,22 @@ def test_a_value_is_refused_for_good_while_its_document_is_not_valid_here() -> N
 # --- what is learnt --------------------------------------------------------------------------------------------------
 
 
+def test_a_learnt_value_is_followed_once_the_disk_takes_its_document() -> None:
+    agreement = make()
+    value = ADOPT.apply(FIRST)
+    answer = Learnt(node="robot3", values=(), fleet=value)
+    todo = agreed(agreement.on_learnt, ev.LearntReceived(learnt=answer, is_answer=True), 100.1)
+    (fetch,) = of(todo, do.FetchDocument)
+    full = ev.DocumentRefused(document="0d", reason="free or remount the disk", is_of_disk=True)
+    agreement.on_refused(full, ToDo())
+    assert "cannot be stored here" in agreement.problems["fleet/document"]
+    assert agreement.problems["fleet/document"].endswith(": free or remount the disk")
+    assert of(agreed(agreement.tick, 103.2), do.FetchDocument) == [fetch]
+    agreed(agreement.on_stored, ev.DocumentStored(document="0d", fleet=SAID), 104.0)
+    assert agreement.fleet_value == value
+    assert "fleet/document" not in agreement.problems
+
+
 def test_a_learnt_value_is_followed_once_its_document_is_stored_and_asked_for_until_then() -> None:
     agreement = make()
     value = ADOPT.apply(FIRST)
