@@ -88,7 +88,7 @@ class Granter:
             is_newest: it is no repeat and no late one. A lower number than the last is then the sender's true one.
         """
         for grant in beat.released:
-            if grant.task == self.task and grant.owner == beat.node:
+            if (grant.task, grant.owner, grant.incarnation) == (self.task, beat.node, beat.incarnation):
                 self._release(grant)
         if accepted is None or accepted[0] != beat.node:
             return False

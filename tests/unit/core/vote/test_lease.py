@@ -132,6 +132,15 @@ def test_nobody_gives_back_another_one_s_grant_or_another_task_s(by: str, given_
     assert not one.may_accept("r3", 10.1)
 
 
+def test_a_life_gives_back_its_own_grants_only() -> None:
+    """And what it says of others fills no memory."""
+    one = Granter(task="guard", lease_s=L, until=-math.inf, standing=None)
+    others = tuple(replace(grant(5), incarnation=life) for life in range(2, 152))
+    one.on_beat(beat("r2", 5, released=others), None, 10.0)
+    assert one._released == {}
+    assert one.on_beat(replace(beat("r2", 5), incarnation=2), ("r2", 3), 10.1)
+
+
 def test_a_beat_that_is_repeated_or_of_a_silenced_owner_prolongs_no_hold() -> None:
     one = granter()
     assert not one.on_beat(beat(), ("r2", 3), 10.5, is_newest=False)
