@@ -82,8 +82,6 @@ class Roll:
         self._may_elect = may_elect
         self.value = state.learnt
         self._seated = self.value, self._seat_in(self.value)
-        self.strangers: set[str] = set()
-        """Generations of this fleet's name that have asked this node, or told it their value."""
         self._register = FleetRegister(
             me=me,
             incarnation=incarnation,
@@ -188,7 +186,6 @@ class Roll:
         if value.electorate.is_founding and not question.generation_id:
             return Admission.PASSED  # of a node that knows no fleet values: its electorate tells all
         if question.generation_id != value.generation_id:
-            self.strangers.add(question.generation_id)
             return Admission.SILENT
         if question.number > value.number:
             todo.fleet.append(AskFleet(peer=asker))
@@ -255,10 +252,7 @@ class Roll:
 
     def learn(self, value: FleetValue, todo: ToDo, now: float) -> None:
         """A peer tells the fleet value that it has learnt."""
-        if value.fleet != self.value.fleet:
-            return
-        if value.generation_id != self.value.generation_id:
-            self.strangers.add(value.generation_id)
+        if (value.fleet, value.generation_id) != (self.value.fleet, self.value.generation_id):
             return
         if self._holds(value):
             self._register.learn(value, todo, now)
