@@ -18,6 +18,7 @@ from support.proposals import proposal_of, vector_of
 from support.states import state_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
+from zsched.core.electorate.strangers import SHOWN_S
 from zsched.core.executor.sparing import Sparing
 from zsched.core.membership.identity import QUIET_S
 from zsched.core.membership.knocking import KNOCKERS_KEPT, SHOWN_AFTER_S
@@ -629,6 +630,19 @@ def test_another_fleet_file_is_a_problem_until_it_is_the_same() -> None:
     assert f"here {node.fleet_file} of /etc/zsched/fleet.yaml)" in node.problems["fleet/robot2"]
     node.handle(ev.BeatReceived(beat=replace(beat("robot2", 3), fleet_file=node.fleet_file)), 100.2)
     assert node.problems == {}
+
+
+def test_a_node_of_another_generation_is_told_while_it_beats() -> None:
+    """Also by a node where nothing else is due that would look for it."""
+    node, now = started(), 100.1
+    said: dict[str, dict[str, Any]] = {"robot2": {"generation": 1}, "robot3": {"lease_terms": f"{'ab' * 8}/2"}}
+    for name, strange in said.items():
+        node.handle(ev.BeatReceived(beat=beat_of(name, 2, incarnation=3, **strange)), now)
+    assert set(node.agreement.problems) == {f"generation/{name}" for name in said}
+    while now < 100.1 + SHOWN_S + 1.0:
+        now = node.next_deadline()
+        node.handle(ev.DeadlineReached(), now)
+    assert node.agreement.problems == {}
 
 
 def test_a_node_that_our_file_does_not_name_is_told_while_it_beats() -> None:

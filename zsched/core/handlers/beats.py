@@ -32,6 +32,7 @@ def send_beat(node: Stages, todo: ToDo, now: float) -> None:
     if "membership" in node.problems:
         _complain(node, now)
     node.membership.fade_lag_factor()
+    node.agreement.forget(now)
     parts = node.agreement.leases.on_sent(node.beat_sequence, now)
     gone, away = node.agreement.helm.opinion(node.agreement.disk, now)
     beat = Beat(

@@ -19,7 +19,7 @@ from zsched.core.electorate.changes import FleetChange
 from zsched.core.electorate.helm import Helm, voters
 from zsched.core.electorate.numbers import Numbers
 from zsched.core.electorate.orders import Orders
-from zsched.core.electorate.strangers import Strangers
+from zsched.core.electorate.strangers import SHOWN_S, Strangers
 from zsched.core.register.task_register import TaskRegister
 from zsched.core.todo import ToDo
 from zsched.core.values.beat import Beat
@@ -111,6 +111,8 @@ class Agreement:
         self.voted = set() if durable is None else set(durable.voted)
         is_elector = durable is not None and me in fleet.electors and not self._disputed and not self._lost
         self._problems: dict[str, str] = {}
+        self._behind_at: dict[NodeId, float] = {}
+        """{node of another generation: when it last said so}; each has its line in the problems."""
         if durable is not None and self._lost:
             value = None if durable.fleet_register is None else durable.fleet_register.learnt
             self._complain_of_loss(is_agreed=value is not None and bool(value.document))
@@ -212,6 +214,8 @@ class Agreement:
         self._fleet, self._nodes = fleet, frozenset(node.name for node in fleet.nodes)
         self.witness.nodes = self._nodes
         self._numbers.adopt(fleet)
+        for node in [node for node in self._behind_at if node not in self._nodes]:
+            self._show_no_more(node)
         kept = dict(self.registers)
         self.registers.clear()  # the roll goes by the same table
         away = {state.task: state for state in self._foreign}
@@ -578,7 +582,7 @@ class Agreement:
         if self.strangers.on_learnt(learnt, self._numbers.value, is_named=self._numbers.is_named):
             self.counters["learnt_stranger"] += 1
             return
-        if not self._is_our_generation(learnt.node, learnt.generation):
+        if not self._is_our_generation(learnt.node, learnt.generation, now):
             return
         if not event.is_answer:
             if learnt.fleet is not None and self._numbers.has_accepted(learnt.fleet):
@@ -657,22 +661,33 @@ class Agreement:
         terms = beat.lease_terms.partition(",")[0]  # behind it a clock is in doubt
         return not beat.electorate and not beat.has_lost_state and terms not in ("", self.leases.terms)
 
-    def _is_our_generation(self, node: NodeId, generation: int) -> bool:
+    def _is_our_generation(self, node: NodeId, generation: int, now: float) -> bool:
         """Whether a node's learnt values mean anything here; the difference is shown."""
         is_ours = generation == self.generation or self._is_guest_of(generation)
         if is_ours and not self._problems:
             return True  # thirty beats a second come by here
-        source = f"generation/{node}"
         if is_ours:
-            self._problems.pop(source, None)
+            self._show_no_more(node)
             return True
         ours = self.generation or 0
         command = f"`zsched init --generation {max(generation, ours)}`"
         where = f"there, with that daemon stopped: {command}"
         if generation > ours:
             where = f"stop this daemon, {command} here, start it; so on every node that is behind"
-        self._problems[source] = f"{node} is of generation {generation}, this node of {ours}; {where}"
+        self._behind_at[node] = now
+        self._problems[f"generation/{node}"] = f"{node} is of generation {generation}, this node of {ours}; {where}"
         return False
+
+    def _show_no_more(self, node: NodeId) -> None:
+        """A node is not of another generation, or nothing is heard or known of it any more."""
+        if self._behind_at.pop(node, None) is not None:
+            self._problems.pop(f"generation/{node}", None)
+
+    def forget(self, now: float) -> None:
+        """Nodes of other generations that are not heard any more are not shown."""
+        self.strangers.forget(now)
+        for node in [node for node, at in self._behind_at.items() if now - at >= SHOWN_S]:
+            self._show_no_more(node)
 
     def _is_guest_of(self, generation: int) -> bool:
         """Whether this node, without a state, follows a newer generation."""
@@ -719,7 +734,7 @@ class Agreement:
         """A peer's beat may show that it has learnt more than we have, or has voted: then ask it."""
         self.newest_generation = max(self.newest_generation, min(beat.generation, MAX_GENERATION))
         self._hear_electorate(beat)
-        if not self._is_our_generation(beat.node, beat.generation):
+        if not self._is_our_generation(beat.node, beat.generation, now):
             return
         is_news = beat.has_voted and beat.node not in self.voted and beat.node in self.electors
         is_news |= self.witness.must_ask(beat) and not self._may_wait(beat, now)
@@ -787,7 +802,6 @@ class Agreement:
 
     def tick(self, todo: ToDo, now: float) -> None:
         """Time has passed."""
-        self.strangers.forget(now)
         if now >= self._settle_at:
             self._numbers.settle(todo, now)
         if now >= self._numbers.next_deadline():

@@ -126,7 +126,7 @@ def test_a_stranger_is_shown_with_whom_it_follows_and_what_brings_it_over() -> N
 def test_a_stranger_that_is_not_heard_any_more_is_not_shown() -> None:
     one = agreement()
     one.is_stranger(beat(RIGHT), ToDo(), 100.0)
-    one.tick(ToDo(), 100.0 + SHOWN_S)
+    one.forget(100.0 + SHOWN_S)
     assert "generation/robot3" not in one.problems
 
 

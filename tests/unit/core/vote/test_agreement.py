@@ -17,6 +17,7 @@ from support.todos import agreed
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.electorate.founding import founded
+from zsched.core.electorate.strangers import SHOWN_S
 from zsched.core.todo import ToDo
 from zsched.core.values.beat import Beat
 from zsched.core.values.change import MoveOwner, Retune, SetHold, SetLeased
@@ -596,6 +597,20 @@ def test_another_generation_teaches_nothing_and_is_shown_until_it_is_gone() -> N
     agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(allocation_of(3),))), 100.0)
     assert "generation/robot2" not in agreement.problems
     assert agreement.registers["merge"].value.revision == 3
+
+
+def test_another_generation_is_shown_until_it_is_silent_or_out_of_the_file() -> None:
+    agreement = make()
+    other = answer(Learnt(node="edge1", values=(), generation=1))
+    agreed(agreement.on_learnt, other, 100.0)
+    agreement.forget(100.0 + SHOWN_S - 0.1)
+    assert "generation/edge1" in agreement.problems
+    agreement.forget(100.0 + SHOWN_S)
+    assert agreement.problems == {}
+    agreed(agreement.on_learnt, other, 200.0)
+    assert "generation/edge1" in agreement.problems
+    agreement.adopt(fleet_of(task_of("merge", ("robot2",)), of=ROBOTS, electors=ROBOTS), ToDo(), 200.1)
+    assert agreement.problems == {}
 
 
 def test_generations_refuse_each_others_ballots() -> None:
