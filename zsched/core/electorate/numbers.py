@@ -86,7 +86,7 @@ class Numbers:
             state=self._stored or RegisterState(task=self._fleet.name, learnt=first),
             registers=self._registers,
             begin=self._created,
-            holds=self.documents.holds,
+            holds=self._may_follow,
             electorate=electorate,
             ballot_s=self._fleet.timing.ballot_s,
             stagger_s=self._fleet.timing.stagger_s,
@@ -96,6 +96,13 @@ class Numbers:
         )
         if not self.documents.holds(self.roll.value):
             self._want(self.roll.value, (), todo, now)
+
+    def _may_follow(self, value: FleetValue) -> bool:
+        """Whether a value's document is stored here, and its tasks are the value's: no change brings others."""
+        fleet = self.documents.fleet(value.document)
+        if fleet is None:
+            return self.documents.holds(value)
+        return {task.name for task in fleet.tasks} == {one.task for one in value.tasks}
 
     def _created(self, creation: Creation) -> TaskRegister | None:
         """The register of a task that the document lists, mostly a blank one; its electors are told by the roll."""

@@ -347,6 +347,16 @@ def test_a_fleet_value_whose_tasks_could_have_no_register_is_not_learnt() -> Non
         assert ("fleet/register" in agreement.problems) is not is_learnt
 
 
+def test_a_fleet_value_whose_tasks_are_not_its_document_s_is_not_learnt() -> None:
+    """By it the node would go by a document whose tasks have no register."""
+    agreement = make()
+    for tasks, is_learnt in (((), False), ((Creation(task="other", number=1),), False), (WITH_EDGE.tasks, True)):
+        said = Learnt(node="robot2", values=(), generation=GENERATION, fleet=replace(WITH_EDGE, tasks=tasks))
+        agreed(agreement.on_learnt, ev.LearntReceived(learnt=said, is_answer=True), 100.1)
+        assert (agreement.number == 3) is is_learnt
+        assert list(agreement.registers) == ["merge"]
+
+
 def test_what_is_told_unasked_leads_to_a_question_only() -> None:
     agreement = make()
     told = Learnt(node="robot2", values=(), generation=GENERATION, fleet=WITH_EDGE)
