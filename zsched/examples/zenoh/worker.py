@@ -4,8 +4,8 @@ Any program that joins with the session of ``ZSCHED_ZENOH_CONFIG`` can do this, 
 """
 
 import os
+import queue
 import signal
-import threading
 
 import zenoh
 
@@ -15,9 +15,9 @@ PREFIX = f"{NODE}/{os.environ['ZSCHED_TASK']}"
 
 def main() -> None:
     """Answer until the daemon says stop."""
-    end = threading.Event()
+    ends: queue.SimpleQueue[int] = queue.SimpleQueue()  # an Event may wait for itself in a signal's handler
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: end.set())
+        signal.signal(number, lambda number, _: ends.put(number))
 
     def on_question(question: zenoh.Sample) -> None:
         robot = str(question.key_expr).split("/")[-2]
@@ -27,7 +27,7 @@ def main() -> None:
 
     with zenoh.open(zenoh.Config.from_file(os.environ["ZSCHED_ZENOH_CONFIG"])) as session:
         session.declare_subscriber(f"{PREFIX}/*/question", on_question)
-        end.wait()
+        ends.get()
 
 
 if __name__ == "__main__":
