@@ -155,7 +155,6 @@ class Stages:
         self.relay_ends = RelayEnds()
         self.gateway = Gateway(fleet)
         self.round_trips = RoundTrips(me)
-        self.has_deadlines = any(task.tuning.deadline_ms is not None for task in fleet.tasks)
         # SCHEDULER, VOTE
         self.votes = Votes(fleet, me)
         self.probation, self.unseen = Probation(fleet), Unseen()
@@ -232,6 +231,11 @@ class Stages:
     def values(self) -> Mapping[TaskId, Allocation]:
         """{task: the newest learnt register value}."""
         return self.agreement.values()
+
+    @property
+    def has_deadlines(self) -> bool:
+        """Whether the way to other nodes counts in any score: by the agreed tunings, for operators change them."""
+        return any(value.tuning.deadline_ms is not None for value in self.values().values())
 
     def owned(self) -> tuple[TaskId, ...]:
         """The tasks that this node owns, as far as it has learnt."""

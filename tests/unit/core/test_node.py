@@ -1003,6 +1003,22 @@ def test_profiles_are_echoed_in_a_fleet_with_a_deadline_and_only_there() -> None
         )
 
 
+@pytest.mark.parametrize("is_known", [True, False])
+def test_profiles_are_echoed_where_an_operator_has_set_a_deadline(*, is_known: bool) -> None:
+    """The fleet file has none; the task had one before this node's start, or it gets one later."""
+    late = allocation_of(2, "edge1", epoch=1, tuning=replace(TUNING, deadline_ms=100.0))
+    node = started(learnt=late if is_known else None)
+    if not is_known:
+        node.handle(learnt_from("robot2", late), 100.1)
+    assert node.values()["merge"].tuning.deadline_ms == 100.0
+    (own,) = of(node.handle(ev.ProfileSampled(device=replace(SAMPLE, cpu_used_cores=3.0)), 101.2), do.PublishProfile)
+    echo = Echo(node="robot1", incarnation=7, sequence=own.profile.sequence, held_s=0.1)
+    node.handle(ev.ProfileReceived(profile=replace(profile("edge1").profile, echoes=(echo,))), 101.5)
+    assert {name: round(far_s, 3) for name, far_s in node.round_trips.seconds().items()} == {"edge1": 0.2}
+    (own,) = of(node.handle(ev.ProfileSampled(device=SAMPLE), 102.3), do.PublishProfile)
+    assert [one.node for one in own.profile.echoes] == ["edge1"]
+
+
 def test_links_that_begin_and_cease_to_hold_beats_up_are_in_the_story() -> None:
     """One peer's every third beat comes 0.7 s late for ten seconds, then all come in time."""
     node, now, sequence = started(), 100.0, 1

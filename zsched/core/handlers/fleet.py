@@ -97,7 +97,6 @@ def _adopt_nodes(node: Stages, fleet: Fleet) -> None:
 def _adopt_choice(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
     """PROFILE, SCHEDULER and VOTE."""
     node.profiler.adopt(fleet.timing)
-    node.has_deadlines = any(task.tuning.deadline_ms is not None for task in fleet.tasks)
     node.votes.adopt(fleet)
     node.rounds.adopt(fleet, now)
     node.agreement.adopt(fleet, todo, now)
