@@ -130,6 +130,11 @@ class Demands:
         is_seen = not is_new and self._note_shortfall(task, profile, load, found)
         return is_seen or (found.work, found.memory_mb, found.job) != (known.work, known.memory_mb, known.job)
 
+    def forget(self, task: TaskId) -> None:
+        """Know nothing of a task that is no more: one of the same name that comes later is another one (0043)."""
+        self._known.pop(task, None)
+        self._shortfalls = {key: seen for key, seen in self._shortfalls.items() if key[0] != task}
+
     def _note_shortfall(self, task: TaskId, profile: Profile, load: WorkerLoad, found: _Known) -> bool:
         """Remember that the task gets less on a machine than forecast, or no longer does; whether that has changed."""
         jobs, job, used = load.jobs, found.job, profile.cpu_used_cores

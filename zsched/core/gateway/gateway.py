@@ -89,6 +89,12 @@ class Gateway:
         news = self.demands.learn(task, profile, now, fastest), self._shares.learn(task, profile)
         self.version += any(news)
 
+    def forget(self, task: TaskId) -> None:
+        """Know no need and no share of a task that is no more."""
+        self.demands.forget(task)
+        self._shares.forget(task)
+        self.version += 1
+
     def demand(self, spec: TaskSpec, profile: Profile) -> Demand:
         """The task's demand on the node of ``profile``."""
         return self.demands.at(spec, profile)

@@ -48,6 +48,11 @@ class Shares:
         self._threads[task], self._kept[task, profile.node] = threads, kept
         return before != (threads, kept)
 
+    def forget(self, task: TaskId) -> None:
+        """Know nothing of a task that is no more."""
+        self._threads.pop(task, None)
+        self._kept = {key: kept for key, kept in self._kept.items() if key[0] != task}
+
     def at(self, task: TaskId, profile: Profile, need_cores: float, coming_cores: float = 0.0) -> float:
         """Cores that the task would get on the node of ``profile`` if it were full; 0 where threads are not counted.
 

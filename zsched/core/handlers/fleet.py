@@ -129,6 +129,7 @@ def _adopt_work(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
     for name in kept:
         node.unready.pop(name, None)
         node.renewing.forget(name)
+        node.gateway.forget(name)
     for stream in [stream for stream in node.missed if stream.partition("/")[0] in kept]:
         del node.missed[stream]
     for executor in come:

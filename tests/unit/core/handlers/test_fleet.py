@@ -11,13 +11,14 @@ import pytest
 from support.allocations import allocation_of
 from support.ballots import ballot_of
 from support.fleets import fleet_of, task_of, tuning_of
-from support.profiles import SAMPLE
+from support.profiles import SAMPLE, load_of, profile_of
 from support.states import state_of
 from support.storm import ELECTORATE, FLEET, ROBOTS, Storm, some_fleet
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.node import Node
 from zsched.core.status import build_snapshot
+from zsched.core.values.electorate import CREATION_STEP
 from zsched.core.values.fleet import Fleet, StreamRule, WorkerSpec
 from zsched.core.values.messages import Learnt, Prepare
 from zsched.core.values.model import NodeKind
@@ -227,6 +228,35 @@ def test_what_a_task_dropped_before_it_left_the_fleet_is_forgotten_when_it_comes
     node.handle(ev.StreamsCounted(counts=counts), START + 10)
     ages = {task.name: task.streams[0].dropped_s for task in build_snapshot(node, START + 15).tasks}
     assert ages == {"merge": 5.0, "other": 14.0}
+
+
+@pytest.mark.parametrize("is_heard", [True, False])
+def test_what_a_task_needed_is_not_what_one_of_its_name_needs_that_comes_later(*, is_heard: bool) -> None:
+    """The removal is heard, or only that the task is another one. 20 GB are more than any candidate here has."""
+    merge, other = (task_of(name, candidates=("edge1",)) for name in ("merge", "other"))
+    fleet, without = fleet_of(merge, other), fleet_of(other)
+    node = node_of(fleet)
+    node.start(START)
+    placed = Learnt(node="robot2", values=(allocation_of(1, "edge1"),))
+    node.handle(ev.LearntReceived(learnt=placed, is_answer=True), START)
+    large = load_of(memory_mb=20_000.0, cpu_cores=2.0, wanted_cores=3.0)
+    learnt = profile_of("edge1", memory_mb=64_000.0, cpu_used_cores=4.0, runnable=4.0, workers=(large,))
+    small = profile_of("edge1", sequence=2, memory_mb=8_000.0, runnable=9.0)
+    for task in ("merge", "other"):
+        shown = replace(learnt, workers=(replace(large, task=task),))
+        assert node.gateway.demands.learn(task, shown, START)
+        assert node.gateway._shares.learn(task, shown)
+    assert [node.gateway.demand(spec, small).memory_mb for spec in (merge, other)] == [20_000.0, 20_000.0]
+    assert node.gateway.share(merge, small, 1.0, 0.0) == pytest.approx(2 / 3)
+    if is_heard:
+        adopt(node, without)
+    else:
+        later = allocation_of(CREATION_STEP + 1, "edge1", tuning=merge.tuning)
+        node.registers["merge"].state = replace(node.registers["merge"].state, learnt=later)
+    adopt(node, fleet)
+    assert node.gateway.demand(merge, small) == merge.demand
+    assert node.gateway.share(merge, small, 1.0, 0.0) == pytest.approx(0.4)
+    assert node.gateway.demand(other, small).memory_mb == 20_000.0, "it has stayed"
 
 
 def test_a_task_that_comes_back_has_the_first_owner_that_it_had() -> None:
