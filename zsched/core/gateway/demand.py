@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from zsched.core.values.fleet import Demand, TaskSpec
 from zsched.core.values.model import NodeId, TaskId
-from zsched.core.values.profile import Jobs, Profile, WorkerLoad, WorkerState
+from zsched.core.values.profile import Jobs, Profile, Renewal, WorkerLoad, WorkerState
 from zsched.core.values.struct import Struct, replace
 
 STARVED_CPU_RATIO = 0.9
@@ -77,6 +77,8 @@ class _Known(Struct, frozen=True):
     """It was measured with enough CPU; otherwise the need may be larger."""
     memory_mb: float | None = None
     job: JobNeed | None = None
+    is_job_old: bool = False
+    """The job is a worker's that is to start again, by a changed recipe."""
     owner: NodeId | None = None
     since: float = 0.0
     """When it was first looked at there."""
@@ -124,8 +126,7 @@ class Demands:
                 found = replace(found, work=least, is_sure=is_held)
             else:
                 found = replace(found, work=use, is_sure=True)
-        if load.jobs is not None:
-            found = replace(found, job=_job(load.jobs, speed_of(profile), known.job))
+        found = _with_job(found, load, speed_of(profile), is_new=is_new)
         self._known[task] = found
         is_seen = not is_new and self._note_shortfall(task, profile, load, found)
         return is_seen or (found.work, found.memory_mb, found.job) != (known.work, known.memory_mb, known.job)
@@ -221,6 +222,19 @@ def _told(load: WorkerLoad, speed: float, fastest: float) -> float | None:
 def _other_s(jobs: Jobs) -> float:
     """A job's wait for things other than a CPU, the same on every machine; 0 where the kernel does not report it."""
     return 0.0 if jobs.wait_s is None else max(jobs.time_s - jobs.wait_s - jobs.cpu_s, 0.0)
+
+
+def _with_job(known: _Known, load: WorkerLoad, speed: float, *, is_new: bool) -> _Known:
+    """With the job of the owner's worker: the one that it reports, or reported before it became silent.
+
+    The job of a program that has been replaced says nothing of the one that runs now and reports none.
+    """
+    is_old = load.renewal is not Renewal.NONE
+    if load.jobs is not None:
+        return replace(known, job=_job(load.jobs, speed, known.job), is_job_old=is_old)
+    if is_old:
+        return replace(known, is_job_old=True)
+    return replace(known, job=None, is_job_old=False) if known.is_job_old and not is_new else known
 
 
 def _job(jobs: Jobs, speed: float, known: JobNeed | None) -> JobNeed:

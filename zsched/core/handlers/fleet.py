@@ -22,7 +22,7 @@ from zsched.core.stages import HISTORY, Handler, Stages
 from zsched.core.todo import ToDo
 from zsched.core.values.adoption import in_force, obstacle
 from zsched.core.values.electorate import CREATION_STEP
-from zsched.core.values.fleet import Fleet, file_hash, fleet_hash
+from zsched.core.values.fleet import Fleet, WorkerSpec, file_hash, fleet_hash
 from zsched.core.values.model import Allocation, NodeKind
 from zsched.core.values.plan import WorkerRole
 
@@ -115,6 +115,8 @@ def _adopt_work(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
             come.append(executor)
         else:
             del kept[spec.name]
+            if _runs_another_program(executor.spec.worker, spec.worker):
+                _learn_anew(node, values[spec.name], now)
             executor.adopt(spec, todo, is_agreed_leased=values[spec.name].leased)
         node.executors[spec.name] = executor
     for executor in kept.values():
@@ -143,6 +145,20 @@ def _adopt_work(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
 def _is_of_before(executor: Executor, value: Allocation) -> bool:
     """Whether the task was removed and added again unheard here: it is another task (decision 0043)."""
     return 0 < executor.epoch < value.epoch // CREATION_STEP * CREATION_STEP
+
+
+def _runs_another_program(before: WorkerSpec, after: WorkerSpec) -> bool:
+    return (before.command, before.env) != (after.command, after.env)
+
+
+def _learn_anew(node: Stages, value: Allocation, now: float) -> None:
+    """Know what the worker needs that the task's owner still runs, and nothing where it has none.
+
+    A worker that was made smaller because no candidate had room for it is never placed by what it needed before.
+    """
+    node.gateway.forget(value.task)
+    if value.owner is not None:
+        node.gateway.learn_demand(value.task, value.owner, now)
 
 
 def compare_file(node: Stages) -> None:

@@ -12,7 +12,7 @@ from support.fleets import task_of
 from support.profiles import load_of, profile_of
 from zsched.core.gateway.demand import QUEUE_RATIO, SETTLE_S, SHORT_RATIO, STARVED_CPU_RATIO, UNSURE, Demands, is_short
 from zsched.core.values.fleet import Demand
-from zsched.core.values.profile import Jobs, Profile, WorkerLoad, WorkerState
+from zsched.core.values.profile import Jobs, Profile, Renewal, WorkerLoad, WorkerState
 
 TASK = task_of(demand=Demand(cpu_cores=0.4, memory_mb=250.0))
 EVERY_S = 2 * SETTLE_S
@@ -309,6 +309,30 @@ def test_a_worker_that_tells_its_jobs_no_more_is_known_by_what_it_told() -> None
     demands.learn("merge", profile(0.5, cpu=2.0), 2 * EVERY_S)
     assert demands.experience("merge", pinned) == seen != (1.0, 1.0)
     assert demands.job("merge") == job is not None
+
+
+@pytest.mark.parametrize("is_moved", [True, False])
+@pytest.mark.parametrize("is_idle", [True, False])
+def test_the_job_of_a_worker_that_was_replaced_bounds_no_worker_that_tells_none(
+    *, is_moved: bool, is_idle: bool
+) -> None:
+    """Its serial job would bound what the next one can use on every machine for ever."""
+    demands, before = Demands(), told(9.0, used=2.0)
+    (load,) = before.workers
+    due = replace(load, renewal=Renewal.DUE, jobs=None if is_idle else load.jobs)
+    demands.learn("merge", before, 0.0)
+    demands.learn("merge", replace(before, workers=(due,)), EVERY_S)
+    job = demands.job("merge")
+    assert job is not None, "it runs still"
+    assert job.most_cores(1.0) is not None
+    after = profile(2.5, node="edge2" if is_moved else "edge1", cpu=3.0)
+    demands.learn("merge", after, 2 * EVERY_S)
+    demands.learn("merge", after, 2 * EVERY_S + SETTLE_S)
+    assert demands.job("merge") is None
+    demands.learn("merge", before, 4 * EVERY_S)
+    demands.learn("merge", after, 5 * EVERY_S)
+    demands.learn("merge", after, 6 * EVERY_S)
+    assert demands.job("merge") is not None, "nothing has changed it since: a worker without work tells none"
 
 
 def test_a_job_without_cpu_time_bounds_nothing() -> None:

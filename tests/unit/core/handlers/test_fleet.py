@@ -259,6 +259,30 @@ def test_what_a_task_needed_is_not_what_one_of_its_name_needs_that_comes_later(*
     assert node.gateway.demand(other, small).memory_mb == 20_000.0, "it has stayed"
 
 
+@pytest.mark.parametrize("worker", [WorkerSpec(command=("small",)), WorkerSpec(command=("large",), env=(("S", "1"),))])
+@pytest.mark.parametrize("owner", ["edge1", None])
+def test_a_changed_worker_needs_what_its_owner_s_one_does_and_nothing_where_there_is_none(
+    owner: str | None, worker: WorkerSpec
+) -> None:
+    task = task_of(worker=WorkerSpec(command=("large",)))
+    node = node_of(fleet_of(task))
+    node.start(START)
+    if owner:
+        placed = Learnt(node="robot2", values=(allocation_of(1, owner),))
+        node.handle(ev.LearntReceived(learnt=placed, is_answer=True), START)
+    large = profile_of("edge1", memory_mb=64_000.0, workers=(load_of(memory_mb=20_000.0),))
+    node.handle(ev.ProfileReceived(profile=large), START)
+    node.gateway.demands.learn("merge", large, START)
+
+    def need_mb() -> float:
+        return node.gateway.demand(task, profile_of("edge2")).memory_mb
+
+    adopt(node, fleet_of(replace(task, max_moves_per_minute=3)))
+    assert need_mb() == 20_000.0, "it is the same program"
+    adopt(node, fleet_of(replace(task, worker=worker)))
+    assert need_mb() == (20_000.0 if owner else 0.0)
+
+
 def test_a_task_that_comes_back_has_the_first_owner_that_it_had() -> None:
     fleet, without = fleet_of(task_of("merge"), task_of("other")), fleet_of(task_of("other"))
     node = node_of(fleet)
