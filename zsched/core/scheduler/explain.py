@@ -297,7 +297,7 @@ def _leads(figures: Figures, again: Decided, owner: CandidateSum, others: list[C
         assert one.total is not None
         assert one.joint is not None
         if rounded(one.total) <= rounded(owner.total):
-            worth = math.ceil((one.joint + needed - one.total) * _SHOWN) / _SHOWN
+            worth = math.ceil((needed + one.penalty) * _SHOWN) / _SHOWN
             lack, way = worth - one.joint, "or the"
             if worth <= 1.0:
                 yield f"{one.node} would have to be worth {worth:.4f} instead of {one.joint:.4f} ({lack:+.4f})"

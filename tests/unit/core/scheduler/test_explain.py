@@ -73,11 +73,15 @@ def decision_of(tuning: Tuning = TUNING, *, owner: str | None = "edge1", **chang
     return Decision(figures=figures, verdict=verdict_of(decide_again(figures).judgement), needs=needs)
 
 
-def decision_worth(worth: Mapping[str, float], *, bonus: float = 0.0) -> Decision:
-    """Three robots that agree on what each edge is worth; edge1 owns the task, nobody has a penalty."""
+def decision_worth(worth: Mapping[str, float], *, bonus: float = 0.0, penalty: float = 0.0) -> Decision:
+    """Three robots that agree on what each edge is worth; edge1 owns the task, edge2 has a penalty if anybody has."""
     decision = decision_of(replace(TUNING, bonus=bonus))
     vectors = tuple(
-        replace(vector, utilities=tuple(replace(one, value=worth[one.candidate]) for one in vector.utilities))
+        replace(
+            vector,
+            utilities=tuple(replace(one, value=worth[one.candidate]) for one in vector.utilities),
+            penalties=(("edge2", penalty),),
+        )
         for vector in decision.figures.vectors
     )
     return judged_again(decision, replace(decision.figures, vectors=vectors, damping=DampingMemory()))
@@ -160,6 +164,18 @@ def test_the_worth_that_is_named_is_enough_whatever_the_owner_s_is(seed: int) ->
     needed = float(told.changes[0].split("worth ")[1].split(" ")[0])
     again = explained(decision_worth({**worth, "edge2": needed}))
     assert again.changes[0].startswith("edge2 leads by")
+
+
+@pytest.mark.parametrize("joint", [0.1, 0.34, 0.36, 0.6])
+def test_the_worth_that_is_named_makes_up_for_a_penalty_also_above_the_joint_worth(joint: float) -> None:
+    """A total is never below 0: what is lacked is more than the distance between the totals then."""
+    worth = {"edge1": 0.4, "edge2": joint, "edge3": 0.0}
+    told = explained(decision_worth(worth, penalty=0.35))
+    lack = 0.7504 - joint
+    assert told.changes[0] == f"edge2 would have to be worth 0.7504 instead of {joint:.4f} ({lack:+.4f})"
+    for needed, begins in ((0.7504, "edge2 leads by"), (0.7503, "edge2 would have to be worth")):
+        again = explained(decision_worth({**worth, "edge2": needed}, penalty=0.35))
+        assert again.changes[0].startswith(begins)
 
 
 def test_a_rival_that_no_worth_would_make_the_leader_is_told_so() -> None:
