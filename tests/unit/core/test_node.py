@@ -1003,6 +1003,20 @@ def test_profiles_are_echoed_in_a_fleet_with_a_deadline_and_only_there() -> None
         )
 
 
+def test_whether_a_task_may_become_exclusive_hangs_on_no_late_beat_of_a_peer_that_is_gone() -> None:
+    node, now = started(learnt=allocation_of(1, "edge1")), 100.0
+    node.handle(learnt_from("robot2", allocation_of(2, "robot3", 2)), now)
+    while node.membership.state("robot2") is not PeerState.GONE:
+        now = max(now, node.next_deadline())
+        node.handle(ev.DeadlineReached(), now)
+    others = {"edge1", "edge2", "robot2", "robot3"}
+    assert (node.sealing._gone, node.sealing._owners) == (others, {"merge": {"edge1", "robot3"}})
+    node.handle(ev.BeatReceived(beat=beat("robot2")), now)
+    assert node.sealing._gone == others
+    node.handle(ev.BeatReceived(beat=beat("robot2", 2)), now)
+    assert node.sealing._gone == others - {"robot2"}
+
+
 @pytest.mark.parametrize("is_known", [True, False])
 def test_profiles_are_echoed_where_an_operator_has_set_a_deadline(*, is_known: bool) -> None:
     """The fleet file has none; the task had one before this node's start, or it gets one later."""

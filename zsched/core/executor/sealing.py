@@ -8,7 +8,8 @@ says:
 * A task without an owner so far is leased from its first owner on, if the proposer's file says exclusive.
 * Otherwise an owner whose file says exclusive proposes the change once no other node works without a lease. It asks
   every candidate and every node that it hears. Each must have learnt this epoch and answer that no worker there works
-  without a lease. Until then no elector grants a lease: the owner waits, and its status says for which nodes.
+  without a lease. Until then no elector grants a lease: the owner waits, and its status says for which nodes. A node
+  that is gone and no candidate is waited for if it has owned the task, for it may work still.
 * The task stops being leased when the owner's file does not say exclusive and all nodes that it hears have its file.
 
 Knows: peers' answers and fleet files. Does not know: grants (`zsched.core.vote.lease`), how a value is agreed.
@@ -41,19 +42,35 @@ class Sealing(Struct):
     """When a lease of an earlier life of this node is over."""
     _files: dict[NodeId, str] = field(default_factory=dict)
     """{peer that was heard: its fleet file}."""
+    _gone: set[NodeId] = field(default_factory=set)
+    """Those of them that are gone."""
+    _owners: dict[TaskId, set[NodeId]] = field(default_factory=dict)
+    """{task: who has owned it, as far as this node has learnt}."""
     _answers: dict[NodeId, Learnt] = field(default_factory=dict)
     _asked_at: float = -math.inf
 
     def adopt(self, fleet: Fleet) -> None:
         """Go by ``fleet``; nodes that it does not name are asked no more."""
         self.fleet = fleet
-        names = {node.name for node in fleet.nodes}
+        names, tasks = {node.name for node in fleet.nodes}, {task.name for task in fleet.tasks}
         self._files = {name: file for name, file in self._files.items() if name in names}
         self._answers = {name: answer for name, answer in self._answers.items() if name in names}
+        self._gone &= names
+        self._owners = {task: owners & names for task, owners in self._owners.items() if task in tasks}
 
     def hear(self, beat: Beat) -> None:
-        """Note the fleet file that a peer's beat names."""
+        """Note the fleet file that a living peer's beat names."""
         self._files[beat.node] = beat.fleet_file
+        self._gone.discard(beat.node)
+
+    def on_gone(self, node: NodeId) -> None:
+        """A peer is gone."""
+        self._gone.add(node)
+
+    def note(self, value: Allocation) -> None:
+        """A newer value was learnt."""
+        if value.owner is not None:
+            self._owners.setdefault(value.task, set()).add(value.owner)
 
     def on_answer(self, learnt: Learnt) -> None:
         """A peer answered a question. Answers count from this part's own first question on."""
@@ -94,11 +111,13 @@ class Sealing(Struct):
 
     def _are_files_mixed(self) -> bool:
         mine = fleet_hash(self.fleet)
-        return any(file != mine for file in self._files.values())
+        return any(file != mine for name, file in self._files.items() if name not in self._gone)
 
     def _waits_for(self, spec: TaskSpec, value: Allocation) -> dict[NodeId, str]:
         """{node that must be heard, or whose worker must stop, before the task is leased: reason}."""
-        others = sorted({*self._files, *spec.candidates} - {self.me})
+        owners = self._owners.get(spec.name, set())
+        heard = {name for name in self._files if name not in self._gone or name in owners}
+        others = sorted({*heard, *spec.candidates} - {self.me})
         reasons = {name: self._obstacle(spec, value, name) for name in others}
         return {name: reason for name, reason in reasons.items() if reason}
 

@@ -162,7 +162,8 @@ def _on_beat(node: Stages, event: ev.BeatReceived, todo: ToDo, now: float) -> No
         node.fileless.add(beat.node)
     elif node.fileless:
         node.fileless.discard(beat.node)
-    node.sealing.hear(beat)
+    if node.membership.state(beat.node) is not PeerState.GONE:  # or the beat is a late one
+        node.sealing.hear(beat)
     if node.renewing.told:
         node.renewing.hear(beat.node, beat.fleet_file, now)
     if beat.fleet_file != node.fleet_file or node.problems:
@@ -251,6 +252,7 @@ def on_transition(node: Stages, change: Transition, todo: ToDo, now: float) -> N
             node.hangs.on_back(change.node, now)
     if change.after is PeerState.GONE:
         node.probation.on_gone(change.node, now)
+        node.sealing.on_gone(change.node)
         for executor in node.executors.values():
             executor.on_gone(change.node, todo)
     todo.must_decide |= any(value.owner == change.node for value in node.values().values())

@@ -53,6 +53,7 @@ def carry_out(node: Stages, value: Allocation, reason: str, todo: ToDo, now: flo
     todo.add(do.RecordStory(stage="vote", text=text, task=task, epoch=value.epoch, move=move, by=by))
     executor.execute(value, todo, now)
     node.tenure.hold(value, node.beat_sequence + 1)
+    node.sealing.note(value)
     for old in executor.predecessors:
         if node.membership.state(old) is PeerState.GONE:
             executor.on_gone(old, todo)

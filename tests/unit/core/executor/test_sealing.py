@@ -118,6 +118,35 @@ def test_who_is_heard_is_waited_for_too_though_it_is_no_candidate() -> None:
     assert one.to_ask(values(), 11.0) == ("e3",)
 
 
+def test_who_is_gone_is_waited_for_only_if_it_is_a_candidate_or_has_owned_the_task() -> None:
+    """A machine that is switched off stopped the task until it was back, though it had never worked on it."""
+    one = asked()
+    one.on_answer(answer())
+    one.hear(beat("e3"))
+    one.on_gone("e3")
+    assert one.due(values(), 10.0) == CHANGE
+    one.note(value("other", owner="e3"))
+    assert one.due(values(), 10.0) == CHANGE, "that is another task"
+    one.note(value(owner="e3", epoch=2))
+    assert one.due(values(), 10.0) == []
+    assert one.problem(EXCLUSIVE, value()).endswith("(e3 has not answered yet)")
+    one.on_answer(answer("e3"))
+    assert one.due(values(), 10.0) == CHANGE
+
+    one = asked()
+    one.on_gone("e2")
+    assert one.due(values(), 10.0) == [], "a candidate, whether it was heard or not"
+
+
+def test_who_is_heard_again_is_waited_for_again() -> None:
+    one = asked()
+    one.on_answer(answer())
+    one.hear(beat("e3"))
+    one.on_gone("e3")
+    one.hear(beat("e3"))
+    assert one.to_ask(values(), 11.0) == ("e3",)
+
+
 def test_an_answer_to_another_question_of_this_node_is_not_remembered() -> None:
     one = sealing()
     one.on_answer(answer())
@@ -176,6 +205,10 @@ def test_a_task_is_everybody_s_again_when_all_files_are_the_same_and_the_life_be
     assert one.due(known, YOUNG_S) == []
     one.hear(beat("e3", OLD))
     assert one.due(known, YOUNG_S) == OPENED
+    one.hear(beat("e3", NEW))
+    assert one.due(known, YOUNG_S) == []
+    one.on_gone("e3")
+    assert one.due(known, YOUNG_S) == OPENED, "it is not heard any more"
 
 
 def test_a_young_owner_may_make_its_task_exclusive() -> None:
