@@ -61,7 +61,7 @@ def decide(judge: Judge, damping: Damping, figures: Figures) -> Decided:
             damping=damping,
         )
     if escape is None:
-        judgement = _look_ahead(judge, judgement, figures)
+        judgement = _look_ahead(judge, judgement, standing, figures)
     is_planned = judgement.outcome is Outcome.PROPOSE and not judgement.is_escape
     is_waiting = is_planned and figures.first is not None
     if is_waiting:
@@ -172,12 +172,12 @@ def _not_ready_for(judge: Judge, figures: Figures) -> float:
     return now - judge.not_ready_since
 
 
-def _look_ahead(judge: Judge, judgement: Judgement, figures: Figures) -> Judgement:
+def _look_ahead(judge: Judge, judgement: Judgement, standing: Standing, figures: Figures) -> Judgement:
     """While an owner whose worker is not ready has its start-up deadline: say that, and when it will be left."""
     since, allocation = judge.not_ready_since, figures.allocation
     if since is None or allocation.owner is None or judgement.outcome is Outcome.PROPOSE:
         return judgement
-    has_other = any(name != allocation.owner for name in judgement.aggregates)
+    has_other = any(name != allocation.owner for name in standing.aggregates)
     not_ready_s = figures.now - since
     ahead = escape_ahead(judge.spec, allocation, figures.owner_profile, not_ready_s, has_other=has_other)
     return replace(judgement, reason=f"{judgement.reason}; {ahead}") if ahead else judgement

@@ -12,11 +12,13 @@ from random import Random
 
 import pytest
 
+from support.decisions import figures_of
 from support.fleets import fleet_of, task_of, tuning_of
+from support.profiles import load_of, profile_of
 from zsched.core.scheduler.decision import decide_again, verdict_of
 from zsched.core.values.decision import Decision
 from zsched.core.values.fleet import Fleet, WorkerSpec
-from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.model import NodeId, TaskId, Utility, UtilityVector
 from zsched.core.values.profile import WorkerState
 from zsched.errors import InvariantError
 from zsched.wire.codec import as_plain, from_plain
@@ -135,3 +137,17 @@ def test_since_when_an_owner_cannot_be_scored_or_is_not_ready_is_remembered() ->
     starting = replace(profile, workers=tuple(replace(one, state=WorkerState.STARTING) for one in profile.workers))
     waits = decide_again(replace(figures, judge=memory, owner_profile=starting)).judgement
     assert f"{owner} will be left in 16 s" in waits.reason
+
+
+def test_too_few_robots_are_no_reason_to_say_that_nobody_else_can_have_a_task_whose_worker_starts() -> None:
+    spec = task_of(candidates=EDGES, worker=WorkerSpec(command=("worker",)))
+    column = tuple(Utility(candidate=name, value=0.5) for name in EDGES)
+    heard = UtilityVector(voter="robot1", task="merge", revision=4, utilities=column)
+    starting = profile_of("edge1", workers=(load_of(state=WorkerState.STARTING),))
+    figures = figures_of(spec, *ROBOTS, vectors=(heard,), owner_profile=starting)
+    judgement = decide_again(figures).judgement
+    assert judgement.reason == (
+        "utilities of 1 robots, 2 needed; edge1 will be left in 20 s, for its worker is starting"
+    )
+    alone = replace(figures, vectors=(replace(heard, utilities=column[:1]),))
+    assert decide_again(alone).judgement.reason.endswith("edge1 is starting; nobody else can have the task")
