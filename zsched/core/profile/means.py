@@ -34,6 +34,11 @@ class Ewma:
         self._at = now
         return self.value
 
+    def look(self, now: float) -> None:
+        """Without a sample for `STALE_S` there is no mean."""
+        if now - self._at > STALE_S:
+            self.value = None
+
     def share(self) -> Ewma:
         """The mean of a part of this figure; the part was 0 until now."""
         part = Ewma(self.tau_s)

@@ -272,7 +272,7 @@ class Profiler:
         if self._device is None:
             return None
         is_measured = now - self._sampled_at <= STALE_S
-        loads = {load.task: load for load in self._workers}
+        loads = {load.task: load for load in self._workers} if is_measured else {}
         workers = tuple(
             WorkerLoad(
                 task=task,
@@ -295,7 +295,7 @@ class Profiler:
             cpu_used_cores=self._cpu.value if is_measured else None,
             memory_mb=self._device.memory_mb,
             memory_used_mb=self._memory.value if is_measured else None,
-            links=self._links,
+            links=self._links if is_measured else tuple(Link(source=one.source, peer=one.peer) for one in self._links),
             workers=workers,
             draining=is_draining,
             speed=self._device.speed,
@@ -336,10 +336,13 @@ def _absorb_use(
 
     A share must be as slow as the whole from which it is subtracted, and see the same samples. A worker without a
     figure (stopped, just started) uses nothing in that sample. So whole minus share is the smoothed rest, and the start
-    or end of a worker makes its node look neither better nor worse.
+    or end of a worker makes its node look neither better nor worse. Without a figure of the machine for `STALE_S` there
+    is neither.
     """
     used = _possible(used, high)
     if used is None:
+        for mean in (whole, *shares.values()):
+            mean.look(now)
         return
     for task in {**shares, **parts}:
         part = _possible(parts.get(task), high)

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from support.profiles import SAMPLE, load_of
+from support.profiles import load_of
 from zsched.core.events import WorkerJobs
 from zsched.core.profile.means import STALE_S, Ewma
 from zsched.core.profile.profile import (
@@ -18,7 +18,7 @@ from zsched.core.profile.profile import (
     SignalFilter,
 )
 from zsched.core.values.fleet import Timing
-from zsched.core.values.profile import DeviceSample, LinkSample, LinkSource, Profile, WorkerLoad, WorkerState
+from zsched.core.values.profile import DeviceSample, Link, LinkSample, LinkSource, Profile, WorkerLoad, WorkerState
 
 TIMING = Timing()
 READY = {"merge": WorkerState.READY}
@@ -381,12 +381,34 @@ def test_sent_at_once_when_a_link_falls_silent_or_is_taken_away() -> None:
 def test_a_sampler_that_died_leaves_nothing_measured() -> None:
     """Its last figures must not stand for ever."""
     profiler = Profiler("edge1", 1, Timing())
-    profiler.absorb(SAMPLE, (), 0.0)
-    first = profiler.publishable({}, is_draining=False, now=0.0)
-    later = profiler.publishable({}, is_draining=False, now=STALE_S + 0.1)
+    link = replace(radio(-60.0, "robot1"), bitrate_mbps=50.0, retry_ratio=0.1)
+    profiler.absorb(device(1.0, 1000.0, load(0.5, 100.0)), (link, LinkSample(source=LinkSource.WIRED)), 0.0)
+    first = profiler.publishable(READY, is_draining=False, now=0.0)
+    later = profiler.publishable(READY, is_draining=False, now=STALE_S + 0.1)
     assert first is not None
     assert later is not None
     assert (first.cpu_used_cores, later.cpu_used_cores, later.memory_used_mb) == (1.0, None, None)
+    assert [one.rssi_dbm for one in first.links] == [-60.0, None]
+    assert later.links == (Link(source=LinkSource.NL80211, peer="robot1"), Link(source=LinkSource.WIRED))
+    assert (first.workers, later.workers) == ((load(0.5, 100.0),), (load(None, None),))
+
+
+def test_what_cannot_be_read_is_soon_not_measured_though_samples_come() -> None:
+    profiler, used = make_profiler(), (2.0, 1000.0)
+    profiler.absorb(device(*used, load(0.5, 100.0)), (), now=0.0)
+
+    def told(now: float) -> list[float | None]:
+        profile = taken(profiler, now)
+        (worker,) = profile.workers
+        return [profile.cpu_used_cores, profile.memory_used_mb, worker.cpu_cores, worker.memory_mb]
+
+    for now, is_known in ((STALE_S, True), (STALE_S + 1.0, False)):
+        profiler.absorb(device(None, None, load(0.5, 100.0)), (), now=now)
+        assert told(now) == ([2.0, 1000.0, 0.5, 100.0] if is_known else [None] * 4)
+    profiler.absorb(device(None, 3000.0, load(0.7, 300.0)), (), now=10.0)
+    assert told(10.0) == [None, 3000.0, None, 300.0], "the old mean is worth nothing any more"
+    profiler.absorb(device(3.0, 3000.0, load(0.7, 300.0)), (), now=11.0)
+    assert told(11.0) == [3.0, 3000.0, 0.7, 300.0]
 
 
 # --- the trend of a signal -----------------------------------------------------------------------------------------
