@@ -63,6 +63,9 @@ class Events:
     def on_reset(self, task: str) -> None:
         print("reset", task, flush=True)
 
+    def on_stopped(self, task: str) -> None:
+        print("stopped", task, flush=True)
+
     def on_compared(self, task: str, *, is_old: bool) -> None:
         print("compared", task, is_old, flush=True)
 

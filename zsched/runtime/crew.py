@@ -321,3 +321,7 @@ class Crew:
     def on_reset(self, task: TaskId) -> None:
         """The supervisor: the worker may be started again."""
         self._post(ev.WorkerChanged(task=task, state=WorkerState.STOPPED, reason="its failures are forgotten"))
+
+    def on_stopped(self, task: TaskId) -> None:
+        """The supervisor: the worker, which had ended, is not started again."""
+        self._post(ev.WorkerChanged(task=task, state=WorkerState.STOPPED, reason="stopped before its next start"))

@@ -133,6 +133,12 @@ def test_a_worker_that_was_killed_is_restarting_and_not_just_starting(house: Hou
     assert house.reasons("token")[-1].startswith("pid "), "an operator's stop is no failure"
 
 
+def test_a_worker_that_is_not_started_again_is_not_restarting(house: House) -> None:
+    house.crew.on_stopped("token")
+    (told,) = zip(house.states("token"), house.reasons("token"), strict=True)
+    assert told_of_worker(*told) == "is stopped: stopped before its next start"
+
+
 def test_a_process_that_is_started_again_and_matches_nobody_is_restarting(house: House) -> None:
     """What it lacks is said of every one that does not get ready; that there was one before must not be lost by it."""
     house.supervisor.start("node")

@@ -69,6 +69,9 @@ class WorkerEvents(Protocol):
     def on_reset(self, task: TaskId) -> None:
         """The worker may be started again: its failures are forgotten."""
 
+    def on_stopped(self, task: TaskId) -> None:
+        """The worker had ended, and is not started again: it was stopped while it waited for that."""
+
     def on_compared(self, task: TaskId, *, is_old: bool) -> None:
         """The worker's process runs by an old recipe, or does not any more."""
 
@@ -376,6 +379,7 @@ class WorkerSupervisor:
             self._begin_stop(worker, worker.spec.stop_grace_s)
         elif worker.phase is _Phase.BACKOFF:
             worker.phase, worker.deadline_s = _Phase.IDLE, None
+            self._tell(self._events.on_stopped, task)
 
     def _on_ready(self, task: TaskId, incarnation: int) -> None:
         worker = self._workers.get(task)

@@ -84,11 +84,11 @@ class Workers(Struct):
             self.reasons.pop(event.task, None)
         elif event.reason:
             self.reasons[event.task] = as_reason(event.reason)
-        if self.states[event.task] is event.state:
-            return None
-        self.states[event.task] = event.state
+        is_same, self.states[event.task] = self.states[event.task] is event.state, event.state
         if event.task in self._leaving and event.state is WorkerState.STOPPED:
             self._forget(event.task)
+        if is_same:
+            return None
         text = f"worker {told_of_worker(event.state, event.reason).removeprefix('is ')}"
         return RecordStory(stage="executor", text=text, task=event.task)
 

@@ -45,6 +45,9 @@ class Recorder:
     def on_reset(self, task: str) -> None:
         self._add("reset", task)
 
+    def on_stopped(self, task: str) -> None:
+        self._add("stopped", task)
+
     def on_compared(self, task: str, *, is_old: bool) -> None:
         self._add("compared", task, is_old)
 
@@ -81,7 +84,9 @@ def python(code: str, **changes: object) -> WorkerSpec:
 
 
 @contextmanager
-def supervised(spec: WorkerSpec, **environment: str) -> Iterator[tuple[WorkerSupervisor, Recorder]]:
+def supervised(
+    spec: WorkerSpec, policy: RestartPolicy = QUICK, **environment: str
+) -> Iterator[tuple[WorkerSupervisor, Recorder]]:
     recorder = Recorder()
     supervisor = WorkerSupervisor(
         specs={"merge": spec},
@@ -89,7 +94,7 @@ def supervised(spec: WorkerSpec, **environment: str) -> Iterator[tuple[WorkerSup
         events=recorder,
         environment=lambda task: {"TASK_SEEN": task, **environment},
         rng=random.Random(1),
-        policy=QUICK,
+        policy=policy,
     )
     try:
         yield supervisor, recorder
@@ -339,6 +344,19 @@ def test_stop_during_the_backoff_starts_nothing() -> None:
         time.sleep(0.15)
         assert len(recorder.calls) == count
         assert supervisor.states()["merge"] is WorkerState.STOPPED
+
+
+def test_who_is_stopped_while_it_waits_for_its_next_start_is_told_of() -> None:
+    """It was said to restart for as long as nobody started it."""
+    patient = RestartPolicy(first_s=600.0, most_s=600.0)
+    with supervised(python("raise SystemExit(1)"), policy=patient) as (supervisor, recorder):
+        supervisor.start("merge")
+        recorder.wait("exited")
+        assert supervisor.why_again("merge")
+        supervisor.stop("merge")
+        recorder.wait("stopped")
+        assert [call[0] for call in recorder.calls] == ["started", "exited", "stopped"]
+        assert supervisor.why_again("merge") == ""
 
 
 def test_foreign_worker_is_never_started_but_may_be_ready() -> None:

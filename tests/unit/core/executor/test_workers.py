@@ -88,3 +88,12 @@ def test_a_worker_that_is_kept_no_more_is_told_of_until_it_has_stopped() -> None
     assert (workers.states, workers.told(0.0)) == ({"merge": WorkerState.STARTING}, {"merge": "pid 7"})
     workers.on_changed(changed(WorkerState.STOPPED, "signal 15"))
     assert (workers.states, workers.told(0.0)) == ({}, {})
+
+
+def test_a_worker_that_is_kept_no_more_and_waits_for_its_next_start_is_told_of_until_nobody_starts_it() -> None:
+    workers = Workers.of(fleet_of(task_of()), "edge1")
+    workers.on_changed(changed(WorkerState.STOPPED, "restarting (failure 1 of 3): exited with status 1"))
+    workers.adopt(fleet_of(tasks=()), "edge1", {"merge"})
+    assert list(workers.states) == ["merge"]
+    assert workers.on_changed(changed(WorkerState.STOPPED, "stopped before its next start")) is None
+    assert (workers.states, workers.told(0.0)) == ({}, {})
