@@ -208,6 +208,8 @@ class Node(Stages):
         for executor in self.executors.values():
             if now >= executor.next_deadline():
                 executor.tick(todo, now)
+        if self.workers.has_unwatched:
+            self.workers.let_go(self.busy())
         self._renew_workers(todo, now)
 
     def _renew_workers(self, todo: ToDo, now: float) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Set as AbstractSet
 from random import Random
 from types import MappingProxyType
 from typing import Any
@@ -49,7 +50,7 @@ from zsched.core.values.document import Flag
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet, TaskSpec, file_hash, fleet_hash
 from zsched.core.values.model import Allocation, NodeId, NodeKind, PeerState, TaskId
-from zsched.core.values.plan import StreamCount
+from zsched.core.values.plan import StreamCount, WorkerRole
 from zsched.core.values.profile import Profile, WorkerState
 from zsched.core.values.struct import Struct
 from zsched.core.vote.agreement import Agreement
@@ -248,6 +249,10 @@ class Stages:
             for name in self.owned()
             if any(self._can_take(candidate, now) for candidate in self.fleet.task(name).candidates)
         )
+
+    def busy(self) -> AbstractSet[TaskId]:
+        """The tasks whose worker here has a role: it is the owner's, or has not ended its work."""
+        return {name for name, one in self.executors.items() if one.role.role is not WorkerRole.IDLE}
 
     def finishing(self) -> tuple[TaskId, ...]:
         """The tasks that have moved away while the worker here has not said that it has finished."""

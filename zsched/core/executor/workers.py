@@ -44,6 +44,8 @@ class Workers(Struct):
 
     _leaving: set[TaskId] = field(default_factory=set)
     """The tasks of which this node keeps no worker any more, while the one that it had is at work."""
+    _unwatched: set[TaskId] = field(default_factory=set)
+    """Those of them whose worker somebody else runs: it goes on, and nobody reports its end."""
 
     def adopt(self, fleet: Fleet, me: NodeId, busy: AbstractSet[TaskId]) -> None:
         """Take the tasks with a worker here from ``fleet``.
@@ -51,18 +53,31 @@ class Workers(Struct):
         Args:
             fleet: the fleet file.
             me: this node.
-            busy: the tasks whose worker here has not ended its work: it is told of until it has stopped.
+            busy: the tasks whose worker here has not ended its work: it is told of until it has stopped, one that
+                somebody else runs until it has ended its work (`let_go`).
         """
         kind = fleet.node(me).kind
         kept = {task.name for task in fleet.tasks if runs_worker(task, me, kind)}
         self._leaving = {task for task in self.states if task not in kept and task in busy}
+        self._unwatched = {task.name for task in fleet.tasks if task.name in self._leaving and not task.worker.command}
         for task in [task for task in self.states if task not in kept | self._leaving]:
             self._forget(task)
         for task in sorted(kept - self.states.keys()):
             self.states[task] = WorkerState.STOPPED
 
+    @property
+    def has_unwatched(self) -> bool:
+        """Whether `let_go` may have something to do."""
+        return bool(self._unwatched)
+
+    def let_go(self, busy: AbstractSet[TaskId]) -> None:
+        """Tell no more of somebody else's workers that this node keeps no more, where they have ended their work."""
+        for task in sorted(self._unwatched - busy):
+            self._forget(task)
+
     def _forget(self, task: TaskId) -> None:
         self._leaving.discard(task)
+        self._unwatched.discard(task)
         del self.states[task]
         for told in (self.reasons, self._troubles, self._mistakes, self._outdated):
             told.pop(task, None)

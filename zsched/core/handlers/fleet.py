@@ -24,7 +24,6 @@ from zsched.core.values.adoption import in_force, obstacle
 from zsched.core.values.electorate import CREATION_STEP
 from zsched.core.values.fleet import Fleet, WorkerSpec, file_hash, fleet_hash
 from zsched.core.values.model import Allocation, NodeKind
-from zsched.core.values.plan import WorkerRole
 
 SOURCE: Final = "fleet"
 """Of the problem that a file cannot be taken over."""
@@ -121,8 +120,7 @@ def _adopt_work(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
         node.executors[spec.name] = executor
     for executor in kept.values():
         executor.end(todo)
-    busy = {name for name, one in node.executors.items() if one.role.role is not WorkerRole.IDLE}
-    node.workers.adopt(fleet, node.me, busy)
+    node.workers.adopt(fleet, node.me, node.busy())
     node.hangs.adopt(fleet, node.worker_states, now)
     node.sealing.adopt(fleet)
     node.tenure.adopt(fleet)

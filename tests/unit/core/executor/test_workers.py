@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from support.fleets import fleet_of, task_of
 from zsched.core import events as ev
 from zsched.core.executor.workers import TROUBLE_S, Workers
+from zsched.core.values.fleet import WorkerSpec
 from zsched.core.values.model import MAX_REASON
 from zsched.core.values.profile import WorkerState
 
@@ -97,3 +100,26 @@ def test_a_worker_that_is_kept_no_more_and_waits_for_its_next_start_is_told_of_u
     assert list(workers.states) == ["merge"]
     assert workers.on_changed(changed(WorkerState.STOPPED, "stopped before its next start")) is None
     assert (workers.states, workers.told(0.0)) == ({}, {})
+
+
+def test_somebody_else_s_worker_that_is_kept_no_more_is_told_of_until_it_has_ended_its_work() -> None:
+    """It runs on, and nobody tells when it ends."""
+    foreign = task_of(worker=WorkerSpec())
+    workers = Workers.of(fleet_of(foreign), "edge1")
+    workers.on_changed(changed(WorkerState.READY))
+    workers.on_outdated(ev.WorkerOutdated(task="merge", reason="its file has changed"))
+    workers.adopt(fleet_of(replace(foreign, candidates=("edge2",))), "edge1", {"merge"})
+    workers.let_go({"merge"})
+    assert workers.states == {"merge": WorkerState.READY}
+    assert workers.has_unwatched
+    workers.let_go(set())
+    assert (workers.states, workers.told(0.0), workers.has_unwatched) == ({}, {}, False)
+
+
+def test_a_worker_of_ours_that_is_kept_no_more_is_told_of_until_its_process_has_ended() -> None:
+    ours = task_of(worker=WorkerSpec(command=("merge",)))
+    workers = Workers.of(fleet_of(ours), "edge1")
+    workers.on_changed(changed(WorkerState.READY))
+    workers.adopt(fleet_of(replace(ours, candidates=("edge2",))), "edge1", {"merge"})
+    workers.let_go(set())
+    assert workers.states == {"merge": WorkerState.READY}

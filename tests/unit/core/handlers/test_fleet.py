@@ -216,6 +216,27 @@ def test_the_worker_of_a_task_that_comes_back_is_not_taken_for_the_old_one() -> 
     assert told == [[Renewal.DUE], [Renewal.NONE], [Renewal.NONE]]
 
 
+def test_a_foreign_worker_of_a_node_that_is_no_candidate_any_more_is_in_its_profile_until_it_is_idle() -> None:
+    task = task_of(worker=WorkerSpec())
+    node = node_of(fleet_of(task), "edge1")
+    node.start(START)
+    node.handle(ev.WorkerChanged(task="merge", state=WorkerState.READY), START)
+    for revision, owner in ((1, "edge1"), (2, "edge2")):
+        told = Learnt(node="robot1", values=(allocation_of(revision, owner),))
+        node.handle(ev.LearntReceived(learnt=told, is_answer=True), START)
+    adopt(node, fleet_of(replace(task, candidates=("edge2",))), START + 0.1)
+    assert node.busy() == {"merge"}, "it drains"
+    assert node.worker_states == {"merge": WorkerState.READY}
+    now = START
+    while node.busy():
+        now = max(now, node.next_deadline())
+        node.handle(ev.DeadlineReached(), now)
+    assert node.worker_states == {}
+    node.handle(ev.WorkerChanged(task="merge", state=WorkerState.STOPPED), now)
+    batch = *node.handle(ev.ProfileSampled(device=SAMPLE), now), *node.handle(ev.DeadlineReached(), now + 2.0)
+    assert [one.profile.workers for one in batch if isinstance(one, do.PublishProfile)][-1] == ()
+
+
 def test_what_a_task_dropped_before_it_left_the_fleet_is_forgotten_when_it_comes_back() -> None:
     rule = StreamRule(direction=Direction.INPUT, from_template="{robot}/map", to_template="{target}/{task}/{robot}/map")
     stays, goes = (task_of(name, rules=(rule,)) for name in ("other", "merge"))
