@@ -73,6 +73,7 @@ _TWINS = ("tests/unit/core/membership/test_twins.py",)
 _WITNESS = ("tests/unit/core/vote/test_witness.py",)
 _RESTORED = ("tests/sim/test_restored_state.py",)
 _ROLLOUT = ("tests/sim/test_exclusive_rollout.py",)
+_SEALING = ("tests/unit/core/executor/test_sealing.py",)
 _MEMBERSHIP = (
     "tests/sim/test_membership_rules.py",
     "tests/unit/core/membership/test_peers.py",
@@ -403,6 +404,13 @@ LEASE_BUGS = (
         "if False:",
         _ROLLOUT,
         38,
+    ),
+    _bug(
+        "a former owner that is gone is not waited for",
+        SEALING,
+        "if name not in self._gone or name in owners}",
+        "if name not in self._gone}",
+        _SEALING,
     ),
     _bug(
         "old fleet file needs no lease",
