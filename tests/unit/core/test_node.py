@@ -336,6 +336,20 @@ def test_of_a_peers_first_news_only_the_first_placement_is_a_move(epoch: int, is
     assert any("first news here" in one.text for one in of(batch, do.RecordStory)) is is_known
 
 
+@pytest.mark.parametrize("life", [3, 4], ids=["the same life", "another life"])
+def test_an_owner_that_this_machine_missed_for_a_while_is_asked_for_its_worker_s_state(life: int) -> None:
+    """Its link was away, not the owner: nobody moved the task then, and the owner's worker has what the task knows."""
+    node, now = started("edge2", learnt=allocation_of(1, "edge1")), 100.0
+    while node.membership.state("edge1") is not PeerState.GONE:
+        now = node.next_deadline()
+        assert now < 110.0
+        node.handle(ev.DeadlineReached(), now)
+    node.handle(ev.BeatReceived(beat=beat("edge1", 2, incarnation=life)), now)
+    batch = node.handle(learnt_from("robot2", allocation_of(2, "edge2")), now + 1.0)
+    (role,) = [one.role for one in of(batch, do.SetRole)]
+    assert (role.role, role.predecessor) == (WorkerRole.ACTIVE, "edge1")
+
+
 # --- own events like peers' ------------------------------------------------------------------------------------------
 
 

@@ -98,7 +98,7 @@ class Executor:
     _has_told: bool = False
     """The worker here has been told a role."""
     _is_owner_gone: bool = False
-    """The owner went during its epoch: nobody asks for its worker's snapshot."""
+    """The owner went during its epoch and is not back: nobody asks for its worker's snapshot."""
     _current: Slot | None = None
     _old: tuple[_Old, ...] = ()
     """The predecessors, the oldest first."""
@@ -393,6 +393,14 @@ class Executor:
         """A peer is gone: nothing more comes from its slots."""
         self._is_owner_gone = self._is_owner_gone or node == self.owner
         self._drop(tuple(old for old in self._old if old.slot.owner == node), f"{node} is gone", todo)
+
+    def on_back(self, node: NodeId) -> None:
+        """A peer is heard again: the owner's worker can be asked for its state, of a new life of that node, too.
+
+        What a worker has that its daemon has started again is the task's state since then.
+        """
+        if node == self.owner:
+            self._is_owner_gone = False
 
     def _drop(self, dropped: tuple[_Old, ...], why: str, todo: ToDo) -> None:
         if not dropped:

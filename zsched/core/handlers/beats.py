@@ -248,6 +248,8 @@ def on_transition(node: Stages, change: Transition, todo: ToDo, now: float) -> N
     if change.after is PeerState.ALIVE:
         node.probation.on_back(change.node, now)
         node.profiler.owe(now)
+        for executor in node.executors.values():
+            executor.on_back(change.node)
         if change.before in (PeerState.SUSPECT, PeerState.GONE):
             node.hangs.on_back(change.node, now)
     if change.after is PeerState.GONE:

@@ -41,6 +41,18 @@ def test_an_owner_that_is_gone_is_not_asked() -> None:
     assert role(execute(one, "edge1", 2)).predecessor is None
 
 
+def test_an_owner_that_is_back_is_asked_whoever_else_was_away() -> None:
+    """This machine lost its link for a while: it missed everybody, and the task stayed where it was."""
+    for back, expected in ((("edge3",), None), (("edge3", "edge2"), "edge2")):
+        one = edge()
+        execute(one, "edge2", 1)
+        for node in ("edge2", "edge3"):
+            done(one.on_gone, node)
+        for node in back:
+            one.on_back(node)
+        assert role(execute(one, "edge1", 2)).predecessor == expected
+
+
 def test_somebody_elses_going_changes_nothing_and_is_forgotten_with_the_epoch() -> None:
     one = edge()
     execute(one, "edge3", 1)
