@@ -45,7 +45,10 @@ from zsched.core.values.plan import Role, Route, RoutePhase, RoutePlan, Slot, Wo
 from zsched.core.values.struct import Struct, replace
 
 ROLE_DRAIN_MARGIN_S = 1.0
-"""The old owner's worker goes idle this much after the robots' drain time (a cold standby's start comes on top)."""
+"""The old owner's worker goes idle this much after the robots' drain time (a cold standby's start comes on top).
+
+A cold one is stopped then, also where it had to go idle at once: until then it is asked for its state.
+"""
 MAX_OLD = 3
 """Predecessors that are kept: a plan has to fit into a frame (`zsched.wire.codec`)."""
 LEAVES_S = 1.0
@@ -121,6 +124,11 @@ class Executor:
         return runs_worker(self.spec, self.me, NodeKind.ROBOT if self.has_streams else NodeKind.EDGE)
 
     @property
+    def _is_cold(self) -> bool:
+        """Whether the worker here runs only while it is needed."""
+        return self.spec.worker.standby is Standby.COLD
+
+    @property
     def predecessors(self) -> tuple[NodeId, ...]:
         """The owners of the old slots while a handover runs, the oldest first."""
         return tuple(dict.fromkeys(old.slot.owner for old in self._old))
@@ -143,7 +151,7 @@ class Executor:
 
     # --- a changed fleet file ------------------------------------------------------------------------------------
 
-    def adopt(self, spec: TaskSpec, todo: ToDo, *, is_agreed_leased: bool) -> None:
+    def adopt(self, spec: TaskSpec, todo: ToDo, now: float, *, is_agreed_leased: bool) -> None:
         """Go by another version of the task's file: worker, right to work and streams follow it at once.
 
         The slots of predecessors stay as they were opened. ``is_agreed_leased``: the task is exclusive for everybody.
@@ -154,10 +162,10 @@ class Executor:
         if spec == before and self.is_leased is was_leased:
             return
         if spec.on_isolation is not OnIsolation.LOCAL:
-            self.rejoin(todo)
+            self.rejoin(todo, now)
         self._adopt_worker(before, todo, had_worker=kept_worker)
         if self.is_leased is not was_leased:
-            self._change_terms(todo)
+            self._change_terms(todo, now)
         self._adopt_routes(before, todo)
 
     def _adopt_worker(self, before: TaskSpec, todo: ToDo, *, had_worker: bool) -> None:
@@ -207,9 +215,9 @@ class Executor:
         was_leased, self.is_leased = self.is_leased, self.spec.exclusive or allocation.leased
         if allocation.epoch == self.epoch:
             if self.is_leased is not was_leased:
-                self._change_terms(todo)
+                self._change_terms(todo, now)
             return
-        self._end_local(todo)  # the local slot closes before a committed owner's opens
+        self._end_local(todo, now)  # the local slot closes before a committed owner's opens
         before = None if self._is_owner_gone else self.owner
         self.epoch, self.owner, self.started_at, self._is_owner_gone = allocation.epoch, allocation.owner, now, False
         self.switched_s = None
@@ -223,16 +231,22 @@ class Executor:
             self._take_up(before, todo)
         elif self.role.role is WorkerRole.ACTIVE and self.is_leased:
             # The new owner may be working already: nothing of the old epoch may leave any more.
-            self._role_deadline = now
+            self._role_deadline = self._over_at(now) if self._is_cold else now
             self.leave(todo)
+        elif self._is_cold and before == self.me and self.role.role is WorkerRole.IDLE:
+            self._role_deadline = self._over_at(now)  # it left before the commit, as the electors asked
         elif self.role.role is WorkerRole.ACTIVE:
-            worker = self.spec.worker
-            # A cold new owner only starts its worker now, and the robots stay here until it is ready.
-            starts_s = worker.start_deadline_s if worker.standby is Standby.COLD else 0.0
-            self._role_deadline = now + starts_s + self.spec.drain_s + ROLE_DRAIN_MARGIN_S
+            self._role_deadline = self._over_at(now)
             self._become(Role(task=self.spec.name, role=WorkerRole.DRAINING, epoch=self.role.epoch), todo)
         elif not self._has_told:
             self._become(self.role, todo)  # a standby that hears nothing asks again and again
+
+    def _over_at(self, now: float) -> float:
+        """When a worker here that loses the task now has no part in the move any more."""
+        # A cold new owner only starts its worker now: until it is ready the robots stay here, and then it asks for the
+        # state.
+        starts_s = self.spec.worker.start_deadline_s if self._is_cold else 0.0
+        return now + starts_s + self.spec.drain_s + ROLE_DRAIN_MARGIN_S
 
     def _take_up(self, before: NodeId | None, todo: ToDo) -> None:
         """The worker here is the owner's from now on; ``before``: whose was, ``None`` where nobody is to be asked."""
@@ -257,10 +271,10 @@ class Executor:
         if role.role is WorkerRole.IDLE and not self._keeps_worker:
             todo.add(StopWorker(task=self.spec.name))  # it stayed for this work only
 
-    def _change_terms(self, todo: ToDo) -> None:
+    def _change_terms(self, todo: ToDo, now: float) -> None:
         """The owner stays, but its worker needs a lease from now on, or no longer needs one."""
         if self.is_local:
-            self.rejoin(todo)  # whoever works alone needed no lease until now
+            self.rejoin(todo, now)  # whoever works alone needed no lease until now
         elif self.owner == self.me and self.runs_worker:
             if self.is_leased:
                 self.leave(todo)  # it works again with its first lease
@@ -302,17 +316,19 @@ class Executor:
         self._current = slot_for(self.spec, self.me, self.me, self.epoch)
         self._go(Phase.PREPARING, RoutePhase.PREPARE, f"cut off from {self.owner}: works alone (degraded)", todo)
 
-    def rejoin(self, todo: ToDo) -> None:
+    def rejoin(self, todo: ToDo, now: float) -> None:
         """The committed owner is heard again: go back to its slot."""
         if not self.is_local or self.owner is None:
             return
-        self._end_local(todo)
+        self._end_local(todo, now)
         self._current = slot_for(self.spec, self.me, self.owner, self.epoch)
         self._go(Phase.PREPARING, RoutePhase.PREPARE, f"back to {self.owner}", todo)
 
-    def _end_local(self, todo: ToDo) -> None:
+    def _end_local(self, todo: ToDo, now: float) -> None:
         if not self.is_local:
             return
+        if self._is_cold:
+            self._role_deadline = now  # nobody asks for its state, so it is stopped, unless it is the owner's from now on
         self.is_local, self._current, self.phase = False, None, Phase.IDLE
         self._become(Role(task=self.spec.name, role=WorkerRole.IDLE), todo)
 
@@ -429,5 +445,5 @@ class Executor:
             if self.role.role is WorkerRole.DRAINING:
                 self._leaves_until = now + LEAVES_S
             self._become(Role(task=self.spec.name, role=WorkerRole.IDLE), todo)
-            if self.spec.worker.standby is Standby.COLD:
+            if self._is_cold:
                 todo.add(StopWorker(task=self.spec.name))

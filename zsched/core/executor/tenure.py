@@ -145,6 +145,6 @@ class Tenure:
                 continue
             if not is_cut_off or membership.state(executor.owner) is PeerState.ALIVE:
                 self._alone_since.pop(name, None)
-                executor.rejoin(todo)
+                executor.rejoin(todo, now)
             elif now >= self._alone_since.setdefault(name, now) + ALONE_AFTER_S:
                 executor.isolate(todo)

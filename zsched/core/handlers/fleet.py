@@ -116,7 +116,7 @@ def _adopt_work(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
             del kept[spec.name]
             if _runs_another_program(executor.spec.worker, spec.worker):
                 _learn_anew(node, values[spec.name], now)
-            executor.adopt(spec, todo, is_agreed_leased=values[spec.name].leased)
+            executor.adopt(spec, todo, now, is_agreed_leased=values[spec.name].leased)
         node.executors[spec.name] = executor
     for executor in kept.values():
         executor.end(todo)

@@ -367,6 +367,70 @@ def test_cold_standbys_old_owner_works_until_the_new_one_can_have_started() -> N
     assert one.role.role is WorkerRole.DRAINING
 
 
+def cold_that_left() -> Executor:
+    """Of an exclusive task: it stopped before the commit of edge2 (epoch 2, at 10 s), as the electors asked."""
+    one = edge(spec=replace(COLD, exclusive=True))
+    done(one.execute, replace(allocation_of(1, "edge1"), leased=True), 0.0)
+    done(one.set_lease, 12.0, 9.0)
+    done(one.leave)
+    assert not of(done(one.execute, replace(allocation_of(2, "edge2"), leased=True), 10.0), StopWorker)
+    return one
+
+
+@pytest.mark.parametrize("has_left", [True, False], ids=["asked before", "hears of it late"])
+def test_a_cold_worker_that_left_at_once_is_stopped_when_the_next_one_can_have_asked_for_its_state(
+    has_left: bool,
+) -> None:
+    one = cold_that_left()
+    if not has_left:
+        one = edge(spec=replace(COLD, exclusive=True))
+        done(one.execute, replace(allocation_of(1, "edge1"), leased=True), 0.0)
+        done(one.set_lease, 12.0, 9.0)
+        done(one.execute, replace(allocation_of(2, "edge2"), leased=True), 10.0)
+    assert one.role.role is WorkerRole.IDLE
+    ends_at = 10.0 + COLD.worker.start_deadline_s + COLD.drain_s + ROLE_DRAIN_MARGIN_S
+    assert one.next_deadline() == ends_at
+    assert not of(done(one.again), StopWorker)
+    assert done(one.tick, ends_at)[-1] == StopWorker(task="merge")
+    assert one.next_deadline() == math.inf
+
+
+def test_a_cold_worker_that_left_runs_on_when_it_is_chosen_again_or_the_task_moves_between_others() -> None:
+    again, others = cold_that_left(), cold_that_left()
+    assert not of(done(again.execute, replace(allocation_of(3, "edge1"), leased=True), 11.0), StopWorker)
+    assert again.next_deadline() == math.inf
+    ends_at = others.next_deadline()
+    done(others.execute, replace(allocation_of(3, "edge3"), leased=True), 11.0)
+    assert others.next_deadline() == ends_at
+
+
+def test_a_cold_owner_that_had_to_leave_and_stays_the_owner_keeps_its_process() -> None:
+    """Its clock is in doubt, or it works again with its next lease."""
+    one = edge(spec=replace(COLD, exclusive=True))
+    done(one.execute, replace(allocation_of(1, "edge1"), leased=True), 0.0)
+    done(one.set_lease, 12.0, 9.0)
+    assert not of(done(one.leave), StopWorker)
+    assert one.next_deadline() == math.inf
+    assert not of(done(one.again), StopWorker)
+
+
+@pytest.mark.parametrize("standby", Standby)
+def test_who_works_alone_with_a_cold_worker_stops_it_behind_that(standby: Standby) -> None:
+    spec = replace(SPEC, on_isolation=OnIsolation.LOCAL, worker=replace(SPEC.worker, standby=standby))
+    spec = replace(spec, candidates=(*SPEC.candidates, "robot1"))
+    for way in ("rejoin", "another", "itself"):
+        one = Executor(spec=spec, me="robot1", has_streams=True)
+        done(one.execute, allocation_of(1, "edge1"), 0.0)
+        done(one.isolate)
+        if way == "rejoin":
+            out = done(one.rejoin, 10.0)
+        else:
+            out = done(one.execute, allocation_of(2, "edge2" if way == "another" else "robot1"), 10.0)
+        out += done(one.tick, 10.0) if one.next_deadline() <= 10.0 else ()
+        assert of(out, StopWorker) == ([StopWorker(task="merge")] if standby is Standby.COLD and way != "itself" else [])
+        assert one.next_deadline() == math.inf
+
+
 def test_foreign_worker_is_told_its_role_and_never_started() -> None:
     one = edge(spec=FOREIGN)
     out = done(one.execute, allocation_of(1, "edge1"), 0.0)
@@ -459,7 +523,7 @@ def test_a_worker_that_was_told_to_stop_at_once_has_nothing_to_hear() -> None:
 
 def adopted(one: Executor, spec: TaskSpec) -> list[Instruction]:
     todo = ToDo()
-    one.adopt(spec, todo, is_agreed_leased=False)
+    one.adopt(spec, todo, 20.0, is_agreed_leased=False)
     return list(todo.apply)
 
 
@@ -510,5 +574,5 @@ def test_who_works_alone_does_so_while_its_file_lets_it(later: OnIsolation) -> N
     done(alone.execute, allocation_of(1, "edge1"), 0.0)
     done(alone.isolate)
     assert alone.is_local
-    alone.adopt(replace(spec, on_isolation=later, drain_s=3.0), ToDo(), is_agreed_leased=False)
+    alone.adopt(replace(spec, on_isolation=later, drain_s=3.0), ToDo(), 1.0, is_agreed_leased=False)
     assert alone.is_local is (later is OnIsolation.LOCAL)
