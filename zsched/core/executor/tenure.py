@@ -47,9 +47,9 @@ class Tenure:
         """Go by ``fleet``, whose tasks the executors are for already."""
         self.fleet = fleet
         self._note_leased()
-        self._alone_since = {task: at for task, at in self._alone_since.items() if task in self.executors}
         self.voters = self.fleet.voters
         self._local = tuple(task.name for task in self.fleet.tasks if task.on_isolation is OnIsolation.LOCAL)
+        self._alone_since = {task: at for task, at in self._alone_since.items() if task in self._local}
 
     @property
     def is_busy(self) -> bool:
@@ -57,10 +57,10 @@ class Tenure:
         return self.leases.is_holding
 
     def next_deadline(self, now: float) -> float:
-        """When `tend` may have something to do."""
+        """When `tend_leases` or `tend_isolation` may have something to do that nothing else brings about."""
         due = self.leases.next_deadline(now)
-        for name, at in self._alone_since.items():
-            if not self.executors[name].is_local:
+        for at in self._alone_since.values():
+            if at + ALONE_AFTER_S > now:  # after it every turn looks: who may not work alone has nothing to wait for
                 due = min(due, at + ALONE_AFTER_S)
         return due
 

@@ -1,0 +1,84 @@
+"""Who works alone, and when to look again (leases: tests/sim/test_lease_rules.py)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from support.allocations import allocation_of
+from support.beats import beat_of
+from support.fleets import fleet_of, task_of
+from support.todos import done
+from zsched.core.executor.handover import Executor
+from zsched.core.executor.tenure import ALONE_AFTER_S, Tenure
+from zsched.core.membership.peers import Membership
+from zsched.core.todo import ToDo
+from zsched.core.values.fleet import Fleet, OnIsolation
+from zsched.core.values.model import NodeId
+from zsched.core.vote.lease import Leases
+
+LOCAL = fleet_of(task_of(on_isolation=OnIsolation.LOCAL))
+HOLD = fleet_of(task_of(on_isolation=OnIsolation.HOLD))
+ENDS_AT = 10.0 + ALONE_AFTER_S
+
+
+def tenure_of(me: NodeId, *, leased: bool = False, owner: str | None = "edge1") -> Tenure:
+    """Of a node that knows the task's owner since 9 s and has heard nobody."""
+    (task,) = LOCAL.tasks
+    executor = Executor(spec=task, me=me, has_streams=me.startswith("r"))
+    done(executor.execute, replace(allocation_of(1, owner), leased=leased), 9.0)
+    leases = Leases(fleet=LOCAL, me=me, incarnation=1, standing={}, now=0.0)
+    return Tenure(fleet=LOCAL, me=me, leases=leases, executors={"merge": executor})
+
+
+def silence(fleet: Fleet = LOCAL, me: NodeId = "robot1") -> Membership:
+    return Membership(me, tuple(node.name for node in fleet.nodes), fleet.timing)
+
+
+def is_alone(tenure: Tenure) -> bool:
+    return tenure.executors["merge"].is_local
+
+
+def test_a_robot_that_hears_nobody_works_alone_when_its_time_has_come() -> None:
+    tenure, membership = tenure_of("robot1"), silence()
+    tenure.tend_isolation(membership, ToDo(), 10.0)
+    assert tenure.next_deadline(10.0) == ENDS_AT
+    tenure.tend_isolation(membership, ToDo(), ENDS_AT - 0.001)
+    assert not is_alone(tenure)
+    tenure.tend_isolation(membership, ToDo(), ENDS_AT)
+    assert is_alone(tenure)
+    assert tenure.next_deadline(ENDS_AT) == math.inf
+    membership.absorb_beat(beat_of("edge1", 1), 11.0)
+    tenure.tend_isolation(membership, ToDo(), 11.0)
+    assert not is_alone(tenure)
+    assert tenure.next_deadline(11.0) == math.inf
+
+
+@pytest.mark.parametrize("late_s", [0.0, 100.0])
+@pytest.mark.parametrize(
+    ("me", "leased", "owner"),
+    [("edge2", False, "edge1"), ("robot1", True, "edge1"), ("robot1", False, None)],
+    ids=["an edge has no streams", "nobody works without a lease", "nobody has the task"],
+)
+def test_who_may_not_work_alone_waits_for_nothing(me: NodeId, leased: bool, owner: str | None, late_s: float) -> None:
+    """Its loop would spin: what is due would stay due."""
+    tenure, membership = tenure_of(me, leased=leased, owner=owner), silence(me=me)
+    tenure.tend_isolation(membership, ToDo(), 10.0)
+    now = ENDS_AT + late_s
+    tenure.tend_isolation(membership, ToDo(), now)
+    assert not is_alone(tenure)
+    assert tenure.next_deadline(now) == math.inf
+
+
+def test_what_was_counted_before_the_file_forbade_it_does_not_count_when_it_allows_it_again() -> None:
+    tenure, membership = tenure_of("robot1"), silence()
+    tenure.tend_isolation(membership, ToDo(), 10.0)
+    for fleet in (HOLD, LOCAL):
+        tenure.adopt(fleet)
+        assert tenure.next_deadline(10.1) == math.inf
+    tenure.tend_isolation(membership, ToDo(), 20.0)
+    assert tenure.next_deadline(20.0) == 20.0 + ALONE_AFTER_S
+    tenure.tend_isolation(membership, ToDo(), 20.0 + ALONE_AFTER_S - 0.001)
+    assert not is_alone(tenure)
