@@ -83,3 +83,17 @@ def test_robot_with_a_quorum_never_works_alone() -> None:
     sim.run(10)
     assert served_by(sim, "robot1") == served_by(sim, "robot2") not in (None, owner, "robot1", "robot2")
     assert served_by(sim, "robot3") == owner, "it hears the owner, so it is not alone"
+
+
+def test_an_edge_that_is_left_alone_sleeps() -> None:
+    """The robots are switched off and the owner is away: nothing is due (the simulator finds a loop that spins)."""
+    sim = started(OnIsolation.LOCAL)
+    owner = sim.agreed(TASK) or ""
+    (last,) = (name for name in EDGES if name != owner)
+    for name in sim.running():
+        if name != last:
+            sim.crash(name)
+    sim.run(5)
+    woken = sim.events
+    sim.run(10)
+    assert sim.events - woken < 200, "a beat, a sample and a round now and then"

@@ -31,9 +31,6 @@ class Loops:
         """Let a machine handle one event now."""
         raise NotImplementedError
 
-    def woken(self, machine: Machine) -> None:
-        """A machine's deadline has come."""
-
     def run(self, seconds: float) -> None:
         """Let virtual time pass."""
         end = self.now + seconds
@@ -91,7 +88,6 @@ class Loops:
         if node is None or machine.is_paused or machine.inbox or machine.busy_until > self.now:
             return  # its loop comes to it after what it is at
         if node.next_deadline() <= machine.clock.local(self.now):
-            self.woken(machine)
             self.deliver(machine, ev.DeadlineReached())
         self.arm(machine)
 

@@ -205,11 +205,10 @@ class Machine:
     """What handling one event costs."""
     disk_s: tuple[float, float] = (0.0, 0.0)
     """How long a synced write takes, from and to."""
-    woken_at: float = -math.inf
     known: dict[TaskId, Allocation] = field(default_factory=dict)
     """Without a disk: the values of this life that were checked already."""
-    wakes: int = 0
-    """How often in a row the loop woke up at the same time: a loop that spins."""
+    at_once: int = 0
+    """How often in a row the node has wanted to be called again at once."""
 
     def end(self) -> None:
         """The process is gone, and what it held in memory; its worker with it."""

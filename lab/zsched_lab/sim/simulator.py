@@ -308,10 +308,6 @@ class Simulator(Links):
 
     # --- events ------------------------------------------------------------------------------------------------------
 
-    def woken(self, machine: Machine) -> None:
-        """A machine's deadline has come; it must let time pass now and then."""
-        self.invariants.on_woken(machine, self.now)
-
     def handle(self, machine: Machine, event: ev.Event) -> None:
         """Let a machine handle one event now, and carry out what it asks for."""
         node = machine.node

@@ -12,6 +12,7 @@ from support.beats import beat_of
 from support.fleets import fleet_of, task_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
+from zsched.core.executor.tenure import Tenure
 from zsched.core.membership.pace import FULL_S
 from zsched.core.values.fleet import StreamRule, WorkerSpec
 from zsched.core.values.messages import Accepted, Promise
@@ -161,6 +162,14 @@ def test_two_that_work_on_an_exclusive_task_are_found() -> None:
             continue
         with pytest.raises(InvariantError, match=r"edge1 .* and edge2 .* both work"):
             sim._carry_out(machine, (do.SetRole(role=role),), 0)
+
+
+def test_a_loop_that_spins_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It wants to be woken again and again for what it then does not do."""
+    sim = settled()
+    monkeypatch.setattr(Tenure, "next_deadline", lambda _tenure, now: now)
+    with pytest.raises(InvariantError, match="its loop spins"):
+        sim.run(1)
 
 
 def test_node_is_woken_at_its_own_deadlines() -> None:
