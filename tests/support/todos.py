@@ -32,7 +32,7 @@ def agreed(call: Callable[..., None], *args: Any) -> ToDo:
 def done(call: Callable[..., None], *args: Any) -> tuple[Instruction, ...]:
     """What a method of `Executor` has this machine do."""
     todo = ToDo()
-    is_timed = call.__name__ in ("execute", "on_flipped", "tick", "set_lease", "rejoin")
+    is_timed = call.__name__ in ("execute", "on_flipped", "tick", "set_lease", "isolate", "rejoin")
     call(*args[:-1], todo, args[-1]) if is_timed else call(*args, todo)
     assert not todo.send
     return tuple(todo.apply)

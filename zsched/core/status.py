@@ -446,17 +446,17 @@ def _task_problems(node: Stages, task: TaskSpec, value: Allocation, now: float) 
         )
     if executor.is_local:
         yield f"cut off from {owner}: this robot works alone, degraded"
-    is_owner_ready = True
+    server, is_server_ready = node.me if executor.is_local else owner, True
     for spec in node.fleet.nodes:
         data = node.gateway.newest(spec.name, now)
         load = None if data is None else data.profile.worker(task.name)
         if load is None or node.membership.state(spec.name) is not PeerState.ALIVE:
             continue
-        is_owner_ready &= spec.name != owner or load.state is WorkerState.READY
+        is_server_ready &= spec.name != server or load.state is WorkerState.READY
         why = f": {load.reason}" if load.reason else ""
         if load.state is WorkerState.FAILED:
             yield f"the worker on {spec.name} failed{why}; mend it, then `zsched retry {task.name} {spec.name}`"
-        elif (spec.name == owner and load.state is not WorkerState.READY) or (
+        elif (spec.name == server and load.state is not WorkerState.READY) or (
             owner is None and _is_in_the_way(task, load)
         ):
             yield f"the worker on {spec.name} {told_of_worker(load.state, load.reason)}"
@@ -475,8 +475,8 @@ def _task_problems(node: Stages, task: TaskSpec, value: Allocation, now: float) 
                 f"robot; `zsched ping {name}` tells whether its data session answers here"
             )
     since = _unready_since(node, executor)
-    if is_owner_ready and now - since >= UNREADY_SHOWN_S:
-        waited = f"this robot's streams have waited for {executor.owner} for {now - since:.0f} s"
+    if is_server_ready and now - since >= UNREADY_SHOWN_S:
+        waited = f"this robot's streams have waited for {executor.served_by} for {now - since:.0f} s"
         yield f"{waited}: {_untaken(task, executor, node.unready.get(task.name))}"
 
 
@@ -502,11 +502,11 @@ def _unready_since(node: Stages, executor: Executor) -> float:
 
 def _untaken(task: TaskSpec, executor: Executor, known: Unready | None) -> str:
     """What our relay misses, as far as it has reported."""
-    newer = "" if task.worker.command else f"; {STARTED_BEFORE.format(owner=executor.owner, task=task.name)}"
+    newer = "" if task.worker.command else f"; {STARTED_BEFORE.format(owner=executor.served_by, task=task.name)}"
     told = known.slot if known is not None and known.slot.epoch == executor.epoch else None
     untaken = () if told is None else told.untaken
     # The control sessions meet, and its daemon calls it ready: what is between us is the way of the data.
-    look = f": `zsched ping {executor.owner}` tells whether its data session answers here"
+    look = f": `zsched ping {executor.served_by}` tells whether its data session answers here"
     if task.worker.ready_when is ReadyWhen.TOKEN:
         if told is None or told.has_token is None:
             return f"our relay does not see its worker's token, or its subscriptions{look}{newer}"

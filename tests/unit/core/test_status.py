@@ -24,7 +24,8 @@ from zsched.core.node import Node
 from zsched.core.report import snapshot_json
 from zsched.core.scheduler.patience import FIRST_PATIENCE
 from zsched.core.status import build_explanation, build_snapshot, status_line
-from zsched.core.values.fleet import Security, WorkerSpec, electorate_hash, lease_terms
+from zsched.core.todo import ToDo
+from zsched.core.values.fleet import OnIsolation, Security, WorkerSpec, electorate_hash, lease_terms
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import ScoreForm
 from zsched.core.values.plan import StreamCount
@@ -684,6 +685,26 @@ def test_a_slot_whose_worker_is_not_seen_is_a_problem_until_it_is() -> None:
     )
     node.handle(ev.SlotReady(task="merge", epoch=1), 114.0)
     assert build_snapshot(node, 120.0).tasks[0].problems == ()
+
+
+def test_who_works_alone_waits_for_its_own_worker_and_only_since_then() -> None:
+    node = make()
+    learn(node, 1, "edge1")
+    executor = node.executors["merge"]
+    executor.spec = replace(executor.spec, on_isolation=OnIsolation.LOCAL)
+    executor.on_ready(1, ToDo())
+    executor.on_flipped(1, 0, ToDo(), 100.5)
+    executor.isolate(ToDo(), 86400.0)
+    alone = "cut off from edge1: this robot works alone, degraded"
+    assert build_snapshot(node, 86401.0).tasks[0].problems == (alone,)
+    waits = f"our relay does not see its worker's token, or its subscriptions{LOOK.replace('edge1', 'robot1')}"
+    assert build_snapshot(node, 86403.0).tasks[0].problems == (
+        alone,
+        f"this robot's streams have waited for robot1 for 3 s: {waits}",
+    )
+    own = profile_of("robot1", sequence=1, workers=(load_of(state=WorkerState.STARTING),))
+    node.gateway.absorb(own, 86403.0)
+    assert build_snapshot(node, 86403.0).tasks[0].problems == (alone, "the worker on robot1 is starting")
 
 
 def test_a_ready_worker_that_our_relay_does_not_see_is_told_although_it_owns_nothing() -> None:

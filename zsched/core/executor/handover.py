@@ -107,6 +107,9 @@ class Executor:
     """The predecessors, the oldest first."""
     _role_deadline: float = math.inf
     started_at: float = 0.0
+    """When the newest slot began to be prepared: a move's, this robot's own when it works alone, or the one back."""
+    _is_move: bool = False
+    """That slot is a move's."""
     switched_s: float | None = None
     """How long the newest move took here, from learning of it to the flip; ``None``: not flipped yet."""
 
@@ -127,6 +130,11 @@ class Executor:
     def _is_cold(self) -> bool:
         """Whether the worker here runs only while it is needed."""
         return self.spec.worker.standby is Standby.COLD
+
+    @property
+    def served_by(self) -> NodeId | None:
+        """Whose worker serves this robot's streams, or will: the owner's; its own while it works alone."""
+        return self.me if self.is_local else self.owner
 
     @property
     def predecessors(self) -> tuple[NodeId, ...]:
@@ -220,7 +228,7 @@ class Executor:
         self._end_local(todo, now)  # the local slot closes before a committed owner's opens
         before = None if self._is_owner_gone else self.owner
         self.epoch, self.owner, self.started_at, self._is_owner_gone = allocation.epoch, allocation.owner, now, False
-        self.switched_s = None
+        self._is_move, self.switched_s = True, None
         self._change_role(allocation, before, todo, now)
         self._prepare(allocation.owner, todo)
 
@@ -303,13 +311,14 @@ class Executor:
         """Whether the worker here may still do what it had in work for its last epoch."""
         return self.role.role is WorkerRole.DRAINING and self._unleased_epoch is not None
 
-    def isolate(self, todo: ToDo) -> None:
+    def isolate(self, todo: ToDo, now: float) -> None:
         """Owner and quorum are out of reach: this robot's own worker serves its streams."""
         may_work = self.spec.on_isolation is OnIsolation.LOCAL and not self.is_leased
         can = self.has_streams and may_work and self.epoch > 0
         if self.is_local or not can or self.owner == self.me:
             return
         self.is_local, self._old, self._role_deadline = True, (), math.inf
+        self.started_at, self._is_move = now, False
         role = Role(task=self.spec.name, role=WorkerRole.ACTIVE, epoch=self.epoch)
         self._wake_worker(role, todo)
         self._become(role, todo)
@@ -321,6 +330,7 @@ class Executor:
         if not self.is_local or self.owner is None:
             return
         self._end_local(todo, now)
+        self.started_at, self._is_move = now, False
         self._current = slot_for(self.spec, self.me, self.owner, self.epoch)
         self._go(Phase.PREPARING, RoutePhase.PREPARE, f"back to {self.owner}", todo)
 
@@ -328,7 +338,7 @@ class Executor:
         if not self.is_local:
             return
         if self._is_cold:
-            self._role_deadline = now  # nobody asks for its state, so it is stopped, unless it is the owner's from now on
+            self._role_deadline = now  # nobody asks for its state: it is stopped, unless it is the owner's from now on
         self.is_local, self._current, self.phase = False, None, Phase.IDLE
         self._become(Role(task=self.spec.name, role=WorkerRole.IDLE), todo)
 
@@ -379,14 +389,17 @@ class Executor:
     def on_ready(self, epoch: int, todo: ToDo) -> None:
         """The relay sees the new owner's worker ready for the slot of ``epoch``."""
         if epoch == self.epoch and self.phase is Phase.PREPARING:
-            self._go(Phase.FLIPPING, RoutePhase.FLIP, f"flips to {self.owner}", todo)
+            self._go(Phase.FLIPPING, RoutePhase.FLIP, f"flips to {self.served_by}", todo)
 
     def on_flipped(self, epoch: int, replayed: int, todo: ToDo, now: float) -> None:
         """The relay switched every stream to the slot of ``epoch``."""
         if epoch != self.epoch or self.phase is not Phase.FLIPPING:
             return
-        took_s = self.switched_s = now - self.started_at
-        done = f"flipped to {self.owner} in {took_s * 1000:.0f} ms, {replayed} kept values replayed"
+        lasted_s = now - self.started_at
+        took_s = lasted_s if self._is_move else None
+        if self._is_move:
+            self.switched_s = took_s
+        done = f"flipped to {self.served_by} in {lasted_s * 1000:.0f} ms, {replayed} kept values replayed"
         if not self._old:
             self._go(Phase.SETTLED, RoutePhase.CLOSE, done, todo, took_s)
             return

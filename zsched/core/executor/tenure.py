@@ -147,4 +147,4 @@ class Tenure:
                 self._alone_since.pop(name, None)
                 executor.rejoin(todo, now)
             elif now >= self._alone_since.setdefault(name, now) + ALONE_AFTER_S:
-                executor.isolate(todo)
+                executor.isolate(todo, now)

@@ -295,6 +295,33 @@ def test_every_step_says_what_it_did() -> None:
     assert {(story.task, story.epoch) for out in steps for story in of(out, RecordStory)} == {("merge", 2)}
 
 
+def test_a_way_out_of_a_cut_and_back_is_timed_from_its_own_beginning_and_is_no_move() -> None:
+    """A day later: `zsched history` and the trace took a day for what the move to edge1 had cost."""
+    one = Executor(spec=replace(SPEC, on_isolation=OnIsolation.LOCAL), me="robot1", has_streams=True)
+    done(one.execute, allocation_of(1, "edge1"), 0.0)
+    done(one.on_ready, 1)
+    told = [*of(done(one.on_flipped, 1, 0, 0.25), RecordStory)]
+    for start, way in ((86400.0, one.isolate), (90000.0, one.rejoin)):
+        told += of(done(way, start), RecordStory)
+        assert one.started_at == start
+        told += of(done(one.on_ready, 1), RecordStory)
+        told += of(done(one.on_flipped, 1, 0, start + 0.5), RecordStory)
+    assert [story.text for story in told] == [
+        "flipped to edge1 in 250 ms, 0 kept values replayed",
+        "cut off from edge1: works alone (degraded)",
+        "flips to robot1",
+        "flipped to robot1 in 500 ms, 0 kept values replayed",
+        "back to edge1",
+        "flips to edge1",
+        "flipped to edge1 in 500 ms, 0 kept values replayed",
+    ]
+    assert [story.took_s for story in told if story.took_s is not None] == [0.25]
+    assert one.switched_s == 0.25
+    done(one.execute, allocation_of(2, "edge2"), 91000.0)
+    done(one.on_ready, 2)
+    assert of(done(one.on_flipped, 2, 0, 91000.125), RecordStory)[0].took_s == one.switched_s == 0.125
+
+
 # --- the worker ------------------------------------------------------------------------------------------------------
 
 
@@ -421,13 +448,14 @@ def test_who_works_alone_with_a_cold_worker_stops_it_behind_that(standby: Standb
     for way in ("rejoin", "another", "itself"):
         one = Executor(spec=spec, me="robot1", has_streams=True)
         done(one.execute, allocation_of(1, "edge1"), 0.0)
-        done(one.isolate)
+        done(one.isolate, 5.0)
         if way == "rejoin":
             out = done(one.rejoin, 10.0)
         else:
             out = done(one.execute, allocation_of(2, "edge2" if way == "another" else "robot1"), 10.0)
         out += done(one.tick, 10.0) if one.next_deadline() <= 10.0 else ()
-        assert of(out, StopWorker) == ([StopWorker(task="merge")] if standby is Standby.COLD and way != "itself" else [])
+        is_over = standby is Standby.COLD and way != "itself"
+        assert of(out, StopWorker) == ([StopWorker(task="merge")] if is_over else [])
         assert one.next_deadline() == math.inf
 
 
@@ -572,7 +600,7 @@ def test_who_works_alone_does_so_while_its_file_lets_it(later: OnIsolation) -> N
     spec = replace(SPEC, on_isolation=OnIsolation.LOCAL)
     alone = Executor(spec=spec, me="robot1", has_streams=True)
     done(alone.execute, allocation_of(1, "edge1"), 0.0)
-    done(alone.isolate)
+    done(alone.isolate, 0.5)
     assert alone.is_local
     alone.adopt(replace(spec, on_isolation=later, drain_s=3.0), ToDo(), 1.0, is_agreed_leased=False)
     assert alone.is_local is (later is OnIsolation.LOCAL)
