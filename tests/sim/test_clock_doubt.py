@@ -267,6 +267,23 @@ def test_tasks_that_are_not_exclusive_do_not_mind() -> None:
     assert "clock" not in sim.node(owner).problems
 
 
+def test_a_doubt_is_no_problem_any_more_where_nothing_is_exclusive_any_more() -> None:
+    """The operator has done about it what can be done, and the clock stays as it is."""
+    sim, _ = started("edge1", "edge2")
+    robot = ROBOTS[0]
+    slewed(sim, robot, 8.0)
+    sim.run(1.0)
+    assert "slewed" in sim.node(robot).problems["clock"]
+    shared = replace(sim.fleet, tasks=(replace(*sim.fleet.tasks, exclusive=False),))
+    for machine in sim.machines.values():
+        machine.fleet = shared
+        sim.reload(machine)
+    assert sim.run_until(lambda: "clock" not in sim.node(robot).problems, 5.0), "its clock is still slewed"
+    leases = sim.node(robot).agreement.leases
+    assert leases.is_in_doubt
+    assert sim.run_until(lambda: not leases.is_in_doubt, 8.0 + DOUBT_S), "it told the others so for ever"
+
+
 def test_an_owner_of_two_exclusive_tasks_stops_both_and_works_on_both_again() -> None:
     both = replace(fleet("edge1"), tasks=tuple(replace(TASK, name=name, candidates=("edge1",)) for name in ("a", "b")))
     sim = Simulator(fleet=both, seed=1)

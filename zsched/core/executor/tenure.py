@@ -92,9 +92,12 @@ class Tenure:
     def on_clock(
         self, event: ClockCompared, standing: Mapping[TaskId, Allocation | None], number: int, now: float
     ) -> bool:
-        """Take a comparison of clocks in. Whether it began or ended a doubt."""
+        """Take a comparison of clocks in. Whether it began or ended a doubt.
+
+        Only an exclusive task begins one; it ends also where none is exclusive any more.
+        """
         is_in_doubt = self.clock.absorb(event, now)
-        if not self.exclusive or is_in_doubt == self.leases.is_in_doubt:
+        if is_in_doubt == self.leases.is_in_doubt or (is_in_doubt and not self.exclusive):
             return False
         if is_in_doubt:
             self.leases.doubt(standing)

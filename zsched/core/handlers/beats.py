@@ -267,7 +267,8 @@ def _on_addresses(node: Stages, event: ev.AddressesTried, _todo: ToDo, _now: flo
 def _on_clock(node: Stages, event: ev.ClockCompared, todo: ToDo, now: float) -> None:
     if node.tenure.on_clock(event, node.agreement.standing(), node.beat_sequence, now):
         todo.must_beat = True  # the others must hear whether our echoes count
-        node.set_problem("clock", node.tenure.clock.complaint)
+    if node.tenure.exclusive or "clock" in node.problems:
+        node.set_problem("clock", node.tenure.clock.complaint if node.tenure.exclusive else None)
 
 
 HANDLERS: Final[Mapping[type[Any], Handler]] = {
