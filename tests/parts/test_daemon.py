@@ -28,9 +28,9 @@ from zsched.adapters.host.operator_client import ask
 from zsched.adapters.host.state_file import StateFile
 from zsched.clock import ClockWatch, Drift, SleepWatch
 from zsched.core import events as ev
-from zsched.core.values.fleet import Fleet, NodeSpec
+from zsched.core.values.fleet import Fleet, LinkSpec, NodeSpec
 from zsched.core.values.model import NodeKind
-from zsched.core.values.profile import DeviceSample
+from zsched.core.values.profile import DeviceSample, LinkSource
 from zsched.core.vote.clocks import is_bad
 from zsched.errors import AdapterError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_OK
@@ -284,6 +284,28 @@ def test_samplers_problem_is_told_once_and_ends(tmp_path: Path, monkeypatch: pyt
     until(sampled, "samples again")
     sampler.stop()
     assert inbox.take(0.0) is None, "and told once"
+
+
+def test_a_link_that_leaves_the_fleet_file_takes_its_problem_along(tmp_path: Path) -> None:
+    inbox, shell = Inbox(), SimpleNamespace(crew=SimpleNamespace(supervisor=None, sessions={}))
+    links = tuple(LinkSpec(source=LinkSource.FIXED, peer=peer, value="none") for peer in ("b", "c"))
+    sampler = Sampler(replace(spec("a"), links=links), 0.001, tmp_path, shell, inbox)  # type: ignore[arg-type]
+    problems: dict[str, str | None] = {}
+
+    def told() -> set[str]:
+        list(inbox.waiting())
+        while (one := inbox.take(0.0)) is not None:
+            if isinstance(one, ev.ProblemReported):
+                problems[one.source] = one.problem
+        return {source for source, problem in problems.items() if problem is not None}
+
+    sampler.start()
+    until(lambda: told() == {"profile/link0", "profile/link1"}, "both cannot be read")
+    sampler.adopt(replace(spec("a"), links=links[1:]), 0.001)
+    until(lambda: told() == {"profile/link0"}, "the other one only")
+    sampler.adopt(spec("a"), 0.001)
+    until(lambda: told() == set(), "none")
+    sampler.stop()
 
 
 def test_work_wakes_a_sampler_at_rest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

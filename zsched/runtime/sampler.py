@@ -45,6 +45,8 @@ class Sampler:
         ``is_watched``: the clocks must be compared as often at all times, for an exclusive task.
         """
         self._links, self._readers = spec.links, readers_for(spec)
+        self._links_read = 0
+        """How many there were when they were read last."""
         self._state_dir = state_dir
         self._device, self._clocks, self._gauges = DeviceProfiler(), ClockWatch(), GaugeWatch()
         self._shell, self._inbox = shell, inbox
@@ -126,8 +128,10 @@ class Sampler:
             self._inbox.post(sampled)  # it shows a change: the loop may sleep for a while
         else:
             self._inbox.post_quietly(sampled)
-        for index, reader in enumerate(readers):
-            self._report(f"profile/link{index}", reader.problem)
+        for index in range(max(len(readers), self._links_read)):
+            # One that the fleet file does not name any more has no problem.
+            self._report(f"profile/link{index}", readers[index].problem if index < len(readers) else None)
+        self._links_read = len(readers)
 
 
 def noted_pid(session: Path | None, driver: int | None) -> int | None:
