@@ -659,6 +659,21 @@ def test_a_node_of_another_generation_is_told_while_it_beats() -> None:
     assert node.agreement.problems == {}
 
 
+def test_who_goes_while_it_has_another_fleet_file_is_no_problem_until_it_is_back_with_it() -> None:
+    """It was switched off during a change: the others would beat at full pace until it is back."""
+    node, now = started(), 100.0
+    strange = replace(beat("robot2", 2), fleet_file="0123456789abcdef")
+    node.handle(ev.BeatReceived(beat=strange), now)
+    assert "fleet/robot2" in node.problems
+    while node.membership.state("robot2") is not PeerState.GONE:
+        now = node.next_deadline()
+        assert now < 110.0
+        node.handle(ev.DeadlineReached(), now)
+    assert "fleet/robot2" not in node.problems
+    node.handle(ev.BeatReceived(beat=replace(strange, sequence=3)), now)
+    assert "fleet/robot2" in node.problems
+
+
 def test_a_node_that_our_file_does_not_name_is_told_while_it_beats() -> None:
     node = started()
 

@@ -255,6 +255,7 @@ def on_transition(node: Stages, change: Transition, todo: ToDo, now: float) -> N
     if change.after is PeerState.GONE:
         node.probation.on_gone(change.node, now)
         node.sealing.on_gone(change.node)
+        node.set_problem(f"fleet/{change.node}", None)  # its first beat says it again, if it is still so
         for executor in node.executors.values():
             executor.on_gone(change.node, todo)
     todo.must_decide |= any(value.owner == change.node for value in node.values().values())
