@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import pytest
 from support.relay_rig import FLEET, TASK, relay_rig
 from support.waiting import until
 from zsched.core.events import ProblemReported, StreamsCounted
-from zsched.core.relay_protocol import RelayStarted, RelayStop
+from zsched.core.relay_protocol import RelayStarted, RelayStop, TaskEnded
 from zsched.core.values.plan import (
     Direction,
     ReadyWhen,
@@ -153,6 +154,33 @@ def test_garbage_and_bad_plans_are_reported_and_survived(process: subprocess.Pop
     problems = [str(report.problem) for report in said if isinstance(report, ProblemReported)]
     assert any("unreadable command" in problem for problem in problems)
     assert any("more wildcards" in problem for problem in problems)
+
+
+def test_what_a_plan_could_not_open_is_over_with_the_next_one_that_opens_whole(
+    process: subprocess.Popen[bytes],
+) -> None:
+    """The operator mends the template: the problem stayed in the status until the daemon began again."""
+    commands, reports = begin(process)
+    next_report(reports)
+    good = Route(
+        stream="t/in/0",
+        direction=Direction.INPUT,
+        from_expr="robot1/in",
+        to_expr="edge1/in",
+        settings=StreamSettings(),
+    )
+    bad, other = replace(good, to_expr="edge1/*/in"), replace(good, to_expr="edge1/*/*/in")
+    told: list[str] = []
+    for epoch, route in ((1, bad), (1, bad), (2, other), (3, good), (3, bad)):
+        slot = Slot(epoch=epoch, owner="edge1", routes=(route,), ready_when=ReadyWhen.TOKEN)
+        write_frame(commands, wire.encode(RoutePlan(task="t", phase=RoutePhase.PREPARE, current=slot)))
+    write_frame(commands, wire.encode(TaskEnded(task="t")))
+    while len(told) < 5:
+        report = next_report(reports)
+        if isinstance(report, ProblemReported):
+            assert report.source == "relay/t"
+            told.append("" if report.problem is None else report.problem.partition(": ")[2].partition(":")[0])
+    assert told == ["robot1/in -> edge1/*/in", "robot1/in -> edge1/*/*/in", "", "robot1/in -> edge1/*/in", ""]
 
 
 def test_a_role_whose_token_goes_is_told_again_by_the_relay(tmp_path: Path) -> None:

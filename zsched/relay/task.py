@@ -123,6 +123,10 @@ class TaskRelay:
         self._say_again_at: float | None = None
         self._is_inherited = False
         """What we carry is the work of a daemon that is gone; the next one may not know of an older slot."""
+        self._broken: set[tuple[int, str]] = set()
+        """(epoch, stream) of what could not be opened."""
+        self._has_problem = False
+        """One was told, and not that it is over."""
         guarded(self._run, name=f"task {task}").start()
 
     def apply(self, plan: RoutePlan) -> None:
@@ -190,6 +194,7 @@ class TaskRelay:
             try:
                 if isinstance(plan, Ended):
                     self._close_all()
+                    self._end_problem()
                     return
                 if isinstance(plan, Finish):
                     self._finish(plan)
@@ -244,7 +249,18 @@ class TaskRelay:
             self._say_again()
 
     def _problem(self, text: str) -> None:
+        self._has_problem = True
         self._report(ProblemReported(source=f"relay/{self._task}", problem=text[:400]))
+
+    def _end_problem(self) -> None:
+        """A plan was taken to its end: what was told is over, unless a stream of one of its slots is not open."""
+        self._broken &= self._all_routes()
+        if self._has_problem and not self._broken:
+            self._has_problem = False
+            self._report(ProblemReported(source=f"relay/{self._task}", problem=None))
+
+    def _all_routes(self) -> set[tuple[int, str]]:
+        return {(epoch, route.stream) for epoch, state in self._slots.items() for route in state.slot.routes}
 
     # --- another data session ----------------------------------------------------------------------------------------
 
@@ -274,6 +290,7 @@ class TaskRelay:
             state.lacks_since = state.lack = None
         for problem in self._streams.rejoin(session, own_ids):
             self._problem(problem)
+            self._broken |= self._all_routes()  # only the next slot opens it again
         self._services.rejoin(session, self._slots)
         for state in self._slots.values():
             for route in state.slot.routes:
@@ -371,6 +388,7 @@ class TaskRelay:
         self._graph.set_routes(
             self._task, tuple(route for state in self._slots.values() for route in state.slot.routes)
         )
+        self._end_problem()
 
     def _inherited(self, plan: RoutePlan) -> tuple[Slot, ...]:
         """The slot that carries since another daemon's time, while the new owner is not ready, and what drains."""
@@ -415,9 +433,11 @@ class TaskRelay:
         return 0 if source is None else source.take_left(epoch) + source.close_slot(epoch, has_answer=self._has_answer)
 
     def _try_route(self, slot: Slot, route: Route, *, is_from_start: bool) -> None:
+        self._broken.discard((slot.epoch, route.stream))
         try:
             self._open_route(slot, route, is_from_start=is_from_start)
         except (ValueError, zenoh.ZError) as error:
+            self._broken.add((slot.epoch, route.stream))
             self._problem(f"{route.stream}: {route.from_expr} -> {route.to_expr}: {error}")
 
     def _open_route(self, slot: Slot, route: Route, *, is_from_start: bool) -> None:

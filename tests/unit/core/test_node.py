@@ -498,6 +498,20 @@ def test_a_problem_of_a_relay_is_sent_at_once_and_not_said_of_a_node_that_is_not
     assert not [one for one in build_snapshot(robot1, 120.0).problems if "relay" in one]
 
 
+def test_what_a_relay_complained_of_ends_with_it_and_with_the_task() -> None:
+    node = started()
+    for source in ("relay/merge", "relay/other", "relay/local", "profile"):
+        node.handle(ev.ProblemReported(source=source, problem="broken"), 100.0)
+    less = replace(FLEET, tasks=(replace(*FLEET.tasks, name="other"),))
+    node.handle(ev.FleetChanged(fleet=less), 100.1)
+    assert {*node.problems} == {"relay/other", "relay/local", "profile"}
+    node.handle(ev.RelayChanged(is_running=False, reason="exit code -9"), 100.2)
+    assert {*node.problems} == {"relay", "profile"}
+    node.handle(ev.ProblemReported(source="relay/local", problem="broken"), 100.3)
+    node.handle(ev.RelayChanged(is_running=True), 100.4)
+    assert {*node.problems} == {"relay/local", "profile"}, "the next one has said it before it was ready"
+
+
 def test_a_relay_that_has_gone_leaves_every_slot_to_be_taken_again() -> None:
     node = started(learnt=allocation_of(1, "edge1"))
     for event in (ev.SlotReady(task="merge", epoch=1), ev.SlotFlipped(task="merge", epoch=1)):

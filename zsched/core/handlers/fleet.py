@@ -130,6 +130,7 @@ def _adopt_work(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
         node.unready.pop(name, None)
         node.renewing.forget(name)
         node.gateway.forget(name)
+        node.set_problem(f"relay/{name}", None)
     for stream in [stream for stream in node.missed if stream.partition("/")[0] in kept]:
         del node.missed[stream]
     for executor in come:

@@ -217,6 +217,8 @@ def _on_relay(node: Stages, event: ev.RelayChanged, _todo: ToDo, now: float) -> 
             if executor.routes:
                 untold = ev.SlotReady(task=name, epoch=executor.epoch, is_ready=False)
                 node.unready[name] = Unready(slot=untold, since=now)
+        for source in [source for source in node.problems if source.startswith("relay/")]:
+            del node.problems[source]  # the next relay says it again, where it is still so
         node.counters["relay_exits"] += 1
 
 
