@@ -10,7 +10,7 @@ import pytest
 
 from support.relay_rig import BESIDE, ROBOT, TASK, Application, Rig, relay_rig, slot
 from support.waiting import until
-from zsched.core.values.plan import RoutePhase, StreamClass
+from zsched.core.values.plan import ReadyWhen, RoutePhase, StreamClass
 from zsched.core.values.plan import Slot as OneSlot
 
 
@@ -42,6 +42,19 @@ def test_a_stream_comes_and_goes_within_an_epoch_and_the_others_lose_nothing(rig
     until(lambda: rig.told(f"{TASK}/in/0").acknowledged == app.sent, "every sample is acknowledged, and once")
     count = rig.told(f"{TASK}/in/0")
     assert (count.lost, count.at_most_lost, count.drops) == (0, 0, ())
+
+
+def test_streams_go_on_when_their_owner_counts_as_ready_by_another_rule(rig: Rig) -> None:
+    rig.start_worker("edge1")
+    app = Application(rig.app)
+    first = slot(1, "edge1", StreamClass.RELIABLE, 1)
+    rig.move(first)
+    thread = app.flow(200, 50)
+    for ready_when in (ReadyWhen.MATCHING, ReadyWhen.TOKEN):
+        rig.plan(RoutePhase.CLOSE, replace(first, ready_when=ready_when))
+        before = app.sent
+        until(lambda before=before: app.back[-1] > before + 100, f"answers go on with {ready_when}")  # type: ignore[misc]
+    app.halt(thread)
 
 
 def test_a_task_that_ends_leaves_nothing_and_may_begin_again(rig: Rig) -> None:

@@ -374,6 +374,8 @@ class TaskRelay:
         if plan.current is not None:
             self._open(plan.current, is_from_start=plan.phase is RoutePhase.PREPARE)
         current = self._current()
+        if current is not None and plan.phase is RoutePhase.CLOSE:
+            self._flip(current)  # it was opened anew: its owner counts as ready by another rule
         if current is not None and plan.phase is RoutePhase.FLIP:
             self._flip_by = monotonic_s() + FLIP_WAIT_S
         if current is not None and plan.phase is RoutePhase.PREPARE and current.is_ready:
