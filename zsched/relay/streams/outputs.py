@@ -46,6 +46,8 @@ LATE_S: Final = 1.0
 """Samples that still come of a slot that was cut are counted for so long."""
 HEARD_SLOTS: Final = 4
 """Closed slots of which is known how far they came: an owner may be left and come back in one epoch (isolation)."""
+LEFT_SLOTS: Final = 4
+"""Closed slots whose answers wait for their turn (`HandoverRule.ALL`), each within the bounds of an open slot."""
 
 
 _Publisher = tuple[str, int]
@@ -110,6 +112,8 @@ class OutputStream:
         self._slots: dict[int, OutputSlot] = {}
         self._ends: dict[str, zenoh.Subscriber[None]] = {}
         self._carrier: OutputSlot | None = None
+        self._left: list[OutputSlot] = []
+        """Closed before their turn came: what their owners had answered still goes out in it."""
         self._acks: Acknowledger | None = None
         self._fence = Fence()
         self._heard: OrderedDict[tuple[int, str], dict[SourceName, int]] = OrderedDict()  # {(epoch, from): numbers}
@@ -279,7 +283,8 @@ class OutputStream:
     def close_slot(self, epoch: int) -> None:
         """Unsubscribe from a slot; if it carried the stream, the flipped one takes over with what it held.
 
-        What is on its way from one that was cut is counted before its subscription ends.
+        What is on its way from one that was cut is counted before its subscription ends. What waits behind the carrier
+        in one that was flipped (`HandoverRule.ALL`) has been acknowledged to its owner: it goes out in its turn.
         """
         with self._lock:
             slot = self._slots.pop(epoch, None)
@@ -290,8 +295,11 @@ class OutputStream:
             is_cut = self._is_cut(slot)
             if slot is self._carrier:  # of any other nothing more was wanted
                 self._counter.lost += slot.missing() if feed is not None else 0
+                self._counter.dropped("stale_epoch", len(slot.held))  # of a pause
                 self._carrier = None
                 self._promote()
+            elif slot.is_flipped and slot.held:
+                self._keep_left(slot, is_cut=is_cut)
             if slot.answers is not None:
                 self._heard[slot.epoch, slot.expr] = slot.answers.close()
                 while len(self._heard) > HEARD_SLOTS:
@@ -300,6 +308,13 @@ class OutputStream:
             self._late.append((monotonic_s() + LATE_S, feed))
         elif feed is not None:
             feed.close()
+
+    def _keep_left(self, slot: OutputSlot, *, is_cut: bool) -> None:
+        is_wanted = self.route.settings.handover is HandoverRule.ALL and not is_cut
+        if is_wanted and len(self._left) < LEFT_SLOTS:
+            self._left.append(slot)
+        else:
+            self._counter.dropped("closed", len(slot.held))
 
     def _is_cut(self, slot: OutputSlot) -> bool:
         return self._carrier is not None and slot.epoch < self._carrier.epoch
@@ -328,8 +343,9 @@ class OutputStream:
     def close(self) -> None:
         """Close every slot and give the publisher back; what has come and not gone out is counted."""
         with self._lock:
-            held = sum(len(slot.held) for slot in self._slots.values() if slot.is_flipped)
+            held = sum(len(slot.held) for slot in (*self._left, *self._slots.values()) if slot.is_flipped)
             self._counter.dropped("closed", held)
+            self._left.clear()
             for slot in self._slots.values():
                 slot.held.clear()
         for epoch in sorted(self._slots, reverse=True):
@@ -459,10 +475,14 @@ class OutputStream:
             self._counter.dropped("overflow")
 
     def _promote(self) -> None:
-        flipped = [slot for slot in self._slots.values() if slot.is_flipped]
         choose = min if self.route.settings.handover is HandoverRule.ALL else max  # with `ALL` each has its turn
-        if flipped:
-            self._take_over(choose(flipped, key=lambda slot: slot.epoch))
+        while flipped := [slot for slot in (*self._left, *self._slots.values()) if slot.is_flipped]:
+            slot = choose(flipped, key=lambda slot: slot.epoch)
+            self._take_over(slot)
+            if slot not in self._left:
+                return
+            self._left.remove(slot)
+            self._carrier = None
 
     def _take_over(self, slot: OutputSlot) -> None:
         self._fence.begin(is_first=self._carrier is None)

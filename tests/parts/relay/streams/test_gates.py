@@ -434,6 +434,38 @@ def test_with_all_the_new_owner_waits_for_the_old_ones_last(bench: Bench) -> Non
     assert counted.move_gap_s is not None
 
 
+def test_with_all_the_answers_of_an_owner_that_dies_before_its_turn_come_in_their_turn(bench: Bench) -> None:
+    """They have been acknowledged to it, and so has its input: nobody would do that again."""
+    move = Handover(bench, HandoverRule.ALL)
+    move.stream.flip(2, drops_held=False)
+    move.put(move.new, "new 1")
+    move.stream.open(3, way_out(3, HandoverRule.ALL))
+    newest = bench.publisher(way_out(3, HandoverRule.ALL).from_expr)
+    move.stream.close_slot(2)
+    move.stream.flip(3, drops_held=False)
+    move.put(newest, "newest 1")
+    move.put(move.old, "old 1")
+    move.stream.close_slot(1)
+    move.put(newest, "newest 2")
+    assert move.is_through("old 1", "new 1", "newest 1", "newest 2")
+    assert drops(move.stream) == {}
+
+
+def test_answers_of_owners_that_died_before_their_turn_are_bounded_and_counted(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(outputs, "LEFT_SLOTS", 1)
+    move = Handover(bench, HandoverRule.ALL)
+    move.stream.open(3, way_out(3, HandoverRule.ALL))
+    for epoch, owner in ((2, move.new), (3, bench.publisher(way_out(3, HandoverRule.ALL).from_expr))):
+        move.stream.flip(epoch, drops_held=False)
+        move.put(owner, f"{epoch}")
+        move.stream.close_slot(epoch)
+    assert drops(move.stream) == {"closed": 1}
+    move.stream.close()
+    assert drops(move.stream) == {"closed": 2}
+
+
 def test_an_end_whose_samples_were_dropped_counts_after_a_grace_time(bench: Bench) -> None:
     move = Handover(bench, HandoverRule.ALL)
     move.stream.flip(2, drops_held=False)
