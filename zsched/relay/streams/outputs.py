@@ -375,7 +375,7 @@ class OutputStream:
             for slot in tuple(self._slots.values()):
                 for (name, zid, eid), sample in slot.answers.overdue() if slot.answers is not None else ():
                     self._pass(slot, slot.keys.setdefault(name, KeyState(name=name)), (zid, eid), sample)
-            if self._pace is None or not self._is_latest:
+            if self._pace is None or not self._is_latest or self._is_paused:
                 return
             for sample in self._pace.overdue(monotonic_s()):
                 self._note_passed(monotonic_s())
@@ -502,7 +502,8 @@ class OutputStream:
             if stamp is not None and not self._fence.passes(self._outlet.key_of(sample), stamp):
                 self._counter.dropped("superseded")
                 return
-        if self._pace is not None and not self._pace.passes(str(sample.key_expr), sample, monotonic_s()):
+        # by the applications' key: under that a new owner's value takes the place of an old one's
+        if self._pace is not None and not self._pace.passes(self._outlet.key_of(sample), sample, monotonic_s()):
             self._counter.dropped("thinned")
             return
         if self._notes_stamps and sample.timestamp is not None:

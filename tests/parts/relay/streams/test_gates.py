@@ -531,6 +531,66 @@ def test_a_new_owners_answer_to_an_older_value_never_follows_a_newer_one(bench: 
     kept.undeclare()
 
 
+@dataclass
+class Thinned:
+    """An output of class ``latest`` with one sample a second, whose clock the test turns."""
+
+    bench: Bench
+    monkeypatch: pytest.MonkeyPatch
+    got: list[str] = field(default_factory=list)
+    now: float = 100.0
+    count: int = 0
+
+    def __post_init__(self) -> None:
+        self.monkeypatch.setattr(outputs, "monotonic_s", lambda: self.now)
+        self.kept = self.bench.outside.declare_subscriber(
+            "robot1/out", lambda s: self.got.append(s.payload.to_string())
+        )
+        routes = [way_out(epoch, HandoverRule.LATEST, StreamClass.LATEST) for epoch in (1, 2)]
+        routes = [replace(route, settings=replace(route.settings, max_hz=1.0)) for route in routes]
+        self.stream = self.bench.output(routes[0])
+        for epoch, route in enumerate(routes, start=1):
+            self.stream.open(epoch, route)
+        self.old, self.new = (self.bench.publisher(route.from_expr) for route in routes)
+        self.stream.flip(1, drops_held=False)
+
+    def put(self, publisher: zenoh.Publisher, text: str) -> None:
+        publisher.put(text)
+        self.count += 1
+        until(lambda: self.stream.count().messages == self.count, f"{text} came")
+
+    def wait(self) -> None:
+        """What was passed over may go on now."""
+        self.now += 1.5
+        self.stream.look_after()
+
+
+def test_an_old_owners_thinned_value_never_follows_the_new_owners(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    move = Thinned(bench, monkeypatch)
+    move.put(move.old, "1")
+    move.put(move.old, "2")
+    move.stream.flip(2, drops_held=False)
+    move.put(move.new, "3")
+    move.wait()
+    move.wait()
+    move.put(move.new, "4")
+    until(lambda: move.got == ["1", "3", "4"], f"{move.got}")
+    assert drops(move.stream) == {"thinned": 2}
+
+
+def test_a_thinned_value_waits_while_its_output_is_paused(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    move = Thinned(bench, monkeypatch)
+    move.put(move.old, "1")
+    move.put(move.old, "2")
+    move.stream.pause()
+    move.wait()
+    move.put(move.old, "3")
+    move.stream.resume(1)
+    until(lambda: move.got == ["1", "3"], f"{move.got}")
+
+
 def test_numbers_that_do_not_fit_are_counted_and_old_ones_dropped(bench: Bench) -> None:
     move = Handover(bench, HandoverRule.ALL)
     source = move.old.id
