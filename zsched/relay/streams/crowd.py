@@ -104,7 +104,7 @@ class Reader(Struct, eq=False):
 
 
 class Crowd:
-    """The applications that receive one output stream. `put` belongs to one thread, the rest to any."""
+    """The applications that receive one output stream. `put` and `take_owed` belong to one thread, the rest to any."""
 
     def __init__(self, session: Session, expr: str, is_pressed: Callable[[], bool], *, is_latest: bool) -> None:
         """``is_pressed`` says whether samples wait before `put`, so many that some will be dropped for all."""
@@ -149,12 +149,17 @@ class Crowd:
         missed, self._missed = self._missed, 0
         return missed
 
-    def take_owed(self) -> list[tuple[Lane, Sample, Timestamp | None]]:
-        """The newest samples that somebody may have missed, once nobody is left behind any more."""
+    @property
+    def owes(self) -> bool:
+        """Whether somebody may have missed samples that are still the newest, and nobody is left behind any more."""
         if not self._owed:
-            return []
+            return False
         self._full()
-        if any(reader.left_until is not None for reader in tuple(self._readers.values())):
+        return all(reader.left_until is None for reader in tuple(self._readers.values()))
+
+    def take_owed(self) -> list[tuple[Lane, Sample, Timestamp | None]]:
+        """Those samples; what `put` has put since is newer."""
+        if not self.owes:
             return []
         owed, self._owed = self._owed, {}
         return [(lane, sample, stamp) for lane, (sample, stamp) in owed.items()]

@@ -18,7 +18,6 @@ already. Class ``reliable`` sends nothing before its receiver has said where it 
 from __future__ import annotations
 
 import contextlib
-import functools
 import logging
 import threading
 from collections import Counter
@@ -120,6 +119,8 @@ class Outlet:
         self._main = None if self._rewriting.is_wild else self._declare(to_expr, Priority.DATA, is_express=False)
         self._queue = self._make_queue()
         self._crowd = self._make_crowd() if has_crowd else None
+        self._makes_up = False
+        """What the crowd is owed goes out behind what waits in the queue."""
 
     def _make_crowd(self) -> Crowd | None:
         if (queue := self._queue) is None:
@@ -318,11 +319,9 @@ class Outlet:
 
     def _look_after_crowd(self, crowd: Crowd) -> None:
         crowd.look_after()
-        for lane, sample, stamp in crowd.take_owed():
-            size = len(sample.payload)
-            action = functools.partial(self._put, lane, sample, stamp, size)
-            if self._queue is not None:
-                self._handed += 1 - self._queue.send(lane, action, size, (sample, stamp))
+        if self._queue is not None and not self._makes_up and crowd.owes:
+            self._makes_up = True
+            self._queue.then(lambda: self._make_up(crowd))
 
     def take_missed(self) -> int:
         """How many samples single slow receivers may have missed since the last time."""
@@ -465,6 +464,12 @@ class Outlet:
             self._note_put(lane, sample, stamp, size, began)
             raise
         self._note_put(lane, sample, stamp, size, began)
+
+    def _make_up(self, crowd: Crowd) -> None:
+        """Put again what somebody has missed: here, where nothing that is newer waits before it."""
+        self._makes_up = False
+        for lane, sample, stamp in crowd.take_owed():
+            self._put(lane, sample, stamp, len(sample.payload))
 
     def _note_put(self, lane: Lane, sample: Sample, stamp: Timestamp | None, size: int, began: float) -> None:
         with self._lock:

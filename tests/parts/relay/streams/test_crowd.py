@@ -4,16 +4,23 @@ from __future__ import annotations
 
 import contextlib
 import socket
+import threading
 from collections.abc import Iterator
+from typing import cast
 
 import pytest
 import zenoh
 
+from support.sessions import hub_and_neighbour
 from support.waiting import free_endpoint, until
+from zsched.core.values.plan import StreamClass, StreamSettings
 from zsched.relay.streams import crowd
-from zsched.relay.streams.crowd import FITS_BYTES, MAX_REST_S, REST_S, Reader, note_feeder
+from zsched.relay.streams.crowd import FITS_BYTES, MAX_REST_S, REST_S, Crowd, Reader, note_feeder
+from zsched.relay.streams.lanes import Lane
+from zsched.relay.streams.outlet import Outlet
 from zsched.sessions.config import client_config, data_config
 from zsched.sessions.link_sockets import LinkSocket, LinkSockets
+from zsched.stream.samples import Given
 
 NOW = 100.0
 
@@ -148,3 +155,55 @@ def test_the_sockets_of_all_links_are_found_and_workers_receive_no_outputs() -> 
         assert {link.zid for link in links} == {str(apps[0].zid()), str(apps[1].zid())}
         assert all(link.taken() > 0 for link in links)
         assert {link.ends[0][1] for link in links} == {int(endpoint.rsplit(":", 1)[1])}
+
+
+def test_what_a_reader_has_missed_comes_again_and_never_behind_a_newer_sample(
+    pair: Pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A put that waits lets newer samples queue up; what is owed when it ends is old."""
+    left, got, put = [pair[0]], list[str](), Lane.put
+    began, gate = threading.Event(), threading.Event()
+    gate.set()
+
+    def slow(lane: Lane, sample: zenoh.Sample, stamp: zenoh.Timestamp | None) -> None:
+        began.set()
+        gate.wait(10)
+        put(lane, sample, stamp)
+
+    monkeypatch.setattr(Lane, "put", slow)
+    monkeypatch.setattr(Crowd, "_look", lambda *_args, **_named: False)
+    monkeypatch.setattr(Crowd, "_wait", lambda _: tuple(left))
+    settings = StreamSettings(stream_class=StreamClass.LATEST, keep_last=1)
+    with hub_and_neighbour() as (relay, outside):
+        kept = outside.declare_subscriber("out", lambda sample: got.append(sample.payload.to_string()))
+        way = Outlet(relay, "in", "out", settings, has_crowd=True)
+        until(lambda: way.is_matching, "the application")
+
+        def send(text: str) -> None:
+            way.send(cast("zenoh.Sample", Given("in", zenoh.ZBytes(text))))
+
+        def is_again() -> bool:
+            way.look_after()
+            return got == ["missed"] * 2
+
+        send("missed")
+        until(lambda: got == ["missed"], "those that have room get it")
+        left.clear()
+        until(is_again, "it is put again")
+        left.append(pair[0])
+        send("too old")
+        until(lambda: got[2:] == ["too old"], "those that have room get it")
+        left.clear()
+        began.clear()
+        gate.clear()
+        send("newer")
+        assert began.wait(10)
+        send("newest")
+        way.look_after()
+        gate.set()
+        until(lambda: got[-1:] == ["newest"], "the newest")
+        send("end")
+        until(lambda: got[-1:] == ["end"], "the end")
+        assert got[2:] == ["too old", "newer", "newest", "end"]
+        way.undeclare()
+        kept.undeclare()
