@@ -483,9 +483,9 @@ class TaskRelay:
 
     def _forget_streams(self) -> None:
         """Close streams that no slot names any more; without any slot they stay, and with them the kept values."""
-        names = {route.stream for state in self._slots.values() for route in state.slot.routes}
-        if not names:
+        if not self._slots:
             return
+        names = {route.stream for state in self._slots.values() for route in state.slot.routes}
         self._streams.keep(names)
         self._services.keep(names)
 

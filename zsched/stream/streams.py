@@ -41,6 +41,7 @@ from zsched.guard import all_end_within, ends_within, guarded, running
 from zsched.ipc.protocol import DaemonGone, StreamKeys, StreamsTaken
 from zsched.log_limit import limit_library
 from zsched.relay.streams.acks import Acks
+from zsched.relay.streams.inputs import InputStream
 from zsched.relay.tokens import Tokens
 from zsched.sessions.closing import APPLICATION_CLOSE_S
 from zsched.sessions.config import lease_s
@@ -74,15 +75,18 @@ JOIN_S: Final = 0.3
 _log = logging.getLogger("zsched.streams")
 
 Payload = bytes | bytearray | str | zenoh.ZBytes
+_Found = tuple[OwnTask, str, InputStream]
+"""A task, the name of one of its inputs, and that input as it was then."""
 
 
 class Publisher:
     """One key of the application that a task's input takes; `put` from any thread."""
 
-    def __init__(self, key: str, task: OwnTask, stream: str, closing: threading.Event) -> None:
+    def __init__(self, key: str, find: Callable[[str], _Found | None], closing: threading.Event) -> None:
+        """``find`` says which input of which task takes a key now, if one does."""
         self.key = key
-        self._task, self._stream = task, stream
-        self._closing = closing
+        self._find, self._closing = find, closing
+        self._found = find(key)
 
     def put(
         self,
@@ -96,13 +100,20 @@ class Publisher:
 
         Class ``reliable`` waits while the queue towards the owner is full, and once for a link that has become full.
         """
-        stream = self._task.input(self._stream)
+        stream = self._stream()
         if stream is None or self._closing.is_set():
             return False
         given = Given(
             self.key, _bytes(payload), encoding, None if attachment is None else _bytes(attachment), timestamp
         )
         return stream.give(cast("Sample", given))
+
+    def _stream(self) -> InputStream | None:
+        """The input that takes our key: rules may change their places, and with them names; a task may come again."""
+        found = self._found
+        if found is None or found[0].input(found[1]) is not found[2]:
+            found = self._found = self._find(self.key)
+        return None if found is None else found[2]
 
 
 class Streams:
@@ -197,10 +208,10 @@ class Streams:
         until = monotonic_s() + KNOWN_S
         while monotonic_s() < until and not self._closing.is_set():
             is_told = key in self._taken  # behind the plans
-            for task in tuple(self._tasks.values()) if is_told else ():
-                if (stream := task.input_of(key)) is not None:
-                    task.wait_fed(stream, FED_S)
-                    return Publisher(key, task, stream, self._closing)
+            if is_told and (found := self._find(key)) is not None:
+                task, stream, _ = found
+                task.wait_fed(stream, FED_S)
+                return Publisher(key, self._find, self._closing)
             time.sleep(LOOK_S)
         self._check_open()
         self._forget(key)
@@ -262,6 +273,11 @@ class Streams:
     def _check_open(self) -> None:
         if self._closing.is_set():
             raise AdapterError(f"the streams of {self.node} are closed")
+
+    def _find(self, key: str) -> _Found | None:
+        """The input that takes a key."""
+        found = ((task, task.input_of(key)) for task in tuple(self._tasks.values()))
+        return next(((task, *one) for task, one in found if one is not None), None)
 
     def _name(self, key: str) -> None:
         with self._lock:

@@ -86,9 +86,9 @@ class OwnTask(TaskRelay):
         """An input by its stream's name, as it is now."""
         return self._own.inputs.get(stream)
 
-    def input_of(self, key: str) -> str | None:
-        """The name of the input stream that takes a key."""
-        return next((name for name, one in tuple(self._own.inputs.items()) if includes(one.route.from_expr, key)), None)
+    def input_of(self, key: str) -> tuple[str, InputStream] | None:
+        """The input that takes a key, with its stream's name."""
+        return next((one for one in tuple(self._own.inputs.items()) if includes(one[1].route.from_expr, key)), None)
 
     def wait_fed(self, stream: str, timeout_s: float) -> None:
         """Wait until what is put into an input goes to the owner, where the task has one."""

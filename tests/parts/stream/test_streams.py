@@ -74,6 +74,8 @@ class Bench:
     own: str = field(default_factory=free_endpoint)
     reports: list[RelayReport] = field(default_factory=list)
     taken: list[bytes] = field(default_factory=list)
+    keys: list[str] = field(default_factory=list)
+    """The worker's keys of these."""
 
     def __post_init__(self) -> None:
         self.relay = Relay()
@@ -96,6 +98,7 @@ class Bench:
         return made
 
     def _echo(self, sample: Input) -> None:
+        self.keys.append(sample.key)
         self.taken.append(sample.payload.to_bytes())
         self._answers.put(sample.payload.to_bytes())
 
@@ -279,6 +282,53 @@ def test_the_other_classes_arrive_and_a_kept_value_goes_to_the_next_owner(
             until(lambda: bench.taken[:1] == [b"49"], "the kept value, at least once more")
         publisher.put("50")
         until(lambda: bench.taken and bench.taken[-1] == b"50", "by the next slot")
+
+
+def rules(*names: str) -> RoutePlan:
+    """A plan with one input for each of these keys, in this order."""
+    routes = tuple(
+        replace(IN, stream=f"t/in/{place}", from_expr=f"robot1/{name}/in", to_expr=f"edge1/t/robot1/{name}/in")
+        for place, name in enumerate(names)
+    )
+    return replace(PLAN, current=replace(SLOT, routes=routes))
+
+
+def test_a_publisher_follows_its_rule_to_another_place_and_its_task_to_another_life(bench: Bench) -> None:
+    """A stream's name is its rule's place in the fleet file: another rule may have it from one moment to the next."""
+    bench.application.unowned("t", ())
+    bench.application.plan(rules("jobs", "map"))
+    with bench.join() as own:
+        publishers = {name: own.publisher(f"robot1/{name}/in") for name in ("jobs", "map")}
+
+        sent: list[bytes] = []
+
+        def adopt(*names: str) -> None:
+            bench.application.plan(rules(*names))
+            ours = [name for name in names if name in publishers]
+
+            def is_adopted() -> bool:
+                inputs = own._tasks["t"]._own.inputs if "t" in own._tasks else {}
+                found = [inputs[place] for place in sorted(inputs)]
+                is_fed = all(source.has_way for source in found)
+                return is_fed and [source.route.from_expr for source in found] == [f"robot1/{name}/in" for name in ours]
+
+            until(is_adopted, f"{names}")
+            for name, publisher in publishers.items():
+                assert publisher.put(name) is (name in ours), (name, names)
+            sent.extend(sorted(name.encode() for name in ours))
+            until(lambda: len(bench.taken) >= len(sent), f"{names}: {bench.taken}")
+
+        adopt("jobs", "map")
+        adopt("map", "jobs")
+        adopt("other", "jobs", "map")
+        adopt("map")
+        adopt("map", "jobs")
+        adopt()
+        bench.application.end("t")
+        until(lambda: "t" not in own._tasks, "the task has ended")
+        adopt("jobs", "map")
+        assert bench.keys == [f"edge1/t/robot1/{taken.decode()}/in" for taken in bench.taken]
+        assert sorted(bench.taken) == sorted(sent)
 
 
 def test_what_is_put_first_has_a_way_already(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
