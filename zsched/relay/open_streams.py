@@ -112,8 +112,9 @@ class OpenStreams:
 
     def _take_input(self, route: Route) -> InputStream:
         cell = self._cells(route.stream)
-        if cell is not None and route.stream not in self._closed:
-            cell[0] = 0  # of a task by this name that has left the fleet
+        if cell is not None:
+            before = self._closed.get(route.stream)
+            cell[0] = 0 if before is None else before.messages
         return InputStream(self._session, route, self._own_ids, self._local, self._times, cell=cell)
 
     def _take_output(self, route: Route) -> OutputStream:
@@ -135,3 +136,5 @@ class OpenStreams:
             del streams[stream]
             count, before = closed(one.count()), self._closed.get(stream)
             self._closed[stream] = count if before is None else together(before, count)
+        if isinstance(one, InputStream) and (cell := self._cells(stream)) is not None:
+            cell[0] = 0  # the books tell nothing of it from now on, so nothing of it is untold

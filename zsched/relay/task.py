@@ -324,9 +324,7 @@ class TaskRelay:
     def _close_all(self) -> None:
         for epoch in sorted(self._slots):
             self._close(epoch)
-        self._streams.close()
-        self._streams.inputs.clear()
-        self._streams.outputs.clear()
+        self._streams.keep(())
         self._services.keep(set())
         self._graph.set_routes(self._task, ())
 

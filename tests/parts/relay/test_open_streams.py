@@ -1,0 +1,94 @@
+"""What stays of the counters of streams that open and close, in this relay's life and in the next one's."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from support.sessions import hub_and_neighbour, matches
+from support.waiting import until
+from zsched.core.values.plan import Direction, Route, StreamCount, StreamSettings
+from zsched.core.values.struct import replace
+from zsched.relay.books import Books
+from zsched.relay.open_streams import OpenStreams
+
+IN = Route(
+    stream="t/in/0",
+    direction=Direction.INPUT,
+    from_expr="robot1/in",
+    to_expr="edge1/t/in",
+    settings=StreamSettings(depth=100),
+)
+
+
+class Life:
+    """A relay with the streams of one task, and its books."""
+
+    def __init__(self, session: zenoh.Session, outside: zenoh.Session, path: Path) -> None:
+        self.books = Books(path)
+        self.streams = OpenStreams(session, frozenset({str(session.zid())}), None, self.books.cell)
+        self._outside = outside
+
+    def take(self, count: int, route: Route = IN) -> None:
+        """Open an input, and take so many samples."""
+        source = self.streams.input_of(route)
+        publisher = self._outside.declare_publisher(route.from_expr, congestion_control=zenoh.CongestionControl.BLOCK)
+        until(lambda: matches(publisher), "the relay subscribes")
+        wanted = source.count().messages + count
+        for _ in range(count):
+            publisher.put(b"x")
+        until(lambda: source.count().messages == wanted, f"{count} samples")
+        publisher.undeclare()
+
+    def remove(self) -> None:
+        """Close all, and wait until everybody knows."""
+        self.streams.keep(())
+        publisher = self._outside.declare_publisher(IN.from_expr)
+        until(lambda: not matches(publisher), "nobody subscribes any more")
+        publisher.undeclare()
+
+    def write(self) -> None:
+        counts = self.streams.counts()
+        self.books.write(counts, counts)
+
+    def told(self) -> StreamCount:
+        """What the books say of an input that has counted nothing."""
+        return self.books.added((StreamCount(stream=IN.stream, in_flight=0),))[0]
+
+
+@pytest.fixture
+def sessions() -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
+    with hub_and_neighbour() as made:
+        yield made
+
+
+def test_an_input_that_was_removed_is_not_lost_in_the_next_life(
+    sessions: tuple[zenoh.Session, zenoh.Session], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    first = Life(*sessions, tmp_path / "books")
+    first.take(5)
+    first.write()
+    first.remove()
+    first.write()
+    assert (Life(*sessions, tmp_path / "books").told().at_most_lost, caplog.messages) == (0, [])
+
+
+def test_an_input_that_comes_again_goes_on_in_the_books(
+    sessions: tuple[zenoh.Session, zenoh.Session], tmp_path: Path
+) -> None:
+    """Under another key, too; what came since the last count is what a kill loses."""
+    first = Life(*sessions, tmp_path / "books")
+    first.take(5)
+    first.remove()
+    first.take(3)
+    other = replace(IN, from_expr="robot1/other")
+    first.take(1, other)
+    first.write()
+    told = first.streams.counts()[0].messages
+    first.take(2, other)
+    found = Life(*sessions, tmp_path / "books").told()
+    assert (told, found.messages, found.at_most_lost) == (9, 11, 2)
+    first.streams.close()
