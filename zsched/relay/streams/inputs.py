@@ -61,6 +61,8 @@ class _InputSlot(Struct):
     """The last counts of the outlet, once that is closed and until the next one is there."""
     sent: int = 0
     """Number of the newest sample that went into this slot; kept values above it are still owed."""
+    lacks_newest: bool = False
+    """Something of it was given up with a data session: the newest value of each key is owed once more."""
 
     @property
     def is_counted(self) -> bool:
@@ -358,6 +360,7 @@ class InputStream:
                     self._counter.dropped("closed", slot.said.waiting)
                 said = slot.said
                 gone = max(0, said.in_flight) if slot.is_counted else 0
+                slot.lacks_newest |= bool(gone or said.waiting)
                 said.at_most_lost += gone
                 said.unconfirmed += max(0, said.in_flight) - gone
                 said.in_flight = said.waiting = 0
@@ -577,12 +580,13 @@ class InputStream:
         return stamp
 
     def _catch_up(self, slot: _InputSlot) -> int:
-        owed = sorted(
-            (kept for values in self._kept.values() for kept in values if kept[0] > slot.sent), key=lambda kept: kept[0]
-        )
-        for _, sample, stamp in owed:
+        lines = self._kept.values()
+        owed = {kept[0]: kept for values in lines for kept in values if kept[0] > slot.sent}
+        if slot.lacks_newest:
+            owed |= {values[-1][0]: values[-1] for values in lines}
+        for _, (_, sample, stamp) in sorted(owed.items()):
             self._counter.dropped(*slot.outlet.send(sample, stamp))
-        slot.sent = self._number
+        slot.sent, slot.lacks_newest = self._number, False
         self._counter.replayed += len(owed)
         self._counter.repeated += len(owed)
         return len(owed)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -18,11 +19,13 @@ from zsched.core.relay_protocol import EndMarker
 from zsched.core.values.plan import Direction, HandoverRule, Route, StreamClass, StreamSettings
 from zsched.ipc.pipe import decode_end, encode_end
 from zsched.relay.streams import outlet, outputs, receive, slots
+from zsched.relay.streams.acks import Acks
 from zsched.relay.streams.inputs import InputStream
+from zsched.relay.streams.lanes import Lane
 from zsched.relay.streams.outputs import OutputStream
 from zsched.sessions import send_queue
 from zsched.sessions.config import worker_config
-from zsched.wire.keyspace import END_CHUNK
+from zsched.wire.keyspace import END_CHUNK, Keyspace
 
 
 @dataclass
@@ -317,6 +320,47 @@ def test_a_mirrored_input_feeds_both_owners_until_the_old_slot_closes(bench: Ben
     until(lambda: got[3:] == ["edge2/t/in"], f"the new one alone, not {got}")
     for one in kept:
         one.undeclare()
+
+
+@pytest.mark.parametrize("is_counted", [True, False])
+def test_the_newest_value_that_is_given_up_with_a_data_session_comes_again(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, *, is_counted: bool
+) -> None:
+    """The owner, which froze, has acknowledged nothing of it; or a put to it waits, and the value behind that."""
+    gate, put = threading.Event(), Lane.put
+
+    def slow(lane: Lane, sample: zenoh.Sample, stamp: zenoh.Timestamp | None) -> None:
+        gate.wait(10)
+        put(lane, sample, stamp)
+
+    got: list[str] = []
+    kept = bench.outside.declare_subscriber("edge1/t/in", lambda s: got.append(s.payload.to_string()))
+    route = way_in(StreamClass.LATEST, keep_last=2)
+    stream = bench.input(route)
+    acks = Acks(bench.relay, Keyspace("t"), "robot1", lambda _node, _task, _life: True)
+    stream.open(1, route, acks.of("edge1", "t") if is_counted else None)
+    until(lambda: stream.is_matching(1), "the target subscribes")
+    stream.flip(1)
+    monkeypatch.setattr(Lane, "put", slow)
+    came = ["0", "1", "2"] if is_counted else ["0"]
+    if is_counted:
+        gate.set()
+    publisher = bench.publisher("robot1/in")
+    for number in range(3):
+        publisher.put(str(number))
+    until(lambda: stream.count().messages == 3, "all are taken")
+    if is_counted:
+        until(lambda: got == came, "all come")
+    stream.hold()
+    assert stream.leave() == (3 if is_counted else 0)
+    gate.set()
+    until(lambda: got == came, "what was put comes")
+    stream.rejoin(bench.relay, bench.own_ids | {str(bench.relay.zid())})
+    stream.resume()
+    until(lambda: got == [*came, "2"], f"the newest: {got}")
+    assert unaccounted(stream.count()) == 0
+    acks.stalled.close()
+    kept.undeclare()
 
 
 def test_a_thinned_stream_ends_with_its_newest_value(bench: Bench) -> None:
