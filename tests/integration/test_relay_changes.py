@@ -7,9 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import zenoh
 
 from support.relay_rig import BESIDE, ROBOT, TASK, Application, Rig, relay_rig, slot
+from support.sessions import matches
 from support.waiting import until
+from zsched.core.relay_protocol import WorkerWatch
 from zsched.core.values.plan import ReadyWhen, RoutePhase, StreamClass
 from zsched.core.values.plan import Slot as OneSlot
 
@@ -55,6 +58,20 @@ def test_streams_go_on_when_their_owner_counts_as_ready_by_another_rule(rig: Rig
         before = app.sent
         until(lambda before=before: app.back[-1] > before + 100, f"answers go on with {ready_when}")  # type: ignore[misc]
     app.halt(thread)
+
+
+def test_an_input_that_changes_while_nobody_owns_its_task_is_followed(rig: Rig) -> None:
+    route = slot(1, "edge1", StreamClass.RELIABLE, 1).routes[0]
+    rig.relays[ROBOT].watch(WorkerWatch(task=TASK, unowned=(route,)))
+    app = Application(rig.app)
+    until(app.connected, "the application sees the relay's subscription")
+    other = replace(route, from_expr=f"{ROBOT}/other")
+    rig.relays[ROBOT].watch(WorkerWatch(task=TASK, unowned=(other,)))
+    until(lambda: not app.connected(), "nobody takes the key of before")
+    publisher = rig.app.declare_publisher(other.from_expr, congestion_control=zenoh.CongestionControl.BLOCK)
+    until(lambda: matches(publisher), "the relay subscribes to the new key")
+    publisher.put(b"x")
+    until(lambda: rig.told(route.stream).messages == 1, "it is counted")
 
 
 def test_a_task_that_ends_leaves_nothing_and_may_begin_again(rig: Rig) -> None:

@@ -342,8 +342,8 @@ class TaskRelay:
 
     def _listen(self, routes: tuple[Route, ...]) -> None:
         for route in routes:
-            if route.stream in self._streams.inputs:
-                continue
+            if self._slots and route.stream in self._streams.inputs:
+                continue  # the plans say what it takes
             try:
                 self._streams.input_of(route)
             except (ValueError, zenoh.ZError) as error:
