@@ -144,6 +144,9 @@ class Streams:
         self._drained: deque[SlotDrained] = deque(maxlen=64)
         """Said again to the next relay, which would wait for it."""
         self._closing, self._closed = threading.Event(), threading.Event()
+        self._telling = threading.Lock()
+        self._problems: dict[str, str] = {}
+        """{task: what is wrong with its streams here}; of none: of the session."""
         keyspace = Keyspace(link.fleet)
         self._acks = Acks(
             self._session, keyspace, link.node, self._has_worker, lease_s(link.session), is_application=True
@@ -360,6 +363,7 @@ class Streams:
         elif isinstance(word, TaskEnded):
             if (task := self._tasks.pop(word.task, None)) is not None:
                 task.end()
+                self._note_problem(word.task, None)
         elif isinstance(word, WorkerWatch):
             self._task(word.task).listen(word.unowned)
         elif isinstance(word, RoutePlan):
@@ -392,9 +396,8 @@ class Streams:
                     for name, task in tuple(self._tasks.items()):
                         task.apply(RoutePlan(task=name, phase=RoutePhase.CLOSE, current=None))
                 continue
-            if self._link.session != self._config:
-                text = "its session is that of an earlier configuration: start the application again"
-                self._link.say(ProblemReported(source="", problem=text))
+            text = "its session is that of an earlier configuration: start the application again"
+            self._note_problem("", text if self._link.session != self._config else None, is_anew=True)
             for drained in tuple(self._drained):
                 self._link.say(drained)
             _log.warning("the relay of %s is there again", self.node)
@@ -408,14 +411,26 @@ class Streams:
         """A task's word (its thread)."""
         if isinstance(word, SlotDrained):
             self._drained.append(word)
-        if isinstance(word, SlotDrained | SlotLost | ProblemReported):
+        if isinstance(word, SlotDrained | SlotLost):
             self._link.say(word)
+        elif isinstance(word, ProblemReported):
+            self._note_problem(word.source.removeprefix("relay/"), word.problem)
         elif isinstance(word, SlotReady) and word.has_token is not None and not word.is_ready:
             text = f"{word.task}: the application does not see the owner's worker"
             _log.warning("%s: it hangs or has ended (`zsched status`), or does not dial our `listen: {streams}`", text)
-            self._link.say(ProblemReported(source="", problem=text[:MAX_REASON]))
+            self._note_problem(word.task, text)
         elif isinstance(word, SlotReady) and word.is_ready:
-            self._link.say(ProblemReported(source="", problem=None))
+            self._note_problem(word.task, None)
+
+    def _note_problem(self, task: str, problem: str | None, *, is_anew: bool = False) -> None:
+        """Tell the relay all that is wrong now; ``is_anew``: it is another one, and knows nothing of it."""
+        with self._telling:
+            before = self._problems.pop(task, None)
+            if problem is not None:
+                self._problems[task] = problem
+            if problem != before or is_anew:
+                text = "; ".join(text for _, text in sorted(self._problems.items()))
+                self._link.say(ProblemReported(source="", problem=text[:MAX_REASON] or None))
 
     def _count(self) -> None:
         while not self._closing.wait(COUNT_S):

@@ -17,7 +17,7 @@ import zenoh
 
 from support.hand_relay import Relay, environment_on
 from support.waiting import free_endpoint, until
-from zsched.core.events import SlotDrained
+from zsched.core.events import ProblemReported, SlotDrained, SlotReady
 from zsched.core.hop.books import unaccounted
 from zsched.core.relay_protocol import RelayReport, SlotLost
 from zsched.core.values.plan import (
@@ -329,6 +329,27 @@ def test_a_publisher_follows_its_rule_to_another_place_and_its_task_to_another_l
         adopt("jobs", "map")
         assert bench.keys == [f"edge1/t/robot1/{taken.decode()}/in" for taken in bench.taken]
         assert sorted(bench.taken) == sorted(sent)
+
+
+def test_what_is_wrong_is_told_until_it_is_mended_whatever_becomes_of_another_task(bench: Bench) -> None:
+    def told() -> str:
+        words = [word.problem for word in tuple(bench.reports) if isinstance(word, ProblemReported)]
+        return words[-1] or "" if words else ""
+
+    text = "{}: the application does not see the owner's worker"
+    anew = "its session is that of an earlier configuration"
+    with bench.join() as own:
+        for task in ("a", "b"):
+            own._report(SlotReady(task=task, epoch=1, is_ready=False, has_token=False))
+        until(lambda: told() == f"{text.format('a')}; {text.format('b')}", f"both: {told()}")
+        own._report(SlotReady(task="b", epoch=1))
+        until(lambda: told() == text.format("a"), f"the other one stays: {told()}")
+        own._config = "of an earlier relay"
+        assert bench.application._link is not None
+        bench.application._link.hang_up()
+        until(lambda: told() == f"{anew}: start the application again; {text.format('a')}", f"once more: {told()}")
+        own._report(SlotReady(task="a", epoch=1))
+        until(lambda: told() == f"{anew}: start the application again", f"that stays: {told()}")
 
 
 def test_what_is_put_first_has_a_way_already(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
