@@ -8,7 +8,7 @@ that it is not the owner) does it wait a moment for the next owner. What the app
 error reply, its first words one of `ServiceProblem`:
 
 =============  =======================================================================================================
-busy           ``max_pending`` requests are at the owner already
+busy           ``max_pending`` requests are at the owner already, or this machine has no thread for one more
 no owner       nobody has taken the request within ``hold_s``: it was not carried out
 owner gone     the owner died, or its link did, before it answered
 moved          the task moved and the old owner's drain time ended before it answered
@@ -39,7 +39,7 @@ from zsched.core.route.keyexpr import is_wild
 from zsched.core.route.wildcards import Rewriter, rewriter
 from zsched.core.values.plan import Route, StreamCount
 from zsched.core.values.struct import Struct, field
-from zsched.guard import guarded, tolerant
+from zsched.guard import guarded, note, tolerant
 from zsched.relay.services.replies import Replies
 from zsched.relay.streams.counter import StreamCounter
 from zsched.relay.streams.receive import undeclare
@@ -222,7 +222,14 @@ class ServiceStream:
             with query:
                 self._fail(query, ServiceProblem.BUSY, f"{self.route.service.max_pending} requests are being answered")
             return
-        guarded(self._serve, query, name=self.route.stream, kind="request", is_lasting=False).start()
+        try:
+            guarded(self._serve, query, name=self.route.stream, kind="request", is_lasting=False).start()
+        except RuntimeError as error:
+            with self._lock:
+                self._running -= 1
+            note("request", error)
+            with query:
+                self._fail(query, ServiceProblem.BUSY, f"{error}: it was not done")
 
     def _serve(self, query: Query) -> None:
         try:

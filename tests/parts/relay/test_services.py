@@ -1,0 +1,63 @@
+"""One service at a time on real sessions: what a request is told, and counted as, before any owner sees it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+
+import pytest
+import zenoh
+
+from support.sessions import hub_and_neighbour, matches
+from support.waiting import until
+from zsched.core.values.plan import Direction, Route, ServiceSettings, StreamSettings
+from zsched.relay.services import service
+from zsched.relay.services.service import Services
+
+SERVICE = Route(
+    stream="t/srv/0",
+    direction=Direction.SERVICE,
+    from_expr="robot1/job",
+    to_expr="edge1/t/robot1/job",
+    settings=StreamSettings(),
+    service=ServiceSettings(hold_s=0.0, max_pending=1),
+)
+
+
+class Bench:
+    """A relay's services, and one who asks."""
+
+    def __init__(self, relay: zenoh.Session, outside: zenoh.Session) -> None:
+        self.services = Services(relay)
+        self._asker = outside.declare_querier(SERVICE.from_expr, timeout=20.0)
+
+    def open(self, route: Route = SERVICE) -> None:
+        self.services.open(1, route)
+        until(lambda: matches(self._asker), "the service is there")
+
+    def ask(self) -> list[str]:
+        """The errors that one request gets."""
+        return [reply.err.payload.to_string() for reply in self._asker.get() if reply.err is not None]
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    with hub_and_neighbour() as (relay, outside):
+        made = Bench(relay, outside)
+        yield made
+        made.services.keep(set())
+
+
+def test_a_request_for_which_no_thread_begins_is_answered_and_takes_nobodys_place(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Refused(threading.Thread):
+        def start(self) -> None:
+            raise RuntimeError("can't start new thread")
+
+    bench.open()
+    with monkeypatch.context() as patched:
+        patched.setattr(service, "guarded", lambda *_args, **_named: Refused())
+        for _ in range(2):
+            assert bench.ask() == ["busy: can't start new thread: it was not done"]
+    assert bench.ask() == ["no owner: nobody serves robot1/job: it was not done"]
