@@ -11,6 +11,7 @@ import zenoh
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import until
 from zsched.core.values.plan import Direction, Route, ServiceSettings, StreamSettings
+from zsched.core.values.struct import replace
 from zsched.relay.services import service
 from zsched.relay.services.service import Services
 
@@ -36,7 +37,11 @@ class Bench:
         until(lambda: matches(self._asker), "the service is there")
 
     def ask(self) -> list[str]:
-        """The errors that one request gets."""
+        """The errors that one request gets; it is put again where it reached nobody (the service was just declared)."""
+        errors: list[str] = until(self._ask, "an answer")
+        return errors
+
+    def _ask(self) -> list[str]:
         return [reply.err.payload.to_string() for reply in self._asker.get() if reply.err is not None]
 
 
@@ -61,3 +66,15 @@ def test_a_request_for_which_no_thread_begins_is_answered_and_takes_nobodys_plac
         for _ in range(2):
             assert bench.ask() == ["busy: can't start new thread: it was not done"]
     assert bench.ask() == ["no owner: nobody serves robot1/job: it was not done"]
+
+
+def test_the_counters_of_a_service_go_on_when_its_rule_changes(bench: Bench) -> None:
+    for number, hold_s in enumerate((0.0, 0.01, 0.0), start=1):
+        bench.open(replace(SERVICE, service=ServiceSettings(hold_s=hold_s)))
+        bench.ask()
+        (count,) = bench.services.counts()
+        assert (count.messages, dict(count.drops)) == (number, {"no_owner": number})
+    bench.services.keep(set())
+    assert bench.services.counts() == ()
+    bench.open()
+    assert bench.services.counts()[0].messages == 3

@@ -34,6 +34,7 @@ import zenoh
 from zenoh import Query, Reply, Sample, SampleKind, Session
 
 from zsched.clock import monotonic_s
+from zsched.core.hop.books import added, closed, together
 from zsched.core.relay_protocol import ERROR_ENCODING, REFUSED_ENCODING, ServiceProblem
 from zsched.core.route.keyexpr import is_wild
 from zsched.core.route.wildcards import Rewriter, rewriter
@@ -364,6 +365,10 @@ class Services:
         self._session = session
         self._local = local
         self._streams: dict[str, ServiceStream] = {}
+        self._closed: dict[str, StreamCount] = {}
+        """What services have counted that were closed, and may come again by the same name..."""
+        self._changing = threading.Lock()
+        """...which a reader of counters sees in one of both places."""
 
     def open(self, epoch: int, route: Route) -> None:
         """Open a slot of one service, which begins to take requests if it is new.
@@ -373,8 +378,7 @@ class Services:
         """
         stream = self._streams.get(route.stream)
         if stream is None or (stream.route.from_expr, stream.route.service) != (route.from_expr, route.service):
-            if stream is not None:
-                stream.close()
+            self._end(route.stream)
             stream = self._streams[route.stream] = ServiceStream(self._session, route, self._local)
         stream.open(epoch, route)
 
@@ -431,8 +435,19 @@ class Services:
         """Close the services whose stream is not among ``names``."""
         for name in tuple(self._streams):
             if name not in names:
-                self._streams.pop(name).close()
+                self._end(name)
 
-    def counts(self) -> list[StreamCount]:
+    def _end(self, name: str) -> None:
+        stream = self._streams.get(name)
+        if stream is None:
+            return
+        stream.close()
+        with self._changing:
+            del self._streams[name]
+            count, before = closed(stream.count()), self._closed.get(name)
+            self._closed[name] = count if before is None else together(before, count)
+
+    def counts(self) -> tuple[StreamCount, ...]:
         """The counters of every service."""
-        return [stream.count() for stream in tuple(self._streams.values())]
+        with self._changing:
+            return added(tuple(stream.count() for stream in tuple(self._streams.values())), self._closed)
