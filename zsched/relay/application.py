@@ -24,6 +24,7 @@ from zsched.core.relay_protocol import RelayReport, TaskEnded
 from zsched.core.route.shares import Shares, Told
 from zsched.core.values.model import MAX_REASON, NodeId, TaskId
 from zsched.core.values.plan import Route, RoutePlan, StreamCount
+from zsched.core.values.struct import replace
 from zsched.errors import WireError
 from zsched.guard import guarded
 from zsched.ipc.pipe import OF_APPLICATIONS, read_frame, write_frame
@@ -101,6 +102,8 @@ class Application:
         self._lock = threading.Lock()
         self._shares = Shares()
         self._link: _Link | None = None
+        self._times: dict[str, StreamCount] = {}
+        """By stream, what was read between two counts: its times are told with the next one."""
         self._session = ""
         self._is_orphaned = False
 
@@ -163,7 +166,9 @@ class Application:
     def apart(self, counts: tuple[StreamCount, ...]) -> tuple[StreamCount, ...]:
         """Our own counters, without answers that an application has had itself; `settled` and `added` take these."""
         with self._lock:
-            return self._shares.apart(counts)
+            timed = tuple(_with_times(count, self._times.get(count.stream)) for count in counts)
+            self._times = {}
+            return self._shares.apart(timed)
 
     def settled(self, counts: tuple[StreamCount, ...]) -> tuple[StreamCount, ...]:
         """Our own counters with those of applications that have gone."""
@@ -220,9 +225,8 @@ class Application:
                 self._let_go(link)
 
     def _let_in(self, connection: socket.socket, first: StreamKeys) -> _Link | None:
-        counts = self.counts()  # not below our lock: streams have locks of their own
+        self._look()
         with self._lock:
-            self._shares.apart(counts)
             other = self._link
             if other is not None:
                 reason = f"the process {other.pid} has streams of {self._here.node} itself; one may at a time"
@@ -245,6 +249,8 @@ class Application:
             if isinstance(word, ProblemReported):
                 self._report(ProblemReported(source=SOURCE, problem=word.problem))
                 continue
+            if isinstance(word, StreamKeys):
+                self._look()
             with self._lock:
                 if isinstance(word, StreamKeys):
                     self._tell(self._shares.name(word.keys))
@@ -256,7 +262,15 @@ class Application:
             for one in heard:
                 self._report(one)
 
+    def _look(self) -> None:
+        """Know the relay's own counters of this moment, at which an application begins or ends to count some itself."""
+        counts = self.counts()  # not below our lock: streams have locks of their own
+        with self._lock:
+            self._shares.apart(counts)
+            self._times = {count.stream: _with_times(count, self._times.get(count.stream)) for count in counts}
+
     def _let_go(self, link: _Link) -> None:
+        self._look()
         with self._lock:
             heard = self._shares.go(monotonic_s())
             self._link = None
@@ -265,6 +279,15 @@ class Application:
             self._report(one)
         self._report(ProblemReported(source=SOURCE, problem=None))
         _log.info("the application (pid %d) has gone", link.pid)
+
+
+def _with_times(count: StreamCount, before: StreamCount | None) -> StreamCount:
+    """``count``, which was read behind ``before``, with the times of both: those that are read begin anew."""
+    if before is None:
+        return count
+    gaps = [one.gap_s for one in (before, count) if one.gap_s is not None]
+    answer_s = before.answer_s if count.answer_s is None else count.answer_s
+    return replace(count, gap_s=max(gaps, default=None), answer_s=answer_s)
 
 
 def _listening(path: Path) -> socket.socket:

@@ -229,6 +229,26 @@ def test_a_program_ends_in_order_whatever_ends_it(
     assert bench.count().acknowledged == 20
 
 
+def test_answers_are_the_applications_from_the_moment_it_names_them_until_it_goes(bench: Bench) -> None:
+    """The relay counts them, too: no answer counts twice or nowhere, and the times of a reading between are told."""
+    counted = StreamCount(stream="t/out/0")
+
+    def of_relay() -> StreamCount:
+        return bench.application.apart((NONE[0], replace(counted, gap_s=0.1)))[1]
+
+    bench.application.counts = lambda: (NONE[0], counted)
+    with bench.join() as own:
+        counted = replace(counted, messages=7, gap_s=0.4)
+        own.subscribe("robot1/out", lambda _answer: None)
+        assert [of_relay().gap_s, of_relay().gap_s] == [0.4, 0.1]
+        assert of_relay().messages == 7
+        counted = replace(counted, messages=10)
+    until(lambda: bench.application._link is None, "it has gone")
+    assert of_relay().messages == 7
+    counted = replace(counted, messages=12)
+    assert of_relay().messages == 9
+
+
 def test_a_second_one_who_closes_waits_until_they_are_closed(bench: Bench) -> None:
     own = bench.join()
     own.subscribe("robot1/out", lambda _answer: time.sleep(0.3))
