@@ -15,6 +15,7 @@ from zenoh import Sample, SampleKind, Timestamp
 from zsched.core.route.wildcards import Rewriting
 from zsched.core.values.plan import Route, StreamClass
 from zsched.relay.streams.outlet import QUEUE_DEPTH
+from zsched.relay.streams.tally import Tally
 from zsched.sessions.send_queue import SendQueue
 from zsched.stream.samples import Received
 
@@ -32,6 +33,7 @@ class Hand:
         is_reliable = settings.stream_class is StreamClass.RELIABLE
         self._deliver = deliver
         self._missed = 0
+        self._is_given_up = False
         self._rewriting, self._to = Rewriting(route.from_expr, route.to_expr), route.to_expr
         self._queue = SendQueue(
             f"to {route.to_expr}",
@@ -85,8 +87,10 @@ class Hand:
         """Hand nothing over any more; how many answers still waited."""
         left = self._queue.close()
         self._missed += left
+        self._is_given_up = True
         return left
 
-    def undeclare(self) -> None:
-        """End the thread behind the answer that it has in hand."""
-        self._queue.close()
+    def undeclare(self) -> Tally:
+        """End the thread behind the answer that it has in hand; how many waited, unless they were given up."""
+        left = self._queue.close()
+        return Tally(waiting=0 if self._is_given_up else left)

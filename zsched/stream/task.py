@@ -55,6 +55,11 @@ class OwnStreams(OpenStreams):
         """Hand no answer over any more; {output stream: how many still waited for its callback}."""
         return {stream: left for stream, hand in tuple(self._hands.items()) if (left := hand.give_up())}
 
+    def _end(self, streams: dict[str, InputStream] | dict[str, OutputStream], stream: str) -> None:
+        super()._end(streams, stream)
+        if streams is self.outputs:
+            self._hands.pop(stream, None)  # nobody waits for what it will never hand over
+
     def _take_input(self, route: Route) -> InputStream:
         return InputStream(self._session, route, self._own_ids, None, self._times, is_ours=True)
 

@@ -513,6 +513,30 @@ def test_answers_that_closing_does_not_wait_for_are_counted_and_told(
     assert "t/out/0: 5 answers had not been handed over when the streams closed" in caplog.text
 
 
+def test_answers_that_wait_when_their_rule_goes_are_counted_and_not_waited_for(bench: Bench) -> None:
+    gate, had = threading.Event(), list[bytes]()
+
+    def slow(answer: Received) -> None:
+        had.append(answer.payload.to_bytes())
+        gate.wait(10)
+
+    with bench.join() as own:
+        own.subscribe("robot1/out", slow)
+        publisher = own.publisher("robot1/front/in")
+        task = own._tasks["t"]
+        for number in range(6):
+            publisher.put(str(number))
+        until(lambda: task.counts()[1].messages == 6 and had, "all have come")
+        bench.application.plan(replace(PLAN, current=replace(SLOT, routes=(IN,))))
+        until(lambda: len(task.counts()) == 1, "the output is gone")
+        gate.set()
+        until(task.has_handed, "nothing is left to be handed over")
+        bench.application.plan(PLAN)
+        until(lambda: len(task.counts()) == 2, "the output is there again")
+        assert (task.counts()[1].messages, task.counts()[1].drops) == (6, (("closed", 5),))
+    assert had == [b"0"]
+
+
 def test_what_comes_too_late_to_be_put_is_told_to_the_one_who_puts_it(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
