@@ -166,7 +166,9 @@ def _replace(path: Path, content: bytes) -> None:
     fresh = fresh_file(path)
     descriptor = os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
     try:
-        os.write(descriptor, content)
+        left = memoryview(content)
+        while left:  # a full disk takes a part, and says so at the next one
+            left = left[os.write(descriptor, left) :]
     finally:
         os.close(descriptor)
     fresh.rename(path)

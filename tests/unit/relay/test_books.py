@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 
 import pytest
@@ -103,6 +105,24 @@ def test_books_that_cannot_be_written_are_said_once(tmp_path: Path, caplog: pyte
         assert first.count().in_flight == first.taken
     assert sum("cannot be written" in line for line in caplog.messages) == 1
     assert sum("cannot be made" in line for line in caplog.messages) == 1
+
+
+def test_books_that_do_not_fit_leave_those_of_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first, write, room = Life(tmp_path), os.write, [10]
+    first.take(3)
+    first.count()
+
+    def full(descriptor: int, content: bytes | memoryview) -> int:
+        if not room[0]:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        taken, room[0] = write(descriptor, content[: room[0]]), 0
+        return taken
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", full)
+        first.take(4)
+        first.count()
+    assert Life(tmp_path).told().messages == 7
 
 
 def test_nothing_is_written_while_nothing_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
