@@ -315,7 +315,10 @@ class SendQueue:
             self._in_hand, self._left_at = waiting.value, monotonic_s()
             self._room.notify()
             if self._sheds:
-                self._lines[waiting.lane].popleft()
+                line = self._lines[waiting.lane]
+                line.popleft()
+                if not line:
+                    del self._lines[waiting.lane]  # lanes may be any number of keys
                 self._has_shed &= self._count > 0
             return waiting.action
 

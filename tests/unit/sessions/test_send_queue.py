@@ -237,3 +237,14 @@ def test_a_put_that_ctrl_c_ends_holds_nothing_up() -> None:
     queue.do_claimed()
     assert receiver.got == [1, 2]
     queue.close()
+
+
+def test_a_lane_of_which_nothing_waits_takes_no_memory() -> None:
+    """A wildcard rule has a lane for each key, and keys come from applications and workers."""
+    receiver = Receiver()
+    queue = SendQueue("t", depth=10, sheds=True)
+    for number in range(100):
+        queue.send(number, receiver.take(number), 1)
+    until(lambda: len(receiver.got) == 100, "all of it")
+    assert not queue._lines
+    queue.close()
