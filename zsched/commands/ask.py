@@ -368,7 +368,7 @@ def endpoint_of(text: str) -> str:
 
 def _ask_elsewhere(door: Door, request: Json) -> Json:
     """The answer of a node of a fleet that has no daemon here."""
-    from zsched.runtime.desk import answer_json, command_of  # noqa: PLC0415 - loads zenoh, which no socket needs
+    from zsched.runtime.desk import answer_json, command_of, unknown  # noqa: PLC0415 - loads zenoh, unlike a socket
 
     if request["verb"] in ONLY_THERE:
         raise CliError(EXIT_USAGE, f"only the machine of a node tells its {request['verb']}: run this there")
@@ -381,7 +381,11 @@ def _ask_elsewhere(door: Door, request: Json) -> Json:
             return answer_json(_ask_cell(door.cell, door.node, command))
         return answer_json(_client(door.endpoint).ask(door.node, command))
     except AdapterError as error:
-        advice = "" if door.cell is not None else _why_silent(door, visit, is_command=command is not None)
+        is_unsure = isinstance(error.__cause__, TimeoutError)
+        is_clear = door.cell is not None or (is_unsure and door.endpoint.startswith(PLAIN))  # it has told its status
+        advice = "" if is_clear else _why_silent(door, visit, is_command=command is not None)
+        if is_unsure and not advice:
+            return answer_json(unknown(str(error)))
         raise CliError(EXIT_UNREACHABLE, f"{error}{advice}") from error
 
 

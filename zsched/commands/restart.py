@@ -8,9 +8,9 @@ from __future__ import annotations
 from zsched.commands.ask import ask_door
 from zsched.commands.common import CliError, print_json, say
 from zsched.commands.logs import worker_node
-from zsched.commands.orders import OrderView, begin, check_said
+from zsched.commands.orders import CODES, OrderView, begin, check_said
 from zsched.commands.retry import worker_states
-from zsched.exits import EXIT_FAILED, EXIT_OK
+from zsched.exits import EXIT_FAILED
 
 SCHEMA = "zsched.restart/1"
 
@@ -19,8 +19,8 @@ def restart(view: OrderView, task: str, whose: str | None) -> int:
     """Ask the node to start its worker again; prints what it answers and returns the exit code.
 
     Raises:
-        CliError: nobody answers, there is no such task or node (2), it was not agreed to (1, or 2 off a terminal), or
-            the node refuses (1).
+        CliError: nobody answers, there is no such task or node (2), it was not agreed to (1, or 2 off a terminal), the
+            node refuses (1), or does not tell what has become of it (5).
     """
     check_said(view)
     status = ask_door(view.door, {"verb": "status"})
@@ -39,5 +39,6 @@ def restart(view: OrderView, task: str, whose: str | None) -> int:
     elif outcome == "ok":
         say(f"{task} on {node}: {detail}")
     else:
-        raise CliError(EXIT_FAILED, f"{task} on {node}: {detail}")
-    return EXIT_OK if outcome == "ok" else EXIT_FAILED
+        advice = f"; it may or may not start again, see `zsched logs {task} {node}`" if outcome == "unknown" else ""
+        raise CliError(CODES.get(outcome, EXIT_FAILED), f"{task} on {node}: {detail}{advice}")
+    return CODES.get(outcome, EXIT_FAILED)

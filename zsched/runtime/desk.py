@@ -22,6 +22,7 @@ from zsched.core.values.gauges import GAUGES
 from zsched.core.values.messages import (
     ChangeFleet,
     Command,
+    CommandOutcome,
     CommandResult,
     ExplainTask,
     FleetTold,
@@ -303,6 +304,11 @@ def command_of(request: dict[str, Any]) -> Command:
         KeyError, TypeError, ValueError, OverflowError: something is missing or wrong.
     """
     return _COMMANDS[request["verb"]](request)
+
+
+def unknown(why: str) -> CommandResult:
+    """The answer to an order of which nobody tells what has become."""
+    return CommandResult(outcome=CommandOutcome.UNKNOWN, detail=why)
 
 
 def answer_json(value: object) -> dict[str, Any]:

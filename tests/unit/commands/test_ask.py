@@ -227,6 +227,34 @@ def test_a_silent_node_of_a_secured_fleet_is_not_taken_for_a_wrong_address(
         assert why in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("endpoint", "node", "code"),
+    [("tcp/robot1:7457", "edge1", 0), ("tls/robot1:7457", "robot1", 0), ("tls/robot1:7457", "edge1", EXIT_UNREACHABLE)],
+)
+def test_an_order_without_an_answer_may_have_been_carried_out_unless_it_was_not_passed_on(
+    monkeypatch: pytest.MonkeyPatch, endpoint: str, node: str, code: int
+) -> None:
+    class There:
+        """robot1, which tells every status."""
+
+        def ask(self, node: str, _command: object) -> None:
+            raise AdapterError(f"{node} did not answer within 3 s") from TimeoutError()
+
+        def status(self) -> object:
+            return SimpleNamespace(node="robot1")
+
+    monkeypatch.setattr(ask, "_client", lambda _endpoint: There())
+    monkeypatch.setattr(ask, "_visit", lambda *_given: SimpleNamespace(is_guest=False, asker="ana"))
+    door, order = Door(socket=Path(), endpoint=endpoint, node=node), {"verb": "retry", "task": "merge", "by": "ana"}
+    if code == 0:
+        told = {"outcome": "unknown", "detail": f"{node} did not answer within 3 s", "revision": None}
+        assert ask_door(door, order) == told
+        return
+    with pytest.raises(CliError, match="passes on no command from elsewhere") as caught:
+        ask_door(door, order)
+    assert caught.value.code == code
+
+
 def test_where_systemd_has_the_unit_it_says_how_systemd_starts_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -134,3 +134,12 @@ def test_restart_that_is_refused_exits_with_1(daemon: Daemon) -> None:
     assert (text.exit_code, as_json.exit_code) == (1, 1)
     assert "echo on edge2: its worker does not run" in text.stderr
     assert faults(json.loads(as_json.stdout)) == []
+
+
+def test_restart_of_which_nobody_tells_the_end_may_have_been_done(daemon: Daemon) -> None:
+    daemon.result = {"outcome": "unknown", "detail": "edge2 did not answer within 3 s", "revision": None}
+    text, as_json = run("restart", "echo", "edge2", "--yes"), run("restart", "echo", "edge2", "--yes", "--json")
+    assert (text.exit_code, as_json.exit_code) == (5, 5)
+    told = "edge2 did not answer within 3 s; it may or may not start again, see `zsched logs echo edge2`"
+    assert f"echo on edge2: {told}" in text.stderr
+    assert faults(json.loads(as_json.stdout)) == []

@@ -33,11 +33,11 @@ from zsched.core.values.messages import (
     Accept,
     Accepted,
     AskDocument,
+    Asking,
     Ballots,
     Command,
     CommandOutcome,
     CommandResult,
-    ExplainTask,
     FleetAnswer,
     FleetQuestion,
     FleetTold,
@@ -441,7 +441,7 @@ class ControlBus:
             return ev.StatusAsked(request=self._questions.keep(query, keys.status(node, asker)))
         if kind == "command":
             command: Any = wire.decode(payload, *COMMANDS)
-            if not isinstance(command, ExplainTask | ReadLines | ReadHistory | ReadFleet | ReadRehearsals):
+            if not isinstance(command, Asking):
                 log.info("command=%s from=%s", type(command).__name__, asker)
                 asking = holder or self._holder_of(asker)
                 if asking is not None:

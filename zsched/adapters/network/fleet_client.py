@@ -1,7 +1,8 @@
 """Asks a fleet from a machine without a daemon: one session as a client, which hangs on the node at one endpoint.
 
 The node that a client hangs on passes its questions on to all nodes that it has a link to. For a moment after the
-session was opened it does not know yet who answers what, so a question that nobody answers is asked again.
+session was opened it does not know yet who answers what, so a question that nobody answers is asked again. An order is
+not, once somebody can have taken it: the first one may yet have its effect.
 
 Knows: zenoh sessions, the keys of status and commands. Does not know: what the answers mean.
 """
@@ -16,7 +17,7 @@ import zenoh
 from zsched.adapters.network.control_bus import Answer, answer_classes
 from zsched.adapters.network.seals import Seals
 from zsched.clock import monotonic_s
-from zsched.core.values.messages import ChangeFleet, Command
+from zsched.core.values.messages import Asking, Command
 from zsched.core.values.model import NodeId
 from zsched.core.values.snapshot import Snapshot
 from zsched.errors import AdapterError, WireError
@@ -26,10 +27,13 @@ from zsched.wire.keyspace import Keyspace
 from zsched.wire.seal import Act
 
 ANSWER_S = 3.0
-"""A question is asked again for this long, as a daemon waits for another node."""
+"""A question is asked again for this long, as a daemon waits for another node; so long an order is waited for."""
 ROUND_S = 1.0
-"""After which it is asked again; a command that changes something is not, for the first one may yet have its effect."""
+"""After which a question is asked again."""
 PAUSE_S = 0.1
+AT_ONCE_SHARE = 0.9
+"""zenoh ends a question at once where nobody is there to take it. One that lasted for this share of its time was taken,
+or may have been."""
 ANY_FLEET = "*"
 """The endpoint says which fleet is meant; its name need not be known."""
 
@@ -63,19 +67,29 @@ class FleetClient:
     def ask(self, node: NodeId | None, command: Command | None) -> Answer:
         """The status of a node, or its answer to a command; of the node at the endpoint when none is named.
 
+        A node that is given an order is asked for its status first: where it is silent, no order has left.
+
         Raises:
-            AdapterError: it did not answer in time, or something that this version does not read.
+            AdapterError: it did not answer in time, or something that this version does not read. With the cause
+                `TimeoutError` the order may have been taken, and nobody has told what became of it.
         """
+        is_order = command is not None and not isinstance(command, Asking)
         life = 0
-        if command is not None and (node is None or self._seals is not None):
+        if command is not None and (is_order or node is None or self._seals is not None):
             status = self.status(node)  # a command is signed for one life of the node that takes it
             node, life = status.node, status.incarnation
-        end = monotonic_s() + ANSWER_S
-        while monotonic_s() < end:
-            answer = self._ask_once(node, command, life)
+        within_s = ANSWER_S if is_order else ROUND_S
+        asked = end = monotonic_s()
+        end += ANSWER_S
+        while asked < end:
+            answer = self._ask_once(node, command, life, within_s)
             if answer is not None:
                 return answer
+            if is_order and monotonic_s() - asked >= AT_ONCE_SHARE * within_s:
+                silence = TimeoutError(f"after {within_s:g} s")
+                raise AdapterError(f"{node} did not answer within {within_s:g} s") from silence
             time.sleep(PAUSE_S)
+            asked = monotonic_s()
         who = node or f"the node at {self._endpoint}"
         raise AdapterError(f"{who} did not answer within {ANSWER_S:g} s; is that a node's control endpoint?")
 
@@ -85,7 +99,7 @@ class FleetClient:
         assert isinstance(status, Snapshot)
         return status
 
-    def _ask_once(self, node: NodeId | None, command: Command | None, life: int) -> Answer | None:
+    def _ask_once(self, node: NodeId | None, command: Command | None, life: int, within_s: float) -> Answer | None:
         keys, whom = self._keys, node or "*"
         key = keys.status(whom, self._asker) if command is None else keys.command(whom, self._asker)
         payload, attachment = None if command is None else wire.encode(command), None
@@ -97,7 +111,7 @@ class FleetClient:
             attachment=attachment,
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=ANSWER_S if isinstance(command, ChangeFleet) else ROUND_S,
+            timeout=within_s,
         )
         here = {str(zid) for zid in (*self._session.info.peers_zid(), *self._session.info.routers_zid())}
         for reply in replies:

@@ -516,6 +516,8 @@ Command = (
 COMMANDS: tuple[type, ...] = get_args(Command)
 Ordered = SetWeights | Strike | KeepRehearsal | RetryTask | RestartTask | MoveTask | HoldTask | TuneTask | ChangeFleet
 """Commands that carry who gives them (``asked``)."""
+Asking = ExplainTask | ReadLines | ReadHistory | ReadFleet | ReadRehearsals
+"""Commands that only ask: given twice they change nothing."""
 
 
 def asked_by(name: str, command: Ordered) -> Command:
