@@ -315,6 +315,7 @@ class Daemon:
             relay=relay,
             bus=bus,
             access=access,
+            desk=desk,
             sampler=sampler,
             compare_sessions=self._watch.note,
             post=self._inbox.post,

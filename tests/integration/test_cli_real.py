@@ -82,9 +82,9 @@ class Site:
         raise AssertionError(f"no owner within {UP_S:g} s\n{self.log()}")
 
 
-def sites(folder: Path, robots: int = 1, edges: int = 0) -> list[Site]:
+def sites(folder: Path, robots: int = 1, edges: int = 0, timing: str = "wifi") -> list[Site]:
     """The machines of a fleet whose daemons share no folder, so that no socket but its own is at hand."""
-    tree = echo_fleet(robots=robots, edges=edges)
+    tree = echo_fleet(robots=robots, edges=edges, timing=timing)
     file = folder / "fleet.yaml"
     file.write_text(json.dumps(tree))
     found = []
@@ -226,6 +226,23 @@ def test_up_with_faults_in_the_fleet_file_ends_with_78_and_names_them(tmp_path: 
 
 
 # --- more than one node ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("is_elsewhere", [False, True], ids=["here", "connect"])
+def test_an_order_without_a_quorum_is_told_so_by_the_slowest_timing(tmp_path: Path, *, is_elsewhere: bool) -> None:
+    """Its round goes on for 6 s; it is no loop that hangs, and no daemon that is not there."""
+    here = sites(tmp_path, robots=3, timing="wan")[0]
+    assert here.zsched("init").returncode == 0
+    endpoint = json.loads(here.file.read_text())["nodes"][here.node]["listen"]["control"]
+    with here.up():
+        end = time.monotonic() + UP_S
+        while not (status := here.status()):
+            assert time.monotonic() < end, here.log()
+        assert (status["quorum"]["this_node"], status["quorum"]["ok"]) == ("elector", False)
+        refused = here.zsched("pause", "echo", "--yes", *(("--connect", endpoint) if is_elsewhere else ()))
+    assert refused.returncode == 4, refused.stderr
+    assert "echo: no quorum: " in refused.stderr
+    assert "nothing was changed" in refused.stderr
 
 
 def look_from_a_machine_without_a_daemon(folder: Path, here: Site, there: Site) -> None:

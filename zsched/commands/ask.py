@@ -54,6 +54,10 @@ READS = frozenset({"access", "explain", "fleet", "history", "lines", "log", "reh
 """Asked twice they change nothing."""
 ASK_TIMEOUT_S = 5.0
 """Above the daemon's own limits (3 s for its loop, 3 s for another node), so that their reasons arrive."""
+AGREED = frozenset({"change", "hold", "move", "tune", "weights"})
+"""Orders whose end comes when the electors have agreed, or cannot."""
+ORDER_TIMEOUT_S = 62.0
+"""Above a daemon's own limit for these by any fleet's timing (60 s): one that answers nothing then is frozen."""
 
 
 class Door(Struct, frozen=True, kw_only=True):
@@ -291,8 +295,8 @@ def _through(sockets: Sequence[Path], node: str) -> Door:
     raise failures[0]
 
 
-def ask_door(door: Door, request: Json, timeout_s: float = ASK_TIMEOUT_S) -> Json:
-    """The daemon's answer to ``request``.
+def ask_door(door: Door, request: Json) -> Json:
+    """The daemon's answer to ``request``; the outcome ``unknown`` of an order that may or may not have been done.
 
     Raises:
         CliError: nobody answers (3), not in time (5), or the daemon refuses (1).
@@ -302,9 +306,9 @@ def ask_door(door: Door, request: Json, timeout_s: float = ASK_TIMEOUT_S) -> Jso
     if door.node is not None:
         request = {**request, "node": door.node}
     try:
-        answer = _asked(door, request, timeout_s)
+        answer = _asked(door, request, ORDER_TIMEOUT_S if request["verb"] in AGREED else ASK_TIMEOUT_S)
     except AdapterError as error:
-        raise _unanswered(door, error) from error
+        raise _unanswered(door, error, is_order=request["verb"] not in READS) from error
     if "error" not in answer:
         return answer
     text = str(answer["error"])
@@ -576,9 +580,10 @@ def operator_at(door: Door) -> str:
     return _visit(door.endpoint, door.cell).operator if door.endpoint else ""
 
 
-def _unanswered(door: Door, error: AdapterError) -> CliError:
+def _unanswered(door: Door, error: AdapterError, *, is_order: bool) -> CliError:
     if isinstance(error.__cause__, TimeoutError):
-        return CliError(EXIT_TIMED_OUT, str(error))
+        unsure = ". What was ordered may or may not have been done: `zsched status` shows it then" if is_order else ""
+        return CliError(EXIT_TIMED_OUT, f"{error}{unsure}")
     if isinstance(error.__cause__, PermissionError):
         advice = f"run this as root{_group_of(door.socket)}"
         return CliError(EXIT_UNREACHABLE, f"may not open {door.socket} (permission denied); {advice}")

@@ -139,7 +139,7 @@ def change(door: Door, what: Json) -> Json:
         ConflictError: the fleet is at another revision than the change's base.
         CliError: nobody answers, or the change did not come about (1, 4, 5).
     """
-    answer = ask_door(door, {"verb": "change", **what}, timeout_s=IN_FORCE_S)
+    answer = ask_door(door, {"verb": "change", **what})
     outcome, detail = str(answer["outcome"]), str(answer["detail"])
     if outcome in ("ok", "unchanged"):
         return answer

@@ -84,6 +84,7 @@ def build_snapshot(node: Stages, now: float) -> Snapshot:
         dropped_ages=tuple(sorted((name, now - at) for name, at in node.dropped_at.items())),
         refused=node.refused_keys.told(node.fleet, now),
         security=node.security,
+        order_s=node.fleet.timing.order_s,
         problems=(
             *node.namesakes.problems(now),
             *_problems(node, quorum, now),

@@ -21,6 +21,7 @@ from zsched.core.values.struct import Struct, field
 from zsched.runtime.access import StreamAccess
 from zsched.runtime.access_rules import names_of
 from zsched.runtime.crew import Crew
+from zsched.runtime.desk import Desk
 from zsched.runtime.endpoints import Endpoints, endpoints_for
 from zsched.runtime.recipes import Recipes
 from zsched.runtime.restarts import moved, opens_anew, restarts, waits_for
@@ -46,6 +47,7 @@ class Adoption(Struct, kw_only=True):
     relay: RelayHandle
     bus: ControlBus
     access: StreamAccess
+    desk: Desk
     post: Callable[[ev.Event], None]
     sampler: Sampler
     compare_sessions: Callable[[bool, tuple[NodeId, ...]], None]
@@ -53,7 +55,8 @@ class Adoption(Struct, kw_only=True):
     _watches: dict[TaskId, WorkerWatch | None] = field(default_factory=dict)
 
     def begin(self) -> None:
-        """Tell the relay what it watches by the file that the daemon starts with."""
+        """Tell the relay what it watches, and the desk how long it waits, by the file that the daemon starts with."""
+        self.desk.adopt(self.started_with.timing)
         self._tell_watches(self.started_with)
 
     def adopt(self, fleet: Fleet, is_agreed: bool = False) -> None:
@@ -75,6 +78,7 @@ class Adoption(Struct, kw_only=True):
         self.supervisor.adopt(self.recipes.specs)
         self.crew.keep(self.recipes.specs)
         self.access.adopt(fleet)
+        self.desk.adopt(fleet.timing)
         is_exclusive = any(task.exclusive for task in fleet.tasks)
         self.sampler.adopt(fleet.node(self.me), fleet.timing.sample_s, is_watched=is_exclusive)
         self.bus.know(names_of(fleet))

@@ -18,8 +18,11 @@ from zsched.core import events as ev
 from zsched.core.report import plain, snapshot_json
 from zsched.core.values.decision import Decision, Explanation
 from zsched.core.values.document import Document, Flag, Rollout, Text
+from zsched.core.values.fleet import Timing
 from zsched.core.values.gauges import GAUGES
 from zsched.core.values.messages import (
+    Agreed,
+    Asking,
     ChangeFleet,
     Command,
     CommandOutcome,
@@ -50,6 +53,7 @@ from zsched.runtime.inbox import Inbox
 from zsched.wire import codec as wire
 
 ANSWER_TIMEOUT_S = 3.0
+"""For the answer to a question, and for the end of an order that a node knows at once."""
 LOCAL_REQUESTS_FROM = 1 << 40
 """Numbers of questions that came over the operator socket; smaller ones came over the bus."""
 
@@ -75,6 +79,11 @@ class Desk:
         self._numbers = itertools.count(LOCAL_REQUESTS_FROM)
         self._waiting: dict[int, queue.SimpleQueue[object]] = {}
         self._lock = threading.Lock()
+        self._order_s = Timing().order_s
+
+    def adopt(self, timing: Timing) -> None:
+        """Go by the clocks of the fleet that is in force from now on; any thread."""
+        self._order_s = timing.order_s
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
         """Answer one request of the socket (``status``, ``explain``, ``log``, ``weights``, ...).
@@ -107,10 +116,14 @@ class Desk:
         return {"error": f"unknown verb {verb!r:.80}; known: {known}"}
 
     def _ask(self, node: NodeId, command: Command | None) -> dict[str, Any]:
+        within_s = self._order_s if isinstance(command, Agreed) else ANSWER_TIMEOUT_S
+        is_order = command is not None and not isinstance(command, Asking)
         if node != self._node:
             try:
-                return answer_json(self._bus.ask_node(node, command))
+                return answer_json(self._bus.ask_node(node, command, within_s))
             except AdapterError as error:
+                if is_order and isinstance(error.__cause__, TimeoutError):
+                    return answer_json(unknown(f"{node} did not answer within {within_s:g} s"))
                 return {"error": str(error)}
         number = next(self._numbers)
         slot: queue.SimpleQueue[object] = queue.SimpleQueue()
@@ -120,9 +133,10 @@ class Desk:
             ev.StatusAsked(request=number) if command is None else ev.commanded(number, command, is_near=True)
         )
         try:
-            return answer_json(slot.get(timeout=ANSWER_TIMEOUT_S))
+            return answer_json(slot.get(timeout=within_s))
         except queue.Empty:
-            return {"error": f"the decision loop of {self._node} did not answer within {ANSWER_TIMEOUT_S:g} s"}
+            why = f"the decision loop of {self._node} did not answer within {within_s:g} s"
+            return answer_json(unknown(why)) if is_order else {"error": why}
         finally:
             with self._lock:
                 self._waiting.pop(number, None)

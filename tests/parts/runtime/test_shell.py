@@ -25,14 +25,16 @@ from zsched.adapters.host.state_file import StateFile
 from zsched.adapters.workers.kept_lines import KeptLines
 from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
 from zsched.commands.history import moves_of
+from zsched.config.timing import WAN
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.electorate.founding import founded
 from zsched.core.relay_protocol import RelayStarted, WorkerSeen
+from zsched.core.values import fleet as fleet_values
 from zsched.core.values.decision import Explanation, Move
 from zsched.core.values.document import Document, Flag, FlagKind, Text
 from zsched.core.values.durable import DurableState
-from zsched.core.values.fleet import Fleet, WorkerSpec
+from zsched.core.values.fleet import Fleet, Timing, WorkerSpec
 from zsched.core.values.messages import (
     Accept,
     Accepted,
@@ -430,7 +432,8 @@ def test_an_order_becomes_the_event_that_says_all_of_it() -> None:
 def test_a_program_on_this_machine_orders_in_no_operator_s_and_no_other_node_s_name(
     house: House, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("zsched.runtime.desk.ANSWER_TIMEOUT_S", 0.001)
+    monkeypatch.setattr(fleet_values, "LEAST_ORDER_S", 0.001)
+    house.desk.adopt(Timing(ballot_s=0.01))
     for said, told in (
         ({"by": "ada@robot1"}, "ada@robot1"),
         ({"by": "ana.operator"}, "ana.operator@robot1"),
@@ -607,17 +610,42 @@ def test_desk_gives_up_on_a_loop_that_does_not_answer(house: House, monkeypatch:
     assert house.events() == []
 
 
+def test_an_order_that_the_loop_tells_no_end_of_may_have_been_carried_out(
+    house: House, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fleet_values, "LEAST_ORDER_S", 0.001)
+    monkeypatch.setattr("zsched.runtime.desk.ANSWER_TIMEOUT_S", 0.05)
+    house.desk.adopt(Timing(ballot_s=0.01))
+    why = "the decision loop of robot1 did not answer within"
+    for order, within_s in (
+        ({"verb": "hold", "task": "merge", "hold": "pause", "by": "ada@robot1"}, 0.14),
+        ({"verb": "restart", "task": "merge"}, 0.05),
+    ):
+        told = house.desk.answer(order)
+        assert told == {"outcome": "unknown", "detail": f"{why} {within_s:g} s", "revision": None}
+
+
 def test_desk_asks_other_nodes_over_the_bus_and_hands_its_errors_on(house: House) -> None:
-    def ask_node(node: str, command: SetWeights | None) -> CommandResult:
-        if node == "edge2":
-            raise AdapterError("edge2 did not answer within 3 s; is it up and reachable?")
-        assert command is not None
-        return RESULT
+    waited: list[float] = []
+
+    def ask_node(node: str, command: SetWeights | None, within_s: float) -> CommandResult:
+        waited.append(within_s)
+        if node == "edge1":
+            assert command is not None
+            return RESULT
+        silence = TimeoutError() if node == "edge3" else None
+        raise AdapterError(f"{node} did not answer within {within_s:g} s; is it up and reachable?") from silence
 
     house.desk._bus = SimpleNamespace(ask_node=ask_node)  # type: ignore[assignment]
+    house.desk.adopt(WAN)
     weights = {"verb": "weights", "task": "merge", "cpu": 1, "memory": 0, "network": 0}
     assert house.desk.answer({**weights, "node": "edge1"})["outcome"] == "ok"
-    assert "edge2 did not answer" in house.desk.answer({"verb": "status", "node": "edge2"})["error"]
+    for node in ("edge2", "edge3"):
+        assert f"{node} did not answer" in house.desk.answer({"verb": "status", "node": node})["error"]
+    assert "edge2 did not answer" in house.desk.answer({**weights, "node": "edge2"})["error"], "nobody has taken it"
+    unsure = {"outcome": "unknown", "detail": "edge3 did not answer within 14 s", "revision": None}
+    assert house.desk.answer({**weights, "node": "edge3"}) == unsure
+    assert waited == [14.0, 3.0, 3.0, 14.0, 14.0], "a question has 3 s, and an order what the fleet's timing gives it"
     assert house.events() == [], "the loop is not asked for another node"
 
 

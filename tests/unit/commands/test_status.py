@@ -20,10 +20,12 @@ from typer.testing import CliRunner, Result
 from support.recorded_daemon import Daemon
 from support.schemas import faults
 from zsched.cli import app
+from zsched.commands import ask
 from zsched.commands.ask import ask_door, find_door
 from zsched.commands.common import CliError
 from zsched.commands.report import render_status
 from zsched.commands.status import _fitted
+from zsched.core.values.fleet import MOST_ORDER_S
 
 CLI = (sys.executable, "-m", "zsched.cli")
 RECORDED = Path(__file__).parent / "recorded_status"
@@ -108,11 +110,26 @@ def test_status_of_a_wedged_loop_exits_with_5(daemon: Daemon) -> None:
     assert run("status").exit_code == 5
 
 
-def test_daemon_that_does_not_answer_in_time_is_told_from_one_that_is_not_there(daemon: Daemon, folder: Path) -> None:
+def test_daemon_that_does_not_answer_in_time_is_told_from_one_that_is_not_there(
+    daemon: Daemon, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     daemon.delay_s = 0.5
-    with pytest.raises(CliError, match=r"did not answer within 0\.1 s") as raised:
-        ask_door(find_door(folder, None), {"verb": "status"}, timeout_s=0.1)
-    assert raised.value.code == 5
+    monkeypatch.setattr(ask, "ASK_TIMEOUT_S", 0.1)
+    door, order = find_door(folder, None), {"verb": "retry", "task": "echo"}
+    for request, is_unsure in (({"verb": "status"}, False), (order, True)):
+        with pytest.raises(CliError, match=r"did not answer within 0\.1 s") as raised:
+            ask_door(door, request)
+        assert raised.value.code == 5
+        assert ("may or may not have been done" in str(raised.value)) == is_unsure
+
+
+def test_an_order_that_is_agreed_is_waited_for_until_the_daemon_tells_its_end(
+    daemon: Daemon, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert ask.ORDER_TIMEOUT_S > MOST_ORDER_S, "whatever the fleet's timing"
+    daemon.delay_s = 0.5
+    monkeypatch.setattr(ask, "ASK_TIMEOUT_S", 0.1)
+    assert ask_door(find_door(folder, None), {"verb": "weights", "task": "echo"})["outcome"] == "ok"
 
 
 def test_status_of_another_major_version_is_refused_with_advice(daemon: Daemon) -> None:

@@ -806,6 +806,11 @@ def test_what_was_missed_has_an_age_and_what_a_rule_wants_has_none() -> None:
         assert ages == [None, None if not lost else {110.0: 5.0, 120.0: 15.0, 130.0: 5.0}[now]]
 
 
+def test_a_node_tells_how_long_it_waits_for_the_end_of_an_order() -> None:
+    node = make()
+    assert build_snapshot(node, 100.0).order_s == node.fleet.timing.order_s > 0.0
+
+
 def test_drops_have_an_age_and_an_input_its_way_in() -> None:
     node = make()
     node.joins_at = ("tcp/127.0.0.1:7458",)

@@ -20,7 +20,7 @@ import zenoh
 
 from zsched.adapters.network import seals as sealing
 from zsched.adapters.network.limits import Buckets, Drops, Limit, Names
-from zsched.adapters.network.open_questions import Questions
+from zsched.adapters.network.open_questions import QUESTION_TTL_S, Questions
 from zsched.adapters.network.seals import Seals
 from zsched.clock import monotonic_s
 from zsched.core import events as ev
@@ -28,6 +28,7 @@ from zsched.core.events import commanded
 from zsched.core.values.beat import Beat
 from zsched.core.values.certificates import Holder, Role, parse_common_name
 from zsched.core.values.decision import Explanation
+from zsched.core.values.fleet import MOST_ORDER_S
 from zsched.core.values.messages import (
     COMMANDS,
     Accept,
@@ -72,8 +73,12 @@ from zsched.wire import codec as wire
 from zsched.wire.keyspace import Keyspace, ParsedKey, counter, parse
 from zsched.wire.seal import Act
 
-OPERATOR_TIMEOUT_S = 3.0
 CLOSE_S = 0.5
+COMMAND_TTL_S = MOST_ORDER_S + QUESTION_TTL_S
+"""An operator's command is kept for longer than anybody waits for its end."""
+AT_ONCE_SHARE = 0.9
+"""zenoh ends a question at once where nobody is there to take it. One that lasted for this share of its time was taken,
+or may have been."""
 RING = 1024
 """Periodic frames that wait for the loop; if it does not come, the oldest go, and zenoh need not wait."""
 
@@ -448,7 +453,7 @@ class ControlBus:
                     command = signed_by(asking, command)
                 if holder is not None:
                     self._post(ev.Commanded(by=holder.label, what=type(command).__name__, task=task_of(command)))
-            return commanded(self._questions.keep(query, keys.command(node, asker)), command)
+            return commanded(self._questions.keep(query, keys.command(node, asker), COMMAND_TTL_S), command)
         raise WireError("key", "unknown kind")
 
     # --- what goes out (the loop) ------------------------------------------------------------------------------------
@@ -640,11 +645,14 @@ class ControlBus:
 
     # --- for operators (a thread of their own) -----------------------------------------------------------------------
 
-    def ask_node(self, node: NodeId, command: Command | None) -> Answer:
-        """Ask another node for its status or an answer, or give it a command; blocks up to 3 s, never in the loop.
+    def ask_node(self, node: NodeId, command: Command | None, within_s: float) -> Answer:
+        """Ask another node for its status or an answer, or give it a command; blocks up to ``within_s``.
+
+        Never in the loop.
 
         Raises:
-            AdapterError: it did not answer.
+            AdapterError: it did not answer. With the cause `TimeoutError` it may have taken the command; without one,
+                nobody was there to take it.
         """
         if self._session is None:
             raise AdapterError("the control session is closed")
@@ -656,12 +664,13 @@ class ControlBus:
         attachment = None
         if self._seals is not None and payload is not None:
             attachment = self._seals.seal(Act.QUESTION, selector, payload, life=self._lives.get(node, 0))
+        asked = monotonic_s()
         for reply in self._session.get(
             selector,
             payload=payload,
             attachment=attachment,
             consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=OPERATOR_TIMEOUT_S,
+            timeout=within_s,
         ):
             if reply.ok is None:
                 continue
@@ -670,4 +679,5 @@ class ControlBus:
             except WireError as error:
                 raise AdapterError(f"{node} answered something else ({error}); is it another version?") from error
             return answer
-        raise AdapterError(f"{node} did not answer within {OPERATOR_TIMEOUT_S:g} s; is it up and reachable?")
+        silence = TimeoutError() if monotonic_s() - asked >= AT_ONCE_SHARE * within_s else None
+        raise AdapterError(f"{node} did not answer within {within_s:g} s; is it up and reachable?") from silence

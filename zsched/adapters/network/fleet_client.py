@@ -14,10 +14,11 @@ import time
 
 import zenoh
 
-from zsched.adapters.network.control_bus import Answer, answer_classes
+from zsched.adapters.network.control_bus import AT_ONCE_SHARE, Answer, answer_classes
 from zsched.adapters.network.seals import Seals
 from zsched.clock import monotonic_s
-from zsched.core.values.messages import Asking, Command
+from zsched.core.values.fleet import MOST_ORDER_S
+from zsched.core.values.messages import Agreed, Asking, Command
 from zsched.core.values.model import NodeId
 from zsched.core.values.snapshot import Snapshot
 from zsched.errors import AdapterError, WireError
@@ -27,13 +28,11 @@ from zsched.wire.keyspace import Keyspace
 from zsched.wire.seal import Act
 
 ANSWER_S = 3.0
-"""A question is asked again for this long, as a daemon waits for another node; so long an order is waited for."""
+"""A question is asked again for this long, as a daemon waits for another node. So long the end of an order is waited
+for that a node knows at once; of one that is agreed, for as long as the node that takes it waits."""
 ROUND_S = 1.0
 """After which a question is asked again."""
 PAUSE_S = 0.1
-AT_ONCE_SHARE = 0.9
-"""zenoh ends a question at once where nobody is there to take it. One that lasted for this share of its time was taken,
-or may have been."""
 ANY_FLEET = "*"
 """The endpoint says which fleet is meant; its name need not be known."""
 
@@ -74,20 +73,20 @@ class FleetClient:
                 `TimeoutError` the order may have been taken, and nobody has told what became of it.
         """
         is_order = command is not None and not isinstance(command, Asking)
-        life = 0
+        life, within_s = 0, ANSWER_S if is_order else ROUND_S
         if command is not None and (is_order or node is None or self._seals is not None):
             status = self.status(node)  # a command is signed for one life of the node that takes it
             node, life = status.node, status.incarnation
-        within_s = ANSWER_S if is_order else ROUND_S
-        asked = end = monotonic_s()
-        end += ANSWER_S
+            if isinstance(command, Agreed):
+                within_s = max(within_s, min(status.order_s, MOST_ORDER_S))
+        asked = monotonic_s()
+        end = asked + ANSWER_S
         while asked < end:
             answer = self._ask_once(node, command, life, within_s)
             if answer is not None:
                 return answer
             if is_order and monotonic_s() - asked >= AT_ONCE_SHARE * within_s:
-                silence = TimeoutError(f"after {within_s:g} s")
-                raise AdapterError(f"{node} did not answer within {within_s:g} s") from silence
+                raise AdapterError(f"{node} did not answer within {within_s:g} s") from TimeoutError()
             time.sleep(PAUSE_S)
             asked = monotonic_s()
         who = node or f"the node at {self._endpoint}"

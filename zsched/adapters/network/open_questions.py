@@ -31,15 +31,16 @@ class Questions:
         self._seal = seal
         self._numbers = itertools.count(1)
         self._open: dict[int, tuple[zenoh.Query, str, float]] = {}
+        """{number: (the query, the answer's key, until when it is kept)}."""
         self._lock = threading.Lock()
 
-    def keep(self, query: zenoh.Query, reply_key: str) -> int:
-        """Remember a query; the oldest ones are dropped when there are too many or they are too old."""
+    def keep(self, query: zenoh.Query, reply_key: str, ttl_s: float = QUESTION_TTL_S) -> int:
+        """Remember a query for ``ttl_s``; the oldest are dropped when there are too many, and those too old."""
         now = monotonic_s()
         with self._lock:
             number = next(self._numbers)
-            self._open[number] = (query, reply_key, now)
-            expired = [n for n, (_, _, at) in self._open.items() if now - at > QUESTION_TTL_S]
+            self._open[number] = (query, reply_key, now + ttl_s)
+            expired = [n for n, (_, _, until) in self._open.items() if now > until]
             expired += list(self._open)[: max(len(self._open) - MAX_QUESTIONS, 0)]
             dropped = [self._open.pop(n)[0] for n in expired if n in self._open]
         for old in dropped:

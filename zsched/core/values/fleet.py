@@ -52,6 +52,11 @@ DEFAULT_FORESEE_S = 3.0
 """How far ahead the signals of a task count when its fleet file does not say."""
 FEWEST_SIGNS, MOST_SIGNS = 3, 4
 """Of life in a lease of data sessions; `zsched.config.timing` keeps ``lease_s`` short enough for the latter."""
+LEAST_ORDER_S, MOST_ORDER_S = 3.0, 60.0
+"""The end of an operator's order is waited for at least and at most this long, by whatever timing."""
+ORDER_BALLOTS = 14.0
+"""And for so many times ``ballot_s``: a round is given up 6 of them after it began, and its last phase may take one
+more; a round that is under way is waited for first."""
 SECONDS = Range(0.01, 3600, "s")
 DBM = Range(RSSI_MIN_DBM, RSSI_MAX_DBM, "dBm")
 
@@ -318,6 +323,11 @@ class Timing:
         """
         is_second = self.zenoh_lease_s >= self.suspect_s
         return max(self.zenoh_lease_s, 2 * self.suspect_s) if is_second else self.zenoh_lease_s
+
+    @property
+    def order_s(self) -> float:
+        """How long a node that takes an operator's order waits for its end (agreed, or not), 3 to 60 s."""
+        return min(max(LEAST_ORDER_S, ORDER_BALLOTS * self.ballot_s), MOST_ORDER_S)
 
     @property
     def data_signs(self) -> int:

@@ -518,6 +518,8 @@ Ordered = SetWeights | Strike | KeepRehearsal | RetryTask | RestartTask | MoveTa
 """Commands that carry who gives them (``asked``)."""
 Asking = ExplainTask | ReadLines | ReadHistory | ReadFleet | ReadRehearsals
 """Commands that only ask: given twice they change nothing."""
+Agreed = SetWeights | MoveTask | HoldTask | TuneTask | ChangeFleet
+"""Orders whose end comes when the electors have agreed, or cannot. A node knows the end of the others at once."""
 
 
 def asked_by(name: str, command: Ordered) -> Command:

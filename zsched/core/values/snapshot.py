@@ -246,3 +246,6 @@ class Snapshot(Struct, frozen=True, kw_only=True):
     """Who dials with a certificate of this fleet and is not let in, and what to do; no problem of the fleet."""
     security: str = ""
     """How the answering node's sessions are let in to (`Exposure`); empty: an older version, which does not tell."""
+    order_s: float = 0.0
+    """How long the answering node waits for the end of an operator's order, by its fleet's timing; 0: an older
+    version, which waits 3 s."""

@@ -167,7 +167,7 @@ def test_closed_bus_takes_calls_and_does_nothing() -> None:
     bus.answer(1, beat_of("parent"))
     assert bus.peers() == 0
     with pytest.raises(AdapterError, match="closed"):
-        bus.ask_node("child", None)
+        bus.ask_node("child", None, 0.1)
 
 
 def test_taken_port_is_an_error_that_says_so(parent: Parent) -> None:

@@ -14,9 +14,10 @@ from zsched.adapters.network.control_bus import ControlBus
 from zsched.adapters.network.fleet_client import FleetClient
 from zsched.core import events as ev
 from zsched.core.values.fleet import Timing
-from zsched.core.values.messages import CommandOutcome, CommandResult, MoveTask
+from zsched.core.values.messages import CommandOutcome, CommandResult, MoveTask, RestartTask
 from zsched.core.values.model import Asked
 from zsched.core.values.snapshot import SCHEMA, QuorumStatus, Snapshot
+from zsched.core.values.struct import replace
 from zsched.errors import AdapterError
 from zsched.sessions.config import client_config, control_config
 
@@ -43,6 +44,7 @@ class There:
     def __init__(self) -> None:
         self.endpoint = free_endpoint()
         self.orders: list[ev.MoveCommanded] = []
+        self.status = SNAPSHOT
         self.asked = 0
         self.is_deaf = False
         """To questions for its status."""
@@ -53,7 +55,7 @@ class There:
         if isinstance(event, ev.StatusAsked):
             self.asked += 1
             if not self.is_deaf:
-                self.bus.answer(event.request, SNAPSHOT)
+                self.bus.answer(event.request, self.status)
         elif isinstance(event, ev.MoveCommanded):
             self.orders.append(event)
 
@@ -102,6 +104,18 @@ def test_an_order_that_nobody_tells_the_end_of_may_have_been_carried_out(
         client.ask("b", MOVE)
     assert isinstance(silent.value.__cause__, TimeoutError)
     assert len(there.orders) == 1
+
+
+def test_an_order_that_is_agreed_is_waited_for_as_long_as_its_node_waits(
+    there: There, client: FleetClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fleet_client, "ANSWER_S", 1.0)
+    monkeypatch.setattr(fleet_client, "ROUND_S", 0.3)
+    there.status = replace(SNAPSHOT, order_s=2.0)
+    with pytest.raises(AdapterError, match=r"^b did not answer within 2 s$"):
+        client.ask("b", MOVE)
+    with pytest.raises(AdapterError, match=r"^b did not answer within 1 s$"):
+        client.ask("b", RestartTask(task="merge"))  # a node knows at once what becomes of it
 
 
 def test_a_node_that_is_silent_is_given_no_order_and_its_status_is_asked_for_again(

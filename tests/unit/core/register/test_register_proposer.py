@@ -29,10 +29,12 @@ from support.registers import (
     promise_all,
     promised,
 )
+from zsched.config.timing import PROFILES
 from zsched.core.register.register import FROM_A_PEER, MAX_QUEUED, MAX_REVISION
 from zsched.core.register.task_register import TaskRegister
 from zsched.core.values.change import MoveOwner, Retune, RoundOutcome
 from zsched.core.values.electorate import Elector, Electorate
+from zsched.core.values.fleet import Timing
 from zsched.core.values.messages import Accepted, Promise, Refusal, Refused
 from zsched.core.values.model import Acceptance, Allocation
 
@@ -232,6 +234,22 @@ def test_no_majority_gives_up_as_no_quorum() -> None:
         ends.append(step.finished)
     assert ends[-1] == (FIRST, RoundOutcome.NO_QUORUM)
     assert ends[:-1] == [None] * (len(ends) - 1)
+
+
+@pytest.mark.parametrize("timing", PROFILES.values(), ids=list(PROFILES))
+def test_two_changes_without_a_majority_end_while_an_operator_still_waits(timing: Timing) -> None:
+    """The second one waits for the first, and its operator is told 'no quorum', and not that a loop hangs."""
+    register, second = make(), replace(FIRST, owner="e2")
+    register.adopt(INITIAL, ballot_s=timing.ballot_s, stagger_s=timing.stagger_s)
+    did(register.propose, FIRST, 0.0)
+    did(register.propose, second, 0.0)
+    ends: list[object] = []
+    now = 0.0
+    while register.is_busy:
+        now = register.next_deadline()
+        ends += did(register.tick, now).ends
+    assert ends == [(FIRST, RoundOutcome.NO_QUORUM), (second, RoundOutcome.NO_QUORUM)]
+    assert now < timing.order_s
 
 
 def test_refused_by_a_majority_tries_above_the_promised_counter() -> None:

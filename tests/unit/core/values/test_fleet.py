@@ -58,6 +58,11 @@ def test_defaults_are_the_design_s_first_ones() -> None:
     assert WorkerSpec().command == ()
 
 
+@pytest.mark.parametrize(("ballot_s", "order_s"), [(0.01, 3.0), (0.3, 4.2), (1.0, 14.0), (3600.0, 60.0)])
+def test_an_order_is_waited_for_by_the_fleet_s_timing_within_bounds(ballot_s: float, order_s: float) -> None:
+    assert Timing(ballot_s=ballot_s).order_s == pytest.approx(order_s)
+
+
 def test_voters_are_the_robots_only() -> None:
     assert FLEET.voters == ("robot1", "robot2")
 
