@@ -495,12 +495,14 @@ def _write(folder: Path, issued: Issued) -> None:
         write_whole(folder / TRUSTED, issued.trusted, PUBLIC)
         write_whole(folder / CERTIFICATE, issued.certificate, PUBLIC)
     except OSError as error:
-        raise AdapterError(
-            f"{folder}: cannot be written: {error.strerror}; the authority has recorded {issued.entry.label}: "
-            f"`zsched pki revoke {issued.entry.label}`, then again"
+        label = issued.entry.label
+        again = (
+            f"the authority has recorded {label}: `zsched pki revoke {label}`, then again"
             if issued.key
-            else f"{folder}: cannot be written: {error.strerror}"
-        ) from error
+            else f"the authority has recorded the certificate, so it is not due any more: `zsched pki renew {label}` "
+            "writes it again"
+        )
+        raise AdapterError(f"{folder}: cannot be written: {error.strerror}; {again}") from error
 
 
 def _request(path: Path | None) -> bytes:

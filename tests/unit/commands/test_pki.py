@@ -140,6 +140,20 @@ def test_renew_takes_what_is_due_or_one_by_name_and_makes_no_key(here: Path) -> 
     assert sorted(path.name for path in (here / "robot1").iterdir()) == ["ca.pem", "certificate.pem"]
 
 
+def test_a_certificate_that_cannot_be_written_is_written_by_its_name(here: Path) -> None:
+    """The authority has recorded it, and takes it for renewed."""
+    pki("init")
+    pki("issue", "robot1", "--out", "first")
+    pki("rotate")
+    (here / "robot1").write_text("no folder")
+    failed = " ".join(pki("renew", code=1).stderr.split())
+    assert "robot1: cannot be written: " in failed
+    assert "so it is not due any more: `zsched pki renew robot1` writes it again" in failed
+    assert pki("renew").stdout == "no certificate is due\n"
+    (here / "robot1").unlink()
+    assert "robot1: certificate.pem" in pki("renew", "robot1").stdout
+
+
 def test_what_is_due_is_sent_to_the_nodes_and_so_is_what_a_node_has_missed(
     here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
