@@ -92,9 +92,11 @@ def issue(where: Where, name: str, role: Role, request: Path | None, out: Path |
     """
     with _opened(where) as (office, authority):
         hosts = _check_name(office.fleet, name, role)
-        _check_free(out, office.fleet.name, Holder(name=name, role=role), makes_key=request is None)
-        issued = authority.issue(name, role, hosts, _request(request), _passphrase(authority), _now())
-        folder = out or Path(issued.entry.label)
+        asked, now = _request(request), _now()
+        holder = authority.next_holder(name, role, asked, now)
+        folder = out or Path(holder.label)
+        _check_free(folder, office.fleet.name, holder, makes_key=request is None)
+        issued = authority.issue(name, role, hosts, asked, _passphrase(authority), now)
         _write(folder, issued)
     files = f"{CERTIFICATE}, {TRUSTED}" + (f", {KEY}" if issued.key else "")
     _say(f"{folder}: {files} of {issued.entry.label}, until {_day(issued.entry)}")
@@ -217,12 +219,11 @@ def renew(where: Where, label: str | None, request: Path | None, out: Path | Non
         labels = [one.label for one in live if one.is_due(now, authority.record.number)] if label is None else [label]
         hosts = {node.name: (node.host,) if node.host else () for node in office.fleet.nodes}
         for one in labels:
-            holder = parse_label(one)
+            holder, folder = parse_label(one), out or Path(one)
             if holder is not None:
-                _check_free(out, office.fleet.name, holder, makes_key=False)
+                _check_free(folder, office.fleet.name, holder, makes_key=False)
             named = hosts.get(holder.name) if holder is not None and holder.role is Role.NODE else None
             issued = authority.renew(one, named, _request(request), secret, _now())
-            folder = out or Path(one)
             _write(folder, issued)
             _say(f"{folder}: {CERTIFICATE}, {TRUSTED} of {one}, until {_day(issued.entry)}")
     if labels:
@@ -462,14 +463,12 @@ def _how_to_install(folder: Path, role: Role, *, has_key: bool) -> str:
     )
 
 
-def _check_free(folder: Path | None, fleet: str, holder: Holder, *, makes_key: bool) -> None:
+def _check_free(folder: Path, fleet: str, holder: Holder, *, makes_key: bool) -> None:
     """Refuse to write over somebody else's certificate, or over a key, of which there may be no other copy.
 
     Raises:
         CliError: such a file is in the folder.
     """
-    if folder is None:  # one of its own, by the label
-        return
     try:
         names = common_names(read_regular(folder / CERTIFICATE, MAX_BYTES))
     except (OSError, ValueError):

@@ -155,10 +155,22 @@ class Authority:
         Raises:
             AdapterError: the holder has another key that is not revoked, the request is not usable, or a file is not.
         """
-        before, at = self.record.newest(name, role), _seconds(now)
+        holder = self.next_holder(name, role, request, now)
+        key = None if request else x509.new_key()
+        public = self._requested(request) if key is None else key.public_key()
+        issued = self._certify(holder, public, tuple(hosts), passphrase, now)
+        return issued if key is None else replace(issued, key=x509.key_pem(key))
+
+    def next_holder(self, name: str, role: Role, request: bytes, now: datetime) -> Holder:
+        """Whose the key is that `issue` would certify.
+
+        Raises:
+            AdapterError: the holder has another key that is not revoked, or the request is not usable.
+        """
+        before = self.record.newest(name, role)
         if before is not None and self.asks_for(before, request):
-            return self._certify(before.holder, self._requested(request), tuple(hosts), passphrase, now)
-        if before is not None and before.revoked is None and before.until > at:
+            return before.holder
+        if before is not None and before.revoked is None and before.until > _seconds(now):
             raise AdapterError(
                 f"{before.label} has a certificate until {day(before.until)}; `zsched pki renew {before.label}` keeps "
                 f"its key; if the key is lost or stolen, `zsched pki revoke {before.label}` first"
@@ -166,11 +178,7 @@ class Authority:
         number = 1 if before is None else before.holder.key + (before.revoked is not None)
         if number > MAX_KEY:
             raise AdapterError(f"{name} has had {MAX_KEY} keys; give it another name")
-        key = None if request else x509.new_key()
-        public = self._requested(request) if key is None else key.public_key()
-        holder = Holder(name=name, role=role, key=number)
-        issued = self._certify(holder, public, tuple(hosts), passphrase, now)
-        return issued if key is None else replace(issued, key=x509.key_pem(key))
+        return Holder(name=name, role=role, key=number)
 
     def renew(
         self, label: str, hosts: Sequence[str] | None, request: bytes, passphrase: bytes, now: datetime

@@ -85,6 +85,31 @@ def test_somebody_else_s_files_are_not_written_over(here: Path) -> None:
     assert common_names((here / "pki" / "certificate.pem").read_bytes()) == ("robot1.k2.yard.zsched.internal",)
 
 
+def test_a_second_fleet_s_machine_of_the_same_name_keeps_the_first_one_s_key(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pki("init")
+    pki("issue", "robot1")
+    before = {path.name: path.read_bytes() for path in (here / "robot1").iterdir()}
+    assert "robot1 has a certificate until" in " ".join(pki("issue", "robot1", code=1).stderr.split())
+    (here / "fleet.yaml").write_text(FLEET.replace("yard", "hall"))
+    monkeypatch.setenv("ZSCHED_AUTHORITY", str(here / "hall-s"))
+    pki("init")
+    refused = " ".join(pki("issue", "robot1", code=1).stderr.split())
+    assert "robot1/certificate.pem (robot1.yard.zsched.internal) is there, and is left as it is" in refused
+    assert json.loads(pki("show", "--json").stdout)["certificates"] == [], "nothing was issued"
+    pki("issue", "robot1", "--out", "elsewhere")
+    assert "(robot1.yard" in pki("renew", "robot1", code=1).stderr
+    (here / "robot1" / "certificate.pem").unlink()
+    del before["certificate.pem"]
+    pki("revoke", "robot1")
+    (here / "robot1.k2").mkdir()
+    (here / "robot1.k2" / "key.pem").write_bytes(before["key.pem"])
+    assert "robot1.k2/key.pem is there" in " ".join(pki("issue", "robot1", code=1).stderr.split())
+    assert (here / "robot1.k2" / "key.pem").read_bytes() == before["key.pem"]
+    assert {path.name: path.read_bytes() for path in (here / "robot1").iterdir()} == before
+
+
 def test_names_that_the_fleet_file_does_not_fit_are_refused_or_told(here: Path) -> None:
     pki("init")
     assert "did you mean robot1?; for people: --role operator" in pki("issue", "robt1", code=2).stderr
