@@ -239,7 +239,7 @@ def deliver(where: Where, door: Door, label: str | None) -> int:
     A node that was away gets it the next time.
 
     Raises:
-        CliError: there is no such node's key, or nobody answers here.
+        CliError: there is no such node's key, the fleet has no such node (any more), or nobody answers here.
         AdapterError: a file is not usable.
     """
     members = {str(one["name"]) for one in ask_door(door, {"verb": "status"})["nodes"]}
@@ -251,6 +251,10 @@ def deliver(where: Where, door: Door, label: str | None) -> int:
         if not named and label is not None:
             hint = nearest(label, [one.label for one in live])
             raise CliError(EXIT_USAGE, f"no node's key {label!r} that is not revoked{hint}")
+        if label is not None and named[0].holder.name not in members:
+            advice = f"`zsched pki renew {label}` writes it to a file, `zsched pki revoke {label}` ends it"
+            said = f"{label}: the fleet has no node {named[0].holder.name}; nothing was renewed or sent"
+            raise CliError(EXIT_FAILED, f"{said}: {advice}")
         due = [one.label for one in named if one.label == label or one.is_due(now, number)]
         secret = _passphrase(authority) if due else b""
         for one in due:

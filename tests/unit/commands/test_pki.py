@@ -183,11 +183,11 @@ def test_what_is_due_is_sent_to_the_nodes_and_so_is_what_a_node_has_missed(
     here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[Json] = []
-    outcomes = {"robot1": "ok", "robot2": "invalid"}
+    outcomes, members = {"robot1": "ok", "robot2": "invalid"}, ["robot1", "robot2"]
 
     def answer(request: Json) -> Json:
         if request["verb"] == "status":
-            return {"fleet": "yard", "nodes": [{"name": "robot1"}, {"name": "robot2"}]}
+            return {"fleet": "yard", "nodes": [{"name": name} for name in members]}
         asked.append(request)
         return {"outcome": outcomes[request["node"]], "detail": "as it is", "revision": None}
 
@@ -212,6 +212,13 @@ def test_what_is_due_is_sent_to_the_nodes_and_so_is_what_a_node_has_missed(
         pki(*words)
         assert [one["node"] for one in asked] == ["robot2"], "nobody renews a revoked key"
         assert "no node's key 'ana.operator'" in pki(*words, "ana.operator", code=2).stderr
+        members.remove("robot2")
+        asked.clear()
+        ended = json.loads(pki("show", "--json").stdout)
+        refused = " ".join(pki(*words, "robot2", code=1).stderr.split())
+        assert "robot2: the fleet has no node robot2; nothing was renewed or sent" in refused
+        assert (asked, json.loads(pki("show", "--json").stdout)) == ([], ended)
+        pki(*words)
         assert "go without --deliver" in pki(*words, "robot2", "--out", "x", code=2).stderr
 
 
