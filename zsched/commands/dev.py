@@ -57,12 +57,15 @@ def dev(options: DevOptions) -> int:
     """Run the fleet until it is ended; the exit code.
 
     Raises:
-        CliError: there is no such file or task.
+        CliError: there is no such file or task, or the file has none.
         ConfigError: the fleet file has faults.
         AdapterError: a node cannot be prepared.
     """
     file = _file(options.file)
     fleet = load_fleet(file)
+    if not fleet.tasks:
+        advice = "write one under `tasks:` (docs/guide/fleet-file.md), or begin with `zsched init --example python`"
+        raise CliError(EXIT_CONFIG, f"{file} has no task, and there is nothing to run; {advice}")
     commands = _commands(fleet, file, options.workers)
     with ExitStack() as stack:
         addresses = _addresses(fleet, stack)

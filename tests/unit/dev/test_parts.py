@@ -126,6 +126,15 @@ def test_a_faulty_file_is_told_as_check_tells_it(tmp_path: Path) -> None:
     assert "fleet.yaml:1:1" in result.stderr
 
 
+def test_a_fleet_without_tasks_has_nothing_to_run(tmp_path: Path) -> None:
+    """`zsched fleet create` writes such a file, and `zsched check` only warns of it."""
+    (tmp_path / "fleet.yaml").write_text("fleet: x\nnodes:\n  robot1: {kind: robot}\ntasks: {}\n")
+    for words in (("dev", str(tmp_path)), ("dev", str(tmp_path), "--task", __file__)):
+        result = CliRunner().invoke(app, words)
+        assert result.exit_code == 78
+        assert "fleet.yaml has no task, and there is nothing to run; write one under `tasks:`" in result.stderr
+
+
 def test_the_snippet_is_the_configuration_of_a_client() -> None:
     config = zenoh.Config.from_json5(json5("tcp/127.0.0.1:7458"))
     assert config.get_json("mode") == '"client"'
