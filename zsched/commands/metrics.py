@@ -20,6 +20,7 @@ from typing import Final
 from zsched.commands.ask import ask_door, find_door
 from zsched.commands.common import CliError, Json
 from zsched.commands.report import all_problems, degradations
+from zsched.errors import ZschedError
 from zsched.exits import EXIT_FAILED, EXIT_OK
 
 MIB: Final = 1 << 20
@@ -181,10 +182,11 @@ def write_metrics(path: Path, runtime_dir: Path | None, node: str | None, connec
 
     Raises:
         CliError: nobody answers, or the file cannot be written (1).
+        ConfigError: this machine has no certificate with which to ask.
     """
     try:
         text = metrics_text(ask_door(find_door(runtime_dir, node, connect=connect), {"verb": "status"}))
-    except CliError:
+    except ZschedError:
         _replace(path, down_text())
         raise
     _replace(path, text)

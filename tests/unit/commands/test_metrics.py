@@ -115,6 +115,19 @@ def test_without_a_daemon_the_file_says_so_and_no_old_figure_stays(folder: Path)
     assert "no daemon in" in result.stderr
 
 
+def test_without_this_machine_s_certificate_no_old_figure_stays(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    listen = "listen: {control: tls/127.0.0.1:1, data: tls/127.0.0.1:2}"
+    config, file = folder / "fleet.yaml", folder / "zsched.prom"
+    config.write_text(
+        f"fleet: hall\nnodes: {{robot1: {{kind: robot, {listen}}}}}\ntasks: {{}}\nsecurity: {{folder: {folder}}}\n"
+    )
+    monkeypatch.setenv("ZSCHED_CONFIG", str(config))
+    file.write_text(metrics_text(recorded()))
+    result = CliRunner().invoke(app, ["metrics", "write", str(file), "--connect", "tls/127.0.0.1:1"])
+    assert (result.exit_code, file.read_text()) == (78, down_text())
+    assert "certificate.pem" in result.stderr
+
+
 def test_a_place_that_cannot_be_written_is_said(folder: Path) -> None:
     result = CliRunner().invoke(app, ["metrics", "write", str(folder / "none" / "zsched.prom")])
     assert result.exit_code == 1

@@ -14,7 +14,8 @@ from zsched.commands.common import CliError, Json
 from zsched.commands.history import read_log
 from zsched.commands.status import ask_status
 from zsched.core.values.struct import Struct
-from zsched.exits import EXIT_OK
+from zsched.errors import ConfigError
+from zsched.exits import EXIT_CONFIG, EXIT_OK
 
 
 class News(Struct, frozen=True, kw_only=True):
@@ -60,6 +61,8 @@ class Feed:
             return News(at=at, status=status, entries=self._entries(door))
         except CliError as error:
             return News(at=at, status=None, why=str(error), code=error.code)
+        except ConfigError as error:  # this machine's certificate is gone, or wrong; it may come back
+            return News(at=at, status=None, why=str(error), code=EXIT_CONFIG)
 
     def _entries(self, door: Door) -> tuple[Json, ...]:
         """Of another machine there is no log: it lies on that machine."""

@@ -25,6 +25,7 @@ from zsched.commands.common import CliError
 from zsched.commands.watch.feed import Feed, News
 from zsched.commands.watch.past import MOST_EVENTS, MOST_MOVES, POINTS, Past
 from zsched.commands.watch.top import LEVELS, Frame, render_top
+from zsched.errors import ConfigError
 from zsched.exits import EXIT_UNREACHABLE
 
 RECORDED = Path(__file__).parent / "recorded"
@@ -278,6 +279,14 @@ def test_the_feed_reads_on_in_the_log_and_waits_for_a_daemon_that_is_away(tmp_pa
     assert [one["verb"] for one in asked] == ["status", "log", "status", "log"]
     assert (third := feed.ask()).status is None
     assert "no daemon answers" in third.why
+
+
+def test_a_certificate_that_goes_is_told_as_a_daemon_that_is_away() -> None:
+    def find() -> Door:
+        raise ConfigError("/etc/zsched/pki/certificate.pem: No such file or directory")
+
+    news = Feed(find).ask()
+    assert (news.status, news.code, news.why.startswith("/etc/zsched/pki/")) == (None, 78, True)
 
 
 def test_another_node_s_log_is_not_asked_for(tmp_path: Path) -> None:
