@@ -150,10 +150,25 @@ def _like(error: Any, text: str) -> CliError | ConfigError:
 
 
 def _draft(fleet: str, text: str) -> Path:
-    """A new file of the operator alone, with the text."""
-    number, name = tempfile.mkstemp(prefix=f"{fleet}-", suffix=".yaml")
-    with os.fdopen(number, "wb") as draft:
-        draft.write(text.encode())
+    """A new file of the operator alone, with the text.
+
+    Raises:
+        CliError: there is no room for it.
+    """
+    name = ""
+    try:
+        number, name = tempfile.mkstemp(prefix=f"{fleet}-", suffix=".yaml")
+        with os.fdopen(number, "wb") as draft:
+            draft.write(text.encode())
+    except OSError as error:
+        place = name or str(error.filename or "")
+        if name:
+            Path(name).unlink(missing_ok=True)
+        where = f"{Path(place).parent}: " if place else ""
+        advice = "make room there, or name another folder: TMPDIR=FOLDER zsched edit"
+        raise CliError(
+            EXIT_FAILED, f"{where}the text for the editor cannot be written: {error.strerror}; {advice}"
+        ) from error
     return Path(name)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -569,6 +570,24 @@ def test_edit_keeps_what_was_typed_where_it_only_plans_or_is_broken_off(
     kept.unlink()
     monkeypatch.setenv("EDITOR", "true")
     assert "your text" not in run("edit").stderr
+    assert list(tmp_path.glob("*.yaml")) == []
+
+
+def test_edit_without_room_for_the_text_names_the_folder_and_leaves_nothing(
+    node: Node, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = tempfile.mkstemp
+
+    def full(**words: Any) -> tuple[int, str]:
+        number, name = made(dir=tmp_path, **words)
+        os.close(number)
+        return os.open("/dev/full", os.O_WRONLY), name
+
+    monkeypatch.setattr(tempfile, "mkstemp", full)
+    failed = run("edit", "--yes")
+    assert (failed.exit_code, node.changes) == (1, [])
+    told = f"{tmp_path}: the text for the editor cannot be written: No space left on device"
+    assert told in " ".join(failed.stderr.split())
     assert list(tmp_path.glob("*.yaml")) == []
 
 

@@ -186,13 +186,14 @@ def _taped(path: Path, kinds: dict[str, str]) -> Iterator[Tape]:
         raise CliError(EXIT_FAILED, f"{path} is there already: name a new file") from error
     except OSError as error:
         raise CliError(EXIT_FAILED, f"{path} cannot be written: {error.strerror}; see its folder") from error
-    with file:
-        writer = Writer(file)
-        writer.start(profile="", library=LIBRARY)
-        try:
-            yield Tape(writer, kinds)
-        except OSError as error:
-            raise CliError(EXIT_FAILED, f"{path} cannot be written any more: {error.strerror}") from error
-        finally:
-            with contextlib.suppress(OSError):
-                writer.finish()  # type: ignore[no-untyped-call]
+    try:
+        with file:  # a disk that is full may be found as late as at the end
+            writer = Writer(file)
+            writer.start(profile="", library=LIBRARY)
+            try:
+                yield Tape(writer, kinds)
+            finally:
+                with contextlib.suppress(OSError):
+                    writer.finish()  # type: ignore[no-untyped-call]
+    except OSError as error:
+        raise CliError(EXIT_FAILED, f"{path} cannot be written any more: {error.strerror}") from error

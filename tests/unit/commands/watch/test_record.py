@@ -125,6 +125,21 @@ def test_a_file_that_is_there_is_kept(folder: Path) -> None:
     assert file.read_text() == "mine"
 
 
+def test_a_disk_that_is_full_is_told_with_the_file(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is written last may find it when the file is closed."""
+    opened = Path.open
+    full = Path("/dev/full")
+
+    def open_full(path: Path, mode: str = "r", *more: Any, **words: Any) -> Any:
+        return opened(full, "wb") if mode == "xb" else opened(path, mode, *more, **words)
+
+    monkeypatch.setattr(Path, "open", open_full)
+    file = folder / "run.mcap"
+    failed = run("-o", file, "--for", "0.1s")
+    assert failed.exit_code == 1
+    assert f"{file} cannot be written any more: No space left on device" in " ".join(failed.stderr.split())
+
+
 def test_what_cannot_be_done_is_said_before_anything_is_written(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = folder / "run.mcap"
     for words, code, text in (
