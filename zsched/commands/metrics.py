@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Final
 
 from zsched.commands.ask import ask_door, find_door
-from zsched.commands.common import CliError, Json
+from zsched.commands.common import CliError, Json, uninterrupted
 from zsched.commands.report import all_problems, degradations
 from zsched.errors import ZschedError
 from zsched.exits import EXIT_FAILED, EXIT_OK
@@ -194,17 +194,18 @@ def write_metrics(path: Path, runtime_dir: Path | None, node: str | None, connec
 
 
 def _replace(path: Path, text: str) -> None:
-    """Put a file in the place of another: a reader sees the old or the new one."""
+    """Put a file in the place of another: a reader sees the old or the new one, and no third one stays."""
     try:
-        descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        try:
-            with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-                file.write(text)
-                os.fchmod(file.fileno(), 0o644)  # node_exporter is another user
-            Path(name).replace(path)
-        except OSError:
-            with contextlib.suppress(OSError):
-                Path(name).unlink()
-            raise
+        with uninterrupted():
+            descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+            try:
+                with os.fdopen(descriptor, "w", encoding="utf-8") as file:
+                    file.write(text)
+                    os.fchmod(file.fileno(), 0o644)  # node_exporter is another user
+                Path(name).replace(path)
+            except OSError:
+                with contextlib.suppress(OSError):
+                    Path(name).unlink()
+                raise
     except OSError as error:
         raise CliError(EXIT_FAILED, f"{path} cannot be written: {error.strerror}; see its folder") from error

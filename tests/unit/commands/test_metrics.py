@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -126,6 +128,22 @@ def test_without_this_machine_s_certificate_no_old_figure_stays(folder: Path, mo
     result = CliRunner().invoke(app, ["metrics", "write", str(file), "--connect", "tls/127.0.0.1:1"])
     assert (result.exit_code, file.read_text()) == (78, down_text())
     assert "certificate.pem" in result.stderr
+
+
+def test_who_is_interrupted_while_it_writes_leaves_the_new_file_and_no_other(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    set_mode = os.fchmod
+
+    def interrupt(descriptor: int, mode: int) -> None:
+        signal.raise_signal(signal.SIGINT)
+        set_mode(descriptor, mode)
+
+    monkeypatch.setattr(os, "fchmod", interrupt)
+    file = folder / "zsched.prom"
+    result = CliRunner().invoke(app, ["metrics", "write", str(file)])
+    assert (result.exit_code, file.read_text()) == (3, down_text())
+    assert [path.name for path in folder.iterdir()] == ["zsched.prom"]
 
 
 def test_a_place_that_cannot_be_written_is_said(folder: Path) -> None:
