@@ -318,8 +318,9 @@ def invite(door: Door, view: ApplyView, guest: Guest, file: Path | None) -> int:
         refuse_open_network((address_of(guest.address).host,), view.accepted)
     former = keys_to_revoke(fleet, guest.name, guest.authority, guest.request)
     code = EXIT_OK
-    if any(node.name == guest.name for node in fleet.nodes):
-        _check_invited_again(door, guest)
+    listed = next((node for node in fleet.nodes if node.name == guest.name), None)
+    if listed is not None:
+        _check_invited_again(door, guest, listed.kind)
         if fleet.security is not None and not set(former) <= set(fleet.security.revoked):
             code = apply(door, view, lambda held: _without_keys(document_text(held), former), DOCUMENT)
     else:
@@ -332,14 +333,16 @@ def invite(door: Door, view: ApplyView, guest: Guest, file: Path | None) -> int:
     return EXIT_OK
 
 
-def _check_invited_again(door: Door, guest: Guest) -> None:
-    """A node of the document that was never there may get its file once more."""
+def _check_invited_again(door: Door, guest: Guest, kind: NodeKind) -> None:
+    """A node of the document, of that kind, that was never there may get its file once more."""
     state = next((str(one["state"]) for one in status_of(door)["nodes"] if one["name"] == guest.name), "")
     if state in HERE:
         raise CliError(EXIT_FAILED, f"{guest.name} is a node of the fleet, and {state}: give the machine another name")
-    if guest.address is not None or guest.tasks:
+    is_other = guest.kind is not kind and guest.kind is not NodeKind.ROBOT  # which is also what nobody has said
+    if guest.address is not None or guest.tasks or is_other:
         advice = "without options it gets its invitation once more; `zsched edit` changes what it is"
-        raise CliError(EXIT_FAILED, f"{guest.name} is in the document already; {advice}")
+        told = "an edge" if kind is NodeKind.EDGE else "a robot"
+        raise CliError(EXIT_FAILED, f"{guest.name} is in the document already, as {told}; {advice}")
 
 
 def fleet_of(text: str) -> Fleet:

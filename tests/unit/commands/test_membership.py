@@ -374,7 +374,8 @@ def test_a_node_without_an_address_dials_the_others(node: Node) -> None:
     [
         (("Robot2",), 2, "is not a name"),
         (("robot1",), 1, "is a node of the fleet, and alive"),
-        (("robot3", "--address", "192.0.2.3"), 1, "is in the document already"),
+        (("robot3", "--address", "192.0.2.3"), 1, "is in the document already, as a robot"),
+        (("robot3", "--kind", "edge"), 1, "is in the document already, as a robot; without options"),
         (("robot2", "--candidate-for", "marge"), 2, "has no task 'marge'; did you mean merge?"),
         (("robot2", "--candidate-for", "count"), 1, "are a selection that robot2 is not in"),
         (("robot2", "--address", "a b"), 2, "is no address"),
