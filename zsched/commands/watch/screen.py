@@ -49,7 +49,7 @@ class TopView(Struct, frozen=True, kw_only=True):
 
 
 def top(view: TopView, *, is_once: bool) -> int:
-    """Show the fleet until ``q``, or once; returns the exit code of the last status.
+    """Show the fleet until ``q``, Ctrl-C or SIGTERM, or once; returns the exit code of the last status.
 
     Raises:
         CliError: already the first question found nobody, or there is no terminal (2).
@@ -114,10 +114,14 @@ def _live(view: TopView, feed: Feed, past: Past) -> None:
 
 @contextlib.contextmanager
 def _screen(wake: int) -> Iterator[None]:
-    """The terminal for ourselves: no echo, keys at once; as it was afterwards. A new size is written to ``wake``."""
+    """The terminal for ourselves: no echo, keys at once; as it was afterwards. A new size is written to ``wake``.
+
+    SIGTERM is a Ctrl-C meanwhile: the default would leave the terminal to the shell as it is.
+    """
     descriptor = sys.stdin.fileno()
     before = termios.tcgetattr(descriptor)
     old_handler = signal.signal(signal.SIGWINCH, lambda _number, _frame: None)
+    old_end = signal.signal(signal.SIGTERM, signal.default_int_handler)
     old_wake = signal.set_wakeup_fd(wake, warn_on_full_buffer=False)
     sys.stdout.write(ENTER)
     try:
@@ -128,6 +132,7 @@ def _screen(wake: int) -> Iterator[None]:
         sys.stdout.write(LEAVE)
         sys.stdout.flush()
         signal.set_wakeup_fd(old_wake)
+        signal.signal(signal.SIGTERM, old_end)
         signal.signal(signal.SIGWINCH, old_handler)
 
 

@@ -10,6 +10,10 @@ import copy
 import json
 import os
 import re
+import select
+import subprocess
+import sys
+import termios
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +28,7 @@ from zsched.commands.ask import Door
 from zsched.commands.common import CliError
 from zsched.commands.watch.feed import Feed, News
 from zsched.commands.watch.past import MOST_EVENTS, MOST_MOVES, POINTS, Past
+from zsched.commands.watch.screen import LEAVE
 from zsched.commands.watch.top import LEVELS, Frame, render_top
 from zsched.errors import ConfigError
 from zsched.exits import EXIT_UNREACHABLE
@@ -327,6 +332,32 @@ def test_once_prints_a_screen_and_exits_as_status_does(tmp_path: Path, monkeypat
     assert fine.stdout.startswith("fleet testbed ")
     assert "\x1b" not in fine.stdout
     assert "needs a terminal" in refused.stderr
+
+
+def test_sigterm_gives_the_terminal_back_as_it_was(tmp_path: Path) -> None:
+    empty = {"node": "robot1", "now": NOON, "entries": [], "cursor": "", "more": False}
+    daemon = OperatorSocket(tmp_path / "robot1.sock", lambda one: recorded() if one["verb"] == "status" else empty)
+    controller, terminal = os.openpty()
+    before = termios.tcgetattr(terminal)
+    daemon.open()
+    try:
+        command = [sys.executable, "-m", "zsched.cli", "top", "--runtime-dir", str(tmp_path)]
+        plain = {**os.environ, "NO_COLOR": "1"}
+        with subprocess.Popen(command, env=plain, stdin=terminal, stdout=terminal, stderr=terminal) as process:
+            shown = b""
+            while b"fleet testbed" not in shown:  # a screen: keys are taken
+                assert select.select([controller], [], [], 60)[0], shown
+                shown += os.read(controller, 1 << 16)
+            process.terminate()
+            while LEAVE.encode() not in shown and select.select([controller], [], [], 10)[0]:
+                shown += os.read(controller, 1 << 16)
+            assert process.wait(60) == 0
+        assert shown.endswith(LEAVE.encode()), "back to what stood there"
+        assert termios.tcgetattr(terminal) == before
+    finally:
+        daemon.close()
+        os.close(controller)
+        os.close(terminal)
 
 
 def test_nobody_there_is_said_at_once(tmp_path: Path) -> None:
