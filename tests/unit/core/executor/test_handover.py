@@ -417,7 +417,6 @@ def test_a_cold_worker_that_left_at_once_is_stopped_when_the_next_one_can_have_a
     assert one.role.role is WorkerRole.IDLE
     ends_at = 10.0 + COLD.worker.start_deadline_s + COLD.drain_s + ROLE_DRAIN_MARGIN_S
     assert one.next_deadline() == ends_at
-    assert not of(done(one.again), StopWorker)
     assert done(one.tick, ends_at)[-1] == StopWorker(task="merge")
     assert one.next_deadline() == math.inf
 
@@ -438,7 +437,6 @@ def test_a_cold_owner_that_had_to_leave_and_stays_the_owner_keeps_its_process() 
     done(one.set_lease, 12.0, 9.0)
     assert not of(done(one.leave), StopWorker)
     assert one.next_deadline() == math.inf
-    assert not of(done(one.again), StopWorker)
 
 
 @pytest.mark.parametrize("standby", Standby)

@@ -47,7 +47,7 @@ def test_a_robot_that_works_alone_stops_and_goes_back_when_the_task_is_leased() 
     spec = replace(SPEC, candidates=("edge1", "robot1"), on_isolation=OnIsolation.LOCAL)
     robot = Executor(spec=spec, me="robot1", has_streams=True)
     done(robot.execute, FIRST, 10.0)
-    (role,) = roles(done(robot.isolate))
+    (role,) = roles(done(robot.isolate, 10.5))
     assert (role.role, role.lease_until_s) == (WorkerRole.ACTIVE, None)
     back = done(robot.execute, replace(FIRST, revision=2, leased=True), 11.0)
     (role,) = roles(back)
@@ -55,4 +55,4 @@ def test_a_robot_that_works_alone_stops_and_goes_back_when_the_task_is_leased() 
     (plan,) = [one.plan for one in back if isinstance(one, ApplyRoutes)]
     assert plan.current is not None
     assert plan.current.owner == "edge1"
-    assert done(robot.isolate) == (), "from now on it needs a lease, and alone it gets none"
+    assert done(robot.isolate, 11.5) == (), "from now on it needs a lease, and alone it gets none"
