@@ -12,7 +12,7 @@ from typing import TypeVar
 import zenoh
 from zenoh import Session
 
-from zsched.core.hop.books import added, closed, together
+from zsched.core.hop.books import add_to, added, closed
 from zsched.core.values.plan import Route, StreamClass, StreamCount
 from zsched.relay.streams.answer_times import AnswerTimes
 from zsched.relay.streams.inputs import InputStream
@@ -134,7 +134,6 @@ class OpenStreams:
         one.close()
         with self._changing:
             del streams[stream]
-            count, before = closed(one.count()), self._closed.get(stream)
-            self._closed[stream] = count if before is None else together(before, count)
+            add_to(self._closed, closed(one.count()))
         if isinstance(one, InputStream) and (cell := self._cells(stream)) is not None:
             cell[0] = 0  # the books tell nothing of it from now on, so nothing of it is untold

@@ -84,6 +84,12 @@ def together(first: StreamCount, other: StreamCount) -> StreamCount:
     )
 
 
+def add_to(table: dict[str, StreamCount], count: StreamCount) -> None:
+    """Add a stream's counters to those under its name."""
+    before = table.get(count.stream)
+    table[count.stream] = count if before is None else together(before, count)
+
+
 def without(count: StreamCount, part: StreamCount) -> StreamCount:
     """The counters of a stream without ``part`` of what they have counted; times stay."""
     drops, less = dict(count.drops), dict(part.drops)

@@ -15,7 +15,7 @@ from __future__ import annotations
 from typing import Final
 
 from zsched.core.events import SlotDrained
-from zsched.core.hop.books import added, closed, together, without
+from zsched.core.hop.books import add_to, added, closed, without
 from zsched.core.relay_protocol import SlotLost, WorkerWatch
 from zsched.core.route.keyexpr import includes
 from zsched.core.values.model import TaskId
@@ -182,10 +182,10 @@ class Shares(Struct, eq=False):
         for stream, count in self.counted.items():
             if count.last_seen_s is not None:
                 self.newest[stream] = now - count.last_seen_s
-            _add(self.past, closed(count))
+            add_to(self.past, closed(count))
         for stream, first in self.began.items():
             if stream in self.relays:
-                _add(self.copies, closed(without(self.relays[stream], first)))
+                add_to(self.copies, closed(without(self.relays[stream], first)))
         self.keys = ()
         self.told, self.parts, self.drained, self.held = set(), {}, set(), {}
         self.counted, self.began = {}, {}
@@ -233,11 +233,6 @@ class Shares(Struct, eq=False):
             if route.direction is Direction.OUTPUT:
                 none = StreamCount(stream=route.stream)
                 self.began.setdefault(route.stream, self.relays.get(route.stream, none))
-
-
-def _add(table: dict[str, StreamCount], count: StreamCount) -> None:
-    before = table.get(count.stream)
-    table[count.stream] = count if before is None else together(before, count)
 
 
 def _slots(plan: RoutePlan) -> tuple[Slot, ...]:

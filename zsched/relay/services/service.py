@@ -34,7 +34,7 @@ import zenoh
 from zenoh import Query, Reply, Sample, SampleKind, Session
 
 from zsched.clock import monotonic_s
-from zsched.core.hop.books import added, closed, together
+from zsched.core.hop.books import add_to, added, closed
 from zsched.core.relay_protocol import ERROR_ENCODING, REFUSED_ENCODING, ServiceProblem
 from zsched.core.route.keyexpr import is_wild
 from zsched.core.route.wildcards import Rewriter, rewriter
@@ -444,8 +444,7 @@ class Services:
         stream.close()
         with self._changing:
             del self._streams[name]
-            count, before = closed(stream.count()), self._closed.get(name)
-            self._closed[name] = count if before is None else together(before, count)
+            add_to(self._closed, closed(stream.count()))
 
     def counts(self) -> tuple[StreamCount, ...]:
         """The counters of every service."""
