@@ -9,7 +9,7 @@ import textwrap
 import time
 from typing import Any, TypeAlias
 
-from zsched.core.values.words import INTENDED
+from zsched.core.values.words import missed
 
 STYLES = {"bold": "1", "dim": "2", "red": "31", "green": "32", "yellow": "33", "stage": "1;36", "alarm": "1;31"}
 
@@ -107,9 +107,8 @@ def none_for(age_s: float | None) -> str:
 
 
 def missed_of(stream: dict[str, Any]) -> int:
-    """How many of a stream's samples somebody may miss (`zsched.core.values.plan.StreamCount.missed`)."""
-    unintended = sum(count for reason, count in stream["drops"].items() if reason not in INTENDED)
-    return int(unintended) + int(stream.get("lost") or 0) + int(stream.get("at_most_lost") or 0)
+    """How many of a stream's samples somebody may miss."""
+    return missed(stream["drops"].items(), stream.get("lost") or 0, stream.get("at_most_lost") or 0)
 
 
 def since_drop(stream: dict[str, Any]) -> str:

@@ -11,7 +11,7 @@ from enum import StrEnum
 from zsched.core.values.limits import Range, check_ranges, key
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.struct import Struct
-from zsched.core.values.words import INTENDED
+from zsched.core.values.words import missed
 
 
 class Direction(StrEnum):
@@ -236,9 +236,8 @@ class StreamCount(Struct, frozen=True, kw_only=True):
 
     @property
     def missed(self) -> int:
-        """Samples that somebody may miss: dropped for no rule's sake, lost on the way, at most lost with an owner."""
-        unintended = sum(number for reason, number in self.drops if reason not in INTENDED)
-        return unintended + self.lost + self.at_most_lost
+        """Samples that somebody may miss."""
+        return missed(self.drops, self.lost, self.at_most_lost)
 
     @property
     def is_still(self) -> bool:

@@ -7,6 +7,7 @@ command line that needs no value (`status`, `history`) does without `zsched.core
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 
 GaugeName = str
 """A gauge's name (`zsched.core.values.gauges`), of the alphabet of `NAME`."""
@@ -22,7 +23,7 @@ MAX_ASKER, MAX_ASKED = 96, 200
 PAPER_METRICS = ("cpu", "memory", "network")
 """The metrics of Eq. 1 to 3; the others are gauges."""
 
-INTENDED = frozenset({"cut", "loop", "retried", "superseded", "thinned", "uncounted"})
+_INTENDED = frozenset({"cut", "loop", "retried", "superseded", "thinned", "uncounted"})
 """Reasons of drops by which nobody misses a sample: a rule wants them, or the sample came by another way."""
 
 NEVER_INITIALISED = "never initialised"
@@ -68,3 +69,11 @@ def check_range(field: str, value: float | None, low: float, high: float) -> Non
     """Raise `ValueError` unless ``low <= value <= high`` (``None``, "not measured", passes; NaN does not)."""
     if value is not None and not low <= value <= high:
         raise ValueError(f"{field}: {value!r} is not in [{low:g}, {high:g}]")
+
+
+def missed(drops: Iterable[tuple[str, int]], lost: int, at_most_lost: int) -> int:
+    """Samples of a stream that somebody may miss: dropped for no rule's sake, lost on the way, or with an owner.
+
+    ``drops``: (reason, how many) of each reason.
+    """
+    return sum(number for reason, number in drops if reason not in _INTENDED) + lost + at_most_lost
