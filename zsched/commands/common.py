@@ -279,6 +279,11 @@ def nearest(name: str, known: Sequence[str]) -> str:
     return f"; did you mean {close[0]}?" if close else f"; there are {', '.join(known) or 'none'}"
 
 
+def told_task(status: Json, task: str) -> Json:
+    """What a status tells of the task; empty: nothing."""
+    return next((one for one in status["tasks"] if one["name"] == task), {})
+
+
 def wants_color(is_refused: bool, env: Mapping[str, str] = os.environ) -> bool:
     """Colour only on a terminal, and not when ``--no-color``, ``NO_COLOR`` (no-color.org) or a dumb one says no."""
     return not is_refused and not env.get("NO_COLOR") and env.get("TERM") != "dumb" and sys.stdout.isatty()

@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door
-from zsched.commands.common import CliError, Json, nearest, print_json, say
+from zsched.commands.common import CliError, Json, nearest, print_json, say, told_task
 from zsched.commands.document import InForce, change_over, document_text, in_force, ordered
 from zsched.commands.orders import (
     OrderView,
@@ -488,8 +488,8 @@ def _tell_stays(watch: _Watch, found: Mapping[str, Json]) -> None:
 def _why_it_stays(name: str, found: Mapping[str, Json]) -> str:
     """The last judgement of some robot, with what keeps the other candidates from the task."""
     for status in found.values():
-        task = next((one for one in status["tasks"] if one["name"] == name), None)
-        if task is not None and task["decision"] is not None:
+        task = told_task(status, name)
+        if task and task["decision"] is not None:
             vetoed = task["decision"]["vetoed"]
             why = "; ".join(f"{other}: {veto}" for other, veto in vetoed.items() if other != task["owner"])
             return f"{task['decision']['reason']}{f' ({why})' if why else ''}"

@@ -17,7 +17,7 @@ from zsched import paths as places
 from zsched.clock import monotonic_s
 from zsched.commands.apply import read_text
 from zsched.commands.ask import door_of
-from zsched.commands.common import CliError, Json, check_reason, nearest
+from zsched.commands.common import CliError, Json, check_reason, nearest, told_task
 from zsched.commands.document import InForce, document_text, in_force, status_of
 from zsched.commands.hand_steps import (
     HandOrder,
@@ -32,7 +32,6 @@ from zsched.commands.hand_steps import (
     task_in,
     tell_end,
     text_with,
-    told_task,
 )
 from zsched.commands.membership import fleet_of
 from zsched.commands.orders import OrderView, Row, begin

@@ -17,7 +17,7 @@ from typing import Final
 
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door
-from zsched.commands.common import CliError, Json, print_json, say, warn
+from zsched.commands.common import CliError, Json, print_json, say, told_task, warn
 from zsched.commands.document import (
     OVERTAKEN_S,
     UNKNOWING,
@@ -144,11 +144,6 @@ def task_in(fleet: Fleet, task: TaskId) -> TaskSpec | None:
 def has_task(text: str, task: TaskId) -> bool:
     """Whether a document has the task. Raises `CliError`: it has faults for this version."""
     return task_in(fleet_of(text), task) is not None
-
-
-def told_task(status: Json, task: TaskId) -> Json:
-    """What a status tells of the task; empty: nothing."""
-    return next((one for one in status["tasks"] if one["name"] == task), {})
 
 
 def by_file(way: Way) -> str:

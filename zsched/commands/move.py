@@ -11,7 +11,7 @@ from typing import Final
 
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door
-from zsched.commands.common import CliError, Json, print_json, say
+from zsched.commands.common import CliError, Json, print_json, say, told_task
 from zsched.commands.orders import (
     PAUSE_S,
     OrderView,
@@ -123,8 +123,8 @@ def _look(door: Door, order: MoveOrder, revision: int) -> tuple[dict[str, Json],
         return {}, [str(error)]
     found, silent = _robots(door, first)
     lacks = missing(Condition(kind="settled", task=order.task), {str(first["node"]): first, **found})
-    task = next((task for task in first["tasks"] if task["name"] == order.task), None)
-    if task is not None and task["revision"] < revision:
+    task = told_task(first, order.task)
+    if task and task["revision"] < revision:
         lacks.append(f"{order.task}: {first['node']} has not learnt revision {revision}")
     return found, [*lacks, *silent.values()]
 
@@ -133,8 +133,8 @@ def unmeasured(statuses: Mapping[str, Json], name: str) -> list[str]:
     """The robots at which answers flow, and the new owner's first one is not told yet."""
     found = []
     for node, status in statuses.items():
-        task = next((one for one in status["tasks"] if one["name"] == name), None)
-        if task is None:
+        task = told_task(status, name)
+        if not task:
             continue
         flows = [stream for stream in task["streams"] if stream.get("gap_s") is not None]
         if flows and task.get("gap_s") is None:

@@ -20,7 +20,7 @@ from typing import Final, TypeVar
 from zsched import paths as places
 from zsched.clock import monotonic_s, wall_s
 from zsched.commands.ask import Door, ask_door
-from zsched.commands.common import CliError, Json, nearest, print_json, say, warn
+from zsched.commands.common import CliError, Json, nearest, print_json, say, told_task, warn
 from zsched.commands.document import IN_FORCE_S, document_text, in_force
 from zsched.commands.flags import drain_quietly, is_given_for, lift_quietly
 from zsched.commands.orders import OrderView, Row, asker, begin
@@ -284,8 +284,8 @@ class Stage:
         self._view, self._order = view, order
         self._sockets = {path.stem: path for path in places.local_sockets(runtime)} if runtime.is_dir() else {}
         self.first = self._status(view.door)
-        task = self._task(self.first)
-        if task is None:
+        task = told_task(self.first, order.task)
+        if not task:
             names = [str(one["name"]) for one in self.first["tasks"]]
             text = f"fleet {self.first['fleet']} has no task {order.task!r}{nearest(order.task, names)}"
             raise CliError(EXIT_USAGE, text)
@@ -329,10 +329,6 @@ class Stage:
     def _status(self, door: Door) -> Json:
         return ask_door(door, {"verb": "status"})
 
-    def _task(self, status: Json) -> Json | None:
-        """What a node tells of the task; ``None``: it does not know it."""
-        return next((one for one in status["tasks"] if one["name"] == self._order.task), None)
-
     def look(self) -> Look:
         """What the robots tell now; what cannot be asked is something that the task lacks."""
         now = monotonic_s()
@@ -348,7 +344,7 @@ class Stage:
             return Look(now=now, owner=None, epoch=-1, lacks=tuple(silent))
         first = next(iter(statuses.values()))
         lacks = [*silent, *self._lacks(statuses, first)]
-        tasks = {robot: task for robot, status in statuses.items() if (task := self._task(status)) is not None}
+        tasks = {robot: task for robot, status in statuses.items() if (task := told_task(status, self._order.task))}
         if not tasks:
             return Look(now=now, owner=None, epoch=-1, lacks=tuple(lacks))
         task = max(tasks.values(), key=lambda one: int(one["epoch"]))

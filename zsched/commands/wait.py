@@ -12,7 +12,7 @@ from typing import Final
 
 from zsched.clock import monotonic_s
 from zsched.commands.ask import ask_door, find_door
-from zsched.commands.common import CliError, Json, nearest, print_json, say
+from zsched.commands.common import CliError, Json, nearest, print_json, say, told_task
 from zsched.commands.page import span
 from zsched.commands.report import all_problems
 from zsched.core.values.struct import Struct
@@ -98,8 +98,8 @@ def _under_way(statuses: Mapping[str, Json], name: str, why: str) -> list[str]:
     """The nodes whose handover of a task is not over, or that know another owner than the first of them."""
     found, owner = [], None
     for node, status in statuses.items():
-        task = next((one for one in status["tasks"] if one["name"] == name), None)
-        if task is None:
+        task = told_task(status, name)
+        if not task:
             if not why:  # who does not know a task has no stream of it, so none to an old owner either
                 found.append(f"{name}: {node} has not learnt of it yet")
             continue
