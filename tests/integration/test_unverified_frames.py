@@ -183,11 +183,11 @@ class Machine:
         return {str(path.relative_to(self.folder)): (path.stat().st_mtime_ns, path.read_bytes()) for path in found}
 
     def at_rest(self) -> dict[str, tuple[int, bytes]]:
-        """The files, once nothing has changed them for a while."""
+        """The files, once nothing has changed them for a while; no write is under way then, however slow the disk."""
         while True:
             before = self.files()
             time.sleep(QUIET_S)
-            if self.files() == before:
+            if self.files() == before and not any(name.endswith(".new") for name in before):
                 return before
 
     def refusals(self) -> int:
