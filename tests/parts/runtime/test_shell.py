@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any, cast, get_type_hints
 
 import pytest
 
@@ -24,6 +24,7 @@ from zsched.adapters.host.decision_log import DecisionLog
 from zsched.adapters.host.state_file import StateFile
 from zsched.adapters.workers.kept_lines import KeptLines
 from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
+from zsched.commands import ask
 from zsched.commands.history import moves_of
 from zsched.config.timing import WAN
 from zsched.core import events as ev
@@ -34,10 +35,12 @@ from zsched.core.values import fleet as fleet_values
 from zsched.core.values.decision import Explanation, Move
 from zsched.core.values.document import Document, Flag, FlagKind, Text
 from zsched.core.values.durable import DurableState
-from zsched.core.values.fleet import Fleet, Timing, WorkerSpec
+from zsched.core.values.fleet import MOST_ORDER_S, Fleet, Timing, WorkerSpec
 from zsched.core.values.messages import (
     Accept,
     Accepted,
+    Agreed,
+    Asking,
     Ballots,
     ChangeFleet,
     CommandOutcome,
@@ -58,6 +61,7 @@ from zsched.core.values.model import Acceptance, Asked, Tuning, Weights
 from zsched.core.values.plan import STILL_S, Role, RoutePhase, RoutePlan, StreamCount, WorkerRole
 from zsched.core.values.profile import WorkerState
 from zsched.errors import AdapterError, WireError
+from zsched.runtime import desk as desk_module
 from zsched.runtime import shell as shell_module
 from zsched.runtime.desk import LOCAL_REQUESTS_FROM, Desk, command_of
 from zsched.runtime.inbox import INBOX_LIMIT, WAITING_LIMIT, Inbox
@@ -427,6 +431,14 @@ def test_an_order_becomes_the_event_that_says_all_of_it() -> None:
     assert command_of({"verb": "change", "text": "x"}) == ChangeFleet(document=Document(text=Text("x")))
     kinds = [type(ev.commanded(1, command)) for command in (move, pin, tuned)]
     assert kinds == [ev.MoveCommanded, ev.HoldCommanded, ev.TuneCommanded]
+
+
+def test_the_command_line_waits_as_long_as_the_desk_and_for_the_same_orders() -> None:
+    """It names them by their verbs: the values' classes, and zenoh, are not loaded for a question."""
+    made = {verb: get_type_hints(make)["return"] for verb, make in desk_module._COMMANDS.items()}
+    assert {verb for verb, kind in made.items() if issubclass(kind, Agreed)} == ask.AGREED
+    assert {verb for verb, kind in made.items() if issubclass(kind, Asking)} <= ask.READS
+    assert ask.ORDER_TIMEOUT_S > MOST_ORDER_S
 
 
 def test_a_program_on_this_machine_orders_in_no_operator_s_and_no_other_node_s_name(
