@@ -33,6 +33,13 @@ from zsched.sessions.config import data_config
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import Keyspace
 
+ROUTE = Route(
+    stream="t/in/0",
+    direction=Direction.INPUT,
+    from_expr="robot1/in",
+    to_expr="edge1/in",
+    settings=StreamSettings(),
+)
 CONFIG = data_config(listen=("tcp/127.0.0.1:0",), connect=())
 END_S = 5.0
 """A relay ends itself within a second; a busy machine may need longer to let it."""
@@ -141,14 +148,7 @@ def test_garbage_and_bad_plans_are_reported_and_survived(process: subprocess.Pop
     commands, reports = begin(process)
     next_report(reports)
     write_frame(commands, b"garbage")
-    route = Route(
-        stream="t/in/0",
-        direction=Direction.INPUT,
-        from_expr="robot1/in",
-        to_expr="edge1/*/in",
-        settings=StreamSettings(),
-    )
-    bad = Slot(epoch=1, owner="edge1", routes=(route,), ready_when=ReadyWhen.TOKEN)
+    bad = Slot(epoch=1, owner="edge1", routes=(replace(ROUTE, to_expr="edge1/*/in"),), ready_when=ReadyWhen.TOKEN)
     write_frame(commands, wire.encode(RoutePlan(task="t", phase=RoutePhase.PREPARE, current=bad)))
     said = [next_report(reports) for _ in range(3)]
     problems = [str(report.problem) for report in said if isinstance(report, ProblemReported)]
@@ -162,16 +162,9 @@ def test_what_a_plan_could_not_open_is_over_with_the_next_one_that_opens_whole(
     """The operator mends the template: the problem stayed in the status until the daemon began again."""
     commands, reports = begin(process)
     next_report(reports)
-    good = Route(
-        stream="t/in/0",
-        direction=Direction.INPUT,
-        from_expr="robot1/in",
-        to_expr="edge1/in",
-        settings=StreamSettings(),
-    )
-    bad, other = replace(good, to_expr="edge1/*/in"), replace(good, to_expr="edge1/*/*/in")
+    bad, other = replace(ROUTE, to_expr="edge1/*/in"), replace(ROUTE, to_expr="edge1/*/*/in")
     told: list[str] = []
-    for epoch, route in ((1, bad), (1, bad), (2, other), (3, good), (3, bad)):
+    for epoch, route in ((1, bad), (1, bad), (2, other), (3, ROUTE), (3, bad)):
         slot = Slot(epoch=epoch, owner="edge1", routes=(route,), ready_when=ReadyWhen.TOKEN)
         write_frame(commands, wire.encode(RoutePlan(task="t", phase=RoutePhase.PREPARE, current=slot)))
     write_frame(commands, wire.encode(TaskEnded(task="t")))

@@ -520,13 +520,19 @@ def test_export_gives_the_text_back_byte_for_byte(node: Node, tmp_path: Path) ->
     assert "agree one: zsched apply" in result.stderr
 
 
-def test_edit_applies_what_the_editor_leaves_and_keeps_what_is_refused(
-    node: Node, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def editor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An editor that gives all weight to the cpu; drafts lie in the test's folder."""
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr("tempfile.tempdir", None)
     monkeypatch.setenv("EDITOR", "sed -i s/0.5,.memory:.0.5/1/")
     monkeypatch.delenv("VISUAL", raising=False)
+
+
+@pytest.mark.usefixtures("editor")
+def test_edit_applies_what_the_editor_leaves_and_keeps_what_is_refused(
+    node: Node, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     done = run("edit", "--yes")
     assert done.exit_code == 0, done.stderr
     assert node.text == TEXT.replace("0.5, memory: 0.5", "1")
@@ -545,13 +551,10 @@ def test_edit_applies_what_the_editor_leaves_and_keeps_what_is_refused(
     assert list(tmp_path.glob("*.yaml")) == [], "nobody has typed anything"
 
 
+@pytest.mark.usefixtures("editor")
 def test_edit_keeps_what_was_typed_where_it_only_plans_or_is_broken_off(
     node: Node, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("TMPDIR", str(tmp_path))
-    monkeypatch.setattr("tempfile.tempdir", None)
-    monkeypatch.setenv("EDITOR", "sed -i s/0.5,.memory:.0.5/1/")
-    monkeypatch.delenv("VISUAL", raising=False)
     plan = run("edit", "--plan")
     (kept,) = tmp_path.glob("*.yaml")
     assert (plan.exit_code, node.changes, "{cpu: 1}" in kept.read_text()) == (10, [], True), plan.output

@@ -17,6 +17,7 @@ from support.beats import beat_of
 from support.fleets import tuning_of
 from support.profiles import profile_of
 from support.proposals import proposal_of
+from support.snapshots import SNAPSHOT
 from support.waiting import free_endpoint, until
 from zsched.adapters.network import control_bus, open_questions
 from zsched.adapters.network.control_bus import RING, ControlBus, signed_by
@@ -53,7 +54,6 @@ from zsched.core.values.messages import (
 )
 from zsched.core.values.model import Acceptance, Asked
 from zsched.core.values.rehearsal import KeepRehearsal, Step, Strike
-from zsched.core.values.snapshot import QuorumStatus, Snapshot
 from zsched.core.values.words import MAX_ASKER
 from zsched.errors import AdapterError
 from zsched.sessions.config import control_config
@@ -69,19 +69,6 @@ BEAT = beat_of("a")
 PROFILE = profile_of("a", cpu_cores=1, cpu_used_cores=None, memory_mb=10, memory_used_mb=None)
 PROPOSAL = proposal_of("a")
 LEARNT = Learnt(node="a", values=(VALUE,))
-SNAPSHOT = Snapshot(
-    schema="zsched.status/1",
-    version="1",
-    fleet="f",
-    node="b",
-    kind="robot",
-    incarnation=1,
-    up_s=1.0,
-    loop_lag_s=0.0,
-    quorum=QuorumStatus(electors=3, needed=2, alive=3, ok=True, this_node="elector"),
-    nodes=(),
-    tasks=(),
-)
 RESULT = CommandResult(outcome=CommandOutcome.OK, detail="done", revision=4)
 COMMAND = SetWeights(task="merge", cpu=1.0, memory=0.0, network=0.0)
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from support.snapshots import SNAPSHOT
 from support.waiting import free_endpoint, until
 from zsched.adapters.network import fleet_client
 from zsched.adapters.network.control_bus import ControlBus
@@ -16,26 +17,12 @@ from zsched.core import events as ev
 from zsched.core.values.fleet import Timing
 from zsched.core.values.messages import CommandOutcome, CommandResult, MoveTask, RestartTask
 from zsched.core.values.model import Asked
-from zsched.core.values.snapshot import SCHEMA, QuorumStatus, Snapshot
 from zsched.core.values.struct import replace
 from zsched.errors import AdapterError
 from zsched.sessions.config import client_config, control_config
 
 MOVE = MoveTask(task="merge", node="edge1", asked=Asked(by="ada@laptop"), base_revision=3)
 DONE = CommandResult(outcome=CommandOutcome.OK, detail="done", revision=4)
-SNAPSHOT = Snapshot(
-    schema=SCHEMA,
-    version="1",
-    fleet="f",
-    node="b",
-    kind="robot",
-    incarnation=1,
-    up_s=1.0,
-    loop_lag_s=0.0,
-    quorum=QuorumStatus(electors=3, needed=2, alive=3, ok=True, this_node="elector"),
-    nodes=(),
-    tasks=(),
-)
 
 
 class There:
