@@ -8,6 +8,9 @@ TEST_JOBS ?= 2
 REAL_JOBS ?= 4
 # Which tests: what is marked `long` tells a whole story, or again what a shorter test tells too.
 MARK ?= not long
+# Of the long ones only a share, OWN/COUNT, OWN from 0; `.ci/run` says which.
+LONG ?=
+ONLY = -m "$(MARK)" $(if $(LONG),--long-share=$(LONG))
 # How the tests with real processes are run; `.ci/run` gives failed ones a second chance, alone.
 PYTEST_REAL ?= -m pytest
 
@@ -42,12 +45,12 @@ test-all: MARK =
 test-all: test  ## All tests
 
 test-cpu: $(VENV)/.dev  ## Tests that only need a processor: unit, paper, simulator
-	$(BIN)/python -m pytest -q -m "$(MARK)" -n $(TEST_JOBS) --dist loadfile tests/unit tests/paper tests/sim tests/planted
+	$(BIN)/python -m pytest -q $(ONLY) -n $(TEST_JOBS) --dist loadfile tests/unit tests/paper tests/sim tests/planted
 
 # Real fleets of the system tests keep real time and fill a machine: they have it to themselves.
 test-real: $(VENV)/.dev  ## Tests with real processes (real daemons on localhost, booted machines, bench)
-	$(BIN)/python $(PYTEST_REAL) -q -m "$(MARK)" --durations=10 tests/system
-	$(BIN)/python $(PYTEST_REAL) -q -m "$(MARK)" -n $(REAL_JOBS) --dist loadfile --no-loadscope-reorder --durations=10 \
+	$(BIN)/python $(PYTEST_REAL) -q $(ONLY) --durations=10 tests/system
+	$(BIN)/python $(PYTEST_REAL) -q $(ONLY) -n $(REAL_JOBS) --dist loadfile --no-loadscope-reorder --durations=10 \
 	  tests/booted tests/integration tests/bench tests/parts
 
 test-quick: $(VENV)/.dev  ## Unit and paper tests only

@@ -31,6 +31,7 @@ from pathlib import Path
 import pytest
 import typer.testing
 
+from support.shares import left_out
 from support.stalls import Moment, Stalls, now
 
 MEASURES = ("TooSlowError", "between", "within")
@@ -54,8 +55,19 @@ def pytest_configure() -> None:
             signal.signal(number, signal.SIG_DFL)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Let pytest-rerunfailures run again what was too slow, and nothing else."""
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """For `.ci/run`."""
+    parser.addoption("--long-share", default="", metavar="OWN/COUNT", help="of long tests only this share, from 0")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out the long tests of other shares; let pytest-rerunfailures run again what was too slow, nothing else."""
+    long = [item for item in items if item.get_closest_marker("long") is not None]
+    others = left_out((str(item.path) for item in long), config.getoption("--long-share"))
+    left = [item for item in long if str(item.path) in others]
+    if left:
+        config.hook.pytest_deselected(items=left)
+        items[:] = [item for item in items if item not in left]
     again = pytest.mark.flaky(reruns=2, only_rerun=["TooSlowError"])
     for item in items:
         module = item.getparent(pytest.Module)

@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 
 
-def planned(folder: Path, *programs: str, target: str = "image") -> str:
+def planned(folder: Path, *programs: str, target: str = "image", words: tuple[str, ...] = ()) -> str:
     """The commands of a target on a machine that has these programs."""
     make = shutil.which("make")
     if make is None:
@@ -20,7 +20,7 @@ def planned(folder: Path, *programs: str, target: str = "image") -> str:
     for name in programs:
         (folder / name).write_text("#!/bin/sh\n")
         (folder / name).chmod(0o755)
-    command = [make, "--dry-run", "--always-make", target]
+    command = [make, "--dry-run", "--always-make", target, *words]
     env = {**os.environ, "PATH": f"{folder}:/nowhere", "SHELL": "/bin/sh"}
     done = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, timeout=60, check=True)
     return done.stdout
@@ -31,6 +31,15 @@ def planned(folder: Path, *programs: str, target: str = "image") -> str:
 )
 def test_the_image_is_built_by_what_there_is(tmp_path: Path, programs: tuple[str, ...], engine: str) -> None:
     assert f"{engine} build" in planned(tmp_path, *programs)
+
+
+def test_a_share_of_the_long_tests_is_a_word_of_every_pytest(tmp_path: Path) -> None:
+    """As `.ci/run` says it; without it `make test-all` runs all."""
+    told = [planned(tmp_path, target="test-all", words=words) for words in ((), ("LONG=1/3",))]
+    lines = [[line for line in one.splitlines() if "-m pytest" in line] for one in told]
+    assert [len(one) for one in lines] == [3, 3]
+    assert not any("--long-share" in line for line in lines[0])
+    assert all("--long-share=1/3" in line for line in lines[1])
 
 
 def test_a_wheel_of_before_does_not_come_into_the_image(tmp_path: Path) -> None:
