@@ -28,6 +28,7 @@ from zsched_lab.paper.matrix import Matrix, collect, undone
 from zsched_lab.paper.metrics import Truth, brief, measure
 from zsched_lab.paper.places import scenario_path
 from zsched_lab.paper.plan import AROUND_S, leave_out, plan_text, without
+from zsched_lab.paper.published import RESULTS, unpack
 from zsched_lab.paper.radio_bench import RADIO_SCHEMES, radio_results, run_radio
 from zsched_lab.paper.report import groups_of, in_block, is_whole, main_level, report
 from zsched_lab.paper.robots import ExploreRobots, LogRobots, Robots, slam_task
@@ -250,6 +251,11 @@ def claim_folder(options: BenchOptions, body: Mapping[str, Any]) -> str | None:
         return None
     if not options.is_resumed and not options.is_report:
         return f"--out {out}: the folder is not empty; name a new one, or go on with --resume"
+    if not plan.exists() and (out / RESULTS).exists():
+        wrong = unpack(out, body)
+        if wrong is None:
+            write_json(plan, body)
+        return wrong
     try:
         before = json.loads(plan.read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -271,13 +277,14 @@ def conclude(options: BenchOptions, scenario: Scenario, inputs: InputsOf, cells:
         "command": command_of(options),
         "scenario": asdict(scenario) | {"fleet": scenario.fleet.name},
         "input": inputs.name,
+        "drives": inputs.drives.name if inputs.drives else None,
         "runs": runs,
         "invalid": invalid,
         "missing": [cell.name for cell in undone(options.out, cells)],
         "skipped": rest.skipped,
         "radio": rest.radio,
     }
-    write_json(options.out / "results.json", results)
+    write_json(options.out / RESULTS, results)
     title = f"{scenario.name}, load {main_level(results)}, seed {scenario.seed}, {inputs.name}"
     main = in_block(runs, scenario.main)
     level = main_level(results)

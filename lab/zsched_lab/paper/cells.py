@@ -26,7 +26,12 @@ class Cell:
     @property
     def name(self) -> str:
         """Its folder's name."""
-        return f"{self.level if self.block == MATRIX else self.block}-{self.scheme.name}-{self.run + 1}"
+        return cell_name(self.block, self.level, self.scheme.name, self.run)
+
+
+def cell_name(block: str, level: str, scheme: str, run: int) -> str:
+    """The name of a run's folder; ``run`` counts from 0."""
+    return f"{level if block == MATRIX else block}-{scheme}-{run + 1}"
 
 
 def cells_of(scenario: Scenario, names: tuple[str, ...], runs: int | None = None) -> tuple[Cell, ...]:

@@ -90,6 +90,7 @@ def measure(folder: Path, scenario: Scenario, truth: Truth) -> Json:
             key: run[key]
             for key in ("scheme", "family", "block", "level", "run", "seed", "host", "mode", "input", "links")
         },
+        "version": run.get("version"),  # runs may be made on several days
         "nodes": per_edge,
         **over_nodes(per_edge),
         **stream_figures(streams, len(run["robots"]), duration_s),

@@ -20,6 +20,7 @@ from typing import Any
 
 from ruamel.yaml import YAML
 
+from zsched import __version__
 from zsched.adapters.host.operator_client import ask
 from zsched.clock import monotonic_s
 from zsched.core.values.model import NodeId
@@ -339,6 +340,7 @@ class CellRun:
         children.stop(*children.running("daemon-"))
         body = {
             "schema": RUN_SCHEMA,
+            "version": __version__,
             "scenario": self._scenario.name,
             "scheme": self._cell.scheme.name,
             "family": self._cell.scheme.family.value,

@@ -20,6 +20,7 @@ from zsched_lab.paper.matrix import (
     collect,
     invalid_reason,
     set_aside,
+    undone,
 )
 from zsched_lab.paper.places import robots_scenario_path, scenario_path
 from zsched_lab.paper.plan import AROUND_S, leave_out, plan_text, without
@@ -283,6 +284,40 @@ def test_a_folder_goes_on_only_with_the_same_bench(tmp_path: Path) -> None:
     (out / "plan.json").unlink()
     (out / "x").write_text("")
     assert "none of" in (claim_folder(resumed, body) or "")
+
+
+def test_a_bench_goes_on_behind_a_results_json_alone(tmp_path: Path) -> None:
+    first, later = tmp_path / "first", tmp_path / "later"
+    given = options(first, is_exploring=True, schemes=("zsched",), drives=tmp_path / "drives")
+    scenario, cells, _ = planned(given)
+    body = plan_body(scenario, InputsOf(given, scenario), cells)
+    claim_folder(given, body)
+    done = {"scheme": "zsched", "run": 0, "level": scenario.level, "block": MATRIX, "map_hz": 3.5, "nodes": {}}
+    done |= {"host": {"pressure": 0.05, "idle_ratio": None}, "links": "recorded", "definitions": DEFINITIONS}
+    failed = {"cell": cells[1].name, "attempt": 1, "reason": "pressure"}
+    for name, file, told in ((cells[0].name, METRICS, done), (f"{cells[1].name}.invalid-1", "invalid.json", failed)):
+        (first / "runs" / name).mkdir(parents=True)
+        (first / "runs" / name / file).write_text(json.dumps(told))
+    assert run_bench(replace(given, is_report=True)) == 0
+    told = json.loads((first / "results.json").read_text())
+    later.mkdir()
+    resumed = replace(given, out=later, is_resumed=True)
+
+    for damaged, word in (
+        ({**told, "drives": None}, "another scenario"),
+        ({**told, "runs": [{**done, "definitions": DEFINITIONS - 1}]}, f"{cells[0].name} has figures by older"),
+        ({**told, "runs": [{}]}, "is no results.json"),
+        ([], "is no results.json"),
+    ):
+        (later / "results.json").write_text(json.dumps(damaged))
+        assert word in (claim_folder(resumed, body) or "")
+        assert [path.name for path in later.iterdir()] == ["results.json"]
+
+    (later / "results.json").write_text(json.dumps(told))
+    assert claim_folder(resumed, body) is None
+    assert undone(later, cells) == list(cells[1:])
+    assert collect(later, cells) == ([done], [failed])
+    assert claim_folder(resumed, body) is None
 
 
 def test_a_report_of_what_is_done_so_far_runs_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
