@@ -236,7 +236,7 @@ def renew(where: Where, label: str | None, request: Path | None, out: Path | Non
 def deliver(where: Where, door: Door, label: str | None) -> int:
     """Renew what is due, or one label, and send every node its newest certificate; the exit code.
 
-    A node that was away gets it the next time.
+    A node that was away gets it the next time. What the fleet has no node for is named, and not renewed.
 
     Raises:
         CliError: there is no such node's key, the fleet has no such node (any more), or nobody answers here.
@@ -255,7 +255,12 @@ def deliver(where: Where, door: Door, label: str | None) -> int:
             advice = f"`zsched pki renew {label}` writes it to a file, `zsched pki revoke {label}` ends it"
             said = f"{label}: the fleet has no node {named[0].holder.name}; nothing was renewed or sent"
             raise CliError(EXIT_FAILED, f"{said}: {advice}")
-        due = [one.label for one in named if one.label == label or one.is_due(now, number)]
+        wanted = [one for one in named if one.label == label or one.is_due(now, number)]
+        for one in wanted:
+            if one.holder.name not in members:
+                told = f"{one.label}: due, and not renewed: the fleet has no node {one.holder.name}"
+                _say(f"{told}; `zsched pki revoke {one.label}` ends it")
+        due = [one.label for one in wanted if one.holder.name in members]
         secret = _passphrase(authority) if due else b""
         for one in due:
             authority.renew(one, None, b"", secret, _now())

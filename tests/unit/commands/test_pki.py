@@ -219,6 +219,12 @@ def test_what_is_due_is_sent_to_the_nodes_and_so_is_what_a_node_has_missed(
         assert "robot2: the fleet has no node robot2; nothing was renewed or sent" in refused
         assert (asked, json.loads(pki("show", "--json").stdout)) == ([], ended)
         pki(*words)
+        pki("rotate")
+        ended = json.loads(pki("show", "--json").stdout)
+        assert pki(*words).stdout == (
+            "robot2: due, and not renewed: the fleet has no node robot2; `zsched pki revoke robot2` ends it\n"
+        )
+        assert (asked, json.loads(pki("show", "--json").stdout)) == ([], ended)
         assert "go without --deliver" in pki(*words, "robot2", "--out", "x", code=2).stderr
 
 
