@@ -118,8 +118,9 @@ def fleet_create(
 def invite(
     name: Annotated[str, typer.Argument(metavar="NAME", help="The new machine's name in the fleet.")],
     kind: Annotated[
-        Kind, typer.Option("--kind", "--role", help="A robot votes and has streams; an edge only works.")
-    ] = Kind.ROBOT,
+        Kind | None,
+        typer.Option("--kind", "--role", help="A robot votes and has streams; an edge only works. [robot]"),
+    ] = None,
     address: Annotated[
         str | None, typer.Option("--address", metavar="ADDRESS", help=f"{AddressHelp} [nobody dials it]")
     ] = None,
@@ -159,7 +160,7 @@ def invite(
     from zsched.core.values.model import NodeKind  # noqa: PLC0415 - as above
 
     tasks = tuple(candidate_for or ())
-    words = ["invite", name, *(["--kind", "edge"] if kind is Kind.EDGE else [])]
+    words = ["invite", name, *(["--kind", kind.value] if kind is not None else [])]
     words += ["--address", address] if address is not None else []
     words += [word for task in tasks for word in ("--candidate-for", task)]
     words += ["--output", str(output)] if output is not None else []
@@ -175,7 +176,8 @@ def invite(
         is_data=True,
         at=(node, runtime_dir, connect),
     )
-    guest = Guest(name=name, kind=NodeKind(kind.value), address=address, tasks=tasks, authority=authority, request=csr)
+    said = None if kind is None else NodeKind(kind.value)
+    guest = Guest(name=name, kind=said, address=address, tasks=tasks, authority=authority, request=csr)
     raise typer.Exit(bring(find_door(runtime_dir, node, connect=connect), view, guest, output))
 
 

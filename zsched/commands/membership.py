@@ -288,7 +288,8 @@ class Guest(Struct, frozen=True, kw_only=True):
     """The machine that is to come."""
 
     name: str
-    kind: NodeKind = NodeKind.ROBOT
+    kind: NodeKind | None = None
+    """``None``: nobody has said; a robot, unless the document knows the node."""
     address: str | None = None
     """``None``: it dials the others, and nobody dials it."""
     tasks: tuple[str, ...] = ()
@@ -338,7 +339,7 @@ def _check_invited_again(door: Door, guest: Guest, kind: NodeKind) -> None:
     state = next((str(one["state"]) for one in status_of(door)["nodes"] if one["name"] == guest.name), "")
     if state in HERE:
         raise CliError(EXIT_FAILED, f"{guest.name} is a node of the fleet, and {state}: give the machine another name")
-    is_other = guest.kind is not kind and guest.kind is not NodeKind.ROBOT  # which is also what nobody has said
+    is_other = guest.kind not in (None, kind)
     if guest.address is not None or guest.tasks or is_other:
         advice = "without options it gets its invitation once more; `zsched edit` changes what it is"
         told = "an edge" if kind is NodeKind.EDGE else "a robot"
@@ -362,7 +363,8 @@ def _with_guest(held: InForce, guest: Guest, address: Address | None) -> str:
     """The document with the node, as the last one to dial, and among the candidates."""
     text = document_text(held)
     fleet = fleet_of(text)
-    entry = _entry_of(guest.name, guest.kind, address, protocol_of(fleet))
+    kind = NodeKind.ROBOT if guest.kind is None else guest.kind
+    entry = _entry_of(guest.name, kind, address, protocol_of(fleet))
     text = add_entries(text, "nodes", f"nodes:\n{entry}", f"the name {guest.name}")
     if address is not None:
         known = fleet.seeds if is_list(text, ("seeds",)) else ()

@@ -392,6 +392,16 @@ def test_what_cannot_be_invited_changes_nothing(node: Node, words: tuple[str, ..
     assert (result.stdout, node.changes) == ("", [])
 
 
+def test_a_kind_that_is_said_is_held_against_the_documents(node: Node) -> None:
+    node.states["edge1"] = "gone"
+    refused = run("invite", "edge1", "--kind", "robot", "--yes")
+    assert (refused.exit_code, refused.stdout) == (1, "")
+    assert "edge1 is in the document already, as an edge; without options" in refused.stderr
+    for words in (("edge1",), ("edge1", "--kind", "edge"), ("robot3", "--kind", "robot")):
+        assert run("invite", *words, "--yes").exit_code == 0
+    assert node.changes == []
+
+
 def test_off_a_terminal_an_invitation_takes_a_yes(node: Node) -> None:
     result = run("invite", "robot2", "--address", "192.0.2.12")
     assert result.exit_code == 2
