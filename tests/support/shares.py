@@ -1,6 +1,6 @@
 """Shares of the long tests: CI runs one of a few for each commit, `make test-all` runs all.
 
-Whole files go together: they share fleets. The files are dealt out in the order of their names, so shares differ little.
+Whole files go together: they share fleets. They are dealt out in the order of their names, so shares differ little.
 """
 
 from __future__ import annotations
