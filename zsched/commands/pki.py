@@ -256,10 +256,9 @@ def deliver(where: Where, door: Door, label: str | None) -> int:
             said = f"{label}: the fleet has no node {named[0].holder.name}; nothing was renewed or sent"
             raise CliError(EXIT_FAILED, f"{said}: {advice}")
         wanted = [one for one in named if one.label == label or one.is_due(now, number)]
-        for one in wanted:
-            if one.holder.name not in members:
-                told = f"{one.label}: due, and not renewed: the fleet has no node {one.holder.name}"
-                _say(f"{told}; `zsched pki revoke {one.label}` ends it")
+        for stray in [one for one in wanted if one.holder.name not in members]:
+            told = f"{stray.label}: due, and not renewed: the fleet has no node {stray.holder.name}"
+            _say(f"{told}; `zsched pki revoke {stray.label}` ends it")
         due = [one.label for one in wanted if one.holder.name in members]
         secret = _passphrase(authority) if due else b""
         for one in due:
