@@ -71,7 +71,7 @@ format: $(VENV)/.dev  ## Format everything
 man: $(VENV)/.dev  ## Write the manual pages anew (man/), from the texts of --help
 	$(BIN)/zsched man man
 
-bench: $(VENV)/.dev  ## Print the figures of the README (takes some minutes; keep the machine quiet)
+bench: $(VENV)/.dev  ## Print figures (takes some minutes; keep the machine quiet)
 	$(BIN)/python -m benchmarks.run
 
 # The wheels' platforms and hashes are in package/requirements.lock; nothing else is fetched. No root is needed.

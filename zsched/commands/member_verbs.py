@@ -238,8 +238,9 @@ def leave(
 ) -> None:
     """Take this machine out of its fleet: its tasks move away, its seat among the electors too, and its daemon ends.
 
-    Nothing of the others' streams is interrupted. Exits with 5 at the deadline: the leave stays in force, and the same
-    command goes on with it; `zsched undrain NODE` takes it back. Another machine is taken out by `zsched node forget`.
+    Nothing of the others' streams is lost; in a secured fleet they pause while the daemons begin again. Exits with 5 at
+    the deadline: the leave stays in force, and the same command goes on with it; `zsched undrain NODE` takes it back.
+    Another machine is taken out by `zsched node forget`.
 
     With --to the machine becomes a node of another fleet of the site, and is ready there in the end. Its own fleet
     names it until then: where the other one does not take it, it goes back.

@@ -173,7 +173,7 @@ def floors_text(groups: Mapping[str, Sequence[Json]]) -> str:
         return ""
     return (
         f"A merger that costs nothing gains {', '.join(floors)} of the task latency. No scheduler can gain more, "
-        "so the claim and the goal of -28 % are out of reach there.\n"
+        "so by the mean the claim and the goal of -28 % are out of reach there.\n"
     )
 
 
