@@ -63,6 +63,7 @@ class Acceptor:
     def adopt(self, fleet: Fleet) -> None:
         """Take nodes and times from ``fleet``; what waits for a task that has gone goes with it."""
         self._fleet, self._nodes = fleet, frozenset(node.name for node in fleet.nodes)
+        self._buckets = {node: bucket for node, bucket in self._buckets.items() if node in self._nodes}
         self._parked = {key: known for key, known in self._parked.items() if key[0] in self.registers}
 
     def next_deadline(self) -> float:
@@ -190,7 +191,12 @@ class Acceptor:
             self._accept_or_park(event, deadline, todo, now)
 
     def may_ask(self, asker: NodeId, now: float) -> bool:
-        """Take one token of the asker's bucket (`PREPARES_PER_S`, at most `PREPARE_BURST` saved); a no costs none."""
+        """Take one token of the asker's bucket (`PREPARES_PER_S`, at most `PREPARE_BURST` saved); a no costs none.
+
+        Who is no node has no bucket: inventing names takes no memory.
+        """
+        if asker not in self._nodes:
+            return False
         tokens, at = self._buckets.get(asker, (PREPARE_BURST, now))
         tokens = min(tokens + (now - at) * PREPARES_PER_S, PREPARE_BURST)
         may_ask = tokens >= 1.0

@@ -371,10 +371,10 @@ class Agreement:
         is refused, and comes again alone.
         """
         ballots, request, asker = event.ballots, event.request, event.asker
-        may_ask = not (ballots.prepares or ballots.ahead) or self.acceptor.may_ask(asker, now)
         sent, todo.send = todo.send, []
         if ballots.fleet is not None:
             self._hear_fleet(ballots.fleet, asker, todo, now)
+        may_ask = not (ballots.prepares or ballots.ahead) or self.acceptor.may_ask(asker, now)
         for prepare in ballots.prepares:
             promise = ev.PrepareAsked(request=request, asker=asker, prepare=prepare)
             self.acceptor.on_prepare(promise, todo, now, may_ask=may_ask)

@@ -272,6 +272,17 @@ def elector_of_a_change(*, has_accepted: bool = True) -> Agreement:
     return agreement
 
 
+def test_names_that_are_no_node_s_take_no_memory() -> None:
+    """Each left what it may ask for how often, for ever; a node's own questions are counted as before."""
+    one = elector_of_a_change()
+    for number in range(1000):
+        ask(one, prepare(TASKS[0], node=f"x{number}"), asker=f"x{number}")
+    assert one.acceptor._buckets == {}
+    assert one.counters["prepare_foreign"] == 1000
+    ask(one, prepare(TASKS[0]))
+    assert list(one.acceptor._buckets) == ["robot2"]
+
+
 def settling(fleet: FleetValue | None = CHANGED) -> ev.BallotsAsked:
     """The first frame with which the proposer of `CHANGED` settles it."""
     asked = [
