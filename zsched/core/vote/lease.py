@@ -429,6 +429,8 @@ class Leases:
         # Nothing is released: the worker of a task that goes may still be at work.
         names = {task.name for task in fleet.tasks}
         self._holders = {task: holder for task, holder in self._holders.items() if task in names}
+        # Who asks for a task that has gone has let its granter go, too: each release would be in all beats for ever.
+        self._releases = {task: release for task, release in self._releases.items() if task in leased}
 
     # --- electors ----------------------------------------------------------------------------------------------------
 

@@ -319,6 +319,16 @@ def test_an_elector_that_never_knew_of_long_leases_waits_for_them_too() -> None:
     assert one.may_accept("guard", "r3", 20.0 + HOLD_S), "a guard time was waited for meanwhile"
 
 
+def test_the_release_of_a_task_that_has_gone_is_in_no_beat_any_more() -> None:
+    """Else beats grow by one for each exclusive task that was ever removed."""
+    held = owner()
+    held.end("guard", 6)
+    held.adopt(FLEET, {"guard": value("r2")}, 10.2)
+    assert [one.task for one in held.on_sent(7, 10.3).released] == ["guard"]
+    held.adopt(WITHOUT, {"other": None}, 10.4)
+    assert held.on_sent(8, 10.5).released == ()
+
+
 def test_a_task_that_stays_in_the_fleet_waits_for_no_lease_again() -> None:
     one = elector()
     assert one.may_accept("guard", "r3", 100.0)
