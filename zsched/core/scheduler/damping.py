@@ -70,6 +70,7 @@ class Damping(Struct):
             if has_failed and not was_draining:
                 gained = 2.0 + float(now - self._owner_since < EARLY_FAILURE_S)
                 self._points[left] = (self.points(left, now) + gained, now)
+            self._forget_old(now)
             self._moves.append((now, has_failed))
         self._owner_since = now
 
@@ -102,6 +103,9 @@ class Damping(Struct):
 
     def moves_within(self, seconds: float, now: float, *, escapes: bool) -> int:
         """How many moves (escapes or the others) this node has learnt in the last ``seconds`` (at most a minute)."""
+        self._forget_old(now)
+        return sum(now - at <= seconds and failed == escapes for at, failed in self._moves)
+
+    def _forget_old(self, now: float) -> None:
         while self._moves and now - self._moves[0][0] > WINDOW_S:
             self._moves.popleft()
-        return sum(now - at <= seconds and failed == escapes for at, failed in self._moves)

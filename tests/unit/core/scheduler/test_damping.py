@@ -28,6 +28,14 @@ def test_first_placement_is_no_move() -> None:
     assert damping.moves_within(WINDOW_S, 10.0, escapes=False) == 0
 
 
+def test_only_moves_of_the_last_minute_are_remembered_also_where_nobody_judges() -> None:
+    """An edge learns of moves for weeks, and asks for no count of them."""
+    damping = Damping()
+    for minute in range(1000):
+        damping.note_move("edge1", has_failed=False, now=WINDOW_S * minute)
+    assert damping.memory().moves == ((WINDOW_S * 998, False), (WINDOW_S * 999, False))
+
+
 def test_penalty_grows_with_every_failure_and_is_bounded() -> None:
     damping, seen = Damping(), []
     for number in range(6):
