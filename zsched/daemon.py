@@ -56,7 +56,7 @@ from zsched.runtime.descriptors import take_descriptors
 from zsched.runtime.desk import Desk
 from zsched.runtime.endpoints import DATA_PORT, Endpoints, claim_port, endpoints_for, free_port, is_here
 from zsched.runtime.inbox import Inbox
-from zsched.runtime.leaving import Leaving
+from zsched.runtime.leaving import Leaving, Told
 from zsched.runtime.library import Library
 from zsched.runtime.membership import copied_file
 from zsched.runtime.memory import shared_memory_objection
@@ -116,14 +116,12 @@ class Daemon:
         self._notify = Notifier()
         self._next_status = 0.0
         self._leftovers = Leftovers()
-        self._is_restart = False
+        self._told = Told()
         self._has_left = False
         """This machine is in no fleet any more, by `zsched leave`."""
         self._sleeps = SleepWatch()
         self._certificate = ""
         """Digest of the certificate that open sessions listen with."""
-        self.begins_anew = False
-        """The process is to become another daemon, in place, once this one has ended."""
         self._door = Door(options.runtime_dir, options.node)
         self._is_ready = False
         self._library = Library(
@@ -137,6 +135,11 @@ class Daemon:
         self._pools: str | None = None
         """An operator's own ``ZENOH_RUNTIME``."""
         self._read_settings()
+
+    @property
+    def begins_anew(self) -> bool:
+        """Whether the process becomes another daemon, in place, once this one has ended."""
+        return self._told.begins_anew
 
     def run(self) -> int:
         """Run until SIGTERM or SIGINT; the exit code."""
@@ -323,7 +326,7 @@ class Daemon:
         adoption.begin()
         shell.follow = adoption.adopt
         relay.start()
-        stack.callback(lambda: relay.leave() if self._is_restart else relay.stop(1.0))
+        stack.callback(lambda: relay.leave() if self._told.keeps_relay else relay.stop(1.0))
         stack.callback(lambda: supervisor.close(FINISH_WORKERS_S if self.begins_anew else CLOSE_WORKERS_S))
         sampler.start()
         stack.callback(sampler.stop)
@@ -410,7 +413,7 @@ class Daemon:
 
     def _handle_signals(self, stack: contextlib.ExitStack) -> None:
         def stop(number: int, _frame: object) -> None:
-            self._is_restart, self.begins_anew = number == RESTART_SIGNAL, False
+            self._told.stop(keeps_relay=number == RESTART_SIGNAL)
             self._inbox.post(ev.StopRequested())
 
         for number in (signal.SIGTERM, signal.SIGINT, RESTART_SIGNAL):
@@ -427,7 +430,8 @@ class Daemon:
 
     def _leave(self) -> None:
         """An operator has taken this machine out of its fleet; called by the operator socket's threads."""
-        self._has_left, self._is_restart, self.begins_anew = True, False, False
+        self._has_left = True
+        self._told.stop()
         log.info("left node=%s: the service does not start it again", self._options.node)
         self._inbox.post(ev.StopRequested())
 
@@ -470,13 +474,15 @@ class Daemon:
                 self._notify.status(status_line(node))
 
     def _end_to_begin_anew(self) -> None:
+        self._told.begin_anew()
+        if not self.begins_anew:
+            return  # somebody has told us to end while we looked whether it is our turn
         log.info(
             "sessions node=%s are opened anew: others are let in or dialled, or its certificate or address is another",
             self._options.node,
         )
         with contextlib.suppress(OSError):  # without it an operator's command says that there is no daemon
             places.again_path(self._options.runtime_dir, self._options.node).touch()
-        self._is_restart = self.begins_anew = True
         self._inbox.post(ev.StopRequested())
 
     def _say_goodbye(self, node: Node, last_words: str) -> None:

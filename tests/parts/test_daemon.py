@@ -396,7 +396,7 @@ import os, signal, sys
 from zsched import daemon
 if "BEGUN" not in os.environ:
     from zsched.runtime.session_watch import SessionWatch
-    os.environ["BEGUN"], SessionWatch.is_due = "1", lambda *_: True
+    os.environ["BEGUN"], SessionWatch.is_due = "1", lambda *_: DUE
     sys.exit(daemon.main(sys.argv[1:]))
 """
 
@@ -518,12 +518,15 @@ def test_journal_stamps_its_own_times_and_an_early_stop_is_an_orderly_one(place:
     assert {line.split()[0] for line in error.splitlines()} <= {"DEBUG", "INFO", "WARNING"}, error
 
 
-def begin_anew(place: Place, second_life: str, env: Mapping[str, str] | None = None) -> Any:
-    """A daemon whose turn it is at once; what its process becomes runs ``second_life`` in place of a daemon's start."""
+def begin_anew(place: Place, second_life: str, env: Mapping[str, str] | None = None, due: str = "True") -> Any:
+    """A daemon whose turn it is at once; what its process becomes runs ``second_life`` in place of a daemon's start.
+
+    ``due``: what tells that it is its turn.
+    """
     place.file.write_text(json.dumps(json.loads(place.file.read_text()) | {"relay_orphan_s": 0}))
     places = ["--state-dir", str(place.folder / "state"), "--runtime-dir", str(place.folder)]
     process = subprocess.Popen(
-        [sys.executable, "-c", FIRST_LIFE + second_life, "--config", str(place.file), "--node", "edge1", *places],
+        [sys.executable, "-c", FIRST_LIFE.replace("DUE", due) + second_life, "--config", str(place.file), "--node", "edge1", *places],
         stderr=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -543,6 +546,17 @@ def test_the_daemon_that_follows_in_the_process_sizes_zenoh_s_pools_itself(
     _, error = process.communicate(timeout=60)
     assert process.returncode == EXIT_OK, error
     assert error.splitlines()[-1] == f"begun with {of_operator}"
+
+
+def test_a_daemon_that_is_stopped_while_it_looks_whether_it_begins_anew_ends(place: Place) -> None:
+    """It went on as another daemon, which nobody had told to stop."""
+    stopped = "os.kill(os.getpid(), signal.SIGTERM) or True"
+    process = begin_anew(place, "print('begun', file=sys.stderr)", due=stopped)
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == EXIT_OK, error
+    assert "begun" not in error
+    assert "INFO zsched.daemon stopping node=edge1" in error
+    assert not list(place.folder.glob("*.again"))
 
 
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGUSR2], ids=["reload", "restart"])

@@ -1,7 +1,7 @@
 """When a daemon that was told to stop goes: once what it owns has moved, or when it has waited for long enough.
 
-Knows: how long each wait is, and that a second signal means now. Does not know: signals, clocks, what moves
-a task.
+Knows: how long each wait is, that a second signal means now, and that who was told to stop does not begin anew. Does
+not know: signals, clocks, what moves a task.
 """
 
 from __future__ import annotations
@@ -25,6 +25,36 @@ FINISH_S = 10.0
 """...and where it begins anew: at most this long, until its workers say that they have finished."""
 TWICE_S = 0.3
 """Two signals so close together are one: a terminal and a wrapper may both pass on the same Ctrl-C."""
+
+
+class Told(Struct, eq=False):
+    """What a process was told of its end: by a signal, which may come between any two steps, or by an operator's thread.
+
+    What the process itself has in mind (`begin_anew`) never takes that back, whichever of both came first.
+    """
+
+    _is_told: bool = False
+    _keeps_relay: bool = False
+    _wants_anew: bool = False
+
+    def stop(self, *, keeps_relay: bool = False) -> None:
+        """Somebody tells it to end. ``keeps_relay``: its service starts again at once."""
+        self._keeps_relay = keeps_relay
+        self._is_told = True
+
+    def begin_anew(self) -> None:
+        """It is to become another daemon, in place."""
+        self._wants_anew = True
+
+    @property
+    def begins_anew(self) -> bool:
+        """Whether it becomes another daemon: nobody has told it to end."""
+        return self._wants_anew and not self._is_told
+
+    @property
+    def keeps_relay(self) -> bool:
+        """Whether its relay stays for the daemon that follows."""
+        return self._keeps_relay or self.begins_anew
 
 
 class Leaving(Struct):

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 
-from zsched.runtime.leaving import ANEW_S, FINISH_S, HAND_OVER_S, LEAVE_S, NOBODY_S, TWICE_S, Leaving
+from zsched.runtime.leaving import ANEW_S, FINISH_S, HAND_OVER_S, LEAVE_S, NOBODY_S, TWICE_S, Leaving, Told
 
 OWNED = ("map", "plan")
 
@@ -50,6 +52,23 @@ def test_a_daemon_that_begins_anew_waits_longer_for_the_move() -> None:
     assert not leaving.is_over(OWNED, OWNED, 100.0 + ANEW_S - 0.01)
     assert leaving.is_over(OWNED, OWNED, 100.0 + ANEW_S)
     assert leaving.is_over(OWNED, (), 100.0 + NOBODY_S), "nobody can take them"
+
+
+@pytest.mark.parametrize("is_first", [True, False])
+def test_who_is_told_to_end_does_not_begin_anew_whichever_came_first(is_first: bool) -> None:
+    for keeps_relay in (False, True):
+        told = Told()
+        steps = [told.begin_anew, partial(told.stop, keeps_relay=keeps_relay)]
+        for step in steps[:: -1 if is_first else 1]:
+            step()
+        assert (told.begins_anew, told.keeps_relay) == (False, keeps_relay)
+
+
+def test_a_process_that_begins_anew_leaves_its_relay_to_the_next() -> None:
+    told = Told()
+    assert (told.begins_anew, told.keeps_relay) == (False, False)
+    told.begin_anew()
+    assert (told.begins_anew, told.keeps_relay) == (True, True)
 
 
 def test_a_daemon_that_begins_anew_lets_its_worker_finish() -> None:
