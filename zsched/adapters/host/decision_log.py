@@ -12,6 +12,7 @@ Knows: files, lines, the fields of a line. Does not know: what a story means.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import queue
@@ -19,7 +20,7 @@ import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from zsched.adapters.host.state_file import hand_over
 from zsched.clock import wall_s
@@ -353,20 +354,32 @@ def read_page(folder: Path, cursor: str, most_bytes: int = PAGE_BYTES) -> tuple[
         OSError: a file cannot be read.
     """
     mark, _, offset_text = cursor.partition(":")
-    found = [path for path in (folder / name for name in NAMES) if path.exists()]
-    marks = [str(path.stat().st_ino) for path in found]
-    first = marks.index(mark) if mark in marks else 0
-    offset = int(offset_text) if mark in marks and offset_text.isdigit() else 0
-    for number in range(first, len(found)):
-        with found[number].open("rb") as file:
-            file.seek(offset)
-            data = file.read(most_bytes)
+    with contextlib.ExitStack() as stack:
+        found = {str(os.fstat(file.fileno()).st_ino): file for file in _opened(folder, stack)}
+        marks = list(found)
+        first = marks.index(mark) if mark in marks else 0
+        offset = int(offset_text) if mark in marks and offset_text.isdigit() else 0
+        for here in marks[first:]:
+            found[here].seek(offset)
+            data = found[here].read(most_bytes)
             if len(data) == most_bytes and b"\n" not in data:
-                data += file.readline()
-        whole = data[: data.rfind(b"\n") + 1]
-        at, offset = offset + len(whole), 0
-        if whole:
-            is_last = number == len(found) - 1 and len(data) < most_bytes
-            return whole.splitlines(), f"{marks[number]}:{at}", not is_last
-        cursor = f"{marks[number]}:{at}"
+                data += found[here].readline()
+            whole = data[: data.rfind(b"\n") + 1]
+            at, offset = offset + len(whole), 0
+            if whole:
+                is_last = here == marks[-1] and len(data) < most_bytes
+                return whole.splitlines(), f"{here}:{at}", not is_last
+            cursor = f"{here}:{at}"
     return [], cursor, False
+
+
+def _opened(folder: Path, stack: contextlib.ExitStack) -> list[BinaryIO]:
+    """The log's files that are there, the older one first.
+
+    The newer one is opened first: set aside meanwhile, it is found by both names, and none is left out.
+    """
+    found: list[BinaryIO] = []
+    for name in reversed(NAMES):
+        with contextlib.suppress(FileNotFoundError):
+            found.insert(0, stack.enter_context((folder / name).open("rb")))
+    return found

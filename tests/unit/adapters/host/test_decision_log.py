@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -147,6 +148,30 @@ def test_a_reader_goes_on_where_it_was_over_a_rotation(tmp_path: Path) -> None:
         page, cursor, has_more = read_page(tmp_path, cursor)
         seen += [json.loads(line)["text"].split()[0] for line in page]
     assert seen == [*map(str, range(20)), "end"]
+
+
+def test_a_page_read_while_the_newer_file_is_set_aside_leaves_nothing_out_and_tells_nothing_twice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = Kept(tmp_path)
+    kept.write(*(story(f"{number} " + "x" * 100) for number in range(20)))
+    old = len((tmp_path / OLD_NAME).read_bytes().splitlines())
+    texts = [entry["text"] for entry in lines(tmp_path)]
+    opened, real = list[str](), Path.open
+
+    def open_and_set_aside(path: Path, *arguments: Any, **named: Any) -> Any:
+        file = real(path, *arguments, **named)
+        opened.append(path.name)
+        if len(opened) == 1:
+            (tmp_path / NAME).replace(tmp_path / OLD_NAME)
+            (tmp_path / NAME).touch()
+        return file
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "open", open_and_set_aside)
+        page, cursor, _ = read_page(tmp_path, "")
+    assert [json.loads(line)["text"] for line in page] == texts[old:], "what was the older file is gone"
+    assert read_page(tmp_path, cursor)[0] == []
 
 
 def test_operators_get_no_figures_and_moves_alone_where_they_ask_for_them(tmp_path: Path) -> None:
