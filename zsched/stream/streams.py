@@ -79,13 +79,20 @@ _Found = tuple[OwnTask, str, InputStream]
 """A task, the name of one of its inputs, and that input as it was then."""
 
 
+class _Here(threading.local):
+    """Where a thread is; each has its own."""
+
+    is_inside = False
+    """In a callback, or a call of ours that a signal may interrupt: closing waits for it, and it for no closing."""
+
+
 class Publisher:
     """One key of the application that a task's input takes; `put` from any thread."""
 
-    def __init__(self, key: str, find: Callable[[str], _Found | None], closing: threading.Event) -> None:
+    def __init__(self, key: str, find: Callable[[str], _Found | None], closing: threading.Event, here: _Here) -> None:
         """``find`` says which input of which task takes a key now, if one does."""
         self.key = key
-        self._find, self._closing = find, closing
+        self._find, self._closing, self._here = find, closing, here
         self._found = find(key)
 
     def put(
@@ -106,7 +113,11 @@ class Publisher:
         given = Given(
             self.key, _bytes(payload), encoding, None if attachment is None else _bytes(attachment), timestamp
         )
-        return stream.give(cast("Sample", given))
+        was_inside, self._here.is_inside = self._here.is_inside, True
+        try:
+            return stream.give(cast("Sample", given))
+        finally:
+            self._here.is_inside = was_inside
 
     def _stream(self) -> InputStream | None:
         """The input that takes our key: rules may change their places, and with them names; a task may come again."""
@@ -152,8 +163,7 @@ class Streams:
             self._session, keyspace, link.node, self._has_worker, lease_s(link.session), is_application=True
         )
         self._tokens = Tokens(self._session, keyspace, lambda _seen: None, lambda _node, _ended: None, self._wake)
-        self._here = threading.local()
-        """Says of a thread whether it is in a callback of the application."""
+        self._here = _Here()
         self._raised: set[tuple[str, str]] = set()
         self._is_hasty = False
         """Closing waits for nothing any more."""
@@ -207,6 +217,13 @@ class Streams:
         self._check_open()
         if (wrong := fault(key)) is not None or is_wild(key):
             raise ValueError(f"{key!r} is no key that can be published: {wrong or 'it has wildcards'}")
+        was_inside, self._here.is_inside = self._here.is_inside, True
+        try:
+            return self._publisher(key)
+        finally:
+            self._here.is_inside = was_inside
+
+    def _publisher(self, key: str) -> Publisher:
         self._name(key)
         until = monotonic_s() + KNOWN_S
         while monotonic_s() < until and not self._closing.is_set():
@@ -214,7 +231,7 @@ class Streams:
             if is_told and (found := self._find(key)) is not None:
                 task, stream, _ = found
                 task.wait_fed(stream, FED_S)
-                return Publisher(key, self._find, self._closing)
+                return Publisher(key, self._find, self._closing, self._here)
             time.sleep(LOOK_S)
         self._check_open()
         self._forget(key)
@@ -233,6 +250,13 @@ class Streams:
         self._check_open()
         if (wrong := fault(key_expr)) is not None:
             raise ValueError(f"{key_expr!r} is no key expression: {wrong}")
+        was_inside, self._here.is_inside = self._here.is_inside, True
+        try:
+            self._subscribe(key_expr, on_sample)
+        finally:
+            self._here.is_inside = was_inside
+
+    def _subscribe(self, key_expr: str, on_sample: Callable[[Received], None]) -> None:
         with self._lock:
             self._callbacks = (*self._callbacks, (key_expr, on_sample))
         self._name(key_expr)
@@ -240,6 +264,7 @@ class Streams:
             if self._changed.wait_for(lambda: key_expr in self._taken, KNOWN_S):
                 return
             self._callbacks = tuple(one for one in self._callbacks if one != (key_expr, on_sample))
+        self._check_open()
         self._forget(key_expr)
         raise ValueError(
             f"no output rule has {key_expr!r} on {self.node}: see `outputs` of the fleet file's tasks (`to`)"
@@ -249,11 +274,12 @@ class Streams:
         """Put the ends behind what was put, wait for it to be processed (`FINISH_S`), and close the session.
 
         Any thread, and more than once: each waits until they are closed. A callback does not wait, since it is waited
-        for: they are closed behind it. Ctrl-C ends the wait, and they close at once. In a process that was forked off
-        nothing is closed: the streams are its parent's.
+        for: they are closed behind it; nor does a signal's handler that interrupts another call of ours. Ctrl-C ends
+        the wait, and they close at once. In a process that was forked off nothing is closed: the streams are its
+        parent's.
         """
         self._closing.set()
-        if getattr(self._here, "is_callback", False):
+        if self._here.is_inside:
             return
         try:
             # no join: one that is interrupted takes the thread for ended (CPython 3.11)
@@ -325,7 +351,7 @@ class Streams:
         )
 
     def _deliver(self, received: Received) -> None:
-        self._here.is_callback = True
+        self._here.is_inside = True
         for key_expr, on_sample in self._callbacks:
             if includes(key_expr, received.key):
                 try:

@@ -229,6 +229,58 @@ def test_a_program_ends_in_order_whatever_ends_it(
     assert bench.count().acknowledged == 20
 
 
+STOPPED = """
+import os, signal, sys, threading
+from pathlib import Path
+from zsched.errors import AdapterError
+from zsched.relay.streams.counter import StreamCounter
+from zsched.stream import Streams, link
+
+streams = Streams.join(runtime_dir=Path(sys.argv[1]))
+signal.signal(signal.SIGTERM, lambda *_: streams.close())
+publisher = streams.publisher("robot1/front/in")
+publisher.put("0")
+inner = {inner}
+
+def interrupted(*words):
+    if threading.current_thread() is threading.main_thread():
+        {inner} = inner
+        os.kill(os.getpid(), signal.SIGTERM)
+    return inner(*words)
+
+{inner} = interrupted
+try:
+    {call}
+except AdapterError:
+    pass
+assert streams._closing.is_set()
+assert not publisher.put("2")
+streams.close()
+assert streams._closed.is_set()
+"""
+
+
+@pytest.mark.parametrize(
+    ("inner", "call"),
+    [
+        ("StreamCounter.seen", 'publisher.put("1")'),
+        ("link.write_frame", 'streams.subscribe("robot1/out", print)'),
+        ("link.write_frame", 'streams.publisher("robot1/back/in")'),
+    ],
+    ids=["put", "subscribe", "publisher"],
+)
+def test_a_signal_that_closes_in_the_middle_of_a_call_does_not_wait_for_that_call(
+    bench: Bench, inner: str, call: str
+) -> None:
+    """Its handler runs in the thread that has the locks which closing needs."""
+    command = [sys.executable, "-c", STOPPED.format(inner=inner, call=call), str(bench.folder)]
+    done = subprocess.run(command, capture_output=True, timeout=30, check=False)
+    assert done.returncode == 0, done.stderr
+    until(lambda: bench.application._link is None, "it has gone")
+    assert bench.count().acknowledged == len(bench.taken)
+    assert unaccounted(bench.count()) == 0
+
+
 def test_answers_are_the_applications_from_the_moment_it_names_them_until_it_goes(bench: Bench) -> None:
     """The relay counts them, too: no answer counts twice or nowhere, and the times of a reading between are told."""
     counted = StreamCount(stream="t/out/0")
