@@ -313,12 +313,16 @@ class Streams:
             if key in self._keys:
                 return
             self._keys = (*self._keys, key)
-        self._link.say(StreamKeys(keys=self._keys, pid=os.getpid()))
+        self._say_keys()
 
     def _forget(self, key: str) -> None:
         with self._lock:
             self._keys = tuple(one for one in self._keys if one != key)
-        self._link.say(StreamKeys(keys=self._keys, pid=os.getpid()))
+        self._say_keys()
+
+    def _say_keys(self) -> None:
+        with self._telling:  # who speaks last says the newest
+            self._link.say(StreamKeys(keys=self._keys, pid=os.getpid()))
 
     def _end(self) -> None:
         """Close when we are told to: in a thread of its own, which no signal interrupts."""
@@ -413,8 +417,9 @@ class Streams:
         alone_since: float | None = monotonic_s()
         _log.warning("the relay of %s is gone: its plans hold for %g s", self.node, ALONE_S)
         while not self._left.wait(AGAIN_S):
+            keys = self._keys
             try:
-                self._link = Link(self._path, self._keys)
+                self._link = Link(self._path, keys)
             except AdapterError as error:
                 if alone_since is not None and monotonic_s() - alone_since > ALONE_S:
                     alone_since = None
@@ -422,6 +427,8 @@ class Streams:
                     for name, task in tuple(self._tasks.items()):
                         task.apply(RoutePlan(task=name, phase=RoutePhase.CLOSE, current=None))
                 continue
+            if self._keys != keys:  # they were told to the link before, meanwhile
+                self._say_keys()
             text = "its session is that of an earlier configuration: start the application again"
             self._note_problem("", text if self._link.session != self._config else None, is_anew=True)
             for drained in tuple(self._drained):

@@ -36,11 +36,13 @@ from zsched.core.values.plan import (
 from zsched.core.values.struct import replace
 from zsched.errors import AdapterError
 from zsched.guard import all_end_within, running
+from zsched.ipc.protocol import StreamKeys
 from zsched.relay.application import Application
 from zsched.relay.streams.inputs import InputStream
 from zsched.relay.streams.lanes import Lane
 from zsched.sessions.config import data_config, worker_config
 from zsched.stream import Received, Streams, streams
+from zsched.stream.link import Link
 from zsched.stream.samples import Given
 from zsched.stream.task import OwnTask
 from zsched.worker import Received as Input
@@ -354,6 +356,40 @@ def test_the_other_classes_arrive_and_a_kept_value_goes_to_the_next_owner(
             until(lambda: bench.taken[:1] == [b"49"], "the kept value, at least once more")
         publisher.put("50")
         until(lambda: bench.taken and bench.taken[-1] == b"50", "by the next slot")
+
+
+def test_a_key_that_comes_while_the_next_relay_is_greeted_is_told_to_that_one(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    key, had = "robot1/back/in", list[bool]()
+    with bench.join() as own:
+        own.publisher("robot1/front/in")
+        old, say, was_said = own._link, own._link.say, threading.Event()
+
+        def say_to_old(word: RelayReport | StreamKeys) -> None:
+            say(word)
+            if isinstance(word, StreamKeys) and key in word.keys:
+                was_said.set()
+
+        def ask() -> None:
+            try:
+                had.append(own.publisher(key).put(b"1"))
+            except ValueError:
+                had.append(False)
+
+        def greet(path: Path, keys: tuple[str, ...]) -> Link:
+            made = Link(path, keys)
+            threading.Thread(target=ask, daemon=True).start()
+            assert was_said.wait(10), "the old one is told"
+            return made
+
+        monkeypatch.setattr(old, "say", say_to_old)
+        monkeypatch.setattr(streams, "Link", greet)
+        assert bench.application._link is not None
+        bench.application._link.hang_up()
+        until(lambda: had, "it is known, or refused")
+        assert had == [True]
+    assert bench.taken == [b"1"]
 
 
 def rules(*names: str) -> RoutePlan:
