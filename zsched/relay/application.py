@@ -214,7 +214,7 @@ class Application:
                 link = None if first is None else self._let_in(connection, first)
                 if link is None:
                     return
-            except (OSError, WireError) as error:
+            except (OSError, RuntimeError, WireError) as error:  # RuntimeError: no thread
                 _log.warning("an application was not let in: %s", error)
                 return
             try:
@@ -232,14 +232,19 @@ class Application:
                 reason = f"the process {other.pid} has streams of {self._here.node} itself; one may at a time"
                 write_frame(connection.fileno(), wire.encode(RelayRefused(reason=reason)))
                 return None
-            link = self._link = _Link(connection, first.pid)
+            link = _Link(connection, first.pid)
             link.tell(wire.encode(self._here))
             link.tell(self._session.encode())
+            self._link = link
             self._tell(self._shares.name(first.keys))
             if self._is_orphaned:
                 self._put(DaemonGone())
-        set_timeout(connection, 0.0)
-        link.start()
+        try:
+            set_timeout(connection, 0.0)
+            link.start()
+        except (OSError, RuntimeError):
+            self._let_go(link)
+            raise
         _log.info("an application (pid %d) has streams itself", first.pid)
         return link
 

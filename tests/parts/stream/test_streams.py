@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import cast
+from unittest.mock import Mock
 
 import pytest
 import zenoh
@@ -37,6 +38,7 @@ from zsched.core.values.struct import replace
 from zsched.errors import AdapterError
 from zsched.guard import all_end_within, running
 from zsched.ipc.protocol import StreamKeys
+from zsched.relay import application
 from zsched.relay.application import Application
 from zsched.relay.streams.inputs import InputStream
 from zsched.relay.streams.lanes import Lane
@@ -390,6 +392,20 @@ def test_a_key_that_comes_while_the_next_relay_is_greeted_is_told_to_that_one(
         until(lambda: had, "it is known, or refused")
         assert had == [True]
     assert bench.taken == [b"1"]
+
+
+@pytest.mark.parametrize("error", [RuntimeError("can't start new thread"), OSError("no more of it")])
+def test_an_application_that_could_not_be_let_in_leaves_the_place_to_the_next(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    with monkeypatch.context() as patched:
+        patched.setattr(application._Link, "start", Mock(side_effect=error))
+        with pytest.raises(AdapterError):
+            Link(bench.folder / "robot1.streams", ())
+    until(lambda: bench.application._link is None, "the place is free")
+    with bench.join() as own:
+        own.publisher("robot1/front/in").put("0")
+    assert bench.taken == [b"0"]
 
 
 def rules(*names: str) -> RoutePlan:
