@@ -107,17 +107,18 @@ class Publisher:
 
         Class ``reliable`` waits while the queue towards the owner is full, and once for a link that has become full.
         """
-        stream = self._stream()
-        if stream is None or self._closing.is_set():
-            return False
         given = Given(
             self.key, _bytes(payload), encoding, None if attachment is None else _bytes(attachment), timestamp
         )
         was_inside, self._here.is_inside = self._here.is_inside, True
         try:
-            return stream.give(cast("Sample", given))
+            return self._give(given) or self._give(given)  # what has closed since we looked may have another place
         finally:
             self._here.is_inside = was_inside
+
+    def _give(self, given: Given) -> bool:
+        stream = self._stream()
+        return stream is not None and not self._closing.is_set() and stream.give(cast("Sample", given))
 
     def _stream(self) -> InputStream | None:
         """The input that takes our key: rules may change their places, and with them names; a task may come again."""

@@ -455,6 +455,33 @@ def test_a_publisher_follows_its_rule_to_another_place_and_its_task_to_another_l
         assert sorted(bench.taken) == sorted(sent)
 
 
+@pytest.mark.parametrize(("names", "is_taken"), [(("map", "jobs"), True), (("map",), False)], ids=["moves", "goes"])
+def test_what_is_put_while_its_rule_moves_or_goes_arrives_or_is_refused(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, names: tuple[str, ...], *, is_taken: bool
+) -> None:
+    give = InputStream.give
+    bench.application.unowned("t", ())
+    bench.application.plan(rules("jobs", "map"))
+    with bench.join() as own:
+        publisher = own.publisher("robot1/jobs/in")
+        source = own._tasks["t"].input("t/in/0")
+
+        def has_way() -> bool:
+            found = own._find(publisher.key)
+            return found is not None and found[2].has_way
+
+        def change_first(stream: InputStream, sample: zenoh.Sample) -> bool:
+            if stream is source:
+                bench.application.plan(rules(*names))
+                until(lambda: own._tasks["t"].input("t/in/0") is not source, "it is closed")
+                until(lambda: has_way() is is_taken, "it has another place, or none")
+            return give(stream, sample)
+
+        monkeypatch.setattr(InputStream, "give", change_first)
+        assert publisher.put("1") is is_taken
+    assert bench.taken == [b"1"][:is_taken]
+
+
 def test_what_is_wrong_is_told_until_it_is_mended_whatever_becomes_of_another_task(bench: Bench) -> None:
     def told() -> str:
         words = [word.problem for word in tuple(bench.reports) if isinstance(word, ProblemReported)]

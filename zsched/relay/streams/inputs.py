@@ -134,7 +134,7 @@ class InputStream:
         self._in_hand: Outlet | None = None
         """Where the sample that is given goes, if its put is left to the giver (`_giving` and our lock guard it)."""
         self._has_end = self._is_late = False
-        """The end marker is on its way; what is given comes behind that (guarded likewise)."""
+        """The end marker is on its way, or we are closed; what is given comes behind that (guarded likewise)."""
         self._receiver: Receiver | None = None if is_ours else self._subscribe(side)
 
     def _subscribe(self, side: Session) -> Receiver:
@@ -152,7 +152,7 @@ class InputStream:
         """Carry a sample of this process; it is put in this thread where nothing waits before it (`is_ours`).
 
         What a full queue or link holds up is this thread, and nobody else: a flip does not wait for it. ``False``: it
-        came behind `end`, and went nowhere.
+        came behind `end` or `close`, and went nowhere.
         """
         with self._giving:
             try:
@@ -320,6 +320,7 @@ class InputStream:
         """Unsubscribe and close every slot."""
         self.stop()
         with self._lock:
+            self._has_end = True
             self._counter.dropped("closed", len(self._paused))
             self._paused.clear()
         for epoch in tuple(self._slots):
@@ -496,7 +497,7 @@ class InputStream:
         if active is not None and self._is_patient and not self._is_paused:
             active.outlet.wait_for_room(size)
         with self._lock:
-            if self._has_end:
+            if is_given and self._has_end:
                 self._is_late = True
                 return
             self._counter.seen(size)
