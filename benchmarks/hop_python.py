@@ -135,13 +135,14 @@ def outward(relay: zenoh.Session, stream_class: StreamClass) -> Way:
     stream = OutputStream(relay, route, frozenset({str(relay.zid())}), lambda: None)
     stream.open(1, route, acks, is_from_start=True)
     stream.flip(1, drops_held=False)
-    slot = stream._slots[1]  # noqa: SLF001 - the one that its receiver feeds
+    feed = stream._slots[1].feed  # noqa: SLF001 - its receiver's
+    assert feed is not None
 
     def sent() -> bool:
         queue = cast("Outlet", stream._outlet)._queue  # noqa: SLF001 - how far its queue is
         return queue is None or (not queue._items and queue._busy_since is None)  # noqa: SLF001
 
-    return lambda sample: stream._carry(slot, sample), sent, stream.close  # noqa: SLF001
+    return lambda sample: stream._carry(feed, sample), sent, stream.close  # noqa: SLF001
 
 
 def cost(made: Way, samples: list[zenoh.Sample]) -> tuple[float, float]:

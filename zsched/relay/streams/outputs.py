@@ -163,7 +163,7 @@ class OutputStream:
             self._session,
             listen_to,
             settings,
-            lambda sample: self._carry(feed.slot, sample),
+            lambda sample: self._carry(feed, sample),
             with_history=has_history,
             give_way=self._give_way,
         )
@@ -172,7 +172,7 @@ class OutputStream:
                 self._session,
                 f"{listen_to}/{AGAIN_CHUNK}/{self._session.zid()}",
                 replace(settings, stream_class=StreamClass.RELIABLE),
-                lambda sample: self._carry_again(feed.slot, sample),
+                lambda sample: self._carry_again(feed, sample),
                 with_history=False,
                 give_way=self._give_way,
             )
@@ -389,8 +389,9 @@ class OutputStream:
 
     # --- one sample --------------------------------------------------------------------------------------------------
 
-    def _carry(self, slot: OutputSlot, sample: Sample) -> None:
+    def _carry(self, feed: Feed, sample: Sample) -> None:
         with self._lock:
+            slot = feed.slot  # which an heir may just have become
             publisher, number = _publisher_of(sample)
             if publisher[0] in self._own_ids:
                 self._counter.seen(len(sample.payload))
@@ -415,8 +416,9 @@ class OutputStream:
             for one in ready:
                 self._pass(slot, key, publisher, one)
 
-    def _carry_again(self, slot: OutputSlot, sample: Sample) -> None:
+    def _carry_again(self, feed: Feed, sample: Sample) -> None:
         with self._lock:
+            slot = feed.slot
             if slot.answers is None or slot.is_closed:
                 return
             name = str(sample.key_expr).rsplit(f"/{AGAIN_CHUNK}/", 1)[0]

@@ -282,9 +282,10 @@ def test_an_answer_in_hand_while_its_slot_closes_starts_no_count_of_its_own(benc
     bench.put(0, 1, 2)
     assert bench.is_through(0, 1, 2)
     until(lambda: len(taken) == 3, "the samples themselves")
-    slot = stream._slots[1]
+    feed = stream._slots[1].feed
+    assert feed is not None
     stream.close_slot(1)
-    stream._carry(slot, taken[2])
+    stream._carry(feed, taken[2])
     stream.open(1, stream.route, bench.acks, is_from_start=True)
     stream.flip(1, drops_held=False)
     until(lambda: matches(bench.again), "the relay subscribes again")

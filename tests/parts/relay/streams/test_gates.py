@@ -671,6 +671,39 @@ def test_one_epoch_after_another_of_the_same_owner_doubles_nothing(bench: Bench)
     kept.undeclare()
 
 
+def test_an_answer_in_hand_while_its_subscription_goes_to_the_next_slot_is_that_ones(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The receiver's thread waited for the lock with it."""
+    is_in_hand = threading.Event()
+    carry, hand_on = OutputStream._carry, OutputStream._hand_on
+
+    def take(stream: OutputStream, *given: Any) -> None:
+        is_in_hand.set()
+        carry(stream, *given)
+
+    def put_and_hand_on(stream: OutputStream, slot: slots.OutputSlot) -> slots.Feed | None:
+        publisher.put("0")
+        assert is_in_hand.wait(10)
+        return hand_on(stream, slot)
+
+    monkeypatch.setattr(OutputStream, "_carry", take)
+    monkeypatch.setattr(OutputStream, "_hand_on", put_and_hand_on)
+    got: list[str] = []
+    kept = bench.outside.declare_subscriber("robot1/out", lambda s: got.append(s.payload.to_string()))
+    route = replace(way_out(1, HandoverRule.ALL), from_expr="edge1/t/out")
+    stream = bench.output(route)
+    for epoch in (1, 2):
+        stream.open(epoch, route)
+        stream.flip(epoch, drops_held=False)
+    publisher = bench.publisher(route.from_expr)
+    stream.close_slot(1)
+    until(lambda: stream.count().messages == 1, "it is carried")
+    assert drops(stream) == {}
+    until(lambda: got == ["0"], "it goes on")
+    kept.undeclare()
+
+
 def test_a_forged_number_does_not_end_an_output(bench: Bench) -> None:
     """Whoever hears a stream knows its publisher: one sample in its name must not make the rest old."""
     out = bench.output(way_out(1, HandoverRule.LATEST, StreamClass.BEST_EFFORT))
