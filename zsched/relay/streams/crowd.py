@@ -138,7 +138,7 @@ class Crowd:
             self._putting_since = None
         if left:
             is_doubtful = monotonic_s() - began >= DROP_WAIT_S * 0.9  # zenoh has given up at somebody's link
-            self._missed += sum(reader.misses(size) for reader in left) + is_doubtful
+            self._note_missed(sum(reader.misses(size) for reader in left) + is_doubtful)
         if left and self._is_latest:
             self._owed[lane] = (sample, stamp)
         elif self._owed:
@@ -146,8 +146,13 @@ class Crowd:
 
     def take_missed(self) -> int:
         """How many samples single receivers may have missed since the last time, summed over them."""
-        missed, self._missed = self._missed, 0
+        with self._lock:
+            missed, self._missed = self._missed, 0
         return missed
+
+    def _note_missed(self, count: int) -> None:
+        with self._lock:
+            self._missed += count
 
     @property
     def owes(self) -> bool:
@@ -180,7 +185,7 @@ class Crowd:
         for reader in full:
             if now - reader.moved_at >= STUCK_S and reader.link.cut():
                 _log.warning("%s: %s took nothing of a sample: its link is ended", self._expr, reader.link.name)
-                self._missed += 1
+                self._note_missed(1)
 
     # --- one put -----------------------------------------------------------------------------------------------------
 

@@ -157,6 +157,24 @@ def test_the_sockets_of_all_links_are_found_and_workers_receive_no_outputs() -> 
         assert {link.ends[0][1] for link in links} == {int(endpoint.rsplit(":", 1)[1])}
 
 
+def test_what_readers_have_missed_is_told_once_also_to_one_who_asks_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[int] = []
+
+    class Full:
+        def misses(self, _size: int) -> bool:
+            told.append(made.take_missed())
+            return True
+
+    monkeypatch.setattr(Crowd, "_look", lambda *_args, **_named: False)
+    monkeypatch.setattr(Crowd, "_wait", lambda _: (Full(), Full()))
+    monkeypatch.setattr(Crowd, "_put_dropping", lambda *_args: None)
+    with hub_and_neighbour() as (session, _):
+        made = Crowd(session, "out", lambda: False, is_latest=False)
+        for _ in range(3):
+            made.put(cast("Lane", None), cast("zenoh.Sample", None), None, 1)
+        assert sum(told) + made.take_missed() == 6
+
+
 def test_what_a_reader_has_missed_comes_again_and_never_behind_a_newer_sample(
     pair: Pair, monkeypatch: pytest.MonkeyPatch
 ) -> None:
