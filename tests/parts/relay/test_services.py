@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 import zenoh
@@ -13,6 +14,7 @@ from support.waiting import until
 from zsched.core.values.plan import Direction, Route, ServiceSettings, StreamSettings
 from zsched.core.values.struct import replace
 from zsched.relay.services import service
+from zsched.relay.services.replies import Replies
 from zsched.relay.services.service import Services
 
 SERVICE = Route(
@@ -29,12 +31,12 @@ class Bench:
     """A relay's services, and one who asks."""
 
     def __init__(self, relay: zenoh.Session, outside: zenoh.Session) -> None:
-        self.services = Services(relay)
-        self._asker = outside.declare_querier(SERVICE.from_expr, timeout=20.0)
+        self.services, self.outside = Services(relay), outside
+        self.asker = outside.declare_querier(SERVICE.from_expr, timeout=20.0)
 
     def open(self, route: Route = SERVICE) -> None:
         self.services.open(1, route)
-        until(lambda: matches(self._asker), "the service is there")
+        until(lambda: matches(self.asker), "the service is there")
 
     def ask(self) -> list[str]:
         """The errors that one request gets; it is put again where it reached nobody (the service was just declared)."""
@@ -42,7 +44,7 @@ class Bench:
         return errors
 
     def _ask(self) -> list[str]:
-        return [reply.err.payload.to_string() for reply in self._asker.get() if reply.err is not None]
+        return [reply.err.payload.to_string() for reply in self.asker.get() if reply.err is not None]
 
 
 @pytest.fixture
@@ -66,6 +68,31 @@ def test_a_request_for_which_no_thread_begins_is_answered_and_takes_nobodys_plac
         for _ in range(2):
             assert bench.ask() == ["busy: can't start new thread: it was not done"]
     assert bench.ask() == ["no owner: nobody serves robot1/job: it was not done"]
+
+
+def test_a_request_whose_session_is_closed_beneath_it_goes_out_by_the_next(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It had its owner before the data session was opened anew, and was not counted as under way yet."""
+    send, refused = Replies.send, [zenoh.ZError("session closed")]
+
+    def send_then(replies: Replies, *words: Any, **request: Any) -> None:
+        if refused:
+            raise refused.pop()
+        send(replies, *words, **request)
+
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            query.reply(SERVICE.to_expr, "done")
+
+    monkeypatch.setattr(Replies, "send", send_then)
+    bench.open(replace(SERVICE, service=ServiceSettings(hold_s=10.0)))
+    owner = bench.outside.declare_queryable(SERVICE.to_expr, answer)
+    bench.services.flip(1)
+    replies: list[zenoh.Reply] = until(lambda: list(bench.asker.get()), "a reply")
+    assert [reply.ok.payload.to_string() for reply in replies if reply.ok is not None] == ["done"]
+    assert dict(bench.services.counts()[0].drops) == {"retried": 1}
+    owner.undeclare()
 
 
 def test_the_counters_of_a_service_go_on_when_its_rule_changes(bench: Bench) -> None:

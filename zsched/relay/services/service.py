@@ -3,9 +3,9 @@
 Knows: which slots are open, which one is asked, which requests are at the owner. Does not know: why a task moves.
 
 A request that reached an owner is never sent again, unless its rule says ``retry: true``: an owner that did not answer
-may have done the work. Only when it is certain that nobody took the request (no queryable matches, or the worker says
-that it is not the owner) does it wait a moment for the next owner. What the application gets instead of an answer is an
-error reply, its first words one of `ServiceProblem`:
+may have done the work. Only when it is certain that nobody took the request (no queryable matches, the worker says
+that it is not the owner, or our session was closed before it went out) does it wait a moment for the next owner. What
+the application gets instead of an answer is an error reply, its first words one of `ServiceProblem`:
 
 =============  =======================================================================================================
 busy           ``max_pending`` requests are at the owner already, or this machine has no thread for one more
@@ -283,13 +283,16 @@ class ServiceStream:
                 return _Outcome.REFUSED
             slot.pending.add(asked)
         try:
-            asked.replies.send(
-                self._session,
-                zenoh.Selector(asked.key, query.parameters),
-                payload=query.payload,
-                encoding=query.encoding,
-                attachment=query.attachment,
-            )
+            try:
+                asked.replies.send(
+                    self._session,
+                    zenoh.Selector(asked.key, query.parameters),
+                    payload=query.payload,
+                    encoding=query.encoding,
+                    attachment=query.attachment,
+                )
+            except zenoh.ZError:  # the session was closed beneath us, for the next one
+                return _Outcome.REFUSED
             return self._hand_on(query, asked, slot)
         finally:
             with self._lock:
