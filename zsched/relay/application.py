@@ -37,6 +37,8 @@ HELLO_S: Final = 1.0
 """An application says its keys within this time."""
 MAX_WAITING: Final = 1024
 """Frames that wait for an application; one that does not read is not told any more, and may come again."""
+END_S: Final = 2.0
+"""A writer whose connection has ended ends within this time."""
 BACKLOG: Final = 4
 RETRY_S: Final = 0.2
 SOURCE: Final = "relay/application"
@@ -70,10 +72,12 @@ class _Link:
             self.connection.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
-        """End the writer."""
+        """End the writer, and wait for it: the descriptor may be another file's as soon as it is given back."""
         self.hang_up()
         with contextlib.suppress(queue.Full):
             self._queue.put_nowait(None)
+        if self._writer.is_alive():
+            self._writer.join(END_S)
 
     def _write(self) -> None:
         while (frame := self._queue.get()) is not None:

@@ -119,5 +119,7 @@ class Link:
             return
 
     def close(self) -> None:
-        """Give the descriptor back, when nobody reads any more."""
-        self._socket.close()
+        """Give the descriptor back, when nobody reads any more; who writes ends first."""
+        self.hang_up()
+        with self._sending:
+            self._socket.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import subprocess
 import sys
@@ -37,6 +38,7 @@ from zsched.core.values.plan import (
 from zsched.core.values.struct import replace
 from zsched.errors import AdapterError
 from zsched.guard import all_end_within, running
+from zsched.ipc.pipe import write_frame
 from zsched.ipc.protocol import StreamKeys
 from zsched.relay import application
 from zsched.relay.application import Application
@@ -47,6 +49,7 @@ from zsched.stream import Received, Streams, streams
 from zsched.stream.link import Link
 from zsched.stream.samples import Given
 from zsched.stream.task import OwnTask
+from zsched.wire import codec as wire
 from zsched.worker import Received as Input
 from zsched.worker import Worker
 
@@ -453,6 +456,68 @@ def test_a_publisher_follows_its_rule_to_another_place_and_its_task_to_another_l
         adopt("jobs", "map")
         assert bench.keys == [f"edge1/t/robot1/{taken.decode()}/in" for taken in bench.taken]
         assert sorted(bench.taken) == sorted(sent)
+
+
+class Others:
+    """Files that are opened when a connection is closed: one of them has its descriptor."""
+
+    def __init__(self, folder: Path) -> None:
+        self._paths = [folder / f"other{number}" for number in range(16)]
+        self._files = contextlib.ExitStack()
+
+    def open(self) -> None:
+        for path in self._paths:
+            self._files.enter_context(path.open("wb"))
+
+    def read(self) -> bytes:
+        self._files.close()
+        return b"".join(path.read_bytes() for path in self._paths)
+
+
+def test_no_word_to_the_relay_goes_into_a_file_that_has_the_descriptor_now(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, encode, others = Link(bench.folder / "robot1.streams", ()), wire.encode, Others(tmp_path)
+    closer = threading.Thread(target=made.close)
+
+    def close_first(word: object) -> bytes:
+        if threading.current_thread() is threading.main_thread():
+            closer.start()
+            closer.join(0.5)
+            others.open()
+        return encode(word)
+
+    monkeypatch.setattr(wire, "encode", close_first)
+    made.say(StreamKeys(keys=("robot1/front/in",), pid=1))
+    closer.join(10)
+    assert others.read() == b""
+    assert made._socket.fileno() == -1
+
+
+def test_no_word_to_an_application_goes_into_a_file_that_has_the_descriptor_now(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, others, was_written = Link(bench.folder / "robot1.streams", ()), Others(tmp_path), threading.Event()
+    link = bench.application._link
+    assert link is not None
+
+    def close_first(descriptor: int, frame: bytes) -> None:
+        made.close()
+        halt = time.monotonic() + 0.5
+        while link.connection.fileno() != -1 and time.monotonic() < halt:
+            time.sleep(0.01)
+        others.open()
+        try:
+            write_frame(descriptor, frame)
+        finally:
+            was_written.set()
+
+    monkeypatch.setattr(application, "END_S", 30.0)
+    monkeypatch.setattr(application, "write_frame", close_first)
+    bench.application.lose_daemon()
+    assert was_written.wait(10)
+    until(lambda: link.connection.fileno() == -1, "its descriptor is given back")
+    assert others.read() == b""
 
 
 @pytest.mark.parametrize(("names", "is_taken"), [(("map", "jobs"), True), (("map",), False)], ids=["moves", "goes"])
