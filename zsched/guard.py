@@ -2,9 +2,10 @@
 
 Knows: what happens when a thread's function raises. Does not know: what threads do.
 
-An exception is logged with its stack, counted under the thread's name, and reported to `on_failure` (the daemon
-and the relay show it in `status`). A thread that serves as long as its process lives (``is_lasting``) then begins
-again, after a pause that doubles while it keeps failing; one that has a single errand ends.
+An exception, a `SystemExit` too (a thread of Python's own ends by it without a word), is logged with its stack,
+counted under the thread's name, and reported to `on_failure` (the daemon and the relay show it in `status`). A thread
+that serves as long as its process lives (``is_lasting``) then begins again, after a pause that doubles while it keeps
+failing; one that has a single errand ends.
 """
 
 from __future__ import annotations
@@ -115,7 +116,7 @@ def _run(run: Callable[[], object], kind: str, *, is_lasting: bool) -> None:
         began_at = monotonic_s()
         try:
             run()
-        except Exception as error:  # noqa: BLE001 - whatever it is, it must not end in silence
+        except BaseException as error:  # noqa: BLE001 - whatever it is, it must not end in silence
             note(kind, error)
         else:
             return
@@ -127,7 +128,7 @@ def _run(run: Callable[[], object], kind: str, *, is_lasting: bool) -> None:
         pause_s = min(2 * pause_s, MAX_PAUSE_S)
 
 
-def note(kind: str, error: Exception) -> None:
+def note(kind: str, error: BaseException) -> None:
     """Log, count and tell that something in a thread has failed."""
     failures[kind] += 1
     _log.error("thread %s failed (%d times so far)", kind, failures[kind], exc_info=error)

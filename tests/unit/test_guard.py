@@ -137,9 +137,27 @@ def test_a_lasting_thread_that_fails_is_told_and_begins_again(told: list[tuple[s
     ]
 
 
-def test_an_errand_that_fails_is_told_and_ends(told: list[tuple[str, str]]) -> None:
+def test_a_lasting_thread_that_calls_exit_is_told_and_begins_again(told: list[tuple[str, str]]) -> None:
+    """Python's own threads end by a `SystemExit` without a word."""
+    calls: list[int] = []
+
     def run() -> None:
-        raise ValueError("no")
+        calls.append(1)
+        if len(calls) == 1:
+            sys.exit(3)
+
+    thread = guarded(run, name="leaving")
+    thread.start()
+    thread.join(60)
+    assert not thread.is_alive()
+    assert len(calls) == 2
+    assert told == [("leaving", "a thread failed (1 times), last with SystemExit: 3")]
+
+
+@pytest.mark.parametrize("error", [ValueError("no"), SystemExit(3)])
+def test_an_errand_that_fails_is_told_and_ends(told: list[tuple[str, str]], error: BaseException) -> None:
+    def run() -> None:
+        raise error
 
     thread = guarded(run, name="errand", is_lasting=False)
     thread.start()

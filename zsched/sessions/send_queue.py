@@ -326,7 +326,10 @@ class SendQueue:
         self._busy_since = monotonic_s()
         try:
             action()
-        except Exception as error:  # noqa: BLE001 - one bad sample must not end its stream
+        except BaseException as error:  # one bad sample must not end its stream
+            is_ours = threading.current_thread() is self._thread
+            if not is_ours and not isinstance(error, Exception):
+                raise  # it ends a program's own thread, as Ctrl-C does
             _log.warning("%s: %s", self._thread.name, error)
         finally:
             self._busy_since = None

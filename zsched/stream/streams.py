@@ -361,7 +361,7 @@ class Streams:
             if includes(key_expr, received.key):
                 try:
                     on_sample(received)
-                except (Exception, SystemExit) as error:  # noqa: BLE001 - no answer and no other callback misses theirs
+                except BaseException as error:  # noqa: BLE001 - no answer and no other callback misses theirs
                     self._note_raised(key_expr, error)
 
     def _note_raised(self, key_expr: str, error: BaseException) -> None:

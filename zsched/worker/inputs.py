@@ -428,7 +428,7 @@ class Dispatcher:
         self._timer.begin()
         try:
             source.on_sample(received)
-        except Exception as error:  # noqa: BLE001 - the worker's own bug must not end its dispatch
+        except BaseException as error:  # noqa: BLE001 - the worker's own bug must not end its dispatch
             self._troubles.note(key, error)
         self._timer.end(came_s)
         newest = self._newest_stamp

@@ -130,7 +130,7 @@ class Service:
             self._timer.begin()
             try:
                 given = self._handler(request)
-            except Exception as error:  # noqa: BLE001 - the asker must hear of it, whatever it is
+            except BaseException as error:  # noqa: BLE001 - the asker must hear of it, whatever it is
                 self._fail(query, request, error)
                 return
             finally:
@@ -144,7 +144,7 @@ class Service:
             except Exception as error:  # noqa: BLE001 - what the handler has returned is no answer
                 self._fail(query, request, error)
 
-    def _fail(self, query: zenoh.Query, request: Request, error: Exception) -> None:
+    def _fail(self, query: zenoh.Query, request: Request, error: BaseException) -> None:
         self._troubles.note(request.key, error)
         query.reply_err(f"failed: {type(error).__name__}: {error}"[:400], encoding=ERROR_ENCODING)
 

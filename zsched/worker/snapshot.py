@@ -119,7 +119,7 @@ class Offer:
         query.reply(self._key, b"", attachment=COMING)
         try:
             content = self._snapshot()
-        except Exception as error:  # noqa: BLE001 - the worker's own bug is the successor's cold start
+        except BaseException as error:  # noqa: BLE001 - the worker's own bug is the successor's cold start
             _log.exception("the worker's snapshot failed")
             query.reply_err(f"failed: {type(error).__name__}: {error}"[:400], encoding=ERROR_ENCODING)
             return
@@ -340,7 +340,7 @@ class Restorer:
         if isinstance(content, bytes) and callback is not None:
             try:
                 callback(content)
-            except Exception:  # noqa: BLE001 - the worker goes on cold
+            except BaseException:  # noqa: BLE001 - the worker goes on cold
                 _log.exception("the worker's on_snapshot failed")
                 content = "its own on_snapshot failed"
         with self._lock:

@@ -45,14 +45,14 @@ class Troubles:
         self._tell = tell
         self._lock = threading.Lock()
         self._count = 0
-        self._newest: Exception | None = None
+        self._newest: BaseException | None = None
         """The newest error that is not told yet: where it came from is looked up only then."""
         self._told_at = -TELL_S
         self._timer: threading.Thread | None = None
         self._log_at: dict[str, float] = {}
         self._closed = threading.Event()
 
-    def note(self, where: str, error: Exception) -> None:
+    def note(self, where: str, error: BaseException) -> None:
         """A callback for ``where`` raised (to be called while the error is handled)."""
         now, kind = monotonic_s(), type(error).__name__
         with self._lock:
@@ -86,7 +86,7 @@ class Troubles:
             self._tell(count, text)
 
 
-def _told(error: Exception) -> str:
+def _told(error: BaseException) -> str:
     """The first line of an error and where it came from, as short as it has to be to be carried."""
     kind = type(error).__name__
     line = (f"{kind}: {error}" if str(error) else kind).strip().partition("\n")[0]
@@ -94,7 +94,7 @@ def _told(error: Exception) -> str:
     return f"{line[: MAX_REASON - _ROOM - len(where)]}{where}"
 
 
-def _place(error: Exception) -> str:
+def _place(error: BaseException) -> str:
     """``file:line`` of the innermost frame that is the author's: in no library, and not ours; empty when none is."""
     place = ""
     for frame, line in traceback.walk_tb(error.__traceback__):

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from asyncio import CancelledError
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -663,7 +664,7 @@ def test_a_flip_does_not_wait_for_a_put_that_waits_for_its_link(bench: Bench, mo
         one.undeclare()
 
 
-@pytest.mark.parametrize("error", [ValueError("no plan"), SystemExit(3)])
+@pytest.mark.parametrize("error", [ValueError("no plan"), SystemExit(3), CancelledError("end")])
 def test_what_a_callback_raises_takes_no_answer_from_another_one(
     bench: Bench, error: BaseException, caplog: pytest.LogCaptureFixture
 ) -> None:

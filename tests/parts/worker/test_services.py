@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
 import zenoh
 
 from support.waiting import until
@@ -16,13 +17,16 @@ from zsched.worker.troubles import Troubles
 KEY = "edge1/t/robot1/job"
 
 
-def test_what_is_no_answer_is_the_handler_s_failure_and_the_next_request_is_answered() -> None:
+@pytest.mark.parametrize("first", [{}, SystemExit(3)])
+def test_what_is_no_answer_is_the_handler_s_failure_and_the_next_request_is_answered(first: object) -> None:
     """The thread ended by it and began again, later each time; the asker heard nothing, and neither did the node."""
     told: list[tuple[int, str]] = []
-    given: list[Any] = [{}, b"done"]
+    given: list[Any] = [first, b"done"]
 
     def handle(_request: Request) -> bytes:
-        answer: bytes = given.pop(0)
+        answer: bytes | SystemExit = given.pop(0)
+        if isinstance(answer, SystemExit):
+            raise answer
         return answer
 
     troubles = Troubles(lambda count, text: told.append((count, text)))
@@ -40,7 +44,8 @@ def test_what_is_no_answer_is_the_handler_s_failure_and_the_next_request_is_answ
         )
         (failed,) = session.get(KEY, timeout=20.0)
         assert failed.err is not None
-        assert failed.err.payload.to_string().startswith("failed: TypeError: ")
+        kind = "SystemExit" if isinstance(first, SystemExit) else "TypeError"
+        assert failed.err.payload.to_string().startswith(f"failed: {kind}: ")
         assert str(failed.err.encoding) == ERROR_ENCODING
         until(lambda: told, "the node hears of it")
         assert told[0][0] == 1

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import queue
+import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from random import Random
 
 import pytest
@@ -234,7 +235,11 @@ def test_a_snapshot_that_stops_half_way_is_late(sessions: tuple[zenoh.Session, z
 
 @pytest.mark.parametrize(
     ("snapshot", "said"),
-    [(lambda: bytes(MAX_SNAPSHOT + 1), "too large"), (lambda: 1 / 0, "ZeroDivisionError")],
+    [
+        (lambda: bytes(MAX_SNAPSHOT + 1), "too large"),
+        (lambda: 1 / 0, "ZeroDivisionError"),
+        (lambda: sys.exit(3), "SystemExit"),
+    ],
 )
 def test_a_snapshot_that_cannot_be_sent_is_refused_with_the_reason(
     sessions: tuple[zenoh.Session, zenoh.Session], snapshot: object, said: str
@@ -363,10 +368,11 @@ def test_who_asks_again_while_the_state_is_on_its_way_waits_too() -> None:
     assert restorer.begin(active(3), then.set) is False
 
 
-def test_a_callback_that_fails_is_a_cold_start() -> None:
+@pytest.mark.parametrize("fail", [lambda: 1 / 0, lambda: sys.exit(3)])
+def test_a_callback_that_fails_is_a_cold_start(fail: Callable[[], object]) -> None:
     inputs = Inputs()
     restorer = Restorer(lambda _node, _timeout_s: b"state", "edge2", inputs)
-    restorer.register(lambda _content: 1 / 0, 1.0)  # type: ignore[arg-type] # it fails on purpose
+    restorer.register(lambda _content: fail(), 1.0)  # type: ignore[arg-type] # it fails on purpose
     restorer.note(active(3))
     restorer.begin(active(3), restorer.deliver)
     end = time.monotonic() + 60

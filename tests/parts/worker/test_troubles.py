@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import logging
 from functools import partial
@@ -95,7 +96,8 @@ def test_an_error_of_any_length_fits_what_is_carried() -> None:
     troubles.close()
 
 
-def test_the_dispatch_goes_on_behind_a_callback_that_raises() -> None:
+@pytest.mark.parametrize("kind", [ValueError, SystemExit, asyncio.CancelledError])
+def test_the_dispatch_goes_on_behind_a_callback_that_raises(kind: type[BaseException]) -> None:
     told: list[int] = []
     troubles = Troubles(lambda count, _text: told.append(count))
     jobs = JobBook("t", "1", lambda _jobs: None)
@@ -103,7 +105,7 @@ def test_the_dispatch_goes_on_behind_a_callback_that_raises() -> None:
     dispatcher.start()
 
     def refuse(sample: Received) -> None:
-        raise ValueError(sample.key)
+        raise kind(sample.key)
 
     source = Input(on_sample=refuse, keep_last=None)
     with hub_and_neighbour() as (hub, neighbour):
