@@ -49,6 +49,8 @@ class Acknowledger:
         self.born_at = self.clock() if born_at is None else born_at
         """When this process began to listen."""
         self._sources: dict[SourceName, Source] = {}
+        self._used: set[SourceName] = set()
+        """Those that have a second chance when room is wanted: something has come of them since they had their last."""
         self._dirty: set[SourceName] = set()
         self._time = RunningTime()
         self._gaps: dict[SourceName, Source] = {}
@@ -136,13 +138,15 @@ class Acknowledger:
 
     def is_whole(self, name: SourceName) -> bool:
         """Whether everything of a source is wanted, by its start marker."""
-        source = self._sources.get(name)
-        return source is not None and source.is_whole is True
+        with self._wake:
+            source = self._sources.get(name)
+            return source is not None and source.is_whole is True
 
     def replay_end(self, name: SourceName) -> int:
         """The numbers of a source below this one may have gone to an earlier owner."""
-        source = self._sources.get(name)
-        return 0 if source is None else source.replay_end
+        with self._wake:
+            source = self._sources.get(name)
+            return 0 if source is None else source.replay_end
 
     def end(self, name: SourceName) -> None:
         """The source's end marker came."""
@@ -170,11 +174,13 @@ class Acknowledger:
         with self._wake:
             for name in names:
                 self._sources.pop(name, None)
+                self._used.discard(name)
 
     def arrived(self, name: SourceName) -> int:
         """The number that the source comes to next."""
-        source = self._sources.get(name)
-        return 0 if source is None else source.arrived
+        with self._wake:
+            source = self._sources.get(name)
+            return 0 if source is None else source.arrived
 
     def processed(self, name: SourceName, number: int, size: int) -> None:
         """A sample is done, or it gave way to a newer one that is; not one whose jump was taken back meanwhile."""
@@ -199,8 +205,15 @@ class Acknowledger:
     def _add(self, name: SourceName, number: int) -> Source:
         source = self._sources[name] = Source.at(number)
         if len(self._sources) > MAX_SOURCES:
-            self._sources.pop(next(iter(self._sources)))
+            self._make_room(name)
         return source
+
+    def _make_room(self, newest: SourceName) -> None:
+        """Forget the oldest of which nothing has come since it was looked at last: a live stream may be the oldest."""
+        while (oldest := next(iter(self._sources))) in self._used or oldest == newest:
+            self._used.discard(oldest)
+            self._sources[oldest] = self._sources.pop(oldest)
+        del self._sources[oldest]
 
     # --- the thread --------------------------------------------------------------------------------------------------
 
@@ -223,6 +236,7 @@ class Acknowledger:
     def _mark(self, name: SourceName) -> None:
         is_first = not self._dirty
         self._dirty.add(name)
+        self._used.add(name)
         if is_first or self._is_urgent():
             self._wake.notify()
 

@@ -244,6 +244,25 @@ def test_who_leaves_says_so_and_nothing_more(book: Book) -> None:
     assert book.acks.arrived(NAME) == 0
 
 
+def test_the_source_that_goes_for_want_of_room_is_one_that_nothing_comes_of(
+    book: Book, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The robot that has been up longest was heard first; many that came and went since are forgotten before it."""
+    monkeypatch.setattr(acknowledger, "MAX_SOURCES", 3)
+    book.acks.skip(NAME, 0)
+    book.acks.note_start(NAME, 0, is_whole=True, replayed=0)
+    others = [("edge1/t/in", f"b{number}", 7) for number in range(9)]
+    for number, other in enumerate(others):
+        assert book.admit(number) == [True]
+        book.acks.processed(NAME, number, 10)
+        assert book.acks.admit(other, 0, in_turn=True) == 0
+        assert book.acks.arrived(other) == 1, "not the one that has just come"
+    assert book.acks.is_whole(NAME)
+    assert book.acks.arrived(NAME) == len(others)
+    assert len(book.acks._sources) == 3
+    assert book.acks._used <= set(book.acks._sources)
+
+
 def test_frames_leave_in_the_order_in_which_they_were_made() -> None:
     """One that says less than the one before it is taken for a stranger's."""
     told: list[int] = []
