@@ -29,6 +29,8 @@ NO_ROOM_S: Final = 0.25
 """A receiver that takes nothing for this long is stalled, not slow: nobody waits for it."""
 POLL_S: Final = 0.05
 JOIN_S: Final = 0.3
+MAX_DEAD: Final = 1024
+"""So many entries that gave way keep their place in the queue; when more than half are such, they are taken out."""
 
 _log = logging.getLogger("zsched.streams")
 
@@ -74,6 +76,8 @@ class SendQueue:
         self._wants_item = False
         self._wants_kick = False
         self._items: deque[_Waiting] = deque()
+        self._dead = 0
+        """Of `_items`, those that gave way."""
         self._lines: dict[Hashable, deque[_Waiting]] = {}
         self._count = 0
         self._bytes = 0
@@ -198,6 +202,7 @@ class SendQueue:
         with self._lock:
             taken = [waiting for waiting in self._items if waiting.lane is not None and waiting.action is not None]
             self._items = deque(waiting for waiting in self._items if waiting.lane is None)
+            self._dead = 0
             self._lines.clear()
             for waiting in taken:
                 self._forget(waiting)
@@ -233,9 +238,13 @@ class SendQueue:
         dropped = 0
         while len(line) > limit or (self._bytes > MAX_BYTES and len(line) > 1):
             old = line.popleft()
-            old.action = None
+            old.action = old.value = None
             self._forget(old)
             dropped += 1
+        self._dead += dropped
+        if self._dead > max(MAX_DEAD, len(self._items) // 2):
+            self._items = deque(waiting for waiting in self._items if waiting.action is not None)
+            self._dead = 0
         self._has_shed |= dropped > 0
         return dropped
 
@@ -309,6 +318,8 @@ class SendQueue:
                 return None
             waiting = self._items.popleft()
             self._is_taken = waiting.action is not None
+            if waiting.action is None:
+                self._dead -= 1
             if waiting.action is None or waiting.lane is None:
                 return waiting.action
             self._forget(waiting)

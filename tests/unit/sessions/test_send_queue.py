@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+import weakref
 from collections.abc import Callable
 
 import pytest
@@ -104,6 +105,67 @@ def test_behind_a_stalled_receiver_only_the_newest_of_each_lane_wait() -> None:
     receiver.gate.set()
     until(lambda: len(receiver.got) == 5, "the newest")
     assert receiver.got == [("a", 0), ("a", 4), ("b", 4), ("a", 5), ("b", 5)]
+    queue.close()
+
+
+class Value:
+    """A payload that can be seen to go."""
+
+
+def test_a_sample_that_gave_way_takes_no_memory_while_a_put_blocks() -> None:
+    receiver = Receiver()
+    receiver.gate.clear()
+    queue = SendQueue("t", depth=100, sheds=True)
+    queue.send("a", receiver.take(0), 1)
+    until(lambda: queue.is_stalled, "the put blocks")
+    value = Value()
+    is_there = weakref.ref(value)
+    queue.send("a", receiver.take(1), 1, value)
+    del value
+    assert is_there() is not None
+    assert queue.send("a", receiver.take(2), 1) == 1
+    assert is_there() is None
+    receiver.gate.set()
+    until(lambda: receiver.got == [0, 2], "the newest")
+    queue.close()
+
+
+def test_what_gave_way_does_not_pile_up_behind_a_put_that_blocks() -> None:
+    receiver = Receiver()
+    receiver.gate.clear()
+    queue = SendQueue("t", depth=100, sheds=True, keep_last=2)
+    queue.send("a", receiver.take("first"), 1)
+    until(lambda: queue.is_stalled, "the put blocks")
+    queue.send("b", receiver.take("b"), 1)
+    queue.then(receiver.take("marker"))
+    longest = 0
+    for number in range(10_000):
+        assert queue.send("a", receiver.take(number), 1) == (number > 1)
+        longest = max(longest, len(queue._items))
+    assert longest < 3000
+    receiver.gate.set()
+    until(lambda: len(receiver.got) == 5, "what did not give way")
+    assert receiver.got == ["first", "b", "marker", 9998, 9999]
+    until(lambda: queue.is_empty, "nothing else waits")
+    assert (queue._count, queue._bytes, queue._dead) == (0, 0, 0)
+    queue.close()
+
+
+def test_what_gave_way_is_not_taken_back_nor_counted_behind_that() -> None:
+    receiver = Receiver()
+    receiver.gate.clear()
+    queue = SendQueue("t", depth=100, sheds=True)
+    queue.send("a", receiver.take("first"), 1)
+    until(lambda: queue.is_stalled, "the put blocks")
+    for number in range(1500):
+        queue.send("a", receiver.take(number), 1, number)
+    queue.then(receiver.take("marker"))
+    assert queue.take_back() == [1499]
+    assert (len(queue._items), queue._dead) == (1, 0)
+    for number in range(1500, 3000):
+        queue.send("a", receiver.take(number), 1, number)
+    receiver.gate.set()
+    until(lambda: receiver.got == ["first", "marker", 2999], "the newest")
     queue.close()
 
 
