@@ -38,6 +38,8 @@ JOIN_S: Final = 0.2
 NAME_S: Final = 0.2
 """The first sample of a source waits this long for the marker that names its slot. That was put before it, but comes in
 another thread of zenoh's."""
+MAX_DEAD: Final = 1024
+"""So many samples that gave way keep their place in the queue; when more than half are such, they are taken out."""
 
 _log = logging.getLogger("zsched.worker")
 
@@ -70,6 +72,8 @@ class Dispatcher:
         self._in_hand: int | None = None
         self._wake = threading.Condition()
         self._queue: deque[Waiting] = deque()
+        self._dead = 0
+        """Of `_queue`, what gave way or was given up."""
         self._markers: list[Marker] = []
         self._asked: set[int] = set()
         """Epochs whose end is to be told again if they are over."""
@@ -142,8 +146,16 @@ class Dispatcher:
         source.shed += 1
         self._timer.skipped += 1
         self._timer.waiting -= 1
+        self._note_dead(1)
         if oldest.is_wanted and oldest.name is not None:
             self._acks.shed(oldest.name)
+
+    def _note_dead(self, count: int) -> None:
+        """Samples of the queue are gone (under the lock): behind a callback that hangs their places do not pile up."""
+        self._dead += count
+        if self._dead > max(MAX_DEAD, len(self._queue) // 2):
+            self._queue = deque(one for one in self._queue if one.sample is not None)
+            self._dead = 0
 
     def put_marker(self, marker: Marker) -> None:
         """Queue an end marker (zenoh's thread)."""
@@ -188,6 +200,7 @@ class Dispatcher:
                 one.source.waiting[name[0]].remove(one)
                 one.sample = None
             self._timer.waiting -= len(waiting)
+            self._note_dead(len(waiting))
             count = len(waiting) + self._backlog.forget(name)
             self._given_up[name] = at, count
             self._open.pop(name, None)
@@ -353,7 +366,10 @@ class Dispatcher:
         if (done := self._backlog.take()) is not None:
             return Waiting(done.source, done.sample, replayed=done.replayed, is_whole=done.is_whole, again=done)
         waiting = self._queue.popleft() if self._queue else None
-        if waiting is None or waiting.sample is None:
+        if waiting is None:
+            return None
+        if waiting.sample is None:
+            self._dead -= 1
             return None
         waiting.source.waiting[str(waiting.sample.key_expr)].remove(waiting)
         self._timer.waiting -= 1

@@ -1,0 +1,109 @@
+"""What waits in a worker takes no more memory than it may."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import cast
+
+import pytest
+import zenoh
+
+from support.waiting import until
+from zsched.hop.acknowledger import Acknowledger
+from zsched.worker import inputs as worker_inputs
+from zsched.worker.inputs import Dispatcher
+from zsched.worker.jobs import JobBook
+from zsched.worker.keep import Debts
+from zsched.worker.samples import Input, KeepLast, Received
+from zsched.worker.troubles import Troubles
+
+
+class Bench:
+    """A dispatcher and what its callback was given; the callback waits while `gate` is closed."""
+
+    def __init__(self) -> None:
+        self.troubles = Troubles(lambda _count, _text: None)
+        self.jobs = JobBook("t", "1", lambda _jobs: None)
+        self.acks = Acknowledger(lambda _session, _frame: None)
+        self.dispatcher = Dispatcher(lambda _epoch: None, self.acks, self.troubles, Debts(self.acks), self.jobs)
+        self.taken: list[str] = []
+        self.gate = threading.Event()
+        self.gate.set()
+
+    def input(self, keep_last: KeepLast) -> Input:
+        return Input(on_sample=self._take, keep_last=keep_last)
+
+    def _take(self, received: Received) -> None:
+        self.gate.wait(60)
+        self.taken.append(f"{received.key} {received.encoding}")
+
+    def put(self, source: Input, key: str, value: str, number: int | None = None) -> None:
+        self.dispatcher.put(source, sample(key, value, number))
+
+    def close(self) -> None:
+        self.gate.set()
+        if self.dispatcher._thread.is_alive():
+            self.dispatcher.close()
+        self.troubles.close()
+        self.acks.close()
+
+
+def sample(key: str, value: str, number: int | None = None) -> zenoh.Sample:
+    """As zenoh gives it; with a ``number`` it has a source."""
+    source_id = SimpleNamespace(zid="a1", eid=7)
+    made = SimpleNamespace(
+        key_expr=key,
+        payload=b"",
+        attachment=None,
+        encoding=value,
+        kind=zenoh.SampleKind.PUT,
+        timestamp=None,
+        congestion_control=zenoh.CongestionControl.BLOCK,
+        source_info=None if number is None else SimpleNamespace(source_id=source_id, source_sn=number),
+    )
+    return cast("zenoh.Sample", made)
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    made = Bench()
+    yield made
+    made.close()
+
+
+def test_what_gave_way_does_not_pile_up_behind_a_callback_that_hangs(bench: Bench) -> None:
+    bench.gate.clear()
+    newest, whole = bench.input(keep_last=1), bench.input(keep_last=None)
+    bench.dispatcher.start()
+    bench.put(newest, "a", "first")
+    until(lambda: bench.dispatcher._is_busy, "it is in hand")
+    longest = 0
+    for number in range(10_000):
+        bench.put(newest, "a", str(number))
+        if number in (10, 9000):
+            bench.put(whole, "b", str(number))
+        longest = max(longest, len(bench.dispatcher._queue))
+    assert longest < 3000
+    assert newest.shed == 9_999
+    bench.gate.set()
+    until(lambda: len(bench.taken) == 4, "what did not give way")
+    assert bench.taken == ["a first", "b 10", "b 9000", "a 9999"]
+    until(lambda: not bench.dispatcher._queue, "nothing else waits")
+    assert bench.dispatcher._dead == 0
+
+
+def test_what_was_given_up_does_not_pile_up_either(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worker_inputs, "MAX_DEAD", 10)
+    whole = bench.input(keep_last=None)
+    for number in range(20):
+        bench.put(whole, "a", str(number), number)
+        bench.put(whole, "b", str(number))
+    bench.dispatcher._give_up(("a", "a1", 7), 0.0)
+    assert (len(bench.dispatcher._queue), bench.dispatcher._dead) == (40, 20)
+    bench.dispatcher._shed(whole, whole.waiting["b"].popleft())
+    assert (len(bench.dispatcher._queue), bench.dispatcher._dead) == (19, 0)
+    bench.dispatcher.start()
+    until(lambda: len(bench.taken) == 19, "the others")
+    assert bench.taken == [f"b {number}" for number in range(1, 20)]
