@@ -197,7 +197,7 @@ class Dispatcher:
                 self._given_up.pop(next(iter(self._given_up)))
             waiting = [one for one in self._queue if one.name == name and one.sample is not None]
             for one in waiting:
-                one.source.waiting[name[0]].remove(one)
+                one.source.take_out(name[0], one)
                 one.sample = None
             self._timer.waiting -= len(waiting)
             self._note_dead(len(waiting))
@@ -371,7 +371,7 @@ class Dispatcher:
         if waiting.sample is None:
             self._dead -= 1
             return None
-        waiting.source.waiting[str(waiting.sample.key_expr)].remove(waiting)
+        waiting.source.take_out(str(waiting.sample.key_expr), waiting)
         self._timer.waiting -= 1
         self._timer.least = min(self._timer.least, self._timer.waiting)
         return waiting

@@ -51,6 +51,7 @@ class Input(Struct, eq=False):
     keep_last: KeepLast = BY_CLASS
     depth: int = 4096
     waiting: dict[str, deque[Waiting]] = field(default_factory=dict)
+    """{key of which something waits: its samples, the oldest first}."""
     shed: int = 0
     """Samples that gave way to newer ones."""
 
@@ -66,6 +67,13 @@ class Input(Struct, eq=False):
         if isinstance(self.keep_last, str):
             return None if is_whole else 1
         return self.keep_last
+
+    def take_out(self, key: str, one: Waiting) -> None:
+        """A sample waits no more; a wildcard input hears any number of keys, so none stays of which nothing waits."""
+        line = self.waiting[key]
+        line.remove(one)
+        if not line:
+            del self.waiting[key]
 
     def wants(self, *, is_whole: bool) -> bool:
         """Whether a sample that gives way to a newer one is lost."""

@@ -107,3 +107,22 @@ def test_what_was_given_up_does_not_pile_up_either(bench: Bench, monkeypatch: py
     bench.dispatcher.start()
     until(lambda: len(bench.taken) == 19, "the others")
     assert bench.taken == [f"b {number}" for number in range(1, 20)]
+
+
+def test_a_key_of_which_nothing_waits_takes_no_memory(bench: Bench) -> None:
+    """A wildcard input hears any number of keys."""
+    source = bench.input(keep_last=1)
+    bench.dispatcher.start()
+    for number in range(1000):
+        bench.put(source, f"key/{number}", "x")
+    until(lambda: len(bench.taken) == 1000, "all of them")
+    assert source.waiting == {}
+
+
+def test_a_key_of_which_everything_was_given_up_takes_no_memory(bench: Bench) -> None:
+    source = bench.input(keep_last=None)
+    for number in range(3):
+        bench.put(source, "a", "x", number)
+    bench.put(source, "b", "x")
+    bench.dispatcher._give_up(("a", "a1", 7), 0.0)
+    assert list(source.waiting) == ["b"]
