@@ -172,8 +172,9 @@ class Dispatcher:
             self._acks.note_start(marker.name, end.count, is_whole=end.is_whole, replayed=end.replayed)
             return
         with self._wake:
-            self._markers.append(marker)
-            self._wake.notify()
+            if len(self._markers) < MAX_SOURCES:  # more of them are a stranger's
+                self._markers.append(marker)
+                self._wake.notify()
 
     def _note_slot(self, marker: Marker) -> None:
         """A publisher feeds one slot for all its life: two words that differ count as none, one is a stranger's."""
@@ -488,18 +489,25 @@ class Dispatcher:
         """Let every marker take effect whose samples are processed, then tell which epochs are over."""
         now = monotonic_s()
         with self._wake:
-            done = [marker for marker in self._markers if self._is_due(marker, now)]
+            done, self._markers = self._parted(now)
             for marker in done:
-                self._markers.remove(marker)
                 self._open.pop(marker.name, None)
                 self._acks.skip(marker.name, marker.end.count)  # what has not come by now is lost, and is said to be
             ended = {marker.end.epoch for marker in done} | self._asked
             self._asked.clear()
-            over = sorted(epoch for epoch in ended if self._is_over(epoch))
+            oldest = self._oldest_open() if ended else 0
+            over = sorted(epoch for epoch in ended if epoch < oldest)
         if over:
             self._acks.flush()  # so that what is processed is known to be when the ends arrive
         for epoch in over:
             self._on_ended(epoch)
+
+    def _parted(self, now: float) -> tuple[list[Marker], list[Marker]]:
+        """The markers that take effect now, and those that wait."""
+        parts: tuple[list[Marker], list[Marker]] = ([], [])
+        for marker in self._markers:
+            parts[not self._is_due(marker, now)].append(marker)
+        return parts
 
     def _is_due(self, marker: Marker, now: float) -> bool:
         state = self._open.get(marker.name)
@@ -509,14 +517,15 @@ class Dispatcher:
         grace_s = GIVE_UP_S if state is not None and state.in_turn else END_GRACE_S
         return not self._queue and now - marker.came_at > grace_s
 
-    def _is_over(self, epoch: int) -> bool:
-        """Whether every input that was heard in the epoch has ended (under the lock)."""
-        return all(state.epoch > epoch or self._is_left(name) for name, state in self._open.items())
+    def _oldest_open(self) -> float:
+        """The oldest epoch in which an input was heard that has not ended (under the lock); infinite: all have.
 
-    def _is_left(self, name: SourceName) -> bool:
-        """Whether nobody is there who would end a source, and all that has come of it is processed."""
-        is_left = self._has_ended(name[1])
-        return is_left and not any(one.name == name and one.sample is not None for one in self._queue)
+        One that nobody is there to end any more has ended when all that has come of it is processed.
+        """
+        waiting = {one.name for one in self._queue if one.sample is not None}
+        opened = self._open.items()
+        left = (state.epoch for name, state in opened if name in waiting or not self._has_ended(name[1]))
+        return min(left, default=math.inf)
 
 
 def _never() -> bool:

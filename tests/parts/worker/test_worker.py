@@ -52,7 +52,7 @@ class Echo:
     def has_inputs_ended(self, epoch: int) -> bool:
         dispatcher = self.worker._dispatcher
         with dispatcher._wake:
-            return dispatcher._is_over(epoch)
+            return dispatcher._oldest_open() > epoch
 
 
 @pytest.fixture

@@ -11,12 +11,13 @@ import pytest
 import zenoh
 
 from support.waiting import until
+from zsched.core.relay_protocol import EndMarker
 from zsched.hop.acknowledger import Acknowledger
 from zsched.worker import inputs as worker_inputs
 from zsched.worker.inputs import Dispatcher
 from zsched.worker.jobs import JobBook
 from zsched.worker.keep import Debts
-from zsched.worker.samples import Input, KeepLast, Received
+from zsched.worker.samples import Input, KeepLast, Marker, Received
 from zsched.worker.troubles import Troubles
 
 
@@ -27,7 +28,11 @@ class Bench:
         self.troubles = Troubles(lambda _count, _text: None)
         self.jobs = JobBook("t", "1", lambda _jobs: None)
         self.acks = Acknowledger(lambda _session, _frame: None)
-        self.dispatcher = Dispatcher(lambda _epoch: None, self.acks, self.troubles, Debts(self.acks), self.jobs)
+        self.ended: list[int] = []
+        self.gone: set[str] = set()
+        self.dispatcher = Dispatcher(
+            self.ended.append, self.acks, self.troubles, Debts(self.acks), self.jobs, self.gone.__contains__
+        )
         self.taken: list[str] = []
         self.gate = threading.Event()
         self.gate.set()
@@ -126,3 +131,34 @@ def test_a_key_of_which_everything_was_given_up_takes_no_memory(bench: Bench) ->
     bench.put(source, "b", "x")
     bench.dispatcher._give_up(("a", "a1", 7), 0.0)
     assert list(source.waiting) == ["b"]
+
+
+def test_end_markers_of_strangers_are_not_kept_without_bound(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worker_inputs, "MAX_SOURCES", 20)
+    for number in range(50):
+        end = EndMarker(epoch=1, count=5)
+        bench.dispatcher.put_marker(Marker(name=(f"key/{number}", "zz", 1), end=end, came_at=0.0))
+    assert len(bench.dispatcher._markers) == 20
+    bench.dispatcher.start()
+    until(lambda: not bench.dispatcher._markers, "they are due in the end")
+    bench.dispatcher.put_marker(Marker(name=("key", "zz", 1), end=EndMarker(epoch=3, count=0), came_at=0.0))
+    until(lambda: bench.ended == [1, 3], "there is room again")
+
+
+def test_an_epoch_is_over_when_what_nobody_ends_any_more_is_processed(bench: Bench) -> None:
+    source = bench.input(keep_last=None)
+    bench.put(source, "a", "x", 0)
+    bench.dispatcher.start()
+    until(lambda: len(bench.taken) == 1, "the first")
+    bench.dispatcher.look_for_end(0)
+    until(lambda: not bench.dispatcher._asked, "it was looked")
+    assert bench.ended == []
+    bench.gate.clear()
+    bench.put(source, "a", "x", 1)
+    bench.put(source, "a", "x", 2)
+    until(lambda: bench.dispatcher._is_busy, "it is in hand")
+    bench.gone.add("a1")
+    bench.dispatcher.look_for_end(0)
+    bench.gate.set()
+    until(lambda: bench.ended, "nobody is there who would end it")
+    assert len(bench.taken) == 3
