@@ -22,7 +22,7 @@ from zsched.wire.keyspace import Keyspace, parse
 PAUSE_S: Final = 0.1
 """A worker says something five times a second; more than this is no worker of ours, and is left out."""
 MAX_SPEAKERS: Final = 256
-"""Tasks, times the kinds of words: more of them are no workers of ours either."""
+"""Tasks, times the kinds of words: more of them within `PAUSE_S` are no workers of ours either."""
 _GARBAGE: Final = ""
 
 Word = WorkerTrouble | WorkerJobs | FrameDropped
@@ -34,6 +34,7 @@ class Troubles:
     def __init__(self, session: Session, keyspace: Keyspace, node: NodeId, report: Callable[[Word], None]) -> None:
         self._report = report
         self._reported_at: dict[tuple[str, type[Word]], float] = {}
+        """{speaker: when its newest word was handed on}, in that order."""
         self._key = keyspace.trouble(node, "*", "*")
         self.rejoin(session)
 
@@ -59,7 +60,10 @@ class Troubles:
         now, speaker = monotonic_s(), (task, type(word))
         if now - self._reported_at.get(speaker, -PAUSE_S) < PAUSE_S:
             return
-        if speaker not in self._reported_at and len(self._reported_at) >= MAX_SPEAKERS:
-            return
+        if self._reported_at.pop(speaker, None) is None and len(self._reported_at) >= MAX_SPEAKERS:
+            silent, since = next(iter(self._reported_at.items()))
+            if now - since < PAUSE_S:
+                return
+            del self._reported_at[silent]
         self._reported_at[speaker] = now
         self._report(word)

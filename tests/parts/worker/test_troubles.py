@@ -6,6 +6,7 @@ import asyncio
 import json
 import logging
 from functools import partial
+from types import SimpleNamespace
 from typing import cast
 
 import pytest
@@ -17,8 +18,8 @@ from zsched.core.events import FrameDropped
 from zsched.core.relay_protocol import WorkerTrouble
 from zsched.core.values.model import MAX_REASON
 from zsched.hop.acknowledger import Acknowledger
+from zsched.relay.troubles import MAX_SPEAKERS, PAUSE_S, Word
 from zsched.relay.troubles import Troubles as Heard
-from zsched.relay.troubles import Word
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import Keyspace
 from zsched.worker.inputs import Dispatcher
@@ -139,3 +140,26 @@ def test_the_relay_hands_on_what_its_own_node_s_workers_say_and_no_flood() -> No
         assert {one for one in heard if not isinstance(one, FrameDropped)} == {trouble}
         assert len(heard) < 100
         kept.clear()
+
+
+def test_tasks_that_came_and_went_take_no_later_one_its_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    now, heard = [100.0], list[Word]()
+    monkeypatch.setattr("zsched.relay.troubles.monotonic_s", lambda: now[0])
+    session = SimpleNamespace(declare_subscriber=lambda *_: None)
+    relay = Heard(cast("zenoh.Session", session), KEYS, "edge1", heard.append)
+
+    def said(task: str) -> bool:
+        """Whether a word of this task was handed on."""
+        heard.clear()
+        relay._hand_on(task, WorkerTrouble(task=task, incarnation="7", count=3, text="ValueError"))
+        return bool(heard)
+
+    for number in range(MAX_SPEAKERS):
+        assert said(f"t{number}")
+    assert not said("one-too-many"), "so many at a time are no workers of ours"
+    now[0] += 2 * PAUSE_S
+    assert said("t0")
+    assert said("another")
+    assert not said("t0"), "it spoke a moment ago, and is remembered"
+    assert said("t1")
+    assert len(relay._reported_at) == MAX_SPEAKERS
