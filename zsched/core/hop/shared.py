@@ -277,10 +277,15 @@ class SharedSender(Struct, kw_only=True, eq=False):
     def _is_expected(self, name: str, now: float) -> bool:
         expected = self.expected.get(name)
         if expected is None:
-            if len(self.expected) >= MAX_RECEIVERS:
+            if len(self.expected) >= MAX_RECEIVERS and not self._forget_decided():
                 return False
             expected = self.expected[name] = Expected(since=now)
         return not expected.is_decided
+
+    def _forget_decided(self) -> bool:
+        """Make room for one more that is expected: relays' lives come and go, and are names of their own."""
+        decided = next((name for name, one in self.expected.items() if one.is_decided), None)
+        return decided is not None and self.expected.pop(decided) is not None
 
     def in_doubt(self, now: float) -> tuple[str, ...]:
         """The expected that have said nothing: somebody must see whether they subscribe, and say so (`decide`)."""

@@ -134,6 +134,25 @@ def test_an_input_waits_for_so_many_that_never_spoke_and_for_no_more() -> None:
     assert len(books.expected) == MAX_RECEIVERS
 
 
+def test_an_input_waits_for_a_new_relay_s_first_word_after_any_number_of_lives() -> None:
+    books = sender(5)
+    for number in range(MAX_RECEIVERS):
+        assert books.settled(f"life{number}", 1.0) == 0
+    now = 1.0 + LOOK_S
+    in_doubt = books.in_doubt(now)
+    assert len(in_doubt) == MAX_RECEIVERS
+    for name in in_doubt[:-1]:
+        books.decide(name, now, is_there=False)
+    assert books.settled("new", now) == 0
+    assert len(books.expected) == MAX_RECEIVERS
+    assert books.settled(in_doubt[-1], now) == 0, "one that is still waited for is not forgotten"
+    books.decide(in_doubt[-1], now, is_there=False)
+    assert books.settled(in_doubt[-1], now) == 5
+    assert books.in_doubt(now + LOOK_S) == ("new",)
+    books.decide("new", now + LOOK_S, is_there=False)
+    assert books.settled("new", now + LOOK_S) == 5
+
+
 def test_much_goes_in_parts_and_progress_brings_the_next() -> None:
     books = sender(2 * BATCH + 1, limit=4 * BATCH)
     ack(books, "a", 0, 1.0, has_gap=True)
