@@ -344,9 +344,14 @@ class Keeper:
             deadlines.append(now + TICK_S)
         if not deadlines:
             self._wake.clear()
-            if any(lane.state.kept for _, lane in lanes):  # one that came just now
+            if self._has_work(now):  # it came while the bell was still set, maybe in a lane of its own
                 self._wake.set()
         return min(deadlines, default=now + TICK_S)
+
+    def _has_work(self, now: float) -> bool:
+        with self._lock:
+            lanes = tuple(self._lanes.values())
+        return self._debts.is_waiting or any(lane.next_deadline(now) is not None for lane in lanes)
 
     def _put_owed(self, lane: KeptLane) -> None:
         for way, owed, skip in lane.take_owed(self._session):

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Iterator
+from typing import Any, cast
 
 import pytest
 import zenoh
 
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import until
+from zsched.clock import monotonic_s
 from zsched.core.hop import shared
 from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks, mark_of
 from zsched.hop.acknowledger import Acknowledger
@@ -346,3 +347,40 @@ def test_an_application_beside_its_relay_is_not_taken_for_the_relay_s_next_life(
     bench.robot("robot1", "aa3").ack(bench.eid, 4)
     until(lambda: "aa3" in lane.state.receivers, "the next relay's word")
     assert sorted(lane.state.receivers) == ["aa2", "aa3"], "in its relay's place, and not in the application's"
+
+
+class LateBell(worker_keep._Bell):
+    """Something happens in the moment before it is put back."""
+
+    def __init__(self, keeper: Keeper, late: Callable[[], object]) -> None:
+        super().__init__(keeper._came)
+        self.late = late
+
+    def clear(self) -> None:
+        self.late()
+        super().clear()
+
+
+@pytest.mark.parametrize("what", ["an answer of a new lane", "the end of a known lane", "an input that waits"])
+def test_the_keeper_does_not_rest_over_what_came_while_it_lay_down(bench: Bench, what: str) -> None:
+    keeper = bench.keeper
+    keeper._subscriber = cast("Any", object())  # no thread: the test is the keeper
+
+    def lane() -> KeptLane:
+        return keeper.lane(KEY, bench.publisher.id, 100)
+
+    def late() -> None:
+        if what == "an answer of a new lane":
+            keep(lane(), 0)
+        elif what == "the end of a known lane":
+            known[0].note_end(EndMarker(epoch=1, count=0))
+        else:
+            bench.debts.processed((KEY, "aa1", 1), 0, 1, {known[0]: 0}, is_unanswered=True)
+
+    keeper._wake = LateBell(keeper, late)
+    known = [] if what == "an answer of a new lane" else [lane()]
+    for one in known:
+        one.hear("aa1", "robot1", StreamAck(eid=bench.eid, first=0, arrived=0, processed=0), monotonic_s())
+    keeper._wake.set()
+    keeper._look_after()
+    assert keeper._wake.is_set()
