@@ -526,7 +526,16 @@ def begin_anew(place: Place, second_life: str, env: Mapping[str, str] | None = N
     place.file.write_text(json.dumps(json.loads(place.file.read_text()) | {"relay_orphan_s": 0}))
     places = ["--state-dir", str(place.folder / "state"), "--runtime-dir", str(place.folder)]
     process = subprocess.Popen(
-        [sys.executable, "-c", FIRST_LIFE.replace("DUE", due) + second_life, "--config", str(place.file), "--node", "edge1", *places],
+        [
+            sys.executable,
+            "-c",
+            FIRST_LIFE.replace("DUE", due) + second_life,
+            "--config",
+            str(place.file),
+            "--node",
+            "edge1",
+            *places,
+        ],
         stderr=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,

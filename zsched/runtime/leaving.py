@@ -28,7 +28,7 @@ TWICE_S = 0.3
 
 
 class Told(Struct, eq=False):
-    """What a process was told of its end: by a signal, which may come between any two steps, or by an operator's thread.
+    """What a process was told of its end: by a signal, which may come between any two steps, or by an operator.
 
     What the process itself has in mind (`begin_anew`) never takes that back, whichever of both came first.
     """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import pytest
@@ -58,8 +59,8 @@ def test_a_daemon_that_begins_anew_waits_longer_for_the_move() -> None:
 def test_who_is_told_to_end_does_not_begin_anew_whichever_came_first(is_first: bool) -> None:
     for keeps_relay in (False, True):
         told = Told()
-        steps = [told.begin_anew, partial(told.stop, keeps_relay=keeps_relay)]
-        for step in steps[:: -1 if is_first else 1]:
+        steps: list[Callable[[], None]] = [told.begin_anew, partial(told.stop, keeps_relay=keeps_relay)]
+        for step in reversed(steps) if is_first else steps:
             step()
         assert (told.begins_anew, told.keeps_relay) == (False, keeps_relay)
 
