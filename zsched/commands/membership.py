@@ -311,6 +311,8 @@ def invite(door: Door, view: ApplyView, guest: Guest, file: Path | None) -> int:
         raise CliError(EXIT_USAGE, f"the invitation is a file: zsched invite {guest.name} > {guest.name}.invite")
     if file is not None and not os.access(file.parent, os.W_OK):
         raise CliError(EXIT_FAILED, f"{file}: that folder takes no file; nothing was done, name another one")
+    if file is None and not view.is_plan:
+        _close_to_others()  # before there is anything to read: who opens it now may read on when it is private
     held = in_force(door)
     fleet = fleet_of(document_text(held))
     check_request(fleet, guest.request, guest.authority)
@@ -438,15 +440,21 @@ def invitation_for(door: Door, guest: Guest, secret: bytes) -> Invitation:
     )
 
 
+def _close_to_others() -> None:
+    """Let only its owner read the file that stdout is, if it is one."""
+    try:
+        number = sys.stdout.fileno()
+    except (AttributeError, OSError):
+        return
+    if stat.S_ISREG(os.fstat(number).st_mode):
+        os.fchmod(number, PRIVATE)
+
+
 def _write(invitation: Invitation, guest: Guest, file: Path | None) -> None:
-    """To a file that only its owner may read if there is a key in it, or to stdout."""
+    """To a file that only its owner may read: workers' settings may be secrets, too; or to stdout."""
     papers = invitation.papers
     text, has_key = encode_invitation(invitation), papers is not None and bool(papers.key)
     if file is None:
-        sys.stdout.flush()
-        number = sys.stdout.fileno() if hasattr(sys.stdout, "fileno") and has_key else None
-        if number is not None and stat.S_ISREG(os.fstat(number).st_mode):
-            os.fchmod(number, PRIVATE)
         sys.stdout.write(text)
     else:
         _write_private(file, text)

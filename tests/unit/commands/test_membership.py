@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import signal
 import stat
-from collections.abc import Iterator
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from ipaddress import ip_address
 from pathlib import Path
@@ -57,8 +59,11 @@ class Node:
         self.changes: list[Json] = []
         self.is_old = False
         self.rollouts: list[Json] = []
+        self.look: Callable[[], object] = object
+        """Called at each question."""
 
     def answer(self, request: Json) -> Json:
+        self.look()
         if request["verb"] == "status":
             nodes = [{"name": name, "state": state} for name, state in self.states.items()]
             tasks = [{"name": "merge", "owner": "robot1"}]
@@ -755,19 +760,16 @@ def test_without_the_authority_the_invitation_says_what_is_missing(node: Node, t
     assert "zsched pki issue robot2" in run("join", file, *here(tmp_path / "robot2")).stdout
 
 
-def test_a_file_on_stdout_with_a_key_is_for_its_owner_only(
-    node: Node, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_that_stdout_is_is_private_before_anything_is_asked(node: Node, tmp_path: Path) -> None:
+    """Who has opened it while others could read it reads what comes later, too."""
     secured(tmp_path, node)
-    file = tmp_path / "robot2.invite"
-    guest = membership.Guest(name="robot3")
-    with file.open("w") as out:
-        file.chmod(0o644)
-        monkeypatch.setattr("sys.stdout", out)
-        from zsched.commands.ask import find_door
-
-        membership._write(membership.invitation_for(find_door(None, None), guest, b""), guest, None)
-    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    file, modes = tmp_path / "robot3.invite", set[int]()
+    file.touch(0o644)
+    node.look = lambda: modes.add(stat.S_IMODE(file.stat().st_mode))
+    with file.open("w") as stdout:
+        command = [sys.executable, "-m", "zsched.cli", "invite", "robot3", "--yes"]
+        subprocess.run(command, stdout=stdout, stderr=subprocess.PIPE, timeout=60, check=True)
+    assert modes == {0o600}
     assert decode_invitation(file.read_bytes()).papers is not None
 
 
