@@ -18,7 +18,9 @@ GONE: Final = "REMOVED"
 LEAST: Final = 4
 """A shorter value is taken out where it stands, and not wherever the same letters are."""
 _WORDS: Final = "pass|passwd|password|passphrase|pwd|secret|token|key|apikey|credential|credentials|auth|pin"
-NAME: Final = re.compile(rf"(?:^|[_-])(?:{_WORDS})(?:[_-]|\d|$)", re.IGNORECASE)
+_PLAIN: Final = "passwd|password|passphrase|secret|token|credential"
+"""Words that stand for nothing else, wherever they are in a name (``PGPASSWORD``, ``apiToken``)."""
+NAME: Final = re.compile(rf"(?:^|[_-])(?:{_WORDS})(?:[_-]|\d|$)|{_PLAIN}", re.IGNORECASE)
 _PAIR: Final = re.compile(
     r"""(?P<name>["']?[A-Za-z_][\w-]*["']?)(?P<sep>\s*:\s+)(?P<value>"(?:[^"\\]|\\.)*"|'[^']*'|[^\s,{}\[\]#][^,}\n#]*)"""
 )
@@ -34,7 +36,7 @@ def secrets_of(fleet: Fleet | None) -> tuple[str, ...]:
     found: set[str] = set()
     for task in fleet.tasks if fleet is not None else ():
         found.update(value for name, value in task.worker.env if NAME.search(name))
-        words = task.worker.command
+        words = [word.removeprefix("--arg=").removeprefix("--option=") for word in task.worker.command]  # of drivers
         found.update(after for word, after in itertools.pairwise(words) if _is_option(word))
         found.update(word.partition("=")[2] for word in words if _is_option(word.partition("=")[0]))
     lines = {line.strip() for value in found for line in value.splitlines()}

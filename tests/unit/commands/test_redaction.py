@@ -8,7 +8,7 @@ from support.clinic import FLEET
 from zsched.commands.redaction import clean, clean_json, clean_yaml, secrets_of
 from zsched.config.load import check_bytes
 
-SECRETS = ("hunter22", "tok,en#1", "abcd1234", "pw4url", "line one", "line two", "swordfish")
+SECRETS = ("hunter22", "tok,en#1", "abcd1234", "pw4url", "line one", "line two", "swordfish", "pg4pass", "camel4case")
 WITH_SECRETS = FLEET.replace(
     "    worker: {command: [python, -m, zsched.tasks.echo]}",
     """    worker:
@@ -21,6 +21,8 @@ WITH_SECRETS = FLEET.replace(
           line two
         BROKER: mqtt://user:pw4url@192.0.2.7:1883/x
         PIN: "12"
+        PGPASSWORD: pg4pass
+        apiToken: camel4case
         MODE: fast
         MONKEY: "7"
 """,
@@ -41,6 +43,15 @@ def test_a_fleet_file_loses_its_secrets_and_nothing_else() -> None:
         assert (kept in text) == (kept in WITH_SECRETS), kept
     assert check_bytes(text.encode()).fleet is not None  # what is left is still a fleet file
     assert clean_yaml(FLEET) == FLEET
+
+
+def test_words_of_a_driver_s_program_are_looked_at_like_any_other_command_s() -> None:
+    driven = "{driver: ros2_lifecycle, node: '/{target}/slam', command: [ros2, run, slam, node, --api-key, abcd1234], ready: matching}"
+    text = FLEET.replace("worker: {command: [python, -m, zsched.tasks.echo]}", f"worker: {driven}")
+    assert driven in text
+    fleet = check_bytes(text.encode()).fleet
+    assert fleet is not None
+    assert leaks(clean_yaml(text, secrets_of(fleet))) == []
 
 
 def test_a_fleet_file_with_faults_loses_them_too() -> None:
@@ -78,5 +89,5 @@ def test_private_keys_go_and_known_values_go_everywhere() -> None:
 
 def test_short_values_are_not_looked_for_everywhere() -> None:
     fleet = check_bytes(WITH_SECRETS.encode()).fleet
-    assert set(secrets_of(fleet)) == {"hunter22", "tok,en#1", "abcd1234", "line one", "line two"}
+    assert set(secrets_of(fleet)) == {*SECRETS} - {"pw4url", "swordfish"}
     assert secrets_of(None) == ()
