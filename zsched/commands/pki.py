@@ -38,6 +38,8 @@ SCHEMA: Final = "zsched.pki.show/1"
 RECORD: Final = "authority.json"
 """What is in every authority's folder."""
 PASSPHRASE: Final = "ZSCHED_AUTHORITY_PASSPHRASE"
+CREDENTIAL: Final = "passphrase"
+"""Of systemd (``LoadCredential=``, systemd.exec(5)): a unit's environment is told to everybody on the machine."""
 MAX_BYTES: Final = 1 << 20
 SENT, HAD = "ok", "unchanged"
 """How a node answers to its certificate."""
@@ -526,6 +528,8 @@ def _passphrase(authority: Authority) -> bytes:
         return b""
     if PASSPHRASE in os.environ:
         return os.environ[PASSPHRASE].encode()
+    if (given := os.environ.get("CREDENTIALS_DIRECTORY")) and (path := Path(given) / CREDENTIAL).exists():
+        return read_regular(path, MAX_BYTES).removesuffix(b"\n")
     return _asked(f"Passphrase of {authority.key_path}")
 
 

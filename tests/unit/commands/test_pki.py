@@ -124,6 +124,9 @@ def test_a_locked_key_asks_for_its_passphrase(here: Path, monkeypatch: pytest.Mo
     assert "the passphrase is wrong" in pki("issue", "robot1", code=1, told="open\n").stderr
     nobody = pki("issue", "robot1", code=1, told="").stderr  # as a timer, without a terminal
     assert "run this on a terminal, or set ZSCHED_AUTHORITY_PASSPHRASE" in nobody
+    monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(here))
+    (here / "passphrase").write_text("open sesame\n")
+    pki("issue", "robot2")
     monkeypatch.setenv("ZSCHED_AUTHORITY_PASSPHRASE", "open sesame")
     pki("issue", "robot1")
     assert (here / "robot1" / "key.pem").exists()
