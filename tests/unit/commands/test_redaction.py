@@ -46,7 +46,7 @@ def test_a_fleet_file_loses_its_secrets_and_nothing_else() -> None:
 
 
 def test_words_of_a_driver_s_program_are_looked_at_like_any_other_command_s() -> None:
-    driven = "{driver: ros2_lifecycle, node: '/{target}/slam', command: [ros2, run, slam, node, --api-key, abcd1234], ready: matching}"
+    driven = "{driver: ros2_lifecycle, node: '/{target}/slam', command: [slam, --api-key, abcd1234], ready: matching}"
     text = FLEET.replace("worker: {command: [python, -m, zsched.tasks.echo]}", f"worker: {driven}")
     assert driven in text
     fleet = check_bytes(text.encode()).fleet
