@@ -38,6 +38,7 @@ from zsched.clock import monotonic_s
 from zsched.core.events import WorkerJobs
 from zsched.core.hop.shared import STALLED_S
 from zsched.core.relay_protocol import StreamAcks, WorkerTrouble
+from zsched.core.route.keyexpr import fault, intersects
 from zsched.core.values.plan import Role, WorkerRole
 from zsched.guard import ends_within, guarded, tolerant
 from zsched.hop.acknowledger import Acknowledger
@@ -116,6 +117,8 @@ class Worker:
         """The report about the first output that no rule of the task takes."""
         self._is_ready = False
         self._declared: list[Any] = []
+        self._inputs: list[str] = []
+        self._services: list[str] = []
         self._errands = Errands(self._stop)
         self._token: zenoh.LivelinessToken | None = None
         self._session = open_session(zenoh_config)
@@ -200,16 +203,18 @@ class Worker:
         `lost` in `zsched status`; of others, what gives way to something newer counts as processed.
 
         Raises:
-            ValueError: ``keep_last`` or ``depth`` is below 1, or the key has another placeholder.
+            ValueError: ``keep_last`` or ``depth`` is below 1, the key has another placeholder, or another input of this
+                worker has keys of it.
             RuntimeError: this worker is ready already.
         """
         self._check_not_ready("subscribe")
-        expr = filled(key_expr, self.prefix)
         source = Input(on_sample=on_sample, keep_last=keep_last, depth=depth)
+        expr = self._taken_by_one(self._inputs, filled(key_expr, self.prefix))
         marker = tolerant(self._on_marker, "marker")
-        ends = self._session.declare_subscriber(f"{expr}/{END_CHUNK}", marker)  # who sees the other sees this
+        remote = zenoh.Locality.REMOTE  # what this worker answers may have a key of its inputs
+        ends = self._session.declare_subscriber(f"{expr}/{END_CHUNK}", marker, allowed_origin=remote)
         put = tolerant(partial(self._dispatcher.put, source), "input")
-        data = self._session.declare_subscriber(expr, put)
+        data = self._session.declare_subscriber(expr, put, allowed_origin=remote)  # who sees this sees the other
         self._declared += [data, ends]
 
     def publisher(
@@ -261,11 +266,11 @@ class Worker:
         one is answered "busy". What it raises becomes an error reply. It is only called while this worker is the owner.
 
         Raises:
-            ValueError: the key has another placeholder.
+            ValueError: the key has another placeholder, or another service of this worker has keys of it.
             RuntimeError: this worker is ready already.
         """
         self._check_not_ready("serve")
-        expr = filled(key_expr, self.prefix)
+        expr = self._taken_by_one(self._services, filled(key_expr, self.prefix))
         service = Service(
             self._session,
             expr,
@@ -277,6 +282,14 @@ class Worker:
             depth=depth,
         )
         self._declared.append(service)
+
+    def _taken_by_one(self, taken: list[str], expr: str) -> str:
+        """``expr``, which is now among ``taken``: a sample goes to one callback, a request to one handler."""
+        for other in taken:
+            if fault(expr) is None and intersects(expr, other):
+                raise ValueError(f"{expr!r} has keys of {other!r}, which is taken already: let one callback take both")
+        taken.append(expr)
+        return expr
 
     def offer_snapshot(self, snapshot: Callable[[], bytes]) -> None:
         """Offer this worker's state to its successor, at most `MAX_SNAPSHOT` bytes; call it before `ready`.

@@ -786,6 +786,41 @@ def test_what_still_waits_when_its_robot_gives_it_up_is_not_done(relay: Relay, t
         assert slow.payloads() == [b"a", b"d"]
 
 
+def test_what_it_answers_under_a_key_of_its_inputs_is_no_input(relay: Relay, tmp_path: Path) -> None:
+    """It answered itself for ever."""
+    taken: list[bytes] = []
+    with Worker.from_env(environment(relay, tmp_path), handles_signals=False) as worker:
+        output = worker.publisher("{prefix}/{epoch}/in")
+
+        def take(received: Received) -> None:
+            taken.append(received.payload.to_bytes())
+            if len(taken) < 5:
+                output.put(received.payload)
+
+        worker.subscribe("{prefix}/*/in", take)
+        worker.ready()
+        relay.tell(WorkerRole.ACTIVE, 4)
+        until(lambda: worker.role.epoch == 4, "the role")
+        for payload in (b"first", b"last"):
+            relay.put(payload)
+            until(lambda: taken[-1:] == [payload], "the input")  # noqa: B023 - called at once
+    assert taken == [b"first", b"last"]
+
+
+def test_no_two_callbacks_take_the_same_keys(relay: Relay, tmp_path: Path) -> None:
+    """Each sample reached one of them, by chance; each request both."""
+    with Worker.from_env(environment(relay, tmp_path), handles_signals=False) as worker:
+        worker.subscribe("{prefix}/*/map", print)
+        worker.serve("{prefix}/ask", lambda _request: b"")
+        for key in ("{prefix}/robot1/map", "{prefix}/*/map", "{prefix}/**"):
+            with pytest.raises(ValueError, match=r"has keys of 'edge1/t/\*/map', which is taken already"):
+                worker.subscribe(key, print)
+        with pytest.raises(ValueError, match="let one callback take both"):
+            worker.serve("{prefix}/*", lambda _request: b"")
+        worker.subscribe("{prefix}/*/scan", print)
+        worker.serve("{prefix}/robot1/map", lambda _request: b"")
+
+
 def test_after_ready_no_input_or_service_is_taken_any_more(relay: Relay, tmp_path: Path) -> None:
     with Worker.from_env(environment(relay, tmp_path), handles_signals=False) as worker:
         worker.subscribe("{prefix}/*/in", lambda _received: None)
