@@ -310,6 +310,11 @@ class Dispatcher:
             is_queued = any(waiting.sample is not None and waiting.name in heard for waiting in self._queue)
             return is_queued or (self._in_hand is not None and self._in_hand <= epoch) or self._backlog.owes(epoch)
 
+    def has_ended(self, epoch: int) -> bool:
+        """Whether every input that was heard in the epoch, or an older one, has ended."""
+        with self._wake:
+            return self._oldest_open() > epoch
+
     def is_still(self, quiet_s: float) -> bool:
         """Whether all that has come is processed, and nothing has come for so long."""
         with self._wake:

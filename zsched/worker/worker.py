@@ -344,9 +344,13 @@ class Worker:
         return self._jobs.job(skipped, came_s)
 
     def drained(self) -> None:
-        """Say that everything taken so far is published (only with ``drains_itself``): ends may go out now."""
+        """Say that everything taken so far is published (only with ``drains_itself``): ends may go out now.
+
+        They do once `role` is draining and every input that was heard in its epoch has ended; say it again until then.
+        """
         role = self._role
-        if self._drains_itself and role.role is WorkerRole.DRAINING:
+        is_due = self._drains_itself and role.role is WorkerRole.DRAINING
+        if is_due and not self._dispatcher.has_waiting(role.epoch) and self._dispatcher.has_ended(role.epoch):
             self._send_ends(role.epoch)
 
     # --- the end -----------------------------------------------------------------------------------------------------

@@ -50,9 +50,7 @@ class Echo:
         return [received.payload.to_bytes() for received in self.taken]
 
     def has_inputs_ended(self, epoch: int) -> bool:
-        dispatcher = self.worker._dispatcher
-        with dispatcher._wake:
-            return dispatcher._oldest_open() > epoch
+        return self.worker._dispatcher.has_ended(epoch)
 
 
 @pytest.fixture
@@ -784,6 +782,32 @@ def test_what_still_waits_when_its_robot_gives_it_up_is_not_done(relay: Relay, t
         slow.gate.set()
         until(lambda: slow.payloads()[-1] == b"d", "the next sample")
         assert slow.payloads() == [b"a", b"d"]
+
+
+def test_who_drains_itself_lets_out_what_comes_before_the_inputs_end(relay: Relay, tmp_path: Path) -> None:
+    """Robots send here until their flip, a moment after the role: that was acknowledged, and its answer withheld."""
+    taken: list[bytes] = []
+    around = environment(relay, tmp_path)
+    with Worker.from_env(around, drains_itself=True, handles_signals=False) as worker:
+        output = worker.publisher("{prefix}/{epoch}/robot1/out", reliable=True)
+        worker.subscribe("{prefix}/*/in", lambda received: taken.append(received.payload.to_bytes()))
+        worker.ready()
+        relay.tell(WorkerRole.ACTIVE, 1)
+        until(lambda: worker.role.epoch == 1, "the role")
+        for number, role in enumerate((WorkerRole.ACTIVE, WorkerRole.DRAINING)):
+            relay.tell(role, 1)
+            until(lambda: worker.role.role is role, "the role")  # noqa: B023 - called at once
+            worker.drained()
+            relay.put(str(number).encode())
+            until(lambda: len(taken) > number, "the input")  # noqa: B023 - as above
+            assert output.put(taken[-1])
+            worker.drained()
+        assert relay.ends == []
+        relay.end(1)
+        until(lambda: worker._dispatcher.has_ended(1), "the end of the input")
+        worker.drained()
+        until(lambda: relay.ends, "the end of the output")
+    assert [payload for _, payload in relay.outputs] == [b"0", b"1"]
 
 
 def test_what_it_answers_under_a_key_of_its_inputs_is_no_input(relay: Relay, tmp_path: Path) -> None:
