@@ -308,8 +308,7 @@ def _access(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
         return
     if _nameless(before) != _nameless(after):
         yield _restart_all("security", _plain(before), _plain(after))
-        return
-    if before != after:
+    if _names(before) != _names(after):
         yield _set(anew, "security", _plain(before), _plain(after))
     nodes, others = ({node.name: (node.kind, node.local is None) for node in fleet.nodes} for fleet in (old, new))
     for name in dict.fromkeys((*others, *nodes)):
@@ -336,6 +335,11 @@ def _in_turns(verdicts: tuple[_Verdict, ...]) -> Iterator[_Verdict]:
 def _nameless(security: Security) -> Security:
     """The section without the names that it lets in."""
     return replace(security, operators=(), guests=(), revoked=())
+
+
+def _names(security: Security) -> tuple[tuple[str, ...], ...]:
+    """The names that the section lets in, and the keys that it does not."""
+    return security.operators, security.guests, security.revoked
 
 
 def _addresses(fleet: Fleet) -> dict[NodeId, set[str]]:

@@ -44,10 +44,11 @@ def restarts(old: Fleet, new: Fleet, me: NodeId, *, is_agreed: bool = False) -> 
 def opens_anew(old: Fleet, new: Fleet) -> bool:
     """Whether sessions that are open by ``old`` let in others, or elsewhere, than ``new`` says; both are secured.
 
-    Such a daemon begins again by itself (`zsched.runtime.reopening`).
+    Such a daemon begins again by itself (`zsched.runtime.reopening`). What else of the section is another does not keep
+    it from that: it begins by the whole section, once it can (`zsched.runtime.session_watch`).
     """
     before, after = old.security, new.security
-    if before is None or after is None or _nameless(before) != _nameless(after):
+    if before is None or after is None:
         return False
     return any(access_control(old, before, side) != access_control(new, after, side) for side in Side)
 

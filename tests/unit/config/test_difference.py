@@ -310,6 +310,15 @@ def test_nobody_has_to_restart_a_daemon_that_begins_again_by_itself() -> None:
     assert any("the daemon of robot9 must be restarted" in one[3] for one in told(edge, before))
 
 
+def test_nobody_has_to_restart_a_daemon_for_signatures_where_a_key_is_revoked_with_them() -> None:
+    offered = with_("security: {}", "security: {signatures: offered}", SECURED)
+    assert {one[3] for one in told(offered, SECURED)} == {"every daemon must be restarted"}
+    revoked = with_("security: {}", "security: {signatures: offered, revoked: [robot1]}", SECURED)
+    anew = "daemons begin again in turns: a robot's streams stop for that moment"
+    assert {one[3] for one in told(revoked, SECURED)} == {anew}
+    assert opens_anew(fleet_of(SECURED), fleet_of(revoked))
+
+
 def test_what_comes_later_is_not_told_together_with_at_once() -> None:
     """A new candidate counts at once, and is let in only once the daemons have begun anew: the later one is told."""
     secured = f"{TEXT.replace('tcp/', 'tls/')}\nsecurity: {{}}\n"

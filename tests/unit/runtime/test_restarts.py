@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from support.fleets import fleet_of, node_of, task_of
-from zsched.core.values.fleet import Fleet, NodeSpec, Security, SharedMemory
+from zsched.core.values.fleet import Fleet, NodeSpec, Security, SharedMemory, Signatures
 from zsched.core.values.model import NodeKind
 from zsched.runtime.restarts import moved, opens_anew, restarts, waits_for
 
@@ -82,6 +82,19 @@ def test_who_is_let_in_by_other_names_begins_anew_by_itself() -> None:
         assert not opens_anew(secured, other), "who is secured otherwise does not meet the others"
         assert any("`security`" in one for one in restarts(secured, other, "robot1"))
     assert not opens_anew(OLD, with_node(addressed("robot9", NodeKind.ROBOT))), "nobody is kept out"
+
+
+@pytest.mark.parametrize(
+    "other",
+    [Security(folder="pki", signatures=Signatures.OFFERED), Security(folder="other")],
+    ids=["signatures", "folder"],
+)
+def test_a_revoked_key_s_sessions_end_also_where_the_rest_of_the_section_is_another(other: Security) -> None:
+    """Nobody has restarted it for the rest; what is revoked since ends sessions all the same."""
+    secured = replace(OLD, security=Security(folder="pki"))
+    new = replace(secured, security=replace(other, revoked=("robot2",)))
+    assert opens_anew(secured, new)
+    assert [one for one in restarts(secured, new, "robot1") if "`security`" in one], "and it takes over the rest"
 
 
 def test_a_daemon_that_begins_again_by_itself_asks_nobody_to_restart_it() -> None:
