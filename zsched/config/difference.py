@@ -60,6 +60,7 @@ class Danger(StrEnum):
     END_EXCLUSIVE = "end-exclusive"
     CHANGE_ELECTORS = "change-electors"
     PAUSE_TASK = "pause-task"
+    END_SECURITY = "end-security"
 
 
 _MEANS: Final[Mapping[Danger, str]] = {
@@ -69,6 +70,7 @@ _MEANS: Final[Mapping[Danger, str]] = {
     Danger.END_EXCLUSIVE: "{about}: two workers may work at the same time from then on",
     Danger.CHANGE_ELECTORS: "{about}: other nodes agree on everything from then on",
     Danger.PAUSE_TASK: "{about}: its only candidate restarts the worker in place",
+    Danger.END_SECURITY: "{about}: whoever reaches its network reads and changes everything from then on",
 }
 
 
@@ -304,7 +306,9 @@ def _access(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
     anew = _Verdict(effect=Effect.STREAMS, text=OPENED_ANEW)
     if before is None or after is None:
         if before is not after:
-            yield _restart_all("security", _plain(before), _plain(after))
+            verdict = _restart_all("security", _plain(before), _plain(after))
+            is_end = after is None
+            yield replace(verdict, danger=Danger.END_SECURITY, about=old.name) if is_end else verdict
         return
     if _nameless(before) != _nameless(after):
         yield _restart_all("security", _plain(before), _plain(after))

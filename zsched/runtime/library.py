@@ -15,7 +15,7 @@ from pathlib import Path
 
 from zsched.adapters.host.document_store import DocumentStore
 from zsched.config.handing import marks_of
-from zsched.config.load import check_bytes
+from zsched.config.load import check_bytes, check_file
 from zsched.config.reader import render_all
 from zsched.core import events as ev
 from zsched.core import instructions as do
@@ -153,7 +153,8 @@ def read_document(content: Document, fleet: str, node: NodeId, config: Path) -> 
         content: the document.
         fleet: the name that it must have.
         node: this node, which must be in it.
-        config: the file this node was started with: paths in the document are relative to its folder.
+        config: the file this node was started with: paths in the document are relative to its folder. Where it secures
+            the node, a document that does not cannot be used: nobody else may take that away.
 
     Raises:
         ConfigError: it cannot be used here.
@@ -166,8 +167,20 @@ def read_document(content: Document, fleet: str, node: NodeId, config: Path) -> 
     if all(one.name != node for one in result.fleet.nodes):
         advice = f"{TAKEN_OUT}, and goes on by its last one until `zsched leave`"
         raise ConfigError(f"the document names no node {node!r}: {advice}")
+    if result.fleet.security is None and _secures(config, fleet):
+        advice = "put it into the document, or, to end it, first delete it from the fleet file of every machine"
+        raise ConfigError(f"the document has no section `security:`, and {config} has one: {advice}")
     handed = tuple((mark.task, mark.cell) for mark in marks_of(content.text))
     return replace(with_rollouts(result.fleet, content.rollouts), handed=handed)
+
+
+def _secures(config: Path, fleet: str) -> bool:
+    """Whether the machine's own file secures this fleet; it is read anew, for who ends that changes it first.
+
+    One that cannot be used says nothing: no daemon starts by it.
+    """
+    own = check_file(config).fleet
+    return own is not None and own.name == fleet and own.security is not None
 
 
 def with_rollouts(fleet: Fleet, rollouts: tuple[Rollout, ...]) -> Fleet:

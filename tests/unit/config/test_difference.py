@@ -163,6 +163,8 @@ def test_dangers_have_names_and_say_what_is_accepted() -> None:
         (TEXT, robot, {Danger.REMOVE_NODE, Danger.CHANGE_ELECTORS}),
         (robot, TEXT, set()),
         (alone, with_("--mode, estimate", "--mode, known", alone), {Danger.PAUSE_TASK}),
+        (SECURED, SECURED.replace("security: {}\n", ""), {Danger.END_SECURITY}),
+        (SECURED.replace("security: {}\n", ""), SECURED, set()),
     ]
     for old, new, expected in cases:
         found = changes(new, old)

@@ -15,6 +15,7 @@ from zsched.core import instructions as do
 from zsched.core.values.document import Document, Flag, FlagKind, Text
 from zsched.core.values.fleet import fleet_hash
 from zsched.core.values.model import NodeId
+from zsched.errors import ConfigError
 from zsched.runtime.library import RECENT, Library
 from zsched.wire.codec import document_hash, encode
 
@@ -120,6 +121,40 @@ def test_a_document_that_is_not_valid_here_is_refused_and_not_stored(desk: Desk,
     assert (event.request, event.is_of_disk) == (3, False)
     assert why in event.reason
     assert desk.store.load(event.document) is None
+
+
+SECURED = FILE.replace("tcp/", "tls/") + "security: {}\n"
+
+
+def test_where_the_fleet_file_secures_the_node_a_document_must_do_so_too(desk: Desk, tmp_path: Path) -> None:
+    """It would be started by in place of the file, in plain text."""
+    file = tmp_path / "config" / "fleet.yaml"
+    file.parent.mkdir()
+    file.write_text(SECURED)
+    plain = document(text=SECURED.replace("security: {}", ""))
+    with pytest.raises(ConfigError, match="no section `security:`"):
+        desk.library.read(plain)  # by which a daemon starts
+    desk.library.order(do.StoreDocument(request=3, content=plain))
+    event = desk.next()
+    assert isinstance(event, ev.DocumentRefused)
+    assert "first delete it from the fleet file of every machine" in event.reason
+    assert desk.store.load(event.document) is None
+    desk.library.order(do.StoreDocument(request=4, content=document(text=f"{SECURED}# another\n")))
+    assert isinstance(desk.next(), ev.DocumentStored)
+    file.write_text(FILE)  # its operator ends it
+    desk.library.order(do.StoreDocument(request=5, content=document()))
+    assert isinstance(desk.next(), ev.DocumentStored)
+
+
+@pytest.mark.parametrize("text", [FILE, "fleet: [", SECURED.replace("fleet: lab", "fleet: hall")])
+def test_a_fleet_file_that_does_not_secure_this_fleet_keeps_no_document_out(
+    desk: Desk, tmp_path: Path, text: str
+) -> None:
+    file = tmp_path / "config" / "fleet.yaml"
+    file.parent.mkdir()
+    file.write_text(text)
+    desk.library.order(do.StoreDocument(request=3, content=document()))
+    assert isinstance(desk.next(), ev.DocumentStored)
 
 
 def test_a_full_disk_refuses_a_document(desk: Desk, tmp_path: Path) -> None:
