@@ -26,6 +26,7 @@ from zsched.runtime.endpoints import Endpoints, endpoints_for
 from zsched.runtime.recipes import Recipes
 from zsched.runtime.restarts import moved, opens_anew, restarts, waits_for
 from zsched.runtime.sampler import Sampler
+from zsched.runtime.sealing import holders_of
 
 SOURCE = "restart"
 """Of the problem that says what a restart is needed for."""
@@ -82,6 +83,8 @@ class Adoption(Struct, kw_only=True):
         is_exclusive = any(task.exclusive for task in fleet.tasks)
         self.sampler.adopt(fleet.node(self.me), fleet.timing.sample_s, is_watched=is_exclusive)
         self.bus.know(names_of(fleet))
+        if fleet.security is not None:
+            self.bus.take_orders_of(holders_of(fleet, fleet.security))
         if is_exclusive:
             self.bus.hear_all_at_once()
         self._tell_watches(fleet)

@@ -169,6 +169,8 @@ class ControlBus:
         """
         self._seals, self._drops, self._refused_keys = seals, Drops(), Names()
         self._buckets = None if limit is None else {what: Buckets(limit, names) for what in _LIMITED}
+        self._orders_of: frozenset[Holder] | None = None
+        """Whose orders count; ``None``: of all that are let in."""
         self._lives: dict[NodeId, int] = {}
         """{node: its newest incarnation}, by the tokens."""
         self._is_voter, self._hears_all_at_once = is_voter, hears_all_beats_at_once
@@ -325,6 +327,14 @@ class ControlBus:
         for buckets in (self._buckets or {}).values():
             buckets.know(names)
 
+    def take_orders_of(self, holders: Iterable[Holder]) -> None:
+        """Of those that are let in let only these give orders from now on.
+
+        The session itself lets in the same until it is opened anew. Meanwhile a key that is revoked, or a name that is
+        gone, must not undo that by an order.
+        """
+        self._orders_of = frozenset(holders)
+
     def peers(self) -> int:
         """How many zenoh peers the session has a link to."""
         return 0 if self._session is None else len(self._session.info.peers_zid())
@@ -447,8 +457,11 @@ class ControlBus:
         if kind == "command":
             command: Any = wire.decode(payload, *COMMANDS)
             if not isinstance(command, Asking):
-                log.info("command=%s from=%s", type(command).__name__, asker)
                 asking = holder or self._holder_of(asker)
+                if asking is not None and self._orders_of is not None and asking not in self._orders_of:
+                    log.warning("refused command=%s from=%s why=revoked or gone", type(command).__name__, asking.label)
+                    raise WireError(sealing.SealFault.SIGNER, f"{asking.label} may give no orders any more")
+                log.info("command=%s from=%s", type(command).__name__, asker)
                 if asking is not None:
                     command = signed_by(asking, command)
                 if holder is not None:

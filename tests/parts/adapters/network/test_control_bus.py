@@ -6,15 +6,17 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, TypeVar, get_args
 
 import pytest
 import zenoh
 
 from support.allocations import allocation_of
+from support.authorities import install, make_authority
 from support.ballots import ballot_of
 from support.beats import beat_of
-from support.fleets import tuning_of
+from support.fleets import fleet_of, tuning_of
 from support.profiles import profile_of
 from support.proposals import proposal_of
 from support.snapshots import SNAPSHOT
@@ -26,7 +28,7 @@ from zsched.clock import monotonic_s
 from zsched.core import events as ev
 from zsched.core.values.certificates import Holder, Role
 from zsched.core.values.document import Document, Text
-from zsched.core.values.fleet import MOST_ORDER_S, Timing
+from zsched.core.values.fleet import MOST_ORDER_S, Fleet, Security, Timing
 from zsched.core.values.messages import (
     COMMANDS,
     Accept,
@@ -36,6 +38,7 @@ from zsched.core.values.messages import (
     CommandOutcome,
     CommandResult,
     ExplainTask,
+    FleetTold,
     Hold,
     HoldTask,
     Learnt,
@@ -43,6 +46,7 @@ from zsched.core.values.messages import (
     Ordered,
     Prepare,
     Promise,
+    ReadFleet,
     Refusal,
     Refused,
     RestartTask,
@@ -56,6 +60,7 @@ from zsched.core.values.model import Acceptance, Asked
 from zsched.core.values.rehearsal import KeepRehearsal, Step, Strike
 from zsched.core.values.words import MAX_ASKER
 from zsched.errors import AdapterError
+from zsched.runtime.sealing import holders_of, seals_of
 from zsched.sessions.config import control_config
 from zsched.wire import codec as wire
 
@@ -433,6 +438,73 @@ def test_a_command_is_answered_however_many_questions_come_meanwhile(
     b.bus.answer(command.request, RESULT)
     asking.join(60)
     assert answers == [RESULT]
+
+
+@pytest.fixture
+def sealed(tmp_path: Path) -> Iterator[tuple[Peer, Peer, Fleet]]:
+    """Two buses of a fleet whose nodes sign, and the fleet."""
+    authority = make_authority(tmp_path / "authority", "f")
+    hub = free_endpoint()
+    peers: list[Peer] = []
+    fleets: list[Fleet] = []
+    for name in ("robot1", "robot2"):
+        install(authority, tmp_path / name, name)
+        fleets.append(
+            fleet_of(name="f", of=("robot1", "robot2"), tasks=(), security=Security(folder=str(tmp_path / name)))
+        )
+        listen, dialled = (free_endpoint(), hub) if peers else (hub, None)
+        peers.append(Peer(name, listen, dialled, seals=seals_of(fleets[-1], 1)))
+    one, other = peers
+    try:
+        for peer in peers:
+            peer.bus.open()
+        until(lambda: one.sees("robot2") and other.sees("robot1"), "both tokens")
+        yield one, other, fleets[0]
+    finally:
+        for peer in peers:
+            peer.bus.close()
+
+
+def test_who_is_gone_may_still_ask_whether_the_others_know(sealed: tuple[Peer, Peer, Fleet]) -> None:
+    """So does `zsched leave`, after the change that takes its node out."""
+    one, other, _ = sealed
+    one.bus.take_orders_of(())
+    answers: list[object] = []
+    asking = threading.Thread(target=lambda: answers.append(other.bus.ask_node("robot1", ReadFleet(), 60.0)))
+    asking.start()
+    told = FleetTold(node="robot1", value=None, fleet_file="")
+    one.bus.answer(one.next(ev.FleetReadAsked).request, told)
+    asking.join(60)
+    assert answers == [told]
+
+
+def test_a_revoked_key_does_not_take_its_revocation_back_before_sessions_are_opened_anew(
+    sealed: tuple[Peer, Peer, Fleet],
+) -> None:
+    one, other, fleet = sealed
+    assert fleet.security is not None
+    back = ChangeFleet(document=Document(text=Text("fleet: f\n")))
+
+    def order() -> object:
+        answers: list[object] = []
+        asking = threading.Thread(target=lambda: answers.append(other.bus.ask_node("robot1", back, 60.0)))
+        asking.start()
+        until(lambda: answers or one.of(ev.FleetCommanded), "the order, or that it is refused")
+        for event in one.of(ev.FleetCommanded):
+            one.bus.answer(event.request, RESULT)
+        asking.join(60)
+        return answers[0]
+
+    assert order() == RESULT
+    one.events.clear()
+    security = replace(fleet.security, revoked=("robot2",))
+    one.bus.take_orders_of(holders_of(fleet, security))
+    assert order() == CommandResult(outcome=CommandOutcome.INVALID, detail="robot1 refused it: signer")
+    assert one.of(ev.FrameDropped) == [ev.FrameDropped(kind="command", reason="signer")]
+    assert not one.of(ev.FleetCommanded)
+    assert not one.of(ev.Commanded)
+    one.bus.take_orders_of(holders_of(fleet, fleet.security))
+    assert order() == RESULT, "somebody else has taken it back"
 
 
 @pytest.mark.parametrize(("node", "is_there"), [("ghost", False), ("b", True)])
