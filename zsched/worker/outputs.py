@@ -101,6 +101,8 @@ class Output:
                 return False
             stamped = self._epochs.get(epoch) or self._declare(epoch)
             stamp = timestamp or self._stamp_now()
+            if stamped.lane is not None:  # here: it is kept, and may wait, while its caller goes on
+                payload, attachment = _own(payload), _own(attachment)
             self.sent += 1
             if self._queue is None:
                 self._put(stamped, payload, attachment, encoding, stamp)
@@ -160,7 +162,6 @@ class Output:
         if stamped.lane is None:
             stamped.unkept += 1
         else:
-            payload, attachment = _own(payload), _own(attachment)
             size = len(payload) if hasattr(payload, "__len__") else 0
             number = stamped.lane.keep((payload, attachment, encoding), timestamp, size)
             if not self.is_latest:

@@ -253,6 +253,21 @@ def test_by_hand_it_is_the_owner() -> None:
         assert worker.publisher("{prefix}/{epoch}/out", latest=True).put(b"x") is True
 
 
+def test_what_a_caller_writes_behind_a_put_is_not_what_is_published(relay: Relay, tmp_path: Path) -> None:
+    with Worker.from_env(environment(relay, tmp_path), handles_signals=False) as worker:
+        out = worker.publisher("{prefix}/{epoch}/robot1/out", latest=True)
+        relay.tell(WorkerRole.ACTIVE, 1)
+        until(lambda: worker.role.role is WorkerRole.ACTIVE, "the role")
+        assert out._queue is not None
+        gate = threading.Event()
+        out._queue.then(partial(_wait, gate))
+        payload = bytearray(b"one")
+        assert out.put(payload)
+        payload[:] = b"two"
+        gate.set()
+        until(lambda: relay.outputs == [("edge1/t/1/robot1/out", b"one")], "what was put")
+
+
 @pytest.mark.parametrize("is_relay_stopped", [False, True], ids=["relay alive", "relay stopped"])
 def test_a_signalled_worker_is_gone_within_a_second(tmp_path: Path, is_relay_stopped: bool) -> None:
     script = (
