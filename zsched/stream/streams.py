@@ -47,6 +47,7 @@ from zsched.sessions.closing import APPLICATION_CLOSE_S
 from zsched.sessions.config import lease_s
 from zsched.sessions.link_sockets import opened
 from zsched.sessions.problems import why_not_open
+from zsched.sessions.puts import Payload, put_arguments
 from zsched.stream.link import Link, RefusedError, place_of
 from zsched.stream.samples import PLAIN, Given, Received
 from zsched.stream.task import OwnTask
@@ -74,7 +75,6 @@ JOIN_S: Final = 0.3
 
 _log = logging.getLogger("zsched.streams")
 
-Payload = bytes | bytearray | str | zenoh.ZBytes
 _Found = tuple[OwnTask, str, InputStream]
 """A task, the name of one of its inputs, and that input as it was then."""
 
@@ -100,16 +100,18 @@ class Publisher:
         payload: Payload,
         *,
         attachment: Payload | None = None,
-        encoding: zenoh.Encoding = PLAIN,
+        encoding: zenoh.Encoding | str = PLAIN,
         timestamp: zenoh.Timestamp | None = None,
     ) -> bool:
         """Put one sample on its way to the owner; ``False``: it went nowhere (streams closed, or the rule is gone).
 
         Class ``reliable`` waits while the queue towards the owner is full, and once for a link that has become full.
+
+        Raises:
+            TypeError: an argument is of another type.
         """
-        given = Given(
-            self.key, _bytes(payload), encoding, None if attachment is None else _bytes(attachment), timestamp
-        )
+        sent, attached, encoded, stamp = put_arguments(payload, attachment, encoding, timestamp)
+        given = Given(self.key, sent, encoded or PLAIN, attached, stamp)
         was_inside, self._here.is_inside = self._here.is_inside, True
         try:
             return self._give(given) or self._give(given)  # what has closed since we looked may have another place
@@ -480,7 +482,3 @@ class Streams:
     def _wake(self) -> None:
         for task in tuple(self._tasks.values()):
             task.wake()
-
-
-def _bytes(payload: Payload) -> zenoh.ZBytes:
-    return payload if isinstance(payload, zenoh.ZBytes) else zenoh.ZBytes(payload)

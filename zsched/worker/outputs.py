@@ -16,6 +16,7 @@ from zenoh import CongestionControl, ext
 from zsched.core.hop.serial import serial_of
 from zsched.core.relay_protocol import EndMarker
 from zsched.core.values.struct import Struct
+from zsched.sessions.puts import Payload, PutArguments, put_arguments
 from zsched.sessions.send_queue import SendQueue
 from zsched.worker.keep import Keeper, KeptLane, put_end
 
@@ -88,27 +89,37 @@ class Output:
         self.shed = 0
         """Samples that gave way to newer ones behind a stalled receiver (class ``latest``)."""
 
-    def put(self, payload: Any, *, attachment: Any = None, encoding: Any = None, timestamp: Any = None) -> bool:
-        """Publish (``bytes`` or ``zenoh.ZBytes``); ``False``, and counted, while this worker is not the owner.
+    def put(
+        self,
+        payload: Payload,
+        *,
+        attachment: Payload | None = None,
+        encoding: zenoh.Encoding | str | None = None,
+        timestamp: zenoh.Timestamp | None = None,
+    ) -> bool:
+        """Publish; ``False``, and counted, while this worker is not the owner.
 
         Without ``timestamp`` the value inherits that of the input it was made of, if that had one: gates tell by it
         that a new owner's first values are older than the old owner's last.
+
+        Raises:
+            TypeError: an argument is of another type, also while this worker is not the owner.
         """
+        sent, attached, encoded, stamp = put_arguments(payload, attachment, encoding, timestamp)
         with self._lock:
             epoch = self._epoch_now()
             if epoch is None:
                 self.withheld += 1
                 return False
             stamped = self._epochs.get(epoch) or self._declare(epoch)
-            stamp = timestamp or self._stamp_now()
-            if stamped.lane is not None:  # here: it is kept, and may wait, while its caller goes on
-                payload, attachment = _own(payload), _own(attachment)
+            if stamped.lane is not None:
+                sent, attached = _own(sent), None if attached is None else _own(attached)
+            given = (sent, attached, encoded, stamp or self._stamp_now())
             self.sent += 1
             if self._queue is None:
-                self._put(stamped, payload, attachment, encoding, stamp)
+                self._put(stamped, given)
                 return True
-            action = lambda: self._put(stamped, payload, attachment, encoding, stamp)  # noqa: E731 - named for its type
-            self.shed += self._queue.send(stamped.key, action, len(payload) if hasattr(payload, "__len__") else 0)
+            self.shed += self._queue.send(stamped.key, lambda: self._put(stamped, given), len(sent))
             return True
 
     def send_end(self, epoch: int) -> None:
@@ -157,29 +168,25 @@ class Output:
                 gone.lane.is_closed = True
         return stamped
 
-    def _put(self, stamped: _Stamped, payload: Any, attachment: Any, encoding: Any, timestamp: Any) -> None:
+    def _put(self, stamped: _Stamped, given: PutArguments) -> None:
+        payload, attachment, encoding, timestamp = given
         publisher, number = stamped.publisher, stamped.unkept
         if stamped.lane is None:
             stamped.unkept += 1
         else:
-            size = len(payload) if hasattr(payload, "__len__") else 0
-            number = stamped.lane.keep((payload, attachment, encoding), timestamp, size)
+            number = stamped.lane.keep((payload, attachment, encoding), timestamp, len(payload))
             if not self.is_latest:
                 self._owe(stamped.lane, number)
-        more = {"attachment": attachment, "encoding": encoding, "timestamp": timestamp}
+        more: dict[str, Any] = {"attachment": attachment, "encoding": encoding, "timestamp": timestamp}
         if isinstance(publisher, zenoh.Publisher):
             more["source_info"] = zenoh.SourceInfo(publisher.id, serial_of(number))
         with self._stalled:
             publisher.put(payload, **more)
 
 
-def _own(value: Any) -> Any:
-    """As bytes of our own: what its caller may change afterwards (a ``bytearray``), and a small part of what came in.
+def _own(value: zenoh.ZBytes) -> zenoh.ZBytes:
+    """As bytes of our own, where it is a small part of what came in.
 
-    The latter lies in zenoh's receive buffer, which it would hold as a whole for as long as it is kept.
+    That lies in zenoh's receive buffer, which it would hold as a whole for as long as it is kept.
     """
-    if isinstance(value, bytearray):
-        return zenoh.ZBytes(value)
-    if isinstance(value, zenoh.ZBytes) and len(value) < RECEIVE_BUFFER:
-        return zenoh.ZBytes(value.to_bytes())
-    return value
+    return zenoh.ZBytes(value.to_bytes()) if len(value) < RECEIVE_BUFFER else value

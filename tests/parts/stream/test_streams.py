@@ -12,7 +12,7 @@ from asyncio import CancelledError
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 from unittest.mock import Mock
 
 import pytest
@@ -154,6 +154,25 @@ def test_what_is_put_is_processed_answered_and_counted_and_the_streams_outlive_t
     assert unaccounted(bench.count()) == 0
     assert bench.count().at_most_lost == 0
     assert bench.taken == [str(number).encode() for number in range(201)]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"payload": None}, {"payload": {}}, {"attachment": 1}, {"encoding": 1}, {"timestamp": 1.0}],
+    ids=["None", "dict", "attachment", "encoding", "timestamp"],
+)
+def test_an_argument_that_zenoh_does_not_take_is_refused_and_takes_no_number(
+    bench: Bench, wrong: dict[str, Any]
+) -> None:
+    with bench.join() as own:
+        publisher = own.publisher("robot1/front/in")
+        arguments: dict[str, Any] = {"payload": b"x", **wrong}
+        with pytest.raises(TypeError, match=f"{next(iter(wrong))}: "):
+            publisher.put(**arguments)
+        assert publisher.put(b"good", encoding="text/plain")
+        until(lambda: bench.count().acknowledged == 1, "the good one")
+    assert bench.taken == [b"good"]
+    assert (bench.count().messages, unaccounted(bench.count())) == (1, 0)
 
 
 def test_closing_ends_every_thread_for_an_interpreter_that_ends_beside_one_may_abort(bench: Bench) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -266,6 +267,41 @@ def test_what_a_caller_writes_behind_a_put_is_not_what_is_published(relay: Relay
         payload[:] = b"two"
         gate.set()
         until(lambda: relay.outputs == [("edge1/t/1/robot1/out", b"one")], "what was put")
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"payload": {}},
+        {"payload": None},
+        {"payload": memoryview(b"x")},
+        {"attachment": 1},
+        {"encoding": 1},
+        {"timestamp": 0.0},
+    ],
+    ids=["dict", "None", "memoryview", "attachment", "encoding", "timestamp"],
+)
+@pytest.mark.parametrize("options", [{"latest": True}, {"reliable": True}, {}], ids=["latest", "reliable", "plain"])
+def test_an_argument_that_zenoh_does_not_take_is_refused_and_takes_no_number(
+    relay: Relay, tmp_path: Path, options: dict[str, bool], wrong: dict[str, Any]
+) -> None:
+    arguments: dict[str, Any] = {"payload": b"x", **wrong}
+    with Worker.from_env(environment(relay, tmp_path), handles_signals=False) as worker:
+        out = worker.publisher("{prefix}/{epoch}/robot1/out", **options)
+        relay.tell(WorkerRole.ACTIVE, 1)
+        until(lambda: worker.role.role is WorkerRole.ACTIVE, "the role")
+        assert out.put(bytearray(b"good"), attachment="attached", encoding="text/plain")
+        until(lambda: relay.outputs == [("edge1/t/1/robot1/out", b"good")], "a good one")
+        with contextlib.suppress(TypeError):
+            assert not out.put(**arguments)
+        assert (out.sent, out._epochs[1].count) == (1, 1)
+        assert out.put("the next")
+        until(lambda: relay.outputs[1:] == [("edge1/t/1/robot1/out", b"the next")], "the next one")
+        assert out._epochs[1].count == 2
+        relay.tell(WorkerRole.IDLE)
+        until(lambda: worker.role.role is WorkerRole.IDLE, "a standby")
+        with pytest.raises(TypeError, match=f"{next(iter(wrong))}: "):
+            out.put(**arguments)
 
 
 @pytest.mark.parametrize("is_relay_stopped", [False, True], ids=["relay alive", "relay stopped"])
