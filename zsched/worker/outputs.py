@@ -97,7 +97,7 @@ class Output:
         encoding: zenoh.Encoding | str | None = None,
         timestamp: zenoh.Timestamp | None = None,
     ) -> bool:
-        """Publish; ``False``, and counted, while this worker is not the owner.
+        """Publish; ``False``, and counted, while this worker is not the owner, and once it is closed.
 
         Without ``timestamp`` the value inherits that of the input it was made of, if that had one: gates tell by it
         that a new owner's first values are older than the old owner's last.

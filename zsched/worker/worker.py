@@ -116,6 +116,8 @@ class Worker:
         self._untaken = ""
         """The report about the first output that no rule of the task takes."""
         self._is_ready = False
+        self._is_closed = False
+        """Nothing is put any more: what an output still took would go down with the session."""
         self._declared: list[Any] = []
         self._inputs: list[str] = []
         self._services: list[str] = []
@@ -377,6 +379,7 @@ class Worker:
         self._debts.settle(monotonic_s())
         self._acks.flush()  # before the session closes: what is done must not be called lost
         self._acks.close()
+        self._is_closed = True
         self._keeper.close()
         for output in tuple(self._outputs):
             output.close()
@@ -501,7 +504,7 @@ class Worker:
     def _epoch_now(self) -> int | None:
         """The epoch that outputs are stamped with, ``None`` while they go nowhere."""
         role = self._role
-        if role.role is WorkerRole.IDLE or self._restorer.is_pending:
+        if self._is_closed or role.role is WorkerRole.IDLE or self._restorer.is_pending:
             self._dispatcher.note_withheld()
             return None
         if self._dispatcher.must_wait(role.epoch) and not self._is_standalone:  # what was withheld before comes first

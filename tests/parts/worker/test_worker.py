@@ -269,6 +269,17 @@ def test_what_a_caller_writes_behind_a_put_is_not_what_is_published(relay: Relay
         until(lambda: relay.outputs == [("edge1/t/1/robot1/out", b"one")], "what was put")
 
 
+def test_behind_its_close_a_worker_takes_nothing_that_would_be_lost() -> None:
+    with Worker.from_env({}, standalone="t", handles_signals=False) as worker:
+        latest = worker.publisher("{prefix}/{epoch}/map", latest=True)
+        plain = worker.publisher("{prefix}/{epoch}/scan")
+        assert latest.put(b"x")
+        assert plain.put(b"x")
+    assert not latest.put(b"late")
+    assert not plain.put(b"late")
+    assert (latest.sent, latest.withheld) == (1, 1)
+
+
 @pytest.mark.parametrize(
     "wrong",
     [
