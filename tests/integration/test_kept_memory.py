@@ -13,7 +13,7 @@ from support.waiting import until
 from zsched.hop.acknowledger import Acknowledger
 from zsched.sessions.stalled_links import StalledLinks
 from zsched.worker.keep import Debts, Keeper
-from zsched.worker.outputs import OUTPUT_DEPTH, Output
+from zsched.worker.outputs import Output, OutputOptions
 
 ANSWERS = 1000
 SIZE = 100
@@ -36,10 +36,7 @@ def test_an_answer_that_is_an_input_does_not_hold_the_buffer_in_which_it_came() 
         output = Output(
             worker,
             "edge1/t/{epoch}/out",
-            latest=False,
-            reliable=True,
-            keep_last=1,
-            depth=OUTPUT_DEPTH,
+            OutputOptions(reliable=True),
             keeper=keeper,
             epoch_now=lambda: 1,
             stamp_now=lambda: None,

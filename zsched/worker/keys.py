@@ -33,6 +33,14 @@ def filled(template: str, prefix: str, known: tuple[str, ...] = IN_INPUTS) -> st
     return key
 
 
+def output_key(template: str, prefix: str) -> str:
+    """The key of an output, still with its epoch's placeholder. Raises `ValueError` when it is none."""
+    key = filled(template, prefix, IN_OUTPUTS)
+    if wrong := keyexpr.fault(_of_an_epoch(key)):
+        raise ValueError(f"{template!r} is no key: {wrong}")
+    return key
+
+
 def output_keys(text: str) -> tuple[str, ...]:
     """The list that the daemon tells; empty: it has told none. Raises `ConfigError` when it is no list of keys."""
     try:
@@ -46,8 +54,12 @@ def output_keys(text: str) -> tuple[str, ...]:
 
 def untaken(key: str, rules: tuple[str, ...]) -> str:
     """What to tell of an output under ``key`` (still with its epoch's placeholder); empty: a rule takes it."""
-    concrete = key.replace("{epoch}", "1")
-    if not rules or keyexpr.fault(concrete) or any(keyexpr.intersects(concrete, rule) for rule in rules):
+    concrete = _of_an_epoch(key)
+    if not rules or any(keyexpr.intersects(concrete, rule) for rule in rules):
         return ""
     text = f"puts on {key}, which no output rule takes: the rules take {', '.join(rules)}"
     return text[: MAX_REASON - _MORE]
+
+
+def _of_an_epoch(key: str) -> str:
+    return key.replace("{epoch}", "1")

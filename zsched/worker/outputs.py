@@ -30,6 +30,23 @@ KEPT_EPOCHS: Final = 2
 """Publishers of older epochs are given back: nobody admits them any more."""
 
 
+class OutputOptions(Struct, frozen=True, kw_only=True):
+    """What `Worker.publisher` is asked for."""
+
+    latest: bool = False
+    """Whether the last value is kept for late subscribers."""
+    reliable: bool = False
+    keep_last: int = 1
+    depth: int = OUTPUT_DEPTH
+
+    def __post_init__(self) -> None:
+        if self.latest and self.reliable:
+            raise ValueError("an output is either latest or reliable")
+        for name, value in (("keep_last", self.keep_last), ("depth", self.depth)):
+            if value < 1:
+                raise ValueError(f"{name}: {value!r} is not 1 or more")
+
+
 class _Stamped(Struct, eq=False):
     """The publisher of one epoch."""
 
@@ -53,11 +70,8 @@ class Output:
         self,
         session: zenoh.Session,
         template: str,
+        options: OutputOptions,
         *,
-        latest: bool,
-        reliable: bool,
-        keep_last: int,
-        depth: int,
         keeper: Keeper,
         epoch_now: Callable[[], int | None],
         stamp_now: Callable[[], zenoh.Timestamp | None],
@@ -66,22 +80,20 @@ class Output:
         """``owe`` hears of an answer of class ``reliable`` before it is put: (its lane, its number)."""
         self._session = session
         self._template = template
-        self.is_latest = latest
-        """Whether the last value is kept for late subscribers."""
-        self._keep_last = max(1, keep_last)
-        self._keeper = keeper if latest or reliable else None
+        self.options = options
+        is_kept = options.latest or options.reliable
+        self._keeper = keeper if is_kept else None
         self._stalled = keeper.stalled
-        self._kept = self._keep_last if latest else depth
-        self._congestion = CongestionControl.BLOCK if latest or reliable else CongestionControl.DROP
+        self._congestion = CongestionControl.BLOCK if is_kept else CongestionControl.DROP
         self._epoch_now = epoch_now
         self._stamp_now = stamp_now
         self._owe = owe
         self._lock = threading.Lock()
         self._epochs: dict[int, _Stamped] = {}
         self._queue: SendQueue | None = None
-        if latest:
-            depth = max(LATEST_DEPTH, self._keep_last)
-            self._queue = SendQueue(f"out {template}", depth=depth, sheds=True, keep_last=self._keep_last)
+        if options.latest:
+            depth = max(LATEST_DEPTH, options.keep_last)
+            self._queue = SendQueue(f"out {template}", depth=depth, sheds=True, keep_last=options.keep_last)
         self.sent = 0
         """Samples that went out, or wait for their receiver."""
         self.withheld = 0
@@ -146,12 +158,12 @@ class Output:
     def _declare(self, epoch: int) -> _Stamped:
         key = self._template.replace("{epoch}", str(epoch))
         publisher: zenoh.Publisher | ext.AdvancedPublisher
-        if self.is_latest:
+        if self.options.latest:
             publisher = ext.declare_advanced_publisher(
                 self._session,
                 key,
                 congestion_control=self._congestion,
-                cache=ext.CacheConfig(self._keep_last),
+                cache=ext.CacheConfig(self.options.keep_last),
                 sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),
                 publisher_detection=True,
             )
@@ -159,7 +171,8 @@ class Output:
             publisher = self._session.declare_publisher(key, congestion_control=self._congestion)
         lane = None
         if self._keeper is not None:
-            lane = self._keeper.lane(key, publisher.id, self._kept, is_whole=not self.is_latest)
+            limit = self.options.keep_last if self.options.latest else self.options.depth
+            lane = self._keeper.lane(key, publisher.id, limit, is_whole=self.options.reliable)
         stamped = self._epochs[epoch] = _Stamped(key=key, publisher=publisher, lane=lane)
         for old in sorted(self._epochs)[:-KEPT_EPOCHS]:
             gone = self._epochs.pop(old)
@@ -175,7 +188,7 @@ class Output:
             stamped.unkept += 1
         else:
             number = stamped.lane.keep((payload, attachment, encoding), timestamp, len(payload))
-            if not self.is_latest:
+            if self.options.reliable:
                 self._owe(stamped.lane, number)
         more: dict[str, Any] = {"attachment": attachment, "encoding": encoding, "timestamp": timestamp}
         if isinstance(publisher, zenoh.Publisher):

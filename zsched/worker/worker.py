@@ -54,9 +54,9 @@ from zsched.worker.errands import Errands
 from zsched.worker.inputs import Dispatcher
 from zsched.worker.jobs import Job, JobBook
 from zsched.worker.keep import Debts, Keeper
-from zsched.worker.keys import IN_OUTPUTS, filled, untaken
+from zsched.worker.keys import filled, output_key, untaken
 from zsched.worker.lives import RelayLives
-from zsched.worker.outputs import OUTPUT_DEPTH, Output
+from zsched.worker.outputs import OUTPUT_DEPTH, Output, OutputOptions
 from zsched.worker.roles import RoleWatch
 from zsched.worker.samples import BY_CLASS, Input, KeepLast, Marker, Received
 from zsched.worker.services import Handler, Service
@@ -111,7 +111,8 @@ class Worker:
         """Holds something once it was told to stop. A signal's handler may put into it, whatever it has interrupted."""
         self._signals = 0
         """How often it was told to stop."""
-        self._outputs: list[Output] = []
+        self._outputs: dict[str, Output] = {}
+        """{key, the epoch still a placeholder: its output}; guarded by `_lock`."""
         self._output_keys = output_keys
         self._untaken = ""
         """The report about the first output that no rule of the task takes."""
@@ -236,29 +237,32 @@ class Worker:
         have acknowledged them: what a broken link lost is sent again. An output that no rule of the task takes is
         logged, and shown in `zsched status` while this worker is the owner.
 
+        The same key with the same options gives the same output again.
+
         Raises:
-            ValueError: the key has another placeholder.
+            ValueError: the key is none, or has another placeholder; it was declared with other options; ``latest`` and
+                ``reliable`` are both set; ``keep_last`` or ``depth`` is below 1.
         """
-        key = filled(template, self.prefix, IN_OUTPUTS)
-        if text := untaken(key, self._output_keys):
+        key = output_key(template, self.prefix)
+        options = OutputOptions(latest=latest, reliable=reliable, keep_last=keep_last, depth=depth)
+        with self._lock:
+            known = self._outputs.get(key)
+            if known is not None and known.options != options:
+                raise ValueError(f"{template!r} is declared already, with {known.options}")
+            output = self._outputs[key] = known or Output(
+                self._session,
+                key,
+                options,
+                keeper=self._keeper,
+                epoch_now=self._epoch_now,
+                stamp_now=self._dispatcher.stamp,
+                owe=self._dispatcher.owe,
+            )
+        if known is None and (text := untaken(key, self._output_keys)):
             _log.warning("the worker %s", text)
             self._untaken = self._untaken or text
             if self._role.role is WorkerRole.ACTIVE:  # as in a callback: its role was told before, and does not change
                 self._errands.put(lambda: self._tell_trouble(0, self._untaken))
-        output = Output(
-            self._session,
-            key,
-            latest=latest,
-            reliable=reliable,
-            keep_last=keep_last,
-            depth=depth,
-            keeper=self._keeper,
-            epoch_now=self._epoch_now,
-            stamp_now=self._dispatcher.stamp,
-            owe=self._dispatcher.owe,
-        )
-        with self._lock:
-            self._outputs.append(output)
         return output
 
     def serve(self, key_expr: str, handler: Handler, depth: int = 16) -> None:
@@ -381,7 +385,7 @@ class Worker:
         self._acks.close()
         self._is_closed = True
         self._keeper.close()
-        for output in tuple(self._outputs):
+        for output in tuple(self._outputs.values()):
             output.close()
         self._errands.close()
         is_closed = ends_within(CLOSE_S, self._close_session, name="zsched close")
@@ -575,10 +579,6 @@ class Worker:
         with self._lock:
             if not self._epochs.close(epoch):
                 return
-            outputs = tuple(self._outputs)
-        self._errands.put(lambda: _end_all(outputs, epoch))
-
-
-def _end_all(outputs: tuple[Output, ...], epoch: int) -> None:
-    for output in outputs:
-        output.send_end(epoch)
+            outputs = tuple(self._outputs.values())
+        for output in outputs:  # an errand each: one that fails takes no end from those behind it
+            self._errands.put(partial(output.send_end, epoch))

@@ -281,6 +281,49 @@ def test_behind_its_close_a_worker_takes_nothing_that_would_be_lost() -> None:
 
 
 @pytest.mark.parametrize(
+    ("key", "options"),
+    [
+        ("{prefix}/{epoch}//scan", {}),
+        ("{prefix}/{epoch}/scan#", {}),
+        ("{prefix}/{epoch}/scan", {"latest": True, "reliable": True}),
+        ("{prefix}/{epoch}/scan", {"latest": True, "keep_last": 0}),
+        ("{prefix}/{epoch}/scan", {"reliable": True, "depth": 0}),
+        ("{prefix}/{epoch}/map", {"latest": True, "keep_last": 2}),
+    ],
+    ids=str,
+)
+def test_an_output_that_could_not_be_as_asked_is_refused_when_it_is_declared(key: str, options: dict[str, Any]) -> None:
+    with Worker.from_env({}, standalone="t", handles_signals=False) as worker:
+        worker.publisher("{prefix}/{epoch}/map", latest=True)
+        with pytest.raises(ValueError, match=r"scan|is n|either|declared already"):
+            worker.publisher(key, **options)
+
+
+def test_an_output_that_is_declared_in_every_callback_is_one() -> None:
+    with Worker.from_env({}, standalone="t", handles_signals=False) as worker:
+        output = worker.publisher("{prefix}/{epoch}/map", latest=True)
+        assert worker.publisher("local/t/{epoch}/map", latest=True) is output
+        assert worker.publisher("{prefix}/{epoch}/scan", latest=True) is not output
+
+
+def test_an_output_that_cannot_end_takes_no_end_from_the_next_one(
+    relay: Relay, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(_epoch: int) -> None:
+        raise zenoh.ZError("no more publishers")
+
+    with Worker.from_env(environment(relay, tmp_path), handles_signals=False) as worker:
+        monkeypatch.setattr(worker.publisher("{prefix}/{epoch}/robot1/out"), "_declare", refuse)
+        worker.publisher("{prefix}/{epoch}/robot2/out")
+        worker.ready()
+        relay.tell(WorkerRole.ACTIVE, 1)
+        until(lambda: f"{ROLE_KEY}/1" in relay.tokens, "the epoch has begun")
+        relay.tell(WorkerRole.IDLE)
+        end = (f"edge1/t/1/robot2/out/{END_CHUNK}", EndMarker(epoch=1, count=0))
+        until(lambda: relay.ends == [end], "the end of the other one")
+
+
+@pytest.mark.parametrize(
     "wrong",
     [
         {"payload": {}},
