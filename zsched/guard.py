@@ -14,7 +14,7 @@ import contextlib
 import logging
 import threading
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import AsyncGenerator, Callable, Coroutine, Generator
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -101,6 +101,20 @@ def tolerant(callback: Callable[[T], object], kind: str) -> Callable[[T], None]:
             note(kind, error)
 
     return call
+
+
+def call_plain(callback: Callable[[T], object], value: T) -> None:
+    """Call what an author has given, in a thread without an event loop.
+
+    Raises:
+        TypeError: it is an ``async def`` or a generator function, of which nothing runs by being called.
+    """
+    returned = callback(value)
+    if returned is None or not isinstance(returned, Coroutine | Generator | AsyncGenerator):
+        return
+    if isinstance(returned, Coroutine):
+        returned.close()  # else Python warns that nobody has awaited it
+    raise TypeError("a callback must be a plain function: of an async def or a generator function nothing runs here")
 
 
 def _named(name: str, begin: Callable[[], None]) -> None:

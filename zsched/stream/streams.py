@@ -37,7 +37,7 @@ from zsched.core.route.keyexpr import fault, includes, is_wild
 from zsched.core.values.model import MAX_REASON, TaskId
 from zsched.core.values.plan import RoutePhase, RoutePlan
 from zsched.errors import AdapterError
-from zsched.guard import all_end_within, ends_within, guarded, running
+from zsched.guard import all_end_within, call_plain, ends_within, guarded, running
 from zsched.ipc.protocol import DaemonGone, StreamKeys, StreamsTaken
 from zsched.log_limit import limit_library
 from zsched.relay.streams.acks import Acks
@@ -362,7 +362,7 @@ class Streams:
         for key_expr, on_sample in self._callbacks:
             if includes(key_expr, received.key):
                 try:
-                    on_sample(received)
+                    call_plain(on_sample, received)
                 except BaseException as error:  # noqa: BLE001 - no answer and no other callback misses theirs
                     self._note_raised(key_expr, error)
 

@@ -25,7 +25,7 @@ import zenoh
 from zsched.clock import monotonic_s
 from zsched.core.hop.receiver import GIVE_UP_S, MAX_SOURCES, SourceName
 from zsched.core.hop.serial import number_near, serial_of
-from zsched.guard import guarded
+from zsched.guard import call_plain, guarded
 from zsched.hop.acknowledger import Acknowledger
 from zsched.worker.backlog import Done, StandbyInputs
 from zsched.worker.jobs import JobBook
@@ -449,7 +449,7 @@ class Dispatcher:
         self._stamp = sample.timestamp
         self._timer.begin()
         try:
-            source.on_sample(received)
+            call_plain(source.on_sample, received)
         except BaseException as error:  # noqa: BLE001 - the worker's own bug must not end its dispatch
             self._troubles.note(key, error)
         self._timer.end(came_s)

@@ -26,7 +26,7 @@ from zsched.core.relay_protocol import ERROR_ENCODING, SnapshotChunk
 from zsched.core.values.model import NodeId
 from zsched.core.values.plan import Role, WorkerRole
 from zsched.core.values.struct import Struct
-from zsched.guard import guarded, tolerant
+from zsched.guard import call_plain, guarded, tolerant
 from zsched.ipc.pipe import decode_chunk, encode_chunk
 
 CHUNK: Final = 256 * 1024
@@ -339,7 +339,7 @@ class Restorer:
         content, callback = result.content, self._callback
         if isinstance(content, bytes) and callback is not None:
             try:
-                callback(content)
+                call_plain(callback, content)
             except BaseException:  # noqa: BLE001 - the worker goes on cold
                 _log.exception("the worker's on_snapshot failed")
                 content = "its own on_snapshot failed"

@@ -703,6 +703,16 @@ def test_what_a_callback_raises_takes_no_answer_from_another_one(
     assert caplog.text.count("Traceback") == 1, "the same error again says nothing new"
 
 
+def test_a_callback_of_which_nothing_would_run_is_told(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
+    async def later(_answer: Received) -> None:
+        raise AssertionError("it is never run")
+
+    with bench.join() as own:
+        own.subscribe("robot1/out", later)  # type: ignore[arg-type] # an author's mistake
+        own.publisher("robot1/front/in").put("0")
+    assert "the callback of robot1/out raised TypeError: a callback must be a plain function" in caplog.text
+
+
 def test_answers_that_closing_does_not_wait_for_are_counted_and_told(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

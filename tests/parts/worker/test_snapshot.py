@@ -368,7 +368,11 @@ def test_who_asks_again_while_the_state_is_on_its_way_waits_too() -> None:
     assert restorer.begin(active(3), then.set) is False
 
 
-@pytest.mark.parametrize("fail", [lambda: 1 / 0, lambda: sys.exit(3)])
+async def _restore_later() -> None:
+    raise AssertionError("it is never run")
+
+
+@pytest.mark.parametrize("fail", [lambda: 1 / 0, lambda: sys.exit(3), _restore_later])
 def test_a_callback_that_fails_is_a_cold_start(fail: Callable[[], object]) -> None:
     inputs = Inputs()
     restorer = Restorer(lambda _node, _timeout_s: b"state", "edge2", inputs)

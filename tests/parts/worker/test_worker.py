@@ -1005,3 +1005,24 @@ def test_an_output_that_no_rule_takes_is_told_at_once_where_an_owner_declares_it
         until(lambda: told, "the mistake")
     text = "puts on edge1/t/{epoch}/uot, which no output rule takes: the rules take edge1/t/*/out"
     assert told[0] == WorkerTrouble(task="t", incarnation="3", count=0, text=text)
+
+
+async def _later(_received: Received) -> None:
+    raise AssertionError("it is never run")
+
+
+def _in_parts(_received: Received) -> Iterator[None]:
+    yield
+
+
+@pytest.mark.parametrize("callback", [_later, _in_parts])
+def test_a_callback_of_which_nothing_would_run_is_a_trouble(
+    relay: Relay, told: list[WorkerTrouble], tmp_path: Path, callback: Any
+) -> None:
+    with Worker.from_env(environment(relay, tmp_path), handles_signals=False) as worker:
+        worker.subscribe("{prefix}/*/in", callback)
+        worker.ready()
+        until(lambda: KEYS.worker("edge1", "t", 3) in relay.tokens, "the ready token")
+        relay.put(b"x")
+        until(lambda: told, "the mistake")
+    assert told[0].text.startswith("TypeError: a callback must be a plain function")
