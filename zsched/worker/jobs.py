@@ -34,6 +34,7 @@ class JobTimer:
     """The jobs of one thread. `begin` and `end` are called in it."""
 
     __slots__ = (
+        "_base_s",
         "_began_s",
         "_cpu_s",
         "_deadline_s",
@@ -59,6 +60,8 @@ class JobTimer:
         """``deadline_s``: a job that takes longer from arrival to end is `late`."""
         self._deadline_s = deadline_s
         self._began_s = self._cpu_s = self._process_s = self._waited_s = 0.0
+        self._base_s: float | None = 0.0
+        """What its thread had waited when it began, less what earlier ones have; ``None``: the kernel does not tell."""
         self._thread_id = 0
         self._is_long = False
         self.is_in_hand = False
@@ -72,9 +75,11 @@ class JobTimer:
 
     def begin(self) -> None:
         """A job begins."""
-        if not self._thread_id:
-            self._thread_id = threading.get_native_id()
-            self._waited_s = _waited_s(self._thread_id) or 0.0
+        thread_id = threading.get_native_id()
+        if thread_id != self._thread_id:  # the first job, or that of a thread that has an ended one's identity
+            told_s = _waited_s(thread_id)
+            self._base_s = None if told_s is None else told_s - self._waited_s
+            self._thread_id = thread_id
         self.is_in_hand = True
         if self._is_long:
             self._process_s = process_time()
@@ -110,11 +115,17 @@ class JobTimer:
             self.long_thread_s, self.long_process_s = thread_s / 2, process_s / 2
 
     def waited_s(self) -> float | None:
-        """How long its thread has waited for a CPU since its first job; ``None``: the kernel does not tell."""
-        if not self._thread_id:
-            return 0.0
-        waited_s = _waited_s(self._thread_id)
-        return None if waited_s is None else max(waited_s - self._waited_s, 0.0)
+        """How long its thread has waited for a CPU since its first job; ``None``: the kernel does not tell.
+
+        Of a thread that has ended: as far as it was seen.
+        """
+        base_s, thread_id = self._base_s, self._thread_id
+        if base_s is None:
+            return None
+        told_s = _waited_s(thread_id) if thread_id else None
+        if told_s is not None:
+            self._waited_s = max(told_s - base_s, self._waited_s)
+        return self._waited_s
 
 
 def _waited_s(thread_id: int) -> float | None:

@@ -18,6 +18,7 @@ from zsched.hop.acknowledger import Acknowledger
 from zsched.relay.troubles import PAUSE_S, Troubles, Word
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import Keyspace
+from zsched.worker import jobs as worker_jobs
 from zsched.worker.inputs import Dispatcher
 from zsched.worker.jobs import TELL_S, JobBook, JobTimer
 from zsched.worker.keep import Debts
@@ -56,6 +57,43 @@ def test_the_kernel_tells_how_long_a_job_waited_for_a_cpu() -> None:
     timer.end()
     waited_s = timer.waited_s()
     assert waited_s is None or 0.0 <= waited_s <= timer.time_s - timer.cpu_s + 0.02
+
+
+def test_what_a_thread_has_waited_stays_behind_its_end_and_its_successor_s_is_added(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A new thread may have the identity of one that has ended, and so its timer."""
+    waits, running = {1: 5.0}, [1]
+    monkeypatch.setattr(worker_jobs, "_waited_s", waits.get)
+    monkeypatch.setattr(threading, "get_native_id", lambda: running[0])
+    timer = JobTimer()
+    timer.begin()
+    timer.end()
+    waits[1] = 7.0
+    assert timer.waited_s() == 2.0
+    del waits[1]
+    assert timer.waited_s() == 2.0
+    running[0], waits[2] = 2, 1.0
+    timer.begin()
+    timer.end()
+    waits[2] = 1.5
+    assert timer.waited_s() == 2.5
+
+
+def test_a_job_in_a_thread_that_has_ended_leaves_the_waiting_time_known() -> None:
+    book = JobBook("t", "7", lambda _word: None)
+
+    def work() -> None:
+        with book.job(skipped=0, came_s=None):
+            pass
+
+    work()
+    is_told = book.report().wait_s is not None  # by this kernel
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert (book.report().wait_s is not None) == is_told
+    book.close()
 
 
 def test_helpers_in_other_threads_are_part_of_a_job() -> None:
