@@ -10,8 +10,10 @@ that writes it.
 from __future__ import annotations
 
 import contextlib
+import operator
 import threading
 from collections.abc import Callable
+from math import inf
 from time import monotonic, process_time, thread_time
 from types import TracebackType
 from typing import Final, Self
@@ -178,7 +180,14 @@ class JobBook:
         return timer
 
     def job(self, skipped: int, came_s: float | None) -> Job:
-        """One job of the calling thread; ``skipped``: this many before it were left undone for it."""
+        """One job of the calling thread; ``skipped``: this many before it were left undone for it.
+
+        Raises:
+            ValueError: ``skipped`` is no whole number from 0 on, or ``came_s`` no time that has been.
+        """
+        count = _whole(skipped)
+        if came_s is not None and not -inf < came_s <= monotonic():  # nor is `nan` such a time
+            raise ValueError(f"came_s is {came_s!r}, which has not been: give it of time.monotonic, not time.time")
         thread = threading.get_ident()
         with self._lock:
             timer = self._own.get(thread)
@@ -188,7 +197,7 @@ class JobBook:
                     for one in self._timers:
                         self._before.add(one)
                 timer = self._own[thread] = JobTimer(self._deadline_s)
-        timer.skipped += skipped
+        timer.skipped += count
         return Job(timer, self.wake, came_s)
 
     def wake(self) -> None:
@@ -259,6 +268,16 @@ class JobBook:
             late=None if self._deadline_s is None else sums.late,
             is_idle=not self._is_busy(),
         )
+
+
+def _whole(skipped: int) -> int:
+    try:
+        count = operator.index(skipped)
+    except TypeError:
+        count = -1
+    if count < 0:
+        raise ValueError(f"skipped is {skipped!r}, which is no whole number (int) from 0 on")
+    return count
 
 
 class _Sums(Struct):

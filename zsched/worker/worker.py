@@ -346,6 +346,9 @@ class Worker:
         The daemon hears how long jobs take, how much CPU, and how many are left undone (docs/guide/worker.md); from
         the first one on, callbacks are no jobs any more. ``skipped``: this many were left undone for this one.
         ``came_s``: when what it works on came, by ``time.monotonic``.
+
+        Raises:
+            ValueError: ``skipped`` is no whole number from 0 on, or ``came_s`` has not been: it is of another clock.
         """
         return self._jobs.job(skipped, came_s)
 

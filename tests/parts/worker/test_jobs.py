@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import threading
 import time
+from collections.abc import Callable
 from functools import partial
 from typing import Any, cast
 
@@ -93,6 +94,26 @@ def test_a_job_in_a_thread_that_has_ended_leaves_the_waiting_time_known() -> Non
     thread.start()
     thread.join()
     assert (book.report().wait_s is not None) == is_told
+    book.close()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"came_s": time.time}, "of time.monotonic, not time.time"),
+        ({"came_s": lambda: float("nan")}, "of time.monotonic"),
+        ({"skipped": lambda: -1}, "whole number"),
+        ({"skipped": lambda: 0.5}, "whole number"),
+    ],
+)
+def test_a_job_of_the_future_or_that_skipped_what_cannot_be_is_refused(
+    options: dict[str, Callable[[], Any]], said: str
+) -> None:
+    """One of them ended all reports of the worker's life: there was no hang detection any more, and no demand."""
+    book = JobBook("t", "7", lambda _word: None)
+    with pytest.raises(ValueError, match=said):
+        book.job(**{"skipped": 0, "came_s": None} | {name: value() for name, value in options.items()})
+    assert (book.report().done, book.report().skipped) == (0, 0)
     book.close()
 
 
