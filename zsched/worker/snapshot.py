@@ -28,6 +28,7 @@ from zsched.core.values.plan import Role, WorkerRole
 from zsched.core.values.struct import Struct
 from zsched.guard import call_plain, guarded, tolerant
 from zsched.ipc.pipe import decode_chunk, encode_chunk
+from zsched.worker.troubles import Troubles
 
 CHUNK: Final = 256 * 1024
 MAX_SNAPSHOT: Final = 32 << 20
@@ -98,10 +99,13 @@ class StateLink:
 class Offer:
     """The queryable under which a worker's successor finds its state."""
 
-    def __init__(self, session: zenoh.Session, key: str, snapshot: Callable[[], bytes]) -> None:
+    def __init__(
+        self, session: zenoh.Session, key: str, snapshot: Callable[[], bytes | bytearray], troubles: Troubles
+    ) -> None:
         """Declare it; ``snapshot`` is called in a thread of its own, once per query."""
         self._key = key
         self._snapshot = snapshot
+        self._troubles = troubles
         self._queryable = session.declare_queryable(key, tolerant(self._hear, "snapshot"), complete=True)
 
     def undeclare(self) -> None:
@@ -118,9 +122,9 @@ class Offer:
     def _answer(self, query: zenoh.Query) -> None:
         query.reply(self._key, b"", attachment=COMING)
         try:
-            content = self._snapshot()
+            content = _copied(self._snapshot())
         except BaseException as error:  # noqa: BLE001 - the worker's own bug is the successor's cold start
-            _log.exception("the worker's snapshot failed")
+            self._troubles.note("offer_snapshot", error)
             query.reply_err(f"failed: {type(error).__name__}: {error}"[:400], encoding=ERROR_ENCODING)
             return
         if len(content) > MAX_SNAPSHOT:
@@ -129,6 +133,13 @@ class Offer:
             return
         for chunk, part in chunks(content):
             query.reply(self._key, part, attachment=encode_chunk(chunk))
+
+
+def _copied(state: bytes | bytearray) -> bytes:
+    """What the worker has given, which nobody changes on its way."""
+    if not isinstance(state, bytes | bytearray):
+        raise TypeError(f"a snapshot is bytes, not {type(state).__name__}")
+    return bytes(state)
 
 
 def chunks(content: bytes) -> list[tuple[SnapshotChunk, bytes]]:

@@ -297,13 +297,13 @@ class Worker:
         taken.append(expr)
         return expr
 
-    def offer_snapshot(self, snapshot: Callable[[], bytes]) -> None:
+    def offer_snapshot(self, snapshot: Callable[[], bytes | bytearray]) -> None:
         """Offer this worker's state to its successor, at most `MAX_SNAPSHOT` bytes; call it before `ready`.
 
         ``snapshot`` is called in a thread of its own whenever the next owner asks, usually while this one still works.
         """
         key = self._keyspace.snapshot(self._node, self._task)
-        self._declared.append(Offer(self._state_link.session, key, snapshot))
+        self._declared.append(Offer(self._state_link.session, key, snapshot, self._troubles))
 
     def on_snapshot(self, restore: Callable[[bytes], None], timeout_s: float = TIMEOUT_S) -> None:
         """Take the predecessor's state over when this worker becomes the owner; call it before `subscribe`.

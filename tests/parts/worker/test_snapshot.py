@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from random import Random
+from typing import Any
 
 import pytest
 import zenoh
@@ -22,6 +23,7 @@ from zsched.ipc.pipe import encode_chunk
 from zsched.sessions.config import data_config, worker_config
 from zsched.worker import snapshot as worker_snapshot
 from zsched.worker.snapshot import CHUNK, MAX_SNAPSHOT, Assembly, Offer, Restorer, StateLink, chunks, fetch
+from zsched.worker.troubles import Troubles
 
 PATIENCE_S = 60.0
 KEY = "@zsched/test/snapshot/edge1/task"
@@ -110,6 +112,19 @@ def asked(session: zenoh.Session, timeout_s: float = PATIENCE_S, key: str = KEY)
     return fetch(session, key, timeout_s), time.monotonic() - started
 
 
+def ignored(_count: int, _text: str) -> None:
+    """For an offer whose failures are not what is tested."""
+
+
+def offered(
+    session: zenoh.Session,
+    key: str,
+    snapshot: Callable[[], bytes | bytearray],
+    tell: Callable[[int, str], None] = ignored,
+) -> Offer:
+    return Offer(session, key, snapshot, Troubles(tell))
+
+
 def until_offered(session: zenoh.Session, key: str = KEY) -> None:
     querier = session.declare_querier(key)
     end = time.monotonic() + PATIENCE_S
@@ -137,7 +152,7 @@ def test_a_worker_that_is_there_before_its_relay_waits_for_it() -> None:
 
 def test_a_large_snapshot_arrives_whole(sessions: tuple[zenoh.Session, zenoh.Session]) -> None:
     content = content_of(8 * CHUNK + 5)
-    offer = Offer(sessions[0], KEY, lambda: content)
+    offer = offered(sessions[0], KEY, lambda: content)
     until_offered(sessions[1])
     assert asked(sessions[1])[0] == content
     offer.undeclare()
@@ -173,7 +188,7 @@ def test_a_worker_that_is_long_in_giving_its_state_is_waited_for(
         time.sleep(6.0)
         return content
 
-    offer = Offer(sessions[0], key, snapshot)
+    offer = offered(sessions[0], key, snapshot)
     until_offered(sessions[1], key)
     assert asked(sessions[1], key=key)[0] == content
     offer.undeclare()
@@ -184,7 +199,7 @@ def test_a_snapshot_that_does_not_follow_its_announcement_is_late(
 ) -> None:
     key = f"{KEY}/never"
     goes_on = threading.Event()
-    offer = Offer(sessions[0], key, lambda: bytes(goes_on.wait(PATIENCE_S)))
+    offer = offered(sessions[0], key, lambda: bytes(goes_on.wait(PATIENCE_S)))
     until_offered(sessions[1], key)
     reason, took_s = asked(sessions[1], timeout_s=2.0, key=key)
     assert str(reason).startswith("late")
@@ -233,22 +248,37 @@ def test_a_snapshot_that_stops_half_way_is_late(sessions: tuple[zenoh.Session, z
     half.undeclare()
 
 
+def test_a_bytearray_is_sent_as_it_is_when_it_is_given(sessions: tuple[zenoh.Session, zenoh.Session]) -> None:
+    key = f"{KEY}/bytearray"
+    offer = offered(sessions[0], key, lambda: bytearray(content_of(CHUNK + 5)))
+    until_offered(sessions[1], key)
+    assert asked(sessions[1], key=key)[0] == content_of(CHUNK + 5)
+    offer.undeclare()
+
+
 @pytest.mark.parametrize(
     ("snapshot", "said"),
     [
         (lambda: bytes(MAX_SNAPSHOT + 1), "too large"),
         (lambda: 1 / 0, "ZeroDivisionError"),
         (lambda: sys.exit(3), "SystemExit"),
+        (lambda: "text", "TypeError"),
+        (lambda: None, "TypeError"),
+        (dict, "TypeError"),
     ],
 )
 def test_a_snapshot_that_cannot_be_sent_is_refused_with_the_reason(
-    sessions: tuple[zenoh.Session, zenoh.Session], snapshot: object, said: str
+    sessions: tuple[zenoh.Session, zenoh.Session], snapshot: Callable[[], Any], said: str
 ) -> None:
-    key = f"{KEY}/bad"
-    offer = Offer(sessions[0], key, snapshot)  # type: ignore[arg-type] # the worker's bug is the point
+    """A value of a wrong type was told as the worker's death, and its own node heard nothing."""
+    key, told = f"{KEY}/bad", list[str]()
+    offer = offered(sessions[0], key, snapshot, lambda _count, text: told.append(text))
     until_offered(sessions[1], key)
     assert said in str(asked(sessions[1], key=key)[0])
     offer.undeclare()
+    if said != "too large":
+        until(lambda: told, "the node hears of it")
+        assert told[0].startswith(said)
 
 
 def test_a_stranger_s_state_beside_the_predecessor_s_is_a_cold_start() -> None:
@@ -262,10 +292,10 @@ def test_a_stranger_s_state_beside_the_predecessor_s_is_a_cold_start() -> None:
         zenoh.open(zenoh.Config.from_json5(worker_config(connect=(endpoint,), shared_memory=False))) as worker,
         zenoh.open(zenoh.Config.from_json5(worker_config(connect=(endpoint,), shared_memory=False))) as stranger,
     ):
-        offer = Offer(worker, key, lambda: content_of(50, 1))
+        offer = offered(worker, key, lambda: content_of(50, 1))
         until_offered(asker, key)
         assert asked(asker, key=key)[0] == content_of(50, 1)
-        false = Offer(stranger, key, lambda: content_of(50, 2))
+        false = offered(stranger, key, lambda: content_of(50, 2))
         until(lambda: asked(asker, key=key)[0] == "contested: two different states are offered", "both to be asked")
         for one in (offer, false):
             one.undeclare()
