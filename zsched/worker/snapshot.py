@@ -300,6 +300,11 @@ class Restorer:
         self.restored = 0
         self.cold_starts = 0
 
+    @property
+    def has_callback(self) -> bool:
+        """Whether the worker takes a state over."""
+        return self._callback is not None
+
     def register(self, callback: Callable[[bytes], None], timeout_s: float) -> None:
         """Take the worker's callback."""
         self._callback, self._timeout_s = callback, timeout_s

@@ -298,20 +298,32 @@ class Worker:
         return expr
 
     def offer_snapshot(self, snapshot: Callable[[], bytes | bytearray]) -> None:
-        """Offer this worker's state to its successor, at most `MAX_SNAPSHOT` bytes; call it before `ready`.
+        """Offer this worker's state to its successor, at most `MAX_SNAPSHOT` bytes; call it once, before `ready`.
 
         ``snapshot`` is called in a thread of its own whenever the next owner asks, usually while this one still works.
+
+        Raises:
+            RuntimeError: this worker is ready already, or offers its state already.
         """
+        self._check_not_ready("offer_snapshot")
+        if any(isinstance(entity, Offer) for entity in self._declared):
+            raise RuntimeError("Worker.offer_snapshot a second time: the next owner takes neither of two states")
         key = self._keyspace.snapshot(self._node, self._task)
         self._declared.append(Offer(self._state_link.session, key, snapshot, self._troubles))
 
     def on_snapshot(self, restore: Callable[[bytes], None], timeout_s: float = TIMEOUT_S) -> None:
-        """Take the predecessor's state over when this worker becomes the owner; call it before `subscribe`.
+        """Take the predecessor's state over when this worker becomes the owner; call it once, before `subscribe`.
 
         ``restore`` runs in the dispatch thread before any input of the new epoch, at most ``timeout_s`` after the role
         came (0.3 s if the predecessor gives no sign of life); until then `role` is idle. Without a snapshot it is not
         called.
+
+        Raises:
+            RuntimeError: this worker is ready already, or takes the state already.
         """
+        self._check_not_ready("on_snapshot")
+        if self._restorer.has_callback:
+            raise RuntimeError("Worker.on_snapshot a second time: one callback takes the state")
         self._errands.put(self._state_link.open)  # before it is needed, not in a move
         self._restorer.register(restore, timeout_s)
         self._dispatcher.remember(lambda: self.role.role is WorkerRole.IDLE)

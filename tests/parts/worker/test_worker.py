@@ -358,6 +358,23 @@ def test_an_argument_that_zenoh_does_not_take_is_refused_and_takes_no_number(
             out.put(**arguments)
 
 
+def test_a_worker_has_one_state_and_says_so_before_it_is_ready() -> None:
+    """Two offers were two states, and each move began cold: "contested"."""
+    with Worker.from_env({}, standalone="t", handles_signals=False) as worker:
+        worker.on_snapshot(print)
+        worker.offer_snapshot(bytes)
+        with pytest.raises(RuntimeError, match="offer_snapshot a second time"):
+            worker.offer_snapshot(bytes)
+        with pytest.raises(RuntimeError, match="on_snapshot a second time"):
+            worker.on_snapshot(print)
+    with Worker.from_env({}, standalone="t", handles_signals=False) as worker:
+        worker.ready()
+        with pytest.raises(RuntimeError, match=r"Worker\.offer_snapshot after Worker\.ready"):
+            worker.offer_snapshot(bytes)
+        with pytest.raises(RuntimeError, match=r"Worker\.on_snapshot after Worker\.ready"):
+            worker.on_snapshot(print)
+
+
 @pytest.mark.parametrize("is_relay_stopped", [False, True], ids=["relay alive", "relay stopped"])
 def test_a_signalled_worker_is_gone_within_a_second(tmp_path: Path, is_relay_stopped: bool) -> None:
     script = (
