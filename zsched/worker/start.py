@@ -17,7 +17,8 @@ from zsched.errors import ConfigError
 from zsched.worker.keys import OUTPUT_KEYS, output_keys
 
 _ENVIRONMENT: Final = ("ZSCHED_FLEET", "ZSCHED_NODE", "ZSCHED_TASK", "ZSCHED_INCARNATION", "ZSCHED_ZENOH_CONFIG")
-
+_ASKED_NODE: Final = "ZSCHED_NODE"
+"""Alone it is no sign of a daemon: a terminal may have it, to say which node the verbs of ``zsched`` ask."""
 
 DEADLINE: Final = "ZSCHED_DEADLINE_MS"
 
@@ -44,10 +45,14 @@ def surroundings(env: Mapping[str, str], standalone: str) -> Surroundings:
         ConfigError: a variable is missing, or the zenoh configuration cannot be read.
     """
     missing = [name for name in _ENVIRONMENT if not env.get(name)]
-    if missing and not (standalone and len(missing) == len(_ENVIRONMENT)):
+    others = [name for name in _ENVIRONMENT if name not in missing and name != _ASKED_NODE]
+    if missing and (others or not standalone):
+        by_hand = "say --standalone (Worker.from_env(standalone=TASK))"
+        if standalone:
+            by_hand = f"with --standalone, unset {', '.join(others)}"
         raise ConfigError(
             f"this worker has no {', '.join(missing)} in its environment: a worker is started by its node's "
-            "daemon (zsched up); to run it by hand, say --standalone (Worker.from_env(standalone=TASK))"
+            f"daemon (zsched up); to run it by hand, {by_hand}"
         )
     if missing:
         return Surroundings(

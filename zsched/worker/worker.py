@@ -158,10 +158,10 @@ class Worker:
     ) -> Self:
         """The worker that the daemon's environment describes.
 
-        ``standalone`` names the task of a worker started by hand: without ``ZSCHED_*`` it is then the owner on node
-        ``local``, epoch 1, on zenoh's default session. ``drains_itself`` says that outputs also leave outside of the
-        input callbacks: the end markers then wait for `drained`; no input waits until what another thread puts has
-        reached the robots. SIGTERM and SIGINT end `wait` (main thread only).
+        ``standalone`` names the task of a worker started by hand: without a daemon's variables (``ZSCHED_NODE`` alone
+        is a terminal's) it is then the owner on node ``local``, epoch 1, on zenoh's default session. ``drains_itself``
+        says that outputs also leave outside of the input callbacks: the end markers then wait for `drained`; no input
+        waits until what another thread puts has reached the robots. SIGTERM and SIGINT end `wait` (main thread only).
 
         Raises:
             ConfigError: a variable is missing, or the zenoh configuration cannot be read.

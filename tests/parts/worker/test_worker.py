@@ -242,14 +242,20 @@ def test_an_input_that_could_keep_nothing_is_refused(relay: Relay, tmp_path: Pat
 
 
 def test_without_a_daemon_it_says_how_to_run_by_hand() -> None:
-    with pytest.raises(ConfigError, match=r"ZSCHED_NODE.*--standalone"):
+    with pytest.raises(ConfigError, match=r"ZSCHED_NODE.*with --standalone, unset ZSCHED_FLEET$"):
         Worker.from_env({"ZSCHED_FLEET": "test"}, standalone="t")
+    with pytest.raises(ConfigError, match=r"unset ZSCHED_FLEET, ZSCHED_TASK$"):
+        Worker.from_env({"ZSCHED_FLEET": "test", "ZSCHED_TASK": "t"}, standalone="t")
+    with pytest.raises(ConfigError, match=r"ZSCHED_FLEET.*say --standalone"):
+        Worker.from_env({"ZSCHED_NODE": "robot1"})
     with pytest.raises(ConfigError, match="zsched up"):
         Worker.from_env({})
 
 
-def test_by_hand_it_is_the_owner() -> None:
-    with Worker.from_env({}, standalone="t", handles_signals=False) as worker:
+@pytest.mark.parametrize("env", [{}, {"ZSCHED_NODE": "robot1"}], ids=["any terminal", "one that asks a fleet"])
+def test_by_hand_it_is_the_owner(env: dict[str, str]) -> None:
+    """Also in the terminal that `zsched dev` opens, in which the variable says whom verbs ask."""
+    with Worker.from_env(env, standalone="t", handles_signals=False) as worker:
         assert (worker.prefix, worker.role.role, worker.role.epoch) == ("local/t", WorkerRole.ACTIVE, 1)
         assert worker.publisher("{prefix}/{epoch}/out", latest=True).put(b"x") is True
 
