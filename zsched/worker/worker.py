@@ -111,6 +111,9 @@ class Worker:
         """Holds something once it was told to stop. A signal's handler may put into it, whatever it has interrupted."""
         self._signals = 0
         """How often it was told to stop."""
+        self._pid = os.getpid()
+        self._handlers: dict[int, Any] = {}
+        """{signal: what was done at it before this worker}"""
         self._outputs: dict[str, Output] = {}
         """{key, the epoch still a placeholder: its output}; guarded by `_lock`."""
         self._output_keys = output_keys
@@ -161,7 +164,8 @@ class Worker:
         ``standalone`` names the task of a worker started by hand: without a daemon's variables (``ZSCHED_NODE`` alone
         is a terminal's) it is then the owner on node ``local``, epoch 1, on zenoh's default session. ``drains_itself``
         says that outputs also leave outside of the input callbacks: the end markers then wait for `drained`; no input
-        waits until what another thread puts has reached the robots. SIGTERM and SIGINT end `wait` (main thread only).
+        waits until what another thread puts has reached the robots. SIGTERM and SIGINT end `wait` (main thread only);
+        behind `close`, in the main thread too, they do what they did before.
 
         Raises:
             ConfigError: a variable is missing, or the zenoh configuration cannot be read.
@@ -179,8 +183,8 @@ class Worker:
             output_keys=around.output_keys,
         )
         if handles_signals and threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGTERM, worker._on_signal)
-            signal.signal(signal.SIGINT, worker._on_signal)
+            for number in (signal.SIGTERM, signal.SIGINT):
+                worker._handlers[number] = signal.signal(number, worker._on_signal)
         return worker
 
     # --- what a worker does ------------------------------------------------------------------------------------------
@@ -409,6 +413,8 @@ class Worker:
             os._exit(0)  # a stopped peer holds zenoh's close for seconds, and its threads hold the interpreter
         if has_alarm:
             signal.setitimer(signal.ITIMER_REAL, 0.0)
+        if threading.current_thread() is threading.main_thread():
+            self._give_signals_back()
 
     def __enter__(self) -> Self:
         return self
@@ -426,7 +432,17 @@ class Worker:
             with contextlib.suppress(zenoh.ZError):
                 close()
 
-    def _on_signal(self, _signal: int, _frame: FrameType | None) -> None:
+    def _give_signals_back(self) -> None:
+        for number, before in self._handlers.items():
+            is_ours = signal.getsignal(number) == self._on_signal  # or somebody else's came behind it
+            if is_ours and before is not None:
+                signal.signal(number, before)
+
+    def _on_signal(self, number: int, _frame: FrameType | None) -> None:
+        if os.getpid() != self._pid:  # a child that this process forked has our handler, and nobody who waits in it
+            signal.signal(number, signal.SIG_DFL)
+            os.kill(os.getpid(), number)
+            return
         self._signals += 1
         self._ended.put(None)  # and not the event: its lock may be held by what this signal has interrupted
 

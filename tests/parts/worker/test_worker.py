@@ -440,6 +440,50 @@ def test_a_signal_that_comes_while_the_worker_waits_is_not_waited_for() -> None:
     assert (found.returncode, found.stdout) == (0, "True False False\n"), found.stderr
 
 
+FORK = """
+import multiprocessing, os, time
+from zsched.worker import Worker
+seen, told = os.pipe()
+def work():
+    os.write(told, b"x")
+    time.sleep(60)
+with Worker.from_env({}, standalone="t"):
+    child = multiprocessing.get_context("fork").Process(target=work)
+    child.start()
+    os.read(seen, 1)  # before, Python itself forgets a signal: a forked interpreter begins with none
+    child.terminate()
+    child.join(5)
+    print(child.exitcode, flush=True)
+    child.kill()
+"""
+
+
+def test_a_child_that_a_worker_forks_ends_at_a_signal() -> None:
+    """It inherits the worker's handler, which only counted: `join` behind `terminate` hung."""
+    found = subprocess.run([sys.executable, "-c", FORK], timeout=60, capture_output=True, text=True, check=False)
+    assert (found.returncode, found.stdout) == (0, "-15\n"), found.stderr
+
+
+CLOSED = """
+import signal
+from zsched.worker import Worker
+numbers = signal.SIGINT, signal.SIGTERM
+before = [signal.getsignal(number) for number in numbers]
+with Worker.from_env({}, standalone="t") as worker:
+    print([signal.getsignal(number) == worker._on_signal for number in numbers])
+print([signal.getsignal(number) for number in numbers] == before)
+with Worker.from_env({}, standalone="t"):
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+print(signal.getsignal(signal.SIGINT) == signal.SIG_IGN, signal.getsignal(signal.SIGTERM) == before[1])
+"""
+
+
+def test_a_closed_worker_gives_the_signals_back_that_are_still_its_own() -> None:
+    """Ctrl-C did nothing behind the `with` block."""
+    found = subprocess.run([sys.executable, "-c", CLOSED], timeout=60, capture_output=True, text=True, check=False)
+    assert (found.returncode, found.stdout) == (0, "[True, True]\nTrue\nTrue True\n"), found.stderr
+
+
 def test_who_is_told_to_stop_takes_its_token_back_and_does_what_has_come(relay: Relay, tmp_path: Path) -> None:
     """Relays keep what is to come once the token went; what is here already is nobody else's."""
     count, is_gone = 20, threading.Event()
