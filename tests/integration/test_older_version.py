@@ -14,6 +14,7 @@ import msgpack
 import pytest
 
 from support.operators import Operator
+from support.waiting import until
 from zsched.adapters.host.state_file import hardware_id
 from zsched_lab.fleet.testbed import TASK, Json, Testbed, echo_fleet
 
@@ -47,8 +48,9 @@ def test_files_and_states_of_an_older_version_become_revision_1_without_a_genera
         bed.start()
         assert bed.wait_settled() == OWNER
         for name in bed.names:
-            status = bed.status(name)
-            assert (bed.task(name)["epoch"], status["problems"], status["quorum"]["generation"]) == (EPOCH, [], 0)
+            assert (bed.task(name)["epoch"], bed.status(name)["quorum"]["generation"]) == (EPOCH, 0)
+            # A busy machine's node may be silent for a moment, and is heard again.
+            until(lambda: bed.status(name)["problems"] == [], f"{name} to see no problem")  # noqa: B023 - called at once
         operator = Operator(bed)
         assert operator.done("fleet", "show").startswith("testbed: revision 1, number 1, settled\nno document")
 
