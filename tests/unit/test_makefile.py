@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
+OF_THE_MAKE_THAT_RUNS_US = ("MAKEFLAGS", "MAKEOVERRIDES", "MFLAGS", "MAKELEVEL", "LONG", "MARK")
+"""Which tests are run now is no matter of what is planned here."""
 
 
 def planned(folder: Path, *programs: str, target: str = "image", words: tuple[str, ...] = ()) -> str:
@@ -21,7 +23,8 @@ def planned(folder: Path, *programs: str, target: str = "image", words: tuple[st
         (folder / name).write_text("#!/bin/sh\n")
         (folder / name).chmod(0o755)
     command = [make, "--dry-run", "--always-make", target, *words]
-    env = {**os.environ, "PATH": f"{folder}:/nowhere", "SHELL": "/bin/sh"}
+    env = {name: value for name, value in os.environ.items() if name not in OF_THE_MAKE_THAT_RUNS_US}
+    env |= {"PATH": f"{folder}:/nowhere", "SHELL": "/bin/sh"}
     done = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, timeout=60, check=True)
     return done.stdout
 
