@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from typing import Final
 
@@ -48,7 +49,7 @@ class Acknowledger:
         """Monotonic seconds."""
         self.born_at = self.clock() if born_at is None else born_at
         """When this process began to listen."""
-        self._sources: dict[SourceName, Source] = {}
+        self._sources: OrderedDict[SourceName, Source] = OrderedDict()
         self._used: set[SourceName] = set()
         """Those that have a second chance when room is wanted: something has come of them since they had their last."""
         self._dirty: set[SourceName] = set()
@@ -138,15 +139,13 @@ class Acknowledger:
 
     def is_whole(self, name: SourceName) -> bool:
         """Whether everything of a source is wanted, by its start marker."""
-        with self._wake:
-            source = self._sources.get(name)
-            return source is not None and source.is_whole is True
+        source = self._sources.get(name)
+        return source is not None and source.is_whole is True
 
     def replay_end(self, name: SourceName) -> int:
         """The numbers of a source below this one may have gone to an earlier owner."""
-        with self._wake:
-            source = self._sources.get(name)
-            return 0 if source is None else source.replay_end
+        source = self._sources.get(name)
+        return 0 if source is None else source.replay_end
 
     def end(self, name: SourceName) -> None:
         """The source's end marker came."""
@@ -178,9 +177,8 @@ class Acknowledger:
 
     def arrived(self, name: SourceName) -> int:
         """The number that the source comes to next."""
-        with self._wake:
-            source = self._sources.get(name)
-            return 0 if source is None else source.arrived
+        source = self._sources.get(name)
+        return 0 if source is None else source.arrived
 
     def processed(self, name: SourceName, number: int, size: int) -> None:
         """A sample is done, or it gave way to a newer one that is; not one whose jump was taken back meanwhile."""
@@ -212,7 +210,7 @@ class Acknowledger:
         """Forget the oldest of which nothing has come since it was looked at last: a live stream may be the oldest."""
         while (oldest := next(iter(self._sources))) in self._used or oldest == newest:
             self._used.discard(oldest)
-            self._sources[oldest] = self._sources.pop(oldest)
+            self._sources.move_to_end(oldest)  # in one step: who reads without the lock misses none
         del self._sources[oldest]
 
     # --- the thread --------------------------------------------------------------------------------------------------
