@@ -80,10 +80,23 @@ _Found = tuple[OwnTask, str, InputStream]
 
 
 class _Here(threading.local):
-    """Where a thread is; each has its own."""
+    """Says of each thread whether it is in a callback, or in a call of ours that a signal may interrupt (``with``).
 
-    is_inside = False
-    """In a callback, or a call of ours that a signal may interrupt: closing waits for it, and it for no closing."""
+    Closing waits for that, so that it must wait for no closing.
+    """
+
+    _depth = 0
+
+    def __enter__(self) -> None:
+        self._depth += 1
+
+    def __exit__(self, *_: object) -> None:
+        self._depth -= 1
+
+    @property
+    def is_inside(self) -> bool:
+        """Whether this thread is."""
+        return self._depth > 0
 
 
 class Publisher:
@@ -112,11 +125,8 @@ class Publisher:
         """
         sent, attached, encoded, stamp = put_arguments(payload, attachment, encoding, timestamp)
         given = Given(self.key, sent, encoded or PLAIN, attached, stamp)
-        was_inside, self._here.is_inside = self._here.is_inside, True
-        try:
+        with self._here:
             return self._give(given) or self._give(given)  # what has closed since we looked may have another place
-        finally:
-            self._here.is_inside = was_inside
 
     def _give(self, given: Given) -> bool:
         stream = self._stream()
@@ -220,11 +230,8 @@ class Streams:
         self._check_open()
         if (wrong := fault(key)) is not None or is_wild(key):
             raise ValueError(f"{key!r} is no key that can be published: {wrong or 'it has wildcards'}")
-        was_inside, self._here.is_inside = self._here.is_inside, True
-        try:
+        with self._here:
             return self._publisher(key)
-        finally:
-            self._here.is_inside = was_inside
 
     def _publisher(self, key: str) -> Publisher:
         self._name(key)
@@ -253,11 +260,8 @@ class Streams:
         self._check_open()
         if (wrong := fault(key_expr)) is not None:
             raise ValueError(f"{key_expr!r} is no key expression: {wrong}")
-        was_inside, self._here.is_inside = self._here.is_inside, True
-        try:
+        with self._here:
             self._subscribe(key_expr, on_sample)
-        finally:
-            self._here.is_inside = was_inside
 
     def _subscribe(self, key_expr: str, on_sample: Callable[[Received], None]) -> None:
         with self._lock:
@@ -358,13 +362,13 @@ class Streams:
         )
 
     def _deliver(self, received: Received) -> None:
-        self._here.is_inside = True
-        for key_expr, on_sample in self._callbacks:
-            if includes(key_expr, received.key):
-                try:
-                    call_plain(on_sample, received)
-                except BaseException as error:  # noqa: BLE001 - no answer and no other callback misses theirs
-                    self._note_raised(key_expr, error)
+        with self._here:
+            for key_expr, on_sample in self._callbacks:
+                if includes(key_expr, received.key):
+                    try:
+                        call_plain(on_sample, received)
+                    except BaseException as error:  # noqa: BLE001 - no answer and no other callback misses theirs
+                        self._note_raised(key_expr, error)
 
     def _note_raised(self, key_expr: str, error: BaseException) -> None:
         """Log it, with its traceback when the first of its kind: it may be the same for every answer."""
