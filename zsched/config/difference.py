@@ -310,7 +310,7 @@ def _access(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
             is_end = after is None
             yield replace(verdict, danger=Danger.END_SECURITY, about=old.name) if is_end else verdict
         return
-    if _nameless(before) != _nameless(after):
+    if before.nameless() != after.nameless():
         yield _restart_all("security", _plain(before), _plain(after))
     if _names(before) != _names(after):
         yield _set(anew, "security", _plain(before), _plain(after))
@@ -334,11 +334,6 @@ def _in_turns(verdicts: tuple[_Verdict, ...]) -> Iterator[_Verdict]:
     for one in verdicts:
         is_other = begins_again and one.in_turns
         yield replace(one, text=one.in_turns, effect=Effect.STREAMS) if is_other else one
-
-
-def _nameless(security: Security) -> Security:
-    """The section without the names that it lets in."""
-    return replace(security, operators=(), guests=(), revoked=())
 
 
 def _names(security: Security) -> tuple[tuple[str, ...], ...]:

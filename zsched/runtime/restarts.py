@@ -9,9 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from zsched.core.values.fleet import Fleet, NodeSpec, Security, dial_endpoint
+from zsched.core.values.fleet import Fleet, NodeSpec, dial_endpoint
 from zsched.core.values.model import NodeId
-from zsched.core.values.struct import replace
 from zsched.runtime.access_rules import Side, access_control
 from zsched.runtime.endpoints import Endpoints, endpoints_for
 from zsched.sessions.config import pool_threads
@@ -82,11 +81,6 @@ def _dialled(fleet: Fleet, me: NodeId) -> dict[NodeId, set[str]]:
     }
 
 
-def _nameless(security: Security | None) -> Security | None:
-    """The section without the names that it lets in."""
-    return None if security is None else replace(security, operators=(), guests=(), revoked=())
-
-
 def _agreed(old: Fleet, new: Fleet) -> Iterator[str]:
     if new.electors != old.electors:
         yield (
@@ -102,7 +96,8 @@ def _agreed(old: Fleet, new: Fleet) -> Iterator[str]:
 
 def _made(old: Fleet, new: Fleet, me: NodeId) -> Iterator[str]:
     changed = [text for name, text in _FIELDS if getattr(new, name) != getattr(old, name)]
-    if _nameless(new.security) != _nameless(old.security):
+    sections = [fleet.security and fleet.security.nameless() for fleet in (old, new)]
+    if sections[0] != sections[1]:
         changed.append("`security`")
     before, after = old.node(me), new.node(me)
     changed += [f"{me}: {text}" for name, text in _OWN if getattr(after, name) != getattr(before, name)]

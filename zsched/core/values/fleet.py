@@ -371,6 +371,10 @@ class Security(Struct, frozen=True, kw_only=True):
     """Sorted labels of keys that are not let in (`zsched.core.values.certificates`)."""
     signatures: Signatures = Signatures.REQUIRED
 
+    def nameless(self) -> Security:
+        """The section without the names that it lets in."""
+        return replace(self, operators=(), guests=(), revoked=())
+
 
 class Cell(Struct, frozen=True, kw_only=True):
     """Another fleet of the same site, and how it is asked."""
