@@ -28,7 +28,7 @@ from zsched.core.values.struct import Struct
 from zsched.errors import AdapterError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE
 from zsched.files import read_regular
-from zsched.runtime.secured import CERTIFICATE, KEY, TRUSTED
+from zsched.runtime.secured import CERTIFICATE, CREDENTIALS, KEY, TRUSTED
 from zsched.sessions.certificate import common_names
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ SCHEMA: Final = "zsched.pki.show/1"
 RECORD: Final = "authority.json"
 """What is in every authority's folder."""
 PASSPHRASE: Final = "ZSCHED_AUTHORITY_PASSPHRASE"
-CREDENTIAL: Final = "passphrase"
+HANDED: Final = "passphrase"
 """Of systemd (``LoadCredential=``, systemd.exec(5)): a unit's environment is told to everybody on the machine."""
 MAX_BYTES: Final = 1 << 20
 SENT, HAD = "ok", "unchanged"
@@ -528,7 +528,7 @@ def _passphrase(authority: Authority) -> bytes:
         return b""
     if PASSPHRASE in os.environ:
         return os.environ[PASSPHRASE].encode()
-    if (given := os.environ.get("CREDENTIALS_DIRECTORY")) and (path := Path(given) / CREDENTIAL).exists():
+    if (given := os.environ.get(CREDENTIALS)) and (path := Path(given) / HANDED).exists():
         return read_regular(path, MAX_BYTES).removesuffix(b"\n")
     return _asked(f"Passphrase of {authority.key_path}")
 
