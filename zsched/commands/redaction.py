@@ -17,7 +17,7 @@ from zsched.core.values.fleet import Fleet
 GONE: Final = "REMOVED"
 LEAST: Final = 4
 """A shorter value is taken out where it stands, and not wherever the same letters are."""
-_WORDS: Final = "pass|passwd|password|passphrase|pwd|secret|token|key|apikey|credential|credentials|auth|pin"
+_WORDS: Final = "pass|pwd|key|apikey|auth|pin"
 _PLAIN: Final = "passwd|password|passphrase|secret|token|credential"
 """Words that stand for nothing else, wherever they are in a name (``PGPASSWORD``, ``apiToken``)."""
 NAME: Final = re.compile(rf"(?:^|[_-])(?:{_WORDS})(?:[_-]|\d|$)|{_PLAIN}", re.IGNORECASE)
