@@ -27,9 +27,9 @@ def unpack(out: Path, body: Mapping[str, Any]) -> str | None:
         told = read_json(results)
         runs: Sequence[Mapping[str, Any]] = told["runs"]
         same = (told["scenario"], told["input"], told["drives"]) == (body["scenario"], body["input"], body["drives"])
-        old = [cell_name(run["block"], run["level"], run["scheme"], run["run"]) for run in runs if not _is_present(run)]
-        invalid = [(f"{one['cell']}.invalid-{one['attempt']}", one) for one in told["invalid"]]
         named = [(cell_name(run["block"], run["level"], run["scheme"], run["run"]), run) for run in runs]
+        old = [name for name, run in named if run.get("definitions") != DEFINITIONS]
+        invalid = [(f"{one['cell']}.invalid-{one['attempt']}", one) for one in told["invalid"]]
     except (OSError, ValueError, KeyError, TypeError) as error:
         return f"--resume: {results} is no results.json of `zsched bench paper` ({type(error).__name__}: {error})"
     if not same:
@@ -41,10 +41,6 @@ def unpack(out: Path, body: Mapping[str, Any]) -> str | None:
     for name, one in invalid:
         _put(out / "runs" / name / "invalid.json", one)
     return None
-
-
-def _is_present(run: Mapping[str, Any]) -> bool:
-    return bool(run.get("definitions") == DEFINITIONS)
 
 
 def _put(path: Path, body: Mapping[str, Any]) -> None:
