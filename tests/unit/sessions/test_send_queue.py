@@ -6,6 +6,7 @@ import threading
 import time
 import weakref
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 
@@ -30,6 +31,15 @@ class Receiver:
         return put
 
 
+def stalled(receiver: Receiver, *, depth: int, first: object = 0, **options: Any) -> SendQueue:
+    """A queue whose first put blocks until the receiver's gate is opened."""
+    receiver.gate.clear()
+    queue = SendQueue("t", depth=depth, **options)
+    queue.send("a", receiver.take(first), 1)
+    until(lambda: queue.is_stalled, "the put blocks")
+    return queue
+
+
 def test_everything_goes_through_in_order_and_markers_keep_their_place() -> None:
     receiver = Receiver()
     queue = SendQueue("t", depth=1000, sheds=False)
@@ -43,10 +53,7 @@ def test_everything_goes_through_in_order_and_markers_keep_their_place() -> None
 
 def test_a_full_queue_that_sheds_nothing_refuses_the_newest() -> None:
     receiver = Receiver()
-    receiver.gate.clear()
-    queue = SendQueue("t", depth=3, sheds=False)
-    queue.send("a", receiver.take(0), 1)
-    until(lambda: queue.is_stalled, "the put blocks")
+    queue = stalled(receiver, depth=3, sheds=False)
     assert [queue.send("a", receiver.take(number), 1) for number in range(1, 6)] == [0, 0, 0, 1, 1]
     assert queue.send("a", receiver.take(9), send_queue.MAX_BYTES) == 1
     receiver.gate.set()
@@ -78,10 +85,7 @@ def test_who_waits_for_room_loses_nothing_to_a_slow_receiver(monkeypatch: pytest
 
 def test_nobody_waits_long_for_a_stalled_receiver() -> None:
     receiver = Receiver()
-    receiver.gate.clear()
-    queue = SendQueue("t", depth=2, sheds=False)
-    queue.send("a", receiver.take(0), 1)
-    until(lambda: queue.is_stalled, "the put blocks")
+    queue = stalled(receiver, depth=2, sheds=False)
     for number in (1, 2):
         queue.send("a", receiver.take(number), 1)
     began = time.monotonic()
@@ -96,10 +100,7 @@ def test_nobody_waits_long_for_a_stalled_receiver() -> None:
 
 def test_behind_a_stalled_receiver_only_the_newest_of_each_lane_wait() -> None:
     receiver = Receiver()
-    receiver.gate.clear()
-    queue = SendQueue("t", depth=100, sheds=True, keep_last=2)
-    queue.send("a", receiver.take(("a", 0)), 1)
-    until(lambda: queue.is_stalled, "the put blocks")
+    queue = stalled(receiver, depth=100, first=("a", 0), sheds=True, keep_last=2)
     dropped = sum(queue.send(lane, receiver.take((lane, n)), 1) for n in range(1, 6) for lane in "ab")
     assert dropped == 6
     receiver.gate.set()
@@ -114,10 +115,7 @@ class Value:
 
 def test_a_sample_that_gave_way_takes_no_memory_while_a_put_blocks() -> None:
     receiver = Receiver()
-    receiver.gate.clear()
-    queue = SendQueue("t", depth=100, sheds=True)
-    queue.send("a", receiver.take(0), 1)
-    until(lambda: queue.is_stalled, "the put blocks")
+    queue = stalled(receiver, depth=100, sheds=True)
     value = Value()
     is_there = weakref.ref(value)
     queue.send("a", receiver.take(1), 1, value)
@@ -132,10 +130,7 @@ def test_a_sample_that_gave_way_takes_no_memory_while_a_put_blocks() -> None:
 
 def test_what_gave_way_does_not_pile_up_behind_a_put_that_blocks() -> None:
     receiver = Receiver()
-    receiver.gate.clear()
-    queue = SendQueue("t", depth=100, sheds=True, keep_last=2)
-    queue.send("a", receiver.take("first"), 1)
-    until(lambda: queue.is_stalled, "the put blocks")
+    queue = stalled(receiver, depth=100, first="first", sheds=True, keep_last=2)
     queue.send("b", receiver.take("b"), 1)
     queue.then(receiver.take("marker"))
     longest = 0
@@ -153,10 +148,7 @@ def test_what_gave_way_does_not_pile_up_behind_a_put_that_blocks() -> None:
 
 def test_what_gave_way_is_not_taken_back_nor_counted_behind_that() -> None:
     receiver = Receiver()
-    receiver.gate.clear()
-    queue = SendQueue("t", depth=100, sheds=True)
-    queue.send("a", receiver.take("first"), 1)
-    until(lambda: queue.is_stalled, "the put blocks")
+    queue = stalled(receiver, depth=100, first="first", sheds=True)
     for number in range(1500):
         queue.send("a", receiver.take(number), 1, number)
     queue.then(receiver.take("marker"))
@@ -171,10 +163,7 @@ def test_what_gave_way_is_not_taken_back_nor_counted_behind_that() -> None:
 
 def test_a_sample_larger_than_the_queue_goes_alone() -> None:
     receiver = Receiver()
-    receiver.gate.clear()
-    queue = SendQueue("t", depth=10, sheds=False)
-    queue.send("a", receiver.take(0), 1)
-    until(lambda: queue.is_stalled, "the put blocks")
+    queue = stalled(receiver, depth=10, sheds=False)
     assert queue.has_room(2 * send_queue.MAX_BYTES)
     assert queue.send("a", receiver.take(1), 2 * send_queue.MAX_BYTES) == 0
     assert not queue.has_room(1), "nothing beside it"
