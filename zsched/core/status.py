@@ -36,7 +36,14 @@ from zsched.core.values.snapshot import (
     VoteStatus,
 )
 from zsched.core.values.struct import replace
-from zsched.core.values.words import NEVER_INITIALISED, RESTARTING, TAKEN_OUT, told_of_hand, told_of_worker
+from zsched.core.values.words import (
+    NEVER_INITIALISED,
+    OWN_CERTIFICATE,
+    RESTARTING,
+    TAKEN_OUT,
+    told_of_hand,
+    told_of_worker,
+)
 from zsched.core.vote.generations import way_out
 from zsched.core.vote.voting import Voting
 
@@ -128,7 +135,8 @@ def _problems(node: Stages, quorum: QuorumStatus, now: float) -> tuple[str, ...]
     is_apart = any(source.startswith("generation/") for source in said)
     is_alone = node.solitude.is_alone(now, has_heard=node.membership.has_heard)
     if is_alone and not is_apart and not node.knocking.problems(now):
-        problems.insert(0, node.solitude.problem(node.me if node.fleet.security is not None else ""))
+        may_be_refused = node.fleet.security is not None and OWN_CERTIFICATE not in said  # that line says why
+        problems.insert(0, node.solitude.problem(node.me if may_be_refused else ""))
     if quorum.stateless:
         names = ", ".join(quorum.stateless)
         problems.append(f"electors without their state, {len(quorum.stateless)} of {quorum.electors}: {names}")

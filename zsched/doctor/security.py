@@ -21,7 +21,7 @@ from zsched.errors import ConfigError
 from zsched.files import read_regular
 from zsched.runtime.own_addresses import Address, addresses_at
 from zsched.runtime.sealing import seals_of
-from zsched.runtime.secured import files_of, require_own
+from zsched.runtime.secured import CERTIFICATE, files_of, require_own
 from zsched.runtime.tls import ENCRYPTED, PLAIN, operator_json5, plain_text_problem, protocol_of
 from zsched.sessions.certificate import validities
 from zsched.sessions.config import tls_files
@@ -79,7 +79,9 @@ def certificates_last(scene: Scene, now: datetime | None = None) -> Result:
     if not files:
         return skipped("the fleet has no certificates: no `security:` section, none in the operator's zenoh file")
     soon = SOON if security is None else OWN_SOON
-    found = [_certificate(name, Path(path), now, soon) for name, path in sorted(files.items())]
+    found = [
+        _certificate(name, Path(path), now, soon, _renewal(scene, name, path)) for name, path in sorted(files.items())
+    ]
     if security is not None:
         found += _own(scene, security)
     return joined(found, passed())
@@ -107,8 +109,16 @@ def _own(scene: Scene, security: Security) -> list[Result]:
     return []
 
 
-def _certificate(name: str, path: Path, now: datetime, soon: timedelta) -> Result:
-    fix = f"renew {path} ({name}), then restart the daemon"
+def _renewal(scene: Scene, name: str, path: str) -> str:
+    if scene.fleet.security is None or name != "certificate":
+        return f"renew {path} ({name}), then restart the daemon"
+    return (
+        f"`zsched pki renew {scene.node}` where the fleet's authority is, and bring {scene.node}/{CERTIFICATE} to "
+        f"{scene.fleet.security.folder} here; the daemon looks every 30 s"
+    )
+
+
+def _certificate(name: str, path: Path, now: datetime, soon: timedelta, fix: str) -> Result:
     try:
         content = read_regular(path, MAX_BYTES)
         if "key" in name:

@@ -67,8 +67,8 @@ def take(fleet: Fleet, state: Path, pem: str) -> CommandResult:
     return CommandResult(outcome=CommandOutcome.OK, detail=f"its certificate is renewed {until}")
 
 
-def ends_soon(fleet: Fleet, now: datetime) -> str | None:
-    """What is to be done about a certificate that ends soon; ``None``: nothing.
+def problem(fleet: Fleet, now: datetime) -> str | None:
+    """What is to be done about a certificate that ends soon, has ended or has not begun; ``None``: nothing.
 
     Raises:
         ConfigError: it cannot be read.
@@ -77,6 +77,11 @@ def ends_soon(fleet: Fleet, now: datetime) -> str | None:
         return None
     own = identity_of(fleet, fleet.security)
     day = f"{own.ends:%Y-%m-%d %H:%M} UTC"
+    if now < own.begins:
+        return (
+            f"this node's certificate begins on {own.begins:%Y-%m-%d %H:%M} UTC, so nobody lets it in: set this "
+            f"machine's clock (`timedatectl`), it says {now:%Y-%m-%d %H:%M} UTC"
+        )
     if now < own.ends - SOON:
         return None
     if now <= own.ends:

@@ -31,7 +31,7 @@ from zsched.core.values.model import ScoreForm
 from zsched.core.values.plan import StreamCount
 from zsched.core.values.profile import DeviceSample, Echo, Jobs, LinkSample, LinkSource, WorkerState
 from zsched.core.values.snapshot import SCHEMA, Snapshot
-from zsched.core.values.words import RESTARTING, TAKEN_OUT, WAS_READY
+from zsched.core.values.words import OWN_CERTIFICATE, RESTARTING, TAKEN_OUT, WAS_READY
 from zsched.core.vote.agreement import Agreement
 from zsched_lab.sim.simulator import Simulator
 
@@ -495,6 +495,11 @@ def test_a_node_that_others_do_not_let_in_is_told_that_its_certificate_may_be_ol
     assert not any(invite in one for one in build_snapshot(node, 110.0).problems), "nobody needs a certificate"
     node.fleet = replace(node.fleet, security=Security(folder="/pki"))
     assert invite in build_snapshot(node, 110.0).problems[0]
+    node.set_problem(OWN_CERTIFICATE, "it has not begun: set the clock")
+    told = build_snapshot(node, 110.0).problems
+    assert "certificate: it has not begun: set the clock" in told
+    assert not any(invite in one for one in told), "that would revoke a good key"
+    node.set_problem(OWN_CERTIFICATE, None)
     node.handle(ev.AddressesTried(found=((node.solitude.dialled[0], "refused"),)), 110.0)
     assert not any(invite in one for one in build_snapshot(node, 110.0).problems), "nobody is there at all"
 

@@ -13,7 +13,7 @@ from zsched.config.load import check_bytes
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import CommandOutcome
 from zsched.pki.authority import Authority
-from zsched.runtime.renewal import ends_soon, take
+from zsched.runtime.renewal import problem, take
 from zsched.runtime.secured import digest_of, files_of, renewed_in, require_own
 
 OK, UNCHANGED, INVALID = CommandOutcome.OK, CommandOutcome.UNCHANGED, CommandOutcome.INVALID
@@ -121,18 +121,25 @@ def test_a_state_folder_that_cannot_be_written_is_told(fleet: Fleet, authority: 
 
 
 def test_a_certificate_that_nobody_renews_is_told_of_a_week_before_its_end(fleet: Fleet) -> None:
-    assert ends_soon(fleet, NOW) is None
-    assert ends_soon(fleet, NOW + timedelta(days=12)) is None
-    soon = ends_soon(fleet, NOW + timedelta(days=14)) or ""
+    assert problem(fleet, NOW) is None
+    assert problem(fleet, NOW + timedelta(days=12)) is None
+    soon = problem(fleet, NOW + timedelta(days=14)) or ""
     assert "certificate ends on" in soon
     assert "`zsched pki renew --deliver`" in soon
-    assert ends_soon(replace(fleet, security=None), NOW + timedelta(days=99)) is None
+    assert problem(replace(fleet, security=None), NOW + timedelta(days=99)) is None
 
 
 def test_a_certificate_that_has_ended_is_told_to_be_brought_for_nothing_can_be_sent(fleet: Fleet) -> None:
-    told = ends_soon(fleet, NOW + timedelta(days=21)) or ""
+    told = problem(fleet, NOW + timedelta(days=21)) or ""
     assert "has ended on" in told
     assert "--deliver" not in told
     assert fleet.security is not None
     assert "`zsched pki renew robot1`" in told
     assert f"bring robot1/certificate.pem to {fleet.security.folder} here" in told
+
+
+def test_a_certificate_that_has_not_begun_is_the_clocks_fault(fleet: Fleet) -> None:
+    """The robot's clock began in 1970: its status blamed the key, and the cure for that revoked a good one."""
+    told = problem(fleet, NOW - timedelta(days=400)) or ""
+    assert "so nobody lets it in: set this machine's clock (`timedatectl`)" in told
+    assert "renew" not in told

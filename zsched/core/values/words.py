@@ -28,6 +28,8 @@ _INTENDED = frozenset({"cut", "loop", "retried", "superseded", "thinned", "uncou
 
 NEVER_INITIALISED = "never initialised"
 """First words of the problem that no elector has a state, and no node remembers one."""
+OWN_CERTIFICATE = "certificate"
+"""Source of the problem that this node's own certificate is not valid, or not for long."""
 TAKEN_OUT = "this machine was taken out"
 """Of the problem that the agreed document does not name this node: `zsched leave` puts its files away."""
 WAS_READY = "was ready until "
