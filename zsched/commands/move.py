@@ -6,8 +6,8 @@ Knows: what is watched, and for how long. Does not know: how a move is agreed.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
-from typing import Final
+from collections.abc import Mapping
+from typing import Final, NamedTuple
 
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door
@@ -29,7 +29,7 @@ from zsched.commands.page import span
 from zsched.commands.report import millis
 from zsched.commands.wait import Condition, missing
 from zsched.core.values.struct import Struct
-from zsched.exits import EXIT_OK, EXIT_TIMED_OUT
+from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT
 
 MOVE_SCHEMA: Final = "zsched.move/1"
 GAP_S: Final = 3.0
@@ -86,8 +86,8 @@ def move(view: OrderView, order: MoveOrder) -> int:
     watch = not order.is_detached
     if watch and not view.is_json:
         say("It is agreed. Ctrl-C ends the watching, not the move.")
-    found, lacks = _watch(view.door, order, int(result["revision"])) if watch else ({}, [])
-    return _tell_move(view, order, str(task["owner"] or ""), result, before, found, lacks)
+    end = _watch(view.door, order, int(result["revision"])) if watch else _End({}, [])
+    return _tell_move(view, order, str(task["owner"] or ""), result, before, end)
 
 
 def _once_it_is_known(door: Door, target: str) -> Json:
@@ -102,31 +102,43 @@ def _once_it_is_known(door: Door, target: str) -> Json:
         time.sleep(PAUSE_S)
 
 
-def _watch(door: Door, order: MoveOrder, revision: int) -> tuple[dict[str, Json], list[str]]:
-    """Every robot's status once the move is over, and what is missing when it is not in time."""
+class _End(NamedTuple):
+    """How a move stands: every robot's status, and what is missing yet."""
+
+    found: dict[str, Json]
+    lacks: list[str]
+    has_left: bool = False
+    """The task is with another owner since, or with nobody; `lacks` says so."""
+
+
+def _watch(door: Door, order: MoveOrder, revision: int) -> _End:
+    """How the move stands once it is over, or the time is."""
     began, settled_at = monotonic_s(), None
     while True:
-        found, lacks = _look(door, order, revision)
+        end = _look(door, order, revision)
         now = monotonic_s()
-        settled_at = (settled_at or now) if not lacks else None
-        is_measured = settled_at is not None and (not unmeasured(found, order.task) or now - settled_at >= GAP_S)
-        if is_measured or now - began >= order.timeout_s:
-            return found, lacks
+        settled_at = (settled_at or now) if not end.lacks else None
+        is_measured = settled_at is not None and (not unmeasured(end.found, order.task) or now - settled_at >= GAP_S)
+        if is_measured or end.has_left or now - began >= order.timeout_s:
+            return end
         time.sleep(PAUSE_S)
 
 
-def _look(door: Door, order: MoveOrder, revision: int) -> tuple[dict[str, Json], list[str]]:
-    """The robots' statuses, and what is missing yet; a node that does not answer now is asked again."""
+def _look(door: Door, order: MoveOrder, revision: int) -> _End:
+    """How the move stands; a node that does not answer now is asked again."""
     try:
         first = status_of(door)
     except CliError as error:
-        return {}, [str(error)]
+        return _End({}, [str(error)])
     found, silent = _robots(door, first)
     lacks = missing(Condition(kind="settled", task=order.task), {str(first["node"]): first, **found})
     task = told_task(first, order.task)
     if task and task["revision"] < revision:
         lacks.append(f"{order.task}: {first['node']} has not learnt revision {revision}")
-    return found, [*lacks, *silent.values()]
+    elif task and task["owner"] != order.node:
+        owner = f"{task['owner'] or 'nobody'} owns it (epoch {task['epoch']})"
+        return _End(found, [f"{order.task}: {owner}; `zsched history` tells why"], has_left=True)
+    return _End(found, [*lacks, *silent.values()])
 
 
 def unmeasured(statuses: Mapping[str, Json], name: str) -> list[str]:
@@ -154,9 +166,9 @@ def _tell_move(
     left: str,
     result: Json,
     before: Mapping[str, Json],
-    found: Mapping[str, Json],
-    lacks: Sequence[str],
+    end: _End,
 ) -> int:
+    found, lacks = end.found, end.lacks
     tasks = [task for status in found.values() for task in status["tasks"] if task["name"] == order.task]
     switched = [task["switched_s"] for task in tasks if task.get("switched_s") is not None]
     switched_s = max(switched, default=None)
@@ -168,6 +180,10 @@ def _tell_move(
         body |= {"revision": result["revision"], "settled": bool(found) and not lacks, "switched_s": switched_s}
         body |= {"gap_s": gap_s}
         print_json({**body, **losses, "missing": list(lacks)})
+    elif end.has_left:
+        say(f"{order.task}: it was given to {order.node}, and has left it again")
+        for lack in lacks:
+            say(f"  {lack}", indent=4)
     elif lacks:
         say(f"{order.task}: not settled after {span(order.timeout_s)}")
         for lack in lacks:
@@ -179,4 +195,6 @@ def _tell_move(
         took = "" if switched_s is None else f", streams switched in {millis(switched_s)}"
         took += "" if gap_s is None else f", answers at most {millis(gap_s)} apart"
         say(f"{order.task}: settled on {order.node}{took}{told_losses(losses)}")
+    if end.has_left:
+        return EXIT_FAILED
     return EXIT_TIMED_OUT if lacks else EXIT_OK
