@@ -70,11 +70,15 @@ def hold(view: OrderView, order: HoldOrder, names: Sequence[str], *, is_all: boo
     ]
     body = {"schema": TASK_SCHEMA, "tasks": plans}
     code = begin(view, rows, body, is_change=bool(changing), warning=_warning(order))
-    if code is not None:
+    is_agreed = not changing and not view.is_plan
+    if code is not None and not (order.is_waiting and is_agreed):
         return code
     results = {name: _give_hold(view, order, known[name]) for name in changing}
     after = {str(task["name"]): task for task in status_of(view.door)["tasks"]}
-    lacks = _wait_known(view, results) if order.is_waiting else []
+    # what an earlier order has agreed may be unknown somewhere, too
+    revisions = {name: int(results.get(name, known[name])["revision"]) for name in chosen}
+    agreed = {name: revisions[name] for name in chosen if results.get(name, {}).get("outcome", "ok") == "ok"}
+    lacks = _wait_known(view, agreed) if order.is_waiting else []
     late = EXIT_TIMED_OUT if lacks else EXIT_OK
     if view.is_json:
         # one that was taken out of the document meanwhile is told as it was
@@ -89,9 +93,8 @@ def hold(view: OrderView, order: HoldOrder, names: Sequence[str], *, is_all: boo
     return max(code, late)
 
 
-def _wait_known(view: OrderView, results: Mapping[str, Json]) -> list[str]:
+def _wait_known(view: OrderView, revisions: Mapping[str, int]) -> list[str]:
     """Wait until every node that is alive has learnt what was agreed; what is missing when that takes too long."""
-    revisions = {name: int(one["revision"]) for name, one in results.items() if one["outcome"] == "ok"}
     began = monotonic_s()
     while True:
         lacks = _not_known(view.door, revisions)

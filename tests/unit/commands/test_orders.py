@@ -185,9 +185,13 @@ def test_a_pause_that_some_node_never_learns_says_which(daemon: Daemon, monkeypa
 
     daemon.answers = answer
     monkeypatch.setattr("zsched.commands.hold.KNOWN_S", 0.1)
-    result = run("pause", "echo", "--wait", "--yes")
-    assert result.exit_code == 5
-    assert result.stdout.splitlines()[-1] == "  edge2 has not learnt revision 8 of echo"
+    for _ in range(2):  # given again it changes nothing, and edge2 still has not learnt it
+        result = run("pause", "echo", "--wait", "--yes")
+        assert result.exit_code == 5, result.output
+        assert result.stdout.splitlines()[-1] == "  edge2 has not learnt revision 8 of echo"
+    assert len(daemon.orders) == 1
+    told = json.loads(run("pause", "echo", "--wait", "--yes", "--json").stdout)
+    assert told["missing"] == ["edge2 has not learnt revision 8 of echo"]
 
 
 def test_a_task_that_is_taken_out_right_after_its_pause_is_told_as_it_was(daemon: Daemon) -> None:
@@ -323,6 +327,28 @@ def test_a_move_of_a_task_that_is_taken_out_meanwhile_says_so(daemon: Daemon) ->
     daemon.answers = answer
     late = run("move", "echo", "edge2", "--yes", "--timeout", "0")
     assert (late.exit_code, "  echo: robot1 does not know it" in late.stdout) == (5, True), late.output
+
+
+def test_a_move_that_its_task_has_left_again_is_no_success(daemon: Daemon) -> None:
+    """The new owner's worker died on its first load; the move was told as settled, with another owner's streams."""
+
+    def answer(request: Json) -> Json:
+        told = Daemon.answer(daemon, request)
+        if request["verb"] != "status" or not daemon.orders:
+            return told
+        left = {**told["tasks"][0], "owner": "edge1", "epoch": 9, "revision": told["tasks"][0]["revision"] + 1}
+        return {**told, "tasks": [left, *told["tasks"][1:]]}
+
+    daemon.answers = answer
+    result = run("move", "echo", "edge2", "--yes")
+    assert result.exit_code == 1, result.output
+    assert result.stdout.splitlines()[-2:] == [
+        "echo: it was given to edge2, and has left it again",
+        "  echo: edge1 owns it (epoch 9); `zsched history` tells why",
+    ]
+    daemon.orders.clear()
+    body = json.loads(run("move", "echo", "edge2", "--yes", "--json").stdout)
+    assert (faults(body), body["settled"], len(body["missing"])) == ([], False, 1)
 
 
 def test_a_move_that_does_not_settle_in_time_exits_with_5(daemon: Daemon) -> None:
