@@ -132,6 +132,19 @@ def test_what_alerts_say_by_a_label_is_kept_by_their_expression() -> None:
         assert kept is None or used <= kept, rule["alert"]
 
 
+def test_what_is_taken_over_several_nodes_stays_within_a_fleet() -> None:
+    """Of two halls with a task of one name it was said for ever that its owners differ."""
+    outer = [re.match(r"(?:max|sum|count) by \(([^)]*)\)", rule["expr"]) for rule in rules()]
+    kept = [{label.strip() for label in one[1].split(",")} for one in outer if one is not None]
+    assert len(kept) > 5
+    assert all(labels & {"instance", "fleet"} for labels in kept)
+
+
+def test_a_node_that_was_never_heard_is_told_as_one_that_is_gone() -> None:
+    (rule,) = [rule for rule in rules() if rule["alert"] == "ZschedNodeGone"]
+    assert 'state=~"gone|unknown"' in rule["expr"]
+
+
 def test_a_legend_says_all_that_grafanas_schema_asks_for() -> None:
     """As `tests/live/grafana_schema.py` found, by the types that Grafana writes itself by."""
     legends = [panel["options"]["legend"] for panel in dashboard()["panels"] if "legend" in panel["options"]]
@@ -174,6 +187,11 @@ def test_grafana_finds_the_dashboard_and_its_source() -> None:
 
 SERIES = {
     'zsched_quorum_ok{instance="robot1"}': "1x2 0x30",
+    'zsched_info{fleet="hall-a", node="robot1", instance="robot1"}': "1x40",
+    'zsched_info{fleet="hall-b", node="robot9", instance="robot9"}': "1x40",
+    'zsched_task_owner{task="echo", node="edge2", instance="robot9"}': "1x40",
+    'zsched_node_state{node="edge3", state="unknown", instance="robot1"}': "1x40",
+    'zsched_events_total{event="dropped_beat_seal", instance="robot1"}': "_x5 37x35",
     'zsched_task_owner{task="echo", node="edge1", instance="robot1"}': "1x2 0x30",
     'zsched_task_owner{task="echo", node="edge2", instance="robot1"}': "0x2 0x30",
     'zsched_task_owner{task="detect", node="edge2", instance="robot1"}': "1x40",
@@ -190,12 +208,30 @@ def test_promtool_takes_the_rules_and_alerts_fire_by_them(tmp_path: Path) -> Non
         }
         for name, labels, notes in (
             ("ZschedNoQuorum", {"instance": "robot1"}, expected("ZschedNoQuorum", instance="robot1")),
-            ("ZschedTaskWithoutOwner", {"task": "echo"}, expected("ZschedTaskWithoutOwner", task="echo")),
+            (
+                "ZschedTaskWithoutOwner",
+                {"task": "echo", "fleet": "hall-a"},
+                expected("ZschedTaskWithoutOwner", task="echo", fleet="hall-a"),
+            ),
+        )
+    ]
+    fired += [
+        {
+            "eval_time": "180s",
+            "alertname": name,
+            "exp_alerts": [
+                {"exp_labels": {"severity": "warning", **labels}, "exp_annotations": expected(name, **labels)}
+            ],
+        }
+        for name, labels in (
+            ("ZschedNodeGone", {"fleet": "hall-a", "node": "edge3"}),
+            ("ZschedFramesDropped", {"instance": "robot1", "event": "dropped_beat_seal"}),
         )
     ]
     quiet: list[dict[str, Any]] = [
         {"eval_time": "10s", "alertname": name, "exp_alerts": []} for name in ("ZschedNoQuorum", "ZschedDown")
     ]
+    quiet.append({"eval_time": "60s", "alertname": "ZschedOwnersDiffer", "exp_alerts": []})
     series = [{"series": name, "values": values} for name, values in SERIES.items()]
     body = {
         "rule_files": [str(RULES)],
