@@ -58,7 +58,11 @@ class Feed:
         try:
             door = self.door()
             status = ask_status(door)
-            return News(at=at, status=status, entries=self._entries(door))
+            try:
+                return News(at=at, status=status, entries=self._entries(door))
+            except CliError as error:  # a log that cannot be read hides no status
+                problems = [*status.get("problems", ()), f"no events are shown: {error}"]
+                return News(at=at, status={**status, "problems": problems})
         except CliError as error:
             return News(at=at, status=None, why=str(error), code=error.code)
         except ConfigError as error:  # this machine's certificate is gone, or wrong; it may come back
