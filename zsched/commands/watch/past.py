@@ -50,7 +50,7 @@ class Past:
 
     def take(self, news: News) -> None:
         """Keep what is new."""
-        self._now = max(news.at, self._now)
+        self._now = news.at
         self.why = news.why
         for entry in news.entries:
             self.events.append(entry)
@@ -65,6 +65,8 @@ class Past:
                 continue
             kept = self.points.setdefault(task["name"], deque(maxlen=POINTS))
             judged_at = news.at - decision["age_s"]
+            if kept and kept[-1].at - judged_at > SAME_S:
+                kept.clear()  # this machine's clock was set back: what is newer than now would hide what is told now
             if not kept or judged_at - kept[-1].at > SAME_S:
                 kept.append(Point(at=judged_at, owner=task["owner"], totals=dict(decision["aggregates"])))
 

@@ -286,6 +286,35 @@ def test_the_feed_reads_on_in_the_log_and_waits_for_a_daemon_that_is_away(tmp_pa
     assert "no daemon answers" in third.why
 
 
+def test_a_log_that_cannot_be_read_hides_no_status(tmp_path: Path) -> None:
+    """A worn SD card: `zsched web` said that no daemon answers, and a critical alert with it."""
+
+    def answer(request: dict[str, Any]) -> dict[str, Any]:
+        return recorded() if request["verb"] == "status" else {"error": "OSError: [Errno 5] Input/output error"}
+
+    daemon = OperatorSocket(tmp_path / "robot1.sock", answer)
+    daemon.open()
+    try:
+        news = Feed(lambda: Door(socket=tmp_path / "robot1.sock")).ask()
+    finally:
+        daemon.close()
+    assert news.status is not None
+    assert (news.why, news.entries) == ("", ())
+    assert "no events are shown: " in news.status["problems"][-1]
+    assert "Input/output error" in news.status["problems"][-1]
+
+
+def test_a_clock_that_is_set_back_hides_nothing_that_is_told_from_then_on() -> None:
+    past, status = past_of(), recorded()
+    newest = past.points["echo"][-1].at
+    for task in status["tasks"]:
+        task["decision"]["age_s"] = 0.1
+        task["decision"]["aggregates"] = {"edge1": 0.125}
+    past.take(News(at=newest - 3600, status=status))
+    assert past.points["echo"][-1].totals == {"edge1": 0.125}
+    assert len(past.points["echo"]) == 1
+
+
 def test_a_certificate_that_goes_is_told_as_a_daemon_that_is_away() -> None:
     def find() -> Door:
         raise ConfigError("/etc/zsched/pki/certificate.pem: No such file or directory")

@@ -285,6 +285,7 @@ const takers = {
     state.now = body;
     for (const [task, point] of Object.entries(body.points)) {
       const kept = (state.points[task] = state.points[task] || []);
+      if (kept.length && kept[kept.length - 1].at - point.at > 0.1) kept.length = 0; // the clock there was set back
       if (!kept.length || point.at > kept[kept.length - 1].at + 0.1) kept.push(point);
       while (kept.length > KEPT_S) kept.shift();
     }
