@@ -199,6 +199,7 @@ def _next(plan: Recovery, value: FleetValue) -> str:
     lines = [f"{value.recovered_by} is the only elector of generation {named}", "next: start this daemon"]
     if others:
         lines.append(f"then on each of {', '.join(others)}: stop zsched, `zsched rejoin {named}`, start it")
+        lines.append("for each of them that is lost for good: `zsched node forget NODE` here")
     if plan.document.is_auto:
         lines.append("electors are added by themselves once those nodes are back (`zsched fleet show`)")
     elif others:

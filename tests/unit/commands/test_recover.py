@@ -177,10 +177,11 @@ def test_off_a_terminal_it_takes_yes_and_at_one_the_answer_counts(
     assert value.learnt is not None
     assert (value.learnt.electorate.names, value.learnt.recovered_by) == (("robot1",), "robot1")
     named = value.learnt.generation_id[:8]
-    assert captured.out.splitlines()[-4:] == [
+    assert captured.out.splitlines()[-5:] == [
         f"robot1 is the only elector of generation {named}",
         "next: start this daemon",
         f"then on each of robot2, robot3: stop zsched, `zsched rejoin {named}`, start it",
+        "for each of them that is lost for good: `zsched node forget NODE` here",
         "electors are added by themselves once those nodes are back (`zsched fleet show`)",
     ]
 
