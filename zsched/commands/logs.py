@@ -90,12 +90,15 @@ def show_logs(view: LogsView, task: str, whose: str | None) -> int:
     door = find_door(view.runtime_dir, view.node, connect=view.connect)
     node = worker_node(ask_door(door, {"verb": "status"}), task, whose)
     asked = door.to(node)
-    lines, after = _all_lines(asked, task, 0)
-    lines = sieve.of(lines)
+    kept, after = _all_lines(asked, task, 0)
+    lines = sieve.of(kept)
     _print(view, node, task, lines[len(lines) - min(view.most, len(lines)) :])
     if not lines:
         least = "" if view.level is None else f" at {view.level} or above"
-        warn(f"the worker of {task} on {node} has printed nothing{least} since the daemon there started")
+        since = "since the daemon there started"
+        if kept and kept[0]["number"] > 1:
+            since = f"in the {len(kept)} lines that its daemon keeps; older ones are in the journal there"
+        warn(f"the worker of {task} on {node} has printed nothing{least} {since}")
     try:
         while view.is_followed:
             time.sleep(PAUSE_S)

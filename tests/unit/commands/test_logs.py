@@ -41,6 +41,16 @@ def test_logs_shows_the_owner_s_lines_page_after_page(daemon: Daemon) -> None:
     assert ([faults(body) for body in bodies], {body["node"] for body in bodies}) == ([[], [], []], {"edge2"})
 
 
+def test_an_error_that_is_kept_no_more_is_not_said_never_to_have_been_printed(daemon: Daemon) -> None:
+    daemon.lines = [{**line, "number": line["number"] + 100} for line in printed("[INFO] one", "[INFO] two")]
+    result = run("logs", "echo", "--level", "error")
+    told = (
+        "printed nothing at error or above in the 2 lines that its daemon keeps; older ones are in the journal there\n"
+    )
+    assert (result.exit_code, result.stdout) == (0, "")
+    assert result.stderr == f"the worker of echo on edge1 has {told}"
+
+
 def test_logs_of_a_worker_that_has_printed_nothing_says_so(daemon: Daemon) -> None:
     daemon.lines = []
     result = run("logs", "echo")
