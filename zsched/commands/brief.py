@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from zsched.commands.page import DROPS_OVER_S, Cell, Page, clock_time, missed_of, span
+from zsched.commands.page import DROPS_OVER_S, Cell, Page, clock_time, missed_of, name_room, short_name, span
 from zsched.commands.report import (
     STATE_STYLES,
     flag_rows,
@@ -43,13 +43,12 @@ def task_rows(page: Page, status: Json, at: float | None) -> None:
     if not tasks:
         page.row((TITLES[0], page.indent - 1, "stage"), (NO_TASK, page.width, "dim"))
         return
-    task_room = min(max([10, *(len(task["name"]) for task in tasks)]), 20)
-    names = [len(task["owner"] or "nobody") + len(_marks(task)) for task in tasks]
-    owner_room = min(max([6, *names]), 20)
+    task_room = name_room(page.width, 10, *(len(task["name"]) for task in tasks))
+    owner_room = name_room(page.width, 6, *(len(task["owner"] or "nobody") + len(_marks(task)) for task in tasks))
     columns = (task_room, owner_room, 8, 15 if at is not None else 6, 9, -7, -7, page.width)
     page.row(*((t, w, "dim" if i else "stage") for i, (t, w) in enumerate(zip(TITLES, columns, strict=True))))
     for task in tasks:
-        cells = _cells(task, at)
+        cells = _cells(task, at, task_room, owner_room)
         page.row(*((text, wide, style) for (text, style), wide in zip(cells, columns, strict=True)))
 
 
@@ -61,13 +60,13 @@ def _pin_rows(page: Page, status: Json) -> None:
             page.row((text, page.width, "yellow"))
 
 
-def _cells(task: Json, at: float | None) -> list[Cell]:
-    owner, since_s, state = task["owner"], task["since_s"], task["owner_state"]
+def _cells(task: Json, at: float | None, task_room: int, owner_room: int) -> list[Cell]:
+    marks, owner, since_s, state = _marks(task), task["owner"], task["since_s"], task["owner_state"]
     since = span(since_s) + ("" if at is None or since_s is None else f" {clock_time(at - since_s, at)}")
     missed, is_new = _missed(task)
     return [
-        (task["name"], "bold"),
-        ((owner or "nobody") + _marks(task), "bold" if owner else "red"),
+        (short_name(task["name"], task_room), "bold"),
+        (short_name(owner or "nobody", owner_room - len(marks)) + marks, "bold" if owner else "red"),
         (state, STATE_STYLES.get(state, "red")),
         (since, ""),
         (str(task["phase"]), "" if task["phase"] in ("idle", "settled") else "yellow"),

@@ -17,7 +17,7 @@ from datetime import UTC, datetime
 from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, print_json, warn
 from zsched.commands.history import age_s_of, is_known, is_move, wall_text, when_of, where_of
-from zsched.commands.page import Cell, Page, memory, span
+from zsched.commands.page import Cell, Page, memory, name_room, short_name, span
 from zsched.commands.report import printable
 from zsched.commands.weight_words import shares
 from zsched.core.values.struct import Struct
@@ -315,13 +315,13 @@ def _seen(page: Page, body: Json) -> None:
         page.block("HEARS", *_heard(sight))
     elif not sight["is_heard"]:
         page.row((f"{body['node']} has no utilities of {robot}: its answer did not come in time", page.width, "yellow"))
-    first = min(max([9, *(len(one["node"]) for one in body["candidates"])]), 20)
+    first = name_room(page.width, 9, *(len(one["node"]) for one in body["candidates"]))
     columns = (first, -7, -7, -7, -8, page.width)
     page.row(*zip(("CANDIDATE", "cpu", "mem", "net", "utility", ""), columns, ("stage", *["dim"] * 5), strict=True))
     for one in body["candidates"]:
         view = next((view for view in one["robots"] if view["robot"] == robot), None)
         if view is None:
-            page.row((one["node"], first, ""), ("-", -7, "dim"))
+            page.row((short_name(one["node"], first), first, ""), ("-", -7, "dim"))
             continue
         terms = [_number(view[term]) for term in ("cpu", "memory", "network", "utility")]
         note = view["refused"] or ("" if view["reachable"] else f"{robot} does not reach it")
@@ -329,7 +329,10 @@ def _seen(page: Page, body: Json) -> None:
         note, style = (note, "red") if note else ("highest" if is_best else "", "green")
         page.row(
             *zip(
-                (one["node"], *terms, note), columns, ("bold" if one["is_owner"] else "", *[""] * 4, style), strict=True
+                (short_name(one["node"], first), *terms, note),
+                columns,
+                ("bold" if one["is_owner"] else "", *[""] * 4, style),
+                strict=True,
             )
         )
     page.block(
@@ -414,18 +417,18 @@ def _vote(page: Page, body: Json) -> None:
 
 def _candidates(page: Page, body: Json) -> None:
     robots = [view["robot"] for one in body["candidates"] for view in one["robots"]]
-    first = min(max([9, *map(len, robots), *(len(one["node"]) for one in body["candidates"])]), 20)
+    first = name_room(page.width, 9, *map(len, robots), *(len(one["node"]) for one in body["candidates"]))
     gauges = [name for name in shares(body["tuning"]["weights"]) if name not in PAPER_METRICS]
     columns = (first, first, -7, -7, -7, *(-max(len(name), 7) for name in gauges), -8, page.width)
     titles = ("CANDIDATE", "robot", "cpu", "mem", "net", *gauges, "utility", "")
     page.row(*zip(titles, columns, ("stage", *["dim"] * (len(columns) - 1)), strict=True))
     for one in body["candidates"]:
         for number, view in enumerate(one["robots"]):
-            name = "" if number else one["node"]
+            name = "" if number else short_name(one["node"], first)
             note = view["refused"] or ("" if view["reachable"] else "does not reach it")
             terms = [_number(view[term]) for term in PAPER_METRICS]
             terms += [_number(view["gauges"].get(gauge)) for gauge in gauges]
-            cells = (name, view["robot"], *terms, _number(view["utility"]), note)
+            cells = (name, short_name(view["robot"], first), *terms, _number(view["utility"]), note)
             styles = ("bold" if one["is_owner"] else "", *[""] * (len(columns) - 2), "red")
             page.row(*zip(cells, columns, styles, strict=True))
         if not one["robots"]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import textwrap
 import time
-from typing import Any, TypeAlias
+from typing import Any, Final, TypeAlias
 
 from zsched.core.values.words import missed
 
@@ -15,6 +15,9 @@ STYLES = {"bold": "1", "dim": "2", "red": "31", "green": "32", "yellow": "33", "
 
 DROPS_OVER_S = 60.0
 """Drops that have not risen for this long are over."""
+
+NAME_ROOM: Final = 20
+"""Columns that a name may take on a page of 100."""
 
 Cell: TypeAlias = tuple[str, str]
 """A text and its style ("" for none)."""
@@ -75,6 +78,20 @@ class Page:
 def counted(number: int, noun: str) -> str:
     """``1 message``, ``2 messages``."""
     return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def name_room(page: int, least: int, *lengths: int) -> int:
+    """Columns for the longest of some names (characters each) on a page: 20 of 100 or fewer, more of a wider one."""
+    return min(max(least, *lengths), max(NAME_ROOM, page - 80))
+
+
+def short_name(name: str, width: int) -> str:
+    """A name in at most ``width`` characters: of a long one the end is kept, for by that names of a fleet differ.
+
+    >>> short_name("warehouse-north-robot-07", 12)
+    '…th-robot-07'
+    """
+    return name if len(name) <= width else f"…{name[len(name) - width + 1 :]}"
 
 
 def cut(text: str, width: int) -> str:

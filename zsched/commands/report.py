@@ -9,7 +9,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Final
 
-from zsched.commands.page import Cell, Page, cut, memory, missed_of, none_for, since_drop, size, span
+from zsched.commands.page import (
+    Cell,
+    Page,
+    cut,
+    memory,
+    missed_of,
+    name_room,
+    none_for,
+    short_name,
+    since_drop,
+    size,
+    span,
+)
 from zsched.commands.weight_words import shares
 from zsched.core.values.gauges import BY_NAME
 from zsched.core.values.words import NEVER_INITIALISED, RESTARTING, WAS_READY, has_lost_its_worker, told_of_worker
@@ -141,7 +153,7 @@ def _electors(page: Page, quorum: Json) -> None:
 def node_rows(page: Page, status: Json, title: str) -> None:
     """A line per node."""
     nodes: list[Json] = status["nodes"]
-    name = min(max([page.indent - 1, *(len(node["name"]) + 1 for node in nodes)]), 20)
+    name = name_room(page.width, page.indent - 1, *(len(node["name"]) + 1 for node in nodes))
     is_wide = page.width >= 96
     bar = 8 if is_wide else 4
     is_timed = is_wide and any(node.get("speed") is not None for node in nodes)
@@ -152,7 +164,7 @@ def node_rows(page: Page, status: Json, title: str) -> None:
     room = page.width - sum(abs(width) + 1 for width in columns[:-1])
     for node in nodes:
         workers = _workers(node["workers"], room, is_single=len(status["tasks"]) == 1)
-        texts = [*_node_cells(node, bar, is_me=node["name"] == status["node"], is_wide=is_wide), workers]
+        texts = [*_node_cells(node, bar, name, is_me=node["name"] == status["node"], is_wide=is_wide), workers]
         if node["state"] in ("gone", "unknown"):  # its last figures are no news
             texts = [(text, style if index == 2 else "dim") for index, (text, style) in enumerate(texts)]
         page.row(*((text, width, style) for (text, style), width in zip(texts, columns, strict=True)))
@@ -197,14 +209,14 @@ def _reading(gauge: str, value: float) -> str:
     return BY_NAME[gauge].shown(value) if gauge in BY_NAME else f"{value:g}"
 
 
-def _node_cells(node: Json, bar: int, *, is_me: bool, is_wide: bool) -> list[tuple[str, str]]:
+def _node_cells(node: Json, bar: int, room: int, *, is_me: bool, is_wide: bool) -> list[tuple[str, str]]:
     state = state_word(node)
     cpu, cores = node["cpu_ratio"], node["cpu_cores"]
     level = "" if cpu is None else "red" if cpu >= FULL else "yellow" if cpu >= BUSY else "green"
     filled = 0 if cpu is None else round(cpu * bar)
     is_tight = node["memory_ratio"] is not None and node["memory_ratio"] >= FULL
     return [
-        (node["name"] + ("*" if is_me else ""), "bold" if is_me else ""),
+        (short_name(node["name"], room - is_me) + "*" * is_me, "bold" if is_me else ""),
         (node["kind"], ""),
         (state, STATE_STYLES.get(state, "red")),
         (span(node["age_s"]), ""),
@@ -423,7 +435,7 @@ def _candidates(page: Page, task: Json, decision: Json) -> None:
     names = sorted({*task["candidates"], *joint}, key=lambda name: (-joint.get(name, -1.0), name))
     if not names:
         return
-    first = min(max([9, *map(len, names)]), 20)
+    first = name_room(page.width, 9, *map(len, names))
     widths = [max(len(voter), 5) for voter in voters]
     room = page.width - page.indent - first - 7 - 3 * 6 - 11  # joint, three terms, a short note
     while widths and sum(widths) + len(widths) > room:
@@ -436,9 +448,11 @@ def _candidates(page: Page, task: Json, decision: Json) -> None:
     for name in names[:MAX_CANDIDATES]:
         veto = decision["vetoed"].get(name)
         if veto and not any(name in column for column in decision["utilities"].values()):
-            page.row((name, first, "red"), (f"     - {veto}", page.width, "red"), indent=page.indent)
+            told = short_name(name, first)
+            page.row((told, first, "red"), (f"     - {veto}", page.width, "red"), indent=page.indent)
             continue
-        cells = _candidate_cells(name, task, decision, voters[: len(widths)])
+        (_, style), *more_cells = _candidate_cells(name, task, decision, voters[: len(widths)])
+        cells = [(short_name(name, first), style), *more_cells]
         page.row(
             *((text, width, style) for (text, style), width in zip(cells, columns, strict=True)), indent=page.indent
         )

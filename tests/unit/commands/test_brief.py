@@ -120,3 +120,21 @@ def test_the_first_line_tells_the_revision_of_an_agreed_document_only() -> None:
     told = {**status, "document": "ab12" * 8, "fleet_revision": 7}
     assert " · revision 7 · up " in render_brief(told, 120, color=False).splitlines()[0]
     assert "revision" not in render_brief({**told, "document": ""}, 120, color=False).splitlines()[0]
+
+
+def test_long_names_can_be_told_apart_and_keep_their_marks() -> None:
+    """Of twelve robots of one hall one row was red, and no row said which robot it was."""
+    status = recorded("healthy")
+    names = [f"warehouse-north-robot-{number:02}" for number in range(len(status["nodes"]))]
+    for node, name in zip(status["nodes"], names, strict=True):
+        node["name"] = name
+    status["node"] = names[0]
+    status["tasks"][0] |= {"owner": names[1], "pin": {"node": names[1], "by": "ana@lab", "reason": "", "known_s": 3.0}}
+    status["tasks"][0]["pin"] |= {"for_s": None, "is_hard": False}
+    for width, head in ((160, "warehouse"), (80, "…")):
+        rows = render_brief(status, width, color=False).splitlines()
+        first = [row.split()[0] for row in rows[2 : 2 + len(names)]]
+        assert [one.rstrip("*")[-9:] for one in first] == [name[-9:] for name in names]
+        assert all(one.startswith(head) for one in first)
+        assert first[0].endswith("*")
+        assert any("-01 (pin)" in row for row in rows)

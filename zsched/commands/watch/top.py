@@ -14,7 +14,7 @@ from typing import Final
 
 from zsched.commands.brief import task_rows
 from zsched.commands.common import Json
-from zsched.commands.page import Cell, Page, clock_time, cut, missed_of, size, span
+from zsched.commands.page import Cell, Page, clock_time, missed_of, name_room, short_name, size, span
 from zsched.commands.report import header, millis, node_rows, per_second, printable, troubles
 from zsched.commands.watch.past import Past, Point
 from zsched.core.values.struct import Struct
@@ -29,6 +29,8 @@ GAP: Final = 2
 """A judgement stays for this many columns when no other follows it."""
 LEAST_MOVES: Final = 3
 """This many moves are shown before streams are."""
+WAY: Final = 20
+"""Columns of a move's ends."""
 REASON: Final = 45
 """The column of a move's reason."""
 MIN_WIDTH, MIN_HEIGHT = 60, 12
@@ -166,12 +168,13 @@ def _bars(task: Json, points: Sequence[Point], frame: Frame) -> list[str]:
     newest = points[-1].totals
     best = sorted(task["candidates"], key=lambda name: (name != task["owner"], -newest.get(name, -1.0)))
     names = [name for name in task["candidates"] if name in best[:MOST_CANDIDATES]]
-    room = min(max([6, *(len(name) + 1 for name in names)]), 20)
+    room = name_room(frame.width, 6, *(len(name) + 1 for name in names))
     held = _held(points, frame.width - room - 9, frame)
     vetoed = {} if task["decision"] is None else task["decision"]["vetoed"]
     for name in names:
         is_owner = name == task["owner"]
-        label = page.paint(cut(name + "*" * is_owner, room).ljust(room), "bold" if is_owner else "")
+        text = short_name(name, room - is_owner) + "*" * is_owner
+        label = page.paint(text.ljust(room), "bold" if is_owner else "")
         if name in newest:
             page.lines.append(f" {label} {newest[name]:.3f}  {_bar(held, name, page)}")
         else:
@@ -245,13 +248,23 @@ def _moves(past: Past, frame: Frame, *, is_whole: bool = False) -> list[str]:
         return []
     page.row(("MOVES", frame.width, "stage"))
     for move in reversed(moves):
-        where = f"{move['from'] or 'nobody'} -> {move['to'] or 'nobody'}"
+        where = _way(move["from"] or "nobody", move["to"] or "nobody", WAY)
         took = "" if move["switched_s"] is None else f" ({millis(move['switched_s'])})"
-        cells: list[Cell] = [(f"{span(move['age_s'])} ago", ""), (move["task"], "bold"), (where, "")]
+        cells: list[Cell] = [(f"{span(move['age_s'])} ago", ""), (short_name(move["task"], 12), "bold"), (where, "")]
         reason = f"{move['reason']}{took}"
         first, *rest = textwrap.wrap(reason, frame.width - REASON) if is_whole and reason else [reason]
-        widths = (-10, 12, 20, frame.width)
+        widths = (-10, 12, WAY, frame.width)
         page.row(*((text, wide, style) for (text, style), wide in zip([*cells, (first, "dim")], widths, strict=True)))
         for more in rest:
             page.row((more, frame.width, "dim"), indent=REASON)
     return page.lines
+
+
+def _way(left: str, to: str, room: int) -> str:
+    """From whom to whom, both with their end where both have no room.
+
+    >>> _way("edge1", "edge2", 20), _way("hall-north-edge1", "hall-north-edge2", 20)
+    ('edge1 -> edge2', '…h-edge1 -> …h-edge2')
+    """
+    way, half = f"{left} -> {to}", (room - 4) // 2
+    return way if len(way) <= room else f"{short_name(left, half)} -> {short_name(to, half)}"
