@@ -212,7 +212,8 @@ class Verbs(TyperGroup):
 
 def print_json(body: Mapping[str, Any], *, is_line: bool = False) -> None:
     """One JSON object on stdout: indented for people, or on one line (a stream of them is NDJSON)."""
-    text = json.dumps(body, ensure_ascii=False, indent=None if is_line else 2)
+    is_utf8 = (sys.stdout.encoding or "").lower().replace("-", "") in ("utf8", "")
+    text = json.dumps(body, ensure_ascii=not is_utf8, indent=None if is_line else 2)
     sys.stdout.write(f"{OBEYED.sub(_escaped, text)}\n")
     sys.stdout.flush()
 

@@ -455,7 +455,8 @@ def _write(invitation: Invitation, guest: Guest, file: Path | None) -> None:
     papers = invitation.papers
     text, has_key = encode_invitation(invitation), papers is not None and bool(papers.key)
     if file is None:
-        sys.stdout.write(text)
+        sys.stdout.buffer.write(text.encode())  # a file's text, whatever the terminal's encoding is
+        sys.stdout.buffer.flush()
     else:
         _write_private(file, text)
     where = "this file" if file is None else str(file)

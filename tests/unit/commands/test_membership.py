@@ -343,6 +343,14 @@ def test_create_refuses_what_is_no_name(tmp_path: Path) -> None:
 # --- invite ----------------------------------------------------------------------------------------------------------
 
 
+def test_an_invitation_on_stdout_is_whole_whatever_the_terminal_s_encoding_is(node: Node) -> None:
+    """In a Latin-1 locale a comment's umlaut went out as one byte, and `join` refused the invitation."""
+    node.text = f"# Tür 3\n{node.text}"
+    result = CliRunner(charset="latin-1").invoke(app, ["invite", "robot2", "--address", "192.0.2.12", "--yes"])
+    assert result.exit_code == 0, result.stderr
+    assert decode_invitation(result.stdout_bytes).node == "robot2"
+
+
 def test_an_invited_node_is_agreed_last_in_who_dials_whom_and_its_file_says_all(node: Node) -> None:
     result = run("invite", "robot2", "--address", "192.0.2.12", "--candidate-for", "merge", "--yes", "-m", "more hands")
     assert result.exit_code == 0, result.stderr
