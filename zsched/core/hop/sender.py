@@ -111,6 +111,11 @@ class Sender(Struct, kw_only=True, eq=False):
         self.greeted_at = now
         return self.lowest
 
+    @property
+    def owes(self) -> bool:
+        """Whether something is to be put besides new samples, now or once the receiver is met."""
+        return self.resend_from is not None or self.is_start_due
+
     def take_owed(self) -> Owed:
         """What is to be put now besides new samples; whoever has put it again says so (`resent`)."""
         if not self.may_resend:

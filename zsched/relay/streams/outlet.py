@@ -102,6 +102,10 @@ class Outlet:
         self._epoch = epoch
         self._lock = threading.Lock()
         self._lanes: dict[tuple[str, str], Lane] = {}
+        self._full: dict[int, Lane] = {}
+        """By entity id, lanes that were full when they were last put to or heard of (our lock)..."""
+        self._due: dict[int, Lane] = {}
+        """...and those that something may have to be put again for: no sample, no word looks at all lanes."""
         self._has_put_ends = False
         self.tally = Tally()
         self._handed = 0
@@ -307,8 +311,9 @@ class Outlet:
             return  # what a put waits for now, one more would wait for behind it
         now = monotonic_s()
         with self._lock:
-            late = [lane for lane in self._lanes.values() if lane.look_after(now)]
-        if late or (greetings is not None and greetings.is_waiting):
+            late = {lane.eid: lane for lane in self._lanes.values() if lane.look_after(now)}
+            self._due |= late
+        if late or self._awaits_answers:
             self._queue.kick()
 
     def part(self, *, is_parted: bool) -> None:
@@ -480,6 +485,8 @@ class Outlet:
                 return
             now = monotonic_s()
             ended = lane.note_put(sample, stamp, size, at=now, took_s=now - began)
+            if lane.is_full():
+                self._full[lane.eid] = lane
             if ended is not None:
                 self.tally.take(ended)
                 self.tally.uncounted += 1
@@ -502,11 +509,15 @@ class Outlet:
                 return False
             if greetings.is_waiting and not (greets and greetings.greet(len(self._lanes))):
                 return False
-        main = self._main
-        if main is not None and len(self._lanes) == 1:  # the usual case, asked before every sample
-            return not main.is_full()
+        if not self._full:  # the usual case, asked before every sample
+            return True
         with self._lock:
-            return not any(lane.is_full() for lane in self._lanes.values())
+            self._full = {eid: lane for eid, lane in self._full.items() if lane.is_full()}
+            return not self._full
+
+    @property
+    def _awaits_answers(self) -> bool:
+        return self._greetings is not None and self._greetings.is_waiting
 
     def _look(self) -> None:
         greetings = self._greetings
@@ -516,8 +527,9 @@ class Outlet:
         self._resend()
 
     def _resend(self) -> None:
-        for lane in tuple(self._lanes.values()):
+        while self._due:
             with self._lock:
+                lane = self._due.pop(next(iter(self._due)))
                 owed = lane.take_owed()
             if owed is not NOTHING:
                 self._put_owed(lane, owed)
@@ -544,10 +556,16 @@ class Outlet:
         if is_new and (self._acks is None or not self._acks.has_token(incarnation)):
             return  # a stranger's; or a life that has just begun, which is greeted when its token comes
         with self._lock:
+            was_awaited = self._awaits_answers
             ended = lane.hear(ack, incarnation, now)
             if ended is not None:
                 self.tally.take(ended)
+            if lane.is_full():
+                self._full[lane.eid] = lane
+            if lane.owes:
+                self._due[lane.eid] = lane
             if self._greetings is not None:
                 self._greetings.heard(lane)
-        if self._queue is not None:
+            has_work = was_awaited or self._awaits_answers or self._full or self._due
+        if self._queue is not None and has_work:  # of a hundred keys each says something, and mostly nothing new
             self._queue.kick()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
@@ -16,8 +16,10 @@ from zsched.core.relay_protocol import EndMarker, StreamAck, StreamAcks
 from zsched.core.values.plan import Direction, OnCrash, Route, StreamClass, StreamSettings
 from zsched.ipc.pipe import decode_end
 from zsched.relay.streams import greetings
+from zsched.relay.streams import outlet as outlets
 from zsched.relay.streams.acks import Acks
 from zsched.relay.streams.inputs import InputStream
+from zsched.relay.streams.lanes import Lane
 from zsched.relay.streams.outlet import Outlet
 from zsched.relay.streams.proofs import LeftOpen
 from zsched.wire import codec as wire
@@ -452,3 +454,60 @@ def test_what_ends_between_two_data_sessions_is_counted_once(bench: Bench, on_cr
     count = stream.count()
     assert unaccounted(count) == 0
     assert (count.in_flight or 0) + count.at_most_lost == 5
+
+
+def test_a_full_key_holds_up_the_rest_until_its_receiver_comes_further(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(outlets, "KEPT_SAMPLES", 2)
+    full, other = (Receiver(bench.other, bench.relay, f"edge1/{key}") for key in "ab")
+    outlet = bench.outlet("robot1/*", "edge1/*")
+    first, second = bench.sample("robot1/a"), bench.sample("robot1/b")
+    for sample in (first, second, first):
+        outlet.send(sample)
+    for receiver in (full, other):
+        receiver.greeted()
+        receiver.ack(0)
+    until(lambda: (full.got, other.got) == ([0, 1], [0]), "what may be on its way")
+    for sample in (first, second):
+        outlet.send(sample)
+    settled(outlet, waiting=2, in_flight=3)
+    other.ack(1)
+    settled(outlet, waiting=2, in_flight=2)  # the key that is full has not come further
+    full.ack(2)
+    until(lambda: (full.got, other.got) == ([0, 1, 2], [0, 1]), "the rest, in order")
+    outlet.undeclare()
+
+
+def test_what_one_key_is_told_costs_no_look_at_the_others(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A hundred keys that acknowledge twenty times a second were two hundred thousand looks a second."""
+    receivers = [Receiver(bench.other, bench.relay, f"edge1/{key}") for key in range(20)]
+    outlet = bench.outlet("robot1/*", "edge1/*")
+    samples = [bench.sample(f"robot1/{key}") for key in range(20)]
+    for sample in samples:
+        outlet.send(sample)
+    for receiver in receivers:
+        receiver.greeted()
+        receiver.ack(0)
+    until(lambda: all(receiver.got == [0] for receiver in receivers), "all of them")
+    for receiver in receivers:
+        receiver.ack(1)
+    settled(outlet, acknowledged=20, in_flight=0)
+    looks: list[Lane] = []
+    for name in ("take_owed", "is_full"):
+        monkeypatch.setattr(Lane, name, _noted(looks, getattr(Lane, name)))
+    for number in range(1, 11):
+        outlet.send(samples[0])
+        until(lambda: receivers[0].got == list(range(number + 1)), "one more of the first key")  # noqa: B023
+        receivers[0].ack(number + 1)
+        until(lambda: outlet.counted().acknowledged == 20 + number, "its acknowledgement")  # noqa: B023
+    assert {lane.key for lane in looks} <= {"edge1/0"}
+    outlet.undeclare()
+
+
+def _noted(looks: list[Lane], method: Callable[[Lane], Any]) -> Callable[[Lane], Any]:
+    def noting(lane: Lane) -> Any:
+        looks.append(lane)
+        return method(lane)
+
+    return noting
