@@ -78,11 +78,14 @@ class KeptLane(Struct, kw_only=True, eq=False):
     """{relay: the publisher of what it alone is sent again}; there while that is owed, or a relay is looked for."""
     is_closed: bool = False
     """Nothing more is put."""
+    is_awake: bool = True
+    """The keeper looks after it: of thousands of keys most are at rest."""
 
     def keep(self, answer: Answer, stamp: Any, size: int) -> int:
         """Keep what is about to be put; answers its number."""
         with self.lock:
             number = self.state.note_put(answer, stamp, size, monotonic_s())
+            self.is_awake = True
         if not self.wake.is_set():
             self.wake.set()
         return number
@@ -91,11 +94,18 @@ class KeptLane(Struct, kw_only=True, eq=False):
         """The end marker was put behind the last answer."""
         with self.lock:
             self.state.note_end(marker, monotonic_s())
+            self.is_awake = True
         self.wake.set()
+
+    def close(self) -> None:
+        """Nothing more is put: once its answers have arrived, the keeper forgets it."""
+        with self.lock:
+            self.is_closed = self.is_awake = True
 
     def settled(self, name: str, now: float, /) -> int:
         """`SharedSender.settled`."""
         with self.lock:
+            self.is_awake = True  # an input waits: who is expected has to be looked for
             return self.state.settled(name, now)
 
     # --- the keeper's thread -----------------------------------------------------------------------------------------
@@ -105,6 +115,7 @@ class KeptLane(Struct, kw_only=True, eq=False):
         with self.lock:
             before, spoken_for = self.state.crowded_out, self.state.contradicted
             self.state.hear(relay, node, ack, now)
+            self.is_awake = True
             is_first = before < self.state.crowded_out == 1
             is_contradicted = spoken_for < self.state.contradicted == 1
         if is_contradicted:
@@ -137,9 +148,11 @@ class KeptLane(Struct, kw_only=True, eq=False):
                 self.state.decide(relay, now, is_there=is_there)
 
     def next_deadline(self, now: float) -> float | None:
-        """When to look after it again; ``None``: there is nothing left to do."""
+        """When to look after it again; ``None``: there is nothing left to do, and it is at rest."""
         with self.lock:
-            return self.state.next_deadline(now)
+            deadline = self.state.next_deadline(now)
+            self.is_awake = deadline is not None
+            return deadline
 
     def give_up(self) -> None:
         """Nobody looks after it any more."""
@@ -325,10 +338,8 @@ class Keeper:
     def _look_after(self) -> float:
         """Answers when to do so again."""
         now = monotonic_s()
-        with self._lock:
-            lanes = tuple(self._lanes.items())
         deadlines = []
-        for eid, lane in lanes:
+        for lane in self._awake():
             lane.look_after(self._session, now)
             self._put_owed(lane)
             lane.close_ways()
@@ -338,7 +349,7 @@ class Keeper:
             elif lane.is_closed:
                 lane.give_up()
                 with self._lock:
-                    self._lanes.pop(eid, None)
+                    self._lanes.pop(lane.source_id.eid, None)
         self._debts.settle(now)
         if self._debts.is_waiting:
             deadlines.append(now + TICK_S)
@@ -349,9 +360,11 @@ class Keeper:
         return min(deadlines, default=now + TICK_S)
 
     def _has_work(self, now: float) -> bool:
+        return self._debts.is_waiting or any(lane.next_deadline(now) is not None for lane in self._awake())
+
+    def _awake(self) -> list[KeptLane]:
         with self._lock:
-            lanes = tuple(self._lanes.values())
-        return self._debts.is_waiting or any(lane.next_deadline(now) is not None for lane in lanes)
+            return [lane for lane in self._lanes.values() if lane.is_awake]
 
     def _put_owed(self, lane: KeptLane) -> None:
         for way, owed, skip in lane.take_owed(self._session):

@@ -178,7 +178,7 @@ class Output:
             gone = self._epochs.pop(old)
             gone.publisher.undeclare()  # type: ignore[no-untyped-call] # zenoh's stubs
             if gone.lane is not None:
-                gone.lane.is_closed = True
+                gone.lane.close()
         return stamped
 
     def _put(self, stamped: _Stamped, given: PutArguments) -> None:

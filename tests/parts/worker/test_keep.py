@@ -384,3 +384,42 @@ def test_the_keeper_does_not_rest_over_what_came_while_it_lay_down(bench: Bench,
     keeper._wake.set()
     keeper._look_after()
     assert keeper._wake.is_set()
+
+
+def test_a_lane_at_rest_is_looked_after_again_once_it_has_something_to_do(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ten times a second the keeper looked at every key that the worker had ever answered on."""
+    monkeypatch.setattr(shared, "NEWCOMERS_S", 0.0)
+    keeper = bench.keeper
+    keeper._subscriber = cast("Any", object())  # no thread: the test is the keeper
+    other = bench.worker.declare_publisher("edge1/t/1/other")
+    resting, busy = keeper.lane(KEY, bench.publisher.id, 100), keeper.lane("edge1/t/1/other", other.id, 100)
+    looks: list[KeptLane] = []
+    monkeypatch.setattr(KeptLane, "look_after", lambda lane, _session, _now: looks.append(lane))
+
+    def looked_at() -> list[KeptLane]:
+        looks.clear()
+        keeper._look_after()
+        return list(looks)
+
+    keep(resting, 0)
+    keep(busy, 0)
+    assert looked_at() == [resting, busy]
+    resting.hear("aa1", "robot1", StreamAck(eid=bench.eid, first=0, arrived=1, processed=1), monotonic_s())
+    assert looked_at() == [resting, busy], "once more, to see that nothing is left"
+    assert looked_at() == [busy]
+    keep(resting, 1)
+    assert looked_at() == [resting, busy]
+    resting.hear("aa1", "robot1", StreamAck(eid=bench.eid, first=0, arrived=2, processed=2), monotonic_s())
+    looked_at()
+    resting.settled("aa2", monotonic_s())  # an input waits for a robot that has said nothing
+    assert looked_at() == [resting, busy]
+    resting.note_end(EndMarker(epoch=1, count=2))
+    assert looked_at() == [resting, busy]
+    resting.hear("aa1", "robot1", StreamAck(eid=bench.eid, first=0, arrived=2, processed=2, is_ended=True), 0.0)
+    looked_at()
+    resting.close()
+    assert looked_at() == [resting, busy]
+    resting.close()
+    assert looked_at() == [busy], "it is forgotten"
