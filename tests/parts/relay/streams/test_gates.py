@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from datetime import timedelta
 from functools import partial
 from typing import Any
 
@@ -572,6 +573,27 @@ def test_a_new_owners_answer_to_an_older_value_never_follows_a_newer_one(bench: 
     stream.close_slot(1)
     until(lambda: got == ["old 1", "new 1", "new 3"], f"{got}")
     assert drops(stream) == {"superseded": 2}
+    kept.undeclare()
+
+
+def test_answers_to_robots_with_other_clocks_hold_up_each_other_in_no_move(bench: Bench) -> None:
+    """One task's only output, robot2's clock an hour behind: its answers were superseded for 2 s after each move."""
+    got: list[str] = []
+    kept = bench.outside.declare_subscriber("robot1/out", lambda s: got.append(s.payload.to_string()))
+    routes = [way_out(epoch, HandoverRule.LATEST, StreamClass.LATEST) for epoch in (1, 2)]
+    stream = bench.output(routes[0])
+    for epoch, route in enumerate(routes, start=1):
+        stream.open(epoch, route)
+    old, new = (bench.publisher(route.from_expr) for route in routes)
+    ahead, hour = bench.relay.new_timestamp(), timedelta(hours=1)
+    behind = zenoh.Timestamp(ahead.get_time() - hour, bench.outside.new_timestamp().get_id())
+    stream.flip(1, drops_held=False)
+    old.put("robot1", timestamp=ahead)
+    until(lambda: stream.count().messages == 1, "the old owner's")
+    stream.flip(2, drops_held=False)
+    new.put("robot2", timestamp=behind)
+    until(lambda: got == ["robot1", "robot2"], f"{got}")
+    assert drops(stream) == {}
     kept.undeclare()
 
 
