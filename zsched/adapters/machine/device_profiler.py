@@ -1,9 +1,10 @@
 """Measures this machine, or the control group it stands for, and the load of each worker's process tree.
 
-CPU in use is a difference, so the first sample has none. Without a quota it is taken from the CPUs this process may run
-on: everything but idle and iowait (a CPU that waits for a disk can run a task; one that the hypervisor stole cannot).
-Under a quota the machine *is* the group that holds the smallest quota: its cores, its own accounting. Memory in use is
-total - MemAvailable, or under a limit the group's working set, or what the machine has left if that is less.
+CPU in use is a difference, so the first sample has none, and the first one on other CPUs. Without a quota it is taken
+from the CPUs this process may run on: everything but idle and iowait (a CPU that waits for a disk can run a task; one
+that the hypervisor stole cannot). Under a quota the machine *is* the group that holds the smallest quota: its cores,
+its own accounting. Memory in use is total - MemAvailable, or under a limit the group's working set, or what the machine
+has left if that is less.
 
 A worker's load is its whole process tree. CPU: the difference of user and system time, children that were waited for
 included, so short-lived ones count. How long its threads have run and waited to run (schedstat) tells what it wants
@@ -120,7 +121,8 @@ class DeviceProfiler:
         self._has_all_cpus = False
         self._cpu_quota: CpuQuota | None = None
         self._memory_quota: MemoryQuota | None = None
-        self._usage: tuple[float, float] | None = None
+        self._usage: tuple[float, float, int | None] | None = None
+        """Seconds in use, seconds of the clock that goes with them, and of how many CPUs (``None``: of a group)."""
         self._stalled: tuple[float, float] | None = None
         self._pressure: float | None = None
         self._used_cores: float | None = None
@@ -181,7 +183,7 @@ class DeviceProfiler:
         self._memory_quota = tree.memory_quota()
         quota, status = tree.cpu_quota(), read_file(f"{self._proc}/{self._pid}/status").decode(errors="replace")
         _, _, allowed = status.partition("Cpus_allowed_list:")
-        self._allowed = parse_cpu_list(allowed.partition("\n")[0]) or None
+        before, self._allowed = self._allowed, parse_cpu_list(allowed.partition("\n")[0]) or None
         stat = read_file(f"{self._proc}/stat")
         times, every = parse_cpu_stat(stat, self._allowed), parse_cpu_stat(stat, None)
         self._has_all_cpus = times is not None and every is not None and times.cpus == every.cpus
@@ -189,6 +191,8 @@ class DeviceProfiler:
             quota = None  # wider than the machine: no limit
         if quota != self._cpu_quota:
             self._usage = self._stalled = None  # another account: its difference to the old one means nothing
+        elif quota is None and self._allowed != before:
+            self._usage = None  # so are the sums of other CPUs
         self._cpu_quota = quota
 
     def _capacity(self, times: CpuTimes | None) -> float:
@@ -198,21 +202,23 @@ class DeviceProfiler:
 
     def _cpu_used(self, times: CpuTimes | None, now: float) -> float | None:
         if self._cpu_quota is not None:
-            used_s, clock_s, scale = self._cpu_quota.used_s(), now, 1.0
+            used_s, clock_s, scale, cpus = self._cpu_quota.used_s(), now, 1.0, None
         elif times is not None:  # the kernel's own ticks are the clock: no jitter between two reads
-            used_s, clock_s, scale = times.busy_s, times.total_s, float(times.cpus)
+            used_s, clock_s, scale, cpus = times.busy_s, times.total_s, float(times.cpus), times.cpus
         else:
             used_s = None
         if used_s is None:
             self._usage = self._used_cores = None
             return None
-        if self._usage is None:
-            self._usage, self._used_cores = (used_s, clock_s), None
+        new = (used_s, clock_s, cpus)
+        # A CPU that leaves or comes takes all its ticks since boot along.
+        if self._usage is None or self._usage[2] != cpus or clock_s < self._usage[1]:
+            self._usage, self._used_cores = new, None
             return None
         elapsed_s = clock_s - self._usage[1]
         if elapsed_s >= MIN_INTERVAL_S:
             self._used_cores = max(0.0, scale * (used_s - self._usage[0]) / elapsed_s)
-            self._usage = (used_s, clock_s)
+            self._usage = new
         return self._used_cores
 
     def _memory(self) -> tuple[float, float | None]:

@@ -79,6 +79,35 @@ def test_only_allowed_cpus_count(tmp_path: Path) -> None:
     assert profiler.sample({}).cpu_used_cores == pytest.approx(0.5)
 
 
+def test_cpu_in_use_is_measured_on_when_a_cpu_leaves_or_comes(tmp_path: Path) -> None:
+    """Its ticks since boot leave or come with it."""
+    profiler = machine(tmp_path)
+    profiler.sample({})
+    write(tmp_path, {"proc/stat": stat("100 0 0 200 0 0 0 0 0 0", "150 0 0 150 0 0 0 0 0 0")})
+    assert profiler.sample({}).cpu_used_cores == pytest.approx(0.5)
+    write(tmp_path, {"proc/stat": stat("110 0 0 200 0 0 0 0 0 0")})
+    assert profiler.sample({}).cpu_used_cores is None, "sums of other CPUs tell no difference"
+    write(tmp_path, {"proc/stat": stat("160 0 0 200 0 0 0 0 0 0")})
+    sample = profiler.sample({})
+    assert (sample.cpu_cores, sample.cpu_used_cores) == (1.0, pytest.approx(1.0))
+    write(tmp_path, {"proc/stat": stat("170 0 0 200 0 0 0 0 0 0", "150 0 0 150 0 0 0 0 0 0")})
+    assert profiler.sample({}).cpu_used_cores is None
+    write(tmp_path, {"proc/stat": stat("180 0 0 200 0 0 0 0 0 0", "150 0 0 160 0 0 0 0 0 0")})
+    assert profiler.sample({}).cpu_used_cores == pytest.approx(1.0)
+
+
+def test_cpu_in_use_is_measured_anew_on_other_cpus_of_the_same_number(tmp_path: Path, clock: Clock) -> None:
+    allowed = "Name:\tx\nCpus_allowed_list:\t{}\nMems_allowed:\t1\n"
+    profiler = machine(tmp_path, **{"proc/self/status": allowed.format(0)})
+    profiler.sample({})
+    clock.now += device_profiler.LIMITS_EVERY_S
+    cpus = ("200 0 0 100 0 0 0 0 0 0", "100 0 0 900 0 0 0 0 0 0")
+    write(tmp_path, {"proc/self/status": allowed.format(1), "proc/stat": stat(*cpus)})
+    assert profiler.sample({}).cpu_used_cores is None
+    write(tmp_path, {"proc/stat": stat(cpus[0], "150 0 0 950 0 0 0 0 0 0")})
+    assert profiler.sample({}).cpu_used_cores == pytest.approx(0.5)
+
+
 def test_quota_makes_the_group_the_machine(tmp_path: Path, clock: Clock) -> None:
     files = {
         "proc/self/mountinfo": V2,
