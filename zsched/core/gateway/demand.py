@@ -79,6 +79,8 @@ class _Known(Struct, frozen=True):
     job: JobNeed | None = None
     is_job_old: bool = False
     """The job is a worker's that is to start again, by a changed recipe."""
+    is_changed: bool = False
+    """The file has named another program since then; the owner may still run the one before."""
     owner: NodeId | None = None
     since: float = 0.0
     """When it was first looked at there."""
@@ -135,6 +137,20 @@ class Demands:
         """Know nothing of a task that is no more: one of the same name that comes later is another one (0043)."""
         self._known.pop(task, None)
         self._shortfalls = {key: seen for key, seen in self._shortfalls.items() if key[0] != task}
+
+    def expect_another(self, task: TaskId) -> None:
+        """Know nothing of a task whose program the file has changed; what its owner's one still shows counts for now.
+
+        A recipe that changes otherwise (the session) starts the same program again.
+        """
+        self.forget(task)
+        self._known[task] = _Known(is_changed=True)
+
+    def is_replaced(self, task: TaskId, profile: Profile) -> bool:
+        """Whether the owner's worker was seen to run by the recipe before, and now is ready by the changed one."""
+        known, load = self._known.get(task, _Known()), profile.worker(task)
+        is_ready = load is not None and load.state is WorkerState.READY and load.renewal is Renewal.NONE
+        return is_ready and known.is_changed and known.is_job_old
 
     def _note_shortfall(self, task: TaskId, profile: Profile, load: WorkerLoad, found: _Known) -> bool:
         """Remember that the task gets less on a machine than forecast, or no longer does; whether that has changed."""

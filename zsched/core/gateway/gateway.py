@@ -86,6 +86,8 @@ class Gateway:
             known[0].speed for name in self._candidates.get(task, ()) if (known := self._profiles.get(name)) is not None
         ]
         fastest = max((speed for speed in speeds if speed is not None), default=None)
+        if self.demands.is_replaced(task, profile):
+            self.forget(task)
         news = self.demands.learn(task, profile, now, fastest), self._shares.learn(task, profile)
         self.version += any(news)
 
@@ -94,6 +96,11 @@ class Gateway:
         self.demands.forget(task)
         self._shares.forget(task)
         self.version += 1
+
+    def expect_another(self, task: TaskId) -> None:
+        """The file names another program for the task: its need and share are the owner's worker's until that is it."""
+        self.forget(task)
+        self.demands.expect_another(task)
 
     def demand(self, spec: TaskSpec, profile: Profile) -> Demand:
         """The task's demand on the node of ``profile``."""

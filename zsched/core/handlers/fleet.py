@@ -153,9 +153,10 @@ def _runs_another_program(before: WorkerSpec, after: WorkerSpec) -> bool:
 def _learn_anew(node: Stages, value: Allocation, now: float) -> None:
     """Know what the worker needs that the task's owner still runs, and nothing where it has none.
 
-    A worker that was made smaller because no candidate had room for it is never placed by what it needed before.
+    A worker that was made smaller because no candidate had room for it is never placed by what it needed before. When
+    the owner runs the changed one, its need is learnt from nothing.
     """
-    node.gateway.forget(value.task)
+    node.gateway.expect_another(value.task)
     if value.owner is not None:
         node.gateway.learn_demand(value.task, value.owner, now)
 

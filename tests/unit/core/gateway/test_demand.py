@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from support.fleets import task_of
+from support.fleets import fleet_of, task_of
 from support.profiles import load_of, profile_of
 from zsched.core.gateway.demand import QUEUE_RATIO, SETTLE_S, SHORT_RATIO, STARVED_CPU_RATIO, UNSURE, Demands, is_short
+from zsched.core.gateway.gateway import Gateway
 from zsched.core.values.fleet import Demand
 from zsched.core.values.profile import Jobs, Profile, Renewal, WorkerLoad, WorkerState
 
@@ -333,6 +334,37 @@ def test_the_job_of_a_worker_that_was_replaced_bounds_no_worker_that_tells_none(
     demands.learn("merge", after, 5 * EVERY_S)
     demands.learn("merge", after, 6 * EVERY_S)
     assert demands.job("merge") is not None, "nothing has changed it since: a worker without work tells none"
+
+
+@pytest.mark.parametrize("is_moved", [True, False])
+@pytest.mark.parametrize("is_changed", [True, False])
+def test_a_changed_program_is_not_held_to_what_the_one_before_needed_and_lacked(
+    *, is_moved: bool, is_changed: bool
+) -> None:
+    """On a machine without free CPU its use alone would never lower the need.
+
+    A recipe that changes otherwise starts the same program again.
+    """
+    fleet = fleet_of(TASK, of=("edge1", "edge2", "robot1"), electors=("robot1",))
+    heavy, pinned = profile(2.0, 600.0, cpu=3.0), told(9.0, got=0.5, used=2.0)
+    light = profile(0.5, 200.0, node="edge2" if is_moved else "edge1", cpu=4.0, wanted=3.0)
+    found = []
+    for before in (heavy, pinned):
+        gateway = Gateway(fleet)
+        due = replace(before, workers=tuple(replace(load, renewal=Renewal.DUE) for load in before.workers))
+        starting = replace(before, workers=(load_of(state=WorkerState.STARTING),))
+        for number, one in enumerate((before, before, due, due, starting, light)):
+            assert gateway.absorb(replace(one, sequence=number), number * EVERY_S) is None
+            gateway.learn_demand("merge", one.node, number * EVERY_S)
+            if number == 0 and is_changed:
+                gateway.expect_another("merge")
+            if number == 3:
+                found.append((gateway.demand(TASK, before).cpu_cores, gateway.demands.experience("merge", before)))
+        found.append((gateway.demand(TASK, before).cpu_cores, gateway.demands.experience("merge", before)))
+    needs, lacks = [need for need, _ in found], [lack for _, lack in found]
+    assert needs[:2] == [2.0, UNSURE * 0.5 if is_changed else 2.0]
+    assert lacks[2] != (1.0, 1.0), "what runs until then is the one before"
+    assert lacks[3] == ((1.0, 1.0) if is_changed else lacks[2])
 
 
 def test_a_job_without_cpu_time_bounds_nothing() -> None:

@@ -302,6 +302,9 @@ def test_a_changed_worker_needs_what_its_owner_s_one_does_and_nothing_where_ther
     assert need_mb() == 20_000.0, "it is the same program"
     adopt(node, fleet_of(replace(task, worker=worker)))
     assert need_mb() == (20_000.0 if owner else 0.0)
+    due = replace(large, workers=(load_of(memory_mb=20_000.0, renewal=Renewal.DUE),))
+    node.gateway.demands.learn("merge", due, START + 1)
+    assert node.gateway.demands.is_replaced("merge", large), "the next one that is ready is the changed one"
 
 
 def test_a_task_that_comes_back_has_the_first_owner_that_it_had() -> None:
