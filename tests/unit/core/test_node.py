@@ -20,10 +20,12 @@ from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.electorate.strangers import SHOWN_S
 from zsched.core.executor.sparing import Sparing
+from zsched.core.handlers.work import carry_out
 from zsched.core.membership.identity import QUIET_S
 from zsched.core.membership.knocking import KNOCKERS_KEPT, SHOWN_AFTER_S
 from zsched.core.node import Node
 from zsched.core.status import build_snapshot
+from zsched.core.todo import ToDo
 from zsched.core.values.beat import Beat
 from zsched.core.values.document import Text
 from zsched.core.values.durable import DurableState
@@ -824,6 +826,42 @@ def test_profiles_with_other_figures_are_no_news() -> None:
     node = started()
     (told,) = of(node.handle(ev.ProfileSampled(device=replace(SAMPLE, cpu_used_cores=3.5)), 102.0), do.PublishProfile)
     assert not told.is_news
+
+
+# --- a node that a task has left -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("votes", "is_failure"),
+    [
+        pytest.param({}, False, id="away: the others have moved the task by plan, or not"),
+        pytest.param({"robot1": True}, False, id="away: it would have fled itself"),
+        pytest.param({"robot1": False, "robot2": False}, False, id="a planned move, and then it was gone"),
+        pytest.param({"robot2": True}, True, id="another robot fled"),
+        pytest.param({"robot1": True, "robot2": False}, True, id="it fled itself, and others answered"),
+    ],
+)
+def test_a_node_has_failed_by_a_vote_for_an_escape_and_not_because_this_robot_was_away(
+    votes: dict[str, bool], *, is_failure: bool
+) -> None:
+    """What one robot holds against a node counts with all of them."""
+    node = started(learnt=allocation_of(4, "edge1", 2))
+    while node.membership.state("edge1") is not PeerState.GONE:
+        node.handle(ev.DeadlineReached(), node.next_deadline())
+    now = node.next_deadline()
+    for voter, is_escape in votes.items():
+        paper = proposal_of(voter, "edge2", base_revision=4, is_escape=is_escape)
+        node.votes.tasks["merge"].absorb(paper, node.values()["merge"], now)
+    node.handle(learnt_from("robot3", allocation_of(5, "edge2", 3)), now)
+    assert set(node.rounds.tasks["merge"].damping.penalties(now)) == ({"edge1"} if is_failure else set())
+
+
+def test_who_has_committed_an_escape_remembers_the_failure() -> None:
+    node = started(learnt=allocation_of(4, "edge1", 2))
+    while node.membership.state("edge1") is not PeerState.GONE:
+        node.handle(ev.DeadlineReached(), node.next_deadline())
+    carry_out(node, allocation_of(5, "edge2", 3), "edge1 is gone", ToDo(), node.next_deadline())
+    assert set(node.rounds.tasks["merge"].damping.penalties(node.next_deadline())) == {"edge1"}
 
 
 # --- an operator who has mended something ----------------------------------------------------------------------------

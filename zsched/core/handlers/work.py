@@ -17,7 +17,7 @@ from zsched.core.stages import Handler, PastValue, Stages, Unready
 from zsched.core.todo import ToDo
 from zsched.core.values.decision import Move
 from zsched.core.values.electorate import CREATION_STEP
-from zsched.core.values.model import Allocation, NodeId, PeerState, TaskId, Weights, told_by
+from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, Weights, told_by
 from zsched.core.values.plan import StreamCount
 from zsched.core.values.profile import WorkerState
 
@@ -33,7 +33,7 @@ def carry_out(node: Stages, value: Allocation, reason: str, todo: ToDo, now: flo
     ``is_known``: the value was there before this node's executor was, so it is no change of owner.
     """
     task, executor = value.task, node.executors[value.task]
-    is_new_epoch = value.epoch > executor.epoch
+    is_new_epoch, is_ours = value.epoch > executor.epoch, reason != FROM_A_PEER
     if _is_first_news(executor.epoch, value, reason):
         is_known, reason = True, FIRST_NEWS
     move = _move_of(node, value, reason, is_known=is_known) if is_new_epoch and value.owner is not None else None
@@ -41,7 +41,7 @@ def carry_out(node: Stages, value: Allocation, reason: str, todo: ToDo, now: flo
     node.history[task].append(PastValue(value=value, at=now, reason=reason))
     if is_new_epoch:
         left = executor.owner
-        failed, drained = _has_failed(node, task, left, now), node.was_draining(left, now)
+        failed, drained = _has_failed(node, value, left, now, is_ours=is_ours), node.was_draining(left, now)
         is_ordered = value.asked is not None or left in node.flags.drained
         node.rounds.on_moved(task, left, has_failed=failed, was_draining=drained, is_ordered=is_ordered, now=now)
     node.expiry.note(value, now)
@@ -73,8 +73,7 @@ def _move_of(node: Stages, value: Allocation, reason: str, *, is_known: bool) ->
 
     A robot that did not commit it itself tells the reason of one that wanted it.
     """
-    heard = [proposal for _, (proposal, _) in sorted(node.votes.tasks[value.task].proposals.items())]
-    votes = [proposal for proposal in heard if proposal.base_revision == value.revision - 1]
+    votes = _votes(node, value)
     wanted = [proposal.reason for proposal in votes if proposal.candidate == value.owner and proposal.reason]
     return Move(
         epoch=value.epoch,
@@ -85,6 +84,12 @@ def _move_of(node: Stages, value: Allocation, reason: str, *, is_known: bool) ->
         votes=tuple((proposal.voter, proposal.candidate) for proposal in votes),
         is_known=is_known,
     )
+
+
+def _votes(node: Stages, value: Allocation) -> list[Proposal]:
+    """What this node has heard and proposed in the vote that led to a value, sorted by voter."""
+    heard = [proposal for _, (proposal, _) in sorted(node.votes.tasks[value.task].proposals.items())]
+    return [proposal for proposal in heard if proposal.base_revision == value.revision - 1]
 
 
 def _reason_of(value: Allocation, reason: str, *, is_new_epoch: bool) -> str:
@@ -101,14 +106,23 @@ def _reason_of(value: Allocation, reason: str, *, is_new_epoch: bool) -> str:
     return f"changed by {who}"
 
 
-def _has_failed(node: Stages, task: TaskId, owner: NodeId | None, now: float) -> bool:
-    """Whether the task fled from this owner: the owner is not there, or its worker has failed."""
-    if owner is None or owner == node.me:
+def _has_failed(node: Stages, value: Allocation, left: NodeId | None, now: float, *, is_ours: bool) -> bool:
+    """Whether the task fled from the owner that it left: that one is not there, or its worker has failed.
+
+    A node that is cut off misses everybody, so what it sees counts with a vote that it has taken part in. Of a move
+    behind its back it knows nothing; those who made it remember (`UtilityVector.penalties`). ``is_ours``: this node has
+    committed the value.
+    """
+    if left is None or left == node.me:
         return False
-    if node.membership.state(owner) in (PeerState.SUSPECT, PeerState.GONE):
+    votes = _votes(node, value)
+    is_escape, has_met = any(one.is_escape for one in votes), any(one.voter != node.me for one in votes)
+    if not is_ours and not (is_escape and has_met):
+        return False
+    if node.membership.state(left) in (PeerState.SUSPECT, PeerState.GONE):
         return True
-    profile = node.gateway.fresh(owner, now)
-    return profile is not None and task in failed_workers(profile)
+    profile = node.gateway.fresh(left, now)
+    return profile is not None and value.task in failed_workers(profile)
 
 
 def _told(weights: Weights) -> str:
