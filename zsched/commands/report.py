@@ -385,10 +385,17 @@ def _work(page: Page, status: Json, task: Json) -> None:
         parts += [(f"{jobs['backlog']} wait", "yellow")] if jobs["backlog"] else []
         if deadline_ms is not None:
             late = jobs.get("late_ratio")
-            told_late = "" if late is None else f", {late:.0%} late"
+            told_late = "" if late is None else f", {late:.0%} {_late_by(task)}"
             age = "" if jobs.get("age_s") is None else f"{millis(jobs['age_s'])} from input to end, "
             parts.append((f"{age}deadline {deadline_ms:g} ms{told_late}", "yellow" if late and late > 1 - MOST else ""))
         page.block("" if number else "JOBS", *parts)
+
+
+def _late_by(task: Json) -> str:
+    """The word for late jobs. A worker counts by the file's deadline, which it was started with, not by a tuned one."""
+    deadline_ms = (task.get("file_tuning") or task["tuning"]).get("deadline_ms")
+    is_tuned = deadline_ms is not None and deadline_ms != task["tuning"].get("deadline_ms")
+    return f"later than {deadline_ms:g} ms" if is_tuned else "late"
 
 
 def millis(seconds: float) -> str:

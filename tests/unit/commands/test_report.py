@@ -509,6 +509,9 @@ def test_what_a_worker_says_of_its_jobs_is_shown_with_the_deadline_and_what_miss
     text = render_status(status, 160, color=False)
     assert "410 ms from input to end, deadline 100 ms, 95% late" in text
     assert "· deadline 100 ms" in text
+    for file_ms, late in ((500.0, "95% later than 500 ms"), (100.0, "95% late"), (None, "95% late")):
+        task["file_tuning"] = {**task["tuning"], "deadline_ms": file_ms}
+        assert f"deadline 100 ms, {late}\n" in render_status(status, 160, color=False), "workers count by the file"
     owner["workers"][0]["jobs"] = None
     assert "JOBS" not in render_status(status, 120, color=False), "nothing is told"
 
