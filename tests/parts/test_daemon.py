@@ -329,6 +329,39 @@ def test_work_wakes_a_sampler_at_rest(tmp_path: Path, monkeypatch: pytest.Monkey
     assert not sampler._thread.is_alive(), "and a stop does not wait"
 
 
+def test_work_makes_a_sampler_look_closely_that_never_rests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A robot's: its radio is measured often at all times. Reports of jobs that follow closely wait for their turn."""
+    inbox, shell = Inbox(), SimpleNamespace(crew=SimpleNamespace(supervisor=None, sessions={}))
+    links = (LinkSpec(source=LinkSource.FIXED, peer="b", value="-60"),)
+    robot = replace(spec("a"), links=links)
+    sampler = Sampler(robot, 0.001, tmp_path, shell, inbox, is_watched=False)  # type: ignore[arg-type]
+    idle = DeviceSample(cpu_cores=1.0, cpu_used_cores=0.0, memory_mb=1024.0, memory_used_mb=100.0)
+    steps: list[str] = []
+
+    def sample(_: Any) -> DeviceSample:
+        steps.append("sample")
+        return idle
+
+    def wait_for_samples() -> None:
+        past = len(steps)
+        until(lambda: steps[past:].count("sample") >= 3, "samples")
+
+    monkeypatch.setattr(sampler._device, "sample", sample)
+    monkeypatch.setattr(sampler._device, "look_closely", lambda: steps.append("closely"))
+    monkeypatch.setattr("zsched.runtime.sampler.RESTING_LOOK_S", 3600.0)
+    sampler.start()
+    wait_for_samples()
+    assert "closely" not in steps, "nothing has happened"
+    assert sampler._wait_s == 0.001
+    for _ in range(2):
+        sampler.hurry()
+        wait_for_samples()
+    assert steps.count("closely") == 1
+    monkeypatch.setattr("zsched.runtime.sampler.RESTING_LOOK_S", 0.0)
+    until(lambda: steps.count("closely") == 2, "its turn")
+    sampler.stop()
+
+
 def test_the_sampler_tells_the_node_of_a_slew_and_a_jump(tmp_path: Path) -> None:
     """What is wrong wakes the loop, what is well does not; the readings are ours, the watch and its judgement real."""
     inbox, shell = Inbox(), SimpleNamespace(crew=SimpleNamespace(supervisor=None, sessions={}))

@@ -6,11 +6,12 @@ Knows: which reader there is for what, how often. Does not know: what a reading 
 from __future__ import annotations
 
 import logging
+import math
 import threading
 from pathlib import Path
 
 from zsched.adapters.machine import core_speed
-from zsched.adapters.machine.device_profiler import DeviceProfiler
+from zsched.adapters.machine.device_profiler import RESTING_LOOK_S, DeviceProfiler
 from zsched.adapters.machine.gauges import GaugeWatch
 from zsched.adapters.radio.network_profiler import readers_for
 from zsched.clock import ClockWatch, monotonic_s
@@ -53,6 +54,10 @@ class Sampler:
         self._pace, self._is_watched = Sampling(period_s=period_s), is_watched
         self._wait_s = period_s
         self._stop, self._wake = threading.Event(), threading.Event()
+        self._has_work = threading.Event()
+        """Work has come since the workers' threads and children were last looked at for that..."""
+        self._looked_at = -math.inf
+        """...and when they were."""
         self._problems: dict[str, str | None] = {}
         self._thread = guarded(self._run, name="zsched-sampler")
 
@@ -62,7 +67,8 @@ class Sampler:
         self._thread.start()
 
     def hurry(self) -> None:
-        """Something happens here that a sample may show: measure often again; from any thread."""
+        """Something happens here that a sample may show: measure often again, and closely; from any thread."""
+        self._has_work.set()
         if self._wait_s > self._pace.period_s:
             self._wake.set()
 
@@ -84,6 +90,7 @@ class Sampler:
         while not self._stop.is_set():
             try:
                 self._compare_clocks()
+                self._look_closely(monotonic_s())
                 self._sample()
             except Exception as error:
                 log.exception("sample_failed")
@@ -93,7 +100,16 @@ class Sampler:
             if self._wake.wait(self._wait_s):
                 self._wake.clear()
                 self._pace.hurry(monotonic_s())
-                self._device.look_closely()
+
+    def _look_closely(self, now: float) -> None:
+        """Let the next sample find a child that a worker at rest has started, for it would count as others' load.
+
+        Not at each report of jobs: a worker that does a little speaks several times a second.
+        """
+        if self._has_work.is_set() and now - self._looked_at >= RESTING_LOOK_S:
+            self._has_work.clear()
+            self._looked_at = now
+            self._device.look_closely()
 
     def _report(self, source: str, problem: str | None) -> None:
         """Report a problem, or its end, when it is news."""
