@@ -13,7 +13,7 @@ from zsched.commands.ask import ask_door
 from zsched.commands.common import CliError, Json, nearest, print_json, say
 from zsched.commands.orders import CODES, OrderView, begin, check_name, check_said, status_of, tell_results
 from zsched.commands.weight_words import NAMES, shares
-from zsched.core.values.fleet import TUNED_LINKS, TUNED_RULES
+from zsched.core.values.fleet import TUNED_LINKS, TUNED_RULES, default_patience
 from zsched.core.values.model import Aggregate, PairReading, Reach, ScoreForm, Tuning, Weights
 from zsched.core.values.struct import replace
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE
@@ -37,6 +37,8 @@ KEYS: Final = (*WEIGHTS, *_NUMBERS, "aggregate", "score", *OF_THE_FILE)
 
 def tuned(before: Json, file: Json, pairs: Sequence[str]) -> dict[str, Any]:
     """A tuning, as JSON values, after ``key=value`` words; ``key=null`` is the file's value.
+
+    A patience that nobody has given goes along with weights and score.
 
     >>> base = {"weights": {"cpu": 0.5, "memory": 0.5, "network": 0.0}, "bonus": 0.1}
     >>> tuned(base, base, ["bonus=0.2"])["bonus"]
@@ -62,7 +64,21 @@ def tuned(before: Json, file: Json, pairs: Sequence[str]) -> dict[str, Any]:
         default = source.get(key, 0.0) if key in WEIGHTS else source.get(key)
         place[key] = default if text == "null" else _setting(pair, key, text)
     after["weights"] = shares(after["weights"])
+    is_untuned = "patience" not in seen and before.get("patience") == _file_patience(before, file)
+    if is_untuned or "patience=null" in pairs:
+        after["patience"] = _file_patience(after, file)
     return after
+
+
+def _file_patience(tuning: Json, file: Json) -> float | None:
+    """The patience under ``tuning`` of a task whose own was not tuned; ``None``: it is learnt."""
+    given: float | None = file.get("patience")
+    return _default_patience(tuning) if given == _default_patience(file) else given
+
+
+def _default_patience(tuning: Json) -> float | None:
+    score = ScoreForm.PAPER if tuning.get("score") == ScoreForm.PAPER else ScoreForm.SERVICE
+    return default_patience(score, shares(tuning["weights"]).get("network", 0.0))
 
 
 def _setting(pair: str, key: str, text: str) -> Any:
@@ -136,7 +152,8 @@ def _checked(after: Json, file: Json) -> Json:
         raise CliError(EXIT_USAGE, f"nu_dbm ({nu:g}) must be below rho_dbm ({rho:g}); nothing was changed")
     if tuning.deadline_ms is not None and tuning.score is ScoreForm.PAPER:
         raise CliError(EXIT_USAGE, "the paper's score knows no deadlines: score=service, or deadline_ms=null")
-    kept: dict[str, Any] = {key: None for key in OF_THE_FILE if after.get(key) == file.get(key)}
+    by_file = {**file, "patience": _file_patience(after, file)}
+    kept: dict[str, Any] = {key: None for key in OF_THE_FILE if after.get(key) == by_file.get(key)}
     body: Json = as_plain(replace(tuning, **kept))
     return body
 
@@ -178,7 +195,9 @@ def _list_tunings(view: OrderView, tasks: Sequence[Json]) -> int:
         print_json({"schema": TUNING_SCHEMA, "tasks": found})
         return EXIT_OK
     for task in tasks:
-        now, file = _flat(task["tuning"]), _flat(_file_tuning(task))
+        by_file = _file_tuning(task)
+        now, file = _flat(task["tuning"]), _flat(by_file)
+        file["patience"] = _file_patience(task["tuning"], by_file)
         words = [
             f"{key}={_figure(key, now.get(key, 0.0))}{_differs(key, now.get(key, 0.0), file.get(key, 0.0))}"
             for key in KEYS

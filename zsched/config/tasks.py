@@ -22,8 +22,6 @@ from zsched.core.values.fleet import (
     DEFAULT_COOL_DOWN_S,
     DEFAULT_FORESEE_S,
     DEFAULT_SCORE,
-    PAPER_PATIENCE,
-    RADIO_PATIENCE,
     TUNED_RULES,
     Demand,
     LinkLimits,
@@ -32,6 +30,7 @@ from zsched.core.values.fleet import (
     StreamRule,
     TaskSpec,
     WorkerSpec,
+    default_patience,
 )
 from zsched.core.values.gauges import BY_NAME
 from zsched.core.values.model import NodeKind, Objective, ScoreForm, Tuning, Weights
@@ -91,6 +90,7 @@ def _task(
     _check_mirrors(given, streams, out)
     scheduling: Section | None = given.get("scheduling")
     more = {} if scheduling is None else _of(scheduling, *_OF_THE_TASK)
+    patience = _patience(scheduling, (tuning or _ANY_TUNING).weights)
     demand: Section | None = given.get("demand")
     gauge_limits: Section | None = given.get("limits")
     task = TaskSpec(
@@ -102,8 +102,8 @@ def _task(
         gauge_limits=() if gauge_limits is None else tuple(sorted(gauge_limits.values.items())),
         worker=worker,
         rules=tuple(stream.value for stream in streams),
-        patience=_patience(scheduling, (tuning or _ANY_TUNING).weights),
-        learns_patience=_learns(scheduling, (tuning or _ANY_TUNING).weights),
+        patience=FIRST_PATIENCE if patience is None else patience,
+        learns_patience=patience is None,
         **_of(given, "on_isolation", "exclusive", "drain_s"),
         **more,
     )
@@ -172,20 +172,14 @@ def _deadline(scheduling: Section, score: ScoreForm, weights: Weights, out: Coll
     return {"deadline_ms": None}
 
 
-def _patience(scheduling: Section | None, weights: Weights) -> float:
-    """As given, or what the task begins with."""
-    if _learns(scheduling, weights):
-        return FIRST_PATIENCE
+def _patience(scheduling: Section | None, weights: Weights) -> float | None:
+    """As given, or the default; ``None``: the task learns it.
+
+    It does not where a radio counts, whose noise costs as much as it (0033).
+    """
     values = {} if scheduling is None else scheduling.values
-    default = PAPER_PATIENCE if _score(scheduling) is ScoreForm.PAPER else RADIO_PATIENCE
-    patience: float = values.get("patience", default)
+    patience: float | None = values.get("patience", default_patience(_score(scheduling), weights.network))
     return patience
-
-
-def _learns(scheduling: Section | None, weights: Weights) -> bool:
-    """Whether the task learns its patience: not where a radio counts, whose noise costs as much as it (0033)."""
-    values = {} if scheduling is None else scheduling.values
-    return "patience" not in values and _score(scheduling) is ScoreForm.SERVICE and not weights.network
 
 
 def _score(scheduling: Section | None) -> ScoreForm:

@@ -61,6 +61,18 @@ SECONDS = Range(0.01, 3600, "s")
 DBM = Range(RSSI_MIN_DBM, RSSI_MAX_DBM, "dBm")
 
 
+def default_patience(score: ScoreForm, network: float) -> float | None:
+    """The patience of a task whose fleet file gives none, in utility seconds; ``None``: it is learnt.
+
+    Args:
+        score: how its machines are scored.
+        network: the weight of its links, in [0, 1].
+    """
+    if score is ScoreForm.PAPER:
+        return PAPER_PATIENCE
+    return RADIO_PATIENCE if network else None
+
+
 class Standby(StrEnum):
     """Whether candidates keep the worker running (warm) or start it on the move (cold)."""
 
@@ -237,7 +249,7 @@ class TaskSpec:
     patience: float = PAPER_PATIENCE
     """Utility seconds that staying may cost before the task moves; 0: none, the first judgement of a lead moves it."""
     learns_patience: bool = False
-    """Its patience is learnt (`zsched.core.scheduler.patience`); ``patience`` is what it begins with."""
+    """Its patience is learnt (`zsched.core.scheduler.patience`), and ``patience`` does not count."""
     on_isolation: OnIsolation = key(OnIsolation.HOLD, "What a robot does that is cut off from the owner.")
     exclusive: bool = key(
         False,
@@ -262,16 +274,26 @@ class TaskSpec:
     def under(self, tuning: Tuning) -> TaskSpec:
         """This task as operators have tuned it: what they have not set is the file's.
 
-        A pair of signals that no link could lie between is left out: another node's file may be the one it fits.
+        A pair of signals that no link could lie between is left out: another node's file may be the one it fits. Where
+        the file's patience is the default one by its own weights and score, the default one by those in force counts.
         """
         own: dict[str, Any] = {name: getattr(tuning, name) for name in TUNED_RULES}
         links: dict[str, Any] = {name: getattr(tuning, name) for name in TUNED_LINKS}
         if tuning.patience is not None:
             own["learns_patience"] = False
+        elif self._has_default_patience:
+            own["patience"] = default_patience(tuning.score, tuning.weights.network)
+            own["learns_patience"] = own["patience"] is None
         limits = replace(self.limits, **{name: value for name, value in links.items() if value is not None})
         if limits.nu_dbm >= limits.rho_dbm:
             limits = replace(limits, nu_dbm=self.limits.nu_dbm, rho_dbm=self.limits.rho_dbm)
         return replace(self, limits=limits, **{name: value for name, value in own.items() if value is not None})
+
+    @property
+    def _has_default_patience(self) -> bool:
+        """The file gives no patience, or the one that the task would have without."""
+        given = None if self.learns_patience else self.patience
+        return given == default_patience(self.tuning.score, self.tuning.weights.network)
 
     def in_force(self, tuning: Tuning) -> Tuning:
         """The tuning with every setting that it leaves to the file; a patience of ``None`` is learnt."""

@@ -7,6 +7,8 @@ import pytest
 
 from support.fleets import tuning_of
 from zsched.core.values.fleet import (
+    PAPER_PATIENCE,
+    RADIO_PATIENCE,
     TUNED_LINKS,
     TUNED_RULES,
     Demand,
@@ -18,11 +20,12 @@ from zsched.core.values.fleet import (
     TaskSpec,
     Timing,
     WorkerSpec,
+    default_patience,
     dial_endpoint,
     electorate_hash,
     fleet_hash,
 )
-from zsched.core.values.model import Aggregate, NodeKind, PairReading, Reach, Weights
+from zsched.core.values.model import Aggregate, NodeKind, PairReading, Reach, ScoreForm, Tuning, Weights
 from zsched.core.values.plan import Direction
 from zsched.core.values.profile import LinkSource
 
@@ -177,6 +180,26 @@ def test_a_tuned_patience_is_not_learnt_and_a_learnt_one_is_told_as_none() -> No
     learning = replace(TASK, learns_patience=True)
     assert learning.in_force(TUNING).patience is None
     assert not learning.under(replace(TUNING, patience=0.7)).learns_patience
+
+
+@pytest.mark.parametrize("file", [(0.0, ScoreForm.SERVICE), (0.2, ScoreForm.SERVICE), (0.0, ScoreForm.PAPER)])
+@pytest.mark.parametrize(
+    ("network", "score", "patience"),
+    [(0.0, "service", None), (0.2, "service", RADIO_PATIENCE), (0.0, "paper", PAPER_PATIENCE), (1.0, "paper", 0.55)],
+)
+def test_a_patience_that_the_file_does_not_give_is_the_one_by_the_weights_and_the_score_in_force(
+    file: tuple[float, ScoreForm], network: float, score: str, patience: float | None
+) -> None:
+    def tuning(weight: float, form: ScoreForm) -> Tuning:
+        return replace(TUNING, weights=Weights(cpu=1.0 - weight, memory=0.0, network=weight), score=form)
+
+    tuned, own = tuning(network, ScoreForm(score)), tuning(*file)
+    given = default_patience(file[1], file[0])
+    task = replace(TASK, tuning=own, patience=0.15 if given is None else given, learns_patience=given is None)
+    assert task.under(own) == task
+    assert task.in_force(tuned).patience == patience
+    assert replace(task, patience=0.7, learns_patience=False).in_force(tuned).patience == 0.7, "the file gives one"
+    assert task.in_force(replace(tuned, patience=0.8)).patience == 0.8
 
 
 def test_ranges_are_those_of_the_file_and_a_signal_that_does_not_fit_the_file_is_left_out() -> None:
