@@ -53,7 +53,7 @@ class JobNeed(Struct, frozen=True):
         return cpu_s / (cpu_s + self.other_s) if self.is_serial and cpu_s > 0.0 else None
 
     def age_s(self, speed: float, free_cores: float) -> float:
-        """Expected seconds from arrival to end on a machine with this many free cores."""
+        """Expected seconds from arrival to end where a job gets this many cores while it runs, at most one."""
         stretch = 1.0 / min(max(free_cores, LEAST_FREE_CORES), 1.0)
         return self.queue_ratio * (self.other_s + stretch * self.work_s / speed)
 
@@ -93,7 +93,9 @@ class Demands:
         self._known: dict[TaskId, _Known] = {}
         self._shortfalls: dict[tuple[TaskId, NodeId], _Shortfall] = {}
 
-    def learn(self, task: TaskId, profile: Profile, now: float, fastest: float | None = None) -> bool:
+    def learn(
+        self, task: TaskId, profile: Profile, now: float, fastest: float | None = None, fair_cores: float = 0.0
+    ) -> bool:
         """Learn the task's need from its owner's profile; whether the need has changed.
 
         With free CPU the use is the need; without, it is a lower bound. For threads that always want to run
@@ -103,7 +105,12 @@ class Demands:
         at once. A worker that is not ready, or a figure without a measurement, changes nothing: a task does not get
         cheaper because its worker restarts.
 
-        ``fastest``: the highest speed among the candidates (``None``: the owner's).
+        Args:
+            task: which one.
+            profile: its owner's.
+            now: monotonic seconds.
+            fastest: the highest speed among the candidates (``None``: the owner's).
+            fair_cores: what a fair scheduler gives the task there while a job runs, >= 0; 0: nobody counts threads.
         """
         load = profile.worker(task)
         if load is None or load.state is not WorkerState.READY or profile.cpu_used_cores is None:
@@ -130,7 +137,7 @@ class Demands:
                 found = replace(found, work=use, is_sure=True)
         found = _with_job(found, load, speed_of(profile), is_new=is_new)
         self._known[task] = found
-        is_seen = not is_new and self._note_shortfall(task, profile, load, found)
+        is_seen = not is_new and self._note_shortfall(task, profile, load, found, fair_cores)
         return is_seen or (found.work, found.memory_mb, found.job) != (known.work, known.memory_mb, known.job)
 
     def forget(self, task: TaskId) -> None:
@@ -152,7 +159,9 @@ class Demands:
         is_ready = load is not None and load.state is WorkerState.READY and load.renewal is Renewal.NONE
         return is_ready and known.is_changed and known.is_job_old
 
-    def _note_shortfall(self, task: TaskId, profile: Profile, load: WorkerLoad, found: _Known) -> bool:
+    def _note_shortfall(
+        self, task: TaskId, profile: Profile, load: WorkerLoad, found: _Known, fair_cores: float
+    ) -> bool:
         """Remember that the task gets less on a machine than forecast, or no longer does; whether that has changed."""
         jobs, job, used = load.jobs, found.job, profile.cpu_used_cores
         if jobs is None or job is None or used is None or load.cpu_cores is None or not found.work:
@@ -164,7 +173,7 @@ class Demands:
         is_lacking = foreseen > 0.0 and _is_told(load) and is_short(load)
         share = min(load.cpu_cores / need / foreseen, 1.0) if is_lacking else 1.0
         age_s = jobs.time_s if jobs.age_s is None else jobs.age_s
-        stretch = max(age_s / max(job.age_s(speed, free), 1e-9), 1.0)
+        stretch = max(age_s / max(job.age_s(speed, max(free, fair_cores)), 1e-9), 1.0)
         before = self._shortfalls.pop((task, profile.node), None)
         if share >= SHORT_RATIO and stretch <= 1.0 / SHORT_RATIO:
             return before is not None

@@ -40,7 +40,7 @@ class Gateway:
         """Take nodes, candidates and the profiles' time to live from ``fleet``; profiles of other nodes go."""
         self._names = frozenset(node.name for node in fleet.nodes)
         self._ttl_s = fleet.timing.profile_ttl_s
-        self._candidates = {task.name: task.candidates for task in fleet.tasks}
+        self._tasks = {task.name: task for task in fleet.tasks}
         for known in (self._profiles, self._tracks):
             for name in [name for name in known if name not in self._names]:
                 del known[name]
@@ -82,14 +82,17 @@ class Gateway:
         profile = self.fresh(owner, now)
         if profile is None:
             return
-        speeds = [
-            known[0].speed for name in self._candidates.get(task, ()) if (known := self._profiles.get(name)) is not None
-        ]
+        spec = self._tasks.get(task)
+        candidates = () if spec is None else spec.candidates
+        speeds = [known[0].speed for name in candidates if (known := self._profiles.get(name)) is not None]
         fastest = max((speed for speed in speeds if speed is not None), default=None)
         if self.demands.is_replaced(task, profile):
             self.forget(task)
-        news = self.demands.learn(task, profile, now, fastest), self._shares.learn(task, profile)
-        self.version += any(news)
+        has_share = self._shares.learn(task, profile)
+        # What a job takes there is compared with what `score` foretells, so by the same share.
+        fair = 0.0 if spec is None else self.share(spec, profile, self.demand(spec, profile).cpu_cores, 0.0)
+        has_need = self.demands.learn(task, profile, now, fastest, fair)
+        self.version += has_need or has_share
 
     def forget(self, task: TaskId) -> None:
         """Know no need and no share of a task that is no more."""

@@ -58,7 +58,8 @@ class Shares:
 
         Args:
             task: which one.
-            profile: of a node that does not have the task.
+            profile: of a node that does not have the task. At its owner the task's own threads count among the
+                others, so the share is a little too small.
             need_cores: of the task there. A task without a known lack of CPU runs this many threads, at least one.
             coming_cores: of other tasks that have just moved there and do not show yet.
         """

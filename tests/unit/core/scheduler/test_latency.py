@@ -30,13 +30,15 @@ def worth(
     speeds: tuple[float, float] = (1.0, 1.0),
     used: tuple[float, float] = (1.0, 1.0),
     away_s: tuple[float | None, float | None] = (0.0, 0.0),
+    runnable: tuple[float | None, float | None] = (None, None),
 ) -> tuple[float, float]:
     """What the owner edge1 and the candidate edge2 are worth, behind the owner's settling."""
     spec = task_of(candidates=EDGES, tuning=tuning, worker=WorkerSpec(command=("x",)), demand=Demand())
     gateway = Gateway(fleet_of(spec, of=(*EDGES, "robot1")))
     for sequence, now in ((1, 0.0), (2, 10.0)):
-        for name, speed, cores in zip(EDGES, speeds, used, strict=True):
-            own = JOBS.done_hz * JOBS.cpu_s if name == "edge1" else 0.0
+        for name, speed, cores, threads in zip(EDGES, speeds, used, runnable, strict=True):
+            told = jobs or JOBS
+            own = told.done_hz * told.cpu_s if name == "edge1" else 0.0
             load = load_of(cpu_cores=own, memory_mb=1.0, jobs=jobs if name == "edge1" else None)
             profile = profile_of(
                 name,
@@ -46,6 +48,7 @@ def worth(
                 memory_used_mb=100.0,
                 workers=(load,),
                 speed=speed,
+                runnable=threads,
             )
             assert gateway.absorb(profile, now) is None
         gateway.learn_demand("merge", "edge1", now)
@@ -81,6 +84,23 @@ def test_a_way_that_nobody_has_measured_counts_nothing() -> None:
 def test_a_candidate_with_nothing_free_stretches_the_job() -> None:
     owner, full = worth(used=(1.0, 3.8))
     assert full < 0.1 < owner
+
+
+SHORT_JOBS = Jobs(time_s=0.025, cpu_s=0.02, wait_s=0.005, age_s=0.025, done_hz=5.0, wanted_hz=5.0)
+"""Beside four endless loops on four cores: the task uses 0.1 cores on the mean, and 0.8 while a job runs."""
+
+
+def test_a_job_on_a_full_machine_runs_at_its_fair_share_however_little_the_task_needs_on_the_mean() -> None:
+    busy, far = worth(jobs=SHORT_JOBS, used=(4.0, 0.1), runnable=(4.1, 0.1), away_s=(0.001, 0.15))
+    assert busy > far
+
+
+def test_a_job_that_takes_longer_than_a_fair_share_lets_expect_is_known_to_be_late_there() -> None:
+    """Groups with weights of their own share differently, and a task with such short jobs lacks no work there."""
+    slow = replace(SHORT_JOBS, time_s=0.15, wait_s=0.13, age_s=0.15)
+    busy, far = worth(jobs=slow, used=(4.0, 0.1), runnable=(4.1, 0.1), away_s=(0.001, 0.05))
+    assert busy < far
+    assert busy < worth(jobs=SHORT_JOBS, used=(4.0, 0.1), runnable=(4.1, 0.1), away_s=(0.001, 0.05))[0] / 3
 
 
 def test_a_job_that_waits_for_a_disk_is_as_late_on_a_faster_machine() -> None:
