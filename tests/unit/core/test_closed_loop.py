@@ -464,6 +464,17 @@ def test_a_task_that_lacks_nothing_stays_where_all_machines_are_full(
     assert Loop(machines, weights=CPU_ONLY, tuning=BY_SERVICE, learns=True).run(90.0) == []
 
 
+@pytest.mark.parametrize("threads", [16.0, 40.0])
+@pytest.mark.parametrize("job_s", [None, 0.02])
+def test_a_small_task_that_lacks_nothing_stays_on_a_large_machine_that_is_full(
+    threads: float, job_s: float | None
+) -> None:
+    """Its fair share of 16 cores is many times its need, as it is of 2."""
+    large = Machine(name="edge1", cores=16.0, base=1.0, threads=threads, task_cores=0.1, job_s=job_s)
+    small = Machine(name="edge2", cores=2.0, base=1.0, threads=2.0, task_cores=0.1, job_s=job_s)
+    assert Loop((large, small), weights=CPU_ONLY, tuning=BY_SERVICE, learns=True).run(90.0) == []
+
+
 @pytest.mark.parametrize("works_until", [60.0, 60.1, 60.3])
 @pytest.mark.parametrize("task_cores", [0.8, 2.5])
 @pytest.mark.parametrize("job_s", [0.02, 0.3, 1.0])

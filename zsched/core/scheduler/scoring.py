@@ -142,7 +142,7 @@ def score(
         # what an owner that is short gets is measured
         is_measured = candidate == allocation.owner and load is not None and is_short(load)
         fair = gateway.share(spec, profile, demand.cpu_cores, unseen.cpu_cores)
-        least = 0.0 if is_measured else min(fair, demand.cpu_cores)
+        least = 0.0 if is_measured else fair
         cpu = _cpu(spec, profile, demand, unseen, allocation.tuning, gateway.demands, network_s, least, fair)
         memory = _memory(spec, profile, demand, unseen, form)
         gauges = _gauges(spec, allocation, profile)
@@ -308,7 +308,7 @@ def _cpu(
 ) -> float | None:
     """Eq. 1, or the share of its jobs that the task would get done, in time where it has a deadline.
 
-    ``least_cores``: it gets at least this on the mean, however full the machine is. ``fair_cores``: a job gets at
+    ``least_cores``: it gets at least this if it needs it, however full the machine is. ``fair_cores``: a job gets at
     least this while it runs. Between its jobs a task uses nothing, so that may be far more than it needs on the mean.
     """
     if profile.cpu_used_cores is None:
@@ -317,15 +317,15 @@ def _cpu(
     used = predicted_use(used_cores, profile.cores_of(spec.name), demand.cpu_cores)
     if tuning.score is ScoreForm.PAPER:
         return cpu_utility(profile.cpu_cores, used)
-    left = profile.cpu_cores - used + demand.cpu_cores
-    free, job = max(left, least_cores), demands.job(spec.name)
+    free, job = profile.cpu_cores - used + demand.cpu_cores, demands.job(spec.name)
     share, stretch = demands.experience(spec.name, profile)
     if job is None:
-        return service_utility(free, demand.cpu_cores, profile.cpu_cores, share=share)
+        return service_utility(free, demand.cpu_cores, profile.cpu_cores, least=least_cores, share=share)
     speed = speed_of(profile)
     if tuning.deadline_ms is not None:
-        share *= on_time(stretch * job.age_s(speed, max(left, fair_cores)) + network_s, tuning.deadline_ms / 1e3)
-    return service_utility(free, demand.cpu_cores, profile.cpu_cores, most=job.most_cores(speed), share=share)
+        share *= on_time(stretch * job.age_s(speed, max(free, fair_cores)) + network_s, tuning.deadline_ms / 1e3)
+    most = job.most_cores(speed)
+    return service_utility(free, demand.cpu_cores, profile.cpu_cores, least=least_cores, most=most, share=share)
 
 
 def _memory(spec: TaskSpec, profile: Profile, demand: Demand, unseen: Demand, form: ScoreForm) -> float | None:

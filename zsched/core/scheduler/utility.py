@@ -71,13 +71,13 @@ def memory_utility(delta: float, theta: float, mu: float) -> float:
 
 
 LEAST_NEED_RATIO = 0.05
-"""A task counts as needing at least this share of a machine: also of a small one more room is better."""
+"""Of what is free a task counts as needing at least this share of a machine: also of a small one more is better."""
 SPARE = 0.05
 """The part of a term that is the machine's free share: enough to place tasks apart, too little to be worth a move."""
 
 
 def service_utility(
-    free: float, demand: float, capacity: float, *, most: float | None = None, share: float = 1.0
+    free: float, demand: float, capacity: float, *, least: float = 0.0, most: float | None = None, share: float = 1.0
 ) -> float:
     """The share of its work that a task would get done, ``min(free / demand, 1)``, and a little for what is left free.
 
@@ -86,6 +86,7 @@ def service_utility(
             the task gets there.
         demand: of the task, in the same unit, >= 0.
         capacity: of the machine, in the same unit, > 0.
+        least: what the task gets there if it needs it, however little is free, in the same unit, >= 0.
         most: what the task can use there at a time, however much is free; ``None``: any amount.
         share: what counts of that share of its work, in [0, 1]: less where it got less than was foreseen, or gets it
             too late (`on_time`).
@@ -94,10 +95,15 @@ def service_utility(
     0.4875
     >>> round(service_utility(free=4.0, demand=2.0, capacity=4.0), 4)
     1.0
+    >>> round(service_utility(free=0.0, demand=0.1, capacity=16.0, least=0.9), 4)
+    0.9503
     >>> round(service_utility(free=4.0, demand=2.0, capacity=4.0, most=1.0), 4)
     0.525
     """
     room = max(free, 0.0) / max(demand, LEAST_NEED_RATIO * capacity)
+    if demand > 0.0:
+        # By the need itself: a small task that gets all that it needs lacks as little on a large machine.
+        room, free = max(room, least / demand), max(free, min(least, demand))
     if most is not None and most < demand:
         room = min(room, most / demand)
     return (1.0 - SPARE) * share * min(room, 1.0) + SPARE * clamp(free / capacity)
