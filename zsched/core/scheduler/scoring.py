@@ -40,7 +40,7 @@ from zsched.core.values.model import (
 )
 from zsched.core.values.profile import Profile, WorkerState
 from zsched.core.values.quorum import majority
-from zsched.core.values.struct import Struct, field
+from zsched.core.values.struct import Struct, field, replace
 
 Bookings = Mapping[NodeId, tuple[TaskSpec, ...]]
 """{owner: its tasks}: of a task that has just come, profiles show nothing yet."""
@@ -147,6 +147,9 @@ def score(
         memory = _memory(spec, profile, demand, unseen, form)
         gauges = _gauges(spec, allocation, profile)
         terms[candidate] = _Terms(cpu, memory, None if link is None else link.utility, gauges)
+    if len(terms) > 1 and all(term.network is None for name, term in terms.items() if name != voter):
+        # A robot always reaches itself: nobody measures that.
+        terms = {name: replace(term, network=None) for name, term in terms.items()}
     measured = frozenset[str]().union(*(term.names() for term in terms.values()))
     utilities = [Utility(candidate=name, value=0.0, reachable=False) for name in unreachable]
     for candidate, term in terms.items():

@@ -405,6 +405,27 @@ def test_a_metric_missing_for_every_candidate_is_dropped_and_the_rest_renormalis
     assert values(scored(mute, *EDGES, agreed=allocation(HALVES))) == {"edge1": 0.25, "edge2": 0.5, "edge3": 0.75}
 
 
+@pytest.mark.parametrize("form", list(ScoreForm))
+def test_a_robot_s_link_to_itself_does_not_make_the_network_measured(form: ScoreForm) -> None:
+    """It is a candidate, and cannot read its signal for some seconds: that is no fault of the owner."""
+    spec = replace(SPEC, candidates=("edge1", "robot1"))
+    agreed = allocation_of(7, "edge1", epoch=3, tuning=Tuning(weights=HALVES, score=form))
+    mute = profile("robot1", links=radio(None), cpu=2.0)
+    vector = scored(profile("edge1"), mute, spec=spec, agreed=agreed)
+    by_cpu = scored(profile("edge1"), mute, spec=spec, agreed=replace(agreed, tuning=Tuning(weights=CPU, score=form)))
+
+    assert vector.refused == ()
+    assert values(vector) == values(by_cpu)
+    assert [one.network for one in vector.utilities] == [None, None], "the sums of `explain` are made from these terms"
+
+
+def test_a_robot_that_alone_may_have_the_task_reaches_itself_without_a_radio() -> None:
+    spec = replace(SPEC, candidates=("edge1", "robot1"))
+    only_network = allocation(Weights(cpu=0.0, memory=0.0, network=1.0))
+    mute = profile("robot1", links=())
+    assert values(scored(profile("edge1", draining=True), mute, spec=spec, agreed=only_network)) == {"robot1": 1.0}
+
+
 def test_a_metric_missing_for_some_excludes_those() -> None:
     vector = scored(ROBOT, profile("edge1", links=()), *EDGES[1:], agreed=allocation(HALVES))
 
