@@ -141,6 +141,8 @@ class Loop:
     patience: float = PAPER_PATIENCE
     learns: bool = False
     """Its patience is learnt."""
+    demand: Demand = Demand()
+    """By the fleet file."""
     seed: int = 0
     moves: list[tuple[float, str]] = field(default_factory=list)
 
@@ -149,7 +151,7 @@ class Loop:
         self.spec = task_of(
             candidates=names,
             tuning=replace(self.tuning, weights=self.weights),
-            demand=Demand(),
+            demand=self.demand,
             patience=self.patience,
             learns_patience=self.learns,
             worker=WorkerSpec(command=("worker",)),
@@ -363,12 +365,27 @@ def test_a_heavy_task_does_not_chase_itself_around_in_a_thousand_rounds(other_co
 
 
 def test_without_the_demand_correction_the_same_task_oscillates() -> None:
-    """The control: workers that do not show what they use let the owner look worse by its own load."""
+    """The control: a worker that does not show what it uses, and of which the fleet file tells nothing either, lets
+    the owner look worse by its own load."""
     machines = tuple(
         Machine(name=name, base=0.2, task_cores=1.6, task_mb=1200.0, shows_worker=False) for name in ("edge1", "edge2")
     )
 
     assert len(Loop(machines).run(THOUSAND_ROUNDS_S)) > 20
+
+
+@pytest.mark.parametrize("threads", [None, 0.0])
+@pytest.mark.parametrize("score_form", list(ScoreForm))
+def test_nor_does_a_task_whose_worker_shows_no_figures_if_the_fleet_file_tells_its_demand(
+    score_form: ScoreForm, threads: float | None
+) -> None:
+    """Somebody else starts its workers: three fifths of a machine's CPU and half of its memory are its own."""
+    machines = tuple(
+        Machine(name=name, cores=2.0, base=0.1, task_cores=1.2, task_mb=2000.0, shows_worker=False, threads=threads)
+        for name in ("edge1", "edge2")
+    )
+    tuning = Tuning(weights=BOTH, score=score_form)
+    assert Loop(machines, tuning=tuning, demand=Demand(cpu_cores=1.2, memory_mb=2000.0)).run(THOUSAND_ROUNDS_S) == []
 
 
 def test_a_starved_owner_is_left_and_not_taken_back_while_the_load_lasts() -> None:

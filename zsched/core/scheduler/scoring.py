@@ -14,6 +14,7 @@ from collections.abc import Set as AbstractSet
 
 from zsched.core.gateway.demand import Demands, is_short, speed_of
 from zsched.core.gateway.gateway import Gateway
+from zsched.core.gateway.sharing import fair_share
 from zsched.core.scheduler.links import pair_link
 from zsched.core.scheduler.utility import (
     cpu_utility,
@@ -38,7 +39,7 @@ from zsched.core.values.model import (
     Utility,
     UtilityVector,
 )
-from zsched.core.values.profile import Profile, WorkerState
+from zsched.core.values.profile import Profile, WorkerLoad, WorkerState
 from zsched.core.values.quorum import majority
 from zsched.core.values.struct import Struct, field, replace
 
@@ -129,7 +130,8 @@ def score(
             refused.append((candidate, "no fresh profile"))
             continue
         demand, unseen = gateway.demand(spec, profile), _unseen(spec, profile, bookings, gateway)
-        reason = _refusal(spec, allocation, profile, demand, unseen)
+        use = _predicted(spec, allocation, profile, demand, unseen)
+        reason = _refusal(spec, allocation, profile, demand, use)
         if reason:
             refused.append((candidate, reason))
             continue
@@ -143,8 +145,8 @@ def score(
         is_measured = candidate == allocation.owner and load is not None and is_short(load)
         fair = gateway.share(spec, profile, demand.cpu_cores, unseen.cpu_cores)
         least = 0.0 if is_measured else fair
-        cpu = _cpu(spec, profile, demand, unseen, allocation.tuning, gateway.demands, network_s, least, fair)
-        memory = _memory(spec, profile, demand, unseen, form)
+        cpu = _cpu(spec, profile, demand, use, allocation.tuning, gateway.demands, network_s, least, fair)
+        memory = _memory(spec, profile, demand, use, form)
         gauges = _gauges(spec, allocation, profile)
         terms[candidate] = _Terms(cpu, memory, None if link is None else link.utility, gauges)
     if len(terms) > 1 and all(term.network is None for name, term in terms.items() if name != voter):
@@ -219,6 +221,49 @@ def _unseen(spec: TaskSpec, profile: Profile, bookings: Bookings | None, gateway
     return Demand(cpu_cores=cpu, memory_mb=memory)
 
 
+class _Use(Struct, frozen=True):
+    """What would be in use on a node if it had the task; ``None`` where the node does not measure it."""
+
+    cpu_cores: float | None
+    memory_mb: float | None
+
+
+def _predicted(spec: TaskSpec, allocation: Allocation, profile: Profile, demand: Demand, unseen: Demand) -> _Use:
+    cpu, memory = profile.cpu_used_cores, profile.memory_used_mb
+    own = _own(spec, allocation, profile, demand)
+    return _Use(
+        cpu_cores=None if cpu is None else predicted_use(cpu + unseen.cpu_cores, own.cpu_cores, demand.cpu_cores),
+        memory_mb=None if memory is None else predicted_use(memory + unseen.memory_mb, own.memory_mb, demand.memory_mb),
+    )
+
+
+def _own(spec: TaskSpec, allocation: Allocation, profile: Profile, demand: Demand) -> Demand:
+    """What of a node's use is the task's own.
+
+    Nobody measures a worker that somebody else started. At the owner its demand is taken for its use, or the owner
+    would look worse by the task's own work.
+    """
+    load = profile.worker(spec.name)
+    cpu, memory = (None, None) if load is None else (load.cpu_cores, load.memory_mb)
+    is_at_work = profile.node == allocation.owner and (load is None or load.state is WorkerState.READY)
+    if cpu is None:
+        cpu = _likely_cores(profile, load, demand) if is_at_work else 0.0
+    if memory is None:
+        memory = min(profile.memory_used_mb or 0.0, demand.memory_mb) if is_at_work else 0.0
+    return Demand(cpu_cores=cpu, memory_mb=memory)
+
+
+def _likely_cores(profile: Profile, load: WorkerLoad | None, demand: Demand) -> float:
+    """What a worker without a figure uses at the owner: its demand, as far as the machine gives it that."""
+    use = profile.cpu_used_cores or 0.0
+    if load is not None and load.jobs is not None and is_short(load):
+        return min(load.jobs.done_hz * load.jobs.cpu_s, use)
+    if profile.runnable is None:
+        return min(demand.cpu_cores, use)
+    others = max(profile.runnable - demand.cpu_cores, 0.0)
+    return min(demand.cpu_cores, use, fair_share(profile.cpu_cores, max(demand.cpu_cores, 1.0), others))
+
+
 def is_out(spec: TaskSpec, profile: Profile) -> bool:
     """Whether a node cannot have the task until an operator or a restart changes something there."""
     load = profile.worker(spec.name)
@@ -236,7 +281,7 @@ def may_get(spec: TaskSpec, state: WorkerState | None) -> bool:
     return state is WorkerState.READY or (starts_then and state is not WorkerState.FAILED)
 
 
-def _refusal(spec: TaskSpec, allocation: Allocation, profile: Profile, demand: Demand, unseen: Demand) -> str:
+def _refusal(spec: TaskSpec, allocation: Allocation, profile: Profile, demand: Demand, use: _Use) -> str:
     """Why the node may not have the task; empty when it may."""
     if profile.draining:
         return "draining"
@@ -250,7 +295,7 @@ def _refusal(spec: TaskSpec, allocation: Allocation, profile: Profile, demand: D
     is_owner = profile.node == allocation.owner
     if not is_owner and not may_get(spec, state):
         return f"worker {state}{why}"
-    used = _memory_use(profile, spec, demand, unseen)
+    used = use.memory_mb
     if used is not None and used > profile.memory_mb:
         return f"needs {demand.memory_mb:.0f} MiB, has {max(profile.memory_mb - used + demand.memory_mb, 0.0):.0f} free"
     return _beyond_limits(spec, profile, is_owner=is_owner)
@@ -290,19 +335,11 @@ def _is_assumed(name: str) -> bool:
     return not BY_NAME[name].is_needed
 
 
-def _memory_use(profile: Profile, spec: TaskSpec, demand: Demand, unseen: Demand) -> float | None:
-    if profile.memory_used_mb is None:
-        return None
-    load = profile.worker(spec.name)
-    own = (load.memory_mb or 0.0) if load is not None else 0.0
-    return predicted_use(profile.memory_used_mb + unseen.memory_mb, own, demand.memory_mb)
-
-
 def _cpu(
     spec: TaskSpec,
     profile: Profile,
     demand: Demand,
-    unseen: Demand,
+    use: _Use,
     tuning: Tuning,
     demands: Demands,
     network_s: float,
@@ -314,10 +351,9 @@ def _cpu(
     ``least_cores``: it gets at least this if it needs it, however full the machine is. ``fair_cores``: a job gets at
     least this while it runs. Between its jobs a task uses nothing, so that may be far more than it needs on the mean.
     """
-    if profile.cpu_used_cores is None:
+    used = use.cpu_cores
+    if used is None:
         return None
-    used_cores = profile.cpu_used_cores + unseen.cpu_cores
-    used = predicted_use(used_cores, profile.cores_of(spec.name), demand.cpu_cores)
     if tuning.score is ScoreForm.PAPER:
         return cpu_utility(profile.cpu_cores, used)
     free, job = profile.cpu_cores - used + demand.cpu_cores, demands.job(spec.name)
@@ -331,8 +367,8 @@ def _cpu(
     return service_utility(free, demand.cpu_cores, profile.cpu_cores, least=least_cores, most=most, share=share)
 
 
-def _memory(spec: TaskSpec, profile: Profile, demand: Demand, unseen: Demand, form: ScoreForm) -> float | None:
-    used_mb = _memory_use(profile, spec, demand, unseen)
+def _memory(spec: TaskSpec, profile: Profile, demand: Demand, use: _Use, form: ScoreForm) -> float | None:
+    used_mb = use.memory_mb
     if used_mb is None:
         return None
     others_mb = used_mb - demand.memory_mb

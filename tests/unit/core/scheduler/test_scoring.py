@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -22,7 +23,7 @@ from zsched.core.values.model import (
     UtilityVector,
     Weights,
 )
-from zsched.core.values.profile import Link, LinkSource, Profile, WorkerState
+from zsched.core.values.profile import Jobs, Link, LinkSource, Profile, WorkerLoad, WorkerState
 
 CPU = Weights(cpu=1.0, memory=0.0, network=0.0)
 HALVES = Weights(cpu=0.5, memory=0.0, network=0.5)
@@ -299,6 +300,50 @@ def test_an_idle_standby_s_load_is_not_counted_twice() -> None:
 
     assert vector.utilities[0].cpu == pytest.approx(1 - 1.8 / 4)
     assert vector.utilities[0].memory == pytest.approx(1 - 1600 / 4000)
+
+
+UNSEEN = Demand(cpu_cores=1.2, memory_mb=1200.0)
+"""Of a worker that somebody else starts, which shows no figures."""
+
+
+def owned_unseen(**options: Any) -> tuple[Utility, ...]:
+    """How the owner edge1, with these figures, and an idle edge2 of the same size count for such a task."""
+    spec = replace(SPEC, candidates=("edge1", "edge2"), demand=UNSEEN, worker=WorkerSpec())
+    tuning = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0), score=ScoreForm.SERVICE)
+    size = {"cpu_cores": 2.0, "memory_mb": 2000.0}
+    nodes = (
+        profile_of("edge1", **{**size, "workers": (load_of(),), **options}),
+        profile_of("edge2", **size, cpu_used_cores=0.1, memory_used_mb=400.0, workers=(load_of(),)),
+    )
+    vector = scored(ROBOT, *nodes, spec=spec, agreed=allocation_of(7, epoch=3, tuning=tuning))
+    assert vector.refused == ()
+    return vector.utilities
+
+
+@pytest.mark.parametrize("workers", [(), (load_of(),)])
+@pytest.mark.parametrize("runnable", [None, 1.3])
+def test_what_a_worker_without_figures_needs_counts_as_its_own_at_the_owner(
+    workers: tuple[WorkerLoad, ...], runnable: float | None
+) -> None:
+    owner, other = owned_unseen(cpu_used_cores=1.3, memory_used_mb=1600.0, workers=workers, runnable=runnable)
+    assert (owner.cpu, owner.memory) == pytest.approx((other.cpu, other.memory))
+
+
+def test_such_a_worker_has_no_more_of_a_full_machine_than_its_fair_share() -> None:
+    owner, _ = owned_unseen(cpu_used_cores=2.0, memory_used_mb=1600.0, runnable=5.2)
+    assert owner.cpu == pytest.approx(service_utility(2.0 * 1.2 / 5.2, 1.2, 2.0))
+
+
+def test_such_a_worker_that_tells_of_undone_jobs_has_what_its_jobs_use() -> None:
+    jobs = Jobs(time_s=0.1, cpu_s=0.1, done_hz=3.0, wanted_hz=12.0)
+    owner, _ = owned_unseen(cpu_used_cores=2.0, memory_used_mb=1600.0, workers=(load_of(jobs=jobs),))
+    assert owner.cpu == pytest.approx(service_utility(0.3, 1.2, 2.0))
+
+
+def test_an_owner_whose_worker_does_not_run_uses_nothing_for_it() -> None:
+    idle = (load_of(state=WorkerState.STOPPED),)
+    owner, _ = owned_unseen(cpu_used_cores=1.3, memory_used_mb=700.0, workers=idle)
+    assert owner.cpu == pytest.approx(service_utility(0.7, 1.2, 2.0))
 
 
 # --- links ---------------------------------------------------------------------------------------------------------

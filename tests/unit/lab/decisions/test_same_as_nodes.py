@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from zsched.core.scheduler.patience import FIRST_PATIENCE
-from zsched.core.values.fleet import DEFAULT_BONUS, DEFAULT_COOL_DOWN_S, PAPER_PATIENCE, Timing
+from zsched.core.values.fleet import DEFAULT_BONUS, DEFAULT_COOL_DOWN_S, PAPER_PATIENCE, Demand, Timing
 from zsched.core.values.model import Tuning
 from zsched_lab.decisions.loads import Array
 from zsched_lab.decisions.replay import Entry, replay
@@ -58,7 +58,11 @@ def by_nodes(world: World, tuning: Tuning, patience: float, *, learns: bool = Fa
         step = min(int((now - STARTED_AT_S) / DT_S), world.steps - 1)
         if name not in column:
             return 1.0, 1000.0
-        return _at(cpu, step, column[name]) * CORES, _at(memory, step, column[name]) * MEMORY_MB
+        # A node sees the task's own work at its owner, and the histories are without it.
+        is_owner = sim.node("robot001").registers[task.name].value.owner == name
+        own = task.demand if is_owner else Demand()
+        used, used_mb = _at(cpu, step, column[name]) * CORES, _at(memory, step, column[name]) * MEMORY_MB
+        return used + own.cpu_cores, used_mb + own.memory_mb
 
     task = replace(world.spec, tuning=tuning, patience=patience, learns_patience=learns)
     sim = Simulator(fleet=replace(world.fleet, tasks=(task,)), seed=1, load=load)
