@@ -12,7 +12,7 @@ import statistics
 from collections.abc import Iterable, Mapping
 from collections.abc import Set as AbstractSet
 
-from zsched.core.gateway.demand import Demands, is_short, speed_of
+from zsched.core.gateway.demand import STARVED_CPU_RATIO, Demands, is_short, speed_of
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.gateway.sharing import fair_share
 from zsched.core.scheduler.links import pair_link
@@ -206,17 +206,20 @@ def book(specs: Iterable[TaskSpec], values: Mapping[TaskId, Allocation]) -> Book
 def _unseen(spec: TaskSpec, profile: Profile, bookings: Bookings | None, gateway: Gateway) -> Demand:
     """What other tasks will use on a node beyond what its profile shows of their workers.
 
-    A worker that somebody else started never shows what it uses, so it is in the profile already, or nowhere.
+    A worker that somebody else started never shows what it uses, so it is in the profile already, or nowhere. What a
+    worker visibly lacks on a full machine is no coming use: it will not get it there while that lasts.
     """
     others = () if bookings is None else bookings.get(profile.node, ())
     if not others:
         return _NOTHING
     cpu = memory = 0.0
+    is_full = (profile.cpu_used_cores or 0.0) >= STARVED_CPU_RATIO * profile.cpu_cores
     for other in others:
         load = profile.worker(other.name)
         if other.name != spec.name and load is not None:
             demand = gateway.demand(other, profile)
-            cpu += max(demand.cpu_cores - (load.cpu_cores or 0.0), 0.0)
+            if not (is_full and is_short(load)):
+                cpu += max(demand.cpu_cores - (load.cpu_cores or 0.0), 0.0)
             memory += max(demand.memory_mb - (load.memory_mb or 0.0), 0.0)
     return Demand(cpu_cores=cpu, memory_mb=memory)
 

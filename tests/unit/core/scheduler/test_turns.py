@@ -8,13 +8,14 @@ from dataclasses import dataclass
 import pytest
 
 from support.allocations import allocation_of
-from support.fleets import fleet_of, task_of
+from support.fleets import fleet_of, task_of, tuning_of
 from support.profiles import load_of, profile_of
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.scoring import book, score
 from zsched.core.scheduler.turns import in_turn, who_moves_first
-from zsched.core.values.fleet import Demand
-from zsched.core.values.model import Allocation, PeerState, UtilityVector
+from zsched.core.scheduler.utility import service_utility
+from zsched.core.values.fleet import Demand, WorkerSpec
+from zsched.core.values.model import Allocation, PeerState, ScoreForm, UtilityVector
 from zsched.core.values.profile import WorkerLoad
 from zsched.core.vote.voting import Voting
 
@@ -127,6 +128,44 @@ def test_nothing_is_booked_for_a_task_elsewhere_for_oneself_and_for_a_foreign_wo
 def test_memory_that_is_booked_cannot_be_had_twice() -> None:
     vector = scored_b(gateway_with(of_a(0.0, 0.0), memory_mb=2800.0), values("edge1"))
     assert dict(vector.refused) == {"edge1": "needs 800 MiB, has 400 free"}
+
+
+STARVED = Demand(cpu_cores=2.0, memory_mb=100.0)
+TUNING = tuning_of(cpu=1.0, memory=0.0, score=ScoreForm.SERVICE)
+STARVED_A, STARVED_B = (
+    task_of(name, demand=STARVED, tuning=TUNING, worker=WorkerSpec(command=("work",))) for name in ("a", "b")
+)
+
+
+def terms_of_a(*, used: float, of_a: float, of_b: float, wants: float | None = 2.0) -> tuple[float, float]:
+    """What edge1, which owns a and b, and edge2 are worth to a: 2 cores each, and edge2 has 0.2 free."""
+    gateway = Gateway(fleet_of(STARVED_A, STARVED_B, of=("edge1", "edge2"), electors=("robot1",)))
+    for node, cores, figures in (("edge1", used, (of_a, of_b)), ("edge2", 1.8, (0.0, 0.0))):
+        workers = tuple(
+            load_of(name, cpu_cores=own, memory_mb=100.0, wanted_cores=wants if own else None)
+            for name, own in zip(("a", "b"), figures, strict=True)
+        )
+        profile = profile_of(node, cpu_cores=2.0, cpu_used_cores=cores, workers=workers, runnable=None)
+        assert gateway.absorb(profile, 0.0) is None
+    agreed = {name: allocation_of(owner="edge1", task=name, tuning=TUNING) for name in ("a", "b")}
+    booked = book((STARVED_A, STARVED_B), agreed)
+    vector = score(STARVED_A, agreed["a"], "robot1", gateway, ALIVE, 0.0, booked)
+    return value(vector, "edge1"), value(vector, "edge2")
+
+
+def test_what_another_task_lacks_on_a_full_machine_is_not_counted_against_a_task_that_lacks_as_much() -> None:
+    owner, other = terms_of_a(used=2.0, of_a=1.0, of_b=1.0)
+    assert owner == pytest.approx(service_utility(1.0, 2.0, 2.0))
+    assert other == pytest.approx(service_utility(0.2, 2.0, 2.0))
+
+
+def test_what_it_lacks_counts_as_coming_as_soon_as_the_machine_has_room_for_it() -> None:
+    """A load has ended: the next reading shows b with all that it wants, and nothing is left for others."""
+    assert terms_of_a(used=1.2, of_a=0.2, of_b=1.0)[0] == pytest.approx(service_utility(0.0, 2.0, 2.0))
+
+
+def test_a_task_that_has_just_come_to_a_full_machine_counts_until_it_shows_that_it_lacks_cpu() -> None:
+    assert terms_of_a(used=2.0, of_a=1.0, of_b=0.0)[0] == pytest.approx(service_utility(0.0, 2.0, 2.0))
 
 
 def test_a_single_task_has_no_bookings() -> None:
