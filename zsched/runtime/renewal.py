@@ -16,7 +16,7 @@ from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import CommandOutcome, CommandResult
 from zsched.errors import ConfigError
 from zsched.pki.files import PUBLIC, make_folder, write_whole
-from zsched.runtime.secured import CERTIFICATE, bytes_of, files_of, identity_of, renewed_in
+from zsched.runtime.secured import CERTIFICATE, authority_rank, bytes_of, files_of, identity_of, renewed_in
 from zsched.sessions.certificate import ders_of, parts_of, pem_of
 
 SOON: Final = timedelta(days=7)
@@ -45,8 +45,9 @@ def take(fleet: Fleet, state: Path, pem: str) -> CommandResult:
     files = files_of(fleet.security)
     try:
         der = ders_of(pem.encode())[0]
-        offered = Trust(bytes_of(files.trusted)).certified(der, now_utc())
-        own = parts_of(ders_of(bytes_of(files.certificate))[0])
+        trusted, own_der = bytes_of(files.trusted), ders_of(bytes_of(files.certificate))[0]
+        offered, own = Trust(trusted).certified(der, now_utc()), parts_of(own_der)
+        rank, own_rank = authority_rank(der, trusted), authority_rank(own_der, trusted)
     except (ValueError, ConfigError) as error:
         return _refused(str(error))
     if offered is None:
@@ -54,7 +55,9 @@ def take(fleet: Fleet, state: Path, pem: str) -> CommandResult:
     if (offered.key, offered.common_name) != (own.key, own.common_name):
         return _refused(f"it is {offered.common_name}'s, or for another key; this node is {own.common_name}")
     until = f"until {offered.ends:%Y-%m-%d}"
-    if offered.ends <= own.ends:
+    if rank > own_rank:
+        return _refused(f"its authority stands behind that of this node's certificate in {files.trusted}")
+    if rank == own_rank and offered.ends <= own.ends:  # of a newer authority it may end earlier
         lasts = f"its certificate lasts until {own.ends:%Y-%m-%d}"
         return CommandResult(outcome=CommandOutcome.UNCHANGED, detail=lasts)
     path = renewed_in(state)

@@ -21,7 +21,7 @@ from zsched.errors import ConfigError
 from zsched.files import owner_of, read_regular
 from zsched.runtime.access_rules import Side, access_control
 from zsched.sessions import config as zenoh_config
-from zsched.sessions.certificate import common_names, ders_of, parts_of, validities
+from zsched.sessions.certificate import common_names, ders_of, own_key_id, parts_of, signing_key_id, validities
 
 CERTIFICATE, KEY, TRUSTED = "certificate.pem", "key.pem", "ca.pem"
 MAX_BYTES: Final = 1 << 20
@@ -50,7 +50,8 @@ class Files(Struct, frozen=True, kw_only=True):
 def files_of(security: Security, env: Mapping[str, str] = os.environ) -> Files:
     """The files of a `security:` section; of each the one that systemd handed over, where there is one.
 
-    A certificate for the same key that was renewed since, and lies in the state folder, takes the place of the first.
+    A certificate for the same key that was renewed since, and lies in the state folder, takes the place of the first:
+    one of a newer authority, or of the same one and with a later end.
     """
     handed = Path(env[CREDENTIALS]) if env.get(CREDENTIALS) else None
 
@@ -61,8 +62,9 @@ def files_of(security: Security, env: Mapping[str, str] = os.environ) -> Files:
 
     first = place(CERTIFICATE)
     renewed = renewed_in(places.state_folder(None, env))
-    certificate = renewed if _is_newer(renewed, first) else first
-    return Files(certificate=certificate, key=place(KEY), trusted=place(TRUSTED))
+    trusted = place(TRUSTED)
+    certificate = renewed if _is_newer(renewed, first, trusted) else first
+    return Files(certificate=certificate, key=place(KEY), trusted=trusted)
 
 
 def renewed_in(state: Path) -> Path:
@@ -70,13 +72,34 @@ def renewed_in(state: Path) -> Path:
     return state / "pki" / CERTIFICATE
 
 
-def _is_newer(renewed: Path, first: Path) -> bool:
-    """Whether a certificate is for the same name and key as another one, and ends later."""
+def authority_rank(der: bytes, trusted: bytes) -> int:
+    """Where the authority of a certificate stands among those that are trusted, newest first; their count: nowhere.
+
+    A certificate's end does not tell: the clock of the authority's machine may have been set back before it rotated.
+
+    Args:
+        der: the certificate; what it says of its authority is believed.
+        trusted: the authorities' own certificates, PEM, in the order of `ca.pem`.
+
+    Raises:
+        ValueError: a certificate is malformed.
+    """
+    keys = [own_key_id(one) for one in ders_of(trusted)]
+    signer = signing_key_id(der)
+    return keys.index(signer) if signer and signer in keys else len(keys)
+
+
+def _is_newer(renewed: Path, first: Path, trusted: Path) -> bool:
+    """Whether a certificate is for the same name and key as another one, and of a newer authority or a later end."""
     try:
-        after, before = (parts_of(ders_of(read_regular(path, MAX_BYTES))[0]) for path in (renewed, first))
+        ders = [ders_of(read_regular(path, MAX_BYTES))[0] for path in (renewed, first)]
+        after, before = map(parts_of, ders)
+        rank, rank_before = (authority_rank(der, read_regular(trusted, MAX_BYTES)) for der in ders)
     except (OSError, ValueError):
         return False
-    return (after.common_name, after.key) == (before.common_name, before.key) and after.ends > before.ends
+    if (after.common_name, after.key) != (before.common_name, before.key):
+        return False
+    return after.ends > before.ends if rank == rank_before else rank < rank_before
 
 
 def _is_handed(path: Path) -> bool:

@@ -1,4 +1,4 @@
-"""Reads of an X.509 certificate (RFC 5280, section 4.1) when it is valid, its holder, its key and its signature.
+"""Reads of an X.509 certificate (RFC 5280, section 4.1) when it is valid, its holder, its keys and its signature.
 
 Knows: PEM, as much DER as leads to these. Does not know: whether a signature is right, what trusts what. Daemons read
 certificates with this, for a library that reads all of one takes 16 MiB.
@@ -21,7 +21,9 @@ PEM_COLUMNS: Final = 64
 COMMON_NAME: Final = bytes((0x06, 0x03, 0x55, 0x04, 0x03))
 """The object identifier 2.5.4.3, as DER."""
 SEQUENCE, VERSION, UTC_TIME, GENERALIZED_TIME = 0x30, 0xA0, 0x17, 0x18
-BIT_STRING: Final = 0x03
+BOOLEAN, BIT_STRING, OCTET_STRING, EXTENSIONS, KEY_ID = 0x01, 0x03, 0x04, 0xA3, 0x80
+OWN_KEY, SIGNING_KEY = bytes((0x06, 0x03, 0x55, 0x1D, 0x0E)), bytes((0x06, 0x03, 0x55, 0x1D, 0x23))
+"""2.5.29.14 and 2.5.29.35: the identifiers of a certificate's own key, and of the key that has signed it."""
 
 
 class Parts(Struct, frozen=True, kw_only=True):
@@ -103,6 +105,34 @@ def common_names(pem: bytes) -> tuple[str, ...]:
     return _each(pem, _common_name)
 
 
+def own_key_id(der: bytes) -> bytes:
+    """The identifier of a certificate's own key (RFC 5280, section 4.2.1.2); empty where it has none.
+
+    Raises:
+        ValueError: it is malformed.
+    """
+    try:
+        found = _extension(der, OWN_KEY)
+        return _inside(found, OCTET_STRING)[0] if found else b""
+    except IndexError as error:
+        raise ValueError(f"the certificate is malformed: {error}") from error
+
+
+def signing_key_id(der: bytes) -> bytes:
+    """The same of the key that has signed it, as the certificate says (section 4.2.1.1).
+
+    Raises:
+        ValueError: it is malformed.
+    """
+    try:
+        found = _extension(der, SIGNING_KEY)
+        names = _inside(found, SEQUENCE)[0] if found else b""
+        tag, content, _ = _element(names) if names else (KEY_ID, b"", b"")
+    except IndexError as error:
+        raise ValueError(f"the certificate is malformed: {error}") from error
+    return content if tag == KEY_ID else b""
+
+
 def _each(pem: bytes, read: Callable[[bytes], T]) -> tuple[T, ...]:
     found = PEM.findall(pem)
     if not found:
@@ -139,6 +169,20 @@ def _common_name(der: bytes) -> str:
             if pair.startswith(COMMON_NAME):
                 return _element(pair[len(COMMON_NAME) :])[1].decode("utf-8", errors="replace")
     return ""
+
+
+def _extension(der: bytes, wanted: bytes) -> bytes:
+    """The value of an extension; empty where there is none. Between the key and them there may be two identifiers."""
+    left = _after(_after(_after(_from_validity(der))))
+    while left:
+        tag, content, left = _element(left)
+        extensions = _inside(content, SEQUENCE)[0] if tag == EXTENSIONS else b""
+        while extensions:
+            one, extensions = _inside(extensions, SEQUENCE)
+            if one.startswith(wanted):
+                value = one[len(wanted) :]
+                return _inside(_after(value) if value[0] == BOOLEAN else value, OCTET_STRING)[0]
+    return b""
 
 
 def _element(data: bytes) -> tuple[int, bytes, bytes]:

@@ -13,7 +13,7 @@ from support.authorities import install, make_authority
 from zsched.core.values.certificates import Role
 from zsched.pki import certificates as x509
 from zsched.pki.signatures import Trust, checking_by, own_certificate, signing_with
-from zsched.sessions.certificate import parts_of
+from zsched.sessions.certificate import ders_of, own_key_id, parts_of, signing_key_id
 
 NOW = datetime.now(UTC)
 
@@ -57,6 +57,16 @@ def test_a_certificate_is_taken_apart_as_the_reference_does(folder: Path) -> Non
         assert (parts.begins, parts.ends) == (reference.not_valid_before_utc, reference.not_valid_after_utc)
         public = serialization.PublicFormat.SubjectPublicKeyInfo
         assert parts.key == reference.public_key().public_bytes(serialization.Encoding.DER, public)
+
+
+def test_a_certificate_names_the_key_that_has_signed_it(folder: Path) -> None:
+    (authority,) = ders_of((folder / "robot1" / "ca.pem").read_bytes())
+    assert own_key_id(authority)
+    assert signing_key_id(certificate(folder, "ana")) == own_key_id(authority)
+    assert signing_key_id(certificate(folder, "stranger")) not in (b"", own_key_id(authority))
+    assert signing_key_id(authority) == b"", "its own says nothing of the kind"
+    with pytest.raises(ValueError, match="malformed"):
+        signing_key_id(certificate(folder, "ana").replace(bytes.fromhex("0603551d23"), bytes.fromhex("0603551d2304")))
 
 
 def test_another_authority_s_certificate_is_none_of_ours(folder: Path) -> None:

@@ -57,6 +57,41 @@ def test_a_newer_certificate_for_the_same_key_is_gone_by(fleet: Fleet, authority
     assert files.certificate.read_text() == pem
 
 
+def test_a_newer_authority_s_certificate_is_gone_by_though_it_ends_earlier(
+    fleet: Fleet, authority: Authority, tmp_path: Path
+) -> None:
+    """The clock of the authority's machine was set back before it rotated; without the node's it would be cut off."""
+    assert fleet.security is not None
+    state, own = tmp_path / "state", renewed(authority)
+    assert take(fleet, state, own).outcome is OK
+    authority.rotate(b"", NOW - timedelta(days=1))
+    (tmp_path / "pki" / "ca.pem").write_bytes(authority.trusted)
+    pem = renewed(authority, timedelta(days=1))
+    result = take(fleet, state, pem)
+    assert result.outcome is OK, result
+    assert files_of(fleet.security).certificate.read_text() == pem
+    assert take(fleet, state, pem).outcome is UNCHANGED
+    again = take(fleet, state, own)
+    assert again.outcome is INVALID, "somebody sends the former one once more"
+    assert "stands behind that of this node's certificate" in again.detail
+    assert files_of(fleet.security).certificate.read_text() == pem
+
+
+def test_a_newer_authority_s_file_that_was_brought_is_gone_by_though_one_that_was_sent_ends_later(
+    fleet: Fleet, authority: Authority, tmp_path: Path
+) -> None:
+    assert fleet.security is not None
+    assert take(fleet, tmp_path / "state", renewed(authority)).outcome is OK
+    authority.rotate(b"", NOW - timedelta(days=1))
+    brought = tmp_path / "pki" / "certificate.pem"
+    brought.write_text(renewed(authority, timedelta(days=1)))
+    (tmp_path / "pki" / "ca.pem").write_bytes(authority.trusted)
+    assert files_of(fleet.security).certificate == brought
+    authority.finish()
+    (tmp_path / "pki" / "ca.pem").write_bytes(authority.trusted)
+    assert files_of(fleet.security).certificate == brought
+
+
 def test_of_what_is_sent_only_the_certificate_is_kept(fleet: Fleet, authority: Authority, tmp_path: Path) -> None:
     """zenoh reads the file in its own way: it could find another first, or one that it cannot load, and not listen."""
     assert fleet.security is not None
