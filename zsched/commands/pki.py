@@ -280,11 +280,15 @@ def _see_anew(door: Door, authority: Authority, members: set[str]) -> None:
     """
     if not authority.is_rotating:
         return
-    age_s, old = (_now() - authority.since).total_seconds(), []
+    age_s, before, old = (_now() - authority.since).total_seconds(), dict(authority.record.lives), []
     for name in sorted(members):
         with contextlib.suppress(CliError):  # it is away
             status = ask_door(Door(socket=door.socket, node=name), {"verb": "status"})
-            old += [name] if float(status.get("up_s", 0.0)) > age_s else []
+            if name in before:
+                is_old = status.get("incarnation") == before[name]
+            else:  # the wall clock may have been set since: it is asked only where nobody has seen the life before
+                is_old = float(status.get("up_s", 0.0)) > age_s
+            old += [name] if is_old else []
     if old:
         told = f"{', '.join(old)}: not begun anew since the new authority was made, and would cut off who goes by it"
         advice = f"put {TRUSTED} there, and wait until `up` in its `zsched status` begins again"
@@ -353,7 +357,7 @@ def rotate(where: Where, *, is_end: bool) -> int:
     """
     with _opened(where) as (_, authority):
         if not is_end:
-            authority.rotate(_passphrase(authority), _now())
+            authority.rotate(_passphrase(authority), _now(), _lives(authority.record.fleet))
             _say(
                 f"authority {authority.record.number} signs from now on; the former one is trusted until the end",
                 f"1. put {authority.folder / TRUSTED} on every machine as {TRUSTED}, and wait until each daemon has "
@@ -376,6 +380,15 @@ def rotate(where: Where, *, is_end: bool) -> int:
             f"next: put {authority.folder / TRUSTED} on every machine as {TRUSTED}: daemons begin anew in turn",
         )
     return EXIT_OK
+
+
+def _lives(fleet: str) -> dict[str, int]:
+    """{node: its incarnation}, of those that the fleet's daemon here hears; empty: there is none."""
+    told: Json = {}
+    with contextlib.suppress(CliError):
+        told = ask_door(find_door(None, None), {"verb": "status"})
+    nodes = told["nodes"] if told.get("fleet") == fleet else ()
+    return {str(one["name"]): one["incarnation"] for one in nodes if one.get("incarnation") is not None}
 
 
 def _see_delivered(authority: Authority) -> None:

@@ -16,7 +16,7 @@ import contextlib
 import fcntl
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -79,6 +79,8 @@ class Record(Struct, frozen=True, kw_only=True):
     trusted: tuple[str, ...]
     """The authorities' own certificates, PEM, the newest first: two while a rotation is not finished."""
     entries: tuple[Entry, ...] = ()
+    lives: tuple[tuple[str, int], ...] = ()
+    """(node, its incarnation when the rotation began), of those that lived; empty: nobody has looked."""
 
     def entry(self, label: str) -> Entry | None:
         """The entry of a label; ``None``: no key of that label was certified."""
@@ -228,8 +230,10 @@ class Authority:
         labels = [one.label for one in newest if one is not None]
         return f", did you mean {' or '.join(labels)}?" if labels else ""
 
-    def rotate(self, passphrase: bytes, now: datetime) -> None:
+    def rotate(self, passphrase: bytes, now: datetime, lives: Mapping[str, int] | None = None) -> None:
         """Begin with a new authority, whose key gets the same passphrase; the former one stays trusted until `finish`.
+
+        ``lives``: {node: its incarnation}; who is in the same life later does not know the new authority.
 
         Raises:
             AdapterError: the rotation before it is not finished, the passphrase is wrong, or a file cannot be written.
@@ -237,7 +241,7 @@ class Authority:
         if self.is_rotating:
             raise AdapterError("the rotation before this one is not finished: `zsched pki rotate --finish` first")
         self.check(passphrase)  # nobody could open a key that a slip of the hand has locked
-        self._found(passphrase, now)
+        self._found(passphrase, now, lives or {})
 
     def left(self) -> tuple[Entry, ...]:
         """The entries, not revoked, whose certificates are of the former authority.
@@ -261,7 +265,7 @@ class Authority:
         left = self.left()
         if not left:
             former = self._folder / key_name(self.record.number - 1)
-            self._save(replace(self.record, trusted=self.record.trusted[:1]))
+            self._save(replace(self.record, trusted=self.record.trusted[:1], lives=()))
             with contextlib.suppress(OSError):
                 former.unlink(missing_ok=True)
         return left
@@ -328,13 +332,14 @@ class Authority:
             raise AdapterError(f"{self.key_path} is not the key of {RECORD}; bring both back from one backup")
         return x509.Signer(key=key, certificate=certificate)
 
-    def _found(self, passphrase: bytes, now: datetime) -> None:
+    def _found(self, passphrase: bytes, now: datetime, lives: Mapping[str, int]) -> None:
         """Begin with the next number. The key is there before the record names it: a crash leaves what was."""
         number = self.record.number + 1
         signer = x509.new_authority(self.record.fleet, number, now)
         self._write(key_name(number), x509.key_pem(signer.key, passphrase), PRIVATE)
         own = x509.certificate_pem(signer.certificate).decode()
-        self._save(replace(self.record, number=number, trusted=(own, *self.record.trusted)))
+        told = tuple(sorted(lives.items()))
+        self._save(replace(self.record, number=number, trusted=(own, *self.record.trusted), lives=told))
 
     def _key_file(self) -> bytes:
         try:
@@ -376,7 +381,7 @@ def create(folder: Path, fleet: str, passphrase: bytes, now: datetime) -> Author
             f"{folder} holds an authority; `zsched pki show` tells of it; another folder: --authority DIR"
         )
     authority = Authority(folder, Record(fleet=fleet, number=0, trusted=()))
-    authority._found(passphrase, now)  # noqa: SLF001 - of this module
+    authority._found(passphrase, now, {})  # noqa: SLF001 - of this module
     return authority
 
 
@@ -417,7 +422,9 @@ def _record(body: dict[str, Any]) -> Record:
         for one in body["entries"]
     )
     trusted = tuple(str(one) for one in body["trusted"])
-    return Record(fleet=str(body["fleet"]), number=int(body["number"]), trusted=trusted, entries=entries)
+    lives = tuple((str(name), int(life)) for name, life in body.get("lives", ()))
+    number = int(body["number"])
+    return Record(fleet=str(body["fleet"]), number=number, trusted=trusted, entries=entries, lives=lives)
 
 
 def key_name(number: int) -> str:

@@ -264,6 +264,35 @@ def test_no_certificate_of_a_new_authority_is_sent_while_a_node_would_not_know_i
         assert asked == ["robot1", "robot2"]
 
 
+def test_a_node_in_the_life_that_it_had_at_the_rotation_is_old_by_any_clock(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The clock of the authority's machine was set forward since: nobody has been up for so long."""
+    lives = {"robot1": 7, "robot2": 8}
+
+    def answer(request: Json) -> Json:
+        if request["verb"] == "status":
+            nodes = [{"name": name, "incarnation": life} for name, life in lives.items()]
+            own = lives[request.get("node", "robot1")]
+            return {"fleet": "yard", "nodes": nodes, "incarnation": own, "up_s": 0.0}
+        return {"outcome": "unchanged", "detail": "as it is", "revision": None}
+
+    pki("init")
+    for name in ("robot1", "robot2"):
+        pki("issue", name)
+    monkeypatch.setenv("ZSCHED_RUNTIME_DIR", str(here))
+    with closing(OperatorSocket(here / "robot1.sock", answer)) as door:
+        door.open()
+        monkeypatch.setenv("ZSCHED_NODE", "robot1")
+        pki("rotate")
+        pki("renew")
+        lives["robot1"] = 9
+        assert "nothing was sent: robot2: not begun anew" in pki("rotate", "--finish", code=1).stderr
+        lives["robot2"] = 6  # a robot without a clock of its own
+        pki("rotate", "--finish")
+        assert json.loads((here / "authority" / "authority.json").read_text())["lives"] == []
+
+
 def test_names_are_those_of_the_document_where_a_daemon_tells_one(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The fleet file may be a copy from before the newest node came."""
     told: Json = {
