@@ -35,6 +35,8 @@ FORMAT: Final = 1
 MAX_BYTES: Final = 4 << 20
 RENEW_SHARE: Final = 2 / 3
 """A certificate is due once this share of its life is over."""
+AHEAD_S: Final = int(x509.EARLY.total_seconds())
+"""So far a node's clock may be behind the one that a certificate was made by."""
 
 
 class Entry(Struct, frozen=True, kw_only=True):
@@ -66,8 +68,13 @@ class Entry(Struct, frozen=True, kw_only=True):
         return holder
 
     def is_due(self, now: int, authority: int) -> bool:
-        """Whether it should be renewed: two thirds of its life are over, or another authority signs now."""
-        return self.authority != authority or now >= self.issued + (self.until - self.issued) * RENEW_SHARE
+        """Whether it should be renewed: two thirds of its life are over, or another authority signs now.
+
+        One that was issued in the future is due, too: a clock was wrong then, and nodes would refuse it until that day.
+        """
+        if self.authority != authority or self.issued > now + AHEAD_S:
+            return True
+        return now >= self.issued + (self.until - self.issued) * RENEW_SHARE
 
 
 class Record(Struct, frozen=True, kw_only=True):

@@ -237,6 +237,17 @@ def test_an_entry_is_due_after_two_thirds_of_its_life(authority: Authority) -> N
     assert entry.is_due(begun, 2)
 
 
+def test_an_entry_of_the_future_is_due(authority: Authority) -> None:
+    """The clock was 40 days ahead for one run of the timer; no node takes what was made then."""
+    issue(authority)
+    authority.renew("robot1", None, b"", b"", NOW + timedelta(days=40))
+    (entry,) = authority.record.entries
+    now = int(NOW.timestamp())
+    assert entry.is_due(now, 1)
+    assert entry.is_due(entry.issued - 3601, 1)
+    assert not entry.is_due(entry.issued - 3599, 1), "valid by the clock of every node that is no more than that behind"
+
+
 def test_a_rotation_by_a_mistyped_passphrase_changes_nothing(tmp_path: Path) -> None:
     """The next key would be locked by it, and nobody knows it."""
     folder = tmp_path / "locked"
