@@ -33,7 +33,7 @@ from zsched.adapters.network.control_bus import ControlBus
 from zsched.adapters.network.limits import in_turn_hz, limit_for
 from zsched.adapters.relay.streams import SILENCE_S, Bequest, RelayHandle
 from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
-from zsched.clock import SleepWatch, monotonic_s, wall_tenths
+from zsched.clock import SleepWatch, monotonic_s
 from zsched.config.load import load_fleet, require_node
 from zsched.core import events as ev
 from zsched.core.node import Node
@@ -155,7 +155,7 @@ class Daemon:
             os.environ.setdefault("ZENOH_RUNTIME", zenoh_config.daemon_pools(len(self._fleet.nodes)))
             if self._pools is None:  # the daemon that this process may become must not take ours for an operator's
                 stack.callback(os.environ.pop, "ZENOH_RUNTIME", None)
-            incarnation = restored.state.incarnation if restored.state is not None else wall_tenths()
+            incarnation = restored.incarnation
             points = endpoints_for(
                 self._fleet, self._spec, functools.partial(self._data_port, stack), is_here, self._protocol
             )

@@ -21,6 +21,7 @@ from typing import Final
 from zsched.adapters.host import decision_log, rehearsals
 from zsched.adapters.host.document_store import FOLDER_NAME, DocumentStore
 from zsched.adapters.host.state_file import (
+    LIFE_NAME,
     MAX_STATE_BYTES,
     STATE_NAME,
     StateFile,
@@ -481,7 +482,7 @@ def _belongings(places: Places, *, is_purged: bool) -> Iterator[Written]:
             continue
         for name, what in _WHAT.items():
             yield from _there(folder / name, what, is_purged=is_purged)
-    more = (rehearsals.FOLDER_NAME, core_speed.NAME, NEXT_CELL) if is_purged else ()
+    more = (rehearsals.FOLDER_NAME, core_speed.NAME, NEXT_CELL, LIFE_NAME) if is_purged else ()
     for name in (*more, *LOGS, COPY_NAME, FOLDER_NAME, STATE_NAME):
         yield from _there(places.state / name, _KEPT.get(name, "the node's records"), is_purged=is_purged)
 

@@ -9,7 +9,7 @@ import logging
 import secrets
 from pathlib import Path
 
-from zsched.adapters.host.state_file import StateFile
+from zsched.adapters.host.state_file import LoadResult, StateFile
 from zsched.clock import wall_tenths
 from zsched.core.electorate.numbers import in_force
 from zsched.core.values.document import Flag
@@ -26,6 +26,8 @@ log = logging.getLogger("zsched.daemon")
 class Restored(Struct, frozen=True, kw_only=True):
     """What the state folder gave."""
 
+    incarnation: int
+    """Of this start: above that of each start before that the folder tells of, also where there is no state."""
     state: DurableState | None = None
     """With this life's incarnation, on the disk already; ``None``: this node is no elector."""
     problem: str | None = None
@@ -44,11 +46,14 @@ def restore(state_file: StateFile, fleet: Fleet, *, config: Path, node: NodeId, 
     ``config``, ``node`` and ``state_dir`` are named in the advice.
     """
     loaded = state_file.load()
+    incarnation = _next_life(state_file, loaded)
     if loaded.state is None:
         command = f"zsched init --config {config} --node {node} --state-dir {state_dir}"
         advice = "" if loaded.is_others else f" (here: `{command}`)"
         log.warning("no_state why=%s%s; no elector", loaded.problem, advice)
-        return Restored(problem=loaded.problem, is_others=loaded.is_others, is_missing=loaded.is_missing)
+        return Restored(
+            incarnation=incarnation, problem=loaded.problem, is_others=loaded.is_others, is_missing=loaded.is_missing
+        )
     if loaded.state.electorate != electorate_hash(fleet) and not _is_agreed(loaded.state):
         generation = loaded.state.generation + 1
         why = (
@@ -57,18 +62,31 @@ def restore(state_file: StateFile, fleet: Fleet, *, config: Path, node: NodeId, 
             "--force` on each, and start all"
         )
         log.warning("other_electorate %s", why)
-        return Restored(problem=why, is_foreign=True)
-    # Not just one more: a folder that was brought back from a backup must not live one of its lives again.
-    state = replace(
-        loaded.state,
-        incarnation=max(loaded.state.incarnation + 1, wall_tenths()),
-        disk=loaded.state.disk or secrets.token_hex(8),
-    )
+        return Restored(incarnation=incarnation, problem=why, is_foreign=True)
+    state = replace(loaded.state, incarnation=incarnation, disk=loaded.state.disk or secrets.token_hex(8))
     try:
         state_file.save(state)
     except AdapterError as error:
-        return Restored(problem=str(error))
-    return Restored(state=state)
+        return Restored(incarnation=incarnation, problem=str(error))
+    return Restored(incarnation=incarnation, state=state)
+
+
+def _next_life(state_file: StateFile, loaded: LoadResult) -> int:
+    """This start's incarnation, noted beside the state.
+
+    A node without a state needs it, too: others refuse what it signs in a lower life than one that they have heard, and
+    a robot without a battery-backed clock starts in the past. Not just one more than the last one: a folder that was
+    brought back from a backup must not live one of its lives again.
+    """
+    if loaded.is_others:  # its lives are not ours to count
+        return wall_tenths()
+    last = max(state_file.last_life(), 0 if loaded.state is None else loaded.state.incarnation)
+    incarnation = max(last + 1, wall_tenths())
+    try:
+        state_file.note_life(incarnation)
+    except AdapterError as error:
+        log.warning("life not noted why=%s", error)
+    return incarnation
 
 
 class Stored(Struct):

@@ -229,6 +229,16 @@ def test_the_mode_is_that_of_the_file_that_was_written_and_not_of_what_its_name_
     assert stat.S_IMODE(second.config.stat().st_mode) == 0o644
 
 
+def test_the_number_of_the_last_start_outlives_a_node_unless_all_goes(second: Places, invitation: Invitation) -> None:
+    join(invitation, second, is_plan=False)
+    (second.state / "life").write_text("7\n")
+    put_away("hall", "robot2", second, is_purged=False)
+    assert (second.state / "life").read_text() == "7\n"
+    join(invitation, second, is_plan=False)
+    put_away("hall", "robot2", second, is_purged=True)
+    assert not (second.state / "life").exists()
+
+
 def test_a_link_in_the_state_folder_never_chooses_whose_keys_are_put_away(
     second: Places, invitation: Invitation, tmp_path: Path
 ) -> None:

@@ -22,7 +22,7 @@ from types import TracebackType
 from typing import Self
 
 from zsched.core.values.durable import DurableState
-from zsched.core.values.model import NodeId
+from zsched.core.values.model import MAX_COUNTER, NodeId
 from zsched.core.values.struct import Struct, replace
 from zsched.core.vote.generations import way_out
 from zsched.errors import AdapterError, WireError
@@ -30,7 +30,10 @@ from zsched.files import read_regular
 from zsched.wire.codec import decode_state, encode_state
 
 STATE_NAME, LOCK_NAME, NEW_NAME = "state", "lock", "state.new"
+LIFE_NAME, NEW_LIFE_NAME = "life", "life.new"
+"""The incarnation of the last start, which every node has, also one without a state."""
 MAX_STATE_BYTES = 4 * 1024 * 1024
+MAX_LIFE_BYTES = 32
 HARDWARE_SOURCES = (
     ("machine", "etc/machine-id"),
     ("dmi", "sys/class/dmi/id/product_uuid"),
@@ -180,6 +183,29 @@ class StateFile:
             raise AdapterError(
                 f"cannot write {self.path}: {error.strerror}; free or remount the disk (the old state is whole)"
             ) from error
+
+    def last_life(self) -> int:
+        """The highest incarnation that was noted in this folder; 0: none."""
+        try:
+            text = read_regular(self.folder / LIFE_NAME, MAX_LIFE_BYTES, is_own=True).decode(errors="replace").strip()
+        except OSError:
+            return 0
+        is_whole = text.isascii() and text.isdigit() and int(text) < MAX_COUNTER
+        return int(text) if is_whole else 0
+
+    def note_life(self, incarnation: int) -> None:
+        """Note the incarnation of a start; when this returns it survives a power cut.
+
+        Raises:
+            AdapterError: the disk is full, read-only or gone, or the lock is not held.
+        """
+        path = self.folder / LIFE_NAME
+        if self._lock_fd is None:
+            raise AdapterError(f"the lock of {self.folder} is not held: acquire it before saving")
+        try:
+            replace_synced(path, self.folder / NEW_LIFE_NAME, f"{incarnation}\n".encode("ascii"))
+        except OSError as error:
+            raise AdapterError(f"cannot write {path}: {error.strerror}; free or remount the disk") from error
 
     def _read(self) -> LoadResult:
         try:

@@ -1,0 +1,78 @@
+"""What a start makes of its state folder: each life is above the one before, whatever the wall clock says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from support.fleets import fleet_of
+from support.states import state_of
+from zsched.adapters.host.state_file import LIFE_NAME, StateFile
+from zsched.core.values.fleet import electorate_hash
+from zsched.runtime import restoring
+from zsched.runtime.restoring import Restored, restore
+
+FLEET = fleet_of(name="hall")
+STATE = state_of("robot1", fleet="hall", incarnation=2, electorate=electorate_hash(FLEET))
+
+
+def start(folder: Path, monkeypatch: pytest.MonkeyPatch, wall: int, node: str = "robot1") -> Restored:
+    monkeypatch.setattr(restoring, "wall_tenths", lambda: wall)
+    with StateFile(folder, fleet="hall", node=node, hardware="") as file:
+        return restore(file, FLEET, config=Path("fleet.yaml"), node=node, state_dir=folder)
+
+
+def save(folder: Path, incarnation: int, electorate: str = STATE.electorate) -> None:
+    with StateFile(folder, fleet="hall", node="robot1", hardware="") as file:
+        file.save(replace(STATE, incarnation=incarnation, electorate=electorate))
+
+
+def test_without_a_state_a_start_with_an_early_clock_is_a_later_life(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a lower one the others would refuse all that it signs, its votes among it."""
+    first = start(tmp_path, monkeypatch, 5000)
+    assert (first.state, first.is_missing, first.incarnation) == (None, True, 5000)
+    assert start(tmp_path, monkeypatch, 40).incarnation == 5001
+    assert start(tmp_path, monkeypatch, 6000).incarnation == 6000
+
+
+def test_a_state_that_was_lost_or_comes_back_begins_no_lower_life(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save(tmp_path, 7000)
+    found = start(tmp_path, monkeypatch, 40)
+    assert found.state is not None
+    assert (found.state.incarnation, found.incarnation) == (7001, 7001)
+    (tmp_path / "state").unlink()
+    assert start(tmp_path, monkeypatch, 40).incarnation == 7002
+    save(tmp_path, 2)  # from a backup
+    again = start(tmp_path, monkeypatch, 40)
+    assert again.state is not None
+    assert again.state.incarnation == 7003
+    save(tmp_path, 9000, "another one's")
+    foreign = start(tmp_path, monkeypatch, 40)
+    assert (foreign.is_foreign, foreign.incarnation) == (True, 9001)
+
+
+def test_another_node_s_folder_is_left_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    save(tmp_path, 7000)
+    found = start(tmp_path, monkeypatch, 40, "robot2")
+    assert (found.is_others, found.incarnation) == (True, 40)
+    assert not (tmp_path / LIFE_NAME).exists()
+
+
+@pytest.mark.parametrize("text", ["", "x", "-3", "9" * 25, str(2**53), "12" * 40])
+def test_a_note_of_another_form_counts_as_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> None:
+    (tmp_path / LIFE_NAME).write_text(text)
+    assert start(tmp_path, monkeypatch, 5000).incarnation == 5000
+
+
+def test_a_life_that_cannot_be_noted_is_lived_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / LIFE_NAME).mkdir()
+    assert start(tmp_path, monkeypatch, 5000).incarnation == 5000
+    assert "life not noted why=cannot write" in caplog.text
