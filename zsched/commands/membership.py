@@ -47,6 +47,7 @@ from zsched.pki.files import write_whole
 from zsched.runtime.membership import Places, Written, belongings, found, is_joined, is_of_a_later_key, put_away
 from zsched.runtime.membership import join as join_here
 from zsched.runtime.own_addresses import addresses_at
+from zsched.runtime.unfinished import unfinished
 from zsched.wire.codec import from_plain
 from zsched.wire.invitation import MAX_BYTES, Invitation, decode_invitation, encode_invitation
 
@@ -226,12 +227,15 @@ def create(view: CreateView) -> int:
     text = _first_text(view, address)
     try:
         with uninterrupted():  # a fleet that is founded by half would be in the way of the next try
-            fleet, files = found(text, view.node, view.places, is_plan=view.is_plan, certify=certify)
-        if papers is not None and view.is_plan:
-            papers.check()
+            fleet, files = found(text, view.node, view.places, is_plan=True, certify=certify)
+            before = unfinished(view.places.config)
+            if papers is not None:
+                papers.check("" if before is None else before.id)
+            if not view.is_plan:
+                fleet, files = found(text, view.node, view.places, is_plan=False, certify=certify)
     except ZschedError:
         if papers is not None:
-            papers.destroy()
+            papers.destroy(view.places.config)
         raise
     where = f"{address.host}, ports {address.port} and {address.port + 1}"
     trust = "secured" if view.is_secured else "NOT SECURED: whoever reaches this network reads and changes everything"

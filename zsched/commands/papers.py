@@ -17,7 +17,15 @@ from typing import TYPE_CHECKING, Final
 from zsched import paths as places
 from zsched.commands.apply import DANGERS, OPEN_NETWORK
 from zsched.commands.common import CliError, check_name, nearest, warn
-from zsched.commands.pki import begin_for, former_keys, holds_authority, issue_for, passphrase_for, supersede
+from zsched.commands.pki import (
+    begin_for,
+    former_keys,
+    holds_authority,
+    is_left_of,
+    issue_for,
+    passphrase_for,
+    supersede,
+)
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId
 from zsched.errors import AdapterError
@@ -25,6 +33,7 @@ from zsched.exits import EXIT_FAILED, EXIT_USAGE
 from zsched.files import read_regular
 from zsched.runtime.membership import Places, Written, request_here
 from zsched.runtime.own_addresses import addresses_at
+from zsched.runtime.unfinished import mark_of
 from zsched.wire.invitation import Papers
 
 if TYPE_CHECKING:
@@ -45,34 +54,39 @@ class FirstPapers:
         self._begun: Begun | None = None
         self._fleet, self._folder = fleet, places.authority_folder(authority, os.environ, fleet)
 
-    def check(self) -> None:
-        """Refuse to begin where there is an authority.
+    def check(self, creation: str = "") -> None:
+        """Refuse to begin where there is an authority, but for one that this creation has left.
 
         Raises:
             CliError: there is one.
         """
-        if holds_authority(self._fleet, self._authority) is not None:
+        is_left = is_left_of(creation, self._fleet, self._node, self._authority)
+        if not is_left and holds_authority(self._fleet, self._authority) is not None:
             advice = "if no fleet needs it any more, move it away; another folder: --authority DIR"
             raise CliError(EXIT_FAILED, f"{self._folder} holds an authority, and is left as it is; {advice}")
 
-    def certify(self, fleet: Fleet) -> Papers:
-        """The certificate and key of the first node.
+    def certify(self, fleet: Fleet, creation: str) -> Papers:
+        """The certificate and key of the first node; what an earlier try of this creation has left is deleted.
 
         Raises:
             CliError: there is an authority already.
             AdapterError: its folder cannot be written.
         """
+        is_left_of(creation, self._fleet, self._node, self._authority, is_destroyed=True)
         self.check()
-        begun = self._begun = begin_for(fleet, self._node, self._authority, asks_passphrase=self._asks)
+        begun = self._begun = begin_for(
+            fleet, self._node, self._authority, asks_passphrase=self._asks, creation=creation
+        )
         issued = begun.issued
         certificate, key, trusted = (pem.decode("ascii") for pem in (issued.certificate, issued.key, issued.trusted))
         return Papers(certificate=certificate, key=key, trusted=trusted)
 
-    def destroy(self) -> None:
-        """The fleet was not founded: nobody has a certificate of its authority, so it goes."""
+    def destroy(self, config: Path) -> None:
+        """The fleet was not founded: nobody has a certificate of its authority, so it goes, and then the mark."""
         if self._begun is not None:
             with suppress(OSError):
                 self._begun.authority.destroy()
+                mark_of(config).unlink(missing_ok=True)
 
     @property
     def files(self) -> tuple[Written, ...]:

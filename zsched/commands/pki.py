@@ -115,8 +115,8 @@ class Begun(Struct, frozen=True, kw_only=True):
     """Whether its key needs a passphrase."""
 
 
-def begin_for(fleet: Fleet, node: str, given: Path | None, *, asks_passphrase: bool) -> Begun:
-    """A new authority for a new fleet, and the first node's certificate with a new key.
+def begin_for(fleet: Fleet, node: str, given: Path | None, *, asks_passphrase: bool, creation: str) -> Begun:
+    """A new authority for a new fleet, and the first node's certificate with a new key; ``creation``: of that fleet.
 
     Raises:
         AdapterError: there is an authority already, or the folder cannot be written.
@@ -125,7 +125,7 @@ def begin_for(fleet: Fleet, node: str, given: Path | None, *, asks_passphrase: b
 
     folder = places.authority_folder(given, os.environ, fleet.name)
     secret = _new_passphrase() if asks_passphrase else os.environ.get(PASSPHRASE, "").encode()
-    authority = create(folder, fleet.name, secret, _now())
+    authority = create(folder, fleet.name, secret, _now(), creation)
     issued = authority.issue(node, Role.NODE, _check_name(fleet, node, Role.NODE), b"", secret, _now())
     return Begun(authority=authority, issued=issued, is_locked=bool(secret))
 
@@ -134,6 +134,25 @@ def holds_authority(fleet: str, given: Path | None) -> Path | None:
     """The folder of a fleet's authority on this machine; ``None``: there is none."""
     folder = places.authority_folder(given, os.environ, fleet)
     return folder if (folder / RECORD).exists() else None
+
+
+def is_left_of(creation: str, fleet: str, node: str, given: Path | None, *, is_destroyed: bool = False) -> bool:
+    """Whether the authority here was made by this creation of a fleet, and nobody but its first node has got anything.
+
+    ``is_destroyed``: it is deleted then.
+    """
+    from zsched.pki.authority import opened  # noqa: PLC0415 - imports cryptography
+
+    folder = holds_authority(fleet, given)
+    if folder is None or not creation:
+        return False
+    with contextlib.suppress(AdapterError, OSError), opened(folder, fleet) as authority:
+        record = authority.record
+        is_left = record.creation == creation and all(one.holder.name == node for one in record.entries)
+        if is_left and is_destroyed:
+            authority.destroy()
+        return is_left
+    return False
 
 
 def passphrase_for(fleet: Fleet, given: Path | None) -> bytes | None:

@@ -88,6 +88,8 @@ class Record(Struct, frozen=True, kw_only=True):
     entries: tuple[Entry, ...] = ()
     lives: tuple[tuple[str, int], ...] = ()
     """(node, its incarnation when the rotation began), of those that lived; empty: nobody has looked."""
+    creation: str = ""
+    """Of the fleet for which it was made (`zsched.runtime.unfinished`); empty: it was made by itself."""
 
     def entry(self, label: str) -> Entry | None:
         """The entry of a label; ``None``: no key of that label was certified."""
@@ -377,8 +379,8 @@ class Authority:
             raise AdapterError(f"{path}: cannot be written: {error.strerror}") from error
 
 
-def create(folder: Path, fleet: str, passphrase: bytes, now: datetime) -> Authority:
-    """A new authority in ``folder``.
+def create(folder: Path, fleet: str, passphrase: bytes, now: datetime, creation: str = "") -> Authority:
+    """A new authority in ``folder``; ``creation``: that of the fleet, of which it is a part.
 
     Raises:
         AdapterError: there is one already, or the folder cannot be written.
@@ -387,7 +389,7 @@ def create(folder: Path, fleet: str, passphrase: bytes, now: datetime) -> Author
         raise AdapterError(
             f"{folder} holds an authority; `zsched pki show` tells of it; another folder: --authority DIR"
         )
-    authority = Authority(folder, Record(fleet=fleet, number=0, trusted=()))
+    authority = Authority(folder, Record(fleet=fleet, number=0, trusted=(), creation=creation))
     authority._found(passphrase, now, {})  # noqa: SLF001 - of this module
     return authority
 
@@ -430,8 +432,14 @@ def _record(body: dict[str, Any]) -> Record:
     )
     trusted = tuple(str(one) for one in body["trusted"])
     lives = tuple((str(name), int(life)) for name, life in body.get("lives", ()))
-    number = int(body["number"])
-    return Record(fleet=str(body["fleet"]), number=number, trusted=trusted, entries=entries, lives=lives)
+    return Record(
+        fleet=str(body["fleet"]),
+        number=int(body["number"]),
+        trusted=trusted,
+        entries=entries,
+        lives=lives,
+        creation=str(body.get("creation", "")),
+    )
 
 
 def key_name(number: int) -> str:

@@ -43,10 +43,11 @@ from zsched.core.values.fleet import Fleet, fleet_hash
 from zsched.core.values.model import NodeId, RegisterState
 from zsched.core.values.struct import Struct, replace
 from zsched.core.vote.generations import blank_state
-from zsched.errors import AdapterError, ConfigError, WireError
+from zsched.errors import AdapterError, ConfigError, WireError, ZschedError
 from zsched.files import read_regular
 from zsched.pki.files import PRIVATE, PUBLIC, write_whole
 from zsched.runtime.secured import CERTIFICATE, KEY, TRUSTED
+from zsched.runtime.unfinished import Creation, mark_of, unfinished
 from zsched.sessions.certificate import common_names, ders_of, parts_of
 from zsched.wire.codec import decode_state, document_hash
 from zsched.wire.invitation import Invitation, Papers
@@ -94,34 +95,83 @@ def found(
     places: Places,
     *,
     is_plan: bool,
-    certify: Callable[[Fleet], Papers] | None = None,
+    certify: Callable[[Fleet, str], Papers] | None = None,
 ) -> tuple[Fleet, tuple[Written, ...]]:
     """Make this machine the first one of a new fleet; ``is_plan``: only say what would be written.
 
-    ``certify`` makes the certificate of a secured fleet; it is called when nothing else is in the way.
+    What an earlier try has written, which a power cut broke off, is deleted first.
+    ``certify`` makes the certificate of a secured fleet; it is called when nothing else is in the way, with the id of
+    this creation: an authority of the same one is what the earlier try has left.
 
     Raises:
         AdapterError: the machine belongs to a fleet already, or a file cannot be written.
         ConfigError: the text has faults.
     """
     fleet = _read(text, places.config)
+    _check_free(fleet, me, places)
+    content = Document(text=Text(text))
+    listed = (CERTIFICATE, TRUSTED, KEY) if certify is not None else ()
+    written = _listed(fleet, me, content, places, listed=listed)
+    if is_plan:
+        return fleet, written
+    with StateFile(places.state, fleet=fleet.name, node=me) as file:
+        _check_free(fleet, me, places)  # nobody else creates one here any more
+        before = unfinished(places.config) or Creation(id=secrets.token_hex(16))
+        _take_back(fleet, places, before)
+        creation = before.adding([text.encode()])
+        try:
+            _put(mark_of(places.config), creation.encoded(), PRIVATE_MODE)
+            papers = None if certify is None else certify(fleet, creation.id)
+            if papers is not None:
+                pems = (papers.certificate, papers.key, papers.trusted)
+                creation = creation.adding([one.encode() for one in pems])
+                _put(mark_of(places.config), creation.encoded(), PRIVATE_MODE)
+            disk = secrets.token_hex(8)
+            value = created(fleet, me, disk=disk, generation_id=secrets.token_hex(16), document=document_hash(content))
+            _put_all(file, fleet, me, value, content, places, disk, papers=papers)
+        except ZschedError:
+            with contextlib.suppress(AdapterError, OSError):  # else the next try does
+                _take_back(fleet, places, creation)
+                if certify is None:  # else its caller does, once there is no authority of this creation
+                    mark_of(places.config).unlink(missing_ok=True)
+            raise
+        with contextlib.suppress(OSError):
+            mark_of(places.config).unlink(missing_ok=True)
+    return fleet, written
+
+
+def _check_free(fleet: Fleet, me: NodeId, places: Places) -> None:
+    """Refuse to found a fleet where there is one, or over what somebody else has written."""
     _check_no_state(fleet.name, me, places.state)
-    if places.config.exists():
+    before = unfinished(places.config)
+    taken = [path for path in _first_files(fleet, places) if os.path.lexists(path)]
+    others = [path for path in taken if before is None or not before.has_written(path)]
+    if places.config in others:
         advice = "use it (`zsched init`), or give another file with --config"
         raise AdapterError(f"{places.config} exists already, and is left as it is; {advice}")
-    content = Document(text=Text(text))
-    disk = secrets.token_hex(8)
-    value = created(fleet, me, disk=disk, generation_id=secrets.token_hex(16), document=document_hash(content))
-    if certify is not None and fleet.security is not None:
-        _check_no_papers(Path(fleet.security.folder))
-    papers = None if certify is None or is_plan else certify(fleet)
-    listed = (CERTIFICATE, TRUSTED, KEY) if certify is not None else ()
-    try:
-        return fleet, _write(fleet, me, value, content, places, disk, papers=papers, listed=listed, is_plan=is_plan)
-    except AdapterError:
-        with contextlib.suppress(OSError):  # else the next try would take it for the file of a fleet that is there
-            places.config.unlink(missing_ok=True)
-        raise
+    if path := next((one for one in others if one.name in (CERTIFICATE, KEY)), None):
+        raise AdapterError(f"{path} exists already, and is left as it is; move the folder {path.parent} away")
+
+
+def _first_files(fleet: Fleet, places: Places) -> tuple[Path, ...]:
+    """What a creation writes outside the state folder, where nothing is in the way without a state."""
+    folder = None if fleet.security is None else Path(fleet.security.folder)
+    return (places.config, *(() if folder is None else (folder / name for name in (CERTIFICATE, KEY, TRUSTED))))
+
+
+def _take_back(fleet: Fleet, places: Places, creation: Creation) -> None:
+    """Delete what a creation has written, and nobody has changed since; its mark stays.
+
+    Raises:
+        AdapterError: a file cannot be deleted.
+    """
+    for path in _first_files(fleet, places):
+        if creation.has_written(path):
+            try:
+                path.unlink()
+                sync_folder(path.parent)
+            except OSError as error:
+                raise AdapterError(f"cannot delete {path}: {error.strerror}; {_advice(error, path)}") from error
 
 
 # --- to ask for a certificate ----------------------------------------------------------------------------------------
@@ -334,13 +384,6 @@ def _check_own_key(path: Path, invitation: Invitation) -> None:
         raise AdapterError(f"{path} is another key than the one that the certificate is for; {advice}")
 
 
-def _check_no_papers(folder: Path) -> None:
-    """Refuse to found a secured fleet over somebody's certificate or key."""
-    for path in (folder / CERTIFICATE, folder / KEY):
-        if path.exists():
-            raise AdapterError(f"{path} exists already, and is left as it is; move the folder {folder} away")
-
-
 def _named(pem: bytes) -> str | None:
     try:
         return next(iter(common_names(pem)), None)
@@ -441,6 +484,7 @@ def put_away(
             _put_one_away(one.path, is_deleted=is_purged or (one.path.name == COPY_NAME and not comes_back))
         with contextlib.suppress(OSError):
             (places.state / OUT_NAME).unlink(missing_ok=True)
+            mark_of(places.config).unlink(missing_ok=True)  # of a creation that was finished but for this
     return tuple(Written(path=one.path, what=_fate(one, is_purged=is_purged)) for one in there)
 
 
@@ -568,13 +612,20 @@ def _write(
     listed: tuple[str, ...],
     is_plan: bool,
 ) -> tuple[Written, ...]:
-    """Write all of it, the state last."""
-    text = content.text.encode()
-    plain = blank_state(fleet, me, generation, None, incarnation=wall_tenths(), hardware=hardware_id(), disk=disk)
-    state = replace(plain, registers=(), fleet_register=RegisterState(task=fleet.name, learnt=value))
+    """Write all of it; ``is_plan``: only say what."""
+    written = _listed(fleet, me, content, places, listed=listed)
+    if not is_plan:
+        with StateFile(places.state, fleet=fleet.name, node=me) as file:
+            _put_all(file, fleet, me, value, content, places, disk, generation=generation, papers=papers)
+    return written
+
+
+def _listed(
+    fleet: Fleet, me: NodeId, content: Document, places: Places, *, listed: tuple[str, ...]
+) -> tuple[Written, ...]:
+    """What is written, in this order."""
     written = [Written(path=places.config, what="the fleet file, as a copy of the agreed document")]
-    old = _other_text(places.config, text)
-    if old is not None:
+    if _other_text(places.config, content.text.encode()) is not None:
         kept = places.config.with_name(f"{places.config.name}{BEFORE}")
         written.append(Written(path=kept, what="the fleet file that was there"))
     folder = None if fleet.security is None else Path(fleet.security.folder)
@@ -582,18 +633,34 @@ def _write(
         written += [Written(path=folder / name, what=_WHAT[name]) for name in listed]
     written.append(Written(path=places.state / FOLDER_NAME, what="the agreed document"))
     written.append(Written(path=places.state / STATE_NAME, what=f"the state of {me}: it has never voted"))
-    if is_plan:
-        return tuple(written)
-    with StateFile(places.state, fleet=fleet.name, node=me) as file:
-        if old is not None:
-            _put(places.config.with_name(f"{places.config.name}{BEFORE}"), old, PUBLIC_MODE)
-        _put(places.config, text, PUBLIC_MODE)
-        if papers is not None and folder is not None:
-            _put_papers(folder, papers)
-        DocumentStore(places.state).save(content)
-        _put(places.state / COPY_NAME, f"{fleet_hash(fleet)}\n".encode(), PRIVATE_MODE)
-        file.create(state)
     return tuple(written)
+
+
+def _put_all(
+    file: StateFile,
+    fleet: Fleet,
+    me: NodeId,
+    value: FleetValue,
+    content: Document,
+    places: Places,
+    disk: str,
+    *,
+    generation: int = 0,
+    papers: Papers | None,
+) -> None:
+    """Write all of it, the state last."""
+    text = content.text.encode()
+    plain = blank_state(fleet, me, generation, None, incarnation=wall_tenths(), hardware=hardware_id(), disk=disk)
+    state = replace(plain, registers=(), fleet_register=RegisterState(task=fleet.name, learnt=value))
+    old = _other_text(places.config, text)
+    if old is not None:
+        _put(places.config.with_name(f"{places.config.name}{BEFORE}"), old, PUBLIC_MODE)
+    _put(places.config, text, PUBLIC_MODE)
+    if papers is not None and fleet.security is not None:
+        _put_papers(Path(fleet.security.folder), papers)
+    DocumentStore(places.state).save(content)
+    _put(places.state / COPY_NAME, f"{fleet_hash(fleet)}\n".encode(), PRIVATE_MODE)
+    file.create(state)
 
 
 def copied_file(state: Path) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 import stat
 import subprocess
@@ -31,7 +32,8 @@ from zsched.core.values.certificates import Role
 from zsched.core.values.document import Document, Rollout, Text
 from zsched.core.values.struct import replace
 from zsched.errors import ConfigError
-from zsched.pki.authority import create
+from zsched.exits import EXIT_WOULD_CHANGE
+from zsched.pki.authority import create, opened
 from zsched.runtime.membership import Places
 from zsched.runtime.secured import require_own
 from zsched.wire.codec import as_plain, document_hash, from_plain
@@ -256,6 +258,45 @@ def test_a_fleet_that_cannot_be_written_leaves_no_authority(tmp_path: Path, auth
     assert "key.pem exists already, and is left as it is" in result.stderr
     assert (tmp_path / "pki" / "key.pem").read_text() == "somebody's"
     assert not authority.exists()
+
+
+def test_a_creation_that_a_power_cut_broke_off_leaves_no_authority_in_the_way(
+    tmp_path: Path, authority: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class PowerCut(BaseException):
+        pass
+
+    def cut(*_: Any) -> None:
+        raise PowerCut
+
+    words = ("fleet", "create", "hall", "--node", "robot1", "--address", "127.0.0.1", *here(tmp_path))
+    for place in ("zsched.pki.authority.Authority.issue", "zsched.runtime.membership._put_papers"):
+        with monkeypatch.context() as patch:
+            patch.setattr(place, cut)
+            with pytest.raises(PowerCut):
+                run(*words)
+        assert (authority / "ca-1.key").exists()
+    key = (authority / "ca-1.key").read_bytes()
+    assert run(*words, "--plan").exit_code == EXIT_WOULD_CHANGE
+    assert (authority / "ca-1.key").read_bytes() == key
+    elsewhere = run(*words[:-4], *here(tmp_path / "elsewhere"))
+    assert "holds an authority, and is left as it is" in elsewhere.stderr, "another creation"
+    result = run(*words)
+    assert result.exit_code == 0, result.stderr
+    assert (authority / "ca-1.key").read_bytes() != key
+    fleet = load_fleet(tmp_path / "fleet.yaml")
+    assert fleet.security is not None
+    require_own(fleet, fleet.security, "robot1")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["authority", "fleet.yaml", "pki", "state"]
+    (tmp_path / "state" / "state").unlink()
+    (tmp_path / "fleet.yaml.creating").write_text(
+        json.dumps({"creation": json.loads((authority / "authority.json").read_text())["creation"], "written": []})
+    )
+    (tmp_path / "fleet.yaml").unlink()
+    shutil.rmtree(tmp_path / "pki")
+    with opened(authority, "hall") as held:
+        held.issue("robot2", Role.NODE, (), b"", b"", datetime.now(UTC))
+    assert "holds an authority, and is left as it is" in run(*words).stderr, "somebody has got a certificate of it"
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP, signal.SIGTERM])

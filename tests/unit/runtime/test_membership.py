@@ -6,6 +6,7 @@ import os
 import shutil
 import stat
 import subprocess
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,9 +18,9 @@ from zsched.adapters.host.state_file import StateFile, replace_synced
 from zsched.config.load import load_fleet
 from zsched.core.values.document import Document
 from zsched.core.values.electorate import FleetValue
-from zsched.core.values.fleet import fleet_hash
+from zsched.core.values.fleet import Fleet, fleet_hash
 from zsched.errors import AdapterError, ConfigError
-from zsched.runtime import next_cell
+from zsched.runtime import membership, next_cell, unfinished
 from zsched.runtime.init import init_state
 from zsched.runtime.membership import (
     BEFORE,
@@ -47,6 +48,25 @@ tasks:
   merge: {candidates: {kind: robot}, weights: {cpu: 1}}
   guard: {candidates: {kind: robot}, weights: {cpu: 1}}
 """
+
+
+SECURED = f"{TEXT.replace('tcp/', 'tls/')}security: {{}}\n"
+
+
+class PowerCut(BaseException):
+    """Nothing runs after it."""
+
+
+def found_by_half(text: str, places: Places, write: str, certify: Callable[[Fleet, str], Papers]) -> None:
+    """The power goes at the write that is named."""
+
+    def cut(*_: object) -> None:
+        raise PowerCut
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(membership, write, cut)
+        with pytest.raises(PowerCut):
+            found(text, "robot1", places, is_plan=False, certify=certify)
 
 
 @pytest.fixture
@@ -135,6 +155,64 @@ def test_no_fleet_is_founded_where_one_is(first: Places, second: Places) -> None
     with pytest.raises(AdapterError, match=r"exists already, and is left as it is; use it \(`zsched init`\)"):
         found(TEXT, "robot1", replace(first, state=second.state), is_plan=False)
     assert not second.config.exists()
+
+
+@pytest.mark.parametrize("write", ["_put_papers", "DocumentStore", "fleet_hash"])
+def test_a_creation_that_a_power_cut_broke_off_can_be_given_again(first: Places, write: str) -> None:
+    """Else its fleet file would be taken for one that is there, and a fleet be made of it that has no document."""
+    text, creations = SECURED, list[str]()
+
+    def certify(_: object, creation: str) -> Papers:
+        creations.append(creation)
+        return Papers(certificate=f"certificate {len(creations)}", key="key", trusted="trusted")
+
+    found_by_half(text, first, write, certify)
+    assert first.config.exists()
+    found(text, "robot1", first, is_plan=True, certify=certify)
+    again = text.replace("127.0.0.1", "127.0.0.2")
+    found(again, "robot1", first, is_plan=False, certify=certify)
+    assert first.config.read_text() == again
+    assert (first.config.parent / "pki" / "certificate.pem").read_text() == "certificate 2"
+    assert creations[0] == creations[1], "by it the authority of the first try is known"
+    assert value_at(first, "robot1")[1].text == again
+    assert not unfinished.mark_of(first.config).exists()
+    with pytest.raises(AdapterError, match="belongs to a fleet"):
+        found(text, "robot1", first, is_plan=False, certify=certify)
+
+
+@pytest.mark.parametrize("name", ["fleet.yaml", "pki/certificate.pem", "pki/key.pem"])
+def test_what_somebody_has_written_since_a_creation_was_broken_off_stays(first: Places, name: str) -> None:
+    def certify(*_: object) -> Papers:
+        return Papers(certificate="certificate", key="key", trusted="trusted")
+
+    found_by_half(SECURED, first, "fleet_hash", certify)
+    path = first.config.parent / name
+    path.write_text("somebody's own")
+    for is_plan in (True, False):
+        with pytest.raises(AdapterError, match=f"{path} exists already, and is left as it is"):
+            found(SECURED, "robot1", first, is_plan=is_plan, certify=certify)
+    assert path.read_text() == "somebody's own"
+    path.unlink()
+    found(SECURED, "robot1", first, is_plan=False, certify=certify)
+
+
+def test_a_creation_that_fails_leaves_nothing_in_the_way(first: Places, monkeypatch: pytest.MonkeyPatch) -> None:
+    def failed(*_: object) -> None:
+        raise AdapterError("the disk is full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(membership, "fleet_hash", failed)
+        with pytest.raises(AdapterError, match="the disk is full"):
+            found(TEXT, "robot1", first, is_plan=False)
+    assert list(first.config.parent.iterdir()) == []
+    mark = unfinished.mark_of(first.config)
+    for text in ("", "{}", "[]", '{"creation": 1}'):
+        mark.write_text(text)
+        assert unfinished.unfinished(first.config) is None
+    found(TEXT, "robot1", first, is_plan=False)
+    mark.write_text('{"creation": "a", "written": []}')  # the power went before it was deleted
+    put_away("hall", "robot1", first, is_purged=False)
+    assert not mark.exists()
 
 
 def test_a_machine_that_joins_knows_the_value_the_document_and_has_a_disk_of_its_own(
