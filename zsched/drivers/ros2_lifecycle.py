@@ -20,7 +20,7 @@ from typing import Final
 
 import zenoh
 
-from zsched.clock import monotonic_s, wall_ns
+from zsched.clock import awake_s, wall_ns
 from zsched.core.route.lifecycle import (
     GET_STATE_REQUEST,
     State,
@@ -145,12 +145,12 @@ class LifecycleNode:
 
     def _lead(self, session: zenoh.Session) -> None:
         """Bring the node where its role wants it, again and again: it may have left that state by itself."""
-        heard_s: float | None = None
+        heard_s: float | None = None  # the node slept as long as the machine did
         while not self._stop.is_set():
             state = self._state(session)
             if state is not None:
-                heard_s = monotonic_s()
-            elif heard_s is not None and monotonic_s() - heard_s > SILENT_S:
+                heard_s = awake_s()
+            elif heard_s is not None and awake_s() - heard_s > SILENT_S:
                 self._fail(f"{self._node} has not told its state for {SILENT_S:g} s")
                 return
             pause_s = SOON_S
@@ -162,6 +162,7 @@ class LifecycleNode:
                 if transition is not None:
                     if not self._changes(session, transition):
                         return
+                    heard_s = awake_s()  # that may have taken longer than a silence may
                     continue
                 pause_s = LOOK_S if state in (State.INACTIVE, State.ACTIVE) else SOON_S
             self._news.wait(pause_s)

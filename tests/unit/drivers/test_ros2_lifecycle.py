@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from support.clocks import Clocks
+from zsched.core.route.lifecycle import State, Transition
 from zsched.drivers.place import Place
 from zsched.drivers.ros2_lifecycle import LifecycleNode, as_client, fault_of, look
 from zsched.errors import ConfigError
@@ -48,6 +50,59 @@ def test_the_end_of_the_process_is_told_by_status_or_signal(tmp_path: Path) -> N
     assert engine.why(0).reason == "/edge1/slam has ended by itself"
     assert engine.why(78).is_final
     assert not engine.why(1).is_final
+
+
+class Led(LifecycleNode):
+    """A node that answers by the script: seconds that pass before, and the state that it tells."""
+
+    def __init__(self, clocks: Clocks, *script: tuple[float, State | None]) -> None:
+        place = Place(fleet="f", node="edge1", task="t", session=Path("none"), variables=())
+        super().__init__(argparse.Namespace(node="/{target}/slam", arg=["sh"]), place, "0")
+        self._clocks, self._script = clocks, iter(script)
+        self.change_s, self.reasons = 0.0, list[str]()
+        self._tell_end = lambda ended: self.reasons.append(ended.reason)
+
+    def lead(self) -> Led:
+        self._lead(None)  # type: ignore[arg-type] - nothing of it is used
+        return self
+
+    def _state(self, session: zenoh.Session) -> int | None:
+        del session
+        passed, state = next(self._script, (0.0, None))
+        self._clocks.awake += passed
+        if state is State.FINALIZED:  # the script is over
+            self._stop.set()
+        self._news.set()
+        return None if state is State.FINALIZED else state
+
+    def _changes(self, session: zenoh.Session, transition: Transition) -> bool:
+        del session, transition
+        self._clocks.awake += self.change_s
+        return True
+
+
+def test_a_node_is_heard_by_the_answer_to_a_long_transition(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It loads a map for 25 s; one question that is lost then is no silence of 27 s."""
+    led = Led(
+        Clocks(monkeypatch), (0.0, State.UNCONFIGURED), (2.0, None), (0.0, State.INACTIVE), (0.0, State.FINALIZED)
+    )
+    led.change_s = 25.0
+    assert led.lead().reasons == []
+    still = Led(Clocks(monkeypatch), (0.0, State.UNCONFIGURED), *(((2.0, None),) * 6))
+    assert still.lead().reasons == ["/edge1/slam has not told its state for 10 s"]
+
+
+def test_a_machine_that_sleeps_is_no_silence_of_a_node(monkeypatch: pytest.MonkeyPatch) -> None:
+    clocks = Clocks(monkeypatch)
+    led = Led(clocks, (0.0, State.INACTIVE), (2.0, None), (0.0, State.INACTIVE), (0.0, State.FINALIZED))
+    waited = led._news.wait
+
+    def wait(timeout: float | None = None) -> bool:
+        clocks.slept += 3600.0
+        return waited(timeout)
+
+    monkeypatch.setattr(led._news, "wait", wait)
+    assert led.lead().reasons == []
 
 
 def test_the_driver_is_a_client_of_the_nodes_relay_only() -> None:
