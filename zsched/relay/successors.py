@@ -17,7 +17,7 @@ import select
 import socket
 from typing import Final
 
-from zsched.clock import monotonic_s
+from zsched.clock import awake_s
 from zsched.core.values.model import TaskId
 from zsched.core.values.struct import Struct, replace
 from zsched.errors import WireError
@@ -49,12 +49,18 @@ class Successors:
         self._reopens = reopens
 
     def wait(self, timeout_s: float) -> Successor | None:
-        """The next daemon, or ``None`` when none came within ``timeout_s``."""
-        until = monotonic_s() + timeout_s
+        """The next daemon, or ``None`` when none came within ``timeout_s``, while the machine was awake.
+
+        One that is at the door at the end is let in: this process may have stood still until then.
+        """
+        until = awake_s() + timeout_s
         poller = select.poll()
         poller.register(self._listener, select.POLLIN)
-        while (left := until - monotonic_s()) > 0:
-            if not poller.poll(left * 1000):
+        is_over = False
+        while not is_over:
+            left_s = max(0.0, until - awake_s())
+            is_over = left_s == 0.0
+            if not poller.poll(left_s * 1000):
                 continue
             link, _ = self._listener.accept()
             found = self._greet(link)
