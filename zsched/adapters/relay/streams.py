@@ -405,8 +405,8 @@ class RelayHandle:
             except ConnectionResetError:  # it ended before it had read all that we said
                 return last_word
             except (WireError, OSError) as error:
-                if self._its_words is not None and isinstance(error, WireError) and error.reason == "kind":
-                    continue  # a newer relay tells more than we read
+                if isinstance(error, WireError) and error.reason == "kind":
+                    continue  # a newer relay tells more than we read: ours, too, if its files were just replaced
                 return f"unreadable report: {error}"
             if isinstance(report, RelayPulse):
                 if report.counted_s > STILL_S:

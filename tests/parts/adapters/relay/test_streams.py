@@ -16,11 +16,14 @@ import pytest
 
 from support.waiting import until
 from zsched.adapters.relay import streams
+from zsched.adapters.relay.child import RelayChild
 from zsched.adapters.relay.streams import RelayHandle
 from zsched.core.events import RelayChanged
-from zsched.core.relay_protocol import HandleReport, RelayStarted
+from zsched.core.relay_protocol import HandleReport, RelayStarted, RelayStop
 from zsched.core.values.plan import Role, WorkerRole
+from zsched.ipc.pipe import write_frame
 from zsched.sessions.config import data_config
+from zsched.wire import codec as wire
 
 CONFIG = data_config(listen=("tcp/127.0.0.1:0",), connect=())
 
@@ -129,6 +132,20 @@ def test_only_a_silent_relay_that_wants_no_processor_is_wedged(tmp_path: Path, d
         assert changes[1].is_running is not is_replaced
     finally:
         handle.stop(0.5)
+
+
+def test_a_report_of_an_unknown_kind_is_passed_over() -> None:
+    """A relay that was started after the program's files were replaced is newer than its daemon."""
+    ours, theirs = socket.socketpair()
+    reports: list[HandleReport] = []
+    handle = RelayHandle(fleet="test", node="robot1", zenoh_config=CONFIG, on_report=reports.append)
+    for frame in (wire.encode(RelayStop()), wire.encode(RelayStarted(pid=7, zid="1"))):
+        write_frame(theirs.fileno(), frame)
+    theirs.close()
+    relay = RelayChild(pid=os.getpid(), link=ours, is_child=True)
+    assert handle._listen(relay) == ""
+    assert [type(report) for report in reports] == [RelayChanged, RelayStarted]
+    relay.close()
 
 
 def test_a_relay_that_is_wedged_before_its_first_word_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
