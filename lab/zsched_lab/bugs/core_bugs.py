@@ -604,16 +604,16 @@ MEMBERSHIP_BUGS = (
     _bug(
         "vouching ignored",
         MEMBERSHIP,
-        "any(at.beat_at > peer.suspect_since for _, at in observers)",
-        "any(at.beat_at < 0.0 for _, at in observers)",
+        "any(at.beat_at > peer.suspect_since for _, at in self._observers(name))",
+        "any(at.beat_at < 0.0 for _, at in self._observers(name))",
         _MEMBERSHIP,
     ),
     _bug("suspicion never confirmed", MEMBERSHIP, 'return "nobody speaks for it"', 'return ""', _MEMBERSHIP),
     _bug(
         "second observer not needed",
         MEMBERSHIP,
-        "            if name in observer.suspects:",
-        "            if observer.suspects or True:",
+        "if name in observer.suspects)",
+        "if observer.suspects or True)",
         _MEMBERSHIP,
     ),
     _bug(

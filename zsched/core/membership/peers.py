@@ -23,6 +23,7 @@ owner that all others hear.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 from zsched.core.sequence import Order, Track
 from zsched.core.values.beat import Beat
@@ -237,7 +238,7 @@ class Membership:
                 changes += self._take_word(beat, now)
         elif restarted:
             changes.append(Transition(node=beat.node, before=before, after=before, reason="restarted"))
-        return (*changes, *self._review(now)) if self._has_suspect else tuple(changes)
+        return (*changes, *self._hear_accusers(now)) if self._has_suspect else tuple(changes)
 
     def _note_way(self, silent_s: float, senders_lag_s: float, now: float) -> None:
         """A beat has followed the one before after so long a silence: its sender, its way or this node was slow."""
@@ -290,7 +291,7 @@ class Membership:
         if now < peer.back_at + self._timing.control_lease_s:
             return ()
         peer.token_lost, peer.token_lost_at = True, now
-        return (self._change(node, PeerState.SUSPECT, "its token went", now), *self._review(now))
+        return (self._change(node, PeerState.SUSPECT, "its token went", now), *self._hear_accusers(now))
 
     def tick(self, now: float) -> tuple[Transition, ...]:
         """Time has passed."""
@@ -333,25 +334,33 @@ class Membership:
             return 1.5 * self._timing.beat_s * self._lag_factor if peer.token_lost else 0.0
         return self._timing.confirm_s * self._lag_factor
 
+    def _hear_accusers(self, now: float) -> list[Transition]:
+        """Turn suspects into gone that another living node misses, too. Time is not judged: beats may wait."""
+        return self._end_suspicions(lambda name, _peer: self._accused_by(name), now)
+
     def _review(self, now: float) -> list[Transition]:
-        """Turn suspects into gone where that is confirmed."""
+        """Turn suspects into gone where another node, or their silence, confirms it."""
+        return self._end_suspicions(lambda name, peer: self._verdict(name, peer, now), now)
+
+    def _end_suspicions(self, judge: Callable[[NodeId, _Peer], str], now: float) -> list[Transition]:
         changes = []
         for name, peer in self._peers.items():
-            if peer.state is not PeerState.SUSPECT:
-                continue
-            reason = self._verdict(name, peer, now)
-            if reason:
+            if peer.state is PeerState.SUSPECT and (reason := judge(name, peer)):
                 changes.append(self._change(name, PeerState.GONE, reason, now))
         return changes
 
+    def _observers(self, name: NodeId) -> list[tuple[NodeId, _Peer]]:
+        return [(other, at) for other, at in self._peers.items() if other != name and at.state is PeerState.ALIVE]
+
+    def _accused_by(self, name: NodeId) -> str:
+        """Why a suspect is gone by another node's word; empty: nobody else misses it."""
+        accusers = (other for other, observer in self._observers(name) if name in observer.suspects)
+        return next((f"{other} misses it too" for other in accusers), "")
+
     def _verdict(self, name: NodeId, peer: _Peer, now: float) -> str:
-        observers = [(other, at) for other, at in self._peers.items() if other != name and at.state is PeerState.ALIVE]
-        for other, observer in observers:
-            if name in observer.suspects:
-                return f"{other} misses it too"
-        if now < self._review_at(peer):
-            return ""
-        if self._size > SMALL_FLEET and any(at.beat_at > peer.suspect_since for _, at in observers):
+        if (reason := self._accused_by(name)) or now < self._review_at(peer):
+            return reason
+        if self._size > SMALL_FLEET and any(at.beat_at > peer.suspect_since for _, at in self._observers(name)):
             # A living node still hears it: a cut between it and us, not its end. A silent node speaks for no peer.
             peer.vouched_until = now + self._timing.beat_s
             return ""

@@ -65,6 +65,25 @@ def gone_at(seen: list[tuple[float, NodeId, PeerState]], node: NodeId) -> float 
     return next((at for at, name, state in seen if name == node and state is GONE), None)
 
 
+def test_a_beat_tells_who_else_is_missed_and_not_that_time_is_up() -> None:
+    """Behind it the suspect's own beat may wait: its time is judged by a tick, when all have been heard."""
+    ear = heard(SMALL)
+    ear.members.absorb_token_lost("a", 1, 0.1)
+    assert ear.beat("b", 1.0) == []
+    assert ear.members.state("a") is SUSPECT
+    assert ear.beat("a", 1.0) == [ALIVE]
+    ear.members.absorb_token_lost("a", 1, 1.1)
+    assert ear.beat("b", 1.2, suspects=("a",)) == [GONE]
+
+
+def test_a_token_that_goes_does_not_tell_that_another_one_s_time_is_up() -> None:
+    ear = heard(LARGE)
+    ear.members.absorb_token_lost("a", 1, 0.1)
+    assert [change.node for change in ear.members.absorb_token_lost("b", 1, 1.0)] == ["b"]
+    assert ear.members.state("a") is SUSPECT
+    assert gone_at([(1.0, one.node, one.after) for one in ear.members.tick(1.0)], "a") == 1.0
+
+
 # --- hearing ---------------------------------------------------------------------------------------------------------
 
 
