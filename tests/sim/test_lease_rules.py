@@ -342,6 +342,7 @@ def test_what_the_worker_was_told_ends_with_its_stop_and_not_with_the_echoes() -
     held.on_given("guard", 11.0)
     held.on_beat(ask(), {}, 10.1)
     assert held.given_until("guard") == 11.0
+    held.on_told_to_stop("guard")
     assert held.on_stopped("guard", 3, 5)
     assert held.given_until("guard") == -math.inf
 

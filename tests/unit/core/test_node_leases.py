@@ -18,6 +18,7 @@ from zsched.core.values.beat import Grant
 from zsched.core.values.fleet import WorkerSpec, lease_terms
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import Allocation, RegisterState
+from zsched.core.values.plan import WorkerRole
 from zsched.core.values.profile import WorkerState
 
 ROBOTS = ("robot1", "robot2", "robot3")
@@ -77,6 +78,10 @@ class Owner:
             ]
 
     def heard(self, name: str, *, echoes: tuple[Grant, ...] = (), is_asked: bool = False) -> tuple[do.Instruction, ...]:
+        """A peer's beat comes, which may ask this owner to leave."""
+        return self.handle(self.peers_beat(name, echoes=echoes, is_asked=is_asked))
+
+    def peers_beat(self, name: str, *, echoes: tuple[Grant, ...] = (), is_asked: bool = False) -> ev.BeatReceived:
         """A peer's beat, which may ask this owner to leave."""
         self.sequence += 1
         beat = beat_of(
@@ -87,7 +92,7 @@ class Owner:
             asked_to_leave=(("guard", "robot1", 4),) if is_asked else (),
             lease_terms=lease_terms(FLEET),
         )
-        return self.handle(ev.BeatReceived(beat=beat))
+        return ev.BeatReceived(beat=beat)
 
     def echoed(self, number: int) -> float | None:
         """Both others echo one of our numbers; until when the worker is then told that it may work."""
@@ -131,6 +136,39 @@ def test_the_word_of_a_worker_whose_process_ended_meanwhile_gives_nothing_back(*
     owner.handle(ev.RoleEnded(task="guard", epoch=4))
     owner.beat()
     assert bool(owner.released) is not has_died
+
+
+def test_a_worker_s_word_that_waits_behind_the_order_to_leave_gives_nothing_back() -> None:
+    """Both are taken in at once behind a stall, so the word is of a stop before: the worker may be at work again."""
+    owner = Owner()
+    owner.work()
+    until = owner.node.executors["guard"].role.lease_until_s
+    assert until is not None
+    for name in ROBOTS[1:]:
+        owner.node.absorb(owner.peers_beat(name, is_asked=True), owner.now)
+    owner.node.absorb(ev.RoleEnded(task="guard", epoch=4), owner.now)
+    batch = owner.handle(ev.DeadlineReached())
+    (told,) = (one.role.role for one in batch if isinstance(one, do.SetRole))
+    assert told is WorkerRole.IDLE, "it is told to stop now"
+    owner.beat()
+    assert owner.now < until
+    assert owner.released == []
+    owner.handle(ev.RoleEnded(task="guard", epoch=4))
+    owner.beat()
+    assert owner.released, "and that stop's word counts"
+
+
+def test_the_word_of_a_worker_that_stops_for_its_clock_gives_back_what_others_wait_for() -> None:
+    """It was told to stop by the doubt, before anybody asked."""
+    owner = Owner()
+    owner.work()
+    batch = owner.handle(ev.ClockCompared(error_ratio=0.1))
+    assert [one.role.role for one in batch if isinstance(one, do.SetRole)] == [WorkerRole.IDLE]
+    for name in ROBOTS[1:]:
+        owner.heard(name, is_asked=True)
+    owner.handle(ev.RoleEnded(task="guard", epoch=4))
+    owner.beat()
+    assert owner.released
 
 
 def test_a_worker_that_was_not_at_work_when_its_process_ended_leaves_no_word_behind() -> None:

@@ -115,19 +115,18 @@ class Tenure:
         leaving = self.leases.leaving()
         for task in self.exclusive:
             executor = self.executors[task]
-            if self.leases.is_in_doubt:
-                executor.leave(todo)
-                continue
-            if task not in leaving:
-                until, before = self.leases.until(task), executor.role
+            before = executor.role
+            if task not in leaving and not self.leases.is_in_doubt:
+                until = self.leases.until(task)
                 executor.set_lease(until, todo, now)
                 if executor.role is not before:
                     self.leases.on_given(task, until)
                 continue
-            before = executor.role
             executor.leave(todo)
             if executor.role is not before:
                 self.leases.on_told_to_stop(task)
+            if self.leases.is_in_doubt:
+                continue  # no clock here tells when a permission is over
             # What the worker was told counts, not what has been echoed since: electors may echo on and on, and a
             # worker that has stopped already will not say so again.
             if now >= self.leases.given_until(task):

@@ -27,8 +27,9 @@ own.
   leased task.
 * A node whose clock is in doubt (`zsched.core.vote.clocks`) neither works nor grants, and its beats name other terms.
   Afterwards it begins like an elector, and an owner, that has just started.
-* The worker's own report that it has stopped ends the owner's wait before the lease does, but only while no earlier
-  report of the same epoch is missing: a late one would give back a lease that the worker has been given since.
+* The worker's own report that it has stopped ends the owner's wait before the lease does, but only once the worker was
+  told to stop, and while no earlier report of the same epoch is missing: a late one would give back a lease that the
+  worker has been given since.
 
 Source: Gray & Cheriton 1989 (leases), with the epoch as fencing token.
 """
@@ -508,8 +509,9 @@ class Leases:
         return -math.inf if holder is None else holder.given_until
 
     def on_told_to_stop(self, task: TaskId) -> None:
-        """The worker of a task that this node holds is told to stop; it will report its stop."""
-        self._holders[task].awaits_report = True
+        """The worker of a task is told to stop; where this node holds the task, it will report its stop."""
+        if task in self._holders:
+            self._holders[task].awaits_report = True
 
     def on_worker_lost(self, task: TaskId) -> None:
         """The worker's process has ended; the next one may get leases before that end is reported."""
@@ -519,12 +521,14 @@ class Leases:
     def on_stopped(self, task: TaskId, epoch: int, number: int) -> bool:
         """The worker reports that it has stopped: give everything back; false when no electors asked for it.
 
-        False, too, when this may be the late report of an earlier stop in this epoch, or of a dead process. The worker
-        may be working again, so `on_run_out` decides.
+        False, too, when this may be the late report of an earlier stop in this epoch, or of a dead process, or was made
+        before the worker was told to stop. The worker may be working again, so `on_run_out` decides.
         """
         holder = self._holders.get(task)
         if holder is None or holder.epoch != epoch or not holder.is_leaving or holder.expects_late_report:
             return False
+        if holder.given_until > -math.inf and not holder.awaits_report:
+            return False  # it waited behind the beat that asks us to leave, so no stop was ordered between the two
         holder.awaits_report = False
         self._releases[task] = holder.release(number)
         return True

@@ -233,7 +233,10 @@ def test_a_worker_s_word_counts_only_when_it_was_asked_to_stop_and_ends_what_it_
     assert not held.on_stopped("guard", 3, 5), "nobody asked"
     assert not held.on_stopped("other", 3, 5)
     assert not held.on_run_out("other", 5, 12.0)
+    held.on_told_to_stop("other")  # it only drains there, for its clock is in doubt
     held.on_beat(asked(), {}, 10.2)
+    assert not held.on_stopped("guard", 3, 5), "nobody has told it to stop yet: this is another stop's word"
+    held.on_told_to_stop("guard")
     assert not held.on_stopped("guard", 2, 5)
     assert held.on_stopped("guard", 3, 5)
     assert held.given_until("guard") == -math.inf
