@@ -36,7 +36,7 @@ from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
 from zsched.clock import SleepWatch, monotonic_s
 from zsched.config.load import load_fleet, require_node
 from zsched.core import events as ev
-from zsched.core.node import Node
+from zsched.core.node import Node, in_parts
 from zsched.core.status import status_line
 from zsched.core.values.fleet import Fleet, WorkerLink, dial_endpoint, electorate_hash, fleet_hash
 from zsched.core.values.model import NodeId, NodeKind
@@ -55,7 +55,7 @@ from zsched.runtime.adoption import Adoption
 from zsched.runtime.descriptors import take_descriptors
 from zsched.runtime.desk import Desk
 from zsched.runtime.endpoints import DATA_PORT, Endpoints, claim_port, endpoints_for, free_port, is_here
-from zsched.runtime.inbox import Inbox
+from zsched.runtime.inbox import INBOX_LIMIT, Inbox
 from zsched.runtime.leaving import Leaving, Told
 from zsched.runtime.library import Library
 from zsched.runtime.membership import copied_file
@@ -114,7 +114,7 @@ class Daemon:
         self._inbox = Inbox()
         on_failure(lambda kind, text: self._inbox.post(ev.ProblemReported(source=f"thread/{kind}", problem=text)))
         self._notify = Notifier()
-        self._next_status = 0.0
+        self._next_status = self._alert_until = 0.0
         self._leftovers = Leftovers()
         self._told = Told()
         self._has_left = False
@@ -439,21 +439,17 @@ class Daemon:
         """Take an event, handle it, carry the batch out; wake up in time for the node's next deadline."""
         shell.carry_out(node.start(monotonic_s()))
         watchdog_s = watchdog_interval_s()
-        next_ping, leaving, alert_until = 0.0, Leaving(), 0.0
+        next_ping, leaving = 0.0, Leaving()
         while True:
             wait = min(node.next_deadline() - monotonic_s(), LOOP_MAX_WAIT_S)
-            if monotonic_s() < alert_until:
+            if monotonic_s() < self._alert_until:
                 wait = min(wait, ALERT_WAIT_S)
-            event = self._inbox.take(wait) or ev.DeadlineReached()
-            now = self._now(node)
-            if now >= node.next_deadline() or now < alert_until or isinstance(event, ev.TokenLost):
-                self._absorb_waiting(node, shell)  # before the event: they came before it, and nobody may look silent
-            now = self._handle(node, shell, event)
+            taken, now = self._turn(node, shell, self._inbox.take(wait) or ev.DeadlineReached())
             if shell.stand_down:
                 raise NameTakenError(f"{node.me}: {shell.stand_down}")
-            if isinstance(event, ev.TokenLost):
-                alert_until = now + ALERT_S
-            if isinstance(event, ev.StopRequested):
+            if any(isinstance(one, ev.TokenLost) for one in taken):
+                self._alert_until = now + ALERT_S
+            for _ in (one for one in taken if isinstance(one, ev.StopRequested)):
                 is_first = leaving.ask(node.owned(), now, begins_anew=self.begins_anew)
                 if is_first and not self.begins_anew:
                     self._notify.stopping()
@@ -492,14 +488,37 @@ class Daemon:
         else:
             log.info("stopping node=%s", node.me)
 
-    def _handle(self, node: Node, shell: Shell, event: ev.Event) -> float:
-        """One event, and what must come before any other (a disk that refused); when that was."""
-        now = self._now(node)
-        shell.carry_out(node.handle(event, now))
-        while (first := self._inbox.take_first()) is not None:
+    def _turn(self, node: Node, shell: Shell, event: ev.Event) -> tuple[list[ev.Event], float]:
+        """Handle one event, and what came with it; all these events, and when they were judged."""
+        taken, now = self._take_all(node, shell, event)
+        parts = in_parts(taken)
+        while parts:
+            *before, last = parts.pop(0)
+            for waiting in before:
+                node.absorb(waiting, now)
+            shell.carry_out(node.handle(last, now))
+            if (first := self._inbox.take_first()) is not None:  # before any other event: a disk has refused
+                more, now = self._take_all(node, shell, first)
+                taken += more
+                parts = in_parts([*(left for part in parts for left in part), *more])
+        return taken, now
+
+    def _take_all(self, node: Node, shell: Shell, event: ev.Event) -> tuple[list[ev.Event], float]:
+        """The event, behind a deadline also all that have come since, in their order; and the time to judge them by.
+
+        Else a loop that stood still, maybe in its own write, would take a node for silent whose beat or answer waits.
+        """
+        taken, now = [event], self._now(node)
+        if now >= node.next_deadline() or now < self._alert_until or isinstance(event, ev.TokenLost):
+            self._absorb_waiting(node, shell)  # before the event: they came before it, and nobody may look silent
             now = self._now(node)
-            shell.carry_out(node.handle(first, now))
-        return now
+        while now >= node.next_deadline() and len(taken) < INBOX_LIMIT:  # a flood must not put deadlines off for ever
+            behind = self._inbox.take(0.0)
+            if behind is None:
+                break  # nothing had come by `now`
+            taken.append(behind)
+            now = self._now(node)
+        return taken, now
 
     def _now(self, node: Node) -> float:
         """The time by which an event is judged; the node hears first that the machine has slept.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import signal
 import socket
@@ -404,14 +405,18 @@ def test_a_node_hears_of_a_sleep_before_what_is_judged_by_the_time_after_it(monk
             self.absorb(event, now)
             return ()
 
+        def next_deadline(self) -> float:
+            return math.inf
+
     node: Any = Hearing()
     frame = ev.StopRequested()  # any event
     shell: Any = SimpleNamespace(carry_out=lambda _batch: None, waiting_frames=lambda: iter([frame]))
     one = object.__new__(daemon.Daemon)
     one._inbox, one._sleeps, one._is_ready = Inbox(), SleepWatch(), True
+    one._alert_until = -math.inf
     one._absorb_waiting(node, shell)
     assert heard == [frame], "nothing is told of no sleep"
-    for step in (lambda: one._absorb_waiting(node, shell), lambda: one._handle(node, shell, frame)):
+    for step in (lambda: one._absorb_waiting(node, shell), lambda: one._turn(node, shell, frame)):
         heard.clear()
         monkeypatch.setattr(clock._Slept, "seconds", clock._Slept.seconds + 60.0)
         step()

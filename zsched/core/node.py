@@ -11,7 +11,7 @@ methods as a peer's. What there is to do stands in one `ToDo`, which goes from s
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from zsched.core import events as ev
@@ -50,6 +50,18 @@ _OFTEN_QUIET: Final = frozenset(
         ev.ClockCompared,
     }
 )
+_ASKED_OF_AN_ELECTOR: Final = (ev.PrepareAsked, ev.AcceptAsked, ev.BallotsAsked, ev.FleetAsked)
+
+
+def in_parts(events: Sequence[ev.Event]) -> list[list[ev.Event]]:
+    """Events that came together, in the parts that make a batch each: what is asked of this node as an elector is last.
+
+    Such an answer waits for a write. What this node asks in the same batch would wait with it, while its deadline runs.
+    Questions may come late: the network, too, keeps no order between those of one node and the beats of another.
+    """
+    last = [event for event in events if isinstance(event, _ASKED_OF_AN_ELECTOR)]
+    first = [event for event in events if not isinstance(event, _ASKED_OF_AN_ELECTOR)]
+    return [part for part in (first, last) if part]
 
 
 class Node(Stages):
@@ -86,8 +98,9 @@ class Node(Stages):
     def absorb(self, event: ev.Event, now: float) -> None:
         """Take an event in and act on nothing yet, nor on the time that has passed: `handle` must follow at once.
 
-        After a stall many beats wait. Whoever judged by the time after the first of them would take the senders of all
-        others for silent.
+        After a stall many events wait. Whoever judged by the time after the first of them would take the senders of all
+        other beats for silent, and a ballot for lost whose answers lie there. Events of any kind may be taken in so, in
+        their order: a stage that hears a report remembers whether it has given the order before.
         """
         if now > self._promised:
             self._note_lag(now - self._promised, now)

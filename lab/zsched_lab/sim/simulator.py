@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from random import Random
-from typing import Any
+from typing import Any, TypeVar
 
 from zsched.clock import NAP_S
 from zsched.core import events as ev
@@ -46,6 +46,7 @@ Gauges = Callable[[NodeId, float], Readings]
 Cut = Callable[[NodeId, tuple[do.Instruction, ...]], int | None]
 """(node, batch) -> after how many instructions the node crashes; ``None``: it carries out all of them and lives."""
 Make = Callable[[Any], ev.Event]
+T = TypeVar("T")
 
 CORES, MEMORY_MB = 4.0, 4000.0
 TOKEN_DELAY_S = 0.005
@@ -310,8 +311,23 @@ class Simulator(Links):
 
     def handle(self, machine: Machine, event: ev.Event) -> None:
         """Let a machine handle one event now, and carry out what it asks for."""
-        node = machine.node
-        assert node is not None
+        assert machine.node is not None
+        local, batch = self._enter(machine, event, machine.node.handle)
+        self.invariants.on_handled(machine, self.now, local)
+        if machine.event_s:
+            machine.busy_until = self.now + machine.event_s
+        if batch:
+            self._carry_out(machine, batch, 0)
+        self.arm(machine)
+
+    def absorb(self, machine: Machine, event: ev.Event) -> None:
+        """Let a machine take one event in, and judge nothing until the next one is handled."""
+        assert machine.node is not None
+        self._enter(machine, event, machine.node.absorb)
+
+    def _enter(self, machine: Machine, event: ev.Event, door: Callable[[ev.Event, float], T]) -> tuple[float, T]:
+        """(the machine's time, what its node's ``door`` answers to an event)."""
+        assert machine.node is not None
         self.events += 1
         if self.events > self.most_events:
             raise InvariantError(f"{self.events} events until {self.now:.3f}: the fleet storms")
@@ -319,16 +335,10 @@ class Simulator(Links):
         try:
             if machine.untold_sleep_s:
                 slept_s, machine.untold_sleep_s = machine.untold_sleep_s, 0.0
-                node.absorb(ev.ClockCompared(error_ratio=0.0, jump_s=slept_s), local)
-            batch = node.handle(event, local)
+                machine.node.absorb(ev.ClockCompared(error_ratio=0.0, jump_s=slept_s), local)
+            return local, door(event, local)
         except Exception as error:
             raise InvariantError(f"{machine.key} raised {error!r} on {event}") from error
-        self.invariants.on_handled(machine, self.now, local)
-        if machine.event_s:
-            machine.busy_until = self.now + machine.event_s
-        if batch:
-            self._carry_out(machine, batch, 0)
-        self.arm(machine)
 
     # --- instructions ------------------------------------------------------------------------------------------------
 

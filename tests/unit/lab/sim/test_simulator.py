@@ -10,13 +10,14 @@ import pytest
 from support.allocations import allocation_of
 from support.beats import beat_of
 from support.fleets import fleet_of, task_of
+from zsched.config.timing import WIRED
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.executor.tenure import Tenure
 from zsched.core.membership.pace import FULL_S
 from zsched.core.values.fleet import StreamRule, WorkerSpec
-from zsched.core.values.messages import Accepted, Promise
-from zsched.core.values.model import Acceptance, Allocation, Ballot, NodeId, PeerState
+from zsched.core.values.messages import Accepted, CommandOutcome, MoveTask, Promise
+from zsched.core.values.model import Acceptance, Allocation, Asked, Ballot, NodeId, PeerState
 from zsched.core.values.plan import Direction, Role, StreamCount, WorkerRole
 from zsched.errors import InvariantError
 from zsched_lab.sim.simulator import RESTART_S, TOKEN_DELAY_S, Simulator
@@ -123,6 +124,42 @@ def test_cut_batch_is_carried_out_so_far_and_the_node_comes_back(keep: int) -> N
     assert sim.disk("robot1") == (before if keep == 0 else written.state)
     sim.run(RESTART_S + 0.01)
     assert "robot1" in sim.running()
+
+
+def instructions_of(sim: Simulator, who: NodeId) -> list[do.Instruction]:
+    """What a node asks for from now on."""
+    seen: list[do.Instruction] = []
+
+    def note(name: NodeId, batch: tuple[do.Instruction, ...]) -> None:
+        seen.extend(batch if name == who else ())
+
+    sim.cut_batch = note
+    return seen
+
+
+def test_a_loop_that_stood_still_accuses_nobody_whose_beat_waits() -> None:
+    """It takes in what has queued up and judges then, as the daemon's does."""
+    sim = Simulator(fleet=replace(FLEET, timing=WIRED), seed=1)
+    sim.start()
+    sim.run(10)
+    told = instructions_of(sim, "robot1")
+    sim.pause(sim.machines["robot1"], 1.6)
+    sim.run(5)
+    accused = [one.text for one in told if isinstance(one, do.RecordStory) and "edge" in one.text.split(" ")[0]]
+    assert accused == []
+
+
+def test_an_order_at_a_node_whose_disk_is_slower_than_a_ballot_is_carried_out() -> None:
+    """Its own promise holds its loop up; the others' are there before the time is looked at."""
+    sim = settled()
+    told = instructions_of(sim, "robot1")
+    sim.machines["robot1"].disk_s = (0.4, 0.4)
+    to = "edge2" if sim.agreed("merge") == "edge1" else "edge1"
+    command = MoveTask(task="merge", node=to, asked=Asked(by="op@robot1"))
+    sim.deliver(sim.machines["robot1"], ev.MoveCommanded(request=1, command=command))
+    sim.run(6)
+    (answer,) = (one.result for one in told if isinstance(one, do.AnswerCommand))
+    assert (answer.outcome, sim.agreed("merge")) == (CommandOutcome.OK, to)
 
 
 def test_broken_disk_keeps_its_old_content_and_tells_the_node() -> None:
