@@ -59,9 +59,10 @@ def in_parts(events: Sequence[ev.Event]) -> list[list[ev.Event]]:
     Such an answer waits for a write. What this node asks in the same batch would wait with it, while its deadline runs.
     Questions may come late: the network, too, keeps no order between those of one node and the beats of another.
     """
-    last = [event for event in events if isinstance(event, _ASKED_OF_AN_ELECTOR)]
-    first = [event for event in events if not isinstance(event, _ASKED_OF_AN_ELECTOR)]
-    return [part for part in (first, last) if part]
+    parts: tuple[list[ev.Event], list[ev.Event]] = ([], [])
+    for event in events:
+        parts[isinstance(event, _ASKED_OF_AN_ELECTOR)].append(event)
+    return [part for part in parts if part]
 
 
 class Node(Stages):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 import zenoh
@@ -63,7 +64,7 @@ class Led(LifecycleNode):
         self._tell_end = lambda ended: self.reasons.append(ended.reason)
 
     def lead(self) -> Led:
-        self._lead(None)  # type: ignore[arg-type] - nothing of it is used
+        self._lead(cast("Any", None))  # nothing of it is used
         return self
 
     def _state(self, session: zenoh.Session) -> int | None:

@@ -144,7 +144,7 @@ def test_a_report_of_an_unknown_kind_is_passed_over() -> None:
     theirs.close()
     relay = RelayChild(pid=os.getpid(), link=ours, is_child=True)
     assert handle._listen(relay) == ""
-    assert [type(report) for report in reports] == [RelayChanged, RelayStarted]
+    assert [type(report).__name__ for report in reports] == ["RelayChanged", "RelayStarted"]
     relay.close()
 
 
