@@ -242,11 +242,19 @@ def test_an_interrupted_drain_is_lifted(
         at.act(DRAIN)
         raise AssertionError("the signal came too late")
 
+    has_come, lift = threading.Event(), stage.lift
+
+    def lifting() -> str:
+        has_come.set()
+        return lift()
+
     def interrupt() -> None:
         daemon.on_change = lambda: None
         signal.pthread_kill(threading.main_thread().ident or 0, number)
+        assert has_come.wait(60.0), "beside others' work a thread may hear late of its signal"
         time.sleep(0.5)  # it is agreed later than the first look for it
 
+    monkeypatch.setattr(stage, "lift", lifting)
     daemon.on_change = interrupt
     monkeypatch.setattr(rehearse, "_run", play)
     before = signal.getsignal(number)
