@@ -248,19 +248,14 @@ def join(invitation: Invitation, places: Places, *, is_plan: bool) -> tuple[Flee
     if invitation.papers is not None and fleet.security is None:
         raise ConfigError("the invitation has a certificate, and its document has no `security:` section")
     _check_papers(fleet, invitation)
-    disk, papers = secrets.token_hex(8), invitation.papers
-    return fleet, _write(
-        fleet,
-        invitation.node,
-        invitation.value,
-        invitation.document,
-        places,
-        disk,
-        generation=invitation.generation,
-        papers=papers,
-        listed=() if papers is None else (CERTIFICATE, TRUSTED, *((KEY,) if papers.key else ())),
-        is_plan=is_plan,
-    )
+    me, content, papers = invitation.node, invitation.document, invitation.papers
+    listed = () if papers is None else (CERTIFICATE, TRUSTED, *((KEY,) if papers.key else ()))
+    written = _listed(fleet, me, content, places, listed=listed)
+    if not is_plan:
+        value, generation, disk = invitation.value, invitation.generation, secrets.token_hex(8)
+        with StateFile(places.state, fleet=fleet.name, node=me) as file:
+            _put_all(file, fleet, me, value, content, places, disk, generation=generation, papers=papers)
+    return fleet, written
 
 
 def is_of_a_later_key(invitation: Invitation, places: Places) -> bool:
@@ -597,27 +592,6 @@ def _check_no_state(fleet: str, node: NodeId, folder: Path) -> None:
     if not file.load().is_missing:
         advice = "leave that fleet first (`zsched leave`), or give a folder with --state-dir"
         raise AdapterError(f"{file.path} exists already: this machine belongs to a fleet; {advice}")
-
-
-def _write(
-    fleet: Fleet,
-    me: NodeId,
-    value: FleetValue,
-    content: Document,
-    places: Places,
-    disk: str,
-    *,
-    generation: int = 0,
-    papers: Papers | None,
-    listed: tuple[str, ...],
-    is_plan: bool,
-) -> tuple[Written, ...]:
-    """Write all of it; ``is_plan``: only say what."""
-    written = _listed(fleet, me, content, places, listed=listed)
-    if not is_plan:
-        with StateFile(places.state, fleet=fleet.name, node=me) as file:
-            _put_all(file, fleet, me, value, content, places, disk, generation=generation, papers=papers)
-    return written
 
 
 def _listed(
