@@ -126,7 +126,7 @@ class Demands:
             told = _told(load, speed, max(fastest or speed, speed))
             least = max(use, known.work or 0.0)
             is_held = known.is_sure and known.work == least
-            is_starved = profile.cpu_used_cores / profile.cpu_cores >= STARVED_CPU_RATIO
+            is_starved = is_full(profile)
             if told is not None and not known.is_sure and (most > use or is_new or is_starved):
                 found = replace(found, work=max(told, known.work or 0.0) if is_new else told)
             elif most > use and not (is_held and least <= most):
@@ -207,6 +207,11 @@ class Demands:
 
 def _others_cores(task: TaskId, profile: Profile, used_cores: float) -> float:
     return max(used_cores - profile.cores_of(task), 0.0)
+
+
+def is_full(profile: Profile) -> bool:
+    """Whether so little CPU is free that a task's use tells no more what it needs."""
+    return profile.cpu_used_cores is not None and profile.cpu_used_cores / profile.cpu_cores >= STARVED_CPU_RATIO
 
 
 def is_short(load: WorkerLoad) -> bool:

@@ -12,7 +12,7 @@ import statistics
 from collections.abc import Iterable, Mapping
 from collections.abc import Set as AbstractSet
 
-from zsched.core.gateway.demand import STARVED_CPU_RATIO, Demands, is_short, speed_of
+from zsched.core.gateway.demand import Demands, is_full, is_short, speed_of
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.gateway.sharing import fair_share
 from zsched.core.scheduler.links import pair_link
@@ -213,12 +213,11 @@ def _unseen(spec: TaskSpec, profile: Profile, bookings: Bookings | None, gateway
     if not others:
         return _NOTHING
     cpu = memory = 0.0
-    is_full = (profile.cpu_used_cores or 0.0) >= STARVED_CPU_RATIO * profile.cpu_cores
     for other in others:
         load = profile.worker(other.name)
         if other.name != spec.name and load is not None:
             demand = gateway.demand(other, profile)
-            if not (is_full and is_short(load)):
+            if not (is_full(profile) and is_short(load)):
                 cpu += max(demand.cpu_cores - (load.cpu_cores or 0.0), 0.0)
             memory += max(demand.memory_mb - (load.memory_mb or 0.0), 0.0)
     return Demand(cpu_cores=cpu, memory_mb=memory)
