@@ -94,7 +94,8 @@ def _is_newer(renewed: Path, first: Path, trusted: Path) -> bool:
     try:
         ders = [ders_of(read_regular(path, MAX_BYTES))[0] for path in (renewed, first)]
         after, before = map(parts_of, ders)
-        rank, rank_before = (authority_rank(der, read_regular(trusted, MAX_BYTES)) for der in ders)
+        authorities = read_regular(trusted, MAX_BYTES)
+        rank, rank_before = (authority_rank(der, authorities) for der in ders)
     except (OSError, ValueError):
         return False
     if (after.common_name, after.key) != (before.common_name, before.key):
