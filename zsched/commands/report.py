@@ -458,8 +458,7 @@ def _candidates(page: Page, task: Json, decision: Json) -> None:
             told = short_name(name, first)
             page.row((told, first, "red"), (f"     - {veto}", page.width, "red"), indent=page.indent)
             continue
-        (_, style), *more_cells = _candidate_cells(name, task, decision, voters[: len(widths)])
-        cells = [(short_name(name, first), style), *more_cells]
+        cells = _candidate_cells(name, first, task, decision, voters[: len(widths)])
         page.row(
             *((text, width, style) for (text, style), width in zip(cells, columns, strict=True)), indent=page.indent
         )
@@ -467,7 +466,7 @@ def _candidates(page: Page, task: Json, decision: Json) -> None:
         page.block("", (f"and {len(names) - MAX_CANDIDATES} more candidates: see --json", "dim"))
 
 
-def _candidate_cells(name: str, task: Json, decision: Json, voters: Sequence[str]) -> list[Cell]:
+def _candidate_cells(name: str, room: int, task: Json, decision: Json, voters: Sequence[str]) -> list[Cell]:
     columns: dict[str, Json] = decision["utilities"]
     found = [column[name] for column in columns.values() if name in column]
     joint, veto = decision["aggregates"].get(name), decision["vetoed"].get(name)
@@ -477,7 +476,7 @@ def _candidate_cells(name: str, task: Json, decision: Json, voters: Sequence[str
     penalty = decision.get("penalties", {}).get(name)  # a later field of the schema's major version
     notes += [f"penalty -{penalty:.2g}"] if penalty else []
     return [
-        (name, style),
+        (short_name(name, room), style),
         (_number(joint, 3), style),
         *((_opinion(columns[voter].get(name)), "") for voter in voters),
         *((_number(_mean([utility[term] for utility in found]), 2), "dim") for term in ("cpu", "memory", "network")),
