@@ -35,7 +35,7 @@ MEMBER_BUGS: tuple[Bug, ...] = (
     _bug(
         "a machine joins in generation 0 whatever operators have counted",
         MEMBERSHIP,
-        ("        generation=invitation.generation,\n", ""),
+        ("generation, disk = invitation.value, invitation.generation, ", "generation, disk = invitation.value, 0, "),
     ),
     _bug(
         "a machine of another generation takes itself for joined",
