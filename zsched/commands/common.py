@@ -307,6 +307,14 @@ def interruptible() -> Iterator[None]:
         yield
 
 
+@contextlib.contextmanager
+def stopped_by_signal() -> Iterator[threading.Event]:
+    """An event that they set meanwhile; none of them interrupts anything."""
+    stop = threading.Event()
+    with _at_signals(dict.fromkeys(_ENDS, lambda _number, _frame: stop.set())):
+        yield stop
+
+
 _ENDS: Final = (signal.SIGINT, signal.SIGHUP, signal.SIGTERM)
 
 

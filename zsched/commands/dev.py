@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final
 
 from zsched import paths as places
-from zsched.commands.common import CliError, Json, nearest, say, wants_color
+from zsched.commands.common import CliError, Json, nearest, say, stopped_by_signal, wants_color
 from zsched.commands.example import APPLICATION
 from zsched.commands.report import render_status
 from zsched.config.load import load_fleet
@@ -27,7 +27,7 @@ from zsched.core.values.plan import Direction
 from zsched.core.values.struct import Struct
 from zsched.dev.fleet import Addresses, LoopbackFile, on_loopback
 from zsched.dev.nodes import Nodes, shares
-from zsched.dev.run import KEYS, Run, stopped_by_signal
+from zsched.dev.run import KEYS, Run
 from zsched.dev.terminal import Keys
 from zsched.dev.watch import Watched
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE

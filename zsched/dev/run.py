@@ -6,11 +6,9 @@ are shown.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
 import selectors
-import signal
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from threading import Event
@@ -37,7 +35,6 @@ LASTING_S: Final = 5.0
 NUMBER: Final = re.compile(r"\b\d[\d.]*")
 KEPT_LINES: Final = 8
 READ_BYTES: Final = 65_536
-END_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 WORKER: Final = "zsched.worker"
 ENDED: Final = re.compile(
     r"worker_(?:ended|failed) task=(?P<task>\S+) failures=(?P<count>\d+)(?: restart_in_s=(?P<wait>[\d.]+))? "
@@ -347,18 +344,6 @@ class Run:
 
     def _owner(self, task: TaskId) -> NodeId | None:
         return self._owners.get(task, (None, 0))[0]
-
-
-@contextlib.contextmanager
-def stopped_by_signal() -> Iterator[Event]:
-    """An event that signals set; while the context lasts, none of them interrupts anything."""
-    stop = Event()
-    before = {number: signal.signal(number, lambda *_: stop.set()) for number in END_SIGNALS}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _of_a_worker(node: NodeId, text: str) -> str:

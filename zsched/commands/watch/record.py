@@ -1,6 +1,6 @@
 """`zsched record`: writes what a fleet does into an MCAP file, for Foxglove and every other reader of MCAP.
 
-Knows: the file, intervals, the tap on maps and frames, signals. Does not know: topics, schemas
+Knows: the file, intervals, the tap on maps and frames. Does not know: topics, schemas
 (`zsched.commands.watch.tracks`).
 """
 
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import signal
 import threading
 from collections import Counter
 from collections.abc import Iterator
@@ -17,7 +16,7 @@ from typing import TYPE_CHECKING, BinaryIO, Final
 
 from zsched.clock import monotonic_s, wall_s
 from zsched.commands.ask import Door, ask_door, find_door
-from zsched.commands.common import CliError, Json, warn
+from zsched.commands.common import CliError, Json, stopped_by_signal, warn
 from zsched.commands.page import size
 from zsched.commands.watch import tracks
 from zsched.commands.watch.feed import Feed
@@ -68,14 +67,11 @@ def record(view: RecordView) -> int:
     first = feed.ask()
     if first.status is None:
         raise CliError(first.code, first.why)
-    ended = threading.Event()
     with contextlib.ExitStack() as stack:
         kinds = {} if door.endpoint else _ros_keys(first.status, view)
         tap = stack.enter_context(_tapped(door, tuple(kinds)))
         tape = stack.enter_context(_taped(view.file, kinds))
-        for number in (signal.SIGINT, signal.SIGTERM):
-            before = signal.signal(number, lambda _number, _frame: ended.set())
-            stack.callback(signal.signal, number, before)
+        ended = stack.enter_context(stopped_by_signal())
         end = float("inf") if view.for_s is None else monotonic_s() + view.for_s
         news = replace(first, entries=())  # the log of before is no part of the recording
         while True:

@@ -1,6 +1,6 @@
 """`zsched trace`: sends a span for each move to an OpenTelemetry collector (OTLP over HTTP).
 
-Knows: the feed, OpenTelemetry's SDK, signals. Does not know: what belongs to a move (`zsched.commands.watch.spans`).
+Knows: the feed, OpenTelemetry's SDK. Does not know: what belongs to a move (`zsched.commands.watch.spans`).
 """
 
 from __future__ import annotations
@@ -8,8 +8,6 @@ from __future__ import annotations
 import logging
 import re
 import secrets
-import signal
-import threading
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -17,7 +15,7 @@ from urllib.parse import urlsplit
 
 from zsched.clock import wall_s
 from zsched.commands.ask import find_door
-from zsched.commands.common import CliError, warn
+from zsched.commands.common import CliError, stopped_by_signal, warn
 from zsched.commands.watch.feed import Feed
 from zsched.commands.watch.spans import Moves, Span, trace_id
 from zsched.core.values.struct import Struct
@@ -62,16 +60,15 @@ def trace(view: TraceView) -> int:
     news = feed.ask()
     if news.status is None:
         raise CliError(news.code, news.why)
-    sender, moves, ended = Sender(view.url, news.status["fleet"], news.status["node"]), Moves(), threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda _number, _frame: ended.set())
+    sender, moves = Sender(view.url, news.status["fleet"], news.status["node"]), Moves()
     oldest = news.at - (view.since_s or 0.0)
-    sender.send(span for span in moves.take(news.entries) if span.end >= oldest)
-    while not view.is_once and not ended.wait(PERIOD_S):
-        news = feed.ask()
-        if news.status is None:
-            warn(f"zsched trace: {news.why}; asking again")
-        sender.send((*moves.take(news.entries), *moves.overdue(wall_s())))
+    with stopped_by_signal() as ended:
+        sender.send(span for span in moves.take(news.entries) if span.end >= oldest)
+        while not view.is_once and not ended.wait(PERIOD_S):
+            news = feed.ask()
+            if news.status is None:
+                warn(f"zsched trace: {news.why}; asking again")
+            sender.send((*moves.take(news.entries), *moves.overdue(wall_s())))
     if view.is_once:
         sender.send(span for span in moves.rest() if span.end >= oldest)
     warn(f"{sender.sent} spans sent, {sender.refused} refused")

@@ -3,7 +3,7 @@
 A connection answers one request and ends. At most `MOST_CONNECTIONS` are open; one that has not said within
 `REQUEST_S` what it wants, or takes its answer too slowly, is cut off. Requests are not logged.
 
-Knows: HTTP, connections, signals, the page's files. Does not know: which requests may ask
+Knows: HTTP, connections, the page's files. Does not know: which requests may ask
 (`zsched.commands.watch.gate`), what they get (`zsched.commands.watch.hub`).
 """
 
@@ -15,7 +15,6 @@ import ipaddress
 import json
 import os
 import queue
-import signal
 import socket
 import threading
 from importlib.resources import files
@@ -24,7 +23,7 @@ from typing import Any, Final
 
 from zsched.clock import monotonic_s
 from zsched.commands.ask import find_door
-from zsched.commands.common import CliError, Json, warn
+from zsched.commands.common import CliError, Json, stopped_by_signal, warn
 from zsched.commands.watch.feed import Feed
 from zsched.commands.watch.gate import EXPLAIN, FILES, HEADERS, LEAST_TOKEN, LIVE, METRICS, Asked, Gate, Refusal, Route
 from zsched.commands.watch.hub import Hub
@@ -81,10 +80,7 @@ def web(view: WebView) -> int:
         warn(f"zsched web: {error}; asking again")
     names = {"localhost", socket.gethostname().lower(), *(name.lower() for name in view.hosts)}
     server = WebServer(host, port, Gate(names=frozenset(names), token=token), Hub(feed))
-    ended = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda _number, _frame: ended.set())
-    with contextlib.closing(server):
+    with contextlib.closing(server), stopped_by_signal() as ended:
         server.start()
         warn(f"zsched web: {server.address}{', with a token' if token else ''}; Ctrl-C ends it")
         ended.wait()
