@@ -1,7 +1,7 @@
 """For all tests: signals are what they are at a terminal, however the tests were started.
 
 A job in the background of a script has SIGINT and SIGQUIT ignored, one under nohup SIGHUP; Python and every process
-that a test starts would inherit that, and tests of Ctrl-C would wait for ever.
+that a test starts would inherit that, and tests of Ctrl-C would wait for ever. A test that leaves them otherwise fails.
 
 A test that finds a measured time too long is run up to three times: a machine is busy once, a fault is slow each time.
 Only tests of modules that measure times are marked for that: it costs a marked test 40 ms beside other processes.
@@ -27,6 +27,7 @@ import tempfile
 from collections.abc import Generator
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pytest
 import typer.testing
@@ -39,7 +40,9 @@ MEASURES = ("TooSlowError", "between", "within")
 
 REAL = ("integration", "system", "booted", "parts", "bench")
 """Folders of tests with real processes."""
+ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 BEGAN = pytest.StashKey[Moment]()
+HANDLED = pytest.StashKey[tuple[dict[signal.Signals, Any], set[signal.Signals]]]()
 STALLS = pytest.StashKey[Stalls]()
 
 
@@ -93,6 +96,23 @@ def _is_real(item: pytest.Item) -> bool:
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """A test begins, with its fixtures."""
     item.stash[BEGAN] = now()
+    item.stash[HANDLED] = _handled()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown(item: pytest.Item) -> Generator[None]:
+    """What a test makes of signals ends with it: another test, far from here, would hang or end by it."""
+    yield
+    left = _handled()
+    if left != item.stash[HANDLED]:
+        for number, handler in item.stash[HANDLED][0].items():
+            signal.signal(number, handler)
+        signal.pthread_sigmask(signal.SIG_SETMASK, item.stash[HANDLED][1])
+        raise AssertionError(f"the test has changed what signals do, or which are blocked: {left}")
+
+
+def _handled() -> tuple[dict[signal.Signals, Any], set[signal.Signals]]:
+    return {number: signal.getsignal(number) for number in ENDS}, signal.pthread_sigmask(signal.SIG_BLOCK, ())
 
 
 @pytest.hookimpl(wrapper=True)
