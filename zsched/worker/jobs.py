@@ -38,6 +38,8 @@ class JobTimer:
     __slots__ = (
         "_base_s",
         "_began_s",
+        "_booked",
+        "_booked_s",
         "_cpu_s",
         "_deadline_s",
         "_is_long",
@@ -64,6 +66,8 @@ class JobTimer:
         self._began_s = self._cpu_s = self._process_s = self._waited_s = 0.0
         self._base_s: float | None = 0.0
         """What its thread had waited when it began, less what earlier ones have; ``None``: the kernel does not tell."""
+        self._booked, self._booked_s = 0, 0.0
+        """(`done`, what was waited until then) when a job had last ended."""
         self._thread_id = 0
         self._is_long = False
         self.is_in_hand = False
@@ -117,9 +121,10 @@ class JobTimer:
             self.long_thread_s, self.long_process_s = thread_s / 2, process_s / 2
 
     def waited_s(self) -> float | None:
-        """How long its thread has waited for a CPU since its first job; ``None``: the kernel does not tell.
+        """How long its thread has waited for a CPU in jobs that have ended; ``None``: the kernel does not tell.
 
-        Of a thread that has ended: as far as it was seen.
+        A job's wait comes with its other times. One that rose while a long job runs would fade before the job counts,
+        and pass for a wait for something else. Of a thread that has ended: as far as it was seen.
         """
         base_s, thread_id = self._base_s, self._thread_id
         if base_s is None:
@@ -127,7 +132,9 @@ class JobTimer:
         told_s = _waited_s(thread_id) if thread_id else None
         if told_s is not None:
             self._waited_s = max(told_s - base_s, self._waited_s)
-        return self._waited_s
+        if self.done != self._booked:
+            self._booked, self._booked_s = self.done, self._waited_s
+        return self._booked_s
 
 
 def _waited_s(thread_id: int) -> float | None:

@@ -81,6 +81,24 @@ def test_what_a_thread_has_waited_stays_behind_its_end_and_its_successor_s_is_ad
     assert timer.waited_s() == 2.5
 
 
+def test_what_a_long_job_waits_for_a_cpu_counts_when_it_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The mean per job is one rate through another: a wait that comes seconds before its job has faded by then."""
+    waits = {1: 5.0}
+    monkeypatch.setattr(worker_jobs, "_waited_s", waits.get)
+    monkeypatch.setattr(threading, "get_native_id", lambda: 1)
+    timer = JobTimer()
+    timer.begin()
+    timer.end()
+    assert timer.waited_s() == 0.0
+    timer.begin()
+    for told in (6.0, 7.0, 8.0):
+        waits[1] = told
+        assert timer.waited_s() == 0.0
+    timer.end()
+    del waits[1]  # and it is told of a thread that has ended, as far as it was seen
+    assert timer.waited_s() == 3.0
+
+
 def test_a_job_in_a_thread_that_has_ended_leaves_the_waiting_time_known() -> None:
     book = JobBook("t", "7", lambda _word: None)
 
