@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +15,9 @@ import pytest
 import zenoh
 
 from support.waiting import free_endpoint, until
+from zsched.core.relay_protocol import WorkerTrouble
 from zsched.core.values.plan import Role, WorkerRole
+from zsched.ipc.pipe import decode_word
 from zsched.sessions.config import data_config, worker_config
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import Keyspace
@@ -67,6 +70,7 @@ class Hub:
     tokens: set[str] = field(default_factory=set)
     totals: list[tuple[str, int]] = field(default_factory=list)
     seen: list[str] = field(default_factory=list)
+    troubles: list[WorkerTrouble] = field(default_factory=list)
     workers: dict[str, subprocess.Popen[str]] = field(default_factory=dict)
     lives: int = 0
 
@@ -80,6 +84,7 @@ class Hub:
             self.session.liveliness().declare_subscriber(f"@zsched/{FLEET}/**", self._token, history=True),
             self.session.declare_subscriber(f"*/{TASK}/*/total", self._total),
             self.session.declare_subscriber(f"*/{TASK}/seen", lambda s: self.seen.append(s.payload.to_string())),
+            self.session.declare_subscriber(KEYS.trouble("*", "*", "*"), self._trouble),
         ]
 
     def _answer(self, query: zenoh.Query) -> None:
@@ -87,6 +92,11 @@ class Hub:
             for key, role in tuple(self.roles.items()):
                 if query.key_expr.intersects(key):
                     query.reply(key, wire.encode(role))
+
+    def _trouble(self, sample: zenoh.Sample) -> None:
+        word = decode_word(sample.payload.to_bytes())
+        if isinstance(word, WorkerTrouble):
+            self.troubles.append(word)
 
     def _token(self, sample: zenoh.Sample) -> None:
         act = self.tokens.add if sample.kind == zenoh.SampleKind.PUT else self.tokens.discard
@@ -247,14 +257,44 @@ def test_a_killed_owner_means_a_cold_start_that_waits_for_no_answer(hub: Hub) ->
     assert "cold_start epoch=2 from=edge1 why='nobody offers one'" in hub.said_by("edge2")
 
 
-def test_a_frozen_owner_costs_a_third_of_a_second(hub: Hub) -> None:
+def test_an_owner_that_does_not_run_for_a_moment_is_waited_for(hub: Hub) -> None:
+    """A full machine lets its threads wait; that is why the task leaves it, and no reason to lose its state."""
+    owned_by_edge1(hub)
+    hub.workers["edge1"].send_signal(signal.SIGSTOP)
+    hub.tell("edge2", WorkerRole.ACTIVE, 2, "edge1")
+    hub.feed("edge2", 100)
+    time.sleep(0.7)
+    hub.workers["edge1"].send_signal(signal.SIGCONT)
+    until(lambda: ("edge2@2", 110) in hub.totals, "the state of edge1")
+
+
+def test_a_frozen_owner_is_waited_for_until_its_link_ends(hub: Hub) -> None:
     owned_by_edge1(hub)
     hub.workers["edge1"].send_signal(signal.SIGSTOP)
     hub.tell("edge2", WorkerRole.ACTIVE, 2, "edge1")
     owns(hub, "edge2", 2)
     hub.feed("edge2", 100)
     until(lambda: ("edge2@2", 100) in hub.totals, "edge2, cold")
-    assert "no answer within 0.3 s" in hub.said_by("edge2")
+    assert "cold_start epoch=2 from=edge1" in hub.said_by("edge2")
+
+
+def test_a_silent_owner_costs_two_seconds_and_one_whose_machine_is_gone_none(hub: Hub) -> None:
+    silent = hub.session.declare_queryable(KEYS.snapshot("edge3", TASK), zenoh.handlers.FifoChannel(4))
+    owned_by_edge1(hub)
+    hub.tell("edge2", WorkerRole.ACTIVE, 2, "edge3")
+    owns(hub, "edge2", 2)
+    hub.tell("edge2", WorkerRole.ACTIVE, 3, "edge3")
+    until(lambda: not hub.shows("edge2", 2), "edge2 has heard of epoch 3")
+    hub.tell("edge2", WorkerRole.ACTIVE, 3)  # its daemon hears that edge3 is gone
+    owns(hub, "edge2", 3)
+    hub.feed("edge2", 100)  # it comes behind the line of the cold start
+    until(lambda: ("edge2@3", 100) in hub.totals, "edge2, cold")
+    said = hub.said_by("edge2")
+    assert "cold_start epoch=2 from=edge3 why='no answer within 2 s'" in said
+    assert "cold_start epoch=3 from=edge3 why='its machine is gone'" in said
+    text = "began epoch 2 without the state of edge3: no answer within 2 s"
+    assert [(one.text, one.is_cold) for one in hub.troubles] == [(text, True)], "and not of the machine that is gone"
+    silent.undeclare()
 
 
 @pytest.mark.parametrize(("mode", "why"), [("none", "nobody offers one"), ("slow", "late: it had not come in time")])

@@ -303,7 +303,8 @@ class Storm:
 
     def worker(self) -> ev.Event:
         if self.rng.random() < 0.2:
-            return ev.WorkerTroubled(task=self.task(), count=self.number(), text="x" * self.rng.choice((0, 3, 400)))
+            text, is_cold = "x" * self.rng.choice((0, 3, 400)), self.rng.random() < 0.3
+            return ev.WorkerTroubled(task=self.task(), count=self.number(), text=text, is_cold=is_cold)
         if self.rng.random() < 0.2:
             return ev.RecipeCompared(task=self.task(), is_old=self.rng.random() < 0.7)
         if self.rng.random() < 0.1:

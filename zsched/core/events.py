@@ -242,12 +242,14 @@ class WorkerChanged(Struct, frozen=True, kw_only=True):
 class WorkerTroubled(Struct, frozen=True, kw_only=True):
     """A worker of this node says that ``count`` of its callbacks have raised; ``text`` is the newest error.
 
-    With ``count`` 0 the text tells of a mistake that lasts as long as the worker lives.
+    With ``count`` 0 the text tells of a mistake that lasts as long as the worker lives. With ``is_cold`` it tells why
+    the worker, which may be starting, has begun an epoch without its predecessor's state.
     """
 
     task: TaskId
     count: int
     text: str
+    is_cold: bool = False
 
 
 class WorkerOutdated(Struct, frozen=True, kw_only=True):

@@ -104,6 +104,8 @@ class WorkerTrouble(Struct, frozen=True, kw_only=True):
     """How many of its callbacks have raised in this life; 0: the text tells of a mistake that lasts."""
     text: str
     """The newest error, in one line."""
+    is_cold: bool = False
+    """The text tells why it has begun an epoch without its predecessor's state, and of no error."""
 
     def __post_init__(self) -> None:
         check_name("trouble.task", self.task)

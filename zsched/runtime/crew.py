@@ -187,12 +187,15 @@ class Crew:
                 self._tell(supervisor, task, life, is_ready=match.is_matched, reason=match.missing)
 
     def on_trouble(self, trouble: WorkerTrouble) -> None:
-        """A worker here says that its callbacks raise; of a process that has ended that is no news."""
+        """A worker here says that its callbacks raise, for one; of a process that has ended that is no news."""
         with self._lock:
             current = self._lives.get(trouble.task)
             if current is None or str(current) == trouble.incarnation:
-                told = ev.WorkerTroubled(task=trouble.task, count=trouble.count, text=trouble.text)
-                self._post(told)
+                self._post(
+                    ev.WorkerTroubled(
+                        task=trouble.task, count=trouble.count, text=trouble.text, is_cold=trouble.is_cold
+                    )
+                )
 
     def is_ours(self, jobs: ev.WorkerJobs) -> bool:
         """Whether that is the word of a worker that runs here, or of one that somebody else started."""

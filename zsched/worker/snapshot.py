@@ -2,10 +2,11 @@
 
 Knows: chunks, their checksum, how long a new owner waits. Does not know: what is in a snapshot, when roles change.
 
-One query, many replies. The first says that the state is `COMING`: an owner that is left because it is busy is longer
-about it than a dead one is waited for. Each other one is a chunk of at most `CHUNK` bytes, its attachment a
-`SnapshotChunk` that names its place, the size of the whole and its checksum. A new owner waits `FIRST_S` for the first
-reply, and ``timeout_s`` for all of them. Whatever goes wrong is a cold start with a reason, never an error.
+One query, many replies. The first says that the state is `COMING`; each other one is a chunk of at most `CHUNK` bytes,
+its attachment a `SnapshotChunk` that names its place, the size of the whole and its checksum. A new owner waits
+``timeout_s`` for all of them: an owner that is left because its machine is busy is long about its first word, too.
+Before that word the wait ends once the node takes the predecessor's machine for gone. Whatever goes wrong is a cold
+start with a reason, never an error.
 """
 
 from __future__ import annotations
@@ -35,14 +36,14 @@ MAX_SNAPSHOT: Final = 32 << 20
 """Bytes; a larger one is refused by both sides."""
 COMING: Final = b"coming"
 """Attachment of the reply that says, before a worker is asked for its state, that somebody is there who has one."""
-FIRST_S: Final = 0.3
-"""Silence after which the predecessor is taken for dead; a relay's flip waits as long for the new owner."""
 SLICE_S: Final = 0.02
 """Silence is counted in pieces of this length: a time in which this process did not run is no silence of another."""
 TIMEOUT_S: Final = 2.0
 CONTEST_S: Final = 0.1
 """A whole state waits this long for another answer to the same question."""
 MAX_OFFERS: Final = 2
+NOBODY, GONE = "nobody offers one", "its machine is gone"
+"""Why there is no state, where its worker has ended or offers none, and where its machine has left the fleet."""
 RELAY_S: Final = 5.0
 """A worker that starts waits this long for its node's relay, which may start later than it does (or again)."""
 
@@ -192,8 +193,11 @@ class Assembly:
         return content
 
 
-def fetch(session: zenoh.Session, key: str, timeout_s: float) -> bytes | str:
-    """The snapshot under ``key``, or why there is none; never takes longer than ``timeout_s``."""
+def fetch(session: zenoh.Session, key: str, timeout_s: float, is_gone: Callable[[], bool]) -> bytes | str:
+    """The snapshot under ``key``, or why there is none.
+
+    It takes ``timeout_s`` at most, and ends before the first word of a predecessor whose machine ``is_gone``.
+    """
     replies: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()
     token = zenoh.CancellationToken()
     until = monotonic_s() + timeout_s
@@ -206,26 +210,31 @@ def fetch(session: zenoh.Session, key: str, timeout_s: float) -> bytes | str:
             consolidation=zenoh.ConsolidationMode.NONE,
             cancellation_token=token,
         )
-        return _assembled(replies, until)
+        return _assembled(replies, timeout_s, until, is_gone)
     except zenoh.ZError as error:
         return f"it could not be asked for ({error})"
     finally:
         token.cancel()
 
 
-def _assembled(replies: queue.SimpleQueue[zenoh.Reply | None], until: float) -> bytes | str:
+def _assembled(
+    replies: queue.SimpleQueue[zenoh.Reply | None], timeout_s: float, until: float, is_gone: Callable[[], bool]
+) -> bytes | str:
     """The one state that is offered. Another answer is waited for, shortly: two states are one too many."""
     assembly = Assembly()
     has_come, whole, problem = False, b"", ""
     is_whole = False
     while True:
-        silence_s = CONTEST_S if is_whole else math.inf if has_come else FIRST_S
         try:
-            reply = _next_reply(replies, silence_s, until)
+            reply = _next_reply(
+                replies, CONTEST_S if is_whole else math.inf, until, (lambda: False) if has_come else is_gone
+            )
         except queue.Empty:
             if is_whole:
                 break
-            return problem or ("late: it had not come in time" if has_come else f"no answer within {FIRST_S:g} s")
+            if has_come:
+                return problem or "late: it had not come in time"
+            return GONE if is_gone() else f"no answer within {timeout_s:g} s"
         if reply is None:
             break
         has_come = True
@@ -239,11 +248,16 @@ def _assembled(replies: queue.SimpleQueue[zenoh.Reply | None], until: float) -> 
         return "contested: two different states are offered"
     if is_whole:
         return whole
-    return problem or ("incomplete: its worker died meanwhile" if has_come else "nobody offers one")
+    return problem or ("incomplete: its worker died meanwhile" if has_come else NOBODY)
 
 
-def _next_reply(replies: queue.SimpleQueue[zenoh.Reply | None], silence_s: float, until: float) -> zenoh.Reply | None:
-    """The next one, ``None``: there are no more. `queue.Empty`: a silence of ``silence_s``, or it is ``until``."""
+def _next_reply(
+    replies: queue.SimpleQueue[zenoh.Reply | None], silence_s: float, until: float, is_gone: Callable[[], bool]
+) -> zenoh.Reply | None:
+    """The next one, ``None``: there are no more.
+
+    `queue.Empty`: a silence of ``silence_s``, it is ``until``, or who should answer ``is_gone``.
+    """
     quiet_s = 0.0
     while True:
         piece_s = max(0.0, min(SLICE_S, silence_s - quiet_s, until - monotonic_s()))
@@ -251,7 +265,7 @@ def _next_reply(replies: queue.SimpleQueue[zenoh.Reply | None], silence_s: float
             return replies.get(timeout=piece_s)
         except queue.Empty:
             quiet_s += SLICE_S
-            if quiet_s >= silence_s or monotonic_s() >= until:
+            if quiet_s >= silence_s or monotonic_s() >= until or is_gone():
                 raise
 
 
@@ -285,14 +299,26 @@ class Restorer:
     behind the worker's callback. Calls come from several threads.
     """
 
-    def __init__(self, fetched: Callable[[NodeId, float], bytes | str], node: NodeId, inputs: Held) -> None:
-        self._fetch = fetched
+    def __init__(
+        self,
+        fetched: Callable[[NodeId, float, Callable[[], bool]], bytes | str],
+        node: NodeId,
+        inputs: Held,
+        tell: Callable[[str], None],
+    ) -> None:
+        """``fetched``: (predecessor, longest wait, whether its machine is gone) -> the state, or why there is none.
+
+        ``tell`` lets the node know of a state that was there, and is lost here.
+        """
+        self._fetch, self._tell = fetched, tell
         self._node = node
         self._inputs = inputs
         self._lock = threading.Lock()
         self._callback: Callable[[bytes], None] | None = None
         self._timeout_s = TIMEOUT_S
         self._noted: Role | None = None
+        self._is_gone = threading.Event()
+        """The node takes the machine of the noted role's predecessor for gone; one for each fetch."""
         self._has_begun = False
         self._result: _Fetched | None = None
         self.is_pending = False
@@ -310,13 +336,19 @@ class Restorer:
         self._callback, self._timeout_s = callback, timeout_s
 
     def note(self, role: Role) -> None:
-        """A role has come: stop the inputs when it begins an epoch that has a predecessor to ask."""
+        """A role has come: stop the inputs when it begins an epoch that has a predecessor to ask.
+
+        One of the same epoch without a predecessor says that its machine is gone.
+        """
         with self._lock:
             is_new = self._noted is None or role.epoch > self._noted.epoch
             is_owner = role.role is WorkerRole.ACTIVE and role.predecessor not in (None, self._node)
+            is_same = self._noted is not None and role.epoch == self._noted.epoch
+            if is_same and role.role is WorkerRole.ACTIVE and role.predecessor is None:
+                self._is_gone.set()
             if self._callback is None or not is_new or not is_owner:
                 return
-            self._noted, self._has_begun, self._result = role, False, None
+            self._noted, self._is_gone, self._has_begun, self._result = role, threading.Event(), False, None
             self.is_pending = True
             self._inputs.hold()
 
@@ -330,8 +362,7 @@ class Restorer:
             if self._has_begun:
                 return self._result is None  # under way: a second asker (a lease was renewed) waits like the first
             self._has_begun = True
-            predecessor = noted.predecessor
-        arguments = (role.epoch, predecessor, then)
+            arguments = (role.epoch, noted.predecessor, self._is_gone, then)
         guarded(self._run, *arguments, name="zsched restore", is_lasting=False).start()
         return True
 
@@ -342,9 +373,9 @@ class Restorer:
         if result is not None:
             self._inputs.release(lambda: self._hand_over(result))
 
-    def _run(self, epoch: int, predecessor: NodeId, then: Callable[[], None]) -> None:
+    def _run(self, epoch: int, predecessor: NodeId, gone: threading.Event, then: Callable[[], None]) -> None:
         started = monotonic_s()
-        content = self._fetch(predecessor, self._timeout_s)
+        content = self._fetch(predecessor, self._timeout_s, gone.is_set)
         with self._lock:
             if self._noted is not None and self._noted.epoch == epoch:  # else the next epoch's fetch goes on
                 self._result = _Fetched(epoch, predecessor, content, monotonic_s() - started)
@@ -370,6 +401,8 @@ class Restorer:
             _log.info("restored epoch=%d from=%s bytes=%d took_ms=%.0f", *where, len(content), took_ms)
         else:
             _log.warning("cold_start epoch=%d from=%s why=%r", *where, content)
+            if content not in (NOBODY, GONE):  # those deaths are told already
+                self._tell(f"began epoch {result.epoch} without the state of {result.predecessor}: {content}")
         return isinstance(content, bytes)
 
 

@@ -39,6 +39,7 @@ from zsched.core.events import WorkerJobs
 from zsched.core.hop.shared import STALLED_S
 from zsched.core.relay_protocol import StreamAcks, WorkerTrouble
 from zsched.core.route.keyexpr import fault, intersects
+from zsched.core.values.model import as_reason
 from zsched.core.values.plan import Role, WorkerRole
 from zsched.guard import ends_within, guarded, tolerant
 from zsched.hop.acknowledger import Acknowledger
@@ -141,7 +142,7 @@ class Worker:
         self._dispatcher = Dispatcher(
             self._inputs_ended, self._acks, self._troubles, self._debts, self._jobs, self._lives.is_over
         )
-        self._restorer = Restorer(self._fetch_snapshot, node, self._dispatcher)
+        self._restorer = Restorer(self._fetch_snapshot, node, self._dispatcher, self._tell_cold)
         self._dispatcher.start()
         self._watch: RoleWatch | None = None
         if not is_standalone:
@@ -319,8 +320,7 @@ class Worker:
         """Take the predecessor's state over when this worker becomes the owner; call it once, before `subscribe`.
 
         ``restore`` runs in the dispatch thread before any input of the new epoch, at most ``timeout_s`` after the role
-        came (0.3 s if the predecessor gives no sign of life); until then `role` is idle. Without a snapshot it is not
-        called.
+        came; until then `role` is idle. Without a snapshot it is not called.
 
         Raises:
             RuntimeError: this worker is ready already, or takes the state already.
@@ -528,8 +528,8 @@ class Worker:
         if self._watch is not None:
             self._watch.show(epoch)
 
-    def _fetch_snapshot(self, predecessor: str, timeout_s: float) -> bytes | str:
-        return fetch(self._state_link.session, self._keyspace.snapshot(predecessor, self._task), timeout_s)
+    def _fetch_snapshot(self, predecessor: str, timeout_s: float, is_gone: Callable[[], bool]) -> bytes | str:
+        return fetch(self._state_link.session, self._keyspace.snapshot(predecessor, self._task), timeout_s, is_gone)
 
     def _is_owner(self) -> bool:
         role = self.role
@@ -563,6 +563,10 @@ class Worker:
     def _tell_trouble(self, count: int, text: str) -> None:
         trouble = WorkerTrouble(task=self._task, incarnation=self._incarnation, count=count, text=text)
         self._tell(trouble)
+
+    def _tell_cold(self, text: str) -> None:
+        said = as_reason(text)
+        self._tell(WorkerTrouble(task=self._task, incarnation=self._incarnation, count=0, text=said, is_cold=True))
 
     def _tell_jobs(self, jobs: WorkerJobs) -> None:
         if not self._is_standalone:

@@ -910,6 +910,12 @@ def test_what_a_worker_complains_of_is_in_the_next_profile() -> None:
     assert told.profile.workers[0].reason == "callback raised 2 times: ValueError: x"
 
 
+def test_a_state_that_is_lost_in_a_move_is_in_the_story() -> None:
+    edge = started("edge1")
+    batch = edge.handle(ev.WorkerTroubled(task="merge", count=0, text="began epoch 2 cold", is_cold=True), 100.1)
+    assert [one.text for one in of(batch, do.RecordStory)] == ["the worker began epoch 2 cold"]
+
+
 def test_a_restart_is_for_a_worker_that_runs_here_and_is_no_failure() -> None:
     edge = make("edge1")
     for state in (WorkerState.STARTING, WorkerState.READY):

@@ -287,7 +287,8 @@ class Executor:
             if self.is_leased:
                 self.leave(todo)  # it works again with its first lease
             else:
-                role = Role(task=self.spec.name, role=WorkerRole.ACTIVE, epoch=self.epoch)
+                came_from = self.role.predecessor
+                role = Role(task=self.spec.name, role=WorkerRole.ACTIVE, epoch=self.epoch, predecessor=came_from)
                 self._wake_worker(role, todo)
                 self._become(role, todo)
 
@@ -419,8 +420,10 @@ class Executor:
             self._go(self.phase, None, text, todo)
 
     def on_gone(self, node: NodeId, todo: ToDo) -> None:
-        """A peer is gone: nothing more comes from its slots."""
+        """A peer is gone: nothing more comes from its slots, and the worker here waits no longer for its state."""
         self._is_owner_gone = self._is_owner_gone or node == self.owner
+        if self.role.predecessor == node:
+            self._become(replace(self.role, predecessor=None), todo)
         self._drop(tuple(old for old in self._old if old.slot.owner == node), f"{node} is gone", todo)
 
     def on_back(self, node: NodeId) -> None:

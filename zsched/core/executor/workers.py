@@ -36,7 +36,7 @@ class Workers(Struct):
     states: dict[TaskId, WorkerState]
     reasons: dict[TaskId, str] = field(default_factory=dict)
     _troubles: dict[TaskId, tuple[str, float]] = field(default_factory=dict)
-    """{task: (the newest error of a ready worker, when it came)}."""
+    """{task: (the newest error of a worker, when it came)}."""
     _mistakes: dict[TaskId, str] = field(default_factory=dict)
     """{task: a mistake of a ready worker that lasts as long as it lives}."""
     _outdated: dict[TaskId, str] = field(default_factory=dict)
@@ -107,15 +107,19 @@ class Workers(Struct):
         text = f"worker {told_of_worker(event.state, event.reason).removeprefix('is ')}"
         return RecordStory(stage="executor", text=text, task=event.task)
 
-    def on_troubled(self, event: ev.WorkerTroubled, now: float) -> None:
-        """A worker that is ready says that its callbacks raise, or that it makes a mistake."""
+    def on_troubled(self, event: ev.WorkerTroubled, now: float) -> RecordStory | None:
+        """A worker that is ready says that its callbacks raise, or that it makes a mistake; or one has begun cold."""
+        if event.is_cold and event.task in self.states:
+            self._troubles[event.task] = (as_reason(event.text), now)
+            return RecordStory(stage="executor", text=f"the worker {as_reason(event.text)}", task=event.task)
         if self.states.get(event.task) is not WorkerState.READY:
-            return
+            return None
         if not event.count:
             self._mistakes[event.task] = as_reason(event.text)
         else:
             times = "once" if event.count == 1 else f"{event.count} times"
             self._troubles[event.task] = (as_reason(f"callback raised {times}: {event.text}"), now)
+        return None
 
     def on_outdated(self, event: ev.WorkerOutdated) -> None:
         """A worker that somebody else started should be started again, or has been."""

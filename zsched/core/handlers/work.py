@@ -146,8 +146,10 @@ def _on_worker(node: Stages, event: ev.WorkerChanged, todo: ToDo, now: float) ->
     todo.must_decide |= event.task in node.owned()
 
 
-def _on_worker_troubled(node: Stages, event: ev.WorkerTroubled, _todo: ToDo, now: float) -> None:
-    node.workers.on_troubled(event, now)
+def _on_worker_troubled(node: Stages, event: ev.WorkerTroubled, todo: ToDo, now: float) -> None:
+    story = node.workers.on_troubled(event, now)
+    if story is not None:
+        todo.add(story)
 
 
 def _on_worker_outdated(node: Stages, event: ev.WorkerOutdated, _todo: ToDo, _now: float) -> None:

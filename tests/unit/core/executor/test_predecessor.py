@@ -74,3 +74,14 @@ def test_a_lease_keeps_the_predecessor() -> None:
     execute(one, "edge2", 1)
     execute(one, "edge1", 2)
     assert role(done(one.set_lease, 5.0, 1.0)).predecessor == "edge2"
+
+
+def test_an_owner_that_goes_while_it_is_asked_is_waited_for_no_longer() -> None:
+    """It died in a move away from it, or this node hears of its death later than of the new owner."""
+    one = edge()
+    execute(one, "edge2", 1)
+    execute(one, "edge1", 2)
+    assert not any(isinstance(step, SetRole) for step in done(one.on_gone, "edge3"))
+    found = role(done(one.on_gone, "edge2"))
+    assert (found.role, found.epoch, found.predecessor) == (WorkerRole.ACTIVE, 2, None)
+    assert not any(isinstance(step, SetRole) for step in done(one.on_gone, "edge2")), "once"

@@ -53,6 +53,19 @@ def test_a_mistake_of_a_worker_is_shown_as_long_as_it_lives() -> None:
     assert workers.told(20.1 + TROUBLE_S) == {}
 
 
+def test_a_state_that_is_lost_is_shown_for_a_minute_also_of_a_worker_that_starts() -> None:
+    workers = Workers({"merge": WorkerState.STARTING})
+    cold = ev.WorkerTroubled(task="merge", count=0, text="began epoch 2 without the state of edge1: late", is_cold=True)
+    story = workers.on_troubled(cold, 10.0)
+    assert story is not None
+    assert (story.stage, story.task) == ("executor", "merge")
+    assert story.text == "the worker began epoch 2 without the state of edge1: late"
+    workers.on_changed(changed(WorkerState.READY))
+    assert workers.told(10.0 + TROUBLE_S) == {"merge": cold.text}
+    assert workers.told(10.1 + TROUBLE_S) == {}
+    assert Workers({}).on_troubled(cold, 0.0) is None
+
+
 def test_an_unknown_task_is_nobody_s_worker() -> None:
     workers = Workers({})
     assert workers.on_changed(changed(WorkerState.READY)) is None
