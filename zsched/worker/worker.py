@@ -115,6 +115,8 @@ class Worker:
         self._pid = os.getpid()
         self._handlers: dict[int, Any] = {}
         """{signal: what was done at it before this worker}"""
+        self._has_signals = True
+        """Signals end this worker; behind `close` they do what they did before."""
         self._outputs: dict[str, Output] = {}
         """{key, the epoch still a placeholder: its output}; guarded by `_lock`."""
         self._output_keys = output_keys
@@ -413,8 +415,7 @@ class Worker:
             os._exit(0)  # a stopped peer holds zenoh's close for seconds, and its threads hold the interpreter
         if has_alarm:
             signal.setitimer(signal.ITIMER_REAL, 0.0)
-        if threading.current_thread() is threading.main_thread():
-            self._give_signals_back()
+        self._give_signals_back()
 
     def __enter__(self) -> Self:
         return self
@@ -433,12 +434,26 @@ class Worker:
                 close()
 
     def _give_signals_back(self) -> None:
-        for number, before in self._handlers.items():
-            is_ours = signal.getsignal(number) == self._on_signal  # or somebody else's came behind it
-            if is_ours and before is not None:
-                signal.signal(number, before)
+        self._has_signals = False
+        if threading.current_thread() is not threading.main_thread():
+            return
+        for number in self._handlers:
+            if signal.getsignal(number) == self._on_signal:  # or somebody else's came behind it
+                signal.signal(number, self._handler_before(number))
+
+    def _handler_before(self, number: int) -> Any:
+        """What a signal did before us; workers that have ended since do nothing with it."""
+        before = self._handlers[number]
+        worker = getattr(before, "__self__", None)
+        if isinstance(worker, Worker) and not worker._has_signals:  # noqa: SLF001 - another one of us
+            return worker._handler_before(number)  # noqa: SLF001 - as above
+        return signal.SIG_DFL if before is None else before
 
     def _on_signal(self, number: int, _frame: FrameType | None) -> None:
+        if not self._has_signals:  # closed, and nobody could put back what was there
+            signal.signal(number, self._handler_before(number))
+            os.kill(os.getpid(), number)
+            return
         if os.getpid() != self._pid:  # a child that this process forked has our handler, and nobody who waits in it
             signal.signal(number, signal.SIG_DFL)
             os.kill(os.getpid(), number)

@@ -477,11 +477,38 @@ with Worker.from_env({}, standalone="t"):
 print(signal.getsignal(signal.SIGINT) == signal.SIG_IGN, signal.getsignal(signal.SIGTERM) == before[1])
 """
 
+TWO_CLOSED = """
+import signal, threading
+from zsched.worker import Worker
+numbers = signal.SIGINT, signal.SIGTERM
+before = [signal.getsignal(number) for number in numbers]
+one, two, three = [Worker.from_env({}, standalone=task) for task in "abc"]
+one.close()
+two.close()
+print([signal.getsignal(number) == three._on_signal for number in numbers])
+three.close()
+print([signal.getsignal(number) == one for number, one in zip(numbers, before)])
+four = Worker.from_env({}, standalone="d")
+closing = threading.Thread(target=four.close)
+closing.start()
+closing.join()
+try:
+    signal.raise_signal(signal.SIGINT)
+except KeyboardInterrupt:
+    print("Ctrl-C works")
+"""
+
 
 def test_a_closed_worker_gives_the_signals_back_that_are_still_its_own() -> None:
     """Ctrl-C did nothing behind the `with` block."""
     found = subprocess.run([sys.executable, "-c", CLOSED], timeout=60, capture_output=True, text=True, check=False)
     assert (found.returncode, found.stdout) == (0, "[True, True]\nTrue\nTrue True\n"), found.stderr
+
+
+def test_workers_closed_in_any_order_and_by_any_thread_give_the_signals_back() -> None:
+    """The first one's handler came back with the second one's end, and Ctrl-C did nothing for ever."""
+    found = subprocess.run([sys.executable, "-c", TWO_CLOSED], timeout=60, capture_output=True, text=True, check=False)
+    assert (found.returncode, found.stdout) == (0, "[True, True]\n[True, True]\nCtrl-C works\n"), found.stderr
 
 
 def test_who_is_told_to_stop_takes_its_token_back_and_does_what_has_come(relay: Relay, tmp_path: Path) -> None:
