@@ -13,14 +13,14 @@ from zsched.core.values.struct import Struct
 
 HAND_OVER_S = 3.0
 """How long a stopping owner waits for tasks that another node could take. With what follows (`LEAVE_S`, workers, relay,
-session: 2.6 s at most) it fits into the unit's TimeoutStopSec=8."""
+session: 3.7 s at most) it fits into the unit's TimeoutStopSec=8."""
 ANEW_S = 10.0
 """...where it begins anew in its process: nobody counts its seconds, and a busy fleet needs some for a move."""
 NOBODY_S = 0.8
 """...and for those that nobody else can: their answers are still to come."""
-LEAVE_S = 0.4
-"""...and how long it stays when they are moved: the next owner's worker asks ours for its state, and what ours has in
-hand is still to come."""
+LEAVE_S = 1.5
+"""...and how long it stays when they are moved: the next owner's worker asks ours for its state, which a full machine
+is long about, and what ours has in hand is still to come."""
 FINISH_S = 10.0
 """...and where it begins anew: at most this long, until its workers say that they have finished."""
 TWICE_S = 0.3

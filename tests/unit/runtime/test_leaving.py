@@ -29,7 +29,7 @@ def test_an_owner_waits_until_its_tasks_have_moved_and_a_little_longer() -> None
     assert not leaving.is_over((), (), 101.0)
     assert not leaving.is_over((), (), 101.0 + LEAVE_S - 0.01)
     assert leaving.is_over((), (), 101.0 + LEAVE_S)
-    assert leaving.last_words((), 101.4) == ""
+    assert leaving.last_words((), 101.0 + LEAVE_S) == ""
 
 
 def test_a_task_that_comes_back_meanwhile_is_waited_for_again() -> None:
