@@ -580,8 +580,10 @@ class Worker:
         self._tell(trouble)
 
     def _tell_cold(self, text: str) -> None:
-        said = as_reason(text)
-        self._tell(WorkerTrouble(task=self._task, incarnation=self._incarnation, count=0, text=said, is_cold=True))
+        said, seen_by_older = as_reason(text), 1  # to whom it is a callback that raised, for a minute
+        self._tell(
+            WorkerTrouble(task=self._task, incarnation=self._incarnation, count=seen_by_older, text=said, is_cold=True)
+        )
 
     def _tell_jobs(self, jobs: WorkerJobs) -> None:
         if not self._is_standalone:
