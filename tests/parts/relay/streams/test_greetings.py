@@ -230,6 +230,7 @@ def test_a_worker_that_was_told_a_wrong_class_or_replays_is_told_the_right_ones(
     main = outlet._main
     assert main is not None
     receiver.eid = main.eid
+    until(lambda: outlet.is_matching, "the subscriber to be seen")  # `latest` goes to nobody before
     outlet.send(bench.sample())
     if is_whole:
         receiver.greeted()
