@@ -308,8 +308,15 @@ def interruptible() -> Iterator[None]:
 
 
 @contextlib.contextmanager
+def ends_as_by_ctrl_c() -> Iterator[None]:
+    """A terminal that closes and SIGTERM raise `KeyboardInterrupt` meanwhile: nothing stays as a step has made it."""
+    with _at_signals(dict.fromkeys((signal.SIGTERM, signal.SIGHUP), signal.default_int_handler)):
+        yield
+
+
+@contextlib.contextmanager
 def stopped_by_signal() -> Iterator[threading.Event]:
-    """An event that they set meanwhile; none of them interrupts anything."""
+    """An event that Ctrl-C, a terminal that closes and SIGTERM set meanwhile; none of them interrupts anything."""
     stop = threading.Event()
     with _at_signals(dict.fromkeys(_ENDS, lambda _number, _frame: stop.set())):
         yield stop

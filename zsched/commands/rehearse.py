@@ -9,18 +9,16 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final, TypeVar
 
 from zsched import paths as places
 from zsched.clock import monotonic_s, wall_s
 from zsched.commands.ask import Door, ask_door
-from zsched.commands.common import CliError, Json, nearest, print_json, say, told_task, warn
+from zsched.commands.common import CliError, Json, ends_as_by_ctrl_c, nearest, print_json, say, told_task, warn
 from zsched.commands.document import IN_FORCE_S, document_text, in_force
 from zsched.commands.flags import drain_quietly, is_given_for, lift_quietly
 from zsched.commands.orders import OrderView, Row, asker, begin
@@ -166,7 +164,7 @@ def _play(view: OrderView, order: RehearseOrder, stage: Stage) -> int:
     interrupted = ""
     over = Over(is_kept=False, why="interrupted")
     still_drained = way_back = ""
-    with _ends_as_by_ctrl_c():
+    with ends_as_by_ctrl_c():
         try:
             over = _run(programme, stage)
         except KeyboardInterrupt:
@@ -203,20 +201,6 @@ def _play(view: OrderView, order: RehearseOrder, stage: Stage) -> int:
     if over.is_kept:
         return EXIT_OK
     return EXIT_FAILED if any(result.broken for result in programme.results) and not interrupted else EXIT_TIMED_OUT
-
-
-@contextmanager
-def _ends_as_by_ctrl_c() -> Iterator[None]:
-    """A terminal that closes and a `kill` end this as Ctrl-C does: nothing stays as a step has made it."""
-    before = {}
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        if signal.getsignal(number) is not signal.SIG_IGN:
-            before[number] = signal.signal(number, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _run(programme: Programme, stage: Stage) -> Over:
