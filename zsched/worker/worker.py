@@ -451,15 +451,12 @@ class Worker:
 
     def _on_signal(self, number: int, _frame: FrameType | None) -> None:
         if not self._has_signals:  # closed, and nobody could put back what was there
-            signal.signal(number, self._handler_before(number))
-            os.kill(os.getpid(), number)
-            return
-        if os.getpid() != self._pid:  # a child that this process forked has our handler, and nobody who waits in it
-            signal.signal(number, signal.SIG_DFL)
-            os.kill(os.getpid(), number)
-            return
-        self._signals += 1
-        self._ended.put(None)  # and not the event: its lock may be held by what this signal has interrupted
+            _pass_on(number, self._handler_before(number))
+        elif os.getpid() != self._pid:  # a child that this process forked has our handler, and nobody who waits in it
+            _pass_on(number, signal.SIG_DFL)
+        else:
+            self._signals += 1
+            self._ended.put(None)  # and not the event: its lock may be held by what this signal has interrupted
 
     def _finish(self) -> None:
         """Take the token back, so that relays keep what is to come for the next worker, and do what has come."""
@@ -575,15 +572,13 @@ class Worker:
             congestion_control=zenoh.CongestionControl.DROP,
         )
 
-    def _tell_trouble(self, count: int, text: str) -> None:
-        trouble = WorkerTrouble(task=self._task, incarnation=self._incarnation, count=count, text=text)
-        self._tell(trouble)
+    def _tell_trouble(self, count: int, text: str, *, is_cold: bool = False) -> None:
+        life = self._incarnation
+        self._tell(WorkerTrouble(task=self._task, incarnation=life, count=count, text=text, is_cold=is_cold))
 
     def _tell_cold(self, text: str) -> None:
-        said, seen_by_older = as_reason(text), 1  # to whom it is a callback that raised, for a minute
-        self._tell(
-            WorkerTrouble(task=self._task, incarnation=self._incarnation, count=seen_by_older, text=said, is_cold=True)
-        )
+        # An older daemon, which does not know the word, takes it for one callback that raised, and forgets it.
+        self._tell_trouble(1, as_reason(text), is_cold=True)
 
     def _tell_jobs(self, jobs: WorkerJobs) -> None:
         if not self._is_standalone:
@@ -634,3 +629,9 @@ class Worker:
             outputs = tuple(self._outputs.values())
         for output in outputs:  # an errand each: one that fails takes no end from those behind it
             self._errands.put(partial(output.send_end, epoch))
+
+
+def _pass_on(number: int, handler: Any) -> None:
+    """Let ``handler`` have the signal that has come to a worker, and all later ones."""
+    signal.signal(number, handler)
+    os.kill(os.getpid(), number)

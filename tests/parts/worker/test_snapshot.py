@@ -164,32 +164,34 @@ def test_where_nobody_offers_one_the_answer_comes_at_once(sessions: tuple[zenoh.
     assert took_s < PATIENCE_S
 
 
-def test_a_silent_predecessor_is_waited_for_until_the_time_is_over(
-    sessions: tuple[zenoh.Session, zenoh.Session],
-) -> None:
+@pytest.fixture
+def silent(sessions: tuple[zenoh.Session, zenoh.Session]) -> Iterator[str]:
+    """The key of a predecessor that is there, and never answers."""
     key = f"{KEY}/silent"
-    silent = sessions[0].declare_queryable(key, zenoh.handlers.FifoChannel(4))
+    queryable = sessions[0].declare_queryable(key, zenoh.handlers.FifoChannel(4))
     until_offered(sessions[1], key)
-    reason, took_s = asked(sessions[1], timeout_s=0.5, key=key)
+    yield key
+    queryable.undeclare()
+
+
+def test_a_silent_predecessor_is_waited_for_until_the_time_is_over(
+    sessions: tuple[zenoh.Session, zenoh.Session], silent: str
+) -> None:
+    reason, took_s = asked(sessions[1], timeout_s=0.5, key=silent)
     assert reason == "no answer within 0.5 s"
     assert 0.5 <= took_s < PATIENCE_S
-    silent.undeclare()
 
 
 def test_a_silent_predecessor_whose_machine_is_gone_is_not_waited_for(
-    sessions: tuple[zenoh.Session, zenoh.Session],
+    sessions: tuple[zenoh.Session, zenoh.Session], silent: str
 ) -> None:
-    key = f"{KEY}/gone"
-    silent = sessions[0].declare_queryable(key, zenoh.handlers.FifoChannel(4))
-    until_offered(sessions[1], key)
     gone = threading.Event()
     later = threading.Timer(0.2, gone.set)
     later.start()
-    reason, took_s = asked(sessions[1], key=key, is_gone=gone.is_set)
+    reason, took_s = asked(sessions[1], key=silent, is_gone=gone.is_set)
     assert reason == "its machine is gone"
     assert took_s < PATIENCE_S / 2
     later.join(PATIENCE_S)
-    silent.undeclare()
 
 
 def test_a_state_that_is_coming_is_taken_whatever_the_node_thinks_of_its_machine(

@@ -110,8 +110,9 @@ class Workers(Struct):
     def on_troubled(self, event: ev.WorkerTroubled, now: float) -> RecordStory | None:
         """A worker that is ready says that its callbacks raise, or that it makes a mistake; or one has begun cold."""
         if event.is_cold and event.task in self.states:
-            self._troubles[event.task] = (as_reason(event.text), now)
-            return RecordStory(stage="executor", text=f"the worker {as_reason(event.text)}", task=event.task)
+            text = as_reason(event.text)
+            self._troubles[event.task] = (text, now)
+            return RecordStory(stage="executor", text=f"the worker {text}", task=event.task)
         if self.states.get(event.task) is not WorkerState.READY:
             return None
         if not event.count:
