@@ -17,6 +17,7 @@ from zsched.core.membership.peers import Membership
 from zsched.core.todo import ToDo
 from zsched.core.values.fleet import Fleet, OnIsolation
 from zsched.core.values.model import NodeId
+from zsched.core.values.plan import WorkerRole
 from zsched.core.vote.lease import Leases
 
 LOCAL = fleet_of(task_of(on_isolation=OnIsolation.LOCAL))
@@ -82,3 +83,20 @@ def test_what_was_counted_before_the_file_forbade_it_does_not_count_when_it_allo
     assert tenure.next_deadline(20.0) == 20.0 + ALONE_AFTER_S
     tenure.tend_isolation(membership, ToDo(), 20.0 + ALONE_AFTER_S - 0.001)
     assert not is_alone(tenure)
+
+
+def test_in_doubt_of_its_clock_a_node_tells_no_worker_to_leave_that_it_holds_no_lease_for() -> None:
+    """It owns nothing exclusive: what worked here before the task became exclusive ends with its drain."""
+    tenure = tenure_of("edge1")
+    executor = tenure.executors["merge"]
+    done(executor.execute, allocation_of(2, "edge2"), 10.0)
+    taken = allocation_of(3, "edge2", epoch=2, leased=True)
+    done(executor.execute, taken, 10.0)
+    tenure.hold(taken, next_number=1)
+    tenure.leases.doubt({})
+    assert tenure.exclusive == ("merge",)
+    assert executor.role.role is WorkerRole.DRAINING
+    todo = ToDo()
+    tenure.tend_leases(1, todo, 10.1)
+    assert not todo.apply
+    assert executor.role.role is WorkerRole.DRAINING
