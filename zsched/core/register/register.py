@@ -417,13 +417,6 @@ class Register(ABC, Generic[V]):
                 self._end(change, RoundOutcome.CONFLICT, todo)
                 self._round = None
 
-    def _begin(self, todo: ToDo, now: float) -> None:
-        """Prepare, unless the change is outdated; read a newer base than ours first."""
-        if self._outcome_by(self.value) is None:
-            self._prepare(todo, now)
-        else:
-            self._finish(todo, RoundOutcome.CONFLICT, now)
-
     def _prepare(self, todo: ToDo, now: float) -> None:
         running = self._running()
         self._counter = max(self._counter, self.state.promised.counter) + 1
@@ -624,7 +617,7 @@ class Register(ABC, Generic[V]):
             if running.phase is _Phase.WAIT and now < (until := min(self._lease_over_at, running.give_up_at)):
                 running.deadline = until  # our next ballot would end the accept that waits
             elif running.phase is _Phase.WAIT:
-                self._begin(todo, now)
+                self._prepare(todo, now)  # no newer value has come: that would have ended the round
             elif self._waits_for_others(running):
                 self._ask_again(running, todo, now)
             else:

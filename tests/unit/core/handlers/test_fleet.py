@@ -16,8 +16,10 @@ from support.states import state_of
 from support.storm import ELECTORATE, FLEET, ROBOTS, Storm, some_fleet
 from zsched.core import events as ev
 from zsched.core import instructions as do
+from zsched.core.handlers.fleet import adopt as take_over
 from zsched.core.node import Node
 from zsched.core.status import build_snapshot
+from zsched.core.todo import ToDo
 from zsched.core.values.electorate import CREATION_STEP
 from zsched.core.values.fleet import Fleet, StreamRule, WorkerSpec
 from zsched.core.values.messages import Learnt, Prepare
@@ -53,6 +55,39 @@ def adopt(node: Node, fleet: Fleet, now: float = START) -> tuple[do.Instruction,
 
 def kinds(batch: Iterable[do.Instruction]) -> set[type]:
     return {type(one) for one in batch}
+
+
+@pytest.mark.parametrize(
+    ("other", "why"),
+    [
+        (replace(FLEET, name="other"), "the file is of fleet 'other', this daemon of "),
+        (replace(FLEET, nodes=FLEET.nodes[1:]), "the file has no node "),
+        (replace(FLEET, nodes=(replace(FLEET.nodes[0], kind=NodeKind.ROBOT), *FLEET.nodes[1:])), "the file makes "),
+    ],
+    ids=["another fleet", "without this node", "another kind"],
+)
+@pytest.mark.parametrize("is_agreed", [False, True])
+def test_a_file_that_cannot_be_taken_over_changes_nothing_and_is_a_problem_until_one_can(
+    other: Fleet, why: str, is_agreed: bool
+) -> None:
+    """Also one that electors have agreed, and that this machine cannot follow."""
+
+    def take(fleet: Fleet) -> None:
+        if is_agreed:
+            take_over(node, fleet, ToDo(), START)
+        else:
+            adopt(node, fleet)
+
+    me = FLEET.nodes[0].name
+    assert FLEET.nodes[0].kind is NodeKind.EDGE
+    node = node_of(FLEET, me)
+    before = (node.fleet, node.fleet_file, node.membership.states(), tuple(node.executors))
+    take(other)
+    assert (node.fleet, node.fleet_file, node.membership.states(), tuple(node.executors)) == before
+    said = f"fleet: a changed fleet file is not in force here: {why}"
+    assert [one for one in build_snapshot(node, START).problems if one.startswith(said)]
+    take(FLEET)
+    assert not [one for one in build_snapshot(node, START).problems if one.startswith(said)]
 
 
 @pytest.mark.parametrize("seed", range(16))

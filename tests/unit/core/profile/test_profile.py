@@ -571,6 +571,15 @@ def test_a_signal_goes_on_by_another_time_constant_and_its_trend_begins_anew(tau
     assert signal.trend_db_s == pytest.approx(0.4, abs=0.06)
 
 
+def test_the_signal_of_a_link_goes_on_by_another_time_constant() -> None:
+    profiler = make_profiler()
+    profiler.absorb(device(), (radio(-60.0),), 100.0)
+    profiler.adopt(replace(TIMING, smoothing_s=4.0))
+    profiler.absorb(device(), (radio(-70.0),), 101.0)
+    (link,) = taken(profiler, 101.0).links
+    assert link.rssi_dbm == pytest.approx(-60.0 - 10.0 * (1 - math.exp(-1.0 / 4.0)))
+
+
 def test_impossible_and_unknown_readings_are_no_readings_and_old_ones_neither() -> None:
     profiler = make_profiler()
     assert gauges_of(profiler, 100.0, ("battery", 1.2), ("temperature_c", math.nan), ("wind", 3.0)) == {}
