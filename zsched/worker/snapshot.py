@@ -7,6 +7,9 @@ its attachment a `SnapshotChunk` that names its place, the size of the whole and
 ``timeout_s`` for all of them: an owner that is left because its machine is busy is long about its first word, too.
 Before that word the wait ends once the node takes the predecessor's machine for gone. Whatever goes wrong is a cold
 start with a reason, never an error.
+
+The question names the epoch that begins. A predecessor that still waits for its own predecessor's state answers behind
+it, and one that was not the owner of the epoch before has none: else an empty state, or an old one, would pass for it.
 """
 
 from __future__ import annotations
@@ -29,6 +32,7 @@ from zsched.core.values.plan import Role, WorkerRole
 from zsched.core.values.struct import Struct
 from zsched.guard import call_plain, guarded, tolerant
 from zsched.ipc.pipe import decode_chunk, encode_chunk
+from zsched.wire.keyspace import counter
 from zsched.worker.troubles import Troubles
 
 CHUNK: Final = 256 * 1024
@@ -39,11 +43,19 @@ COMING: Final = b"coming"
 SLICE_S: Final = 0.02
 """Silence is counted in pieces of this length: a time in which this process did not run is no silence of another."""
 TIMEOUT_S: Final = 2.0
+EPOCH: Final = "epoch"
+"""Parameter of the question: the epoch that begins. Workers of older versions neither name nor read it."""
+TOLD_S: Final = 0.5
+"""A successor may learn of a move before the predecessor's worker has heard that it was the owner."""
+SETTLE_S: Final = 5.0
+"""A predecessor waits so long for its own state before it refuses: longer than a successor waits for it."""
+MAX_WAITING: Final = 4
+"""Questions that wait in threads of their own, so that others are answered meanwhile."""
 CONTEST_S: Final = 0.1
 """A whole state waits this long for another answer to the same question."""
 MAX_OFFERS: Final = 2
 NOBODY, GONE = "nobody offers one", "its machine is gone"
-"""Why there is no state, where its worker has ended or offers none, and where its machine has left the fleet."""
+"""Why there is no state: its worker cannot be reached or offers none, or its machine has left the fleet."""
 RELAY_S: Final = 5.0
 """A worker that starts waits this long for its node's relay, which may start later than it does (or again)."""
 
@@ -101,12 +113,20 @@ class Offer:
     """The queryable under which a worker's successor finds its state."""
 
     def __init__(
-        self, session: zenoh.Session, key: str, snapshot: Callable[[], bytes | bytearray], troubles: Troubles
+        self,
+        session: zenoh.Session,
+        key: str,
+        snapshot: Callable[[], bytes | bytearray],
+        troubles: Troubles,
+        book: StateBook,
     ) -> None:
-        """Declare it; ``snapshot`` is called in a thread of its own, once per query."""
+        """Declare it; ``snapshot`` is called in a thread of its own, once per query, when ``book`` says that it may."""
         self._key = key
         self._snapshot = snapshot
         self._troubles = troubles
+        self._book = book
+        self._waiting = threading.Semaphore(MAX_WAITING)
+        self._saving = threading.Lock()
         self._queryable = session.declare_queryable(key, tolerant(self._hear, "snapshot"), complete=True)
 
     def undeclare(self) -> None:
@@ -114,16 +134,34 @@ class Offer:
         self._queryable.undeclare()
 
     def _hear(self, query: zenoh.Query) -> None:
+        epoch = _asked_for(query)
+        if self._book.must_wait(epoch) and self._waiting.acquire(blocking=False):
+            guarded(self._wait, query, epoch, name="zsched offer", is_lasting=False).start()
+        else:
+            self._take(query, epoch)
+
+    def _wait(self, query: zenoh.Query, epoch: int | None) -> None:
+        try:
+            self._take(query, epoch)
+        finally:
+            self._waiting.release()
+
+    def _take(self, query: zenoh.Query, epoch: int | None) -> None:
         try:
             with query:
-                self._answer(query)
+                self._answer(query, epoch)
         except zenoh.ZError as error:
             _log.info("a snapshot could not be sent (%s)", error)
 
-    def _answer(self, query: zenoh.Query) -> None:
+    def _answer(self, query: zenoh.Query, epoch: int | None) -> None:
         query.reply(self._key, b"", attachment=COMING)
+        if why_not := self._book.settle(epoch):
+            _log.info("no state for epoch %s: %s", epoch, why_not)
+            query.reply_err(why_not, encoding=ERROR_ENCODING)
+            return
         try:
-            content = _copied(self._snapshot())
+            with self._saving:
+                content = _copied(self._snapshot())
         except BaseException as error:  # noqa: BLE001 - the worker's own bug is the successor's cold start
             self._troubles.note("offer_snapshot", error)
             query.reply_err(f"failed: {type(error).__name__}: {error}"[:400], encoding=ERROR_ENCODING)
@@ -134,6 +172,11 @@ class Offer:
             return
         for chunk, part in chunks(content):
             query.reply(self._key, part, attachment=encode_chunk(chunk))
+
+
+def _asked_for(query: zenoh.Query) -> int | None:
+    """The epoch that begins; ``None``: the question names none, or nonsense."""
+    return counter(query.parameters.get(EPOCH) or "")
 
 
 def _copied(state: bytes | bytearray) -> bytes:
@@ -193,8 +236,8 @@ class Assembly:
         return content
 
 
-def fetch(session: zenoh.Session, key: str, timeout_s: float, is_gone: Callable[[], bool]) -> bytes | str:
-    """The snapshot under ``key``, or why there is none.
+def fetch(session: zenoh.Session, key: str, epoch: int, timeout_s: float, is_gone: Callable[[], bool]) -> bytes | str:
+    """The snapshot under ``key`` for the ``epoch`` that begins, or why there is none.
 
     It takes ``timeout_s`` at most, and ends before the first word of a predecessor whose machine ``is_gone``.
     """
@@ -203,7 +246,7 @@ def fetch(session: zenoh.Session, key: str, timeout_s: float, is_gone: Callable[
     until = monotonic_s() + timeout_s
     try:
         session.get(
-            key,
+            f"{key}?{EPOCH}={epoch}",
             zenoh.handlers.Callback(tolerant(replies.put, "snapshot"), lambda: replies.put(None), indirect=False),
             target=zenoh.QueryTarget.ALL,  # a stranger's offer may call itself complete, and must not be the only one
             timeout=timeout_s + 1.0,
@@ -278,7 +321,8 @@ def _added(assembly: Assembly, reply: zenoh.Reply) -> bytes | str | None:
     sample = reply.ok
     if sample is None:
         error = reply.err
-        return f"refused: {error.payload.to_bytes()[:200]!r}" if error is not None else "an empty reply"
+        said = "" if error is None else error.payload.to_bytes()[:200].decode(errors="replace")
+        return f"refused: {said}" if error is not None else "an empty reply"
     chunk = decode_chunk(sample.attachment.to_bytes()) if sample.attachment is not None else None
     if chunk is None:
         return "corrupt: a piece without its place"
@@ -292,6 +336,74 @@ class _Fetched(Struct, frozen=True):
     took_s: float
 
 
+class StateBook:
+    """What a worker's state is: whether it ever had a task's, and whether a predecessor's is on its way to it.
+
+    Calls come from several threads.
+    """
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._worked = 0
+        """The newest epoch in which this worker was told to work."""
+        self._coming = 0
+        """The epoch whose predecessor's state is on its way here; 0: none is."""
+        self._settled, self._is_cold = 0, False
+        """The newest epoch that has begun behind such a wait, and whether it has begun without the state."""
+
+    def work(self, epoch: int) -> None:
+        """This worker is told to work in ``epoch``."""
+        with self._changed:
+            self._worked = max(self._worked, epoch)
+            self._changed.notify_all()
+
+    def expect(self, epoch: int) -> None:
+        """The state that ``epoch`` begins with is on its way."""
+        with self._changed:
+            self._coming = epoch
+            self._changed.notify_all()
+
+    def settled(self, epoch: int, *, is_cold: bool) -> None:
+        """``epoch`` has begun with its predecessor's state, or without (``is_cold``)."""
+        with self._changed:
+            self._settled, self._is_cold = epoch, is_cold
+            self._coming = 0 if self._coming == epoch else self._coming
+            self._changed.notify_all()
+
+    def must_wait(self, epoch: int | None) -> bool:
+        """Whether `settle` would not answer at once."""
+        with self._changed:
+            return self._comes_for(epoch) or self._is_early(epoch)
+
+    def settle(self, epoch: int | None) -> str:
+        """Wait until there is what ``epoch`` is to begin with; why there is nothing (empty: there is).
+
+        ``None``: the asker's version does not name its epoch.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: not self._is_early(epoch), TOLD_S)
+            if self._is_early(epoch):
+                return f"its worker was not the owner of epoch {(epoch or 0) - 1}"
+            awaited = self._coming
+            if not self._comes_for(epoch):
+                return ""
+            self._changed.wait_for(lambda: self._coming != awaited, SETTLE_S)
+            if self._settled == awaited and not self._is_cold:
+                return ""
+            return f"its worker has not got the state of epoch {awaited} itself"
+
+    def _comes_for(self, epoch: int | None) -> bool:
+        """Whether a state is on its way that comes before ``epoch``.
+
+        What comes for a later one changes nothing: A, the owner again, has what B, the owner in between, asks for.
+        """
+        return self._coming > 0 and (epoch is None or self._coming < epoch)
+
+    def _is_early(self, epoch: int | None) -> bool:
+        """Whether this worker has not worked in the epoch before, as far as it has heard."""
+        return epoch is not None and self._worked < epoch - 1
+
+
 class Restorer:
     """A new owner's side: while it `is_pending`, no input is processed and nothing is put out.
 
@@ -301,18 +413,20 @@ class Restorer:
 
     def __init__(
         self,
-        fetched: Callable[[NodeId, float, Callable[[], bool]], bytes | str],
+        fetched: Callable[[NodeId, int, float, Callable[[], bool]], bytes | str],
         node: NodeId,
         inputs: Held,
         tell: Callable[[str], None],
+        book: StateBook,
     ) -> None:
-        """``fetched``: (predecessor, longest wait, whether its machine is gone) -> the state, or why there is none.
+        """``fetched``: (predecessor, epoch, longest wait, whether its machine is gone) -> the state, or why there is none.
 
-        ``tell`` lets the node know of a state that was there, and is lost here.
+        ``book`` is told of it for this worker's own offer. ``tell`` lets the node know of a state that was there, and is lost here.
         """
         self._fetch, self._tell = fetched, tell
         self._node = node
         self._inputs = inputs
+        self._book = book
         self._lock = threading.Lock()
         self._callback: Callable[[bytes], None] | None = None
         self._timeout_s = TIMEOUT_S
@@ -342,14 +456,18 @@ class Restorer:
         """
         with self._lock:
             is_new = self._noted is None or role.epoch > self._noted.epoch
-            is_owner = role.role is WorkerRole.ACTIVE and role.predecessor not in (None, self._node)
+            works = role.role is not WorkerRole.IDLE  # one that drains already was told too late that it is the owner
+            is_owner = works and role.predecessor not in (None, self._node)
             is_same = self._noted is not None and role.epoch == self._noted.epoch
             if is_same and role.role is WorkerRole.ACTIVE and role.predecessor is None:
                 self._is_gone.set()
+            if works:
+                self._book.work(role.epoch)
             if self._callback is None or not is_new or not is_owner:
                 return
             self._noted, self._is_gone, self._has_begun, self._result = role, threading.Event(), False, None
             self.is_pending = True
+            self._book.expect(role.epoch)
             self._inputs.hold()
 
     def begin(self, role: Role, then: Callable[[], None]) -> bool:
@@ -375,7 +493,7 @@ class Restorer:
 
     def _run(self, epoch: int, predecessor: NodeId, gone: threading.Event, then: Callable[[], None]) -> None:
         started = monotonic_s()
-        content = self._fetch(predecessor, self._timeout_s, gone.is_set)
+        content = self._fetch(predecessor, epoch, self._timeout_s, gone.is_set)
         with self._lock:
             if self._noted is not None and self._noted.epoch == epoch:  # else the next epoch's fetch goes on
                 self._result = _Fetched(epoch, predecessor, content, monotonic_s() - started)
@@ -395,14 +513,14 @@ class Restorer:
             self.is_pending = self.is_pending and not is_newest
             self.restored += isinstance(content, bytes)
             self.cold_starts += isinstance(content, str)
+        self._book.settled(result.epoch, is_cold=isinstance(content, str))
         where = (result.epoch, result.predecessor)
         if isinstance(content, bytes):
             took_ms = result.took_s * 1000
             _log.info("restored epoch=%d from=%s bytes=%d took_ms=%.0f", *where, len(content), took_ms)
         else:
             _log.warning("cold_start epoch=%d from=%s why=%r", *where, content)
-            if content not in (NOBODY, GONE):  # those deaths are told already
-                self._tell(f"began epoch {result.epoch} without the state of {result.predecessor}: {content}")
+            self._tell(f"began epoch {result.epoch} without the state of {result.predecessor}: {content}")
         return isinstance(content, bytes)
 
 

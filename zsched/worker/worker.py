@@ -61,7 +61,7 @@ from zsched.worker.outputs import OUTPUT_DEPTH, Output, OutputOptions
 from zsched.worker.roles import RoleWatch
 from zsched.worker.samples import BY_CLASS, Input, KeepLast, Marker, Received
 from zsched.worker.services import Handler, Service
-from zsched.worker.snapshot import TIMEOUT_S, Offer, Restorer, StateLink, fetch
+from zsched.worker.snapshot import TIMEOUT_S, Offer, Restorer, StateBook, StateLink, fetch
 from zsched.worker.start import open_session, relay_endpoint, surroundings
 from zsched.worker.troubles import Troubles
 
@@ -144,7 +144,8 @@ class Worker:
         self._dispatcher = Dispatcher(
             self._inputs_ended, self._acks, self._troubles, self._debts, self._jobs, self._lives.is_over
         )
-        self._restorer = Restorer(self._fetch_snapshot, node, self._dispatcher, self._tell_cold)
+        self._states = StateBook()
+        self._restorer = Restorer(self._fetch_snapshot, node, self._dispatcher, self._tell_cold, self._states)
         self._dispatcher.start()
         self._watch: RoleWatch | None = None
         if not is_standalone:
@@ -316,7 +317,7 @@ class Worker:
         if any(isinstance(entity, Offer) for entity in self._declared):
             raise RuntimeError("Worker.offer_snapshot a second time: the next owner takes neither of two states")
         key = self._keyspace.snapshot(self._node, self._task)
-        self._declared.append(Offer(self._state_link.session, key, snapshot, self._troubles))
+        self._declared.append(Offer(self._state_link.session, key, snapshot, self._troubles, self._states))
 
     def on_snapshot(self, restore: Callable[[bytes], None], timeout_s: float = TIMEOUT_S) -> None:
         """Take the predecessor's state over when this worker becomes the owner; call it once, before `subscribe`.
@@ -527,7 +528,7 @@ class Worker:
         then = partial(self._errands.put, lambda: self._begin(role))
         now = self._role
         is_stale = now.role is WorkerRole.IDLE or now.epoch != role.epoch
-        if not is_stale and self._restorer.begin(role, then):
+        if self._restorer.begin(role, then):  # also one that is over: who follows asks us for what we have asked for
             return
         if not is_stale:
             self._dispatcher.begin(role.epoch)
@@ -540,8 +541,11 @@ class Worker:
         if self._watch is not None:
             self._watch.show(epoch)
 
-    def _fetch_snapshot(self, predecessor: str, timeout_s: float, is_gone: Callable[[], bool]) -> bytes | str:
-        return fetch(self._state_link.session, self._keyspace.snapshot(predecessor, self._task), timeout_s, is_gone)
+    def _fetch_snapshot(
+        self, predecessor: str, epoch: int, timeout_s: float, is_gone: Callable[[], bool]
+    ) -> bytes | str:
+        key = self._keyspace.snapshot(predecessor, self._task)
+        return fetch(self._state_link.session, key, epoch, timeout_s, is_gone)
 
     def _is_owner(self) -> bool:
         role = self.role

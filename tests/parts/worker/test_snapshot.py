@@ -22,7 +22,7 @@ from zsched.core.values.plan import Role, WorkerRole
 from zsched.ipc.pipe import encode_chunk
 from zsched.sessions.config import data_config, worker_config
 from zsched.worker import snapshot as worker_snapshot
-from zsched.worker.snapshot import CHUNK, MAX_SNAPSHOT, Assembly, Offer, Restorer, StateLink, chunks, fetch
+from zsched.worker.snapshot import CHUNK, MAX_SNAPSHOT, Assembly, Offer, Restorer, StateBook, StateLink, chunks, fetch
 from zsched.worker.troubles import Troubles
 
 PATIENCE_S = 60.0
@@ -106,10 +106,15 @@ def never() -> bool:
 
 
 def asked(
-    session: zenoh.Session, timeout_s: float = PATIENCE_S, key: str = KEY, is_gone: Callable[[], bool] = never
+    session: zenoh.Session,
+    timeout_s: float = PATIENCE_S,
+    key: str = KEY,
+    is_gone: Callable[[], bool] = never,
+    *,
+    epoch: int = 2,
 ) -> tuple[bytes | str, float]:
     started = time.monotonic()
-    return fetch(session, key, timeout_s, is_gone), time.monotonic() - started
+    return fetch(session, key, epoch, timeout_s, is_gone), time.monotonic() - started
 
 
 def ignored(_count: int, _text: str) -> None:
@@ -121,8 +126,14 @@ def offered(
     key: str,
     snapshot: Callable[[], bytes | bytearray],
     tell: Callable[[int, str], None] = ignored,
+    *,
+    worked: int = 1,
+    book: StateBook | None = None,
 ) -> Offer:
-    return Offer(session, key, snapshot, Troubles(tell))
+    """By a worker that was told to work in the epoch ``worked``."""
+    book = book or StateBook()
+    book.work(worked)
+    return Offer(session, key, snapshot, Troubles(tell), book)
 
 
 def until_offered(session: zenoh.Session, key: str = KEY) -> None:
@@ -318,6 +329,61 @@ def test_a_stranger_s_state_beside_the_predecessor_s_is_a_cold_start() -> None:
             one.undeclare()
 
 
+def test_who_waits_for_a_state_itself_answers_behind_it_and_an_older_question_at_once(
+    sessions: tuple[zenoh.Session, zenoh.Session],
+) -> None:
+    """The owner again (epoch 3) is asked by the owner in between (epoch 2), which it asks itself."""
+    (worker, asker), key, book, states = sessions, f"{KEY}/chain", StateBook(), [b"before"]
+    offer = offered(worker, key, lambda: states[0], book=book)
+    until_offered(asker, key)
+    book.work(3)
+    book.expect(3)
+    later: queue.SimpleQueue[bytes | str] = queue.SimpleQueue()
+    for _ in range(2):
+        threading.Thread(target=lambda: later.put(asked(asker, key=key, epoch=4)[0]), daemon=True).start()
+    assert asked(asker, key=key, epoch=2)[0] == b"before"
+    assert later.empty()
+    states[0] = b"behind"
+    book.settled(3, is_cold=False)
+    assert [later.get(timeout=PATIENCE_S) for _ in range(2)] == [b"behind", b"behind"]
+    offer.undeclare()
+
+
+@pytest.mark.parametrize("ends", [lambda book: book.settled(3, is_cold=True), lambda book: book.expect(5)])
+def test_who_did_not_get_the_state_itself_does_not_hand_on_an_empty_one(ends: Callable[[StateBook], None]) -> None:
+    book = StateBook()
+    book.work(3)
+    book.expect(3)
+    assert book.must_wait(4)
+    said: list[str] = []
+    waiting = threading.Thread(target=lambda: said.append(book.settle(4)), daemon=True)
+    waiting.start()
+    ends(book)
+    waiting.join(PATIENCE_S)
+    assert said == ["its worker has not got the state of epoch 3 itself"]
+
+
+def test_one_that_began_cold_hands_its_state_on_later() -> None:
+    """What it has made since is the task's state."""
+    book = StateBook()
+    book.work(3)
+    book.expect(3)
+    book.settled(3, is_cold=True)
+    assert not book.must_wait(4)
+    assert book.settle(4) == ""
+
+
+def test_a_question_without_an_epoch_waits_for_whatever_comes() -> None:
+    """It is an older version's."""
+    book = StateBook()
+    assert not book.must_wait(None)
+    assert book.settle(None) == ""
+    book.expect(3)
+    assert book.must_wait(None)
+    book.settled(3, is_cold=False)
+    assert not book.must_wait(None)
+
+
 def test_garbage_is_corrupt(sessions: tuple[zenoh.Session, zenoh.Session]) -> None:
     key = f"{KEY}/garbage"
     liar = sessions[0].declare_queryable(key, lambda query: query.reply(key, b"state", attachment=b"what"))
@@ -353,7 +419,7 @@ def restored(
 ) -> tuple[Restorer, Inputs, list[bytes]]:
     inputs, got = Inputs(), list[bytes]()
     done: queue.SimpleQueue[None] = queue.SimpleQueue()
-    restorer = Restorer(lambda _node, _timeout_s, _is_gone: answer, "edge2", inputs, tell)
+    restorer = Restorer(lambda _node, _epoch, _timeout_s, _is_gone: answer, "edge2", inputs, tell, StateBook())
     restorer.register(got.append, 1.0)
     restorer.note(role)
     if restorer.begin(role, lambda: done.put(None)):
@@ -383,7 +449,7 @@ def test_without_one_the_inputs_go_on_and_it_is_counted(caplog: pytest.LogCaptur
         active(3, None),
         active(3, "edge2"),
         Role(task="t", role=WorkerRole.IDLE),
-        Role(task="t", role=WorkerRole.DRAINING, epoch=3, predecessor="edge1"),
+        Role(task="t", role=WorkerRole.DRAINING, epoch=3),
     ],
 )
 def test_nothing_waits_where_there_is_nobody_to_ask(role: Role) -> None:
@@ -403,11 +469,11 @@ def test_who_asks_again_while_the_state_is_on_its_way_waits_too() -> None:
     inputs = Inputs()
     comes, then = threading.Event(), threading.Event()
 
-    def late(_node: str, _timeout_s: float, _is_gone: Callable[[], bool]) -> bytes:
+    def late(_node: str, _epoch: int, _timeout_s: float, _is_gone: Callable[[], bool]) -> bytes:
         comes.wait(PATIENCE_S)
         return b"state"
 
-    restorer = Restorer(late, "edge2", inputs, list[str]().append)
+    restorer = Restorer(late, "edge2", inputs, list[str]().append, StateBook())
     restorer.register(lambda _content: None, 1.0)
     restorer.note(active(3))
     assert restorer.begin(active(3), then.set)
@@ -420,12 +486,12 @@ def test_who_asks_again_while_the_state_is_on_its_way_waits_too() -> None:
 def test_a_role_without_the_predecessor_of_before_ends_the_wait_of_its_epoch_alone() -> None:
     asked, goes_on, then = list[Callable[[], bool]](), threading.Event(), threading.Event()
 
-    def silent(_node: str, _timeout_s: float, is_gone: Callable[[], bool]) -> str:
+    def silent(_node: str, _epoch: int, _timeout_s: float, is_gone: Callable[[], bool]) -> str:
         asked.append(is_gone)
         goes_on.wait(PATIENCE_S)
         return "its machine is gone"
 
-    restorer = Restorer(silent, "edge2", Inputs(), list[str]().append)
+    restorer = Restorer(silent, "edge2", Inputs(), list[str]().append, StateBook())
     restorer.register(lambda _content: None, 1.0)
     restorer.note(active(3))
     assert restorer.begin(active(3), lambda: None)
@@ -447,20 +513,24 @@ async def _restore_later() -> None:
     raise AssertionError("it is never run")
 
 
-@pytest.mark.parametrize(
-    ("why", "is_told"),
-    [("nobody offers one", False), ("its machine is gone", False), ("late: x", True), ("no answer within 2 s", True)],
-)
-def test_the_node_hears_of_a_state_that_is_lost_and_of_a_death_from_others(why: str, is_told: bool) -> None:
+@pytest.mark.parametrize("why", ["nobody offers one", "its machine is gone", "late: x", "no answer within 2 s"])
+def test_the_node_hears_of_every_state_that_is_lost(why: str) -> None:
     told: list[str] = []
     restored(why, active(3), told.append)
-    assert told == [f"began epoch 3 without the state of edge1: {why}"] * is_told
+    assert told == [f"began epoch 3 without the state of edge1: {why}"]
+
+
+def test_one_that_is_told_too_late_that_it_was_the_owner_restores_all_the_same() -> None:
+    """It drains already: who follows it asks it for the state."""
+    role = Role(task="t", role=WorkerRole.DRAINING, epoch=3, predecessor="edge1")
+    restorer, inputs, got = restored(b"state", role)
+    assert (got, inputs.said, restorer.is_pending) == ([b"state"], ["hold", "release"], False)
 
 
 @pytest.mark.parametrize("fail", [lambda: 1 / 0, lambda: sys.exit(3), _restore_later])
 def test_a_callback_that_fails_is_a_cold_start(fail: Callable[[], object]) -> None:
     inputs, told = Inputs(), list[str]()
-    restorer = Restorer(lambda _node, _timeout_s, _is_gone: b"state", "edge2", inputs, told.append)
+    restorer = Restorer(lambda _node, _epoch, _timeout_s, _is_gone: b"state", "edge2", inputs, told.append, StateBook())
     restorer.register(lambda _content: fail(), 1.0)  # type: ignore[arg-type] # it fails on purpose
     restorer.note(active(3))
     restorer.begin(active(3), restorer.deliver)

@@ -245,7 +245,8 @@ class Executor:
             self._role_deadline = self._over_at(now)  # it left before the commit, as the electors asked
         elif self.role.role is WorkerRole.ACTIVE:
             self._role_deadline = self._over_at(now)
-            self._become(Role(task=self.spec.name, role=WorkerRole.DRAINING, epoch=self.role.epoch), todo)
+            # One that hears of its epoch only now begins it with its predecessor's state all the same.
+            self._become(replace(self.role, role=WorkerRole.DRAINING, lease_until_s=None), todo)
         elif not self._has_told:
             self._become(self.role, todo)  # a standby that hears nothing asks again and again
 
@@ -292,10 +293,16 @@ class Executor:
                 self._wake_worker(role, todo)
                 self._become(role, todo)
 
-    def on_role_ended(self, epoch: int) -> None:
-        """The worker says that it has left ``epoch``; this counts only after the order to leave."""
+    def on_role_ended(self, epoch: int, todo: ToDo) -> None:
+        """The worker says that it has left ``epoch``; this counts only after the order to leave.
+
+        Without one, a worker has ended that worked in it, so it had its predecessor's state. The next one must not have
+        it again: it is older than what was done since.
+        """
         if epoch == self._unleased_epoch and self.role.role is not WorkerRole.ACTIVE:
             self._unleased_epoch = None
+        if epoch == self.role.epoch and self.role.predecessor is not None:
+            self._become(replace(self.role, predecessor=None), todo)
 
     def on_worker_ended(self) -> None:
         """The worker's process has ended, and its former role with it."""

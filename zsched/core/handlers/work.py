@@ -198,7 +198,7 @@ def _on_slot_drained(node: Stages, event: ev.SlotDrained, todo: ToDo, _now: floa
 
 def _on_role_ended(node: Stages, event: ev.RoleEnded, todo: ToDo, _now: float) -> None:
     if event.task in node.executors:
-        node.executors[event.task].on_role_ended(event.epoch)
+        node.executors[event.task].on_role_ended(event.epoch, todo)
     todo.must_beat |= node.agreement.leases.on_stopped(event.task, event.epoch, node.beat_sequence)
 
 

@@ -489,14 +489,14 @@ def test_a_worker_may_work_without_a_lease_until_it_has_said_that_it_has_stopped
     one = edge()
     assert not one.may_work_unleased(0.0)
     done(one.execute, allocation_of(1, "edge1"), 0.0)
-    one.on_role_ended(1)
+    done(one.on_role_ended, 1)
     assert one.may_work_unleased(0.0), "nobody told it to stop"
     done(one.execute, replace(allocation_of(1, "edge1"), leased=True), 1.0)
     assert one.role.role is WorkerRole.IDLE
     assert one.may_work_unleased(100.0), "it has not said that it has"
-    one.on_role_ended(0)
+    done(one.on_role_ended, 0)
     assert one.may_work_unleased(100.0), "that was of another epoch"
-    one.on_role_ended(1)
+    done(one.on_role_ended, 1)
     assert not one.may_work_unleased(100.0)
 
 
@@ -518,7 +518,7 @@ def test_a_worker_that_has_drained_hears_of_its_end_a_little_later() -> None:
     ends_at = one.next_deadline()
     (told,) = [out.role.role for out in done(one.tick, ends_at) if isinstance(out, SetRole)]
     assert told is WorkerRole.IDLE
-    one.on_role_ended(1)
+    done(one.on_role_ended, 1)
     assert one.may_work_unleased(ends_at + LEAVES_S - 0.001)
     assert not one.may_work_unleased(ends_at + LEAVES_S)
 
@@ -529,7 +529,7 @@ def test_an_old_owner_s_worker_finishes_until_it_says_so_or_its_time_is_over() -
     seen.append(one.is_finishing)
     done(one.execute, allocation_of(2, "edge2"), 1.0)
     seen.append(one.is_finishing)
-    one.on_role_ended(1)
+    done(one.on_role_ended, 1)
     seen.append(one.is_finishing)
     assert seen == [False, True, False]
     done(other.execute, allocation_of(1, "edge1"), 0.0)

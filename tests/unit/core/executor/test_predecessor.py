@@ -85,3 +85,23 @@ def test_an_owner_that_goes_while_it_is_asked_is_waited_for_no_longer() -> None:
     found = role(done(one.on_gone, "edge2"))
     assert (found.role, found.epoch, found.predecessor) == (WorkerRole.ACTIVE, 2, None)
     assert not any(isinstance(step, SetRole) for step in done(one.on_gone, "edge2")), "once"
+
+
+def test_who_works_after_a_worker_that_has_worked_is_not_given_the_state_of_before_the_epoch() -> None:
+    """It has ended behind the state that it had; what it did since is not in that."""
+    one = edge()
+    execute(one, "edge2", 1)
+    execute(one, "edge1", 2)
+    assert not done(one.on_role_ended, 1), "that was another epoch"
+    found = role(done(one.on_role_ended, 2))
+    assert (found.role, found.epoch, found.predecessor) == (WorkerRole.ACTIVE, 2, None)
+    assert not any(isinstance(step, SetRole) for step in done(one.on_role_ended, 2)), "once"
+
+
+def test_one_that_hears_of_its_epoch_at_its_end_knows_whose_state_it_begins_with() -> None:
+    """Who follows it asks it, also where the task moved on before its worker had heard anything."""
+    one = edge()
+    execute(one, "edge2", 1)
+    execute(one, "edge1", 2)
+    found = role(execute(one, "edge3", 3))
+    assert (found.role, found.epoch, found.predecessor) == (WorkerRole.DRAINING, 2, "edge2")
