@@ -22,6 +22,7 @@ import zenoh
 from ruamel.yaml import YAML
 
 from support.ros_host import opened
+from support.verbs import command
 from support.waiting import free_endpoint, until
 from zsched.core.route.ros2 import Endpoint, EndpointKind, default_qos, endpoint_token
 from zsched.core.values.plan import RosGraph
@@ -222,6 +223,20 @@ def test_a_worker_that_somebody_else_starts_is_seen_to_come_and_to_go(tmp_path: 
     )
     fleet.bed.wait(lambda: fleet.task()["owner"] == "edge1", 60, "an escape after the deadline")
     assert fleet.serving() == "edge1"
+
+    def told() -> bool:
+        problems = fleet.task()["problems"]
+        is_named = any(text.startswith("the worker on edge2 was ready until") for text in problems)
+        return is_named and "no other candidate can take it" in problems
+
+    fleet.bed.wait(told, 60, "status names the standby that is away")
+    said = command(fleet.bed, "wait", "--for", "healthy", "--timeout", "0")
+    assert "healthy: not met" in said
+    assert "no other candidate can take it" in said
+    third = fleet.start_worker("edge2")
+    said = command(fleet.bed, "wait", "--for", "healthy", "--timeout", "50")
+    assert "healthy: met" in said, said
+    end(third)  # or it would get the task while the other one is away
 
     end(second)
     fleet.bed.wait(lambda: fleet.worker("edge1")["state"] == "stopped", 60, "its end is seen")

@@ -12,7 +12,7 @@ from zsched.core.executor.handover import Executor, Phase
 from zsched.core.executor.rollouts import waiting
 from zsched.core.scheduler.judge import by
 from zsched.core.scheduler.rounds import TaskRound
-from zsched.core.scheduler.scoring import joined
+from zsched.core.scheduler.scoring import joined, may_get
 from zsched.core.stages import Stages, Unready
 from zsched.core.values.decision import Explanation
 from zsched.core.values.document import Flag
@@ -20,7 +20,7 @@ from zsched.core.values.fleet import NodeSpec, TaskSpec
 from zsched.core.values.gauges import possible
 from zsched.core.values.model import Allocation, NodeId, Pause, PeerState, Pin, TaskId
 from zsched.core.values.plan import Direction, ReadyWhen, Route, StreamCount
-from zsched.core.values.profile import WorkerLoad, WorkerState
+from zsched.core.values.profile import Profile, WorkerLoad, WorkerState
 from zsched.core.values.quorum import majority
 from zsched.core.values.snapshot import (
     SCHEMA,
@@ -38,9 +38,11 @@ from zsched.core.values.snapshot import (
 from zsched.core.values.struct import replace
 from zsched.core.values.words import (
     NEVER_INITIALISED,
+    NO_SPARE,
     OWN_CERTIFICATE,
     RESTARTING,
     TAKEN_OUT,
+    WAS_READY,
     told_of_hand,
     told_of_worker,
 )
@@ -459,14 +461,14 @@ def _task_problems(node: Stages, task: TaskSpec, value: Allocation, now: float) 
     for spec in node.fleet.nodes:
         data = node.gateway.newest(spec.name, now)
         load = None if data is None else data.profile.worker(task.name)
-        if load is None or node.membership.state(spec.name) is not PeerState.ALIVE:
+        if data is None or load is None or node.membership.state(spec.name) is not PeerState.ALIVE:
             continue
         is_server_ready &= spec.name != server or load.state is WorkerState.READY
         why = f": {load.reason}" if load.reason else ""
         if load.state is WorkerState.FAILED:
             yield f"the worker on {spec.name} failed{why}; mend it, then `zsched retry {task.name} {spec.name}`"
         elif (spec.name == server and load.state is not WorkerState.READY) or (
-            owner is None and _is_in_the_way(task, load)
+            _is_in_the_way(task, load) and (owner is None or _may_follow(node, task, data.profile, server))
         ):
             yield f"the worker on {spec.name} {told_of_worker(load.state, load.reason)}"
         elif load.state is WorkerState.READY and load.reason:
@@ -477,6 +479,8 @@ def _task_problems(node: Stages, task: TaskSpec, value: Allocation, now: float) 
                 f"the worker on {spec.name} has had work for {load.unended_s:.0f} s and finished no job{more}: it "
                 f"may hang in a callback; see `zsched logs {task.name}`, `zsched restart {task.name}` starts it anew"
             )
+    if owner is not None and owner == server and is_server_ready and node.membership.state(owner) is PeerState.ALIVE:
+        yield from _no_spare(node, task, owner, now)
     for name in sorted(node.unseen.found.get(task.name, ())):
         if name != owner:  # of the owner the wait is told, below
             yield (
@@ -496,9 +500,40 @@ def _hangs(load: WorkerLoad) -> bool:
 
 
 def _is_in_the_way(task: TaskSpec, load: WorkerLoad) -> bool:
-    """Whether this worker may be why a task has no owner: somebody else has to start it, or it has failed before."""
+    """Whether this worker keeps its node from the task until somebody looks: it is missed, has failed before, or hangs.
+
+    Missed is one that somebody else has to start.
+    """
     is_missed = not task.worker.command and load.state is WorkerState.STOPPED and bool(load.reason)
-    return is_missed or (load.state is not WorkerState.READY and load.reason.startswith(RESTARTING))
+    return is_missed or (load.state is not WorkerState.READY and load.reason.startswith((RESTARTING, WAS_READY)))
+
+
+def _may_follow(node: Stages, task: TaskSpec, profile: Profile, server: NodeId | None) -> bool:
+    """Whether that is another candidate, and nobody keeps tasks from it on purpose."""
+    name = profile.node
+    return name != server and name in task.candidates and name not in node.flags.closed and not profile.draining
+
+
+def _no_spare(node: Stages, task: TaskSpec, owner: NodeId, now: float) -> Iterator[str]:
+    """That no worker could take a task over now; nodes that are away, or closed by an operator, are no trouble."""
+    is_missed, untold = False, list[str]()
+    for spec in node.fleet.nodes:
+        data = node.gateway.newest(spec.name, now)
+        if data is None or node.membership.state(spec.name) is not PeerState.ALIVE:
+            continue
+        if not _may_follow(node, task, data.profile, owner):
+            continue
+        load = data.profile.worker(task.name)
+        is_told = load is not None and (load.state is WorkerState.FAILED or _is_in_the_way(task, load))
+        if not is_told and may_get(task, None if load is None else load.state):
+            return
+        is_missed = True
+        if load is None:
+            untold.append(f"{spec.name} runs no worker for it")
+        elif not is_told:  # why the others cannot stands in lines of their own
+            untold.append(f"the worker on {spec.name} {told_of_worker(load.state, load.reason)}")
+    if is_missed:
+        yield f"{NO_SPARE}: {'; '.join(untold)}" if untold else NO_SPARE
 
 
 def _unready_since(node: Stages, executor: Executor) -> float:

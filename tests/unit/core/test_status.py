@@ -25,13 +25,14 @@ from zsched.core.report import snapshot_json
 from zsched.core.scheduler.patience import FIRST_PATIENCE
 from zsched.core.status import build_explanation, build_snapshot, status_line
 from zsched.core.todo import ToDo
-from zsched.core.values.fleet import OnIsolation, Security, WorkerSpec, electorate_hash, lease_terms
+from zsched.core.values.document import Flag, FlagKind
+from zsched.core.values.fleet import Fleet, OnIsolation, Security, Standby, WorkerSpec, electorate_hash, lease_terms
 from zsched.core.values.messages import Learnt
-from zsched.core.values.model import ScoreForm
+from zsched.core.values.model import PeerState, ScoreForm
 from zsched.core.values.plan import StreamCount
 from zsched.core.values.profile import DeviceSample, Echo, Jobs, LinkSample, LinkSource, WorkerState
 from zsched.core.values.snapshot import SCHEMA, Snapshot
-from zsched.core.values.words import OWN_CERTIFICATE, RESTARTING, TAKEN_OUT, WAS_READY
+from zsched.core.values.words import OWN_CERTIFICATE, RESTARTING, TAKEN_OUT, WAS_READY, told_of_worker
 from zsched.core.vote.agreement import Agreement
 from zsched_lab.sim.simulator import Simulator
 
@@ -44,12 +45,12 @@ FLEET = fleet_of(
 )
 
 
-def make(me: str = "robot1", *, has_state: bool = True, alive: tuple[str, ...] = ROBOTS) -> Node:
+def make(me: str = "robot1", *, has_state: bool = True, alive: tuple[str, ...] = ROBOTS, fleet: Fleet = FLEET) -> Node:
     """A node at 100 s that has heard the beats of ``alive``."""
-    hashed = electorate_hash(FLEET)
+    hashed = electorate_hash(fleet)
     state = state_of(me, electorate=hashed)
     node = Node(
-        fleet=FLEET,
+        fleet=fleet,
         me=me,
         durable=state if has_state else None,
         incarnation=7,
@@ -592,6 +593,93 @@ def test_a_task_without_an_owner_says_which_workers_have_failed_before() -> None
     assert build_snapshot(node, 100.0).tasks[0].problems == said
 
 
+def served(edges: tuple[str, ...] = EDGES, worker: WorkerSpec = FLEET.tasks[0].worker) -> Node:
+    """A fleet whose task edge1 serves, and in which these edges live; the other workers are to be told."""
+    task = task_of(candidates=edges, worker=worker)
+    fleet = fleet_of(task, of=sorted((*ROBOTS, *edges)), electors=ROBOTS)
+    node = make(alive=(*ROBOTS, *edges), fleet=fleet)
+    learn(node, 1, "edge1")
+    told_by(node, "edge1", 1, WorkerState.READY)
+    return node
+
+
+def problems_of(node: Node) -> tuple[str, ...]:
+    return build_snapshot(node, 100.0).tasks[0].problems
+
+
+@pytest.mark.parametrize(
+    ("command", "state", "reason"),
+    [
+        ((), WorkerState.STOPPED, "no token"),
+        ((), WorkerState.STOPPED, f"{WAS_READY}12:00:00 UTC, its token went: it has ended, hangs or is frozen"),
+        (("work",), WorkerState.STARTING, f"{WAS_READY}12:00:00 UTC, its token went: it may hang"),
+        (("work",), WorkerState.STARTING, f"{RESTARTING} (failure 1 of 3): killed by signal 9"),
+        (("work",), WorkerState.STOPPED, f"{RESTARTING} (failure 1 of 3): killed by signal 9"),
+    ],
+    ids=["missed", "missed again", "hangs", "restarts", "waits for its restart"],
+)
+def test_a_standby_that_is_away_is_told_of_although_the_task_is_served(
+    command: tuple[str, ...], state: WorkerState, reason: str
+) -> None:
+    node = served((*EDGES, "edge3"), WorkerSpec(command=command))
+    told_by(node, "edge3", 1, WorkerState.READY)
+    told_by(node, "edge2", 1, WorkerState.READY)
+    assert problems_of(node) == ()
+    told_by(node, "edge2", 2, state, reason)
+    away = f"the worker on edge2 {told_of_worker(state, reason)}"
+    assert problems_of(node) == (away,), "edge3 could take it"
+    told_by(node, "edge3", 2, state, reason)
+    assert problems_of(node) == (away, away.replace("edge2", "edge3"), "no other candidate can take it")
+    assert not degradations(snapshot_json(build_snapshot(node, 100.0))), "it is served"
+
+
+def test_a_task_that_no_other_candidate_could_take_now_says_why() -> None:
+    node = served((*EDGES, "edge3"))
+    assert problems_of(node) == (), "nothing is known of the others yet"
+    told_by(node, "edge2", 1, WorkerState.STARTING, "pid 7")
+    assert problems_of(node) == ("no other candidate can take it: the worker on edge2 is starting: pid 7",)
+    told_by(node, "edge3", 1, WorkerState.FAILED, "no map")
+    failed = "the worker on edge3 failed: no map; mend it, then `zsched retry merge edge3`"
+    assert problems_of(node) == (failed, "no other candidate can take it: the worker on edge2 is starting: pid 7")
+    told_by(node, "edge2", 2, WorkerState.READY)
+    assert problems_of(node) == (failed,)
+    node.handle(ev.ProfileReceived(profile=profile_of("edge2", incarnation=3, sequence=3)), 100.0)
+    assert problems_of(node) == (failed, "no other candidate can take it: edge2 runs no worker for it")
+    told_by(node, "edge1", 2, WorkerState.STARTING)
+    assert problems_of(node) == ("the worker on edge1 is starting", failed), "it is not served: that is said first"
+
+
+def test_a_standby_that_a_move_starts_is_ready_enough() -> None:
+    node = served(worker=WorkerSpec(command=("work",), standby=Standby.COLD))
+    for sequence, reason in enumerate(("", "stopped by SIGINT"), 1):
+        told_by(node, "edge2", sequence, WorkerState.STOPPED, reason)
+        assert problems_of(node) == (), "as after every move away from there"
+
+
+def test_candidates_that_are_away_or_closed_on_purpose_are_no_trouble() -> None:
+    lone = served(("edge1",))
+    assert problems_of(lone) == (), "that nobody else can have it says the fleet file"
+    gone = served()
+    told_by(gone, "edge2", 1, WorkerState.STARTING)
+    assert problems_of(gone)
+    for now in (101.0, 103.0):
+        gone.handle(ev.BeatReceived(beat=beat_of("edge1", 2, incarnation=3)), now)
+        gone.handle(ev.DeadlineReached(), now)
+    assert gone.membership.states()["edge2"] is not PeerState.ALIVE
+    assert not any("edge2" in one or "no other" in one for one in build_snapshot(gone, 103.0).tasks[0].problems)
+    for kind in FlagKind:
+        closed = served(worker=WorkerSpec())
+        told_by(closed, "edge2", 1, WorkerState.STOPPED, "no token")
+        assert len(problems_of(closed)) == 2
+        closed.flags.take((Flag(kind=kind, subject="edge2", by="ada@robot1"),), 100.0)
+        assert problems_of(closed) == (), kind
+    stopping = served(worker=WorkerSpec())
+    load = load_of(state=WorkerState.STOPPED, reason="no token")
+    profile = profile_of("edge2", incarnation=3, workers=(load,), draining=True)
+    stopping.handle(ev.ProfileReceived(profile=profile), 100.0)
+    assert problems_of(stopping) == ()
+
+
 def test_an_owner_s_worker_that_was_ready_is_not_said_to_be_starting() -> None:
     node = make()
     node.handle(ev.BeatReceived(beat=beat_of("edge1", incarnation=3)), 100.0)
@@ -661,7 +749,8 @@ def test_a_slot_that_is_not_taken_is_told_of_only_once_the_owner_s_own_worker_is
     learn(node, 1, "edge1")
     told_by(node, "edge1", 1, WorkerState.READY)
     told_by(node, "edge2", 1, WorkerState.STARTING)
-    (waits,) = build_snapshot(node, 103.0).tasks[0].problems
+    (no_spare, waits) = build_snapshot(node, 103.0).tasks[0].problems
+    assert no_spare == "no other candidate can take it: the worker on edge2 is starting"
     assert waits.startswith("this robot's streams have waited for edge1 for 3 s")
     told_by(node, "edge1", 2, WorkerState.STARTING)
     told_by(node, "edge2", 2, WorkerState.READY)

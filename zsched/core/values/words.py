@@ -36,6 +36,8 @@ WAS_READY = "was ready until "
 """First words of the reason of a worker that was ready and no longer is; its supervisor calls that starting."""
 RESTARTING = "restarting"
 """First words of the reason of a worker that has failed and is, or will be, started again."""
+NO_SPARE = "no other candidate can take it"
+"""First words of the problem that a task is served, and no worker of another living candidate could take it over."""
 _READY = "ready"
 
 
