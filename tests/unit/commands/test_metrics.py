@@ -67,6 +67,13 @@ def test_figures_are_the_status_s() -> None:
     assert values(text, "zsched_up") == {(): 1}
 
 
+def test_a_task_that_no_other_candidate_could_take_is_told() -> None:
+    status = recorded()
+    assert values(metrics_text(status), "zsched_task_without_spare") == {("echo",): 0}
+    status["tasks"][0]["problems"] = ["another one", "no other candidate can take it"]
+    assert values(metrics_text(status), "zsched_task_without_spare") == {("echo",): 1}
+
+
 def test_degraded_is_told_and_what_is_not_measured_is_left_out() -> None:
     status = recorded("degraded")
     text = metrics_text(status)
