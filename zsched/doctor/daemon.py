@@ -11,7 +11,7 @@ from typing import Final
 from zsched import __version__
 from zsched.core.scheduler.flags import HANDS_OVER, told_flag
 from zsched.core.values.document import Flag, FlagKind
-from zsched.core.values.words import has_lost_its_worker, told_of_worker
+from zsched.core.values.words import NO_SPARE, has_lost_its_worker, told_of_worker
 from zsched.doctor.model import Json, Result, Scene, failed, joined, passed, skipped, warned
 from zsched.ipc.takeover import code_digest
 
@@ -106,6 +106,8 @@ def tasks_have_owners(scene: Scene) -> Result:
             fix = f"zsched explain {task['name']} names why each candidate cannot have it"
             found.append(failed(told, fix=fix))
         found += _lost_workers(status, task)
+        spare = (f"{task['name']}: {text}" for text in task["problems"] if text.startswith(NO_SPARE))
+        found += [warned(told, fix="PROBLEMS in zsched status say what each of them lacks") for told in spare]
     owners = ", ".join(f"{task['name']} on {task['owner']}" for task in status["tasks"]) or "no tasks"
     return joined(
         found, passed(f"{owners}; {quorum['alive']} of {quorum['electors']} electors, {quorum['needed']} needed")

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final
 
 from zsched.core.values.fleet import TaskSpec, runs_worker
-from zsched.core.values.words import RESTARTING, has_lost_its_worker, told_of_worker
+from zsched.core.values.words import RESTARTING, WAS_READY, has_lost_its_worker, told_of_worker
 from zsched.doctor.model import Json, Result, Scene, failed, joined, passed, skipped, warned
 from zsched.drivers import container, ros2_lifecycle, systemd
 from zsched.drivers.engine import Look
@@ -149,6 +149,8 @@ def _worker(node: str, load: Json) -> Result:
         return failed(told, fix=f"mend its cause, then: zsched retry {task} {node}")
     if has_lost_its_worker(state, reason) and state != "stopped":
         return failed(told, fix=f"zsched logs {task} {node}; zsched restart {task} {node} starts it anew")
+    if state == "stopped" and reason.startswith(WAS_READY):
+        return failed(told, fix="somebody else starts it: do so as the line says")
     if reason.startswith(RESTARTING) or (state == "ready" and reason):
         return warned(told, fix=f"zsched logs {task} {node} shows what it printed")
     return passed(told)

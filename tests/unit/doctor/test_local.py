@@ -383,6 +383,11 @@ def test_a_worker_that_failed_is_found(tmp_path: Path) -> None:
             FAIL,
             "zsched logs merge edge1; zsched restart merge edge1 starts it anew",
         ),
+        (
+            {"state": "stopped", "reason": "was ready until 12:00:00 UTC, its token went: start it again on edge1"},
+            FAIL,
+            "somebody else starts it: do so as the line says",
+        ),
         ({"state": "ready", "reason": "raises: no model file"}, WARN, "zsched logs merge edge1 shows what it printed"),
     ],
 )
@@ -406,6 +411,14 @@ def test_an_owner_whose_worker_hangs_is_found_by_its_node_and_by_the_others(tmp_
     first = answer(scene, nodes=[{"name": "edge1", "workers": [{**load, "reason": ""}]}])
     assert run("worker.state", first).verdict is PASS, "it starts"
     assert run("task.owners", first).verdict is PASS
+
+
+def test_a_task_that_no_other_candidate_could_take_is_found(tmp_path: Path) -> None:
+    scene = scene_of(tmp_path)
+    (task,) = scene.status["tasks"]
+    told = "no other candidate can take it: the worker on edge2 is starting"
+    assert_finds(run("task.owners", answer(scene, tasks=[{**task, "problems": [told]}])), WARN, f"merge: {told}")
+    assert run("task.owners", answer(scene, tasks=[{**task, "problems": ["another one"]}])).verdict is PASS
 
 
 def test_a_fleet_without_tasks_is_said_to_have_none(tmp_path: Path) -> None:
