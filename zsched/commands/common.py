@@ -23,6 +23,7 @@ from typer.core import TyperCommand, TyperGroup
 from zsched.core.values.words import A_NAME, MAX_ASKED, NAME
 from zsched.errors import AdapterError, ConfigError, ZschedError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE
+from zsched.latch import Latch
 from zsched.screen import fitted
 
 Json = dict[str, Any]
@@ -315,9 +316,9 @@ def ends_as_by_ctrl_c() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def stopped_by_signal() -> Iterator[threading.Event]:
-    """An event that Ctrl-C, a terminal that closes and SIGTERM set meanwhile; none of them interrupts anything."""
-    stop = threading.Event()
+def stopped_by_signal() -> Iterator[Latch]:
+    """A latch that Ctrl-C, a terminal that closes and SIGTERM set meanwhile; none of them interrupts anything."""
+    stop = Latch()
     with _at_signals(dict.fromkeys(_ENDS, lambda _number, _frame: stop.set())):
         yield stop
 

@@ -11,7 +11,6 @@ import re
 import selectors
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from threading import Event
 from typing import IO, Final
 
 from zsched.clock import monotonic_s
@@ -22,6 +21,7 @@ from zsched.dev.nodes import Json, Nodes
 from zsched.dev.terminal import Keys
 from zsched.dev.watch import Watched
 from zsched.exits import EXIT_FAILED, EXIT_OK
+from zsched.latch import Latch
 
 TICK_S: Final = 0.1
 LOOK_S: Final = 0.5
@@ -89,7 +89,7 @@ class Run:
         *,
         say: Callable[[str], None],
         show: Callable[[Json], None],
-        stop: Event,
+        stop: Latch,
         is_verbose: bool = False,
     ) -> None:
         self._nodes, self._watched = nodes, watched

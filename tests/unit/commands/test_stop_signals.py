@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 
 import pytest
 
@@ -18,6 +20,27 @@ def test_a_signal_is_an_event_and_does_what_it_did_again(number: signal.Signals)
         os.kill(os.getpid(), number)
         assert stop.wait(30.0)
     assert signal.getsignal(number) is before
+
+
+STORM = """
+import signal, time
+from zsched.commands.common import stopped_by_signal
+until_s = time.monotonic() + 2.0
+while time.monotonic() < until_s:
+    with stopped_by_signal() as stop:
+        signal.signal(signal.SIGALRM, signal.getsignal(signal.SIGTERM))
+        signal.setitimer(signal.ITIMER_REAL, 5e-5, 5e-5)
+        for _ in range(100):
+            stop.wait(0.0)
+        assert stop.wait(9.0)
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+"""
+
+
+def test_a_signal_that_comes_in_the_middle_of_another_one_s_handler_hangs_nothing() -> None:
+    """The handler took a lock that the wait, or the handler, which it had interrupted, held."""
+    done = subprocess.run([sys.executable, "-c", STORM], timeout=60, capture_output=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 def test_what_is_ignored_stays_ignored() -> None:

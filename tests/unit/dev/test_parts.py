@@ -8,7 +8,6 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from threading import Event
 
 import pytest
 import zenoh
@@ -22,6 +21,7 @@ from zsched.core.values.model import NodeId
 from zsched.dev.nodes import shares
 from zsched.dev.run import LASTING_S, Lasting, Run, _of_a_worker, _parts
 from zsched.dev.watch import Watched
+from zsched.latch import Latch
 
 EXAMPLE = Path(__file__).parents[3] / "zsched" / "examples" / "python" / "fleet.yaml"
 
@@ -189,7 +189,7 @@ class _Nodes:
 )
 def test_a_task_is_moved_only_to_a_worker_that_is_ready(state: str, said: str, stopped: list[str]) -> None:
     nodes, told = _Nodes(), list[str]()
-    run = Run(nodes, Watched({}, EXAMPLE.parent), say=told.append, show=lambda _: None, stop=Event())  # type: ignore[arg-type]
+    run = Run(nodes, Watched({}, EXAMPLE.parent), say=told.append, show=lambda _: None, stop=Latch())  # type: ignore[arg-type]
     run._owners = {"shout": (NodeId("edge1"), 1)}
     run._status = {"nodes": [{"name": "edge2", "workers": [{"task": "shout", "state": state}]}]}
     run._obey("m")
@@ -227,7 +227,7 @@ def test_a_failed_worker_whose_file_is_not_watched_is_tried_again_by_a_verb(tmp_
     nodes, told = _Nodes(), list[str]()
     nodes.folder = tmp_path
     command = ("python", "-m", "shout")
-    run = Run(nodes, Watched({"shout": command}, tmp_path), say=told.append, show=lambda _: None, stop=Event())  # type: ignore[arg-type]
+    run = Run(nodes, Watched({"shout": command}, tmp_path), say=told.append, show=lambda _: None, stop=Latch())  # type: ignore[arg-type]
     run._tell_worker(NodeId("edge1"), "shout", "failed")
     assert f"then `zsched retry shout edge1 --runtime-dir {tmp_path} --node edge1`" in told[0]
 
@@ -248,7 +248,7 @@ def test_what_is_wrong_with_a_task_is_told_once_when_it_has_lasted_and_again_whe
 def test_a_run_tells_what_is_wrong_with_its_tasks_but_no_failed_worker_twice(monkeypatch: pytest.MonkeyPatch) -> None:
     nodes, told = _Nodes(), list[str]()
     nodes.folder = Path("/run/dev")
-    run = Run(nodes, Watched({}, EXAMPLE.parent), say=told.append, show=lambda _: None, stop=Event())  # type: ignore[arg-type]
+    run = Run(nodes, Watched({}, EXAMPLE.parent), say=told.append, show=lambda _: None, stop=Latch())  # type: ignore[arg-type]
     task = {
         "name": "shout",
         "owner": None,

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import threading
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,6 +23,7 @@ from zsched.core.route import keyexpr
 from zsched.core.values.struct import Struct, replace
 from zsched.errors import AdapterError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_UNREACHABLE, EXIT_USAGE
+from zsched.latch import Latch
 
 if TYPE_CHECKING:
     from mcap.writer import Writer
@@ -93,7 +93,7 @@ def record(view: RecordView) -> int:
     return EXIT_OK
 
 
-def _wait(until: float, tap: StreamTap | None, tape: Tape, ended: threading.Event) -> None:
+def _wait(until: float, tap: StreamTap | None, tape: Tape, ended: Latch) -> None:
     """Write what the tap hears as it comes, until then."""
     if tap is None:
         ended.wait(max(until - monotonic_s(), 0.0))

@@ -19,6 +19,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from support import browser
+from support.signals import signal_another_thread, signal_at_once
 from support.waiting import DEADLINE_S, until
 from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.commands.ask import Door
@@ -34,6 +35,8 @@ STATUS: dict[str, Any] = json.loads(
     (Path(__file__).parents[3] / "unit/commands/watch/recorded/fleet.json").read_text(encoding="utf-8")
 )
 TOKEN = "a-token-of-some-length"
+PAIRS = 5
+"""Of two signals close together that are tried."""
 
 
 class FakeDaemon:
@@ -313,6 +316,18 @@ def test_the_verb_waits_for_a_daemon_and_ends_on_sigterm(tmp_path: Path) -> None
             made.socket.close()
         process.send_signal(signal.SIGTERM)
         assert process.wait(DEADLINE_S) == 0
+
+
+@pytest.mark.parametrize("is_pair", [True, False], ids=["SIGHUP and SIGTERM", "another thread's"])
+def test_the_verb_ends_whichever_thread_has_the_signal(tmp_path: Path, is_pair: bool) -> None:
+    """The kernel gives the second signal to another thread, and a wait without an end never let its handler run."""
+    for _ in range(PAIRS if is_pair else 1):
+        with verb(tmp_path) as (process, _):
+            if is_pair:
+                signal_at_once(process, signal.SIGHUP, signal.SIGTERM)
+            else:
+                signal_another_thread(process, signal.SIGTERM)
+            assert process.wait(20) in (0, -signal.SIGTERM)  # the second one may come when it has ended
 
 
 @pytest.mark.skipif(browser.PATH is None, reason=browser.WHY_NOT)
