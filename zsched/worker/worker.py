@@ -23,7 +23,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import queue
 import signal
 import threading
 import time
@@ -44,6 +43,7 @@ from zsched.core.values.plan import Role, WorkerRole
 from zsched.guard import ends_within, guarded, tolerant
 from zsched.hop.acknowledger import Acknowledger
 from zsched.ipc.pipe import decode_end
+from zsched.latch import Latch
 from zsched.log_limit import limit_library
 from zsched.sessions.closing import ALARM_S, CLOSE_S
 from zsched.sessions.config import lease_s
@@ -108,8 +108,8 @@ class Worker:
         self._early_end = 0
         """The newest epoch whose inputs have ended although our role in it has not, or has not come yet."""
         self._stop = threading.Event()
-        self._ended: queue.SimpleQueue[None] = queue.SimpleQueue()
-        """Holds something once it was told to stop. A signal's handler may put into it, whatever it has interrupted."""
+        self._ended = Latch()
+        """It was told to stop."""
         self._signals = 0
         """How often it was told to stop."""
         self._pid = os.getpid()
@@ -352,12 +352,7 @@ class Worker:
 
     def wait(self, timeout_s: float | None = None) -> bool:
         """Sleep at most this long; ``False`` as soon as the worker is asked to end."""
-        try:
-            self._ended.get(timeout=None if timeout_s is None else max(timeout_s, 0.0))
-        except queue.Empty:
-            return not (self._stop.is_set() or self._signals)
-        self._ended.put(None)  # for whoever else waits, or will
-        return False
+        return not self._ended.wait(timeout_s)
 
     def job(self, *, skipped: int = 0, came_s: float | None = None) -> Job:
         """A piece of work that is not done in a callback: ``with worker.job(): ...``, in whatever thread does it.
@@ -386,7 +381,7 @@ class Worker:
     def stop(self) -> None:
         """Let `wait` answer ``False`` (any thread)."""
         self._stop.set()
-        self._ended.put(None)
+        self._ended.set()
 
     def close(self) -> None:
         """Do what has come, then close the session within a second.
@@ -457,7 +452,7 @@ class Worker:
             _pass_on(number, signal.SIG_DFL)
         else:
             self._signals += 1
-            self._ended.put(None)  # and not the event: its lock may be held by what this signal has interrupted
+            self._ended.set()  # and not `_stop`, an event: its lock may be held by what this signal has interrupted
 
     def _finish(self) -> None:
         """Take the token back, so that relays keep what is to come for the next worker, and do what has come."""

@@ -18,6 +18,7 @@ import pytest
 import zenoh
 
 from support.hand_relay import INPUT, KEYS, ROLE_KEY, Relay, environment
+from support.signals import signal_another_thread, signal_at_once
 from support.waiting import free_endpoint, until, within
 from zsched.clock import monotonic_s
 from zsched.core.relay_protocol import EndMarker, StreamAck, StreamAcks, WorkerTrouble
@@ -31,6 +32,9 @@ from zsched.worker import Output, Received, Worker
 from zsched.worker import backlog as worker_backlog
 from zsched.worker import inputs as worker_inputs
 from zsched.worker.backlog import MAX_WITHHELD
+
+PAIRS = 5
+"""Of two signals close together that are tried."""
 
 
 class Echo:
@@ -438,6 +442,32 @@ def test_a_signal_that_comes_while_the_worker_waits_is_not_waited_for() -> None:
     """Its handler took the lock that the wait which it had interrupted held: only SIGKILL ended that."""
     found = subprocess.run([sys.executable, "-c", STORM], timeout=60, capture_output=True, text=True, check=False)
     assert (found.returncode, found.stdout) == (0, "True False False\n"), found.stderr
+
+
+ENDLESS = """
+from zsched.worker import Worker
+with Worker.from_env({}, standalone="t") as worker:
+    worker.ready()
+    print("waits", flush=True)
+    assert not worker.wait()
+"""
+
+
+@pytest.mark.parametrize("is_pair", [True, False], ids=["SIGINT and SIGTERM", "another thread's"])
+def test_a_worker_ends_whichever_thread_has_the_signal(is_pair: bool) -> None:
+    """The kernel gives the second signal to another thread, and a wait without an end never let its handler run."""
+    for _ in range(PAIRS if is_pair else 1):
+        with subprocess.Popen([sys.executable, "-c", ENDLESS], stdout=subprocess.PIPE, text=True) as process:
+            try:
+                assert process.stdout is not None
+                assert process.stdout.readline() == "waits\n"
+                if is_pair:
+                    signal_at_once(process, signal.SIGINT, signal.SIGTERM)
+                else:
+                    signal_another_thread(process, signal.SIGTERM)
+                assert process.wait(20) in (0, -signal.SIGTERM)  # the second one may come when it has ended
+            finally:
+                process.kill()
 
 
 FORK = """
