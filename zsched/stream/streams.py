@@ -39,6 +39,7 @@ from zsched.core.values.plan import RoutePhase, RoutePlan
 from zsched.errors import AdapterError
 from zsched.guard import all_end_within, call_plain, ends_within, guarded, running
 from zsched.ipc.protocol import DaemonGone, StreamKeys, StreamsTaken
+from zsched.latch import Latch
 from zsched.log_limit import limit_library
 from zsched.relay.streams.acks import Acks
 from zsched.relay.streams.inputs import InputStream
@@ -102,7 +103,7 @@ class _Here(threading.local):
 class Publisher:
     """One key of the application that a task's input takes; `put` from any thread."""
 
-    def __init__(self, key: str, find: Callable[[str], _Found | None], closing: threading.Event, here: _Here) -> None:
+    def __init__(self, key: str, find: Callable[[str], _Found | None], closing: Latch, here: _Here) -> None:
         """``find`` says which input of which task takes a key now, if one does."""
         self.key = key
         self._find, self._closing, self._here = find, closing, here
@@ -167,7 +168,7 @@ class Streams:
         self._tasks: dict[TaskId, OwnTask] = {}
         self._drained: deque[SlotDrained] = deque(maxlen=64)
         """Said again to the next relay, which would wait for it."""
-        self._closing, self._closed = threading.Event(), threading.Event()
+        self._closing, self._closed = Latch(), Latch()  # which a signal's handler sets, and waits for
         self._telling = threading.Lock()
         self._problems: dict[str, str] = {}
         """{task: what is wrong with its streams here}; of none: of the session."""

@@ -308,6 +308,37 @@ def test_a_signal_that_closes_in_the_middle_of_a_call_does_not_wait_for_that_cal
     assert unaccounted(bench.count()) == 0
 
 
+CLOSED_TWICE = """
+import signal, sys, threading
+from pathlib import Path
+from zsched.stream import Streams
+
+own = Streams.join(runtime_dir=Path(sys.argv[1]))
+signal.signal(signal.SIGTERM, lambda *_: own.close())
+left = {after}
+
+def interrupted(frame, event, _):
+    global left
+    if event == "line" and Path(frame.f_code.co_filename).name in ("threading.py", "latch.py"):
+        left -= 1
+        if left == 0:
+            signal.raise_signal(signal.SIGTERM)
+    return interrupted
+
+sys.settrace(interrupted)
+own.close()
+sys.settrace(None)
+assert own._closed.is_set()
+"""
+
+
+@pytest.mark.parametrize("after", range(1, 8))
+def test_a_signal_that_closes_in_the_middle_of_a_close_waits_as_that_one_does(bench: Bench, after: int) -> None:
+    """Its handler waited for the lock of the event that the call which it had interrupted was setting."""
+    command = [sys.executable, "-c", CLOSED_TWICE.format(after=after), str(bench.folder)]
+    assert subprocess.run(command, timeout=30, check=False).returncode == 0
+
+
 def test_answers_are_the_applications_from_the_moment_it_names_them_until_it_goes(bench: Bench) -> None:
     """The relay counts them, too: no answer counts twice or nowhere, and the times of a reading between are told."""
     counted = StreamCount(stream="t/out/0")
