@@ -4,8 +4,8 @@ Any program that joins with the session of ``ZSCHED_ZENOH_CONFIG`` can do this, 
 """
 
 import os
-import queue
 import signal
+import time
 
 import zenoh
 
@@ -15,9 +15,9 @@ PREFIX = f"{NODE}/{os.environ['ZSCHED_TASK']}"
 
 def main() -> None:
     """Answer until the daemon says stop."""
-    ends: queue.SimpleQueue[int] = queue.SimpleQueue()  # an Event may wait for itself in a signal's handler
+    ends: list[int] = []  # an Event may wait for itself in a signal's handler
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda number, _: ends.put(number))
+        signal.signal(number, lambda number, _: ends.append(number))
 
     def on_question(question: zenoh.Sample) -> None:
         robot = str(question.key_expr).split("/")[-2]
@@ -27,7 +27,8 @@ def main() -> None:
 
     with zenoh.open(zenoh.Config.from_file(os.environ["ZSCHED_ZENOH_CONFIG"])) as session:
         session.declare_subscriber(f"{PREFIX}/*/question", on_question)
-        ends.get()
+        while not ends:
+            time.sleep(0.2)  # a wait without an end may sleep through a signal
 
 
 if __name__ == "__main__":
