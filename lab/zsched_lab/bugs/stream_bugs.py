@@ -599,4 +599,11 @@ STREAM_BUGS = (
         "behind it\n                signal.signal(number, self._handlers[number])",
         (f"{_WORKER}::test_workers_closed_in_any_order_and_by_any_thread_give_the_signals_back",),
     ),
+    _bug(
+        "a wait without an end lets no handler run",
+        "zsched.latch",
+        "timeout=min(SLICE_S, left_s)",
+        "timeout=None if timeout_s is None else left_s",
+        ("tests/unit/test_latch.py::test_a_signal_that_another_thread_has_releases_the_main_thread",),
+    ),
 )
