@@ -419,9 +419,9 @@ class Restorer:
         tell: Callable[[str], None],
         book: StateBook,
     ) -> None:
-        """``fetched``: (predecessor, epoch, longest wait, whether its machine is gone) -> the state, or why there is none.
+        """``fetched``: (predecessor, epoch, longest wait, whether its machine is gone) -> the state, or why not.
 
-        ``book`` is told of it for this worker's own offer. ``tell`` lets the node know of a state that was there, and is lost here.
+        ``book`` is told of it for this worker's own offer; ``tell`` lets the node know of a state that is lost here.
         """
         self._fetch, self._tell = fetched, tell
         self._node = node

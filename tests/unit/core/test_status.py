@@ -834,6 +834,15 @@ def test_a_ready_worker_that_our_relay_does_not_see_is_told_although_it_owns_not
     ), "the owner's is told once, by the wait"
 
 
+def test_an_owner_that_our_relay_does_not_see_is_told_by_the_wait_for_it_alone() -> None:
+    node = make()
+    learn(node, 1, "edge1")
+    node.unseen.found["merge"] = frozenset(EDGES)
+    (told, waits) = build_snapshot(node, 103.0).tasks[0].problems
+    assert told.startswith("the worker on edge2 is ready, and our relay does not see its token")
+    assert waits.startswith("this robot's streams have waited for edge1 for 3 s")
+
+
 def test_a_worker_that_shows_itself_before_we_have_its_document_is_seen_once_we_have() -> None:
     """edge1 has adopted the document with a new task before this robot."""
     node = make()
