@@ -8,7 +8,7 @@ from __future__ import annotations
 from random import Random
 from typing import Final
 
-from zsched.core.values.fleet import Fleet
+from zsched.core.values.fleet import Fleet, Standby, WorkerSpec
 from zsched.core.values.model import NodeId
 from zsched.core.values.plan import ReadyWhen
 from zsched.core.values.struct import replace
@@ -23,10 +23,13 @@ def with_foreign_workers(rng: Random, fleet: Fleet) -> Fleet:
     """The same fleet, in some schedules with workers that it does not start."""
     if any(task.exclusive for task in fleet.tasks) or rng.random() > SHARE:
         return fleet
-    tasks = tuple(
-        replace(task, worker=replace(task.worker, command=(), ready_when=ReadyWhen.MATCHING)) for task in fleet.tasks
-    )
+    tasks = tuple(replace(task, worker=_foreign(task.worker)) for task in fleet.tasks)
     return replace(fleet, tasks=tasks)
+
+
+def _foreign(worker: WorkerSpec) -> WorkerSpec:
+    """One that somebody else runs, so it is warm: no file may have a cold one."""
+    return replace(worker, command=(), ready_when=ReadyWhen.MATCHING, standby=Standby.WARM)
 
 
 def absences(rng: Random, fleet: Fleet, until: float) -> list[tuple[float, NodeId, float]]:
