@@ -76,11 +76,12 @@ def _other_isolation(_rng: Random, fleet: Fleet) -> Fleet:
 def _other_worker(rng: Random, fleet: Fleet) -> Fleet:
     """Warm or cold, more or less time to start, fewer failures until it is given up, watched for its output.
 
-    One that somebody else runs stays warm.
+    One that somebody else runs stays warm, and always gets another time.
     """
-    becomes_cold = fleet.tasks[0].worker.standby is Standby.WARM and fleet.tasks[0].worker.command
-    standby = Standby.COLD if becomes_cold else Standby.WARM
-    deadline_s, failures, silence_s = rng.choice((2.0, 3.0, 5.0)), rng.choice((1, 3)), rng.choice((None, 3.0))
+    is_ours = bool(fleet.tasks[0].worker.command)
+    standby = Standby.COLD if is_ours and fleet.tasks[0].worker.standby is Standby.WARM else Standby.WARM
+    deadline_s = rng.choice((2.0, 3.0, 5.0) if is_ours else (2.0, 4.0, 5.0))
+    failures, silence_s = rng.choice((1, 3)), rng.choice((None, 3.0))
     worker = replace(
         fleet.tasks[0].worker,
         standby=standby,
