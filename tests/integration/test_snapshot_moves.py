@@ -230,15 +230,17 @@ def test_an_owner_of_a_moment_hands_on_the_state_that_it_still_waits_for(hub: Hu
     hub.feed(third, 100)
     until(lambda: (f"{third}@3", 110) in hub.totals, f"the total of {third}")
     assert [total for name, total in hub.totals if name == f"{third}@3"] == [110]
+    assert "cold_start" not in hub.said_by(third)
 
 
 def test_an_owner_of_a_moment_that_hears_of_it_too_late_hands_on_the_state(hub: Hub) -> None:
-    """It is told only that it drains, and the one behind it asks before that."""
+    """It is told only that it drains."""
     owned_by_edge1(hub)
     hub.start_worker("edge3")
     hub.tell("edge1", WorkerRole.DRAINING, 1)
-    hub.tell("edge3", WorkerRole.ACTIVE, 3, "edge2")
     hub.tell("edge2", WorkerRole.DRAINING, 2, "edge1")
+    until(lambda: hub.asked, "edge2 has heard that, and asks edge1")
+    hub.tell("edge3", WorkerRole.ACTIVE, 3, "edge2")
     owns(hub, "edge3", 3)
     hub.feed("edge3", 100)
     until(lambda: ("edge3@3", 110) in hub.totals, "the total of edge3")

@@ -17,7 +17,7 @@ from zsched.latch import SLICE_S, Latch
 
 ROUNDS = 8
 WAITS = """
-import os, signal, sys, threading
+import os, signal, sys, threading, time
 from zsched.latch import Latch
 
 latch = Latch()
@@ -29,6 +29,7 @@ for _ in range(int(sys.argv[1])):
     latch = Latch()
     print("waits", flush=True)
     assert latch.wait()
+    time.sleep(0.05)  # the other signal's handler sets this latch, too, and not the next one
     print("is released", flush=True)
 os._exit(0)  # a signal may be on its way, and Python gives up its handlers first
 """

@@ -343,13 +343,24 @@ class StateBook:
     """
 
     def __init__(self) -> None:
+        self.longest_s = SETTLE_S
+        """A question waits so long for the state that is on its way here."""
         self._changed = threading.Condition()
+        self._is_ready = False
         self._worked = 0
         """The newest epoch in which this worker was told to work."""
         self._coming = 0
         """The epoch whose predecessor's state is on its way here; 0: none is."""
-        self._settled, self._is_cold = 0, False
-        """The newest epoch that has begun behind such a wait, and whether it has begun without the state."""
+        self._overtaken = 0
+        """The newest epoch whose state was on its way when the next epoch came; 0: one that began since has one."""
+        self._begun, self._is_cold = 0, False
+        """The newest epoch that has begun here, and whether it has done so without its predecessor's state."""
+
+    def ready(self) -> None:
+        """This worker has said what it takes and offers."""
+        with self._changed:
+            self._is_ready = True
+            self._changed.notify_all()
 
     def work(self, epoch: int) -> None:
         """This worker is told to work in ``epoch``."""
@@ -360,14 +371,16 @@ class StateBook:
     def expect(self, epoch: int) -> None:
         """The state that ``epoch`` begins with is on its way."""
         with self._changed:
+            self._overtaken = self._coming or self._overtaken
             self._coming = epoch
             self._changed.notify_all()
 
-    def settled(self, epoch: int, *, is_cold: bool) -> None:
+    def begun(self, epoch: int, *, is_cold: bool) -> None:
         """``epoch`` has begun with its predecessor's state, or without (``is_cold``)."""
         with self._changed:
-            self._settled, self._is_cold = epoch, is_cold
+            self._begun, self._is_cold = epoch, is_cold
             self._coming = 0 if self._coming == epoch else self._coming
+            self._overtaken = 0 if epoch > self._overtaken else self._overtaken
             self._changed.notify_all()
 
     def must_wait(self, epoch: int | None) -> bool:
@@ -383,14 +396,20 @@ class StateBook:
         with self._changed:
             self._changed.wait_for(lambda: not self._is_early(epoch), TOLD_S)
             if self._is_early(epoch):
-                return f"its worker was not the owner of epoch {(epoch or 0) - 1}"
-            awaited = self._coming
+                lack = f"was not the owner of epoch {(epoch or 1) - 1}" if self._is_ready else "is not ready"
+                return f"its worker {lack}"
             if not self._comes_for(epoch):
+                return self._why_not(epoch)
+            awaited, had_one = self._coming, self._begun > 0
+            self._changed.wait_for(lambda: self._coming != awaited, self.longest_s)
+            if self._begun >= awaited and (had_one or not self._is_cold):
                 return ""
-            self._changed.wait_for(lambda: self._coming != awaited, SETTLE_S)
-            if self._settled == awaited and not self._is_cold:
-                return ""
-            return f"its worker has not got the state of epoch {awaited} itself"
+            return _lacking(awaited)
+
+    def _why_not(self, epoch: int | None) -> str:
+        """A state that never came is missing in what is here."""
+        is_missing = self._overtaken > 0 and (epoch is None or epoch > self._overtaken)
+        return _lacking(self._overtaken) if is_missing else ""
 
     def _comes_for(self, epoch: int | None) -> bool:
         """Whether a state is on its way that comes before ``epoch``.
@@ -401,7 +420,11 @@ class StateBook:
 
     def _is_early(self, epoch: int | None) -> bool:
         """Whether this worker has not worked in the epoch before, as far as it has heard."""
-        return epoch is not None and self._worked < epoch - 1
+        return epoch is not None and not (self._is_ready and self._worked >= epoch - 1)
+
+
+def _lacking(epoch: int) -> str:
+    return f"its worker has not got the state of epoch {epoch} itself"
 
 
 class Restorer:
@@ -448,6 +471,7 @@ class Restorer:
     def register(self, callback: Callable[[bytes], None], timeout_s: float) -> None:
         """Take the worker's callback."""
         self._callback, self._timeout_s = callback, timeout_s
+        self._book.longest_s = max(SETTLE_S, timeout_s + SETTLE_S / 2)
 
     def note(self, role: Role) -> None:
         """A role has come: stop the inputs when it begins an epoch that has a predecessor to ask.
@@ -459,16 +483,23 @@ class Restorer:
             works = role.role is not WorkerRole.IDLE  # one that drains already was told too late that it is the owner
             is_owner = works and role.predecessor not in (None, self._node)
             is_same = self._noted is not None and role.epoch == self._noted.epoch
-            if is_same and role.role is WorkerRole.ACTIVE and role.predecessor is None:
+            if is_same and role.predecessor is None and self._is_told_by(role):
                 self._is_gone.set()
             if works:
                 self._book.work(role.epoch)
+            if works and is_new and role.predecessor in (None, self._node):
+                self._book.begun(role.epoch, is_cold=False)  # what is here is the task's
             if self._callback is None or not is_new or not is_owner:
                 return
             self._noted, self._is_gone, self._has_begun, self._result = role, threading.Event(), False, None
             self.is_pending = True
             self._book.expect(role.epoch)
             self._inputs.hold()
+
+    def _is_told_by(self, role: Role) -> bool:
+        """Whether a role without a predecessor says something: an older daemon's that drains never names one."""
+        noted = self._noted
+        return role.role is WorkerRole.ACTIVE or (noted is not None and noted.role is role.role is WorkerRole.DRAINING)
 
     def begin(self, role: Role, then: Callable[[], None]) -> bool:
         """Start the fetch of this role's epoch, once; ``then`` follows in its thread. ``False``: nothing to await."""
@@ -513,7 +544,7 @@ class Restorer:
             self.is_pending = self.is_pending and not is_newest
             self.restored += isinstance(content, bytes)
             self.cold_starts += isinstance(content, str)
-        self._book.settled(result.epoch, is_cold=isinstance(content, str))
+        self._book.begun(result.epoch, is_cold=isinstance(content, str))
         where = (result.epoch, result.predecessor)
         if isinstance(content, bytes):
             took_ms = result.took_s * 1000

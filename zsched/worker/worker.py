@@ -341,10 +341,12 @@ class Worker:
     def ready(self) -> None:
         """Say that the inputs are declared: the token that the robots' relays wait for. Call it once."""
         self._is_ready = True
+        self._states.ready()
         if self._is_standalone or self._token is not None:
             return
         key = self._keyspace.worker(self._node, self._task, self._incarnation)
         self._token = self._session.liveliness().declare_token(key)
+        self._errands.put(self._show_now)
 
     def _check_not_ready(self, call: str) -> None:
         if self._is_ready:
@@ -533,8 +535,14 @@ class Worker:
         self._restorer.deliver()
 
     def _show_role(self, epoch: int) -> None:
-        if self._watch is not None:
+        """Show that we work in ``epoch``, with the state that it begins with: before `ready` nobody can know that."""
+        if self._watch is not None and self._is_ready:
             self._watch.show(epoch)
+
+    def _show_now(self) -> None:
+        role = self.role
+        if role.role is WorkerRole.ACTIVE:
+            self._show_role(role.epoch)
 
     def _fetch_snapshot(
         self, predecessor: str, epoch: int, timeout_s: float, is_gone: Callable[[], bool]

@@ -560,8 +560,8 @@ STREAM_BUGS = (
     _bug(
         "a standby gives its state for the owner's",
         "zsched.worker.snapshot",
-        "self._worked < epoch - 1",
-        "self._worked < epoch - 9",
+        "self._worked >= epoch - 1",
+        "self._worked >= epoch - 9",
         ("tests/integration/test_snapshot_moves.py",),
     ),
     _bug(

@@ -132,6 +132,7 @@ def offered(
 ) -> Offer:
     """By a worker that was told to work in the epoch ``worked``."""
     book = book or StateBook()
+    book.ready()
     book.work(worked)
     return Offer(session, key, snapshot, Troubles(tell), book)
 
@@ -344,43 +345,90 @@ def test_who_waits_for_a_state_itself_answers_behind_it_and_an_older_question_at
     assert asked(asker, key=key, epoch=2)[0] == b"before"
     assert later.empty()
     states[0] = b"behind"
-    book.settled(3, is_cold=False)
+    book.begun(3, is_cold=False)
     assert [later.get(timeout=PATIENCE_S) for _ in range(2)] == [b"behind", b"behind"]
     offer.undeclare()
 
 
-@pytest.mark.parametrize("ends", [lambda book: book.settled(3, is_cold=True), lambda book: book.expect(5)])
-def test_who_did_not_get_the_state_itself_does_not_hand_on_an_empty_one(ends: Callable[[StateBook], None]) -> None:
+def book_of(worked: int, *, begun: int = 0) -> StateBook:
+    """Of a worker that is ready, and began ``begun`` with a state."""
     book = StateBook()
-    book.work(3)
+    book.ready()
+    if begun:
+        book.begun(begun, is_cold=False)
+    book.work(worked)
+    return book
+
+
+def settling(book: StateBook, epoch: int) -> queue.SimpleQueue[str]:
+    """What it says to a question that waits."""
+    said: queue.SimpleQueue[str] = queue.SimpleQueue()
+    assert book.must_wait(epoch)
+    threading.Thread(target=lambda: said.put(book.settle(epoch)), daemon=True).start()
+    return said
+
+
+@pytest.mark.parametrize("ends", [lambda book: book.begun(3, is_cold=True), lambda book: book.expect(5)])
+def test_who_did_not_get_the_state_itself_does_not_hand_on_an_empty_one(ends: Callable[[StateBook], None]) -> None:
+    book = book_of(3)
     book.expect(3)
-    assert book.must_wait(4)
-    said: list[str] = []
-    waiting = threading.Thread(target=lambda: said.append(book.settle(4)), daemon=True)
-    waiting.start()
+    said = settling(book, 4)
     ends(book)
-    waiting.join(PATIENCE_S)
-    assert said == ["its worker has not got the state of epoch 3 itself"]
+    assert said.get(timeout=PATIENCE_S) == "its worker has not got the state of epoch 3 itself"
+
+
+def test_who_had_a_state_before_goes_on_with_it_and_hands_that_on() -> None:
+    """A, the owner again, whom B could give nothing: what A has is the task's state."""
+    book = book_of(3, begun=1)
+    book.expect(3)
+    said = settling(book, 4)
+    book.begun(3, is_cold=True)
+    assert said.get(timeout=PATIENCE_S) == ""
+
+
+@pytest.mark.parametrize("begun", [0, 1])
+def test_a_state_that_was_overtaken_on_its_way_is_missing_until_a_newer_epoch_begins(begun: int) -> None:
+    """A -> B -> A -> B while B still waits for A's first state: what B has must not replace what A has."""
+    book = book_of(2, begun=begun)
+    book.expect(2)
+    book.work(4)
+    book.expect(4)
+    assert book.settle(3) == "its worker has not got the state of epoch 2 itself"
+    assert book.settle(2) == "", "of the epoch before nothing is missing"
+    said = settling(book, 5)
+    book.begun(4, is_cold=False)
+    assert said.get(timeout=PATIENCE_S) == ""
+    assert book.settle(5) == ""
 
 
 def test_one_that_began_cold_hands_its_state_on_later() -> None:
     """What it has made since is the task's state."""
-    book = StateBook()
-    book.work(3)
+    book = book_of(3)
     book.expect(3)
-    book.settled(3, is_cold=True)
+    book.begun(3, is_cold=True)
     assert not book.must_wait(4)
     assert book.settle(4) == ""
 
 
+def test_one_that_is_not_ready_has_not_said_whether_it_takes_a_state(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worker_snapshot, "TOLD_S", 0.05)
+    book = StateBook()
+    book.work(3)
+    assert book.settle(4) == "its worker is not ready"
+    monkeypatch.setattr(worker_snapshot, "TOLD_S", PATIENCE_S)
+    said = settling(book, 4)
+    book.ready()
+    assert said.get(timeout=PATIENCE_S) == ""
+
+
 def test_a_question_without_an_epoch_waits_for_whatever_comes() -> None:
     """It is an older version's."""
-    book = StateBook()
+    book = book_of(3)
     assert not book.must_wait(None)
     assert book.settle(None) == ""
     book.expect(3)
     assert book.must_wait(None)
-    book.settled(3, is_cold=False)
+    book.begun(3, is_cold=False)
     assert not book.must_wait(None)
 
 

@@ -13,7 +13,7 @@ from zsched.commands.common import stopped_by_signal
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_is_an_event_and_does_what_it_did_again(number: signal.Signals) -> None:
+def test_a_signal_sets_a_latch_and_does_what_it_did_again(number: signal.Signals) -> None:
     before = signal.getsignal(number)
     with stopped_by_signal() as stop:
         assert not stop.is_set()
