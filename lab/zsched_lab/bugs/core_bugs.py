@@ -474,6 +474,13 @@ LEASE_BUGS = (
         60191,
     ),
     _bug(
+        "a generation that begins gives back a lease that is in use",
+        TENURE,
+        "        if value.owner is None:\n",
+        "        if value.owner is None and not self.exclusive:\n",
+        ("tests/unit/core/executor/test_tenure.py",),
+    ),
+    _bug(
         "late word of an earlier stop gives a newer lease back",
         LEASE,
         "not holder.is_leaving or holder.expects_late_report:",

@@ -70,8 +70,14 @@ class Tenure:
     # --- exclusive tasks ---------------------------------------------------------------------------------------------
 
     def hold(self, value: Allocation, next_number: int) -> None:
-        """A newer value was learnt: begin or end this node's side of the task's lease."""
+        """A newer value was learnt: begin or end this node's side of the task's lease.
+
+        One without an owner begins a generation. None of the electors of before has waited for our worker, which works
+        until its lease ends: they must not hear that it has stopped.
+        """
         self._note_leased()
+        if value.owner is None:
+            return
         if value.task in self.exclusive and value.owner == self.me:
             self.leases.begin(value.task, value.epoch, next_number)
         else:

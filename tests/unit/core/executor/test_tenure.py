@@ -100,3 +100,20 @@ def test_in_doubt_of_its_clock_a_node_tells_no_worker_to_leave_that_it_holds_no_
     tenure.tend_leases(1, todo, 10.1)
     assert not todo.apply
     assert executor.role.role is WorkerRole.DRAINING
+
+
+def test_a_generation_that_begins_gives_nothing_back_for_a_worker_that_still_works() -> None:
+    """Electors of the one before would let another owner work beside it, as long as its lease lasts."""
+    tenure = tenure_of("edge1", leased=True)
+    owned, begins = allocation_of(1, "edge1", leased=True), allocation_of(1 << 32, None, leased=True)
+    tenure.hold(owned, next_number=1)
+    assert tenure.leases.on_sent(1, 10.0).released == ()
+    executor = tenure.executors["merge"]
+    done(executor.execute, begins, 10.1)
+    tenure.hold(begins, next_number=2)
+    assert tenure.leases.on_sent(2, 10.1).released == ()
+    assert executor.role.role is WorkerRole.ACTIVE
+    taken = allocation_of((1 << 32) + 1, "edge2", leased=True)
+    done(executor.execute, taken, 10.2)
+    tenure.hold(taken, next_number=3)
+    assert [grant.number for grant in tenure.leases.on_sent(3, 10.2).released] == [2]
