@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+import zenoh
 
 from support.verbs import command, move
 from zsched import paths
 from zsched.adapters.host.operator_client import ask
+from zsched.worker.snapshot import TIMEOUT_S
 from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 
 WORKER = '''
@@ -35,11 +36,11 @@ def restore(content):
 def save():
     early = count
     time.sleep(float(sys.argv[1]))
-    return str(early if sys.argv[2:] else count).encode()
+    return str(early if sys.argv[3:] else count).encode()
 
 with Worker.from_env() as worker:
     out = worker.publisher("{prefix}/{epoch}/robot1/out")
-    worker.on_snapshot(restore, timeout_s=10.0)
+    worker.on_snapshot(restore, timeout_s=float(sys.argv[2]))
     worker.subscribe("{prefix}/robot1/in", take, keep_last=None)
     worker.offer_snapshot(save)
     worker.ready()
@@ -50,37 +51,26 @@ with Worker.from_env() as worker:
 
 @contextmanager
 def counting(
-    folder: Path, *, edges: int = 2, save_s: float = 0.0, early: bool = False, link: str = "peer"
-) -> Iterator[tuple[Testbed, str, list[int]]]:
-    """A fleet whose task has counted to 50 and counts on; its owner, and every count that robot1 got.
+    folder: Path, *words: str, edges: int = 2, link: str = "peer"
+) -> Iterator[tuple[Testbed, str, list[int], zenoh.Publisher]]:
+    """A fleet whose task has counted to 50; its owner, every count that robot1 got, and what it counts by.
 
-    ``early``: a state that takes ``save_s`` is that of the beginning.
+    ``words``: for the worker: how long its state takes, how long it waits for one, and whether it is the early one.
     """
     script = folder / "worker.py"
     script.write_text(WORKER)
-    worker = {"command": [sys.executable, str(script), str(save_s), *(["early"] * early)], "link": link}
+    worker = {"command": [sys.executable, str(script), *words], "link": link}
     tree = echo_fleet(robots=1, edges=edges, stream_class="reliable", task={"worker": worker})
     with Testbed(folder, tree) as bed:
         bed.init()
         bed.start()
         first = bed.wait_whole()
         totals: list[int] = []
-        session, is_over = bed.app("robot1"), threading.Event()
+        session = bed.app("robot1")
         subscriber = session.declare_subscriber("robot1/out", lambda out: totals.append(int(out.payload.to_bytes())))
         publisher = session.declare_publisher("robot1/in")
-
-        def feed() -> None:
-            while not is_over.wait(0.02):
-                publisher.put(b"x")
-
-        feeder = threading.Thread(target=feed)
-        feeder.start()
-        try:
-            bed.wait(lambda: totals and totals[-1] >= 50, 60, "a count worth keeping")
-            yield bed, first, totals
-        finally:
-            is_over.set()
-            feeder.join()
+        bed.wait(lambda: publisher.put(b"x") or (totals and totals[-1] >= 50), 60, "a count worth keeping")
+        yield bed, first, totals, publisher
         subscriber.undeclare()
 
 
@@ -92,16 +82,15 @@ def test_the_state_moves_with_the_task(tmp_path: Path, link: str, save_s: float,
 
     An owner that is told to stop stays until its state has been taken, though that takes a second.
     """
-    with counting(tmp_path, save_s=save_s, link=link) as (bed, first, totals):
+    with counting(tmp_path, str(save_s), str(TIMEOUT_S), link=link) as (bed, first, totals, publisher):
         second = next(name for name in ("edge1", "edge2") if name != first)
         if stops:
             assert bed.stop(first)[first][0] == 0
         else:
             move(bed, second)
         before = max(totals)
-        bed.wait(lambda: totals[-1] > before, 60, "the new owner counts on")
-        # the state lacks what came between it and the flip, some tenths of a second
-        assert min(totals[totals.index(before) :]) >= 25, bed.log(second) + bed.log(first)
+        bed.wait(lambda: publisher.put(b"x") or totals[-1] > before, 60, "the new owner counts on")
+        assert min(totals[totals.index(before) :]) >= before - 5, bed.log(second) + bed.log(first)
         log = bed.log(second)
         assert f"from={first} bytes=" in log, log
         assert "cold_start" not in log
@@ -110,7 +99,7 @@ def test_the_state_moves_with_the_task(tmp_path: Path, link: str, save_s: float,
 @pytest.mark.parametrize("edges", [2, 3], ids=["back", "on"])
 def test_the_state_follows_a_task_that_moves_twice_at_once(tmp_path: Path, edges: int) -> None:
     """The owner in between is asked while it still waits for the state itself."""
-    with counting(tmp_path, edges=edges, save_s=0.6, early=True) as (bed, first, totals):
+    with counting(tmp_path, "0.6", "10", "early", edges=edges) as (bed, first, totals, publisher):
         others = [name for name in bed.names if name.startswith("edge") and name != first]
         second, third = others[0], (*others, first)[1]
         for node in (second, third):
@@ -120,7 +109,7 @@ def test_the_state_follows_a_task_that_moves_twice_at_once(tmp_path: Path, edges
             bed.wait(lambda node=node: bed.owner() == node, 60, f"the move, of which was said: {said}")  # type: ignore[misc] # at once
         bed.wait(lambda: f"epoch=3 from={second}" in bed.log(third), 60, "the third owner has the state or not")
         before = len(totals)
-        bed.wait(lambda: len(totals) >= before + 20, 60, "counts of the third owner")
+        bed.wait(lambda: publisher.put(b"x") or len(totals) >= before + 20, 60, "counts of the third owner")
         began = next(number for number, total in enumerate(totals) if total >= 50)
         assert min(totals[began:]) >= 50, bed.log(second) + bed.log(third)
         assert f"restored epoch=3 from={second}" in bed.log(third)
@@ -128,11 +117,15 @@ def test_the_state_follows_a_task_that_moves_twice_at_once(tmp_path: Path, edges
 
 def test_an_owner_s_worker_that_is_started_again_is_not_given_the_state_of_before_the_move(tmp_path: Path) -> None:
     """It is older than what was done since; without one the worker knows that it has to begin anew."""
-    with counting(tmp_path) as (bed, first, totals):
+    with counting(tmp_path, "0", str(TIMEOUT_S)) as (bed, first, totals, publisher):
         second = next(name for name in ("edge1", "edge2") if name != first)
         move(bed, second)
         bed.wait(lambda: f"restored epoch=2 from={first}" in bed.log(second), 60, "the state")
         before = len(totals)
         command(bed, "restart", TASK, second, "--yes")
-        bed.wait(lambda: any(total < 50 for total in totals[before:]), 60, "the new worker counts from 1")
+
+        def is_anew() -> bool:
+            return any(total < 50 for total in totals[before:])
+
+        bed.wait(lambda: publisher.put(b"x") or is_anew(), 60, "the new worker counts from 1")
         assert bed.log(second).count("restored epoch=2") == 1
