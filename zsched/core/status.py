@@ -458,25 +458,24 @@ def _task_problems(node: Stages, task: TaskSpec, value: Allocation, now: float) 
     if executor.is_local:
         yield f"cut off from {owner}: this robot works alone, degraded"
     server, is_server_ready = node.me if executor.is_local else owner, True
-    for spec in node.fleet.nodes:
-        data = node.gateway.newest(spec.name, now)
-        load = None if data is None else data.profile.worker(task.name)
-        if data is None or load is None or node.membership.state(spec.name) is not PeerState.ALIVE:
+    for profile in _heard(node, now):
+        name, load = profile.node, profile.worker(task.name)
+        if load is None:
             continue
-        is_server_ready &= spec.name != server or load.state is WorkerState.READY
+        is_server_ready &= name != server or load.state is WorkerState.READY
         why = f": {load.reason}" if load.reason else ""
         if load.state is WorkerState.FAILED:
-            yield f"the worker on {spec.name} failed{why}; mend it, then `zsched retry {task.name} {spec.name}`"
-        elif (spec.name == server and load.state is not WorkerState.READY) or (
-            _is_in_the_way(task, load) and (owner is None or _may_follow(node, task, data.profile, server))
+            yield f"the worker on {name} failed{why}; mend it, then `zsched retry {task.name} {name}`"
+        elif (name == server and load.state is not WorkerState.READY) or (
+            _is_in_the_way(task, load) and (owner is None or _may_follow(node, task, profile, server))
         ):
-            yield f"the worker on {spec.name} {told_of_worker(load.state, load.reason)}"
+            yield f"the worker on {name} {told_of_worker(load.state, load.reason)}"
         elif load.state is WorkerState.READY and load.reason:
-            yield f"the worker on {spec.name}{why}"
-        elif spec.name == owner and load.unended_s is not None and _hangs(load):
+            yield f"the worker on {name}{why}"
+        elif name == owner and load.unended_s is not None and _hangs(load):
             more = f", and {load.jobs.backlog} wait" if load.jobs is not None and load.jobs.backlog else ""
             yield (
-                f"the worker on {spec.name} has had work for {load.unended_s:.0f} s and finished no job{more}: it "
+                f"the worker on {name} has had work for {load.unended_s:.0f} s and finished no job{more}: it "
                 f"may hang in a callback; see `zsched logs {task.name}`, `zsched restart {task.name}` starts it anew"
             )
     if owner is not None and owner == server and is_server_ready and node.membership.state(owner) is PeerState.ALIVE:
@@ -508,6 +507,14 @@ def _is_in_the_way(task: TaskSpec, load: WorkerLoad) -> bool:
     return is_missed or (load.state is not WorkerState.READY and load.reason.startswith((RESTARTING, WAS_READY)))
 
 
+def _heard(node: Stages, now: float) -> Iterator[Profile]:
+    """The newest profiles of the nodes that are alive, in the fleet file's order."""
+    for spec in node.fleet.nodes:
+        data = node.gateway.newest(spec.name, now)
+        if data is not None and node.membership.state(spec.name) is PeerState.ALIVE:
+            yield data.profile
+
+
 def _may_follow(node: Stages, task: TaskSpec, profile: Profile, server: NodeId | None) -> bool:
     """Whether that is another candidate, and nobody keeps tasks from it on purpose."""
     name = profile.node
@@ -517,21 +524,18 @@ def _may_follow(node: Stages, task: TaskSpec, profile: Profile, server: NodeId |
 def _no_spare(node: Stages, task: TaskSpec, owner: NodeId, now: float) -> Iterator[str]:
     """That no worker could take a task over now; nodes that are away, or closed by an operator, are no trouble."""
     is_missed, untold = False, list[str]()
-    for spec in node.fleet.nodes:
-        data = node.gateway.newest(spec.name, now)
-        if data is None or node.membership.state(spec.name) is not PeerState.ALIVE:
+    for profile in _heard(node, now):
+        if not _may_follow(node, task, profile, owner):
             continue
-        if not _may_follow(node, task, data.profile, owner):
-            continue
-        load = data.profile.worker(task.name)
+        load = profile.worker(task.name)
         is_told = load is not None and (load.state is WorkerState.FAILED or _is_in_the_way(task, load))
         if not is_told and may_get(task, None if load is None else load.state):
             return
         is_missed = True
         if load is None:
-            untold.append(f"{spec.name} runs no worker for it")
+            untold.append(f"{profile.node} runs no worker for it")
         elif not is_told:  # why the others cannot stands in lines of their own
-            untold.append(f"the worker on {spec.name} {told_of_worker(load.state, load.reason)}")
+            untold.append(f"the worker on {profile.node} {told_of_worker(load.state, load.reason)}")
     if is_missed:
         yield f"{NO_SPARE}: {'; '.join(untold)}" if untold else NO_SPARE
 
