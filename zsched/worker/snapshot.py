@@ -479,27 +479,25 @@ class Restorer:
         One of the same epoch without a predecessor says that its machine is gone.
         """
         with self._lock:
-            is_new = self._noted is None or role.epoch > self._noted.epoch
-            works = role.role is not WorkerRole.IDLE  # one that drains already was told too late that it is the owner
-            is_owner = works and role.predecessor not in (None, self._node)
-            is_same = self._noted is not None and role.epoch == self._noted.epoch
-            if is_same and role.predecessor is None and self._is_told_by(role):
+            noted = self._noted
+            is_new = noted is None or role.epoch > noted.epoch
+            # an older daemon's role that drains never names a predecessor
+            names = role.role is WorkerRole.ACTIVE or (noted is not None and noted.role is WorkerRole.DRAINING)
+            if names and noted is not None and noted.epoch == role.epoch and role.predecessor is None:
                 self._is_gone.set()
-            if works:
-                self._book.work(role.epoch)
-            if works and is_new and role.predecessor in (None, self._node):
+            if role.role is WorkerRole.IDLE:
+                return
+            # from here on also one that drains: it was told too late that it is the owner
+            asks = role.predecessor not in (None, self._node)
+            self._book.work(role.epoch)
+            if is_new and not asks:
                 self._book.begun(role.epoch, is_cold=False)  # what is here is the task's
-            if self._callback is None or not is_new or not is_owner:
+            if self._callback is None or not is_new or not asks:
                 return
             self._noted, self._is_gone, self._has_begun, self._result = role, threading.Event(), False, None
             self.is_pending = True
             self._book.expect(role.epoch)
             self._inputs.hold()
-
-    def _is_told_by(self, role: Role) -> bool:
-        """Whether a role without a predecessor says something: an older daemon's that drains never names one."""
-        noted = self._noted
-        return role.role is WorkerRole.ACTIVE or (noted is not None and noted.role is role.role is WorkerRole.DRAINING)
 
     def begin(self, role: Role, then: Callable[[], None]) -> bool:
         """Start the fetch of this role's epoch, once; ``then`` follows in its thread. ``False``: nothing to await."""
