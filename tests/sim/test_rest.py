@@ -6,7 +6,8 @@ import pytest
 
 from zsched.config.timing import PROFILES
 from zsched_lab.sim.faults import play
-from zsched_lab.sim.rest import AT_MOST_S, FEWEST, QUANTILES_S, quantile, spread, too_slow
+from zsched_lab.sim.rest import AT_MOST_S, FEWEST, QUANTILES_S, quantile, spread, too_few, too_slow
+from zsched_lab.sim.simulate import Job, with_enough_of_each
 from zsched_lab.sim.swarm import plan
 
 
@@ -34,6 +35,19 @@ def test_a_batch_is_too_slow_when_a_quantile_is_and_too_small_to_tell_when_it_is
     assert any(f"{percent} %" in one for one in too_slow({"wan": times}))
     assert not any(f"{percent} %" in one for one in too_slow({"wan": [0.1, *times[:-1]]}))
     assert not any(f"{percent} %" in one for one in too_slow({"wan": times[1:]}))
+
+
+def test_a_profile_that_few_schedules_have_gets_further_ones_until_it_can_be_judged() -> None:
+    most = [Job(seed=seed) for seed in range(1000) if plan(seed).fleet.timing.name != "wan"]
+    rest = [Job(seed=seed) for seed in range(1000, 2000)]
+    played = list(with_enough_of_each(iter([*most[:200], *rest]), 200, FEWEST[90]))
+    assert [job.seed for job in played[:200]] == [job.seed for job in most[:200]], "those that were asked for"
+    assert {job.profile for job in played[200:]} == {"wan"}
+    assert len(played) == 200 + FEWEST[90]
+    times = {name: [0.1 for job in played if job.profile == name] for name in PROFILES}
+    assert too_few(times) == []
+    assert too_few({**times, "wan": times["wan"][1:]}) == ["wan"]
+    assert list(with_enough_of_each(iter(rest), 7, 0)) == rest[:7]
 
 
 def test_a_quantile_is_the_time_of_the_first_schedule_beyond_it() -> None:

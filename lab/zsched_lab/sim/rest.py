@@ -44,6 +44,12 @@ def too_slow(times: Mapping[str, Sequence[float]]) -> list[str]:
     return found
 
 
+def too_few(times: Mapping[str, Sequence[float]]) -> list[str]:
+    """The timing profiles of a batch that have too few schedules for any of their bounds."""
+    fewest = min(FEWEST.values())
+    return [name for name in QUANTILES_S if len(times.get(name, ())) < fewest]
+
+
 def spread(times: Sequence[float]) -> str:
     """Quantiles of some times, for people."""
     told = ", ".join(f"p{percent} {quantile(times, percent):.2f}" for percent in (50, 90, 99))

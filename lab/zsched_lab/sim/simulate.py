@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import gc
+import itertools
 import json
 import multiprocessing
 import signal
@@ -22,9 +23,10 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from zsched.config.timing import PROFILES
 from zsched.core.values.struct import replace
 from zsched_lab.sim.faults import Result, play
-from zsched_lab.sim.rest import spread, too_slow
+from zsched_lab.sim.rest import spread, too_few, too_slow
 from zsched_lab.sim.swarm import KINDS, MAX_NODES, MIN_NODES, PENDING, SECONDS, Plan, plan
 
 CHUNK = 10
@@ -53,6 +55,11 @@ class Job:
         """Its schedule."""
         kinds = KINDS - PENDING | self.pending
         return plan(self.seed, nodes=self.nodes, seconds=self.seconds, kinds=kinds)
+
+    @property
+    def profile(self) -> str:
+        """The name of its timing profile."""
+        return self.plan.fleet.timing.name
 
     @property
     def command(self) -> str:
@@ -98,7 +105,7 @@ class Totals:
         self.faults += result.faults
         self.generations += "new generation" in result.faults
         if result.settled_s is not None:
-            self.settled_s.setdefault(job.plan.fleet.timing.name, []).append(round(result.settled_s, 3))
+            self.settled_s.setdefault(job.profile, []).append(round(result.settled_s, 3))
         if result.violation:
             self.violations[str(job.seed)] = result.violation
 
@@ -199,6 +206,9 @@ def _arguments(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m zsched_lab.sim.simulate", description=__doc__)
     parser.add_argument("--seed", default="0", help="first seed, or 'commit': one made from the commit's hash")
     parser.add_argument("--runs", type=int, default=100, help="how many seeds in a row")
+    parser.add_argument(
+        "--of-each", type=int, default=0, metavar="N", help="then further seeds, until each timing profile has N"
+    )
     parser.add_argument("--nodes", type=int, choices=range(MIN_NODES, MAX_NODES + 1), help="default: by seed")
     parser.add_argument("--seconds", type=float, default=SECONDS, help="virtual seconds of a schedule")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
@@ -224,8 +234,8 @@ def _jobs(given: argparse.Namespace, first: int) -> Iterator[Job]:
     keep = None
     if given.keep is not None:
         keep = frozenset(int(part) for part in given.keep.split(",") if part != "none")
-    for seed in range(first, first + given.runs):
-        yield Job(
+    jobs = (
+        Job(
             seed=seed,
             nodes=given.nodes,
             seconds=given.seconds,
@@ -233,6 +243,25 @@ def _jobs(given: argparse.Namespace, first: int) -> Iterator[Job]:
             calm_at=given.calm_at,
             pending=frozenset(given.pending),
         )
+        for seed in itertools.count(first)
+    )
+    yield from with_enough_of_each(jobs, given.runs, given.of_each)
+
+
+def with_enough_of_each(jobs: Iterator[Job], runs: int, fewest: int) -> Iterator[Job]:
+    """The first ``runs`` jobs, then only those of the timing profiles that have fewer than ``fewest``, until none has.
+
+    A profile that few schedules have would else have too few for its bounds (`zsched_lab.sim.rest`).
+    """
+    has = dict.fromkeys(PROFILES, 0)
+    for job in itertools.islice(jobs, runs):
+        has[job.profile] += 1
+        yield job
+    while min(has.values()) < fewest:
+        job = next(jobs)
+        if has[job.profile] < fewest:
+            has[job.profile] += 1
+            yield job
 
 
 def _explain(job: Job, result: Result, *, is_shrinking: bool) -> None:
@@ -276,6 +305,8 @@ def main(arguments: list[str] | None = None) -> int:
     print(f"faults: {counts}")
     for name, times in sorted(totals.settled_s.items()):
         print(f"came to rest, {name}: {spread(times)}")
+    for name in too_few(totals.settled_s):
+        print(f"came to rest, {name}: too few schedules to be judged")
     pace = 60 * played / max(took_s, 1e-9)
     print(f"{totals.events} events; {totals.generations} new generations; {pace:.0f} schedules a minute")
     slow = too_slow(totals.settled_s)
