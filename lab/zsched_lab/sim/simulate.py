@@ -26,7 +26,7 @@ from pathlib import Path
 from zsched.config.timing import PROFILES
 from zsched.core.values.struct import replace
 from zsched_lab.sim.faults import Result, play
-from zsched_lab.sim.rest import spread, too_few, too_slow
+from zsched_lab.sim.rest import FEWEST, spread, too_few, too_slow
 from zsched_lab.sim.swarm import KINDS, MAX_NODES, MIN_NODES, PENDING, SECONDS, Plan, plan
 
 CHUNK = 10
@@ -305,7 +305,7 @@ def main(arguments: list[str] | None = None) -> int:
     print(f"faults: {counts}")
     for name, times in sorted(totals.settled_s.items()):
         print(f"came to rest, {name}: {spread(times)}")
-    for name in too_few(totals.settled_s):
+    for name in too_few(totals.settled_s) if played >= min(FEWEST.values()) else ():
         print(f"came to rest, {name}: too few schedules to be judged")
     pace = 60 * played / max(took_s, 1e-9)
     print(f"{totals.events} events; {totals.generations} new generations; {pace:.0f} schedules a minute")
