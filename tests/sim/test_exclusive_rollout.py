@@ -13,8 +13,10 @@ from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet, WorkerSpec
 from zsched.core.values.model import NodeId
 from zsched.core.values.plan import WorkerRole
+from zsched_lab.sim.faults import play
 from zsched_lab.sim.parts import Machine
 from zsched_lab.sim.simulator import CORES, Simulator
+from zsched_lab.sim.swarm import plan
 
 TASK, LOOK_S = "merge", 0.01
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2", "edge3")
@@ -67,6 +69,12 @@ class Rollout:
             self.sim.machines[name].fleet = fleet
             self.sim.start(name)
             self.run(0.5)
+
+    def reload(self, fleet: Fleet, *names: NodeId) -> None:
+        """Nodes take another fleet file while they run."""
+        for name in names:
+            self.sim.machines[name].fleet = fleet
+            self.sim.reload(self.sim.machines[name])
 
     def run(self, seconds: float) -> float:
         """Let time pass and look all the while; for how long two were at work."""
@@ -139,6 +147,27 @@ def test_a_planned_move_away_from_an_owner_with_the_old_file_waits_until_it_has_
     assert rollout.owner() not in (None, owner)
     assert rollout.at_work() == {rollout.owner()}
     assert rollout.sim.working[TASK][0] == rollout.owner()
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_an_owner_that_takes_the_file_while_it_works_is_exclusive_once_its_worker_has_stopped(seed: int) -> None:
+    rollout = Rollout(seed)
+    owner = rollout.owner() or ""
+    rollout.reload(NEW, *rollout.others(owner))
+    rollout.run(3.0)
+    rollout.sim.work.stop_s = (6.0,)
+    rollout.reload(NEW, owner)
+    for _ in range(5):
+        assert rollout.run(1.0) == 0.0
+        assert f"({owner} has not said that its worker has stopped)" in rollout.problems(owner)
+    rollout.run(3.0)
+    assert rollout.at_work() == {rollout.owner()} == {rollout.sim.working[TASK][0]}
+    assert rollout.problems(owner) == ""
+
+
+def test_a_move_right_after_such_an_owner_has_taken_the_file_does_not_meet_its_worker() -> None:
+    """Found by the simulator: electors do not wait for a worker that has never had a lease."""
+    assert play(plan(310003726)).violation == ""
 
 
 @pytest.mark.parametrize("seed", range(2))

@@ -441,7 +441,7 @@ def _round_trips(node: Stages, spec: TaskSpec) -> tuple[tuple[NodeId, float], ..
 
 def _task_problems(node: Stages, task: TaskSpec, value: Allocation, now: float) -> Iterator[str]:
     executor, owner = node.executors[task.name], value.owner
-    if differs := node.sealing.problem(task, value):
+    if differs := node.sealing.problem(task, value, now):
         yield differs
     if value.paused:
         yield (

@@ -406,6 +406,14 @@ LEASE_BUGS = (
         38,
     ),
     _bug(
+        "an owner does not wait for its own worker without a lease",
+        SEALING,
+        "if self.executors[spec.name].may_work_unleased(now):",
+        "if False:",
+        _SEALING + _ROLLOUT,
+        310003726,
+    ),
+    _bug(
         "a former owner that is gone is not waited for",
         SEALING,
         "if name not in self._gone or name in owners}",

@@ -6,10 +6,11 @@ the task's register whether the task is leased (`Allocation.leased`). Every node
 says:
 
 * A task without an owner so far is leased from its first owner on, if the proposer's file says exclusive.
-* Otherwise an owner whose file says exclusive proposes the change once no other node works without a lease. It asks
-  every candidate and every node that it hears. Each must have learnt this epoch and answer that no worker there works
-  without a lease. Until then no elector grants a lease: the owner waits, and its status says for which nodes. A node
-  that is gone and no candidate is waited for if it has owned the task, for it may work still.
+* Otherwise an owner whose file says exclusive proposes the change once no node works without a lease. Its own worker
+  must have said that it has stopped. It asks every candidate and every node that it hears. Each must have learnt this
+  epoch and answer that no worker there works without a lease. Until then no elector grants a lease: the owner waits,
+  and its status says for which nodes. A node that is gone and no candidate is waited for if it has owned the task, for
+  it may work still.
 * The task stops being leased when the owner's file does not say exclusive and all nodes that it hears have its file.
 
 Knows: peers' answers and fleet files. Does not know: grants (`zsched.core.vote.lease`), how a value is agreed.
@@ -90,7 +91,9 @@ class Sealing(Struct):
         return [
             (spec.name, SetLeased(base_revision=values[spec.name].revision, leased=spec.exclusive))
             for spec in self._open(values)
-            if not (self._waits_for(spec, values[spec.name]) if spec.exclusive else is_young or self._are_files_mixed())
+            if not (
+                self._waits_for(spec, values[spec.name], now) if spec.exclusive else is_young or self._are_files_mixed()
+            )
         ]
 
     def to_ask(self, values: Mapping[TaskId, Allocation], now: float) -> tuple[NodeId, ...]:
@@ -99,7 +102,8 @@ class Sealing(Struct):
         if not tasks or now - self._asked_at < ASK_EVERY_S:
             return ()
         self._asked_at = now
-        return tuple(sorted({name for spec in tasks for name in self._waits_for(spec, values[spec.name])}))
+        waits_for = {name for spec in tasks for name in self._waits_for(spec, values[spec.name], now)}
+        return tuple(sorted(waits_for - {self.me}))
 
     def _open(self, values: Mapping[TaskId, Allocation]) -> list[TaskSpec]:
         """The tasks owned here whose agreed value differs from this node's file."""
@@ -113,12 +117,17 @@ class Sealing(Struct):
         mine = fleet_hash(self.fleet)
         return any(file != mine for name, file in self._files.items() if name not in self._gone)
 
-    def _waits_for(self, spec: TaskSpec, value: Allocation) -> dict[NodeId, str]:
-        """{node that must be heard, or whose worker must stop, before the task is leased: reason}."""
+    def _waits_for(self, spec: TaskSpec, value: Allocation, now: float) -> dict[NodeId, str]:
+        """{node that must be heard, or whose worker must stop, before the task is leased: reason}.
+
+        Ours, too: electors do not wait for a worker that has never had a lease.
+        """
         owners = self._owners.get(spec.name, set())
         heard = {name for name in self._files if name not in self._gone or name in owners}
         others = sorted({*heard, *spec.candidates} - {self.me})
         reasons = {name: self._obstacle(spec, value, name) for name in others}
+        if self.executors[spec.name].may_work_unleased(now):
+            reasons[self.me] = "has not said that its worker has stopped"
         return {name: reason for name, reason in reasons.items() if reason}
 
     def _obstacle(self, spec: TaskSpec, value: Allocation, node: NodeId) -> str:
@@ -132,8 +141,8 @@ class Sealing(Struct):
         epoch = next((known.epoch for known in answer.values if known.task == spec.name), 0)
         return "" if epoch >= value.epoch else f"has not learnt epoch {value.epoch}"
 
-    def problem(self, spec: TaskSpec, value: Allocation) -> str:
-        """How this node's file and the agreed value differ; empty when they do not."""
+    def problem(self, spec: TaskSpec, value: Allocation, now: float) -> str:
+        """How this node's file and the agreed value differ at ``now``; empty when they do not."""
         if value.owner is None or value.leased is spec.exclusive:
             return ""
         if not spec.exclusive:
@@ -141,5 +150,5 @@ class Sealing(Struct):
         text = "exclusive by this node's fleet file, not yet for the fleet"
         if value.owner != self.me:
             return f"{text}: {value.owner} waits, or works without a lease (see its status)"
-        waits = ", ".join(f"{name} {reason}" for name, reason in self._waits_for(spec, value).items())
+        waits = ", ".join(f"{name} {reason}" for name, reason in self._waits_for(spec, value, now).items())
         return f"{text}: nobody works until all candidates go by it ({waits or 'agreeing'})"

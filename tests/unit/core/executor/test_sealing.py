@@ -12,6 +12,7 @@ from support.fleets import fleet_of, task_of, tuning_of
 from support.todos import done
 from zsched.core.executor.handover import Executor
 from zsched.core.executor.sealing import ASK_EVERY_S, Sealing
+from zsched.core.todo import ToDo
 from zsched.core.values.beat import Beat
 from zsched.core.values.change import SetLeased
 from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec, fleet_hash, lease_terms
@@ -90,8 +91,21 @@ def test_whoever_may_work_without_a_lease_is_waited_for_and_named(said: Learnt |
         one.on_answer(said)
     assert one.due(values(), 10.0) == []
     text = "exclusive by this node's fleet file, not yet for the fleet: nobody works until all candidates go by it"
-    assert one.problem(EXCLUSIVE, value()) == f"{text} ({why})"
+    assert one.problem(EXCLUSIVE, value(), 10.0) == f"{text} ({why})"
     assert one.to_ask(values(), 11.0) == ("e2",)
+
+
+def test_an_owner_waits_for_its_own_worker_too_which_nobody_else_knows_to_work_without_a_lease() -> None:
+    executor = Executor(spec=OPEN, me="e1", has_streams=False)
+    done(executor.execute, value(), 0.0)
+    one = Sealing(fleet=NEW, me="e1", executors={"guard": executor}, over_at=YOUNG_S)
+    executor.adopt(EXCLUSIVE, ToDo(), 10.0, is_agreed_leased=False)
+    assert one.to_ask(values(), 10.0) == ("e2",), "nobody asks itself"
+    one.on_answer(answer())
+    assert one.due(values(), 10.0) == []
+    assert one.problem(EXCLUSIVE, value(), 10.0).endswith("(e1 has not said that its worker has stopped)")
+    done(executor.on_role_ended, 3)
+    assert one.due(values(), 10.0) == CHANGE
 
 
 def test_who_has_learnt_nothing_of_the_task_is_waited_for_from_its_first_epoch_on() -> None:
@@ -114,7 +128,7 @@ def test_who_is_heard_is_waited_for_too_though_it_is_no_candidate() -> None:
     one.hear(beat("e3"))
     one.hear(beat("e1"))  # our own
     assert one.due(values(), 10.0) == []
-    assert one.problem(EXCLUSIVE, value()).endswith("(e3 has not answered yet)")
+    assert one.problem(EXCLUSIVE, value(), 10.0).endswith("(e3 has not answered yet)")
     assert one.to_ask(values(), 11.0) == ("e3",)
 
 
@@ -129,7 +143,7 @@ def test_who_is_gone_is_waited_for_only_if_it_is_a_candidate_or_has_owned_the_ta
     assert one.due(values(), 10.0) == CHANGE, "that is another task"
     one.note(value(owner="e3", epoch=2))
     assert one.due(values(), 10.0) == []
-    assert one.problem(EXCLUSIVE, value()).endswith("(e3 has not answered yet)")
+    assert one.problem(EXCLUSIVE, value(), 10.0).endswith("(e3 has not answered yet)")
     one.on_answer(answer("e3"))
     assert one.due(values(), 10.0) == CHANGE
 
@@ -237,11 +251,11 @@ def test_the_tasks_whose_worker_may_work_without_a_lease_are_told() -> None:
     ],
 )
 def test_status_says_how_the_file_and_the_fleet_differ(of: Fleet, known: Allocation, text: str) -> None:
-    said = sealing(of).problem(of.tasks[0], known)
+    said = sealing(of).problem(of.tasks[0], known, 10.0)
     assert said == text or (text and said.endswith(text))
 
 
 def test_status_of_an_owner_that_waits_for_nobody_says_that_it_is_being_agreed() -> None:
     one = asked()
     one.on_answer(answer())
-    assert one.problem(EXCLUSIVE, value()).endswith("(agreeing)")
+    assert one.problem(EXCLUSIVE, value(), 10.0).endswith("(agreeing)")
