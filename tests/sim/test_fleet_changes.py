@@ -132,6 +132,19 @@ def test_a_document_that_is_not_valid_here_is_shown_and_the_node_goes_on_by_its_
     assert play.sim.node("robot3").agreement.counters["document_refused"] == 1
 
 
+def test_a_task_that_an_agreed_document_makes_exclusive_works_on_by_leases() -> None:
+    """By a document leases hang on its number, and on nothing in a file: all nodes were taken for others for ever."""
+    shared, exclusive = (replace(FLEET, tasks=(replace(*FLEET.tasks, exclusive=is_one),)) for is_one in (False, True))
+    play = Play(fleet=shared)
+    play.adopt()
+    owner = play.sim.agreed(TASK) or ""
+    assert play.sim.machines[owner].roles[TASK].lease_until_s is None
+    assert play.told("robot1", ChangeFleet(document=play.document(exclusive))).outcome is CommandOutcome.OK
+    assert play.sim.run_until(lambda: play.sim.node(owner).values()[TASK].leased, 5)
+    assert play.sim.run_until(lambda: play.sim.working.get(TASK, ("", 0.0))[0] == owner, 5), "by a lease"
+    play.settle()
+
+
 def test_without_a_majority_nothing_changes_and_the_operator_is_told() -> None:
     play = Play()
     play.adopt()

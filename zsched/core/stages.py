@@ -194,8 +194,9 @@ class Stages:
         self.rollouts = Rollouts()
         self.rollouts.take(fleet, now)
         self.hangs = HangWatch(fleet)
-        self.tenure = Tenure(fleet, me, self.agreement.leases, self.executors)
-        self.sealing = Sealing(fleet, me, self.executors, self.agreement.leases.over_at)
+        leases = self.agreement.leases
+        self.tenure = Tenure(fleet, me, leases, self.executors)
+        self.sealing = Sealing(fleet, me, self.executors, leases.over_at, lambda: leases.terms)
         self.missed: dict[str, tuple[int, float]] = {}
         """{stream: (how many of its samples somebody may miss, when that last rose)}."""
         self.rates = StreamRates()

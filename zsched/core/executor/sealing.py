@@ -19,12 +19,12 @@ Knows: peers' answers and fleet files. Does not know: grants (`zsched.core.vote.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 from zsched.core.executor.handover import Executor
 from zsched.core.values.beat import Beat
 from zsched.core.values.change import SetLeased
-from zsched.core.values.fleet import Fleet, TaskSpec, fleet_hash, lease_terms
+from zsched.core.values.fleet import Fleet, TaskSpec, fleet_hash
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import Allocation, NodeId, TaskId
 from zsched.core.values.struct import Struct, field
@@ -41,6 +41,8 @@ class Sealing(Struct):
     executors: Mapping[TaskId, Executor]
     over_at: float
     """When a lease of an earlier life of this node is over."""
+    terms: Callable[[], str]
+    """The terms of this node's leases now: by its file, or by the agreed number (`Leases.terms`)."""
     _files: dict[NodeId, str] = field(default_factory=dict)
     """{peer that was heard: its fleet file}."""
     _gone: set[NodeId] = field(default_factory=set)
@@ -134,7 +136,7 @@ class Sealing(Struct):
         answer = self._answers.get(node)
         if answer is None:
             return "has not answered yet"
-        if answer.lease_terms != lease_terms(self.fleet):
+        if answer.lease_terms != self.terms():
             return "goes by other leases"
         if spec.name in answer.unleased:
             return "works without a lease"

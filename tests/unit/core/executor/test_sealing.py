@@ -35,7 +35,7 @@ NEW, OLD = fleet(EXCLUSIVE), fleet(OPEN)
 
 def sealing(of: Fleet = NEW, me: str = "e1") -> Sealing:
     executors = {task.name: Executor(spec=task, me=me, has_streams=False) for task in of.tasks}
-    return Sealing(fleet=of, me=me, executors=executors, over_at=YOUNG_S)
+    return Sealing(fleet=of, me=me, executors=executors, over_at=YOUNG_S, terms=lambda: lease_terms(of))
 
 
 def value(task: str = "guard", *, leased: bool = False, owner: str | None = "e1", epoch: int = 3) -> Allocation:
