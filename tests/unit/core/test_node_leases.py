@@ -192,3 +192,24 @@ def test_a_stranger_s_answer_is_none_of_those_that_an_owner_waits_for() -> None:
         owner.handle(ev.LearntReceived(learnt=learnt, is_answer=True))
     assert "robot2" in owner.node.sealing._answers
     assert "ghost" not in owner.node.sealing._answers
+
+
+@pytest.mark.parametrize("is_ready", [True, False])
+def test_a_worker_that_was_not_ready_when_it_was_told_to_stop_works_without_a_lease_no_more_once_it_is(
+    is_ready: bool,
+) -> None:
+    """It has shown no epoch, so it never says that it has left one: the fleet waited until it was started anew."""
+    by_old_file = replace(FLEET, tasks=(replace(*FLEET.tasks, exclusive=False),))
+    state = state_of("robot1", RegisterState(task="guard"))
+    node = Node(fleet=by_old_file, me="robot1", durable=state, incarnation=7, electorate="e", rng=Random(1), now=100.0)
+    node.start(100.0)
+    node.handle(ev.WorkerChanged(task="guard", state=WorkerState.STARTING), 100.0)
+    for new in (replace(value(4), leased=False), replace(value(5), epoch=4)):
+        learnt = Learnt(node="robot2", values=(new,))
+        node.handle(ev.LearntReceived(learnt=learnt, is_answer=True), 100.1)
+    assert node.executors["guard"].role.role is WorkerRole.IDLE
+    if is_ready:
+        node.handle(ev.WorkerChanged(task="guard", state=WorkerState.READY), 101.0)
+    batch = node.handle(ev.LearntAsked(request=1), 101.0)
+    (answer,) = [one.learnt for one in batch if isinstance(one, do.AnswerLearnt)]
+    assert answer.unleased == (() if is_ready else ("guard",))

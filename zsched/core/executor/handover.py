@@ -299,14 +299,21 @@ class Executor:
         Without one, a worker has ended that worked in it, so it had its predecessor's state. The next one must not have
         it again: it is older than what was done since.
         """
-        if epoch == self._unleased_epoch and self.role.role is not WorkerRole.ACTIVE:
-            self._unleased_epoch = None
+        if epoch == self._unleased_epoch:
+            self._confirm()
         if epoch == self.role.epoch and self.role.predecessor is not None:
             self._become(replace(self.role, predecessor=None), todo)
 
-    def on_worker_ended(self) -> None:
-        """The worker's process has ended, and its former role with it."""
-        if self.role.role is not WorkerRole.ACTIVE:
+    def on_worker_anew(self) -> None:
+        """The worker's process has ended, and its former role with it; or it is ready only now.
+
+        One that has not been ready shows no epoch, so it does not say that it has left one.
+        """
+        self._confirm()
+
+    def _confirm(self) -> None:
+        """Nobody works in the epoch without a lease any more, unless the worker here may: it was told nothing since."""
+        if self.role.role is not WorkerRole.ACTIVE or self.role.epoch != self._unleased_epoch:
             self._unleased_epoch = None
 
     def may_work_unleased(self, now: float) -> bool:

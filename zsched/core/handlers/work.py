@@ -137,8 +137,8 @@ def _on_worker(node: Stages, event: ev.WorkerChanged, todo: ToDo, now: float) ->
     story = node.workers.on_changed(event)
     if story is None:
         return
-    if event.state in (WorkerState.STOPPED, WorkerState.FAILED):
-        node.executors[event.task].on_worker_ended()
+    if event.state is not WorkerState.STARTING:
+        node.executors[event.task].on_worker_anew()
     if was_ready:
         node.agreement.leases.on_worker_lost(event.task)
     node.hangs.note_worker(event.task, event.state, now)
