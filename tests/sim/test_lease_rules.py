@@ -129,6 +129,19 @@ def test_a_release_of_another_life_number_or_owner_frees_nothing(other: Grant) -
     assert not elector.may_accept("e2", 10.2)
 
 
+@pytest.mark.parametrize("number", [5, 6])
+def test_nobody_gives_back_numbers_that_it_has_not_sent_yet(number: int) -> None:
+    """One forged beat, a late one, too: the owner got no lease any more as long as its daemon lived."""
+    elector = granter()
+    elector.on_beat(beat(number=5), ("e1", 3), 10.0)
+    elector.on_beat(beat(number=number, released=(grant(2**50),)), ("e1", 3), 10.1, is_newest=number > 5)
+    assert not elector.may_accept("e2", 10.1 + HOLD_S / 2)
+    elector = granter()
+    elector.on_beat(beat(number=number, released=(grant(2**50),)), ("e1", 3), 10.1)
+    elector.on_beat(beat(number=7), ("e1", 3), 10.2)
+    assert elector.echo(10.2) == grant(7)
+
+
 def test_the_owner_s_next_life_is_granted_only_when_its_former_one_cannot_work_any_more() -> None:
     elector = granter()
     elector.on_beat(beat(number=5, life=1), ("e1", 3), 10.0)

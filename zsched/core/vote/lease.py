@@ -89,7 +89,8 @@ class Granter:
             is_newest: it is no repeat and no late one. A lower number than the last is then the sender's true one.
         """
         for grant in beat.released:
-            if (grant.task, grant.owner, grant.incarnation) == (self.task, beat.node, beat.incarnation):
+            is_its_own = (grant.task, grant.owner, grant.incarnation) == (self.task, beat.node, beat.incarnation)
+            if is_its_own and grant.number <= beat.sequence:  # nobody gives back what it has not sent yet
                 self._release(grant)
         if accepted is None or accepted[0] != beat.node:
             return False

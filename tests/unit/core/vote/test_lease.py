@@ -117,7 +117,7 @@ def test_only_a_grant_that_begins_is_worth_a_beat_at_once() -> None:
 @pytest.mark.parametrize(("number", "is_free"), [(4, False), (5, True), (6, True)])
 def test_a_release_frees_what_it_covers(number: int, *, is_free: bool) -> None:
     one = granter()
-    one.on_beat(beat("r2", 5, released=(grant(number),)), None, 10.1)
+    one.on_beat(beat("r2", 6, released=(grant(number),)), None, 10.1)
     assert (one.echo(10.1) is None) is is_free
     assert one.may_accept("r3", 10.1) is is_free
 
