@@ -445,7 +445,10 @@ class Agreement:
         elif not register.is_possible(answer):
             self.counters["answer_unfit"] += 1
         else:
+            known = register.state.learnt
             register.on_answer(answer, todo, now)
+            if register.state.learnt is not known:  # our own answer waits for a write, and may come behind this
+                self.leases.on_newer_value(register.value)
 
     @property
     def electors(self) -> tuple[NodeId, ...]:

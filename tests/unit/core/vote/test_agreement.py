@@ -358,6 +358,29 @@ def test_what_no_single_answer_proves_is_learnt_from_a_majority() -> None:
     assert [one for one, _ in effects.learnt] == [held.value]
 
 
+def test_an_elector_that_learns_by_its_own_round_that_a_task_is_leased_grants_it_as_all_others_do() -> None:
+    """Its answer to itself waits for a write, so it learns the value before it has accepted it."""
+    before = allocation_of(3, "robot2")
+    agreement = make(RegisterState(task="merge", accepted=Acceptance(ballot=ballot_of(), value=before), learnt=before))
+    leased = replace(before, revision=4, leased=True)
+    (asked,) = of(agreed(agreement.retune, command(), 101.0), do.SendPrepare)
+    ballot, held = asked.prepare.ballot, Acceptance(ballot=ballot_of(3, "robot2"), value=leased)
+    for name in ROBOTS[1:]:
+        promise = Promise(elector=name, task="merge", ballot=ballot, accepted=held)
+        effects = agreed(agreement.on_answer, ev.ElectorAnswered(answer=promise), 101.0)
+    (own,) = of(effects, do.SendAccept)
+    for name in ROBOTS[1:]:
+        yes = Accepted(elector=name, task="merge", ballot=ballot)
+        agreed(agreement.on_answer, ev.ElectorAnswered(answer=yes), 101.0)
+    assert agreement.values()["merge"] == leased
+    accept = ev.AcceptAsked(request=1, asker="robot1", accept=own.accept)
+    agreed(agreement.acceptor.on_accept, accept, 101.0)
+    heard = beat_of("robot2", 9, learnt=(("merge", 4, 3),))
+    agreement.leases.on_beat(heard, agreement.accepted(), 101.1)
+    (echo,) = agreement.leases.on_sent(1, 101.1).echoes
+    assert (echo.task, echo.owner, echo.number) == ("merge", "robot2", 9)
+
+
 def test_only_an_elector_s_answer_is_believed_or_one_about_what_was_accepted_here() -> None:
     """edge1 is no elector; if it had committed something, electors would have accepted it."""
     agreement = make()
