@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,17 @@ def as_written(tree: dict[str, Any]) -> str:
 def tasks_of(bed: Testbed, node: str) -> dict[str, str | None]:
     """{task: its owner}, as a node tells."""
     return {str(task["name"]): task["owner"] for task in bed.status(node)["tasks"]}
+
+
+def goes_by(bed: Testbed, node: str, revision: int) -> bool:
+    """Whether a node has taken a revision over, and its task has no problem."""
+    status = bed.status(node)
+    return status["fleet_revision"] == revision and not status["tasks"][0]["problems"]
+
+
+def has_more(stream: Stream, than: int) -> bool:
+    """Whether a stream has brought 20 answers more."""
+    return len(stream.back) > than + 20
 
 
 def test_a_task_comes_and_goes_by_the_document_while_a_stream_runs(tmp_path: Path) -> None:
@@ -91,6 +103,31 @@ def test_a_task_comes_and_goes_by_the_document_while_a_stream_runs(tmp_path: Pat
         bed.wait(lambda: len(stream.back) >= stream.sent, 60, "every sample is answered")
         assert stream.back == list(range(stream.sent))
         sub.undeclare()
+
+
+def test_a_task_becomes_exclusive_by_the_document_and_everybody_s_again_while_a_stream_runs(tmp_path: Path) -> None:
+    tree = echo_fleet(edges=2, stream_class="reliable")
+    tree["tasks"][TASK]["outputs"][0]["handover"] = "all"
+    with Testbed(tmp_path, tree) as bed:
+        bed.init()
+        bed.start()
+        bed.wait_settled()
+        operator, session = Operator(bed), bed.app("robot1")
+        stream = Stream(session)
+        bed.wait(lambda: matches(stream.publisher), 60, "the relay subscribes")
+        stream.start()
+        file = tmp_path / "agreed.yaml"
+        for is_exclusive, accepted in ((False, ()), (True, ("make-exclusive",)), (False, ("end-exclusive",))):
+            tree["tasks"][TASK]["exclusive"] = is_exclusive
+            file.write_text(as_written(tree))
+            operator.done("apply", file, "--yes", *(word for one in accepted for word in ("--accept", one)))
+            revision = bed.status("robot1")["fleet_revision"]
+            for name in bed.names:
+                bed.wait(partial(goes_by, bed, name, revision), 60, f"{name} goes by it and has no problem")
+            bed.wait(partial(has_more, stream, len(stream.back)), 60, "the stream flows on")
+        stream.end()
+        bed.wait(lambda: len(stream.back) >= stream.sent, 60, "every sample is answered")
+        assert stream.back == list(range(stream.sent))
 
 
 def test_up_with_another_file_founds_nothing_where_a_fleet_is(tmp_path: Path) -> None:

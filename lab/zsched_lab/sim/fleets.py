@@ -48,6 +48,8 @@ FORGETS = 0.15
 """So often a step of the faults is followed by a machine that begins its next life without documents that it had."""
 FORGETS_LAST = 0.5
 """So often it happens once more at rest, where no later change brings another document."""
+EXCLUDES = 0.4
+"""So often another document says whether the first task is exclusive, where the one before says the other."""
 FETCHED_S = 8.0
 DOWN_S = (0.05, 0.5, 3.0, 12.0)
 COMING = 0.35
@@ -86,12 +88,14 @@ class Schedule:
     _says_flags: Random = field(init=False)
     _comes: Random = field(init=False)
     _forgets: Random = field(init=False)
+    _excludes: Random = field(init=False)
 
     def __post_init__(self) -> None:
         self.rng = Random(f"fleets {self.seed}")
         self._says_flags = Random(f"flags {self.seed}")
         self._comes = Random(f"members {self.seed}")
         self._forgets = Random(f"forgotten {self.seed}")
+        self._excludes = Random(f"exclusive {self.seed}")
         self.fleet = fleet_of(self.rng)
         if self._comes.random() < AUTO:
             self.fleet = replace(self.fleet, is_auto=True, replace_s=2.0, away_s=6.0)
@@ -190,12 +194,15 @@ class Schedule:
             self.done["elector removed"] += 1
 
     def _document(self) -> None:
-        """Another document, with tasks that come and go; now and then with another length of leases."""
+        """Another document, with tasks that come and go, or are exclusive; now and then with other leases."""
         lease_s = self.rng.choice((self.fleet.timing.lease_s, self.fleet.timing.lease_s, 0.7, 1.6))
         value = self._newest()
         fleet = self.fleet if value is None else self.sim.documents.says.get(value.document, self.fleet)
         timing = replace(self.fleet.timing, lease_s=lease_s)
         first = fleet.tasks[0]
+        if self._excludes.random() < EXCLUDES:
+            first = replace(first, exclusive=not first.exclusive)
+            self.done["exclusive or not"] += 1
         extra = tuple(
             replace(first, name=name, exclusive=False) for name in ("other", "third") if self.rng.random() < 0.4
         )
