@@ -165,6 +165,21 @@ def test_an_owner_that_takes_the_file_while_it_works_is_exclusive_once_its_worke
     assert rollout.problems(owner) == ""
 
 
+def test_a_move_away_while_such_an_owner_s_worker_stops_waits_for_it() -> None:
+    rollout = Rollout(1)
+    owner = rollout.owner() or ""
+    rollout.sim.work.stop_s = (4.0,)
+    rollout.busy.add(owner)
+    rollout.reload(NEW, *ROBOTS, *EDGES)
+    rollout.run(3.0)  # the simulator raises when two work at once
+    assert rollout.at_work() == set()
+    successor = rollout.owner() or ""
+    assert successor != owner
+    assert f"{owner} works without a lease" in rollout.problems(successor)
+    rollout.run(3.0)
+    assert rollout.at_work() == {rollout.owner()} == {rollout.sim.working[TASK][0]}
+
+
 def test_a_move_right_after_such_an_owner_has_taken_the_file_does_not_meet_its_worker() -> None:
     """Found by the simulator: electors do not wait for a worker that has never had a lease."""
     assert play(plan(310003726)).violation == ""

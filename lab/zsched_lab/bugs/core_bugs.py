@@ -73,6 +73,8 @@ _TWINS = ("tests/unit/core/membership/test_twins.py",)
 _WITNESS = ("tests/unit/core/vote/test_witness.py",)
 _RESTORED = ("tests/sim/test_restored_state.py",)
 _ROLLOUT = ("tests/sim/test_exclusive_rollout.py",)
+_DOCUMENTS = ("tests/sim/test_fleet_changes.py",)
+_NODE_LEASES = ("tests/unit/core/test_node_leases.py",)
 _SEALING = ("tests/unit/core/executor/test_sealing.py",)
 _MEMBERSHIP = (
     "tests/sim/test_membership_rules.py",
@@ -256,6 +258,13 @@ REGISTER_BUGS = (
         _AGREEMENT,
     ),
     _bug(
+        "an elector's own round does not tell its leases",
+        AGREEMENT,
+        "if register.state.learnt is not known:  # our own",
+        "if False:  # our own",
+        _AGREEMENT,
+    ),
+    _bug(
         "accepted values are told as learnt",
         AGREEMENT,
         "values = tuple(value for value in self.values().values() if value.revision > 0)",
@@ -292,6 +301,13 @@ LEASE_BUGS = (
         LEASE,
         "elif grant.number not in self._ahead.get(elector, ()):",
         "else:",
+        _LEASE,
+    ),
+    _bug(
+        "numbers that were not sent yet are given back",
+        LEASE,
+        "if is_its_own and grant.number <= beat.sequence:",
+        "if is_its_own:",
         _LEASE,
     ),
     _bug(
@@ -414,11 +430,25 @@ LEASE_BUGS = (
         310003726,
     ),
     _bug(
+        "the number of an agreed document is taken for other leases",
+        "zsched.core.stages",
+        "lambda: leases.terms)",
+        "lambda at_first=leases.terms: at_first)",
+        _DOCUMENTS,
+    ),
+    _bug(
         "a former owner that is gone is not waited for",
         SEALING,
         "if name not in self._gone or name in owners}",
         "if name not in self._gone}",
         _SEALING,
+    ),
+    _bug(
+        "a worker that was never ready is waited for",
+        EXECUTOR,
+        "before = self._unleased_epoch\n        self._confirm()",
+        "before = self._unleased_epoch",
+        _NODE_LEASES,
     ),
     _bug(
         "old fleet file needs no lease",

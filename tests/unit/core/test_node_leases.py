@@ -13,6 +13,7 @@ from support.fleets import fleet_of, task_of
 from support.states import state_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
+from zsched.core.executor.handover import LEAVES_S
 from zsched.core.node import Node
 from zsched.core.values.beat import Grant
 from zsched.core.values.fleet import WorkerSpec, lease_terms
@@ -210,6 +211,6 @@ def test_a_worker_that_was_not_ready_when_it_was_told_to_stop_works_without_a_le
     assert node.executors["guard"].role.role is WorkerRole.IDLE
     if is_ready:
         node.handle(ev.WorkerChanged(task="guard", state=WorkerState.READY), 101.0)
-    batch = node.handle(ev.LearntAsked(request=1), 101.0)
+    batch = node.handle(ev.LearntAsked(request=1), 101.0 + LEAVES_S)
     (answer,) = [one.learnt for one in batch if isinstance(one, do.AnswerLearnt)]
     assert answer.unleased == (() if is_ready else ("guard",))

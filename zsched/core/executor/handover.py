@@ -52,7 +52,7 @@ A cold one is stopped then, also where it had to go idle at once: until then it 
 MAX_OLD = 3
 """Predecessors that are kept: a plan has to fit into a frame (`zsched.wire.codec`)."""
 LEAVES_S = 1.0
-"""A worker that has drained learns within this time that it is idle."""
+"""A worker that has drained, or that is ready only now, learns within this time that it is idle."""
 
 
 class Phase(StrEnum):
@@ -97,7 +97,7 @@ class Executor:
     _unleased_epoch: int | None = None
     """The epoch in which the worker here worked without a lease; ``None`` once it has confirmed its end."""
     _leaves_until: float = -math.inf
-    """Until when a worker that has drained, and so has left its epoch, learns that it is idle."""
+    """Until when a worker learns that it is idle that has drained, and so has left its epoch, or is ready only now."""
     _has_told: bool = False
     """The worker here has been told a role."""
     _is_owner_gone: bool = False
@@ -304,12 +304,19 @@ class Executor:
         if epoch == self.role.epoch and self.role.predecessor is not None:
             self._become(replace(self.role, predecessor=None), todo)
 
-    def on_worker_anew(self) -> None:
-        """The worker's process has ended, and its former role with it; or it is ready only now.
-
-        One that has not been ready shows no epoch, so it does not say that it has left one.
-        """
+    def on_worker_ended(self) -> None:
+        """The worker's process has ended, and its former role with it."""
         self._confirm()
+
+    def on_worker_ready(self, now: float) -> None:
+        """The worker is ready only now: until then it shows no epoch, so it does not say that it has left one.
+
+        It may have begun by what it was told before.
+        """
+        before = self._unleased_epoch
+        self._confirm()
+        if self._unleased_epoch != before:
+            self._leaves_until = now + LEAVES_S
 
     def _confirm(self) -> None:
         """Nobody works in the epoch without a lease any more, unless the worker here may: it was told nothing since."""

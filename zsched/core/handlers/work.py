@@ -137,8 +137,10 @@ def _on_worker(node: Stages, event: ev.WorkerChanged, todo: ToDo, now: float) ->
     story = node.workers.on_changed(event)
     if story is None:
         return
-    if event.state is not WorkerState.STARTING:
-        node.executors[event.task].on_worker_anew()
+    if event.state is WorkerState.READY:
+        node.executors[event.task].on_worker_ready(now)
+    elif event.state is not WorkerState.STARTING:
+        node.executors[event.task].on_worker_ended()
     if was_ready:
         node.agreement.leases.on_worker_lost(event.task)
     node.hangs.note_worker(event.task, event.state, now)

@@ -503,10 +503,10 @@ def test_a_worker_may_work_without_a_lease_until_it_has_said_that_it_has_stopped
 def test_a_worker_whose_process_ended_works_no_more_unless_the_next_one_may() -> None:
     one = edge()
     done(one.execute, allocation_of(1, "edge1"), 0.0)
-    one.on_worker_anew()
+    one.on_worker_ended()
     assert one.may_work_unleased(0.0), "the next process may work at once"
     done(one.execute, replace(allocation_of(1, "edge1"), leased=True), 1.0)
-    one.on_worker_anew()
+    one.on_worker_ended()
     assert not one.may_work_unleased(1.0)
 
 
@@ -514,12 +514,13 @@ def test_a_worker_that_is_ready_only_when_it_was_told_to_stop_has_nothing_to_con
     """It has shown no epoch, so it never says that it has left one."""
     one = edge()
     done(one.execute, allocation_of(1, "edge1"), 0.0)
-    one.on_worker_anew()
+    one.on_worker_ready(0.0)
     assert one.may_work_unleased(0.0), "ready, and the owner's"
     done(one.execute, replace(allocation_of(1, "edge1"), leased=True), 1.0)
     assert one.may_work_unleased(1.0)
-    one.on_worker_anew()
-    assert not one.may_work_unleased(1.0)
+    one.on_worker_ready(2.0)
+    assert one.may_work_unleased(2.0 + 0.9 * LEAVES_S), "it may have begun by what it was told before"
+    assert not one.may_work_unleased(2.0 + LEAVES_S)
 
 
 def test_an_owner_that_was_chosen_again_before_its_worker_has_confirmed_hears_it_then() -> None:

@@ -98,7 +98,7 @@ def test_whoever_may_work_without_a_lease_is_waited_for_and_named(said: Learnt |
 def test_an_owner_waits_for_its_own_worker_too_which_nobody_else_knows_to_work_without_a_lease() -> None:
     executor = Executor(spec=OPEN, me="e1", has_streams=False)
     done(executor.execute, value(), 0.0)
-    one = Sealing(fleet=NEW, me="e1", executors={"guard": executor}, over_at=YOUNG_S)
+    one = Sealing(fleet=NEW, me="e1", executors={"guard": executor}, over_at=YOUNG_S, terms=lambda: lease_terms(NEW))
     executor.adopt(EXCLUSIVE, ToDo(), 10.0, is_agreed_leased=False)
     assert one.to_ask(values(), 10.0) == ("e2",), "nobody asks itself"
     one.on_answer(answer())
