@@ -142,9 +142,13 @@ class StandbyInputs(Generic[SourceT]):
             self._bytes -= sum(len(done.sample.payload) for done in line) - sum(len(one.sample.payload) for one in left)
         return before - len(self._again) - sum(len(line) for line in self._kept.values())
 
-    def begin(self) -> None:
-        """This worker is the owner: everything that is kept is to be processed again."""
-        kept = (done for line in self._kept.values() for done in line)
+    def begin(self, *, is_settled: bool = False) -> None:
+        """This worker is the owner: everything that is kept is to be processed again.
+
+        ``is_settled``: no other state is on its way, so what has its result is not. What was to be processed again
+        before still is: a lease begins an epoch once more, also while a state that has come is caught up with.
+        """
+        kept = (done for line in self._kept.values() for done in line if not is_settled or done.quiet_at is None)
         self._again = deque(sorted((*self._again, *kept), key=_turn_of))
         self._kept.clear()
         self._bytes = 0

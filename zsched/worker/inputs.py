@@ -278,14 +278,8 @@ class Dispatcher:
             self._epoch = epoch
             self._is_begin_due = False
             self._begun += 1
-            self._backlog.begin()
-            if not self._is_held and self._first is None:
-                self._settle_state(is_restored=False)
+            self._backlog.begin(is_settled=not self._is_held and self._first is None)
             self._wake.notify()
-
-    def _settle_state(self, *, is_restored: bool) -> None:
-        """Our state stays, or a predecessor's has taken its place."""
-        self._backlog.settle(is_restored=is_restored, now=monotonic_s())
 
     def forget(self, epoch: int) -> None:
         """The epoch is over for this worker: what has not ended will not."""
@@ -351,7 +345,7 @@ class Dispatcher:
             if first is not None:
                 is_restored = first()
                 with self._wake:
-                    self._settle_state(is_restored=is_restored)
+                    self._backlog.settle(is_restored=is_restored, now=monotonic_s())
             if claimed is not None:
                 self._process(claimed)
             self._is_busy = False

@@ -32,6 +32,8 @@ from zsched.worker import Output, Received, Worker
 from zsched.worker import backlog as worker_backlog
 from zsched.worker import inputs as worker_inputs
 from zsched.worker.backlog import MAX_WITHHELD
+from zsched.worker.snapshot import Offer, StateBook
+from zsched.worker.troubles import Troubles
 
 PAIRS = 5
 """Of two signals close together that are tried."""
@@ -728,6 +730,46 @@ def test_what_was_withheld_for_want_of_a_lease_goes_out_before_what_comes_with_i
     gate.set()
     until(lambda: len(relay.outputs) >= 2, "both outputs")
     assert [payload for _, payload in relay.outputs] == [b"a", b"b"]
+
+
+def test_a_lease_that_comes_while_a_state_is_caught_up_with_takes_nothing_from_it(relay: Relay, tmp_path: Path) -> None:
+    """What was processed before the state came was acknowledged, and then missing in the state: nobody counted it."""
+    total, taken, gate, book = [0], list[int](), threading.Event(), StateBook()
+    gate.set()
+
+    def add(received: Received) -> None:
+        taken.append(int(received.payload.to_bytes()))
+        gate.wait(60)
+        total[0] += taken[-1]
+
+    def tell(lease_until_s: float) -> None:
+        role = Role(task="t", role=WorkerRole.ACTIVE, epoch=3, lease_until_s=lease_until_s, predecessor="edge2")
+        relay.role = role
+        relay.session.put(ROLE_KEY, wire.encode(role))
+
+    book.ready()
+    book.work(2)
+    offer = Offer(relay.session, KEYS.snapshot("edge2", "t"), lambda: b"100", Troubles(lambda *_: None), book)
+    with Worker.from_env(environment(relay, tmp_path), handles_signals=False) as worker:
+        worker.on_snapshot(lambda content: total.__setitem__(0, int(content)))
+        worker.subscribe("{prefix}/*/in", add, keep_last=None)
+        worker.ready()
+        until(lambda: KEYS.worker("edge1", "t", 3) in relay.tokens, "the ready token")
+        for _ in range(5):
+            relay.put(b"1")
+        until(lambda: total == [5], "as a standby, without an answer")
+        gate.clear()
+        tell(0.0)
+        until(lambda: len(taken) == 6, "the state, and the first sample once more")
+        tell(monotonic_s() + 60.0)
+        until(lambda: worker.role == relay.role, "the lease")
+        begun = threading.Event()
+        worker._errands.put(begun.set)
+        assert begun.wait(60)
+        gate.set()
+        until(lambda: worker._dispatcher.is_still(0.0), "all of it")
+        assert total == [105]
+    offer.undeclare()
 
 
 def test_what_comes_behind_the_end_of_an_epoch_is_answered_in_the_next_one(relay: Relay, echo: Echo) -> None:

@@ -80,6 +80,20 @@ def test_what_was_answered_is_processed_again_only_for_a_state_that_took_the_pla
         assert turns(backlog) == expected
 
 
+def test_a_begin_behind_a_state_that_has_come_takes_nothing_from_what_is_processed_again_for_it() -> None:
+    """A lease comes while the worker catches up: its role begins once more."""
+    backlog = StandbyInputs[Input]()
+    for turn in (1, 2, 3):
+        backlog.keep(done(turn, quiet_at=99.0))
+    backlog.begin()
+    backlog.settle(is_restored=True, now=100.0)
+    assert backlog.take() is not None
+    backlog.keep(done(4, quiet_at=100.0))  # it went into the state that has come
+    backlog.keep(done(5))
+    backlog.begin(is_settled=True)
+    assert turns(backlog) == [2, 3, 5]
+
+
 def test_of_an_input_that_keeps_the_newest_only_those_wait_and_nothing_is_lost() -> None:
     backlog, newest = StandbyInputs[Input](), Input(on_sample=lambda _: None, keep_last=2)
     assert [backlog.keep(done(turn, source=newest)) for turn in range(4)] == [[], [], [], []]
