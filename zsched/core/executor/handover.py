@@ -102,6 +102,8 @@ class Executor:
     """The worker here has been told a role."""
     _is_owner_gone: bool = False
     """The owner went during its epoch and is not back: nobody asks for its worker's snapshot."""
+    _predecessor: NodeId | None = None
+    """Whose worker is asked for the state that this node's epoch begins with, also by one that stops meanwhile."""
     _current: Slot | None = None
     _old: tuple[_Old, ...] = ()
     """The predecessors, the oldest first."""
@@ -260,13 +262,14 @@ class Executor:
     def _take_up(self, before: NodeId | None, todo: ToDo) -> None:
         """The worker here is the owner's from now on; ``before``: whose was, ``None`` where nobody is to be asked."""
         self._role_deadline = math.inf
+        self._predecessor = None if before == self.me else before
         role = Role(
             task=self.spec.name,
             role=WorkerRole.ACTIVE,
             epoch=self.epoch,
             # An exclusive task's worker may run at once, but works only from its first lease on.
             lease_until_s=0.0 if self.is_leased else None,
-            predecessor=None if before == self.me else before,
+            predecessor=self._predecessor,
         )
         self._wake_worker(role, todo)
         self._become(role, todo)
@@ -288,7 +291,7 @@ class Executor:
             if self.is_leased:
                 self.leave(todo)  # it works again with its first lease
             else:
-                came_from = self.role.predecessor
+                came_from = self._predecessor
                 role = Role(task=self.spec.name, role=WorkerRole.ACTIVE, epoch=self.epoch, predecessor=came_from)
                 self._wake_worker(role, todo)
                 self._become(role, todo)
@@ -301,6 +304,8 @@ class Executor:
         """
         if epoch == self._unleased_epoch:
             self._confirm()
+        if epoch == self.epoch:
+            self._predecessor = None
         if epoch == self.role.epoch and self.role.predecessor is not None:
             self._become(replace(self.role, predecessor=None), todo)
 
@@ -368,13 +373,12 @@ class Executor:
         """Exclusive tasks: this node's worker may work until ``until_s`` (again, after it had to stop)."""
         if self.owner != self.me or until_s <= now or until_s == self.role.lease_until_s:
             return
-        came_from = self.role.predecessor
         role = Role(
             task=self.spec.name,
             role=WorkerRole.ACTIVE,
             epoch=self.epoch,
             lease_until_s=until_s,
-            predecessor=came_from,
+            predecessor=self._predecessor,
         )
         self._become(role, todo)
 
@@ -443,6 +447,8 @@ class Executor:
     def on_gone(self, node: NodeId, todo: ToDo) -> None:
         """A peer is gone: nothing more comes from its slots, and the worker here waits no longer for its state."""
         self._is_owner_gone = self._is_owner_gone or node == self.owner
+        if self._predecessor == node:
+            self._predecessor = None
         if self.role.predecessor == node:
             self._become(replace(self.role, predecessor=None), todo)
         self._drop(tuple(old for old in self._old if old.slot.owner == node), f"{node} is gone", todo)

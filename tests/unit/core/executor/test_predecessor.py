@@ -1,5 +1,7 @@
 """Who is asked for the state of an epoch: the owner of the one before, while it is there."""
 
+import pytest
+
 from support.allocations import allocation_of
 from support.fleets import task_of
 from support.todos import done
@@ -74,6 +76,25 @@ def test_a_lease_keeps_the_predecessor() -> None:
     execute(one, "edge2", 1)
     execute(one, "edge1", 2)
     assert role(done(one.set_lease, 5.0, 1.0)).predecessor == "edge2"
+
+
+def test_so_does_one_that_comes_after_the_worker_had_to_stop() -> None:
+    """Its worker may still be starting, or waiting for the state: it works in that epoch all the same."""
+    one = edge(exclusive=True)
+    execute(one, "edge2", 1)
+    execute(one, "edge1", 2)
+    assert role(done(one.leave)).role is WorkerRole.IDLE
+    assert role(done(one.set_lease, 5.0, 1.0)).predecessor == "edge2"
+
+
+@pytest.mark.parametrize(("step", "what"), [("on_gone", "edge2"), ("on_role_ended", 2)])
+def test_but_not_where_that_machine_has_gone_meanwhile_or_the_worker_had_the_state(step: str, what: object) -> None:
+    one = edge(exclusive=True)
+    execute(one, "edge2", 1)
+    execute(one, "edge1", 2)
+    done(one.leave)
+    done(getattr(one, step), what)
+    assert role(done(one.set_lease, 5.0, 1.0)).predecessor is None
 
 
 def test_an_owner_that_goes_while_it_is_asked_is_waited_for_no_longer() -> None:
