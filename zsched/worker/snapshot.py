@@ -513,12 +513,17 @@ class Restorer:
         guarded(self._run, *arguments, name="zsched restore", is_lasting=False).start()
         return True
 
-    def deliver(self) -> None:
-        """Hand over what has come, in the dispatch thread, and let the inputs follow; nothing while it is awaited."""
+    def deliver(self, epoch: int) -> None:
+        """Hand over what has come, in the dispatch thread, and let the inputs follow; nothing while it is awaited.
+
+        What has come for another epoch waits for that one's own call, behind which its inputs are processed.
+        """
         with self._lock:
-            result, self._result = self._result, None
-        if result is not None:
-            self._inputs.release(lambda: self._hand_over(result))
+            result = self._result
+            if result is None or result.epoch != epoch:
+                return
+            self._result = None
+        self._inputs.release(lambda: self._hand_over(result))
 
     def _run(self, epoch: int, predecessor: NodeId, gone: threading.Event, then: Callable[[], None]) -> None:
         started = monotonic_s()

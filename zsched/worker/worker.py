@@ -532,7 +532,7 @@ class Worker:
             if now.role is WorkerRole.ACTIVE:
                 self._show_role(role.epoch)
             self._look_for_end(role.epoch)
-        self._restorer.deliver()
+        self._restorer.deliver(role.epoch)
 
     def _show_role(self, epoch: int) -> None:
         """Show that we work in ``epoch``, with the state that it begins with: before `ready` nobody can know that."""

@@ -472,9 +472,9 @@ def restored(
     restorer.note(role)
     if restorer.begin(role, lambda: done.put(None)):
         assert restorer.is_pending
-        restorer.deliver()  # nothing yet, or already there: either way no harm
+        restorer.deliver(role.epoch)  # nothing yet, or already there: either way no harm
         done.get(timeout=PATIENCE_S)
-        restorer.deliver()
+        restorer.deliver(role.epoch)
     return restorer, inputs, got
 
 
@@ -557,6 +557,28 @@ def test_a_role_without_the_predecessor_of_before_ends_the_wait_of_its_epoch_alo
     assert then.wait(PATIENCE_S)
 
 
+def test_a_state_that_has_come_waits_until_its_own_epoch_begins() -> None:
+    """The wait of an epoch that is over ends just then: inputs would go on before this one has begun."""
+    inputs, got = Inputs(), list[bytes]()
+    goes_on, later = threading.Event(), threading.Event()
+
+    def asked(_node: str, epoch: int, _timeout_s: float, _is_gone: Callable[[], bool]) -> bytes:
+        assert epoch == 5 or goes_on.wait(PATIENCE_S)
+        return f"of {epoch}".encode()
+
+    restorer = Restorer(asked, "edge2", inputs, list[str]().append, StateBook())
+    restorer.register(got.append, 1.0)
+    for epoch, then in ((3, lambda: None), (5, later.set)):
+        restorer.note(active(epoch))
+        assert restorer.begin(active(epoch), then)
+    assert later.wait(PATIENCE_S)
+    goes_on.set()
+    restorer.deliver(3)
+    assert (got, restorer.is_pending, "release" in inputs.said) == ([], True, False)
+    restorer.deliver(5)
+    assert (got, restorer.is_pending) == ([b"of 5"], False)
+
+
 async def _restore_later() -> None:
     raise AssertionError("it is never run")
 
@@ -581,7 +603,7 @@ def test_a_callback_that_fails_is_a_cold_start(fail: Callable[[], object]) -> No
     restorer = Restorer(lambda _node, _epoch, _timeout_s, _is_gone: b"state", "edge2", inputs, told.append, StateBook())
     restorer.register(lambda _content: fail(), 1.0)  # type: ignore[arg-type] # it fails on purpose
     restorer.note(active(3))
-    restorer.begin(active(3), restorer.deliver)
+    restorer.begin(active(3), lambda: restorer.deliver(3))
     until(lambda: told, "the node hears of it")
     assert not restorer.is_pending
     assert restorer.cold_starts == 1
