@@ -332,10 +332,11 @@ class Worker:
         if self._restorer.has_callback:
             raise RuntimeError("Worker.on_snapshot a second time: one callback takes the state")
         self._errands.put(self._state_link.open)  # before it is needed, not in a move
-        self._restorer.register(restore, timeout_s)
         self._dispatcher.remember(lambda: self.role.role is WorkerRole.IDLE)
-        role = self._role
-        self._restorer.note(role)
+        with self._lock:  # a role that comes just now is noted here or behind this, with the callback
+            self._restorer.register(restore, timeout_s)
+            role = self._role
+            self._restorer.note(role)
         self._errands.put(lambda: self._begin(role))
 
     def ready(self) -> None:

@@ -732,6 +732,40 @@ def test_what_was_withheld_for_want_of_a_lease_goes_out_before_what_comes_with_i
     assert [payload for _, payload in relay.outputs] == [b"a", b"b"]
 
 
+def test_a_role_that_comes_while_the_worker_says_that_it_takes_a_state_is_no_cold_start(
+    relay: Relay, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its role was noted before the callback was there, and read before it was the role: nobody asked for the state."""
+    book, got = StateBook(), list[bytes]()
+    book.ready()
+    book.work(2)
+    offer = Offer(relay.session, KEYS.snapshot("edge2", "t"), lambda: b"100", Troubles(lambda *_: None), book)
+    with Worker.from_env(environment(relay, tmp_path), handles_signals=False) as worker:
+        restorer, noted, goes_on = worker._restorer, threading.Event(), threading.Event()
+        note = restorer.note
+
+        def slowly(role: Role) -> None:
+            note(role)
+            if role.epoch == 3 and not noted.is_set():
+                noted.set()
+                goes_on.wait(60)
+
+        monkeypatch.setattr(restorer, "note", slowly)
+        relay.role = Role(task="t", role=WorkerRole.ACTIVE, epoch=3, predecessor="edge2")
+        relay.session.put(ROLE_KEY, wire.encode(relay.role))
+        assert noted.wait(60)
+        saying = threading.Thread(target=lambda: worker.on_snapshot(got.append))
+        saying.start()
+        saying.join(0.3)
+        goes_on.set()
+        saying.join(60)
+        worker.ready()
+        until(lambda: worker.role == relay.role, "it works")
+        until(lambda: f"{ROLE_KEY}/3" in relay.tokens, "and shows that")
+        assert got == [b"100"]
+    offer.undeclare()
+
+
 def test_a_lease_that_comes_while_a_state_is_caught_up_with_takes_nothing_from_it(relay: Relay, tmp_path: Path) -> None:
     """What was processed before the state came was acknowledged, and then missing in the state: nobody counted it."""
     total, taken, gate, book = [0], list[int](), threading.Event(), StateBook()
