@@ -22,6 +22,7 @@ from zsched.core.values.model import MAX_REASON, NodeId, TaskId
 from zsched.core.values.plan import ReadyWhen
 from zsched.core.values.profile import WorkerState
 from zsched.core.values.words import WAS_READY
+from zsched.guard import guarded
 from zsched.runtime.sessions import SessionsRead
 from zsched.wire.keyspace import Keyspace, counter
 
@@ -35,6 +36,7 @@ NO_TOKEN: Final = (
 OTHER_NETWORK: Final = "did it open $ZSCHED_ZENOH_CONFIG, or does it subscribe to another key?"
 REJOIN_S: Final = 4.0
 """A worker that runs already is seen so soon after its relay's start: it dials at least once a second."""
+UNSEEN: Final = "the relay that was started since does not see its token"
 
 _log = logging.getLogger("zsched.crew")
 
@@ -69,6 +71,8 @@ class Crew:
         self._doubted: frozenset[TaskId] = frozenset()
         """Of which a problem says that matching does not tell whether the worker is there."""
         self._relay_at = -math.inf
+        self._relays = 0
+        """Which start or end of a relay was the newest."""
         self._lock = threading.Lock()  # an end and a token's end come from two threads
 
     def _take(self, tasks: tuple[TaskSpec, ...]) -> None:
@@ -141,10 +145,27 @@ class Crew:
     def on_relay_started(self) -> None:
         """A relay runs: workers that join it in the next moments may have been there before it."""
         self._relay_at = monotonic_s()
+        with self._lock:
+            self._relays += 1
+            guarded(self._miss, self._relays, name="zsched missed", is_lasting=False).start()
+
+    def _miss(self, relay: int) -> None:
+        """Who was ready and does not come to this relay is not ready any more: what it never saw, it never sees go."""
+        threading.Event().wait(REJOIN_S)
+        with self._lock:
+            if relay != self._relays:  # it has ended since
+                return
+            for task in sorted(self._seen - self._lost.keys() - self._matching):
+                life, tokens = self._lives.get(task), self._tokens.get(task, set())
+                is_there = bool(tokens) if life is None else life in tokens
+                supervisor = self._supervisor_of(task)
+                if not is_there and supervisor is not None:
+                    self._tell(supervisor, task, life or 0, is_ready=False, reason=UNSEEN)
 
     def on_relay_ended(self) -> None:
         """No relay runs: the next one tells anew which tokens it sees, some of them before it says that it runs."""
         with self._lock:
+            self._relays += 1
             self._tokens.clear()
 
     def on_token(self, seen: WorkerSeen) -> None:

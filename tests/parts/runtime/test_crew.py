@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -364,6 +365,37 @@ def test_a_new_relay_tells_anew_which_tokens_are_there(house: House) -> None:
     house.crew.on_relay_started()
     adopt(house, "others", "alone")
     assert house.states("alone")[-1] is WorkerState.READY, "it may tell so before it says that it runs"
+
+
+@pytest.mark.parametrize("task", ["alone", "token"])
+def test_a_worker_that_a_new_relay_never_sees_is_not_ready_any_more(
+    house: House, monkeypatch: pytest.MonkeyPatch, task: str
+) -> None:
+    """It froze, or ended, while no relay was there to see its token go; one that comes back is ready again."""
+    monkeypatch.setattr(crew_module, "REJOIN_S", 0.1)
+    life = 7
+    if task == "token":
+        house.supervisor.start(task)
+        life = until(lambda: house.crew.life_of(task), "it runs")
+    seen = WorkerSeen(node="edge1", task=task, incarnation=str(life), is_present=True)
+    house.crew.on_token(seen)
+    house.crew.on_relay_ended()
+    house.crew.on_token(seen)
+    house.crew.on_relay_started()
+    time.sleep(0.3)
+    assert house.states(task)[-1] is WorkerState.READY, "this relay sees it"
+    house.crew.on_relay_started()
+    house.crew.on_relay_ended()
+    time.sleep(0.3)
+    assert house.states(task)[-1] is WorkerState.READY, "no relay is there that could"
+    house.crew.on_relay_started()
+    until(lambda: house.states(task)[-1] is not WorkerState.READY, "the next one does not")
+    assert crew_module.UNSEEN in house.reasons(task)[-1]
+    if task == "token":
+        until(lambda: "not ready again within 4 s" in str(house.reasons(task)), "it is started again")
+    else:
+        house.crew.on_token(seen)
+        assert house.states(task)[-1] is WorkerState.READY
 
 
 def test_a_match_that_comes_before_the_supervisor_has_heard_of_the_task_counts(house: House) -> None:
