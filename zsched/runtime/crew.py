@@ -317,6 +317,9 @@ class Crew:
             match = self._matches.get(task)
             if match is not None and match.is_matched and self.supervisor is not None:
                 self._tell(self.supervisor, task, incarnation, is_ready=True, reason="it matches already")
+            elif incarnation in self._tokens.get(task, ()) and self.supervisor is not None:
+                self._strays.pop(task, None)  # a program that starts in no time is seen before we hear of its start
+                self._tell(self.supervisor, task, incarnation, is_ready=True, reason="its token")
 
     def on_exited(self, task: TaskId, incarnation: int, returncode: int, reason: str) -> None:
         """The supervisor: a worker process has ended."""

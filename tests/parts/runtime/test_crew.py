@@ -95,6 +95,15 @@ def test_a_process_that_never_matches_is_told_what_it_lacks(house: House) -> Non
     assert "did it open $ZSCHED_ZENOH_CONFIG, or does it subscribe to another key?" in str(house.reasons("node"))
 
 
+def test_a_token_that_comes_before_the_word_of_its_process_s_start_counts(house: House) -> None:
+    """On a busy machine a program that starts in some milliseconds was never ready, and killed at its deadline."""
+    house.crew.on_token(WorkerSeen(node="edge1", task="token", incarnation="100001", is_present=True))
+    house.supervisor.start("token")
+    until(lambda: house.crew.life_of("token") == 100001, "it runs")
+    until(lambda: house.supervisor.states()["token"] is WorkerState.READY, "the supervisor knows")
+    assert house.states("token")[-2:] == [WorkerState.STARTING, WorkerState.READY]
+
+
 def test_a_worker_that_was_ready_is_not_told_what_it_has_done_already(house: House) -> None:
     """It was stopped or hangs: how to get ready is no news to it, and it is not starting."""
     house.supervisor.start("token")
