@@ -291,6 +291,10 @@ class TaskRelay:
         for problem in self._streams.rejoin(session, own_ids):
             self._problem(problem)
             self._broken |= self._all_routes()  # only the next slot opens it again
+        for epoch, state in self._slots.items():
+            if state.slot.ready_when is ReadyWhen.TOKEN:
+                for source in self._streams.inputs.values():
+                    source.part(epoch, is_parted=True)  # until its token is seen by this session
         self._services.rejoin(session, self._slots)
         for state in self._slots.values():
             for route in state.slot.routes:
@@ -450,6 +454,8 @@ class TaskRelay:
         if route.direction is Direction.INPUT:
             source = self._streams.input_of(route)
             source.open(epoch, route, acks, self._stamps if _replays(slot) else None)
+            if is_counted and not self._tokens.workers(slot.owner, self._task):
+                source.part(epoch, is_parted=True)  # nobody else who subscribes, a recorder, is taken for the worker
             return
         sink = self._streams.output_of(route)
         sink.know(route.from_expr, notes_stamps=_replays(slot))

@@ -1,0 +1,108 @@
+"""What a task's relay holds back while its owner's worker is away, whoever else subscribes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import pytest
+import zenoh
+
+from support.sessions import hub_and_neighbour
+from support.waiting import until
+from zsched.core.relay_protocol import StreamAck, StreamAcks
+from zsched.core.values.plan import (
+    Direction,
+    ReadyWhen,
+    Route,
+    RoutePhase,
+    RoutePlan,
+    Slot,
+    StreamClass,
+    StreamCount,
+    StreamSettings,
+)
+from zsched.ipc.pipe import decode_end
+from zsched.relay.graph import GraphMirror
+from zsched.relay.open_streams import OpenStreams
+from zsched.relay.streams import greetings
+from zsched.relay.streams.acks import Acks
+from zsched.relay.streams.receive import undeclare
+from zsched.relay.task import TaskRelay
+from zsched.relay.tokens import Tokens
+from zsched.wire import codec as wire
+from zsched.wire.keyspace import END_CHUNK, Keyspace
+
+KEYS = Keyspace("test")
+IN = Route(
+    stream="t/in/0",
+    direction=Direction.INPUT,
+    from_expr="robot1/in",
+    to_expr="edge1/t/robot1/in",
+    settings=StreamSettings(stream_class=StreamClass.RELIABLE, depth=100),
+)
+
+
+class Scene:
+    """A robot's relay of one task, whose owner is settled; the test is the owner's machine."""
+
+    def __init__(self, relay: zenoh.Session, other: zenoh.Session) -> None:
+        self.relay, self.other = relay, other
+        self.tokens = Tokens(relay, KEYS, lambda _seen: None, lambda _node, _ended: None, self._wake)
+        acks = Acks(relay, KEYS, "robot1", self.tokens.has_worker)
+        self.streams = OpenStreams(relay, frozenset({str(relay.zid())}))
+        graph = GraphMirror(relay, None, "robot1")
+        self.task = TaskRelay(relay, "t", self.tokens, acks, lambda _word: None, graph, self.streams)
+
+    def _wake(self) -> None:
+        self.task.wake()
+
+    def settle(self) -> None:
+        slot = Slot(epoch=3, owner="edge1", routes=(IN,), ready_when=ReadyWhen.TOKEN)
+        self.task.apply(RoutePlan(task="t", phase=RoutePhase.CLOSE, current=slot))
+        until(lambda: (source := self.streams.inputs.get(IN.stream)) is not None and source.has_way, "the way")
+
+    def put(self, count: int) -> None:
+        before = self.count().messages
+        for _ in range(count):
+            self.other.put("robot1/in", b"x", congestion_control=zenoh.CongestionControl.BLOCK)
+        until(lambda: self.count().messages == before + count, "the relay has them")
+
+    def count(self) -> StreamCount:
+        return next(iter(self.task.counts()), StreamCount(stream="t/in/0"))
+
+
+@pytest.fixture
+def scene(monkeypatch: pytest.MonkeyPatch) -> Iterator[Scene]:
+    monkeypatch.setattr(greetings, "FOREIGN_S", 0.3)
+    with hub_and_neighbour() as (relay, other):
+        made = Scene(relay, other)
+        yield made
+        made.task.end()
+
+
+def test_what_comes_while_the_worker_is_away_waits_for_it_also_beside_a_recorder(scene: Scene) -> None:
+    """This relay has never seen the worker: a recorder of everything was taken for it after a while."""
+    recorded: list[str] = []
+    recorder = scene.other.declare_subscriber("**", lambda sample: recorded.append(str(sample.key_expr)))
+    scene.settle()
+    scene.put(5)
+    time.sleep(1.0)
+    assert (scene.count().drops, scene.count().in_flight) == ((), 5)
+    assert IN.to_expr not in recorded
+    got: list[bytes] = []
+
+    def greeted(sample: zenoh.Sample) -> None:
+        marker, info = decode_end(sample.payload.to_bytes()), sample.source_info
+        assert marker is not None
+        assert info is not None
+        ack = StreamAck(eid=info.source_id.eid, first=0, arrived=marker.count, processed=marker.count)
+        key = KEYS.ack("edge1", "t", "7", str(scene.relay.zid()))
+        scene.other.put(key, wire.encode(StreamAcks(acks=(ack,))))
+
+    ends = scene.other.declare_subscriber(f"{IN.to_expr}/{END_CHUNK}", greeted)
+    data = scene.other.declare_subscriber(IN.to_expr, lambda sample: got.append(sample.payload.to_bytes()))
+    token = scene.other.liveliness().declare_token(KEYS.worker("edge1", "t", "7"))
+    until(lambda: got == [b"x"] * 5, "the worker gets all of it")
+    for one in (token, data, ends, recorder):
+        undeclare(one)
