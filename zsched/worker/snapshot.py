@@ -510,7 +510,10 @@ class Restorer:
                 return self._result is None  # under way: a second asker (a lease was renewed) waits like the first
             self._has_begun = True
             arguments = (role.epoch, noted.predecessor, self._is_gone, then)
-        guarded(self._run, *arguments, name="zsched restore", is_lasting=False).start()
+        try:
+            guarded(self._run, *arguments, name="zsched restore", is_lasting=False).start()
+        except RuntimeError:  # no thread is to be had; who waits for nothing would never be the owner
+            self._run(*arguments)
         return True
 
     def deliver(self, epoch: int) -> None:
@@ -527,7 +530,11 @@ class Restorer:
 
     def _run(self, epoch: int, predecessor: NodeId, gone: threading.Event, then: Callable[[], None]) -> None:
         started = monotonic_s()
-        content = self._fetch(predecessor, epoch, self._timeout_s, gone.is_set)
+        try:
+            content = self._fetch(predecessor, epoch, self._timeout_s, gone.is_set)
+        except Exception as error:  # noqa: BLE001 - no room for the state, say: whatever it is, the inputs wait for us
+            _log.exception("the state could not be asked for")
+            content = f"failed: {type(error).__name__}: {error}"
         with self._lock:
             if self._noted is not None and self._noted.epoch == epoch:  # else the next epoch's fetch goes on
                 self._result = _Fetched(epoch, predecessor, content, monotonic_s() - started)

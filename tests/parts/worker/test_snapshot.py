@@ -579,6 +579,38 @@ def test_a_state_that_has_come_waits_until_its_own_epoch_begins() -> None:
     assert (got, restorer.is_pending) == ([b"of 5"], False)
 
 
+@pytest.mark.parametrize("error", [MemoryError("32 MiB"), zenoh.ZError("closed"), RuntimeError("no thread")])
+def test_a_wait_that_fails_is_a_cold_start_and_no_worker_that_stands_still(error: Exception) -> None:
+    def fails(_node: str, _epoch: int, _timeout_s: float, _is_gone: Callable[[], bool]) -> bytes:
+        raise error
+
+    inputs, told, then = Inputs(), list[str](), threading.Event()
+    restorer = Restorer(fails, "edge2", inputs, told.append, StateBook())
+    restorer.register(lambda _content: None, 1.0)
+    restorer.note(active(3))
+    assert restorer.begin(active(3), then.set)
+    assert then.wait(PATIENCE_S), "the worker hears of its end"
+    restorer.deliver(3)
+    assert (restorer.is_pending, inputs.said) == (False, ["hold", "release"])
+    assert told == [f"began epoch 3 without the state of edge1: failed: {type(error).__name__}: {error}"]
+
+
+def test_where_there_is_no_thread_to_wait_in_the_caller_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+    def none(_self: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    inputs, got, then = Inputs(), list[bytes](), threading.Event()
+    restorer = Restorer(lambda *_: b"state", "edge2", inputs, list[str]().append, StateBook())
+    restorer.register(got.append, 1.0)
+    restorer.note(active(3))
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, "start", none)
+        assert restorer.begin(active(3), then.set)
+    assert then.is_set()
+    restorer.deliver(3)
+    assert (got, restorer.is_pending) == ([b"state"], False)
+
+
 async def _restore_later() -> None:
     raise AssertionError("it is never run")
 
