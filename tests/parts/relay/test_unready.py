@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from functools import partial
 
 import pytest
 import zenoh
@@ -57,8 +58,8 @@ class Scene:
     def _wake(self) -> None:
         self.task.wake()
 
-    def settle(self) -> None:
-        slot = Slot(epoch=3, owner="edge1", routes=(IN,), ready_when=ReadyWhen.TOKEN)
+    def settle(self, route: Route = IN, ready: ReadyWhen = ReadyWhen.TOKEN) -> None:
+        slot = Slot(epoch=3, owner="edge1", routes=(route,), ready_when=ready)
         self.task.apply(RoutePlan(task="t", phase=RoutePhase.CLOSE, current=slot))
         until(lambda: (source := self.streams.inputs.get(IN.stream)) is not None and source.has_way, "the way")
 
@@ -106,3 +107,27 @@ def test_what_comes_while_the_worker_is_away_waits_for_it_also_beside_a_recorder
     until(lambda: got == [b"x"] * 5, "the worker gets all of it")
     for one in (token, data, ends, recorder):
         undeclare(one)
+
+
+LATCHED = Route(
+    stream="t/in/0",
+    direction=Direction.INPUT,
+    from_expr="robot1/in",
+    to_expr="edge1/t/robot1/in",
+    settings=StreamSettings(stream_class=StreamClass.LATEST, keep_last=1),
+)
+
+
+def test_a_foreign_worker_that_is_back_before_anybody_has_looked_gets_the_kept_values(scene: Scene) -> None:
+    """Its publisher puts a map once: without it the next life of the worker never had one."""
+    scene.settle(LATCHED, ReadyWhen.MATCHING)
+    scene.put(1)
+    for _ in range(5):
+        got: list[bytes] = []
+        life = scene.other.declare_subscriber(LATCHED.to_expr, partial(_take, got))
+        until(partial(bool, got), "the map", 5.0)
+        undeclare(life)
+
+
+def _take(got: list[bytes], sample: zenoh.Sample) -> None:
+    got.append(sample.payload.to_bytes())

@@ -182,6 +182,11 @@ class InputStream:
         slot = self._slots.get(epoch)
         return slot is not None and slot.outlet.is_matching
 
+    def take_parted(self, epoch: int) -> bool:
+        """Whether nobody subscribed to the slot's keys for a moment since the last time (`Outlet.take_parted`)."""
+        slot = self._slots.get(epoch)
+        return slot is not None and slot.outlet.take_parted()
+
     @property
     def has_way(self) -> bool:
         """True when what comes goes to an owner, or waits for the one that is flipped to."""

@@ -22,7 +22,7 @@ import logging
 import threading
 from collections import Counter
 from collections.abc import Callable
-from typing import Final
+from typing import Any, Final
 
 import zenoh
 from zenoh import Priority, Sample, Session, Timestamp
@@ -33,6 +33,7 @@ from zsched.core.hop.sender import KEPT_BYTES, KEPT_BYTES_LATEST, KEPT_SAMPLES
 from zsched.core.relay_protocol import EndMarker, StreamAck, mark_of
 from zsched.core.route.wildcards import Rewriting
 from zsched.core.values.plan import OnCrash, StreamClass, StreamSettings
+from zsched.guard import tolerant
 from zsched.relay.streams.acks import WorkerAcks
 from zsched.relay.streams.crowd import Crowd
 from zsched.relay.streams.greetings import Greetings
@@ -120,6 +121,11 @@ class Outlet:
         holds = self._is_reliable and acks is not None
         self._greetings = Greetings(self._lock, self._put_start) if holds else None
         self._probe = session.declare_publisher(to_expr)
+        self._has_parted = False
+        """Nobody subscribed for a moment, since that was asked last (of a worker that shows no token)."""
+        if acks is None and not has_crowd and settings.stream_class is StreamClass.LATEST:
+            seen = zenoh.handlers.Callback(tolerant(self._matched, "matching"), indirect=False)
+            self._watch = self._probe.declare_matching_listener(seen)
         self._main = None if self._rewriting.is_wild else self._declare(to_expr, Priority.DATA, is_express=False)
         self._queue = self._make_queue()
         self._crowd = self._make_crowd() if has_crowd else None
@@ -150,6 +156,15 @@ class Outlet:
     def is_matching(self) -> bool:
         """True when somebody subscribes to where this outlet leads (it may be a zombie or a recorder)."""
         return is_matched(self._probe)
+
+    def _matched(self, status: Any) -> None:
+        """Somebody subscribes to where this outlet leads, or nobody does any more (zenoh's thread)."""
+        self._has_parted |= not status.matching
+
+    def take_parted(self) -> bool:
+        """Whether nobody subscribed for a moment since the last time: who does now is another life."""
+        parted, self._has_parted = self._has_parted, False
+        return parted
 
     def also_from(self, from_expr: str) -> None:
         """Take samples of another owner, too: its ``from`` captures what fills the wildcards of ``to``.
