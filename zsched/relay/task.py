@@ -375,6 +375,7 @@ class TaskRelay:
                 self._flip(self._slots[old.epoch], is_reported=False)
         if plan.current is not None:
             self._open(plan.current, is_from_start=plan.phase is RoutePhase.PREPARE)
+        self._carry_on()
         current = self._current()
         if current is not None and plan.phase is RoutePhase.CLOSE:
             self._flip(current)  # it was opened anew: its owner counts as ready by another rule
@@ -426,6 +427,33 @@ class TaskRelay:
                 source.flip(epoch, has_answer=self._has_answer)
             self._services.flip(epoch)
 
+    def _carry_on(self) -> None:
+        """A stream that is another one now, by a changed fleet file, has lost the slot that carries: it goes on there.
+
+        That slot stays as it was opened, until the flip.
+        """
+        carrier = self._carrier()
+        if carrier is None or carrier is self._current():
+            return
+        epoch = carrier.slot.epoch
+        lost = [route for route in carrier.slot.routes if not self._has(epoch, route)]
+        for route in lost:
+            self._try_route(carrier.slot, route, is_from_start=False, is_as_opened=True)
+        if lost:
+            for sink in self._streams.outputs.values():
+                sink.flip(epoch, drops_held=False)
+            for source in self._streams.inputs.values():
+                source.flip(epoch, has_answer=self._has_answer)
+            self._services.flip(epoch)
+
+    def _has(self, epoch: int, route: Route) -> bool:
+        """Whether a route's stream has the slot, or is none any more that could have it."""
+        if route.direction is Direction.SERVICE:
+            return self._services.has_slot(epoch, route)
+        streams = self._streams.inputs if route.direction is Direction.INPUT else self._streams.outputs
+        one = streams.get(route.stream)
+        return one is None or one.route.near != route.near or one.has_slot(epoch)
+
     def _close_stream(self, epoch: int, route: Route) -> int:
         """Close one stream's part of a slot; how many of its samples the worker had not acknowledged."""
         if route.direction is Direction.SERVICE:
@@ -436,28 +464,29 @@ class TaskRelay:
         source = self._streams.inputs.get(route.stream)
         return 0 if source is None else source.take_left(epoch) + source.close_slot(epoch, has_answer=self._has_answer)
 
-    def _try_route(self, slot: Slot, route: Route, *, is_from_start: bool) -> None:
+    def _try_route(self, slot: Slot, route: Route, *, is_from_start: bool, is_as_opened: bool = False) -> None:
+        """``is_as_opened``: in the stream of its name that there is, though that goes by another file now."""
         self._broken.discard((slot.epoch, route.stream))
         try:
-            self._open_route(slot, route, is_from_start=is_from_start)
+            self._open_route(slot, route, is_from_start=is_from_start, is_as_opened=is_as_opened)
         except (ValueError, zenoh.ZError) as error:
             self._broken.add((slot.epoch, route.stream))
             self._problem(f"{route.stream}: {route.from_expr} -> {route.to_expr}: {error}")
 
-    def _open_route(self, slot: Slot, route: Route, *, is_from_start: bool) -> None:
+    def _open_route(self, slot: Slot, route: Route, *, is_from_start: bool, is_as_opened: bool) -> None:
         epoch = slot.epoch
         is_counted = slot.ready_when is ReadyWhen.TOKEN  # a foreign worker counts nothing
         acks = self._acks.of(slot.owner, self._task) if is_counted else None
         if route.direction is Direction.SERVICE:
-            self._services.open(epoch, route)
+            (self._services.open_beside if is_as_opened else self._services.open)(epoch, route)
             return
         if route.direction is Direction.INPUT:
-            source = self._streams.input_of(route)
+            source = self._streams.inputs[route.stream] if is_as_opened else self._streams.input_of(route)
             source.open(epoch, route, acks, self._stamps if _replays(slot) else None)
             if is_counted and not self._tokens.workers(slot.owner, self._task):
                 source.part(epoch, is_parted=True)  # nobody else who subscribes, a recorder, is taken for the worker
             return
-        sink = self._streams.output_of(route)
+        sink = self._streams.outputs[route.stream] if is_as_opened else self._streams.output_of(route)
         sink.know(route.from_expr, notes_stamps=_replays(slot))
         sink.open(epoch, route, acks, is_from_start=is_from_start)
 

@@ -139,6 +139,10 @@ class ServiceStream:
         with self._lock:
             self._slots[epoch] = slot
 
+    def has_slot(self, epoch: int) -> bool:
+        """Whether a slot is open."""
+        return epoch in self._slots
+
     def is_matching(self, epoch: int) -> bool:
         """True when somebody answers under the slot's key."""
         slot = self._slots.get(epoch)
@@ -384,6 +388,19 @@ class Services:
             self._end(route.stream)
             stream = self._streams[route.stream] = ServiceStream(self._session, route, self._local)
         stream.open(epoch, route)
+
+    def open_beside(self, epoch: int, route: Route) -> None:
+        """Open a slot of a service that goes by other settings now.
+
+        Raises:
+            ValueError, zenoh.ZError: see `ServiceStream.open`.
+        """
+        self._streams[route.stream].open(epoch, route)
+
+    def has_slot(self, epoch: int, route: Route) -> bool:
+        """Whether a route's service has the slot, or is none any more that could have it."""
+        stream = self._streams.get(route.stream)
+        return stream is None or stream.route.from_expr != route.from_expr or stream.has_slot(epoch)
 
     def is_matching(self, epoch: int) -> bool:
         """True when every service that has a slot of the epoch would be answered there."""

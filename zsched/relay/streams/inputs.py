@@ -177,6 +177,10 @@ class InputStream:
             self._stamps = stamps
             self._slots[epoch] = _InputSlot(outlet=outlet, route=route, epoch=epoch, acks=acks)
 
+    def has_slot(self, epoch: int) -> bool:
+        """Whether a slot is open."""
+        return epoch in self._slots
+
     def is_matching(self, epoch: int) -> bool:
         """True when somebody subscribes to the slot's keys."""
         slot = self._slots.get(epoch)

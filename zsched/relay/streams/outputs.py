@@ -225,6 +225,10 @@ class OutputStream:
             self._outlet.also_from(from_expr)
             self._notes_stamps = notes_stamps
 
+    def has_slot(self, epoch: int) -> bool:
+        """Whether a slot is open."""
+        return epoch in self._slots
+
     def has_passed(self, stamp: Timestamp) -> bool:
         """Whether an answer with this timestamp, its input's, has passed; of the newest `MAX_STAMPS`."""
         with self._lock:

@@ -1,10 +1,11 @@
-"""What a task's relay holds back while its owner's worker is away, whoever else subscribes."""
+"""One task's relay on real sessions: what it holds back for a worker that is away, what carries on in a move."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator
 from functools import partial
+from typing import Any
 
 import pytest
 import zenoh
@@ -18,12 +19,15 @@ from zsched.core.values.plan import (
     Route,
     RoutePhase,
     RoutePlan,
+    ServiceSettings,
     Slot,
     StreamClass,
     StreamCount,
     StreamSettings,
 )
+from zsched.core.values.struct import replace
 from zsched.ipc.pipe import decode_end
+from zsched.relay import task as task_module
 from zsched.relay.graph import GraphMirror
 from zsched.relay.open_streams import OpenStreams
 from zsched.relay.streams import greetings
@@ -109,6 +113,25 @@ def test_what_comes_while_the_worker_is_away_waits_for_it_also_beside_a_recorder
         undeclare(one)
 
 
+def test_nor_is_one_after_another_data_session_that_has_not_seen_the_worker(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(task_module, "REJOIN_S", 0.2)
+    recorder = scene.other.declare_subscriber("**", lambda _sample: None)
+    token = scene.other.liveliness().declare_token(KEYS.worker("edge1", "t", "7"))
+    until(scene.tokens.seen, "the worker")
+    scene.settle()
+    assert scene.task.leave(0.1, 0.2).wait(60)
+    undeclare(token)
+    until(lambda: not scene.tokens.seen(), "its end")
+    scene.tokens.rejoin(scene.relay)
+    scene.task.rejoin(scene.relay, frozenset({str(scene.relay.zid())}))
+    scene.put(3)
+    time.sleep(1.2)
+    assert (scene.count().drops, scene.count().in_flight) == ((), 3)
+    undeclare(recorder)
+
+
 LATCHED = Route(
     stream="t/in/0",
     direction=Direction.INPUT,
@@ -127,6 +150,59 @@ def test_a_foreign_worker_that_is_back_before_anybody_has_looked_gets_the_kept_v
         life = scene.other.declare_subscriber(LATCHED.to_expr, partial(_take, got))
         until(partial(bool, got), "the map", 5.0)
         undeclare(life)
+
+
+BEST = StreamSettings(stream_class=StreamClass.BEST_EFFORT)
+BRIEF = ServiceSettings(timeout_s=5.0, hold_s=0.2)
+
+
+def whole(epoch: int, owner: str, settings: StreamSettings, service: ServiceSettings) -> Slot:
+    """With a stream of each kind, of a worker that shows no token."""
+    ends = {"in": ("robot1/in", f"{owner}/t/robot1/in"), "out": (f"{owner}/t/{epoch}/robot1/out", "robot1/out")}
+    ends["srv"] = ("robot1/ask", f"{owner}/t/ask")
+    routes = tuple(
+        Route(
+            stream=f"t/{name}/0",
+            direction=direction,
+            from_expr=ends[name][0],
+            to_expr=ends[name][1],
+            settings=settings,
+            service=service,
+        )
+        for name, direction in (("in", Direction.INPUT), ("out", Direction.OUTPUT), ("srv", Direction.SERVICE))
+    )
+    return Slot(epoch=epoch, owner=owner, routes=routes, ready_when=ReadyWhen.MATCHING)
+
+
+def test_what_carries_goes_on_when_the_fleet_file_changes_its_streams_in_the_middle_of_a_move(scene: Scene) -> None:
+    """The next owner is not ready for long; until then inputs, answers and requests had no way at all."""
+    old, got, answers = whole(3, "edge1", BEST, BRIEF), list[bytes](), list[bytes]()
+    other, kept = scene.other, list[Any]()
+    kept.append(other.declare_subscriber("edge1/t/robot1/in", partial(_take, got)))
+    kept.append(other.declare_subscriber("robot1/out", partial(_take, answers)))
+    kept.append(
+        other.declare_queryable("edge1/t/ask", lambda query: query.reply(query.key_expr, b"told"), complete=True)
+    )
+    scene.task.apply(RoutePlan(task="t", phase=RoutePhase.CLOSE, current=old))
+    changes = ((BEST, BRIEF), (replace(BEST, depth=20), replace(BRIEF, hold_s=0.3)))
+    for depth, (settings, service) in enumerate(changes, 1):
+        new = whole(4, "edge2", settings, service)
+        scene.task.apply(RoutePlan(task="t", phase=RoutePhase.PREPARE, current=new, predecessors=(old,)))
+        until(lambda new=new: scene.task._plan is not None and scene.task._plan.current == new, "the plan")  # type: ignore[misc]
+        until(lambda: {one.stream for one in scene.task.counts()} == {"t/in/0", "t/out/0", "t/srv/0"}, "the streams")
+        time.sleep(0.3)
+        other.put("robot1/in", b"x")
+        other.put("edge1/t/3/robot1/out", b"y")
+        until(partial(_counts, got, depth), "the input", 5.0)
+        until(partial(_counts, answers, depth), "the answer", 5.0)
+        said = [reply.ok.payload.to_bytes() for reply in other.get("robot1/ask") if reply.ok is not None]
+        assert said == [b"told"]
+    for one in kept:
+        undeclare(one)
+
+
+def _counts(got: list[bytes], count: int) -> bool:
+    return len(got) == count
 
 
 def _take(got: list[bytes], sample: zenoh.Sample) -> None:
