@@ -36,6 +36,8 @@ NO_TOKEN: Final = (
 OTHER_NETWORK: Final = "did it open $ZSCHED_ZENOH_CONFIG, or does it subscribe to another key?"
 REJOIN_S: Final = 4.0
 """A worker that runs already is seen so soon after its relay's start: it dials at least once a second."""
+MISSED_S: Final = 8.0
+"""Who was ready and is not seen so long after its relay's start is gone; a busy machine may need more than usual."""
 UNSEEN: Final = "the relay that was started since does not see its token"
 
 _log = logging.getLogger("zsched.crew")
@@ -151,7 +153,7 @@ class Crew:
 
     def _miss(self, relay: int) -> None:
         """Who was ready and does not come to this relay is not ready any more: what it never saw, it never sees go."""
-        threading.Event().wait(REJOIN_S)
+        threading.Event().wait(MISSED_S)
         with self._lock:
             if relay != self._relays:  # it has ended since
                 return

@@ -381,7 +381,7 @@ def test_a_worker_that_a_new_relay_never_sees_is_not_ready_any_more(
     house: House, monkeypatch: pytest.MonkeyPatch, task: str
 ) -> None:
     """It froze, or ended, while no relay was there to see its token go; one that comes back is ready again."""
-    monkeypatch.setattr(crew_module, "REJOIN_S", 0.1)
+    monkeypatch.setattr(crew_module, "MISSED_S", 0.1)
     life = 7
     if task == "token":
         house.supervisor.start(task)
