@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
 from support.plays import FLEET, ROBOTS, TASK, Play
 from support.slices import slices
+from zsched.core import events as ev
 from zsched.core.electorate.documents import Documents
 from zsched.core.values.electorate import CREATION_STEP
-from zsched.core.values.messages import ChangeFleet, CommandOutcome
+from zsched.core.values.fleet import Fleet
+from zsched.core.values.messages import ChangeFleet, CommandOutcome, TuneTask
+from zsched.core.values.model import Asked
 from zsched_lab.sim import fleets
 
 
@@ -143,6 +147,43 @@ def test_a_task_that_an_agreed_document_makes_exclusive_works_on_by_leases() -> 
     assert play.sim.run_until(lambda: play.sim.node(owner).values()[TASK].leased, 5)
     assert play.sim.run_until(lambda: play.sim.working.get(TASK, ("", 0.0))[0] == owner, 5), "by a lease"
     play.settle()
+
+
+def tuned(fleet: Fleet, **settings: Any) -> Fleet:
+    task = fleet.tasks[0]
+    return replace(fleet, tasks=(replace(task, tuning=replace(task.tuning, **settings)),))
+
+
+def bonuses(play: Play) -> set[float]:
+    return {play.sim.node(name).values()[TASK].tuning.bonus for name in play.sim.running()}
+
+
+@pytest.mark.parametrize("is_cut_off", [False, True], ids=["off", "cut off"])
+def test_who_was_away_when_a_setting_changed_does_not_undo_what_was_tuned_since(is_cut_off: bool) -> None:
+    """It takes the document over long after the others: what it changes there is older than an operator's word."""
+    play = Play()
+    play.adopt()
+    others = [name for name in (*ROBOTS, "edge1", "edge2") if name != "robot3"]
+    if is_cut_off:
+        play.sim.cut(("robot3",), tuple(others))
+    else:
+        play.sim.crash("robot3")
+    play.sim.run_until(lambda: False, 5)
+    document = play.document(tuned(FLEET, bonus=0.2))
+    assert play.told("robot1", ChangeFleet(document=document)).outcome is CommandOutcome.OK
+    assert play.sim.run_until(lambda: play.sim.node("robot1").values()[TASK].tuning.bonus == 0.2, 10)
+    value = play.sim.node("robot1").values()[TASK]
+    wanted, ada = replace(value.tuning, bonus=0.4), Asked(by="ada@robot1")
+    order = TuneTask(task=TASK, tuning=wanted, base_revision=value.revision, asked=ada)
+    play.sim.deliver(play.sim.machines["robot1"], ev.commanded(99, order))
+    assert play.sim.run_until(lambda: play.sim.node("robot1").values()[TASK].tuning == wanted, 10)
+    if is_cut_off:
+        play.sim.heal()
+    else:
+        play.sim.start("robot3")
+    assert play.sim.run_until(lambda: play.sim.node("robot3").fleet.tasks[0].tuning.bonus == 0.2, 20)
+    play.sim.run_until(lambda: False, 10)
+    assert bonuses(play) == {0.4}
 
 
 def test_without_a_majority_nothing_changes_and_the_operator_is_told() -> None:

@@ -67,8 +67,8 @@ ADOPTION_BUGS: tuple[Bug, ...] = (
     _bug(
         "a changed tuning is never proposed",
         RETUNING,
-        "            if changed and value.revision > 0:\n",
-        "            if changed and value.revision < 0:\n",
+        "            if changed and value.revision > 0 and not self._ahead:\n",
+        "            if changed and value.revision < 0 and not self._ahead:\n",
         _FLEET,
     ),
     _bug(

@@ -164,6 +164,7 @@ def _on_beat(node: Stages, event: ev.BeatReceived, todo: ToDo, now: float) -> No
         node.fileless.discard(beat.node)
     if node.membership.state(beat.node) is not PeerState.GONE:  # or the beat is a late one
         node.sealing.hear(beat)
+        node.retuning.hear(beat.node, beat.fleet_revision, node.agreement.fleet_revision)
     if node.renewing.told:
         node.renewing.hear(beat.node, beat.fleet_file, now)
     if beat.fleet_file != node.fleet_file or node.problems:
@@ -255,6 +256,7 @@ def on_transition(node: Stages, change: Transition, todo: ToDo, now: float) -> N
     if change.after is PeerState.GONE:
         node.probation.on_gone(change.node, now)
         node.sealing.on_gone(change.node)
+        node.retuning.on_gone(change.node)
         node.set_problem(f"fleet/{change.node}", None)  # its first beat says it again, if it is still so
         for executor in node.executors.values():
             executor.on_gone(change.node, todo)

@@ -4,13 +4,16 @@ A task's tuning is agreed: the file's counts for its first value only. When a no
 tuning, it wants these fields changed in the agreed one. All nodes that take the file over want the same. So they try
 one after another, by rank, and the first success ends it for all. A tuning that somebody else has changed meanwhile is
 left as it is: the newer word counts. Some settings are the file's unless an operator has set them; a file that changes
-such a setting ends what the operator has set.
+such a setting ends what the operator has set. A node that was away and takes over what the others go by already wants
+nothing: they have had it agreed, and what operators have tuned since is newer.
 
-Knows: which fields differ, whose turn it is. Does not know: how a value is agreed.
+Knows: which fields differ, whose turn it is, who had a newer document when it was first heard. Does not know: how a
+value is agreed.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
 from typing import Any
@@ -38,6 +41,24 @@ class Retuning(Struct):
 
     me: NodeId
     _wishes: dict[TaskId, _Wish] = field(default_factory=dict)
+    _heard: set[NodeId] = field(default_factory=set)
+    """The peers that are heard, or were until a moment ago."""
+    _ahead: dict[NodeId, int] = field(default_factory=dict)
+    """{peer: its fleet value's revision} of those that had a newer one when they were first heard, while we lack it."""
+
+    def hear(self, peer: NodeId, revision: int, ours: int) -> None:
+        """A peer's beat tells the revision of its fleet value; ``ours`` is this node's."""
+        if peer not in self._heard:
+            self._heard.add(peer)
+            if revision > ours:
+                self._ahead[peer] = revision
+        elif self._ahead and ours >= self._ahead.get(peer, math.inf):
+            del self._ahead[peer]
+
+    def on_gone(self, peer: NodeId) -> None:
+        """A peer is gone: what it has when it is heard again may be old for all others."""
+        self._heard.discard(peer)
+        self._ahead.pop(peer, None)
 
     def adopt(self, old: Fleet, new: Fleet, values: Mapping[TaskId, Allocation], now: float) -> None:
         """Want what differs between two files; a task that was never agreed begins with the new file's tuning."""
@@ -47,7 +68,7 @@ class Retuning(Struct):
         for task in new.tasks:
             value = values[task.name]
             changed = _changed(before.get(task.name, task), task)
-            if changed and value.revision > 0:
+            if changed and value.revision > 0 and not self._ahead:
                 wanted = replace(value.tuning, **changed)
                 self._wishes[task.name] = _Wish(seen=value.tuning, wanted=wanted, at=now + rank * RANK_S)
 
