@@ -158,6 +158,21 @@ def bonuses(play: Play) -> set[float]:
     return {play.sim.node(name).values()[TASK].tuning.bonus for name in play.sim.running()}
 
 
+def test_two_changes_of_settings_one_after_the_other_are_both_agreed() -> None:
+    """Nodes propose a changed setting by rank: while the first two are away, the next change comes before that."""
+    play = Play()
+    play.adopt()
+    for name in ("edge1", "edge2"):
+        play.sim.crash(name)
+    play.sim.run_until(lambda: False, 5)
+    one = tuned(FLEET, bonus=0.2)
+    for said in (one, tuned(one, cool_down_s=33.0)):
+        assert play.told("robot1", ChangeFleet(document=play.document(said))).outcome is CommandOutcome.OK
+    play.sim.run_until(lambda: False, 10)
+    tunings = [play.sim.node(name).values()[TASK].tuning for name in play.sim.running()]
+    assert {(one.bonus, one.cool_down_s) for one in tunings} == {(0.2, 33.0)}
+
+
 @pytest.mark.parametrize("is_cut_off", [False, True], ids=["off", "cut off"])
 def test_who_was_away_when_a_setting_changed_does_not_undo_what_was_tuned_since(is_cut_off: bool) -> None:
     """It takes the document over long after the others: what it changes there is older than an operator's word."""

@@ -3,9 +3,10 @@
 A task's tuning is agreed: the file's counts for its first value only. When a node takes over a file with another
 tuning, it wants these fields changed in the agreed one. All nodes that take the file over want the same. So they try
 one after another, by rank, and the first success ends it for all. A tuning that somebody else has changed meanwhile is
-left as it is: the newer word counts. Some settings are the file's unless an operator has set them; a file that changes
-such a setting ends what the operator has set. A node that was away and takes over what the others go by already wants
-nothing: they have had it agreed, and what operators have tuned since is newer.
+left as it is: the newer word counts. What an earlier file wants, and is not agreed yet, is wanted with the rest. Some
+settings are the file's unless an operator has set them; a file that changes such a setting ends what the operator has
+set. A node that was away and takes over what the others go by already wants nothing: they have had it agreed, and what
+operators have tuned since is newer.
 
 Knows: which fields differ, whose turn it is, who had a newer document when it was first heard. Does not know: how a
 value is agreed.
@@ -30,10 +31,15 @@ AGAIN_S = 5.0
 
 
 class _Wish(Struct):
-    seen: Tuning
-    """The agreed tuning when the file was taken over."""
+    seen: tuple[Tuning, ...]
+    """The agreed tuning when the file was taken over, and what earlier files wanted of it: that may be agreed yet."""
     wanted: Tuning
     at: float
+
+    @property
+    def is_back(self) -> bool:
+        """Whether it may be agreed already while the wish of an earlier file, which it takes back, is under way."""
+        return len(self.seen) > 1 and self.wanted in self.seen
 
 
 class Retuning(Struct):
@@ -62,23 +68,28 @@ class Retuning(Struct):
 
     def adopt(self, old: Fleet, new: Fleet, values: Mapping[TaskId, Allocation], now: float) -> None:
         """Want what differs between two files; a task that was never agreed begins with the new file's tuning."""
-        before = {task.name: task for task in old.tasks}
+        known = {task.name: task for task in old.tasks}
         rank = [node.name for node in new.nodes].index(self.me)
         self._wishes = {task: wish for task, wish in self._wishes.items() if any(one.name == task for one in new.tasks)}
         for task in new.tasks:
             value = values[task.name]
-            changed = _changed(before.get(task.name, task), task)
+            changed = _changed(known.get(task.name, task), task)
             if changed and value.revision > 0 and not self._ahead:
-                wanted = replace(value.tuning, **changed)
-                self._wishes[task.name] = _Wish(seen=value.tuning, wanted=wanted, at=now + rank * RANK_S)
+                seen: tuple[Tuning, ...] = (value.tuning,)
+                before = self._wishes.get(task.name)
+                if before is not None and value.tuning in before.seen:  # it is not agreed yet
+                    seen = (*before.seen, before.wanted)
+                wanted = replace(seen[-1], **changed)
+                self._wishes[task.name] = _Wish(seen=seen, wanted=wanted, at=now + rank * RANK_S)
 
     def due(self, values: Mapping[TaskId, Allocation], now: float) -> Iterator[tuple[TaskId, Retune]]:
         """The changes to propose now."""
         for task, wish in tuple(self._wishes.items()):
             value = values[task]
-            if value.tuning != wish.seen or wish.seen == wish.wanted:
+            is_there = value.tuning == wish.wanted and (now >= wish.at + AGAIN_S or not wish.is_back)
+            if value.tuning not in wish.seen or is_there:
                 del self._wishes[task]
-            elif now >= wish.at:
+            elif now >= wish.at and value.tuning != wish.wanted:
                 wish.at = now + AGAIN_S
                 yield task, Retune(base_revision=value.revision, tuning=wish.wanted)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from typing import Any
 
@@ -87,4 +88,34 @@ def test_who_found_no_quorum_tries_again_and_ends_once_somebody_had_success() ->
     assert list(retuning.due({"merge": value}, AGAIN_S)) == wanted
     done = replace(value, revision=6, tuning=FILE)
     assert list(retuning.due({"merge": done}, 2 * AGAIN_S)) == []
+    assert retuning.is_idle
+
+
+def test_a_second_file_wants_what_the_first_one_wanted_too() -> None:
+    """Before the first wish is agreed the next file comes: neither change is lost, whichever is agreed first."""
+    tunings = FILE, replace(FILE, bonus=0.2), replace(FILE, bonus=0.2, cool_down_s=33.0)
+    files = [fleet_of(task_of(tuning=tuning)) for tuning in tunings]
+    value = replace(allocation_of(5, "edge1"), tuning=FILE)
+    retuning = Retuning("edge2")
+    for old, new in itertools.pairwise(files):
+        retuning.adopt(old, new, {"merge": value}, 0.0)
+    wanted = Retune(base_revision=5, tuning=tunings[2])
+    assert list(retuning.due({"merge": value}, RANK_S)) == [("merge", wanted)]
+    between = replace(value, revision=6, tuning=tunings[1])
+    assert list(retuning.due({"merge": between}, RANK_S + AGAIN_S)) == [("merge", replace(wanted, base_revision=6))]
+    assert list(retuning.due({"merge": replace(value, revision=7, tuning=tunings[2])}, RANK_S + AGAIN_S)) == []
+    assert retuning.is_idle
+
+
+def test_a_second_file_takes_back_what_the_first_one_wanted() -> None:
+    """The first wish may be agreed behind the second file: until then all looks as it should."""
+    files = [fleet_of(task_of(tuning=tuning)) for tuning in (FILE, replace(FILE, bonus=0.2), FILE)]
+    value = replace(allocation_of(5, "edge1"), tuning=FILE)
+    retuning = Retuning("edge1")
+    for old, new in itertools.pairwise(files):
+        retuning.adopt(old, new, {"merge": value}, 0.0)
+    assert list(retuning.due({"merge": value}, 0.1)) == []
+    late = replace(value, revision=6, tuning=replace(FILE, bonus=0.2))
+    assert list(retuning.due({"merge": late}, 0.2)) == [("merge", Retune(base_revision=6, tuning=FILE))]
+    assert list(retuning.due({"merge": replace(value, revision=7)}, 0.3 + 2 * AGAIN_S)) == []
     assert retuning.is_idle
