@@ -9,6 +9,7 @@ import pytest
 
 from support.plays import FLEET, ROBOTS, TASK, Play
 from support.slices import slices
+from zsched.config.timing import WAN
 from zsched.core import events as ev
 from zsched.core.electorate.documents import Documents
 from zsched.core.values.electorate import CREATION_STEP
@@ -171,6 +172,19 @@ def test_two_changes_of_settings_one_after_the_other_are_both_agreed() -> None:
     play.sim.run_until(lambda: False, 10)
     tunings = [play.sim.node(name).values()[TASK].tuning for name in play.sim.running()]
     assert {(one.bonus, one.cool_down_s) for one in tunings} == {(0.2, 33.0)}
+
+
+def test_a_fleet_that_gets_the_clocks_of_slow_links_is_changed_over_slow_links() -> None:
+    """Rounds about the fleet itself go by the changed clocks, as rounds about tasks do."""
+    play = Play()
+    play.adopt()
+    slow = replace(FLEET, timing=WAN)
+    assert play.told("robot1", ChangeFleet(document=play.document(slow))).outcome is CommandOutcome.OK
+    play.settle(20)
+    play.sim.delay_s = (0.2, 0.25)
+    result = play.told("robot1", ChangeFleet(document=play.document(replace(slow, relay_orphan_s=5.0))), WAN.order_s)
+    assert result.outcome is CommandOutcome.OK
+    assert play.sim.run_until(lambda: play.sim.node("robot3").fleet.relay_orphan_s == 5.0, 10)
 
 
 @pytest.mark.parametrize("is_cut_off", [False, True], ids=["off", "cut off"])

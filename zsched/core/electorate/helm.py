@@ -37,6 +37,10 @@ class Helm:
         self._read: tuple[str, Course | None] = "", None
         """(document, what it says)."""
 
+    def adopt(self, *, stagger_s: float) -> None:
+        """Go by another fleet file (argument as of the class)."""
+        self._pilot.stagger_s = stagger_s
+
     @property
     def reason(self) -> str:
         """What the pilot does, or why it does nothing; empty: it rests."""

@@ -73,6 +73,8 @@ class Numbers:
     def adopt(self, fleet: Fleet) -> None:
         """Go by another fleet file; its registers are there already, but for those of a document (`Roll`)."""
         self._fleet = fleet
+        if self.roll is not None:
+            self.roll.adopt(ballot_s=fleet.timing.ballot_s, stagger_s=fleet.timing.stagger_s)
 
     def begin(self, generation: int, electorate: str, todo: ToDo, now: float, *, may_elect: bool) -> None:
         """The generation is known: count by what the state holds, or by what every node makes of its file."""

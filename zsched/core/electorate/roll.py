@@ -102,6 +102,12 @@ class Roll:
         if not self.value.settled:
             self._settling.begin(self.value, now + self._jitter(), self._rank())
 
+    def adopt(self, *, ballot_s: float, stagger_s: float) -> None:
+        """Another fleet file is gone by: its clocks hold from the next round on."""
+        self._stagger_s = stagger_s
+        self._register.adopt_clocks(ballot_s=ballot_s, stagger_s=stagger_s)
+        self._settling.pause_s = 2 * ballot_s
+
     # --- queries -----------------------------------------------------------------------------------------------------
 
     @property

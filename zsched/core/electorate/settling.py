@@ -28,7 +28,8 @@ class Settling:
     """One elector's work for one number."""
 
     def __init__(self, pause_s: float) -> None:
-        self._pause_s = pause_s
+        self.pause_s = pause_s
+        """What is missing is tried again after this time."""
         self._of: Electorate | None = None
         self._whole_at: float | None = None
         """When the last identity round of this number ended."""
@@ -44,7 +45,7 @@ class Settling:
         if value.settled:
             self._of, self._whole_at = None, None
         elif self._of != value.electorate:
-            at += rank * self._pause_s + (_guard_s(value) if rank else 0.0)
+            at += rank * self.pause_s + (_guard_s(value) if rank else 0.0)
             self._of, self._whole_at, self._ask_at, self._say_at = value.electorate, None, at, at
 
     def due(self, value: FleetValue, registers: Iterable[TaskRegister]) -> float:
@@ -61,7 +62,7 @@ class Settling:
         for register in missing:
             register.settle(todo, now)
         if missing:
-            self._ask_at = now + self._pause_s
+            self._ask_at = now + self.pause_s
             return None
         if self._whole_at is None:
             self._whole_at = now
@@ -70,7 +71,7 @@ class Settling:
             self._say_at = now + (hold_s(value.guard_lease_s) if is_leased else _guard_s(value))
         if now < self._say_at:
             return None
-        self._say_at = now + self._pause_s
+        self._say_at = now + self.pause_s
         has_waited = now >= self._whole_at + hold_s(value.guard_lease_s)
         return Settle(base_revision=value.revision, number=value.number, has_waited=has_waited)
 

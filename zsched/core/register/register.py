@@ -146,7 +146,12 @@ class Register(ABC, Generic[V]):
             ballot_s: deadline of one phase, seconds.
             stagger_s: wait per rank, seconds.
         """
-        self._initial, self._ballot_s, self._stagger_s = initial, ballot_s, stagger_s
+        self._initial = initial
+        self.adopt_clocks(ballot_s=ballot_s, stagger_s=stagger_s)
+
+    def adopt_clocks(self, *, ballot_s: float, stagger_s: float) -> None:
+        """Go by other clocks from the next phase on (arguments as of `adopt`)."""
+        self._ballot_s, self._stagger_s = ballot_s, stagger_s
 
     def count_with(self, count: Electorate, *, is_elector: bool, is_blank: bool, now: float) -> None:
         """A newer fleet value is learnt: rounds count with its electors, and the one under way begins again.

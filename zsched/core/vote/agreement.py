@@ -52,6 +52,8 @@ from zsched.core.vote.lease import Leases
 from zsched.core.vote.questions import ASK_AT_ONCE_S, ASK_LEARNT_EVERY_S, Questions
 from zsched.core.vote.witness import Witness, as_seen, as_tuple
 
+HELM_BALLOTS = 2
+"""Each elector proposes a change of the electors so many times ``ballot_s`` after the one before."""
 SETTLE_AFTER_START_S = 0.3
 """A starting elector learns first what was accepted before (an identity round), once its peers are connected."""
 
@@ -144,7 +146,7 @@ class Agreement:
         )
         self.orders = Orders(self._numbers)
         self.strangers = Strangers(fleet=fleet.name, silence_s=fleet.timing.suspect_s)
-        self.helm = Helm(self._numbers, me, stagger_s=2 * fleet.timing.ballot_s, now=now)
+        self.helm = Helm(self._numbers, me, stagger_s=HELM_BALLOTS * fleet.timing.ballot_s, now=now)
         self.at_start = ToDo()
         """What the first batch must do: fetch a document that is missing."""
         if self.generation is not None:
@@ -214,6 +216,8 @@ class Agreement:
         self._fleet, self._nodes = fleet, frozenset(node.name for node in fleet.nodes)
         self.witness.nodes = self._nodes
         self._numbers.adopt(fleet)
+        self.strangers.silence_s = fleet.timing.suspect_s
+        self.helm.adopt(stagger_s=HELM_BALLOTS * fleet.timing.ballot_s)
         for node in [node for node in self._behind_at if node not in self._nodes]:
             self._show_no_more(node)
         kept = dict(self.registers)
