@@ -334,7 +334,9 @@ class WorkerSupervisor:
         for task, worker in kept.items():
             has_changed = worker.spec != specs[task]
             worker.spec, worker.is_kept = specs[task], True
-            if has_changed and worker.phase in {_Phase.FAILED, _Phase.BACKOFF}:
+            if worker.phase in {_Phase.FAILED, _Phase.BACKOFF} and (
+                has_changed or worker.made_by.is_old(self._recipe_of(worker))
+            ):
                 self._on_reset(task)
             if not worker.spec.command:
                 self._on_stop(task)

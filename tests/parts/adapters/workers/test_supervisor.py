@@ -618,6 +618,30 @@ def test_a_mended_command_is_tried_although_the_one_before_has_failed_for_good()
         recorder.wait("started", 2)
 
 
+def test_mended_variables_are_tried_although_the_worker_has_failed_for_good_with_those_before() -> None:
+    """What a task says of its deadline and its outputs reaches a worker by its environment alone."""
+    made, recorder = {"ZSCHED_OUTPUT_KEYS": "wrong"}, Recorder()
+    code = f"import os, time; os.environ['ZSCHED_OUTPUT_KEYS'] != 'wrong' or os._exit(78); {SLEEP}"
+    supervisor = WorkerSupervisor(
+        specs={"merge": python(code)},
+        context=WorkerContext(fleet="hall", node="edge1", incarnation=7),
+        events=recorder,
+        environment=lambda _task: dict(made),
+        policy=QUICK,
+    )
+    try:
+        supervisor.start("merge")
+        recorder.wait("failed")
+        supervisor.adopt({"merge": python(code), "other": python(code)})
+        wait_until(lambda: len(supervisor.states()) == 2)
+        made["ZSCHED_OUTPUT_KEYS"] = "right"
+        supervisor.adopt({"merge": python(code)})
+        recorder.wait("started", 2, timeout_s=10.0)
+        assert len([call for call in recorder.calls if call[0] == "reset"]) == 1, "the same recipe is no reason"
+    finally:
+        supervisor.close(within_s=10.0)
+
+
 def test_a_failed_worker_whose_command_goes_is_not_started_without_one() -> None:
     with supervised(python("raise SystemExit(78)")) as (supervisor, recorder):
         supervisor.start("merge")
