@@ -324,7 +324,7 @@ class Daemon:
             post=self._inbox.post,
         )
         adoption.begin()
-        shell.follow = adoption.adopt
+        shell.follow, shell.end = adoption.adopt, adoption.end
         relay.start()
         stack.callback(lambda: relay.leave() if self._told.keeps_relay else relay.stop(1.0))
         stack.callback(lambda: supervisor.close(FINISH_WORKERS_S if self.begins_anew else CLOSE_WORKERS_S))

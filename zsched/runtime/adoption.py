@@ -93,6 +93,16 @@ class Adoption(Struct, kw_only=True):
         needs = restarts(self.started_with, fleet, self.me, is_agreed=is_agreed)
         self.post(ev.ProblemReported(source=SOURCE, problem=waits_for(needs, begins_again)))
 
+    def end(self, task: TaskId) -> None:
+        """The relay ends everything of a task, also what it watches, which one of that name that follows needs again.
+
+        A task that was removed and added again, unheard here, is in the fleet before and after.
+        """
+        self.relay.end(task)
+        watch = self._watches.get(task)
+        if watch is not None:
+            self.relay.watch(watch)
+
     def _tell_watches(self, fleet: Fleet) -> None:
         found = {task.name: watch_for(fleet, task, self.me) for task in fleet.tasks}
         for task, watch in found.items():

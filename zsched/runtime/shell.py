@@ -94,6 +94,8 @@ class Shell:
         self.log: DecisionLog | None = None
         self.follow: Callable[[Fleet, bool], None] = lambda _fleet, _is_agreed: None
         """Lets the adapters follow another fleet (`zsched.runtime.adoption`), once they are all made."""
+        self.end: Callable[[TaskId], None] = lambda task: self._streams().end(task)
+        """Ends the streams of a task (`zsched.runtime.adoption`)."""
         self.measure_soon: Callable[[], None] = lambda: None
         """Told that work begins, ends or goes on here (`zsched.runtime.sampler`)."""
         self.take_certificate: Callable[[str], CommandResult] = _no_certificate
@@ -207,7 +209,7 @@ class Shell:
                 self.follow(fleet, is_agreed)
                 self._unfollowed = None
             case do.EndTask(task=task):
-                self._streams().end(task)
+                self.end(task)
             case do.SetRole(role=role):
                 self._streams().set_role(role)
                 self.measure_soon()

@@ -3,18 +3,37 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 from unittest.mock import Mock
 
 import pytest
 
-from support.fleets import fleet_of
+from support.fleets import fleet_of, task_of
+from zsched.adapters.relay.streams import RelayHandle
+from zsched.core import instructions as do
+from zsched.core.relay_protocol import TaskEnded, WorkerWatch
 from zsched.core.values.certificates import Holder
-from zsched.core.values.fleet import Fleet, Security
+from zsched.core.values.fleet import Fleet, Security, StreamRule, WorkerSpec
+from zsched.core.values.plan import Direction, ReadyWhen
 from zsched.runtime.adoption import Adoption
 from zsched.runtime.endpoints import endpoints_for
+from zsched.runtime.inbox import Inbox
+from zsched.runtime.shell import Shell
 
 SECURITY = Security(folder="pki")
+RULE = StreamRule(direction=Direction.INPUT, from_template="scan", to_template="{target}/scan")
 FLEET = fleet_of(of=("robot1", "robot2"), tasks=(), security=SECURITY)
+
+
+def adoption_of(fleet: Fleet, **parts: Any) -> Adoption:
+    others = ("recipes", "crew", "supervisor", "relay", "bus", "access", "desk", "post", "sampler", "compare_sessions")
+    return Adoption(
+        me="robot1",
+        started_with=fleet,
+        points=endpoints_for(fleet, fleet.node("robot1"), lambda: 7458, protocol="tls"),
+        protocol="tls",
+        **{name: parts.get(name, Mock()) for name in others},
+    )
 
 
 @pytest.mark.parametrize(
@@ -27,24 +46,28 @@ FLEET = fleet_of(of=("robot1", "robot2"), tasks=(), security=SECURITY)
 )
 def test_orders_count_by_the_fleet_in_force_before_sessions_are_opened_anew(new: Fleet, then: list[str]) -> None:
     bus, compared = Mock(), Mock()
-    adoption = Adoption(
-        me="robot1",
-        started_with=FLEET,
-        points=endpoints_for(FLEET, FLEET.node("robot1"), lambda: 7458, protocol="tls"),
-        protocol="tls",
-        recipes=Mock(),
-        crew=Mock(),
-        supervisor=Mock(),
-        relay=Mock(),
-        bus=bus,
-        access=Mock(),
-        desk=Mock(),
-        post=Mock(),
-        sampler=Mock(),
-        compare_sessions=compared,
-    )
+    adoption = adoption_of(FLEET, bus=bus, compare_sessions=compared)
     adoption.adopt(new)
     (holders,) = bus.take_orders_of.call_args.args
     assert sorted(one.label for one in holders) == then
     assert Holder(name="robot1") in holders
     compared.assert_called_once_with(True, ())  # it begins anew in its turn
+
+
+@pytest.mark.parametrize("is_another_file", [False, True], ids=["the same file", "another file"])
+def test_a_task_that_was_removed_and_added_again_is_watched_again(is_another_file: bool) -> None:
+    """The relay forgets the watch with the task of before; without it no worker is seen to be ready by matching."""
+    task = task_of(worker=WorkerSpec(ready_when=ReadyWhen.MATCHING), candidates=("robot1",), rules=(RULE,))
+    fleet = fleet_of(task, of=("robot1", "robot2"))
+    relay = RelayHandle(fleet="hall", node="robot1", zenoh_config="{}", on_report=Mock())
+    adoption = adoption_of(fleet, relay=relay)
+    shell = Shell(node="robot1", inbox=Inbox(), bus=Mock(), state_file=Mock(), desk=Mock())
+    shell.relay, shell.follow, shell.end = relay, adoption.adopt, adoption.end
+    adoption.begin()
+    told = [frame for frame in relay._outbox.items.values() if isinstance(frame, WorkerWatch)]
+    assert [one.task for one in told] == ["merge"]
+    more = (do.AdoptFleet(fleet=replace(fleet, relay_orphan_s=5.0)),) if is_another_file else ()
+    shell.carry_out((*more, do.EndTask(task="merge")))
+    assert list(relay._outbox.items.values())[-1] == told[0], "behind the end of the task"
+    shell.carry_out((do.AdoptFleet(fleet=fleet_of(of=("robot1", "robot2"), tasks=())), do.EndTask(task="merge")))
+    assert list(relay._outbox.items.values())[-1] == TaskEnded(task="merge"), "a task that is gone is watched no more"
