@@ -71,6 +71,11 @@ def test_many_tasks_with_slow_workers_all_leave_a_busy_owner_in_the_end() -> Non
     assert play(one).violation == ""
 
 
+def test_a_machine_that_stood_still_while_its_clock_was_slewed_and_well_again_hears_that_it_is_well() -> None:
+    """Its watch stopped looking before the machine went on, so the doubt had no end (311001444)."""
+    assert play(plan(311001444)).violation == ""
+
+
 def test_about_one_schedule_of_fifty_has_beats_without_room_for_everything() -> None:
     plans = [plan(seed) for seed in range(1000)]
     many = [one for one in plans if len(one.fleet.tasks) > 20]

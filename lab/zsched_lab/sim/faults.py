@@ -329,8 +329,7 @@ class Stage:
                 self.sim.deliver(self.sim.machines[name], event)
 
         def is_believed() -> bool:
-            node = self.sim.machines[name].node if name in self.sim.machines else None
-            return node is None or "clock" not in node.problems
+            return name not in self.sim.machines or self.sim.machines[name].believes_its_clock
 
         slew(
             fault.size,

@@ -210,6 +210,12 @@ class Machine:
     at_once: int = 0
     """How often in a row the node has wanted to be called again at once."""
 
+    @property
+    def believes_its_clock(self) -> bool:
+        """Whether its node has heard all that the watch has told, and is in no doubt; true of one that does not run."""
+        is_behind = self.is_paused or bool(self.inbox)
+        return self.node is None or not (is_behind or "clock" in self.node.problems)
+
     def end(self) -> None:
         """The process is gone, and what it held in memory; its worker with it."""
         self.node = None

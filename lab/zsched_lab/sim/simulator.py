@@ -302,8 +302,7 @@ class Simulator(Links):
                 self.deliver(machine, event)
 
         def is_believed() -> bool:
-            node, is_behind = machine.node, machine.is_paused or bool(machine.inbox)  # it has not heard of it yet
-            return machine.life != life or node is None or not (is_behind or "clock" in node.problems)
+            return machine.life != life or machine.believes_its_clock
 
         self.later(LOOK_S, lambda: awake(counted_s, tell=tell, later=self.later, is_believed=is_believed))
 
