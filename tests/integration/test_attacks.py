@@ -332,10 +332,14 @@ def test_who_is_dialled_because_a_member_named_its_address_says_and_hears_nothin
         until(lambda: strangers < victim.links(), "both are linked: the member, and whom it told of")
         foreign.put(KEYS.beat("edge1"), b"forged", congestion_control=zenoh.CongestionControl.BLOCK)
         assert not list(foreign.get(KEYS.status("robot1", "edge1"), timeout=ANSWER_S))
-        liar.put(KEYS.beat("robot2"), b"own")
-        until(lambda: victim.heard, "the member's own frame")
+
+        def is_heard() -> bool:
+            liar.put(KEYS.beat("robot2"), b"own")  # more than one: a busy machine drops what does not block
+            return bool(victim.heard)
+
+        until(is_heard, "the member's own frame")
         victim.session.put(KEYS.beat("robot1"), b"", allowed_destination=zenoh.Locality.REMOTE)
-    assert victim.heard == [KEYS.beat("robot2")]
+    assert set(victim.heard) == {KEYS.beat("robot2")}
     assert KEYS.beat("robot1") not in heard
 
 
