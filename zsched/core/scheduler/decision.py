@@ -10,7 +10,7 @@ figures give the same judgement, bit for bit.
 from __future__ import annotations
 
 from zsched.core.scheduler.damping import Damping
-from zsched.core.scheduler.judge import Judge, Judgement, Outcome, escape_ahead, escape_reason
+from zsched.core.scheduler.judge import Judge, Judgement, Outcome, escape_ahead, escape_reason, short_of_memory
 from zsched.core.scheduler.scoring import Standing, compare
 from zsched.core.values.decision import Figures, Rules, Verdict
 from zsched.core.values.fleet import TaskSpec, WorkerSpec
@@ -44,6 +44,10 @@ def decide(judge: Judge, damping: Damping, figures: Figures) -> Decided:
     compared = compare(judge.spec, allocation, {vector.voter: vector for vector in figures.vectors})
     standing = _keep_out(compared, figures)
     escape = _escape(judge, standing, figures)
+    if escape is not None and escape == short_of_memory(judge.spec, allocation, figures.owner_profile):
+        roomy = _with_room(standing, figures)
+        # where all are short of memory, to flee would only be to come back
+        standing, escape = (roomy, escape) if roomy.aggregates.keys() - {allocation.owner} else (standing, None)
     needed = _robots_needed(figures, is_escape=escape is not None)
     if standing.voters_heard < needed:
         reason = f"utilities of {standing.voters_heard} robots, {needed} needed"
@@ -140,6 +144,21 @@ def _keep_out(standing: Standing, figures: Figures) -> Standing:
         standing,
         aggregates={name: value for name, value in standing.aggregates.items() if name not in closed},
         vetoed={**standing.vetoed, **{name: why for name, why in closed.items() if name in figures.rules.candidates}},
+    )
+
+
+def _with_room(standing: Standing, figures: Figures) -> Standing:
+    """The standing without the candidates that would be left again at once, for the same want of memory."""
+    told = (one for vector in standing.vectors for one in vector.utilities if one.candidate != figures.allocation.owner)
+    short = {
+        one.candidate: f"would have {one.memory * 100:.0f} % of its memory free"
+        for one in told
+        if one.memory is not None and one.memory < figures.rules.memory_floor_ratio
+    }
+    return replace(
+        standing,
+        aggregates={name: value for name, value in standing.aggregates.items() if name not in short},
+        vetoed={**short, **standing.vetoed},
     )
 
 

@@ -316,12 +316,20 @@ def escape_reason(
             return f"{owner} gives it away: its worker starts again, by the changed fleet file"
         if _is_told(spec, profile) and not_ready_for_s > spec.worker.start_deadline_s:
             return f"the worker on {owner} has not been ready for {not_ready_for_s:.1f} s{why}"
-        if allocation.tuning.score is ScoreForm.PAPER and profile.memory_used_mb is not None:
-            free_ratio = 1.0 - profile.memory_used_mb / profile.memory_mb
-            if free_ratio < spec.memory_floor_ratio:
-                return f"memory of {owner} is {max(free_ratio, 0.0) * 100:.0f} % free"
     veto = standing.vetoed.get(owner)
-    return None if veto is None or not veto.startswith("reached by") else f"{owner} is {veto}"
+    if veto is not None and veto.startswith("reached by"):
+        return f"{owner} is {veto}"
+    return short_of_memory(spec, allocation, profile)
+
+
+def short_of_memory(spec: TaskSpec, allocation: Allocation, profile: Profile | None) -> str | None:
+    """That the owner leaves less memory free than the task's floor, where the score is the paper's; the last escape."""
+    if profile is None or profile.memory_used_mb is None or allocation.tuning.score is not ScoreForm.PAPER:
+        return None
+    free_ratio = 1.0 - profile.memory_used_mb / profile.memory_mb
+    if free_ratio >= spec.memory_floor_ratio:
+        return None
+    return f"memory of {allocation.owner} is {max(free_ratio, 0.0) * 100:.0f} % free"
 
 
 def _is_told(spec: TaskSpec, profile: Profile) -> bool:

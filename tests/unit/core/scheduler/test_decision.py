@@ -16,9 +16,9 @@ from support.decisions import figures_of
 from support.fleets import fleet_of, task_of, tuning_of
 from support.profiles import load_of, profile_of
 from zsched.core.scheduler.decision import decide_again, verdict_of
-from zsched.core.values.decision import Decision
+from zsched.core.values.decision import Decision, Figures
 from zsched.core.values.fleet import Fleet, WorkerSpec
-from zsched.core.values.model import NodeId, TaskId, Utility, UtilityVector
+from zsched.core.values.model import NodeId, ScoreForm, TaskId, Utility, UtilityVector
 from zsched.core.values.profile import WorkerState
 from zsched.errors import InvariantError
 from zsched.wire.codec import as_plain, from_plain
@@ -151,3 +151,42 @@ def test_too_few_robots_are_no_reason_to_say_that_nobody_else_can_have_a_task_wh
     )
     alone = replace(figures, vectors=(replace(heard, utilities=column[:1]),))
     assert decide_again(alone).judgement.reason.endswith("edge1 is starting; nobody else can have the task")
+
+
+def full(*, has_room: bool) -> Figures:
+    """An owner with 3 % of its memory free, by the paper's score; edge2 is worth most, and only edge3 may have room."""
+    tuning = tuning_of(cpu=0.5, memory=0.5, score=ScoreForm.PAPER)
+    spec = task_of(candidates=EDGES, tuning=tuning, worker=WorkerSpec(command=("worker",)))
+    free = {"edge1": 0.03, "edge2": 0.04, "edge3": 0.3 if has_room else 0.02}
+    worth = {"edge1": 0.3, "edge2": 0.9, "edge3": 0.5}
+    column = tuple(Utility(candidate=name, value=worth[name], memory=free[name]) for name in EDGES)
+    vectors = tuple(UtilityVector(voter=name, task="merge", revision=4, utilities=column) for name in ROBOTS)
+    owner = profile_of("edge1", memory_used_mb=3880.0, workers=(load_of(),))
+    return figures_of(spec, *ROBOTS, vectors=vectors, owner_profile=owner)
+
+
+def test_an_owner_short_of_memory_is_left_for_a_machine_that_is_not() -> None:
+    decided = decide_again(full(has_room=True))
+    assert (decided.judgement.candidate, decided.judgement.is_escape) == ("edge3", True)
+    assert decided.judgement.reason == "memory of edge1 is 3 % free"
+    assert decided.standing.vetoed == {"edge2": "would have 4 % of its memory free"}
+
+
+def test_where_all_are_short_of_memory_nobody_is_fled_from() -> None:
+    decided = decide_again(full(has_room=False))
+    assert (decided.escape, decided.judgement.is_escape) == (None, False)
+    assert decided.judgement.reason.startswith("edge2 leads by 0.5"), "cool-down and patience hold it as ever"
+
+
+def test_a_task_does_not_go_round_between_machines_that_are_all_short_of_memory() -> None:
+    """Each flight took half a second, and nothing held the next one."""
+    tuning = tuning_of(score=ScoreForm.PAPER, cool_down_s=2.0)
+    spec = task_of(candidates=EDGES[:2], tuning=tuning, worker=WorkerSpec(command=("worker",)))
+    used_mb = [1000.0]
+    sim = Simulator(fleet=fleet_of(spec), seed=1, load=lambda _node, _now: (1.0, used_mb[0]))
+    sim.start()
+    sim.run(10.0)
+    used_mb[0] = 3880.0
+    before = len(sim.owners)
+    sim.run(20.0)
+    assert len(sim.owners) == before
