@@ -864,6 +864,19 @@ def test_who_has_committed_an_escape_remembers_the_failure() -> None:
     assert set(node.rounds.tasks["merge"].damping.penalties(node.next_deadline())) == {"edge1"}
 
 
+@pytest.mark.parametrize("is_escape", [True, False])
+def test_a_flight_from_a_node_that_has_not_failed_counts_in_the_cap_of_escapes(*, is_escape: bool) -> None:
+    """It is too far, or drains: six of them a minute held back planned moves, and sixty held nothing back."""
+    node = started(learnt=allocation_of(4, "edge1", 2))
+    for voter in ("robot1", "robot2"):
+        paper = proposal_of(voter, "edge2", base_revision=4, is_escape=is_escape)
+        node.votes.tasks["merge"].absorb(paper, node.values()["merge"], 100.0)
+    node.handle(learnt_from("robot3", allocation_of(5, "edge2", 3)), 100.1)
+    damping = node.rounds.tasks["merge"].damping
+    assert damping.penalties(100.1) == {}
+    assert damping.memory().moves == ((100.1, is_escape),)
+
+
 # --- an operator who has mended something ----------------------------------------------------------------------------
 
 

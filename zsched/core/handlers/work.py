@@ -42,8 +42,15 @@ def carry_out(node: Stages, value: Allocation, reason: str, todo: ToDo, now: flo
     if is_new_epoch:
         left = executor.owner
         failed, drained = _has_failed(node, value, left, now, is_ours=is_ours), node.was_draining(left, now)
-        is_ordered = value.asked is not None or left in node.flags.drained
-        node.rounds.on_moved(task, left, has_failed=failed, was_draining=drained, is_ordered=is_ordered, now=now)
+        node.rounds.on_moved(
+            task,
+            left,
+            has_failed=failed,
+            was_draining=drained,
+            is_escape=any(one.is_escape for one in _votes(node, value)),
+            is_ordered=value.asked is not None or left in node.flags.drained,
+            now=now,
+        )
     node.expiry.note(value, now)
     node.votes.on_learnt(task)
     node.rounds.on_learnt(task, is_new_epoch=is_new_epoch, now=now)

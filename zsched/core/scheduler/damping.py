@@ -58,20 +58,22 @@ class Damping(Struct):
         *,
         has_failed: bool,
         was_draining: bool = False,
+        is_escape: bool = False,
         is_ordered: bool = False,
         now: float,
     ) -> None:
         """An epoch was learnt: ``left`` is the owner before (``None``: the first placement, which is no move).
 
         A node that drained was told to: that says nothing against it, however soon, and though it is gone by now.
-        An operator's move counts neither against the node that was left nor in the cap.
+        An operator's move counts neither against the node that was left nor in the cap. ``is_escape``: it was fled
+        from, though it may not have failed.
         """
         if left is not None and not is_ordered:
             if has_failed and not was_draining:
                 gained = 2.0 + float(now - self._owner_since < EARLY_FAILURE_S)
                 self._points[left] = (self.points(left, now) + gained, now)
             self._forget_old(now)
-            self._moves.append((now, has_failed))
+            self._moves.append((now, has_failed or is_escape))
         self._owner_since = now
 
     def forgive(self, node: NodeId | None) -> None:
@@ -104,7 +106,7 @@ class Damping(Struct):
     def moves_within(self, seconds: float, now: float, *, escapes: bool) -> int:
         """How many moves (escapes or the others) this node has learnt in the last ``seconds`` (at most a minute)."""
         self._forget_old(now)
-        return sum(now - at <= seconds and failed == escapes for at, failed in self._moves)
+        return sum(now - at <= seconds and fled == escapes for at, fled in self._moves)
 
     def _forget_old(self, now: float) -> None:
         while self._moves and now - self._moves[0][0] > WINDOW_S:

@@ -419,11 +419,18 @@ class Rounds:
         has_failed: bool,
         now: float,
         was_draining: bool = False,
+        is_escape: bool = False,
         is_ordered: bool = False,
     ) -> None:
-        """A new owner is known: ``left`` is the one before, ``has_failed`` whether it was fled from."""
-        damping = self.tasks[name].damping
-        damping.note_move(left, has_failed=has_failed, was_draining=was_draining, is_ordered=is_ordered, now=now)
+        """A new owner is known: ``left`` is the one before (`Damping.note_move`)."""
+        self.tasks[name].damping.note_move(
+            left,
+            has_failed=has_failed,
+            was_draining=was_draining,
+            is_escape=is_escape,
+            is_ordered=is_ordered,
+            now=now,
+        )
 
     def forgive(self, name: TaskId, node: NodeId | None, now: float) -> None:
         """An operator has mended what was held against a node (``None``: against any); judge again at once."""
