@@ -184,7 +184,9 @@ class Profiler:
 
     def _link(self, sample: LinkSample, now: float) -> Link:
         rssi = trend = None
-        if sample.source is not LinkSource.WIRED:
+        if sample.source is LinkSource.FIXED:  # the file's word, and no reading: nothing in it is an outlier
+            rssi, trend = sample.rssi_dbm, None if sample.rssi_dbm is None else 0.0
+        elif sample.source is not LinkSource.WIRED:
             signal = self._signals.setdefault(sample.peer, SignalFilter(_signal_tau_s(self._timing)))
             rssi = signal.update(sample.rssi_dbm, now)
             trend = signal.trend_db_s

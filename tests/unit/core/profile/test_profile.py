@@ -18,6 +18,7 @@ from zsched.core.profile.profile import (
     SignalFilter,
 )
 from zsched.core.values.fleet import Timing
+from zsched.core.values.model import RSSI_MAX_DBM, RSSI_MIN_DBM
 from zsched.core.values.profile import DeviceSample, Link, LinkSample, LinkSource, Profile, WorkerLoad, WorkerState
 
 TIMING = Timing()
@@ -148,6 +149,18 @@ def test_signals_are_smoothed_in_dbm_and_each_link_for_itself() -> None:
     assert way.rssi_dbm == pytest.approx(-60.0 - 10.0 * (1 - math.exp(-1.0)))
     assert direct.peer == "robot2"
     assert direct.rssi_dbm == pytest.approx(-40.0)
+
+
+@pytest.mark.parametrize("dbm", [RSSI_MIN_DBM, -100.0, -40.0, -5.0, RSSI_MAX_DBM])
+def test_a_fixed_signal_is_the_figure_of_the_file_whatever_it_is(dbm: float) -> None:
+    """The fleet file takes it from -120 to 0: dropped as a driver's fault it was not measured, and nobody said so."""
+    profiler = make_profiler()
+    for step, signal in enumerate((-60.0, dbm)):
+        profiler.absorb(device(), (LinkSample(source=LinkSource.FIXED, rssi_dbm=signal),), 100.0 + step)
+        (link,) = taken(profiler, 100.0 + step).links
+        assert (link.rssi_dbm, link.trend_db_s) == (signal, 0.0)
+    profiler.absorb(device(), (LinkSample(source=LinkSource.FIXED),), 102.0)
+    assert taken(profiler, 102.0).links == (Link(source=LinkSource.FIXED),)
 
 
 def test_a_wired_link_has_no_signal_and_says_wired() -> None:
