@@ -69,6 +69,8 @@ class Gauge(Struct, frozen=True, kw_only=True):
         """
         if reading is None:
             return f"{self.name} is not measured" if self.is_needed else ""
+        if limit == (self.low if self.is_floor else self.high):
+            return ""  # no reading is beyond it: it only asks for the gauge
         sign = 1.0 if self.is_floor else -1.0
         inside = sign * (reading - limit)
         at = f"{'would be' if is_reckoned else 'is'} at {self.shown(reading)}"

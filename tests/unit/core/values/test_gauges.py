@@ -59,6 +59,16 @@ def test_an_owner_is_left_beyond_the_limit_and_others_wait_for_the_margin(
     assert gauge.fault(inside, limit, is_owner=False) == ""
 
 
+@pytest.mark.parametrize(("name", "limit"), [("gpu", 1.0), ("battery", 0.0)])
+def test_a_limit_that_no_reading_is_beyond_only_asks_for_the_gauge(name: str, limit: float) -> None:
+    """Nor is it missed by the margin, or by what a task would add: three GPUs at 95 % are three candidates."""
+    gauge = BY_NAME[name]
+    for reading in (limit, limit + 0.03 * (1 if gauge.is_floor else -1)):
+        assert gauge.fault(reading, limit, is_owner=False) == gauge.fault(reading, limit, is_owner=True) == ""
+    assert BY_NAME["gpu"].fault(1.3, 1.0, is_owner=False, is_reckoned=True) == ""
+    assert BY_NAME["gpu"].fault(None, 1.0, is_owner=False) == "gpu is not measured"
+
+
 def test_only_a_machine_without_a_gpu_is_refused_for_what_is_not_measured() -> None:
     told = {gauge.name: gauge.fault(None, gauge.best, is_owner=False) for gauge in GAUGES}
     assert told == {"gpu": "gpu is not measured", "battery": "", "temperature_c": ""}
