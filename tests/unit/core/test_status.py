@@ -390,6 +390,18 @@ def test_a_task_says_what_staying_may_cost(patience: float, *, learns: bool) -> 
     assert [task["patience"] for task in snapshot_json(snapshot)["tasks"]] == [patience] * 2
 
 
+@pytest.mark.parametrize("me", ["robot1", "edge1"])
+def test_a_tuned_patience_is_told_by_nodes_that_judge_nothing_too(me: str) -> None:
+    node = make(me)
+    value = allocation_of(5, "edge1")
+    tuned = replace(value, tuning=replace(value.tuning, patience=0.9))
+    node.handle(ev.LearntReceived(learnt=Learnt(node="robot2", values=(tuned,)), is_answer=True), 100.0)
+    assert {task.name: task.patience for task in build_snapshot(node, 100.0).tasks}[value.task] == 0.9
+    changed = replace(FLEET, tasks=tuple(replace(task, max_moves_per_minute=3) for task in FLEET.tasks))
+    node.handle(ev.FleetChanged(fleet=changed), 100.1)
+    assert {task.name: task.patience for task in build_snapshot(node, 100.1).tasks}[value.task] == 0.9
+
+
 @pytest.mark.parametrize("deadline_ms", [None, 100.0])
 def test_the_way_there_and_back_is_told_of_a_task_with_a_deadline(deadline_ms: float | None) -> None:
     node = make()

@@ -53,7 +53,7 @@ def carry_out(node: Stages, value: Allocation, reason: str, todo: ToDo, now: flo
         )
     node.expiry.note(value, now)
     node.votes.on_learnt(task)
-    node.rounds.on_learnt(task, is_new_epoch=is_new_epoch, now=now)
+    node.rounds.on_learnt(task, is_new_epoch=is_new_epoch, now=now, tuning=value.tuning)
     text = f"learnt revision {value.revision}: owner {value.owner}, weights {_told(value.tuning.weights)}"
     text += "" if value.asked is None and not is_known else f", {reason}"
     by = "" if value.asked is None or is_known else value.asked.by

@@ -91,8 +91,8 @@ class TaskRound:
     def by(self, spec: TaskSpec) -> TaskRound:
         """The same standing by another version of the task's file; the last judgement was by the one before."""
         if spec != self.file:
-            self.file, self.tuning = spec, None
-            self._judge_by(spec)
+            self.file = spec
+            self._judge_by(spec if self.tuning is None else spec.under(self.tuning))
             self.figures = self.standing = self.judgement = None
             self.told = ""
         return self
@@ -437,10 +437,12 @@ class Rounds:
         self.tasks[name].damping.forgive(node)
         self.hurry(now)
 
-    def on_learnt(self, name: TaskId, *, is_new_epoch: bool, now: float) -> None:
-        """A newer revision is known."""
+    def on_learnt(self, name: TaskId, *, is_new_epoch: bool, now: float, tuning: Tuning | None = None) -> None:
+        """A newer revision is known, and its tuning: an edge, which judges nothing, tells it all the same."""
         task = self.tasks[name]
         task.told = ""
+        if tuning is not None:
+            task.under(tuning)
         task.judge.reset(is_new_owner=is_new_epoch)
         if is_new_epoch:
             task.settled_at = now
