@@ -20,7 +20,8 @@ STARVED_CPU_RATIO = 0.9
 UNSURE = 1.5
 """Need of a worker that always wants to run and never had enough: this many times its use."""
 SETTLE_S = 4.0
-"""After a move the smoothed use still rises for this long: it is only a lower bound of the need."""
+"""After a move, or a worker's start, the smoothed use still rises for this long: it is only a lower bound of the need.
+"""
 
 
 CALM_WAIT_RATIO = 0.1
@@ -83,7 +84,7 @@ class _Known(Struct, frozen=True):
     """The file has named another program since then; the owner may still run the one before."""
     owner: NodeId | None = None
     since: float = 0.0
-    """When it was first looked at there."""
+    """When it was first looked at there, with its worker ready."""
 
 
 class Demands:
@@ -113,9 +114,12 @@ class Demands:
             fair_cores: what a fair scheduler gives the task there while a job runs, >= 0; 0: nobody counts threads.
         """
         load = profile.worker(task)
+        known = self._known.get(task, _Known())
+        if load is not None and load.state is not WorkerState.READY and known.owner == profile.node:
+            # once it is ready its use rises from nothing, as after a move
+            self._known[task] = replace(known, owner=None)
         if load is None or load.state is not WorkerState.READY or profile.cpu_used_cores is None:
             return False
-        known = self._known.get(task, _Known())
         found = known if known.owner == profile.node else replace(known, owner=profile.node, since=now)
         is_new = now - found.since < SETTLE_S
         if load.memory_mb is not None:

@@ -121,6 +121,19 @@ def test_a_task_does_not_cost_less_because_its_worker_restarts(state: WorkerStat
     assert learnt(known, known, restarting) == Demand(cpu_cores=1.5, memory_mb=600.0)
 
 
+def test_a_worker_that_is_ready_again_has_time_to_use_what_it_needs() -> None:
+    """Otherwise the first look after its restart makes the task small, and another task comes to its machine."""
+    demands, known, again = Demands(), profile(1.5, 600.0), profile(0.05, 20.0)
+    demands.learn("merge", known, 0.0)
+    demands.learn("merge", known, EVERY_S)
+    demands.learn("merge", profile(0.0, 20.0, state=WorkerState.STARTING), 2 * EVERY_S)
+    for after_s in (0.5, 0.5 + 0.9 * SETTLE_S):
+        demands.learn("merge", again, 2 * EVERY_S + after_s)
+        assert demands.at(TASK, again) == Demand(cpu_cores=1.5, memory_mb=600.0)
+    demands.learn("merge", again, 2 * EVERY_S + 0.6 + SETTLE_S)
+    assert demands.at(TASK, again) == TASK.demand, "from then on its use is its need"
+
+
 def test_a_figure_that_was_not_measured_leaves_the_known_one() -> None:
     known = profile(1.5, 600.0)
     for without in (profile(None, None), profile(cpu=None), replace(known, workers=())):
