@@ -865,6 +865,20 @@ def test_who_has_committed_an_escape_remembers_the_failure() -> None:
 
 
 @pytest.mark.parametrize("is_escape", [True, False])
+def test_a_node_that_is_silent_for_a_moment_has_failed_only_if_the_task_fled_from_it(*, is_escape: bool) -> None:
+    """A machine is left because it is full, and then its beats come late: a planned move holds nothing against it."""
+    node = started(learnt=allocation_of(4, "edge1", 2))
+    while node.membership.state("edge1") is not PeerState.SUSPECT:
+        node.handle(ev.DeadlineReached(), node.next_deadline())
+    now = node.next_deadline()
+    for voter in ("robot1", "robot2"):
+        paper = proposal_of(voter, "edge2", base_revision=4, is_escape=is_escape)
+        node.votes.tasks["merge"].absorb(paper, node.values()["merge"], now)
+    carry_out(node, allocation_of(5, "edge2", 3), "2 of 2 for edge2", ToDo(), now)
+    assert set(node.rounds.tasks["merge"].damping.penalties(now)) == ({"edge1"} if is_escape else set())
+
+
+@pytest.mark.parametrize("is_escape", [True, False])
 def test_a_flight_from_a_node_that_has_not_failed_counts_in_the_cap_of_escapes(*, is_escape: bool) -> None:
     """It is too far, or drains: six of them a minute held back planned moves, and sixty held nothing back."""
     node = started(learnt=allocation_of(4, "edge1", 2))

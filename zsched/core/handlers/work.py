@@ -117,8 +117,9 @@ def _has_failed(node: Stages, value: Allocation, left: NodeId | None, now: float
     """Whether the task fled from the owner that it left: that one is not there, or its worker has failed.
 
     A node that is cut off misses everybody, so what it sees counts with a vote that it has taken part in. Of a move
-    behind its back it knows nothing; those who made it remember (`UtilityVector.penalties`). ``is_ours``: this node has
-    committed the value.
+    behind its back it knows nothing; those who made it remember (`UtilityVector.penalties`). Who is silent for a moment
+    while the task leaves it for a better one has not failed: a full machine's beats come late. ``is_ours``: this node
+    has committed the value.
     """
     if left is None or left == node.me:
         return False
@@ -126,7 +127,8 @@ def _has_failed(node: Stages, value: Allocation, left: NodeId | None, now: float
     is_escape, has_met = any(one.is_escape for one in votes), any(one.voter != node.me for one in votes)
     if not is_ours and not (is_escape and has_met):
         return False
-    if node.membership.state(left) in (PeerState.SUSPECT, PeerState.GONE):
+    state = node.membership.state(left)
+    if state is PeerState.GONE or (state is PeerState.SUSPECT and is_escape):
         return True
     profile = node.gateway.fresh(left, now)
     return profile is not None and value.task in failed_workers(profile)
