@@ -11,7 +11,7 @@ both promise more than they give would pass the task back and forth for ever.
 from __future__ import annotations
 
 from zsched.core.values.model import NodeId, TaskId
-from zsched.core.values.profile import Profile
+from zsched.core.values.profile import Profile, WorkerState
 
 
 def fair_share(capacity: float, threads: float, others: float) -> float:
@@ -37,9 +37,14 @@ class Shares:
         """What a task got on a machine as a part of its fair share there, at most 1; the newest figure."""
 
     def learn(self, task: TaskId, profile: Profile) -> bool:
-        """Note how many threads of the task want to run on its owner, and what they get; whether that has changed."""
+        """Note how many threads of the task want to run on its owner, and what they get; whether that has changed.
+
+        A worker that starts does other work, by other threads: that tells nothing of the task.
+        """
         load = profile.worker(task)
-        if load is None or load.wanted_cores is None or load.cpu_cores is None or profile.runnable is None:
+        if load is None or load.state is not WorkerState.READY:
+            return False
+        if load.wanted_cores is None or load.cpu_cores is None or profile.runnable is None:
             return False
         threads = max(load.wanted_cores, 1.0)
         fair = fair_share(profile.cpu_cores, threads, max(profile.runnable - threads, 0.0))

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from support.profiles import load_of, profile_of
 from zsched.core.gateway.sharing import Shares, fair_share
-from zsched.core.values.profile import Profile
+from zsched.core.values.profile import Profile, WorkerState
 
 
 def profile(
@@ -26,6 +28,18 @@ def test_by_its_need_until_it_was_seen_to_lack_cpu_then_by_its_threads() -> None
     assert not shares.learn("merge", profile(got=0.7)), "it has what it wants"
     assert shares.learn("merge", profile(got=2.0, wanted=4.0))
     assert shares.at("merge", profile(node="edge2"), 0.3) == pytest.approx(4.0 * 4 / 12)
+
+
+@pytest.mark.parametrize("state", [WorkerState.STARTING, WorkerState.STOPPED, WorkerState.FAILED])
+def test_a_worker_that_starts_again_tells_nothing_of_the_task_s_threads(state: WorkerState) -> None:
+    """It loads a model by one thread for some seconds; its four threads are as many afterwards."""
+    shares = Shares()
+    shares.learn("merge", profile(got=2.0, wanted=4.0))
+    before = shares.at("merge", profile(node="edge2"), 4.0), shares.at("merge", profile(), 4.0)
+    starting = profile(got=0.1, wanted=1.0)
+    load = replace(starting.workers[0], state=state)
+    assert not shares.learn("merge", replace(starting, workers=(load,)))
+    assert before == (shares.at("merge", profile(node="edge2"), 4.0), shares.at("merge", profile(), 4.0))
 
 
 def test_what_comes_shares_as_well_and_nobody_counted_is_nothing() -> None:
