@@ -24,6 +24,7 @@ from zsched.core.handlers.work import carry_out
 from zsched.core.membership.identity import QUIET_S
 from zsched.core.membership.knocking import KNOCKERS_KEPT, SHOWN_AFTER_S
 from zsched.core.node import Node
+from zsched.core.register.register import FROM_A_PEER
 from zsched.core.status import build_snapshot
 from zsched.core.todo import ToDo
 from zsched.core.values.beat import Beat
@@ -47,7 +48,7 @@ from zsched.core.values.messages import (
     TakeCertificate,
     Utilities,
 )
-from zsched.core.values.model import Acceptance, Allocation, Ballot, PeerState, RegisterState
+from zsched.core.values.model import Acceptance, Allocation, Asked, Ballot, PeerState, RegisterState
 from zsched.core.values.plan import Direction, ReadyWhen, RoutePhase, StreamCount, WorkerRole
 from zsched.core.values.profile import Echo, WorkerState
 
@@ -306,6 +307,24 @@ def learnt_from(peer: str, value: Allocation) -> ev.LearntReceived:
 def moves_in(batch: tuple[do.Instruction, ...]) -> list[tuple[str | None, str | None, int, bool]]:
     stories = of(batch, do.RecordStory)
     return [(one.move.left, one.move.owner, one.move.epoch, one.move.is_known) for one in stories if one.move]
+
+
+@pytest.mark.parametrize(
+    ("revision", "epoch", "told"),
+    [
+        pytest.param(5, 3, "moved by ada@robot1", id="she has moved it"),
+        pytest.param(6, 4, "moved by ada@robot1", id="a vote and then she, or she twice"),
+        pytest.param(6, 3, FROM_A_PEER, id="a vote, and then she has changed its weights, or the other way round"),
+    ],
+)
+def test_an_order_that_came_behind_a_move_is_not_told_as_the_move(revision: int, epoch: int, told: str) -> None:
+    """A robot was away while the task moved; it must not tell, nor count, an operator's move that nobody ordered."""
+    node = started(learnt=allocation_of(4, "edge1", 2))
+    now = node.next_deadline()
+    value = allocation_of(revision, "edge2", epoch, asked=Asked(by="ada@robot1"))
+    node.handle(learnt_from("robot2", value), now)
+    assert node.history["merge"][-1].reason == told
+    assert len(node.rounds.tasks["merge"].damping.memory().moves) == (told == FROM_A_PEER)
 
 
 def test_an_owner_that_was_there_before_the_start_is_told_as_known_and_the_next_one_as_a_move() -> None:

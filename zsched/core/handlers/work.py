@@ -36,8 +36,9 @@ def carry_out(node: Stages, value: Allocation, reason: str, todo: ToDo, now: flo
     is_new_epoch, is_ours = value.epoch > executor.epoch, reason != FROM_A_PEER
     if _is_first_news(executor.epoch, value, reason):
         is_known, reason = True, FIRST_NEWS
+    is_by_order = value.asked is not None and (is_ours or _has_only_moved(node, value))
     move = _move_of(node, value, reason, is_known=is_known) if is_new_epoch and value.owner is not None else None
-    reason = _reason_of(value, reason, is_new_epoch=is_new_epoch) if move is None else move.reason
+    reason = _reason_of(node, value, reason, is_new_epoch=is_new_epoch) if move is None else move.reason
     node.history[task].append(PastValue(value=value, at=now, reason=reason))
     if is_new_epoch:
         left = executor.owner
@@ -48,7 +49,7 @@ def carry_out(node: Stages, value: Allocation, reason: str, todo: ToDo, now: flo
             has_failed=failed,
             was_draining=drained,
             is_escape=any(one.is_escape for one in _votes(node, value)),
-            is_ordered=value.asked is not None or left in node.flags.drained,
+            is_ordered=is_by_order or left in node.flags.drained,
             now=now,
         )
     node.expiry.note(value, now)
@@ -87,7 +88,7 @@ def _move_of(node: Stages, value: Allocation, reason: str, *, is_known: bool) ->
         revision=value.revision,
         left=node.executors[value.task].owner,
         owner=value.owner,
-        reason=wanted[0] if wanted and reason == FROM_A_PEER else _reason_of(value, reason, is_new_epoch=True),
+        reason=wanted[0] if wanted and reason == FROM_A_PEER else _reason_of(node, value, reason, is_new_epoch=True),
         votes=tuple((proposal.voter, proposal.candidate) for proposal in votes),
         is_known=is_known,
     )
@@ -99,13 +100,23 @@ def _votes(node: Stages, value: Allocation) -> list[Proposal]:
     return [proposal for proposal in heard if proposal.base_revision == value.revision - 1]
 
 
-def _reason_of(value: Allocation, reason: str, *, is_new_epoch: bool) -> str:
-    """Why the value is what it is; a node that did not commit an operator's order tells it from the value."""
+def _has_only_moved(node: Stages, value: Allocation) -> bool:
+    """Whether each revision since the last one that is known here was a move, so that the newest one is."""
+    known, start = node.history[value.task], value.epoch // CREATION_STEP * CREATION_STEP
+    revision, epoch = (known[-1].value.revision, known[-1].value.epoch) if known else (start, start)
+    return value.revision - revision == value.epoch - epoch > 0
+
+
+def _reason_of(node: Stages, value: Allocation, reason: str, *, is_new_epoch: bool) -> str:
+    """Why the value is what it is; a node that did not commit an operator's order tells it from the value.
+
+    Who has missed a revision does not know whether the order is the one that has moved the task.
+    """
     if value.asked is None or reason != FROM_A_PEER:
         return reason
     who = told_by(value.asked)
     if is_new_epoch:
-        return f"moved by {who}"
+        return f"moved by {who}" if _has_only_moved(node, value) else reason
     if value.pause is not None and value.pause.revision == value.revision:
         return f"paused by {who}"
     if value.pin is not None and value.pin.revision == value.revision:
