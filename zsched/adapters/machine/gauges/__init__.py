@@ -20,7 +20,7 @@ from zsched.guard import guarded
 
 LOOK_S: Final = 2.0
 REST_S: Final = 30.0
-"""Between two looks at a machine that has none of the gauges."""
+"""Between two looks at a machine that has never had one of the gauges."""
 
 
 class Reader(Protocol):
@@ -50,7 +50,8 @@ class GaugeWatch:
         """Files below ``root`` ("/" but in tests)."""
         self._readers = readers(root)
         self._stop = threading.Event()
-        self._newest: tuple[float, Readings] = (0.0, ())
+        self._kept: dict[str, tuple[float, float]] = {}
+        """{gauge: (its newest reading, when it was read)}."""
         self._thread = guarded(self._run, name="zsched-gauges")
 
     def start(self) -> None:
@@ -62,9 +63,9 @@ class GaugeWatch:
         self._stop.set()
 
     def newest(self, now: float) -> Readings:
-        """The last readings; empty once they are older than `STALE_S`."""
-        at, found = self._newest
-        return found if now - at <= max(STALE_S, LOOK_S) else ()
+        """The newest reading of every gauge, unless it is older than `STALE_S`: a driver may miss one."""
+        kept = self._kept
+        return tuple((name, reading) for name, (reading, at) in kept.items() if now - at <= max(STALE_S, LOOK_S))
 
     def look(self) -> Readings:
         """Read all gauges now."""
@@ -74,9 +75,11 @@ class GaugeWatch:
                 reading = reader.read()
                 if reading is not None:
                     found.append((name, reading))
-        self._newest = (monotonic_s(), tuple(found))
-        return self._newest[1]
+        now = monotonic_s()
+        self._kept = {**self._kept, **{name: (reading, now) for name, reading in found}}
+        return tuple(found)
 
     def _run(self) -> None:
         while not self._stop.is_set():
-            self._stop.wait(LOOK_S if self.look() else REST_S)
+            self.look()
+            self._stop.wait(LOOK_S if self._kept else REST_S)

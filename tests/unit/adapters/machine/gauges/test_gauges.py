@@ -9,7 +9,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from zsched.adapters.machine.gauges import GaugeWatch, battery, gpu, readers, temperature_c
+from zsched.adapters.machine.gauges import LOOK_S, REST_S, GaugeWatch, battery, gpu, readers, temperature_c
 from zsched.clock import monotonic_s
 from zsched.core.profile.means import STALE_S
 
@@ -138,6 +138,42 @@ def test_readings_of_a_thread_that_hangs_grow_old(tmp_path: Path) -> None:
     found = watch.look()
     assert watch.newest(monotonic_s()) == found != ()
     assert watch.newest(monotonic_s() + STALE_S + 0.1) == ()
+
+
+def test_a_reading_that_a_driver_misses_leaves_the_one_before_for_as_long_as_it_is_young(tmp_path: Path) -> None:
+    """A machine whose only gauge is its GPU lost its task to one failed reading: it was not looked at for 30 s."""
+    zone(tmp_path, 0, "cpu", "40000")
+    watch, waits, now = GaugeWatch(tmp_path), list[float](), monotonic_s()
+
+    class Stop:
+        def is_set(self) -> bool:
+            return len(waits) == 2
+
+        def wait(self, seconds: float) -> None:
+            waits.append(seconds)
+            (tmp_path / "sys/class/thermal/thermal_zone0/temp").unlink(missing_ok=True)
+
+    watch._stop = Stop()  # type: ignore[assignment]
+    watch._run()
+    assert watch.look() == (), "it is missed from the second look on"
+    assert waits == [LOOK_S, LOOK_S]
+    assert watch.newest(now) == (("temperature_c", 40.0),)
+    assert watch.newest(monotonic_s() + STALE_S + 0.1) == ()
+
+
+def test_a_machine_that_has_never_had_a_gauge_is_seldom_looked_at(tmp_path: Path) -> None:
+    watch, waits = GaugeWatch(tmp_path), list[float]()
+
+    class Stop:
+        def is_set(self) -> bool:
+            return bool(waits)
+
+        def wait(self, seconds: float) -> None:
+            waits.append(seconds)
+
+    watch._stop = Stop()  # type: ignore[assignment]
+    watch._run()
+    assert waits == [REST_S]
 
 
 def test_this_machine_as_psutil_sees_it() -> None:
