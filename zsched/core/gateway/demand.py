@@ -20,8 +20,7 @@ STARVED_CPU_RATIO = 0.9
 UNSURE = 1.5
 """Need of a worker that always wants to run and never had enough: this many times its use."""
 SETTLE_S = 4.0
-"""After a move, or a worker's start, the smoothed use still rises for this long: it is only a lower bound of the need.
-"""
+"""After a move, or a worker's start, the smoothed use rises for so long: it is only a lower bound of the need."""
 
 
 CALM_WAIT_RATIO = 0.1

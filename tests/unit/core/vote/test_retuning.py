@@ -77,6 +77,32 @@ def test_a_tuning_that_comes_between_is_the_newer_word() -> None:
     assert retuning.is_idle
 
 
+def test_a_second_changed_file_does_not_end_what_the_first_one_wants() -> None:
+    """No quorum, or another node's turn: the second file differs from the first one only in what was changed last."""
+    tunings = (FILE, replace(FILE, cool_down_s=30.0), replace(FILE, cool_down_s=30.0, bonus=0.2))
+    first, second, third = (fleet_of(task_of(tuning=tuning)) for tuning in tunings)
+    value = replace(allocation_of(5, "edge1"), tuning=FILE)
+    retuning = Retuning("edge2")
+    retuning.adopt(first, second, {"merge": value}, 0.0)
+    retuning.adopt(second, third, {"merge": value}, 0.1)
+    assert [retune.tuning for _, retune in retuning.due({"merge": value}, 9.0)] == [tunings[2]]
+    retuning.adopt(third, first, {"merge": value}, 10.0)
+    assert list(retuning.due({"merge": value}, 99.0)) == [], "both are taken back"
+    assert retuning.is_idle
+
+
+def test_what_an_earlier_file_wanted_ends_with_a_tuning_that_came_between() -> None:
+    tunings = (FILE, replace(FILE, cool_down_s=30.0), replace(FILE, cool_down_s=30.0, bonus=0.2))
+    first, second, third = (fleet_of(task_of(tuning=tuning)) for tuning in tunings)
+    value = replace(allocation_of(5, "edge1"), tuning=FILE)
+    newer = replace(value, revision=6, tuning=replace(FILE, cool_down_s=7.0))
+    retuning = Retuning("edge2")
+    retuning.adopt(first, second, {"merge": value}, 0.0)
+    retuning.adopt(second, third, {"merge": newer}, 0.1)
+    (due,) = retuning.due({"merge": newer}, 9.0)
+    assert due[1].tuning == replace(newer.tuning, bonus=0.2)
+
+
 def test_who_found_no_quorum_tries_again_and_ends_once_somebody_had_success() -> None:
     old, new = fleet_of(task_of(tuning=FILE, patience=0.3)), fleet_of(task_of(tuning=FILE, patience=0.4))
     value = replace(allocation_of(5, "edge1"), tuning=replace(FILE, patience=0.7))
