@@ -13,6 +13,7 @@ RENEWING, RETUNING = "zsched.core.executor.renewing", "zsched.core.vote.retuning
 ADOPTION, HANDOVER = "zsched.core.values.adoption", "zsched.core.executor.handover"
 
 _FLEET = ("tests/unit/core/handlers/test_fleet.py",)
+_CHANGES = ("tests/sim/test_fleet_changes.py",)
 _RENEWING = ("tests/unit/core/executor/test_renewing.py",)
 
 
@@ -70,6 +71,34 @@ ADOPTION_BUGS: tuple[Bug, ...] = (
         "            if changed and value.revision > 0 and not self._ahead:\n",
         "            if changed and value.revision < 0 and not self._ahead:\n",
         _FLEET,
+    ),
+    _bug(
+        "who was away undoes what was tuned since",
+        RETUNING,
+        " and not self._ahead:",
+        ":",
+        _CHANGES,
+    ),
+    _bug(
+        "a second change loses the first one",
+        RETUNING,
+        "seen = (*before.seen, before.wanted)",
+        "pass",
+        ("tests/unit/core/vote/test_retuning.py",),
+    ),
+    _bug(
+        "the register of the fleet keeps the clocks of before",
+        "zsched.core.electorate.roll",
+        "        self._register.adopt_clocks(ballot_s=ballot_s, stagger_s=stagger_s)\n",
+        "",
+        _CHANGES,
+    ),
+    _bug(
+        "an owner that had to stop forgets its predecessor",
+        HANDOVER,
+        "            lease_until_s=until_s,\n            predecessor=self._predecessor,",
+        "            lease_until_s=until_s,\n            predecessor=self.role.predecessor,",
+        ("tests/unit/core/executor/test_predecessor.py",),
     ),
     _bug(
         "the owner starts its worker first",

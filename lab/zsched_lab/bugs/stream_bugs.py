@@ -13,9 +13,10 @@ INPUTS, SHARED = "zsched.worker.inputs", "zsched.core.hop.shared"
 KEPT, HELD, SLOTS = "zsched.core.hop.kept", "zsched.core.hop.held", "zsched.relay.streams.slots"
 GREETINGS, SENDER, OUTLET = "zsched.relay.streams.greetings", "zsched.core.hop.sender", "zsched.relay.streams.outlet"
 
-BOOKS = "zsched.relay.books"
+BOOKS, TASK = "zsched.relay.books", "zsched.relay.task"
 
 _BOOKS = ("tests/unit/relay/test_books.py",)
+_TASK = ("tests/parts/relay/test_task.py",)
 _GREETINGS = ("tests/parts/relay/streams/test_greetings.py",)
 _GATES = ("tests/parts/relay/streams/test_gates.py",)
 _RECEIVE = ("tests/parts/relay/streams/test_receive.py",)
@@ -605,5 +606,42 @@ STREAM_BUGS = (
         "timeout=min(SLICE_S, left_s)",
         "timeout=None if timeout_s is None else left_s",
         ("tests/unit/test_latch.py::test_a_signal_that_another_thread_has_releases_the_main_thread",),
+    ),
+    _bug(
+        "a lease drops what has to be processed again",
+        INPUTS,
+        "            self._backlog.begin(is_settled=not self._is_held and self._first is None)\n",
+        "            self._backlog.begin()\n"
+        "            if not self._is_held and self._first is None:\n"
+        "                self._backlog.settle(is_restored=False, now=monotonic_s())\n",
+        (_WORKER,),
+    ),
+    _bug(
+        "a recorder is taken for a worker that is away",
+        TASK,
+        "if is_counted and not self._tokens.workers(slot.owner, self._task):",
+        "if False:",
+        _TASK,
+    ),
+    _bug(
+        "a changed file takes the slot that carries away",
+        TASK,
+        "        self._carry_on()\n",
+        "",
+        _TASK,
+    ),
+    _bug(
+        "a foreign worker that is back at once gets no kept values",
+        TASK,
+        " or any(parted))",
+        ")",
+        _TASK,
+    ),
+    _bug(
+        "a worker that no relay sees stays ready",
+        "zsched.runtime.crew",
+        "if not is_there and supervisor is not None:",
+        "if False:",
+        ("tests/parts/runtime/test_crew.py",),
     ),
 )
