@@ -37,15 +37,17 @@ from zsched.core.values.electorate import (
 from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.lease import hold_s
 from zsched.core.values.messages import (
+    Accepted,
     FleetQuestion,
     Learnt,
+    Promise,
     Refused,
     votes_of,
 )
 from zsched.core.values.model import NO_BALLOT, Allocation, NodeId, RegisterState, TaskId
 from zsched.core.values.struct import replace
 from zsched.core.vote.acceptor import Acceptor
-from zsched.core.vote.belief import GENERATION_STEP, MAX_GENERATION, is_proven
+from zsched.core.vote.belief import GENERATION_STEP, MAX_GENERATION, is_fleet_fit, is_proven
 from zsched.core.vote.commands import answer_end, refuse_gone, wanted_retune
 from zsched.core.vote.generations import lost_text, moved_text
 from zsched.core.vote.lease import Leases
@@ -413,10 +415,18 @@ class Agreement:
         answer = event.answer.content
         if answer.elector not in self._nodes:
             self.counters["answer_foreign"] += 1
-        elif not self._numbers.is_possible(answer):
+        elif not self._numbers.is_possible(answer) or self._tells_unfit(answer):
             self.counters["answer_unfit"] += 1
         elif self._numbers.on_answer(answer, todo, now):
             self._count_anew(todo)
+
+    def _tells_unfit(self, answer: Promise[FleetValue] | Promise | Accepted | Refused) -> bool:
+        """Whether a refusal brings a fleet value that could not be true."""
+        return isinstance(answer, Refused) and answer.fleet is not None and not self._is_fit(answer.fleet)
+
+    def _is_fit(self, value: FleetValue) -> bool:
+        known = self._numbers.value
+        return known is None or is_fleet_fit(known, value)
 
     def on_stored(self, event: ev.DocumentStored, todo: ToDo, now: float) -> None:
         """A document is on disk: the value that waits for it is learnt, or an operator's command goes on."""
@@ -441,6 +451,9 @@ class Agreement:
     def on_answer(self, event: ev.ElectorAnswered, todo: ToDo, now: float) -> None:
         """An elector answered our prepare or accept."""
         answer = event.answer
+        if self._tells_unfit(answer):
+            self.counters["answer_unfit"] += 1
+            return
         if isinstance(answer, Refused) and answer.elector in self._nodes and self._numbers.hear(answer, todo, now):
             self._count_anew(todo)
         register = self.registers.get(answer.task)
@@ -599,7 +612,9 @@ class Agreement:
             is_news = self._questions.is_unasked(revision, self.fleet_revision, now)
             self._ask(learnt.node, newer, ASK_AT_ONCE_S, todo, now, is_news=is_news, of_fleet=revision)
             return
-        if learnt.fleet is not None and self._numbers.learn(learnt.fleet, learnt.node, todo, now):
+        if learnt.fleet is not None and not self._is_fit(learnt.fleet):
+            self.counters["learnt_unfit"] += 1
+        elif learnt.fleet is not None and self._numbers.learn(learnt.fleet, learnt.node, todo, now):
             self._count_anew(todo)
         why = self.witness.on_answer(learnt)
         self._lose(why if self._is_of_our_seat(learnt) else "", todo)

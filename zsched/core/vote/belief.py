@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from zsched.core.register.register import MAX_REVISION
 from zsched.core.register.task_register import TaskRegister
+from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import Allocation, NodeId
@@ -37,6 +38,14 @@ def is_fit(fleet: Fleet, value: Allocation, register: TaskRegister, start: int =
     newest = max([register.value.revision, start, *(one.revision for one in known)])
     is_known = value.owner is None or any(node.name == value.owner for node in fleet.nodes)
     return is_known and value.epoch <= value.revision <= newest + MAX_AHEAD
+
+
+def is_fleet_fit(known: FleetValue, value: FleetValue) -> bool:
+    """Whether a fleet value could be true: neither of its counters is far ahead of the ``known`` one's.
+
+    Behind one that is, every true value would be too old to be learnt, and nothing could be agreed any more.
+    """
+    return value.revision <= known.revision + MAX_AHEAD and value.number <= known.number + MAX_AHEAD
 
 
 def is_proven(

@@ -42,7 +42,7 @@ from zsched.core.values.messages import (
 )
 from zsched.core.values.model import NO_BALLOT, Acceptance, Ballot, RegisterState
 from zsched.core.vote.agreement import Agreement
-from zsched.core.vote.belief import GENERATION_STEP
+from zsched.core.vote.belief import GENERATION_STEP, MAX_AHEAD
 from zsched.core.vote.lease import Leases
 from zsched.core.vote.questions import ASK_LEARNT_EVERY_S
 from zsched.wire.codec import decode_state, encode_state
@@ -198,6 +198,48 @@ def test_a_fleet_value_of_another_name_is_not_accepted() -> None:
         answers.append(of(agreed(agreement.acceptor.on_fleet_asked, event, 100.1), do.AnswerFleet))
     assert answers[0] == []
     assert isinstance(answers[1][0].answer.content, Accepted), "all else about it was right"
+
+
+AHEAD: list[dict[str, Any]] = [{"revision": 2 + MAX_AHEAD + 1}, {"number": 2 + MAX_AHEAD + 1}]
+
+
+@pytest.mark.parametrize("ahead", AHEAD)
+def test_a_fleet_value_that_is_absurdly_far_ahead_is_neither_learnt_nor_accepted(ahead: dict[str, Any]) -> None:
+    """One such answer would make every true value too old, on disk."""
+    value = replace(ADOPTED, settled=True)
+    agreement = make(value)
+    far = replace(WITH_EDGE, **ahead)
+    told = Learnt(node="edge1", values=(), generation=GENERATION, fleet=far)
+    assert not agreed(agreement.on_learnt, ev.LearntReceived(learnt=told, is_answer=True), 100.1).must_persist
+    ballot = ballot_of(9, "robot2")
+    for task in ("merge", FLEET.name):
+        refused = Refused(
+            elector="robot2",
+            task=task,
+            ballot=ballot,
+            refusal=Refusal.NUMBER,
+            promised=NO_BALLOT,
+            number=far.number,
+            fleet=far,
+        )
+        agreed(agreement.on_answer, ev.ElectorAnswered(answer=refused), 100.2)
+        agreed(agreement.on_fleet_answer, ev.FleetAnswered(answer=fleet_answer(refused)), 100.2)
+    accept = Accept(
+        task=FLEET.name,
+        acceptance=Acceptance(ballot=ballot, value=far),
+        electorate=agreement.electorate,
+        generation_id=value.generation_id,
+        number=value.number,
+    )
+    asked_for = ev.FleetAsked(request=1, asker="robot2", question=FleetQuestion(accept=accept))
+    (said,) = of(agreed(agreement.acceptor.on_fleet_asked, asked_for, 100.3), do.AnswerFleet)
+    assert isinstance(said.answer.content, Refused)
+    assert said.answer.content.refusal is Refusal.VALUE
+    assert agreement.fleet_value == value
+    assert agreement.counters == {"learnt_unfit": 1, "answer_unfit": 4, "accept_unfit": 1}
+    true = Learnt(node="robot2", values=(), generation=GENERATION, fleet=WITH_EDGE)
+    agreed(agreement.on_learnt, ev.LearntReceived(learnt=true, is_answer=True), 100.4)
+    assert agreement.fleet_value == WITH_EDGE
 
 
 # --- learnt ----------------------------------------------------------------------------------------------------------
