@@ -27,7 +27,7 @@ OUTPUT_DEPTH: Final = 4096
 RECEIVE_BUFFER: Final = 1 << 16
 """Bytes of zenoh's batches (``transport/link/rx/buffer_size``); what is larger has come in several, and has its own."""
 KEPT_EPOCHS: Final = 2
-"""Publishers of older epochs are given back: nobody admits them any more."""
+"""Publishers of older epochs are given back once they have ended: nobody admits them any more."""
 
 
 class OutputOptions(Struct, frozen=True, kw_only=True):
@@ -56,6 +56,8 @@ class _Stamped(Struct, eq=False):
     """Of what is kept until the robots' relays have it (classes ``latest`` and ``reliable``)."""
     unkept: int = 0
     """Samples put so far that are not kept."""
+    has_ended: bool = False
+    """The end marker is behind its last sample."""
 
     @property
     def count(self) -> int:
@@ -124,6 +126,7 @@ class Output:
                 self.withheld += 1
                 return False
             stamped = self._epochs.get(epoch) or self._declare(epoch)
+            stamped.has_ended = False
             if stamped.lane is not None:
                 sent, attached = _own(sent), None if attached is None else _own(attached)
             given = (sent, attached, encoded, stamp or self._stamp_now())
@@ -152,6 +155,7 @@ class Output:
         marker = EndMarker(epoch=epoch, count=stamped.count)
         with self._stalled:
             put_end(self._session, stamped.key, stamped.publisher.id, marker)
+        stamped.has_ended = True
         if stamped.lane is not None:
             stamped.lane.note_end(marker)
 
@@ -174,7 +178,7 @@ class Output:
             limit = self.options.keep_last if self.options.latest else self.options.depth
             lane = self._keeper.lane(key, publisher.id, limit, is_whole=self.options.reliable)
         stamped = self._epochs[epoch] = _Stamped(key=key, publisher=publisher, lane=lane)
-        for old in sorted(self._epochs)[:-KEPT_EPOCHS]:
+        for old in [one for one in sorted(self._epochs)[:-KEPT_EPOCHS] if self._epochs[one].has_ended]:
             gone = self._epochs.pop(old)
             gone.publisher.undeclare()  # type: ignore[no-untyped-call] # zenoh's stubs
             if gone.lane is not None:

@@ -335,6 +335,28 @@ def test_an_output_that_cannot_end_takes_no_end_from_the_next_one(
         until(lambda: relay.ends == [end], "the end of the other one")
 
 
+@pytest.mark.parametrize("options", [{"latest": True}, {"reliable": True}, {}], ids=["latest", "reliable", "plain"])
+def test_an_epoch_that_two_newer_ones_follow_ends_with_what_it_has_put(
+    relay: Relay, tmp_path: Path, options: dict[str, Any]
+) -> None:
+    """Its publisher was given back before, and the end came of another one, which had put nothing."""
+    with Worker.from_env(environment(relay, tmp_path), handles_signals=False) as worker:
+        output = worker.publisher("{prefix}/{epoch}/robot1/out", **options)
+        worker.ready()
+        until(lambda: KEYS.worker("edge1", "t", 3) in relay.tokens, "the ready token")
+        for epoch in (1, 3, 5):
+            output._epoch_now = partial(int, epoch)
+            assert output.put(b"x")
+        for epoch in (0, 1, 3):
+            output.send_end(epoch)
+        until(lambda: len(relay.ends) == 3, "the ends")
+        said = [(marker.epoch, marker.count) for _, marker in relay.ends]
+        assert said == [(0, 0), (1, 1), (3, 1)]
+        output._epoch_now = partial(int, 7)
+        assert output.put(b"x")
+        assert sorted(output._epochs) == [5, 7], "what has ended is given back"
+
+
 @pytest.mark.parametrize(
     "wrong",
     [
