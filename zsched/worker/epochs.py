@@ -1,6 +1,6 @@
 """Decides with which epoch a worker stamps an output.
 
-Knows: the role's epoch, the one before it that has not ended here, which ones have. Does not know: zenoh, inputs (it is
+Knows: the role's epoch, those before it that have not ended here, which ones have. Does not know: zenoh, inputs (it is
 told the epoch of the input in hand), where roles come from.
 
 When one epoch follows another on the same owner, or the owner that drains is the owner again, its inputs flow on. It
@@ -22,6 +22,8 @@ CARRY_S: Final = 2.5
 """The older epoch's inputs that have not come by then never will..."""
 CARRY_LOOK_S: Final = 0.2
 """...and those that have come are processed first: the worker looks this often whether one still waits."""
+MAX_CARRIED: Final = 4
+"""So many older epochs are carried; when one more is left in that time, they and it end at once."""
 
 
 class Epochs:
@@ -30,38 +32,49 @@ class Epochs:
     def __init__(self) -> None:
         self.ended = -1
         """The newest epoch whose outputs are closed."""
-        self._carried = 0
+        self._older: tuple[int, ...] = ()
+        """Epochs that were carried when the newest role came, the oldest first."""
 
     def follow(self, before: Role, role: Role) -> None:
         """A new role: from now on an older epoch may be carried beside it."""
         has_worked = before.role is not WorkerRole.IDLE and role.role is WorkerRole.ACTIVE
         is_owner_again = has_worked and self.ended < before.epoch < role.epoch
-        if is_owner_again and before.epoch and not self.is_carried(self._carried):
-            self._carried = before.epoch
+        carried = self._carried()
+        if is_owner_again and before.epoch and before.epoch not in carried and len(carried) < MAX_CARRIED:
+            self._older = (*carried, before.epoch)
 
     def is_carried(self, epoch: int) -> bool:
         """True while the epoch's inputs are still worked on beside a newer role."""
-        return bool(epoch) and epoch == self._carried and epoch > self.ended
+        return epoch in self._carried()
+
+    def _carried(self) -> tuple[int, ...]:
+        return tuple(epoch for epoch in self._older if epoch > self.ended) if self._older else ()
 
     def resume(self, epoch: int) -> None:
         """It was told to stop, and works on in the same epoch after all."""
         if self.ended == epoch:
             self.ended = epoch - 1
 
-    def close(self, epoch: int) -> bool:
-        """Nothing more will be stamped with ``epoch``; ``False`` when that was so already."""
+    def close(self, epoch: int) -> tuple[int, ...]:
+        """Nothing more will be stamped with ``epoch``, or with an older one that is carried; which ones end by that.
+
+        The oldest first; none when that was so already.
+        """
         if epoch <= self.ended:
-            return False
+            return ()
+        older = tuple(one for one in self._carried() if one < epoch)
         self.ended = epoch
-        return True
+        return (*older, epoch)
 
     def stamp(self, role: Role, in_hand: int | None) -> int | None:
         """The epoch for an output made of an input of epoch ``in_hand``; ``None``: it is closed, or not told yet."""
         if in_hand is not None and in_hand > role.epoch:
             return None
-        if self.is_carried(self._carried) and (in_hand is None or in_hand <= self._carried):
-            return self._carried
-        return role.epoch if role.epoch > self.ended or self.is_carried(self._carried) else None
+        carried = self._carried()
+        for epoch in carried:
+            if in_hand is None or in_hand <= epoch:
+                return epoch
+        return role.epoch if role.epoch > self.ended or carried else None
 
 
 def lets_out(before: Role, role: Role, now: float) -> bool:

@@ -632,11 +632,11 @@ class Worker:
 
     def _send_ends(self, epoch: int) -> None:
         with self._lock:
-            if not self._epochs.close(epoch):
-                return
+            ended = self._epochs.close(epoch)
             outputs = tuple(self._outputs.values())
-        for output in outputs:  # an errand each: one that fails takes no end from those behind it
-            self._errands.put(partial(output.send_end, epoch))
+        for one in ended:
+            for output in outputs:  # an errand each: one that fails takes no end from those behind it
+                self._errands.put(partial(output.send_end, one))
 
 
 def _pass_on(number: int, handler: Any) -> None:

@@ -967,6 +967,25 @@ def test_who_is_chosen_again_before_it_hears_that_it_was_left_answers_in_the_new
     assert relay.outputs == [("edge1/t/1/robot1/out", b"a"), *again]
 
 
+@pytest.mark.usefixtures("echo")
+def test_who_is_left_and_chosen_again_twice_ends_both_epochs(relay: Relay) -> None:
+    """A -> B -> A -> C -> A within the time in which an epoch's inputs may still come."""
+    publishers = []
+    for epoch in (1, 3):
+        relay.tell(WorkerRole.ACTIVE, epoch)
+        until(lambda epoch=epoch: f"{ROLE_KEY}/{epoch}" in relay.tokens, "the worker has begun")  # type: ignore[misc]
+        relay.open_slot(epoch)
+        relay.put(b"x")
+        until(lambda epoch=epoch: len(relay.outputs) == epoch // 2 + 1, "the output")  # type: ignore[misc]
+        publishers.append(relay.publisher)
+    relay.tell(WorkerRole.ACTIVE, epoch=5)
+    until(lambda: f"{ROLE_KEY}/5" in relay.tokens, "the worker has begun with the third")
+    for epoch, relay.publisher in zip((1, 3), publishers, strict=True):
+        relay.end(epoch)
+    until(lambda: len(relay.ends) == 2, "both ends")
+    assert [(marker.epoch, marker.count) for _, marker in relay.ends] == [(1, 1), (3, 1)]
+
+
 @pytest.fixture
 def newest(relay: Relay, tmp_path: Path) -> Iterator[Echo]:
     """The owner of epoch 1 that keeps the newest value only; the relay has a new publisher, as for another slot."""

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from zsched.core.values.plan import Role, WorkerRole
-from zsched.worker.epochs import Epochs, lets_out
+from zsched.worker.epochs import MAX_CARRIED, Epochs, lets_out
 
 
 def role(kind: WorkerRole, epoch: int) -> Role:
@@ -58,14 +58,34 @@ def test_an_epoch_that_has_ended_is_not_carried() -> None:
     assert epochs.stamp(SECOND, 1) == 2
 
 
-def test_two_epochs_on_come_one_is_carried() -> None:
+def test_two_epochs_on_both_are_carried_and_end_one_after_the_other() -> None:
     epochs = Epochs()
     third = role(WorkerRole.ACTIVE, 3)
     epochs.follow(IDLE, FIRST)
     epochs.follow(FIRST, SECOND)
     epochs.follow(SECOND, third)
-    assert epochs.is_carried(1)
-    assert [epochs.stamp(third, in_hand) for in_hand in (1, 3)] == [1, 3]
+    assert [epochs.is_carried(epoch) for epoch in (1, 2, 3)] == [True, True, False]
+    assert [epochs.stamp(third, in_hand) for in_hand in (None, 1, 2, 3)] == [1, 1, 2, 3]
+    assert epochs.close(1) == (1,)
+    assert [epochs.stamp(third, in_hand) for in_hand in (None, 1, 2, 3)] == [2, 2, 2, 3]
+    assert epochs.close(2) == (2,)
+    assert [epochs.stamp(third, in_hand) for in_hand in (None, 1, 2, 3)] == [3, 3, 3, 3]
+
+
+def test_with_a_newer_epoch_those_end_that_were_carried() -> None:
+    epochs = Epochs()
+    epochs.follow(IDLE, FIRST)
+    epochs.follow(FIRST, SECOND)
+    assert epochs.close(2) == (1, 2)
+    assert epochs.close(1) == ()
+
+
+def test_only_so_many_epochs_are_carried() -> None:
+    epochs = Epochs()
+    for epoch in range(1, MAX_CARRIED + 2):
+        epochs.follow(role(WorkerRole.ACTIVE, epoch), role(WorkerRole.ACTIVE, epoch + 1))
+    assert not epochs.is_carried(MAX_CARRIED + 1)
+    assert epochs.close(MAX_CARRIED + 1) == tuple(range(1, MAX_CARRIED + 2))
 
 
 def test_asked_to_leave_and_staying_after_all() -> None:
