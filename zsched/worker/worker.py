@@ -491,7 +491,10 @@ class Worker:
     def _change_role(self, before: Role, role: Role) -> None:
         """Follow a new role: the token that says in which epoch we work; the ends of an epoch that was cut short."""
         if self._epochs.is_carried(before.epoch):
-            guarded(self._end_later, before.epoch, name="zsched carry", is_lasting=False).start()
+            try:
+                guarded(self._end_later, before.epoch, name="zsched carry", is_lasting=False).start()
+            except RuntimeError:  # no thread is to be had: nobody would end it, were its inputs never to end
+                self._send_ends(before.epoch)
         elif before.epoch and before.epoch != role.epoch:
             self._send_ends(before.epoch)
         if role.role is WorkerRole.DRAINING:

@@ -24,6 +24,7 @@ from zsched.clock import monotonic_s
 from zsched.core.relay_protocol import EndMarker, StreamAck, StreamAcks, WorkerTrouble
 from zsched.core.values.plan import Role, WorkerRole
 from zsched.errors import ConfigError
+from zsched.guard import guarded
 from zsched.ipc.pipe import encode_end
 from zsched.sessions.config import data_config, worker_config
 from zsched.wire import codec as wire
@@ -31,6 +32,7 @@ from zsched.wire.keyspace import END_CHUNK
 from zsched.worker import Output, Received, Worker
 from zsched.worker import backlog as worker_backlog
 from zsched.worker import inputs as worker_inputs
+from zsched.worker import worker as worker_module
 from zsched.worker.backlog import MAX_WITHHELD
 from zsched.worker.snapshot import Offer, StateBook
 from zsched.worker.troubles import Troubles
@@ -984,6 +986,25 @@ def test_who_is_left_and_chosen_again_twice_ends_both_epochs(relay: Relay) -> No
         relay.end(epoch)
     until(lambda: len(relay.ends) == 2, "both ends")
     assert [(marker.epoch, marker.count) for _, marker in relay.ends] == [(1, 1), (3, 1)]
+
+
+@pytest.mark.usefixtures("echo")
+def test_who_is_chosen_again_and_can_have_no_thread_is_the_owner_all_the_same(
+    relay: Relay, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*arguments: Any, name: str, **options: Any) -> threading.Thread:
+        if name == "zsched carry":
+            raise RuntimeError("can't start new thread")
+        return guarded(*arguments, name=name, **options)
+
+    monkeypatch.setattr(worker_module, "guarded", refuse)
+    relay.tell(WorkerRole.ACTIVE, epoch=1)
+    until(lambda: f"{ROLE_KEY}/1" in relay.tokens, "the worker has begun")
+    relay.tell(WorkerRole.ACTIVE, epoch=3)
+    until(lambda: f"{ROLE_KEY}/3" in relay.tokens, "the worker has begun with the next one")
+    relay.put(b"x")
+    until(lambda: relay.outputs == [("edge1/t/3/robot1/out", b"x")], "the output")
+    until(lambda: [marker.epoch for _, marker in relay.ends] == [1], "the end of the first epoch")
 
 
 @pytest.fixture
