@@ -144,6 +144,10 @@ class Crowd:
         elif self._owed:
             self._owed.pop(lane, None)
 
+    def forget(self, lane: Lane) -> None:
+        """A lane is given back: what somebody has missed of it is counted already (`put`'s thread)."""
+        self._owed.pop(lane, None)
+
     def take_missed(self) -> int:
         """How many samples single receivers may have missed since the last time, summed over them."""
         with self._lock:

@@ -45,6 +45,10 @@ class Greetings:
             lane.part(monotonic_s())
             self._unmet[lane.eid] = lane
 
+    def forget(self, lane: Lane) -> None:
+        """A lane is given back (under the lock)."""
+        self._unmet.pop(lane.eid, None)
+
     def heard(self, lane: Lane) -> None:
         """A lane's receiver has said something (under the lock): whether it is met by that, or must be greeted."""
         if lane.is_met:

@@ -43,6 +43,10 @@ class Lane(Sender, kw_only=True, eq=False):
     publisher: zenoh.Publisher | ext.AdvancedPublisher
     source_id: zenoh.EntityGlobalId
     eid: int
+    used_at: float = 0.0
+    """When a sample was last given to it (monotonic seconds)."""
+    is_left: bool = False
+    """It was given back to make room for another key."""
 
     def put(self, sample: Sample, stamp: Timestamp | None) -> None:
         """Put a sample on under the next number (the caller counts), with everything that zenoh lets us keep."""
@@ -123,13 +127,19 @@ def declare_publisher(
 
 
 def put_marker(
-    session: Session, key: str, source_id: zenoh.EntityGlobalId, priority: Priority, marker: EndMarker
+    session: Session,
+    key: str,
+    source_id: zenoh.EntityGlobalId,
+    priority: Priority,
+    marker: EndMarker,
+    *,
+    waits: bool = True,
 ) -> None:
-    """Put an end or start marker on the way of the samples of ``key``; may wait for its link."""
+    """Put an end or start marker on the way of the samples of ``key``; ``waits``: for its link, if that has no room."""
     session.put(
         f"{key}/{END_CHUNK}",
         encode_end(marker),
-        congestion_control=CongestionControl.BLOCK,
+        congestion_control=CongestionControl.BLOCK if waits else CongestionControl.DROP,
         priority=priority,
         source_info=zenoh.SourceInfo(source_id, serial_of(marker.count)),
     )

@@ -48,6 +48,13 @@ QUEUE_DEPTH: Final = 1024
 """A reliable outlet's queue holds at least this many samples, whatever its depth says."""
 MAX_LANES: Final = 4096
 """Publishers of one wildcard stream towards one place: keys come from the applications, memory is ours."""
+REST_S: Final = 10.0
+"""A key that has carried nothing for so long, and of which all has arrived, gives way to a new one: they may change
+over the weeks."""
+ROOM_SHARE: Final = 16
+"""From this share of `MAX_LANES` below it on there is room made, and for as many at a time..."""
+ROOM_EVERY_S: Final = 0.1
+"""...this often at most: all keys are looked at."""
 MAX_OWED: Final = 4096
 """Samples that wait for the next owner after a crash (`OnCrash.REPLAY`); a queue has room for them besides its own."""
 SKIP_EPOCH: Final = 0
@@ -107,6 +114,8 @@ class Outlet:
         """By entity id, lanes that were full when they were last put to or heard of (our lock)..."""
         self._due: dict[int, Lane] = {}
         """...and those that something may have to be put again for: no sample, no word looks at all lanes."""
+        self._room_at = 0.0
+        """When keys may be looked at again for room."""
         self._has_put_ends = False
         self.tally = Tally()
         self._handed = 0
@@ -372,14 +381,71 @@ class Outlet:
         if key is None:
             return None
         name = (key, f"{priority}{is_express}")
-        lane = self._lanes.get(name)
-        if lane is None and len(self._lanes) >= MAX_LANES:
-            return None
+        lane, now = self._lanes.get(name), monotonic_s()
         if lane is None:
+            if len(self._lanes) >= MAX_LANES - MAX_LANES // ROOM_SHARE and now >= self._room_at:
+                self._room_at = now + ROOM_EVERY_S
+                self._make_room(now)
+            if len(self._lanes) >= MAX_LANES:
+                return None
             lane = self._declare(key, priority, is_express=is_express)
             if self._queue is not None and self._greetings is None and self._acks is not None:
                 self._queue.then(lambda: self._put_names((lane,)))
+        lane.used_at = now
         return lane
+
+    def _make_room(self, now: float) -> None:
+        """Give back the keys that have rested longest (under the stream's lock).
+
+        Nothing of them waits here, and of what their receiver acknowledges it has all; else they stay. What it has
+        said of them stays counted. A key that comes again is another publisher, which begins with number 0.
+        """
+        if self._queue is not None and not self._queue.is_empty:
+            return
+        with self._lock:
+            named = {id(lane): name for name, lane in self._lanes.items() if self._may_leave(lane, now)}
+            at_rest = [lane for lane in self._lanes.values() if id(lane) in named]
+            at_rest.sort(key=lambda lane: lane.used_at)
+            left = at_rest[: max(1, MAX_LANES // ROOM_SHARE)]
+            for lane in left:
+                del self._lanes[named[id(lane)]]
+                self._full.pop(lane.eid, None)
+                self._due.pop(lane.eid, None)
+                if self._greetings is not None:
+                    self._greetings.forget(lane)
+                lane.is_left = True
+                self.tally.unconfirmed += 0 if self._acks is None else lane.in_flight
+                self.tally.take(lane.sums())
+        for lane in left:
+            if self._acks is not None:
+                self._acks.forget(lane.eid)
+        if left and self._queue is not None:
+            self._queue.then(lambda: self._give_back(left))
+        elif left:
+            self._give_back(left)
+
+    def _may_leave(self, lane: Lane, now: float) -> bool:
+        is_at_rest = lane is not self._main and now - lane.used_at >= REST_S
+        is_awaited = self._acks is not None and self._queue is not None and lane.in_flight > 0
+        return is_at_rest and not is_awaited
+
+    def _give_back(self, lanes: list[Lane]) -> None:
+        """A worker, which waits for the end of all that it has heard, is told that nothing comes of them any more."""
+        try:
+            for lane in lanes:
+                if self._acks is not None and lane.count:
+                    self._put_left(lane)
+                if self._crowd is not None:
+                    self._crowd.forget(lane)
+                undeclare(lane.publisher)
+        except zenoh.ZError:
+            _log.debug("%s: the session closed first", self._to)
+
+    def _put_left(self, lane: Lane) -> None:
+        marker = EndMarker(epoch=SKIP_EPOCH, count=lane.count, slot=self._epoch, is_given_up=True)
+        priority, waits = lane.publisher.priority, self._queue is not None
+        with self._stalled:
+            put_marker(self._session, lane.key, lane.source_id, priority, marker, waits=waits)
 
     def _declare(self, key: str, priority: Priority, *, is_express: bool) -> Lane:
         settings, is_reliable = self._settings, self._is_reliable
@@ -449,9 +515,7 @@ class Outlet:
                 open_lanes += [one for one in lanes if one.in_flight]
         try:
             for lane in open_lanes:
-                marker = EndMarker(epoch=SKIP_EPOCH, count=lane.count, slot=self._epoch, is_given_up=True)
-                with self._stalled:
-                    put_marker(self._session, lane.key, lane.source_id, lane.publisher.priority, marker)
+                self._put_left(lane)
         except zenoh.ZError:
             _log.debug("%s: the session closed first", self._to)
         self._undeclare()
@@ -571,6 +635,8 @@ class Outlet:
         if is_new and (self._acks is None or not self._acks.has_token(incarnation)):
             return  # a stranger's; or a life that has just begun, which is greeted when its token comes
         with self._lock:
+            if lane.is_left:
+                return
             was_awaited = self._awaits_answers
             ended = lane.hear(ack, incarnation, now)
             if ended is not None:

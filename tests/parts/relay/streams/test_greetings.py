@@ -172,6 +172,42 @@ def test_another_life_begins_behind_what_the_former_one_may_have_done(bench: Ben
     outlet.undeclare()
 
 
+def test_a_key_whose_samples_are_done_gives_way_and_its_worker_is_told(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A worker waits for the end of all that it has heard; what it has done stays counted."""
+    monkeypatch.setattr(outlets, "MAX_LANES", 2)
+    monkeypatch.setattr(outlets, "REST_S", 0.0)
+    monkeypatch.setattr(outlets, "ROOM_EVERY_S", 0.0)
+    receivers = {key: Receiver(bench.other, bench.relay, f"edge1/{key}") for key in "abc"}
+    outlet = bench.outlet("robot1/*", "edge1/*", epoch=7)
+
+    def sent(key: str) -> None:
+        receiver, begun = receivers[key], len(receivers[key].starts)
+        sample = bench.sample(f"robot1/{key}")
+        until(lambda: outlet.send(sample) == ("", 0), "room")
+        receiver.greeted(begun + 1)
+        receiver.ack(0)
+        until(lambda: receiver.got and receiver.got[-1] == 0, "the sample")
+
+    sent("a")
+    sent("b")
+    assert outlet.send(bench.sample("robot1/c")) == ("too_many_keys", 1), "nothing of them is done"
+    receivers["a"].ack(1)
+    settled(outlet, acknowledged=1, in_flight=1)
+    sent("c")
+    until(lambda: receivers["a"].starts[-1].is_given_up, "the word that nothing comes of it")
+    assert (receivers["a"].starts[-1].slot, receivers["a"].starts[-1].count) == (7, 1)
+    for key in "bc":
+        receivers[key].ack(1)
+    settled(outlet, acknowledged=3, in_flight=0, lost=0, at_most_lost=0)
+    sent("a")
+    receivers["a"].ack(1)
+    settled(outlet, acknowledged=4, in_flight=0, lost=0, at_most_lost=0)
+    assert receivers["a"].got == [0, 0], "another publisher, which begins anew"
+    outlet.undeclare()
+
+
 def test_only_a_life_with_a_token_is_another_life(bench: Bench) -> None:
     """One forged acknowledgement while the worker stood still: what it had not got was not sent again."""
     receiver = Receiver(bench.other, bench.relay, "edge1/in")

@@ -9,6 +9,7 @@ import zenoh
 
 from support.sessions import hub_and_neighbour
 from support.waiting import until
+from zsched.core.hop.books import unaccounted
 from zsched.core.values.fleet import LocalMode, LocalSide
 from zsched.core.values.plan import Direction, Route, StreamClass, StreamSettings
 from zsched.ipc.pipe import decode_end
@@ -144,6 +145,39 @@ def test_keys_are_bounded_and_what_is_too_much_is_counted(bench: Bench, monkeypa
     wanted = {"edge1/t/k0", "edge1/t/k1", "edge1/t/k2"}
     until(lambda: set(bench.heard) >= wanted, "the three keys that have a lane")
     assert set(bench.heard) == wanted
+
+
+@pytest.mark.parametrize("stream_class", list(StreamClass))
+@pytest.mark.parametrize("direction", [Direction.INPUT, Direction.OUTPUT])
+def test_keys_that_rest_give_way_to_new_ones(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, direction: Direction, stream_class: StreamClass
+) -> None:
+    """Robots that put under a new id each time would be heard no more after the first thousands."""
+    monkeypatch.setattr(outlet, "MAX_LANES", 3)
+    monkeypatch.setattr(outlet, "REST_S", 0.0)
+    monkeypatch.setattr(outlet, "ROOM_EVERY_S", 0.0)
+    route = way(direction, "from/t/*", "to/t/*", stream_class)
+    stream: InputStream | OutputStream
+    if direction is Direction.INPUT:
+        stream = InputStream(bench.relay, route, bench.own_ids)
+        bench.streams.append(stream)
+        stream.open(1, route)
+        stream.flip(1)
+    else:
+        stream = OutputStream(bench.relay, route, bench.own_ids, lambda: None)
+        bench.streams.append(stream)
+        stream.open(1, route)
+        stream.flip(1, drops_held=False)
+    bench.listen("to/t/*")
+    until(lambda: bench.put("from/t/k", "x") or bench.heard, "the stream flows")
+    for number in [*range(8), 0]:
+        before = len(bench.heard.get(f"to/t/k{number}", []))
+        bench.put(f"from/t/k{number}", "x")
+        until(lambda number=number, before=before: len(bench.heard.get(f"to/t/k{number}", [])) > before, "the sample")  # type: ignore[misc] # bound at once
+    count = stream.count()
+    assert (count.drops, count.lost, count.doubled) == ((), 0, 0)
+    if direction is Direction.INPUT:
+        until(lambda: unaccounted(stream.count()) == 0, "the books")
 
 
 def test_a_local_side_is_a_client_or_a_peer_without_the_fleets_settings() -> None:
