@@ -11,13 +11,14 @@ waits. The stream's lock guards it.
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Iterator, Mapping
 from typing import Final, cast
 
 import zenoh
 from zenoh import Priority, Sample, SampleKind
 
-from zsched.core.hop.receiver import GIVE_UP_S, SourceName
+from zsched.core.hop.receiver import GIVE_UP_S, MAX_SOURCES, SourceName
 from zsched.core.hop.serial import serial_of
 from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker
 from zsched.core.values.struct import Struct, field
@@ -88,19 +89,25 @@ class Answers:
         self._is_from_start = is_from_start
         self._in_turn = in_turn
         self._early: dict[SourceName, _Early] = {}
-        self._names: set[SourceName] = set(heard)
+        self._names: dict[str, set[SourceName]] = {}
+        """{key: whose samples of it are known}."""
         self._starts = dict(heard)
+        self._forgotten: OrderedDict[SourceName, int] = OrderedDict()
+        """{source: the number it comes to next}, the oldest first."""
+        for name in heard:
+            self._names.setdefault(name[0], set()).add(name)
         for name, number in heard.items():
             acks.expect(name, number)
             acks.skip(name, number)  # it says that we are back
 
     def take(self, name: SourceName, serial: int, sample: Sample, *, is_again: bool = False) -> tuple[Sample, ...]:
         """A sample came; answers those that go on now, in order."""
-        self._names.add(name)
+        self._know(name)
         if name not in self._early and self._acks.take(name, serial, len(sample.payload)):
             return (sample,)
         number = self._acks.number(name, serial)
-        expected = self._acks.expect(name, 0 if self._is_from_start and self._in_turn else number)
+        start = self._start_of(name) if self._in_turn else None
+        expected = self._acks.expect(name, number if start is None else start)
         if number < expected:
             if self._acks.admit(name, serial_of(number), in_turn=True) is not None:  # a jump is taken back
                 self._acks.processed(name, number, len(sample.payload))
@@ -141,7 +148,7 @@ class Answers:
 
     def ended(self, name: SourceName) -> None:
         """The source's end marker came."""
-        self._names.add(name)
+        self._know(name)
         self._acks.end(name)
 
     def reopen(self, name: SourceName) -> None:
@@ -159,9 +166,9 @@ class Answers:
         ``passed``: behind the last one of each that went on; ``ends``: behind the last one of all, where that is known.
         """
         total = 0
-        for name in self._names:
+        for name in self._names.get(key, ()):
             start = self._start_of(name)
-            if start is not None and name[0] == key:
+            if start is not None:
                 until = max(ends.get(name, 0), self._acks.arrived(name))
                 total += max(0, until - max(start, passed.get(name, 0)))
         return total
@@ -174,6 +181,32 @@ class Answers:
         """The first number that we had to get; ``None``: we came when the stream had begun."""
         return self._starts.get(name, 0 if self._is_from_start else None)
 
+    def has_come(self, name: SourceName, until: int) -> bool:
+        """Whether everything of a source below a number has come, or is given up."""
+        return self._acks.arrived(name) >= until
+
+    def is_waiting(self, key: str) -> bool:
+        """Whether something of a key came early and waits."""
+        return any(name in self._early for name in self._names.get(key, ()))
+
+    def forget(self, key: str) -> None:
+        """Keep of a key only how far its sources are: should it come again, what was before is not lost."""
+        for name in self._names.pop(key, ()):
+            self._forgotten[name] = self._acks.arrived(name)
+            self._starts.pop(name, None)
+        while len(self._forgotten) > MAX_SOURCES:
+            self._forgotten.popitem(last=False)
+
+    def _know(self, name: SourceName) -> None:
+        """Something came of a source."""
+        names = self._names.get(name[0])
+        if names is None:
+            names = self._names[name[0]] = set()
+        if name not in names:
+            names.add(name)
+            if (number := self._forgotten.pop(name, None)) is not None:
+                self._starts[name] = number
+
     def overdue(self) -> Iterator[tuple[SourceName, Sample]]:
         """What goes on now because the missing ones before it never came."""
         for name, early in tuple(self._early.items()):
@@ -183,9 +216,11 @@ class Answers:
 
     def close(self) -> dict[SourceName, int]:
         """The slot is closed: its workers hear once more how far it came; answers the number each comes to next."""
-        heard = {name: self._acks.arrived(name) for name in self._names}
-        self._acks.leave(self._names)
+        known = [name for names in self._names.values() for name in names]
+        heard = {**self._forgotten, **{name: self._acks.arrived(name) for name in known}}
+        self._acks.leave(heard)
         self._names.clear()
+        self._forgotten.clear()
         self._early.clear()
         return heard
 
@@ -210,6 +245,7 @@ class Answers:
 
         What an earlier life of this relay had is not lost, nor is, where it had none, a beginning before its time.
         """
+        self._know(name)
         number = self._acks.number(name, serial_of(marker.count))
         if self._start_of(name) == 0 == self._acks.arrived(name):
             is_late = marker.age_s is not None and self._acks.clock() - marker.age_s < self._acks.born_at

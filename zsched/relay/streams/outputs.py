@@ -298,7 +298,7 @@ class OutputStream:
             feed = self._hand_on(slot)
             is_cut = self._is_cut(slot)
             if slot is self._carrier:  # of any other nothing more was wanted
-                self._counter.lost += slot.missing() if feed is not None else 0
+                self._counter.lost += slot.missing() + slot.take_lost() if feed is not None else 0
                 self._counter.dropped("stale_epoch", len(slot.held))  # of a pause
                 self._carrier = None
                 self._promote()
@@ -339,6 +339,7 @@ class OutputStream:
         feed.slot = heirs[0]
         heirs[0].feed = feed
         heirs[0].keys = slot.keys
+        heirs[0].lost += slot.take_lost()
         heirs[0].answers, slot.answers = slot.answers, heirs[0].answers
         for key in heirs[0].keys.values():
             key.reopen()
@@ -377,6 +378,7 @@ class OutputStream:
             self._late.pop(0)[1].close()
         with self._lock:
             for slot in tuple(self._slots.values()):
+                self._counter.lost += slot.take_lost() if slot is self._carrier else 0
                 for (name, zid, eid), sample in slot.answers.overdue() if slot.answers is not None else ():
                     self._pass(slot, slot.keys.setdefault(name, KeyState(name=name)), (zid, eid), sample)
             if self._pace is None or not self._is_latest or self._is_paused:

@@ -24,6 +24,10 @@ from zsched.relay.streams.receive import Receiver
 
 END_GRACE_S: Final = 0.1
 """A marker travels behind its data on one link; what is still missing this long after it was dropped on the way."""
+MAX_KEYS: Final = 4096
+"""Concrete keys of a slot that are known: they may change over the weeks."""
+FORGET_SHARE: Final = 16
+"""This share of them is forgotten at a time: all are looked at for it."""
 QUIET_S: Final = 1.0
 """A worker that has put nothing here (it was restarted) may end others' slots when nothing has come for this long."""
 
@@ -98,6 +102,8 @@ class KeyState(Struct):
             return False
         is_known = self.end_of in self.sources or not self.sources or not self.end.count
         has_come = self.received >= self.end.count or self.last_number + 1 >= self.end.count
+        if not self.sources and answers is not None and self.ender is not None:  # it was forgotten
+            has_come |= answers.has_come(self.ender, self.end.count)
         is_complete = is_known and has_come
         if is_complete or now - self.end_at <= END_GRACE_S:
             return is_complete
@@ -143,6 +149,8 @@ class OutputSlot(Struct, eq=False):
     held_bytes: int = 0
     is_flipped: bool = False
     is_closed: bool = False
+    lost: int = 0
+    """Missing of keys that are forgotten, and not counted yet."""
 
     def missing(self) -> int:
         """How many samples its owner has put out that did not come (as far as it has said how many there are)."""
@@ -152,5 +160,30 @@ class OutputSlot(Struct, eq=False):
         """What has come on a concrete key; ``None`` when it is none of this slot's."""
         state = self.keys.get(name)
         if state is None and keyexpr.intersects(self.expr, name):
+            if len(self.keys) >= MAX_KEYS:
+                self._make_room()
             state = self.keys[name] = KeyState(name=name)
         return state
+
+    def _make_room(self) -> None:
+        """Forget the keys that have rested longest; what is missing of them is said to be, for nobody else counts it.
+
+        Not those of which something waits, or has yet to come before an end marker.
+        """
+        answers = self.answers
+        at_rest = [
+            key
+            for key in self.keys.values()
+            if key.end is None and (answers is None or not answers.is_waiting(key.name))
+        ]
+        at_rest.sort(key=lambda key: key.heard_at)
+        for key in at_rest[: max(1, MAX_KEYS // FORGET_SHARE)]:
+            self.lost += key.missing(answers)
+            if answers is not None:
+                answers.forget(key.name)
+            del self.keys[key.name]
+
+    def take_lost(self) -> int:
+        """What was missing of keys that were forgotten since the last time."""
+        lost, self.lost = self.lost, 0
+        return lost

@@ -15,7 +15,7 @@ from support.waiting import until
 from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks
 from zsched.core.values.plan import Direction, HandoverRule, Route, StreamClass, StreamSettings
 from zsched.ipc.pipe import encode_end
-from zsched.relay.streams import answers
+from zsched.relay.streams import answers, slots
 from zsched.relay.streams.acks import Acks
 from zsched.relay.streams.outlet import Outlet
 from zsched.relay.streams.outputs import OutputStream
@@ -324,3 +324,52 @@ def test_an_end_marker_that_says_less_than_has_come_or_will_come_ends_nothing(be
     until(lambda: stream.has_ended(1), "the real one")
     bench.wait_ack(is_ended=True)
     assert bench.passed == ["0", "1", "2", "3", "4"]
+
+
+def cared(stream: OutputStream) -> bool:
+    stream.look_after()
+    return True
+
+
+def test_keys_are_forgotten_and_nothing_of_them_is_lost(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Over the weeks they may be any number, and what is known of each takes a kilobyte."""
+    monkeypatch.setattr(slots, "MAX_KEYS", 2)
+    settings = StreamSettings(stream_class=StreamClass.RELIABLE, depth=500, handover=HandoverRule.ALL)
+    route = Route(
+        stream="t/out/0", direction=Direction.OUTPUT, from_expr="edge1/t/1/*", to_expr="robot1/*", settings=settings
+    )
+    stream = bench.stream = OutputStream(bench.relay, route, frozenset(), lambda: None)
+    stream.open(1, route, bench.acks, is_from_start=True)
+    stream.flip(1, drops_held=False)
+    publishers = {
+        name: bench.worker.declare_publisher(f"edge1/t/1/{name}", congestion_control=zenoh.CongestionControl.BLOCK)
+        for name in "abcde"
+    }
+    passed: list[str] = []
+    app = bench.worker.declare_subscriber("robot1/*", lambda s: passed.append(f"{s.key_expr} {s.payload.to_string()}"))
+    until(lambda: matches(publishers["a"]), "the relay subscribes")
+    until(lambda: cast("Outlet", stream._outlet).is_matching, "the application hears it")
+
+    def put(name: str, number: int) -> None:
+        publisher = publishers[name]
+        publisher.put(str(number), source_info=zenoh.SourceInfo(publisher.id, number))
+        until(lambda: cared(stream) and f"robot1/{name} {number}" in passed, f"{name} {number}")
+
+    for name in "abcde":
+        put(name, 0)
+        put(name, 1)
+    slot = stream._slots[1]
+    assert list(slot.keys) == ["edge1/t/1/d", "edge1/t/1/e"]
+    put("a", 2)
+    put("a", 3)
+    assert (stream.count().lost, stream.count().doubled) == (0, 0)
+    put("b", 3)
+    assert stream.count().lost == 1, "what is missing since then is"
+    for name, count in {"a": 4, "b": 4, "c": 2, "d": 2, "e": 2}.items():
+        source = zenoh.SourceInfo(publishers[name].id, count)
+        marker = encode_end(EndMarker(epoch=1, count=count))
+        bench.worker.put(f"edge1/t/1/{name}/{END_CHUNK}", marker, source_info=source)
+    until(lambda: len(slot.keys) == 5 and stream.has_ended(1), "the end of all")
+    stream.close_slot(1)
+    assert (stream.count().lost, stream.count().doubled, len(passed)) == (1, 0, 13)
+    app.undeclare()
