@@ -165,10 +165,11 @@ class Crew:
                     self._tell(supervisor, task, life or 0, is_ready=False, reason=UNSEEN)
 
     def on_relay_ended(self) -> None:
-        """No relay runs: the next one tells anew which tokens it sees, some of them before it says that it runs."""
+        """No relay runs: the next one tells anew whom it sees, some of them before it says that it runs."""
         with self._lock:
             self._relays += 1
             self._tokens.clear()
+            self._matches.clear()
 
     def on_token(self, seen: WorkerSeen) -> None:
         """A token of a worker here; one of a process that has ended says nothing (its end was reported)."""

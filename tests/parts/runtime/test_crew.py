@@ -87,6 +87,21 @@ def test_a_process_that_matches_is_ready_and_is_not_ended_at_its_deadline(house:
     until(lambda: "not ready again within 4 s: was ready until" in str(house.reasons("node")), "the deadline")
 
 
+def test_what_a_relay_has_seen_that_ended_says_nothing_of_the_next_process(house: House) -> None:
+    """It was called ready, and got the task, before anybody had seen that it subscribes."""
+    house.supervisor.start("node")
+    life = until(lambda: house.crew.life_of("node"), "it runs")
+    house.match("node")
+    until(lambda: house.supervisor.states()["node"] is WorkerState.READY, "the supervisor knows")
+    house.crew.on_relay_ended()
+    os.kill(house.supervisor.pids()["node"], signal.SIGKILL)
+    until(lambda: house.crew.life_of("node") not in (0, life), "the next process runs")
+    time.sleep(0.2)
+    assert house.states("node")[-1] is WorkerState.STARTING
+    house.match("node")
+    until(lambda: house.states("node")[-1] is WorkerState.READY, "the next relay sees it")
+
+
 def test_a_process_that_never_matches_is_told_what_it_lacks(house: House) -> None:
     house.supervisor.start("node")
     until(lambda: house.states("node"), "it runs")
