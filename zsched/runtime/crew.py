@@ -147,6 +147,8 @@ class Crew:
     def on_relay_started(self) -> None:
         """A relay runs: workers that join it in the next moments may have been there before it."""
         self._relay_at = monotonic_s()
+        if self.supervisor is not None:
+            self.supervisor.regain_sight(MISSED_S)
         with self._lock:
             self._relays += 1
             guarded(self._miss, self._relays, name="zsched missed", is_lasting=False).start()
@@ -170,6 +172,8 @@ class Crew:
             self._relays += 1
             self._tokens.clear()
             self._matches.clear()
+        if self.supervisor is not None:
+            self.supervisor.lose_sight()
 
     def on_token(self, seen: WorkerSeen) -> None:
         """A token of a worker here; one of a process that has ended says nothing (its end was reported)."""

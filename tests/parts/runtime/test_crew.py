@@ -102,6 +102,29 @@ def test_what_a_relay_has_seen_that_ended_says_nothing_of_the_next_process(house
     until(lambda: house.states("node")[-1] is WorkerState.READY, "the next relay sees it")
 
 
+def test_no_worker_is_ended_while_no_relay_could_see_it(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its token went, as its link broke; then the relay was away for longer than a worker may take to start."""
+    monkeypatch.setattr(crew_module, "MISSED_S", 2.0)
+    house.supervisor.start("token")
+    life = until(lambda: house.crew.life_of("token"), "it runs")
+    seen = WorkerSeen(node="edge1", task="token", incarnation=str(life), is_present=True)
+    house.crew.on_token(seen)
+    until(lambda: house.supervisor.states()["token"] is WorkerState.READY, "the supervisor knows")
+    house.crew.on_token(replace(seen, is_present=False))
+    house.crew.on_relay_ended()
+    time.sleep(SPECS["token"].start_deadline_s + 1.0)
+    assert house.crew.life_of("token") == life
+    house.crew.on_relay_started()
+    time.sleep(1.0)
+    assert house.crew.life_of("token") == life, "the relay may be about to see it"
+    house.crew.on_token(seen)
+    until(lambda: house.supervisor.states()["token"] is WorkerState.READY, "it is seen")
+    house.crew.on_relay_ended()
+    house.crew.on_relay_started()
+    until(lambda: house.supervisor.states()["token"] is not WorkerState.READY, "nobody sees it any more")
+    until(lambda: house.crew.life_of("token") != life, "it is ended in the end")
+
+
 def test_a_process_that_never_matches_is_told_what_it_lacks(house: House) -> None:
     house.supervisor.start("node")
     until(lambda: house.states("node"), "it runs")

@@ -45,6 +45,8 @@ from zsched.sessions.comparison import lacking
 
 log = logging.getLogger("zsched.worker")
 
+BLIND_S = 1.0
+"""While nobody sees who is ready, a worker's time to be so is looked at this often."""
 INCARNATIONS_PER_DAEMON = 100_000
 MAX_LINE = 200
 """Characters of a worker's last line that go into the reason of its exit."""
@@ -202,6 +204,7 @@ class WorkerSupervisor:
         self._rng, self._policy = rng or random.Random(), policy or RestartPolicy()
         self._why_not_ready, self._session = why_not_ready, session
         self._started = 0
+        self._is_blind = False
         self._guard = WorkerGuard()
         self._commands: deque[Callable[[], None]] = deque()
         self._watch = ProcessWatch()
@@ -231,6 +234,14 @@ class WorkerSupervisor:
     def mark_gone(self, task: TaskId, incarnation: int) -> None:
         """The token of ``incarnation`` went while its process may live: it must become ready again in time."""
         self._command(self._on_gone, task, incarnation)
+
+    def lose_sight(self) -> None:
+        """Nobody sees who is ready: until `regain_sight` no worker is ended for not being so."""
+        self._command(self._on_sight, None)
+
+    def regain_sight(self, within_s: float) -> None:
+        """Somebody looks who is ready: each worker that is not has at least so long to be seen."""
+        self._command(self._on_sight, within_s)
 
     def report_hung(self, task: TaskId, incarnation: int, reason: str) -> None:
         """The worker of ``incarnation`` makes no progress: kill it, count a failure, start it again.
@@ -402,6 +413,12 @@ class WorkerSupervisor:
         elif worker.phase is _Phase.READY and incarnation == worker.incarnation:
             worker.phase, worker.deadline_s = _Phase.STARTING, awake_s() + worker.spec.start_deadline_s
 
+    def _on_sight(self, within_s: float | None) -> None:
+        self._is_blind = within_s is None
+        for worker in self._workers.values():
+            if worker.phase is _Phase.STARTING and worker.deadline_s is not None and within_s is not None:
+                worker.deadline_s = max(worker.deadline_s, awake_s() + within_s)
+
     def _on_hung(self, task: TaskId, incarnation: int, reason: str) -> None:
         worker = self._workers.get(task)
         if worker is None:
@@ -450,7 +467,9 @@ class WorkerSupervisor:
 
     def _on_deadline(self, worker: _Worker, now: float) -> None:
         worker.deadline_s = None
-        if worker.phase is _Phase.BACKOFF:
+        if worker.phase is _Phase.STARTING and self._is_blind:
+            worker.deadline_s = now + BLIND_S
+        elif worker.phase is _Phase.BACKOFF:
             self._spawn(worker, now)
         elif worker.phase is _Phase.STARTING:
             why = self._why_not_ready(worker.task)
