@@ -567,9 +567,11 @@ class Agreement:
         self._seats = seats
         if self._lost and self._numbers.roll is not None and self._numbers.roll.seat is None:
             self._lost = ""  # as any other member it begins blank
-            self._problems.pop("state", None)
-            self._numbers.roll.may_elect_again(todo)
-        elif self._lost:
+            todo.must_persist = True
+            if not self._disputed and self._durable is not None:
+                self._problems.pop("state", None)
+                self._numbers.roll.may_elect_again(todo)
+        elif self._lost and not self._disputed and self._durable is not None:
             self._complain_of_loss(is_agreed=bool(self.document_hash))
 
     def _is_of_our_seat(self, learnt: Learnt) -> bool:

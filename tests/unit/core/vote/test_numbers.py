@@ -499,6 +499,37 @@ def test_an_elector_whose_name_is_disputed_takes_nobody_for_gone() -> None:
     assert agreement.helm.opinion(agreement.disk, 100.0) == ((), ())
 
 
+@pytest.mark.parametrize("why", ["", "two daemons", "the disk is full"])
+def test_who_has_lost_its_state_and_gets_another_seat_elects_if_nothing_else_forbids_it(why: str) -> None:
+    held = RegisterState(task=FLEET.name, learnt=replace(ADOPTED, settled=True))
+    disputed = why if why == "two daemons" else ""
+    state = state_of(
+        "robot1", generation=GENERATION, disk="d1", fleet_register=held, lost="its folder is old", disputed=disputed
+    )
+    agreement = Agreement(
+        fleet=FLEET,
+        me="robot1",
+        durable=state,
+        incarnation=7,
+        electorate="e",
+        rng=Random(1),
+        now=100.0,
+        stored={"0d": FLEET},
+    )
+    if why and not disputed:
+        agreement.on_persist_failed(why)
+    gone = replace(WITHOUT_ROBOT1, settled=True)
+    back = AddElector(base_revision=gone.revision, name="robot1", disk="d1").apply(gone)
+    for value in (gone, back):
+        told = Learnt(node="robot2", values=(), generation=GENERATION, fleet=value)
+        agreed(agreement.on_learnt, ev.LearntReceived(learnt=told, is_answer=True), 100.2)
+    assert agreement.fleet_value == back
+    assert agreement.is_elector is not bool(why)
+    assert why in agreement.problems.get("state", "")
+    after = agreement.to_persist(100.3)
+    assert after is None or (after.lost, after.disputed) == ("", disputed)
+
+
 def test_electors_that_start_unsettled_ask_after_a_while_that_differs() -> None:
     begun = {seed: make(ADOPTED, seed=seed).next_deadline() - 100.0 for seed in range(4)}
     assert all(0.5 <= after_s / FLEET.timing.stagger_s < 1.5 for after_s in begun.values())
