@@ -282,7 +282,8 @@ class Roll:
         seat, number = self.seat, self.value.number
         self.value = value
         todo.must_persist = todo.must_beat = True
-        self._list(todo, now)
+        if self._holds(value):  # else it went while its round ran: stages go by the tasks of before until it is back
+            self._list(todo, now)
         if value.number != number:
             self._count(is_blank=seat != self.seat, is_new=True, now=now)
         if is_ours:  # nobody else knows that this is chosen yet

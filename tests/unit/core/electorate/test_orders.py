@@ -312,30 +312,48 @@ def test_an_elector_that_starts_again_asks_what_became_of_a_value_that_it_has_ac
     assert [type(one.question) for one in of(todo, do.AskElectors)] == [Prepare]
 
 
-def test_a_value_whose_document_goes_while_its_round_runs_is_followed_once_that_is_fetched_again() -> None:
-    """Another node's value, which this round hands on: no change of this node's keeps its document here."""
-    agreement = make(ADOPTED, {"0d": FLEET})
-    agreed(agreement.on_stored, ev.DocumentStored(document="0e", fleet=SAID), 100.0)
+def learns_what_goes(agreement: Agreement, value: FleetValue, said: Fleet) -> ToDo:
+    """A round of this node chooses ``value``, whose document has gone from here while the round ran."""
+    agreed(agreement.on_stored, ev.DocumentStored(document=value.document, fleet=said), 100.0)
     agreement.change_fleet(SetLease(base_revision=2, lease_s=2.0), todo := ToDo(), 100.1)
     (ask,) = of(todo, do.AskElectors)
     assert isinstance(ask.question, Prepare)
-    value = replace(ADOPTED, document="0e", revision=3)
     todo = ToDo()
     for name in ROBOTS[1:]:
         held = Acceptance(ballot=BALLOT, value=value)
         promise = Promise(elector=name, task=FLEET.name, ballot=ask.question.ballot, accepted=held)
         agreement.on_fleet_answer(ev.FleetAnswered(answer=FleetAnswer(promise=promise)), todo, 100.2)
     for number in range(RECENT + 1):
-        agreed(agreement.on_stored, ev.DocumentStored(document=f"a{number}", fleet=SAID), 100.3)
+        agreed(agreement.on_stored, ev.DocumentStored(document=f"a{number}", fleet=said), 100.3)
     todo = ToDo()
     for name in ROBOTS[1:]:
         accepted = Accepted(elector=name, task=FLEET.name, ballot=ask.question.ballot)
         agreement.on_fleet_answer(ev.FleetAnswered(answer=FleetAnswer(accepted=accepted)), todo, 100.4)
+    return todo
+
+
+def test_a_value_whose_document_goes_while_its_round_runs_is_followed_once_that_is_fetched_again() -> None:
+    """Another node's value, which this round hands on: no change of this node's keeps its document here."""
+    agreement, value = make(ADOPTED, {"0d": FLEET}), replace(ADOPTED, document="0e", revision=3)
+    todo = learns_what_goes(agreement, value, SAID)
     assert (agreement.fleet_value, todo.in_force) == (value, None)
     assert "this node asks its peers" in agreement.problems["fleet/document"]
     assert [one.document for one in of(todo, do.FetchDocument)] == ["0e"]
     todo = agreed(agreement.on_stored, ev.DocumentStored(document="0e", fleet=SAID), 100.5)
     assert (todo.in_force, agreement.problems) == (in_force(SAID, value), {})
+
+
+def test_a_task_that_such_a_value_lacks_is_known_here_until_its_document_is_back() -> None:
+    """All stages go by the fleet of before, and ask for the task's value."""
+    agreement, value = make(ADOPTED, {"0d": FLEET}), replace(ADOPTED, document="0e", revision=3, tasks=())
+    bare = replace(SAID, tasks=())
+    learns_what_goes(agreement, value, bare)
+    assert agreement.fleet_value == value
+    assert list(agreement.values()) == ["merge"]
+    agreement.leases.doubt(agreement.standing())
+    todo = agreed(agreement.on_stored, ev.DocumentStored(document="0e", fleet=bare), 100.5)
+    assert todo.in_force == in_force(bare, value)
+    assert list(agreement.values()) == []
 
 
 def test_what_is_known_here_is_kept_on_disk_and_older_ones_go() -> None:
