@@ -36,7 +36,7 @@ class Tenure:
     """The tasks whose workers need a lease: by this node's file, or for everybody."""
     clock: ClockDoubt = field(default_factory=ClockDoubt)
     voters: tuple[NodeId, ...] = field(init=False)
-    """The robots that count: without a majority of them this node is cut off."""
+    """The robots that count: without a majority of them this node is cut off; of the electors, if it alone does."""
     _alone_since: dict[TaskId, float] = field(default_factory=dict)
     _local: tuple[TaskId, ...] = field(init=False)
 
@@ -144,9 +144,10 @@ class Tenure:
         """Work alone exactly while cut off from the owner and from a quorum."""
         if not self._local:
             return
-        voters = self.voters
-        heard = sum(membership.state(name) is PeerState.ALIVE for name in voters)
-        is_cut_off = heard < majority(len(voters))
+        # The only robot that counts is always its own majority; whether anything can still be agreed electors tell.
+        counted = self.leases.electors if self.voters == (self.me,) else self.voters
+        heard = sum(membership.state(name) is PeerState.ALIVE for name in counted)
+        is_cut_off = heard < majority(len(counted))
         for name in self._local:
             executor = self.executors[name]
             if executor.owner is None:

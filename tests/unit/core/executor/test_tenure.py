@@ -25,13 +25,13 @@ HOLD = fleet_of(task_of(on_isolation=OnIsolation.HOLD))
 ENDS_AT = 10.0 + ALONE_AFTER_S
 
 
-def tenure_of(me: NodeId, *, leased: bool = False, owner: str | None = "edge1") -> Tenure:
+def tenure_of(me: NodeId, *, leased: bool = False, owner: str | None = "edge1", fleet: Fleet = LOCAL) -> Tenure:
     """Of a node that knows the task's owner since 9 s and has heard nobody."""
-    (task,) = LOCAL.tasks
+    (task,) = fleet.tasks
     executor = Executor(spec=task, me=me, has_streams=me.startswith("r"))
     done(executor.execute, replace(allocation_of(1, owner), leased=leased), 9.0)
-    leases = Leases(fleet=LOCAL, me=me, incarnation=1, standing={}, now=0.0)
-    return Tenure(fleet=LOCAL, me=me, leases=leases, executors={"merge": executor})
+    leases = Leases(fleet=fleet, me=me, incarnation=1, standing={}, now=0.0)
+    return Tenure(fleet=fleet, me=me, leases=leases, executors={"merge": executor})
 
 
 def silence(fleet: Fleet = LOCAL, me: NodeId = "robot1") -> Membership:
@@ -55,6 +55,18 @@ def test_a_robot_that_hears_nobody_works_alone_when_its_time_has_come() -> None:
     tenure.tend_isolation(membership, ToDo(), 11.0)
     assert not is_alone(tenure)
     assert tenure.next_deadline(11.0) == math.inf
+
+
+def test_the_only_robot_works_alone_when_it_hears_neither_the_owner_nor_most_electors() -> None:
+    """It was its own majority, and waited for an owner that nobody could replace."""
+    fleet = fleet_of(*LOCAL.tasks, of=("edge1", "edge2", "robot1"), electors=("edge1", "edge2", "robot1"))
+    tenure, membership = tenure_of("robot1", fleet=fleet), silence(fleet)
+    tenure.tend_isolation(membership, ToDo(), 10.0)
+    tenure.tend_isolation(membership, ToDo(), ENDS_AT)
+    assert is_alone(tenure)
+    membership.absorb_beat(beat_of("edge2", 1), 11.0)
+    tenure.tend_isolation(membership, ToDo(), 11.0)
+    assert not is_alone(tenure), "with another elector it can move the task"
 
 
 @pytest.mark.parametrize("late_s", [0.0, 100.0])
