@@ -450,7 +450,7 @@ class Restorer:
         self._node = node
         self._inputs = inputs
         self._book = book
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self._callback: Callable[[bytes], None] | None = None
         self._timeout_s = TIMEOUT_S
         self._noted: Role | None = None
@@ -526,7 +526,7 @@ class Restorer:
             if result is None or result.epoch != epoch:
                 return
             self._result = None
-        self._inputs.release(lambda: self._hand_over(result))
+            self._inputs.release(lambda: self._hand_over(result))  # under the lock: the next epoch's hold comes behind
 
     def _run(self, epoch: int, predecessor: NodeId, gone: threading.Event, then: Callable[[], None]) -> None:
         started = monotonic_s()

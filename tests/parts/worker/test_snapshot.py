@@ -579,6 +579,29 @@ def test_a_state_that_has_come_waits_until_its_own_epoch_begins() -> None:
     assert (got, restorer.is_pending) == ([b"of 5"], False)
 
 
+def test_the_next_epoch_s_hold_is_not_undone_by_the_state_of_the_one_before() -> None:
+    """It came between the moment in which that state was taken and the one in which the inputs went on."""
+    inputs, later = Inputs(), list[threading.Thread]()
+    restorer = Restorer(lambda *_: b"state", "edge2", inputs, list[str]().append, StateBook())
+    restorer.register(lambda _content: None, 1.0)
+    restorer.note(active(3))
+    has_come = threading.Event()
+    assert restorer.begin(active(3), has_come.set)
+    assert has_come.wait(PATIENCE_S)
+    release = inputs.release
+
+    def released(first: object) -> None:
+        later.append(threading.Thread(target=restorer.note, args=(active(5),)))
+        later[0].start()
+        later[0].join(0.3)
+        release(first)
+
+    inputs.release = released  # type: ignore[method-assign]
+    restorer.deliver(3)
+    later[0].join(PATIENCE_S)
+    assert (inputs.said, restorer.is_pending) == (["hold", "release", "hold"], True)
+
+
 @pytest.mark.parametrize("error", [MemoryError("32 MiB"), zenoh.ZError("closed"), RuntimeError("no thread")])
 def test_a_wait_that_fails_is_a_cold_start_and_no_worker_that_stands_still(error: Exception) -> None:
     def fails(_node: str, _epoch: int, _timeout_s: float, _is_gone: Callable[[], bool]) -> bytes:
