@@ -50,7 +50,7 @@ TOLD_S: Final = 0.5
 SETTLE_S: Final = 5.0
 """A predecessor waits so long for its own state before it refuses: longer than a successor waits for it."""
 MAX_WAITING: Final = 4
-"""Questions that wait in threads of their own, so that others are answered meanwhile."""
+"""Questions that wait in threads of their own, so that others are answered meanwhile; further ones are refused."""
 CONTEST_S: Final = 0.1
 """A whole state waits this long for another answer to the same question."""
 MAX_OFFERS: Final = 2
@@ -135,10 +135,14 @@ class Offer:
 
     def _hear(self, query: zenoh.Query) -> None:
         epoch = _asked_for(query)
-        if self._book.must_wait(epoch) and self._waiting.acquire(blocking=False):
+        if not self._book.must_wait(epoch):
+            self._take(query, epoch)
+        elif self._waiting.acquire(blocking=False):
             guarded(self._wait, query, epoch, name="zsched offer", is_lasting=False).start()
         else:
-            self._take(query, epoch)
+            _log.warning("a question for the state was refused: %d wait already", MAX_WAITING)
+            with query:
+                query.reply_err("too many questions wait", encoding=ERROR_ENCODING)
 
     def _wait(self, query: zenoh.Query, epoch: int | None) -> None:
         try:

@@ -22,7 +22,18 @@ from zsched.core.values.plan import Role, WorkerRole
 from zsched.ipc.pipe import encode_chunk
 from zsched.sessions.config import data_config, worker_config
 from zsched.worker import snapshot as worker_snapshot
-from zsched.worker.snapshot import CHUNK, MAX_SNAPSHOT, Assembly, Offer, Restorer, StateBook, StateLink, chunks, fetch
+from zsched.worker.snapshot import (
+    CHUNK,
+    MAX_SNAPSHOT,
+    MAX_WAITING,
+    Assembly,
+    Offer,
+    Restorer,
+    StateBook,
+    StateLink,
+    chunks,
+    fetch,
+)
 from zsched.worker.troubles import Troubles
 
 PATIENCE_S = 60.0
@@ -347,6 +358,25 @@ def test_who_waits_for_a_state_itself_answers_behind_it_and_an_older_question_at
     states[0] = b"behind"
     book.begun(3, is_cold=False)
     assert [later.get(timeout=PATIENCE_S) for _ in range(2)] == [b"behind", b"behind"]
+    offer.undeclare()
+
+
+def test_however_many_questions_wait_one_that_need_not_is_answered_at_once(
+    sessions: tuple[zenoh.Session, zenoh.Session], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (worker, asker), key, book = sessions, f"{KEY}/many", StateBook()
+    monkeypatch.setattr(worker_snapshot, "TOLD_S", 2.0)
+    offer = offered(worker, key, lambda: b"state", worked=1, book=book)
+    until_offered(asker, key)
+    later: queue.SimpleQueue[bytes | str] = queue.SimpleQueue()
+    for _ in range(MAX_WAITING + 2):
+        threading.Thread(target=lambda: later.put(asked(asker, key=key, epoch=9)[0]), daemon=True).start()
+    assert [later.get(timeout=1.0) for _ in range(2)] == ["refused: too many questions wait"] * 2
+    content, took_s = asked(asker, key=key, epoch=2)
+    assert content == b"state"
+    assert took_s < 1.0
+    refusal = "refused: its worker was not the owner of epoch 8"
+    assert [later.get(timeout=PATIENCE_S) for _ in range(MAX_WAITING)] == [refusal] * MAX_WAITING
     offer.undeclare()
 
 
