@@ -53,6 +53,8 @@ MAX_OLD = 3
 """Predecessors that are kept: a plan has to fit into a frame (`zsched.wire.codec`)."""
 LEAVES_S = 1.0
 """A worker that has drained, or that is ready only now, learns within this time that it is idle."""
+BEGUN_S = 10.0
+"""A worker that is ready has begun with its epoch so long after it was chosen: it waits 2 s for a state by default."""
 
 
 class Phase(StrEnum):
@@ -304,14 +306,23 @@ class Executor:
         """
         if epoch == self._unleased_epoch:
             self._confirm()
+        self._forget_predecessor(epoch, todo)
+
+    def _forget_predecessor(self, epoch: int, todo: ToDo) -> None:
         if epoch == self.epoch:
             self._predecessor = None
         if epoch == self.role.epoch and self.role.predecessor is not None:
             self._become(replace(self.role, predecessor=None), todo)
 
-    def on_worker_ended(self) -> None:
-        """The worker's process has ended, and its former role with it."""
+    def on_worker_ended(self, todo: ToDo, now: float, *, was_ready: bool = False) -> None:
+        """The worker's process has ended, and its former role with it.
+
+        ``was_ready``: until now. While no relay runs nobody tells that it worked in its epoch, as one does that is
+        ready for so long.
+        """
         self._confirm()
+        if was_ready and now - self.started_at >= BEGUN_S:
+            self._forget_predecessor(self.epoch, todo)
 
     def on_worker_ready(self, now: float) -> None:
         """The worker is ready only now: until then it shows no epoch, so it does not say that it has left one.

@@ -160,7 +160,7 @@ def _on_worker(node: Stages, event: ev.WorkerChanged, todo: ToDo, now: float) ->
     if event.state is WorkerState.READY:
         node.executors[event.task].on_worker_ready(now)
     elif event.state is not WorkerState.STARTING:
-        node.executors[event.task].on_worker_ended()
+        node.executors[event.task].on_worker_ended(todo, now, was_ready=was_ready)
     if was_ready:
         node.agreement.leases.on_worker_lost(event.task)
     node.hangs.note_worker(event.task, event.state, now)

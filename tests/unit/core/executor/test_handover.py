@@ -12,7 +12,7 @@ import pytest
 from support.allocations import allocation_of
 from support.fleets import task_of
 from support.todos import done
-from zsched.core.executor.handover import LEAVES_S, MAX_OLD, ROLE_DRAIN_MARGIN_S, Executor, Phase
+from zsched.core.executor.handover import BEGUN_S, LEAVES_S, MAX_OLD, ROLE_DRAIN_MARGIN_S, Executor, Phase
 from zsched.core.instructions import ApplyRoutes, Instruction, RecordStory, SetRole, StartWorker, StopWorker
 from zsched.core.todo import ToDo
 from zsched.core.values.fleet import OnIsolation, Standby, StreamRule, TaskSpec, WorkerSpec
@@ -503,11 +503,28 @@ def test_a_worker_may_work_without_a_lease_until_it_has_said_that_it_has_stopped
 def test_a_worker_whose_process_ended_works_no_more_unless_the_next_one_may() -> None:
     one = edge()
     done(one.execute, allocation_of(1, "edge1"), 0.0)
-    one.on_worker_ended()
+    one.on_worker_ended(ToDo(), 0.0)
     assert one.may_work_unleased(0.0), "the next process may work at once"
     done(one.execute, replace(allocation_of(1, "edge1"), leased=True), 1.0)
-    one.on_worker_ended()
+    one.on_worker_ended(ToDo(), 1.0)
     assert not one.may_work_unleased(1.0)
+
+
+@pytest.mark.parametrize(
+    ("was_ready", "at", "asks"), [(True, 1.0 + BEGUN_S, False), (True, 0.9 + BEGUN_S, True), (False, 90.0, True)]
+)
+def test_the_next_process_does_not_get_the_state_that_the_one_before_began_with(
+    was_ready: bool, at: float, asks: bool
+) -> None:
+    """While no relay runs nobody tells that it had worked: what it did since would be undone by the older state."""
+    one = edge()
+    done(one.execute, allocation_of(1, "edge2"), 0.0)
+    done(one.execute, allocation_of(2, "edge1"), 1.0)
+    assert one.role.predecessor == "edge2"
+    todo = ToDo()
+    one.on_worker_ended(todo, at, was_ready=was_ready)
+    assert (one.role.role, one.role.predecessor == "edge2") == (WorkerRole.ACTIVE, asks)
+    assert bool(todo.apply) is not asks
 
 
 def test_a_worker_that_is_ready_only_when_it_was_told_to_stop_has_nothing_to_confirm() -> None:
