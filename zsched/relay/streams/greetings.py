@@ -6,11 +6,14 @@ answer leads to (`zsched.core.hop.sender`).
 A start marker (an end marker of epoch 0) says the lowest number that may still come; `zsched.worker` acknowledges it at
 once. A subscriber that never answers is no `zsched.worker`: after `FOREIGN_S`, longer than any lease of a frozen
 process, or after `STRANGE_S` where the worker answers for other keys, its samples go out and are counted ``uncounted``.
+A worker may stand still for a second, too: so it is asked for a key that it has answered for, and must have said
+something meanwhile.
 The outlet's lock guards what it holds; `greet` is called in the queue's thread only, because its puts may block.
 """
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable
 from typing import Final
@@ -21,6 +24,8 @@ from zsched.sessions.matching import is_matched
 
 STRANGE_S: Final = 1.0
 FOREIGN_S: Final = 10.0
+ASK_S: Final = 0.2
+"""A worker that says nothing is asked this often, at most."""
 
 
 class Greetings:
@@ -33,6 +38,11 @@ class Greetings:
         self._unmet: dict[int, Lane] = {}
         self._is_away = False
         self._is_parted = False
+        self._known: Lane | None = None
+        """The lane that the worker has answered for last..."""
+        self._heard_at = -math.inf
+        """...and when it said something."""
+        self._asked_at = -math.inf
 
     @property
     def is_waiting(self) -> bool:
@@ -48,10 +58,13 @@ class Greetings:
     def forget(self, lane: Lane) -> None:
         """A lane is given back (under the lock)."""
         self._unmet.pop(lane.eid, None)
+        if self._known is lane:
+            self._known = None
 
     def heard(self, lane: Lane) -> None:
         """A lane's receiver has said something (under the lock): whether it is met by that, or must be greeted."""
         if lane.is_met:
+            self._known, self._heard_at = lane, monotonic_s()
             self._unmet.pop(lane.eid, None)
         else:
             self.add(lane)
@@ -86,16 +99,29 @@ class Greetings:
                 lowest = lane.take_greeting(now)
             if lowest is not None:
                 self._put_start(lane, lowest)
-            if _is_foreign(lane, now, has_others=has_others):
+            if self._is_foreign(lane, now, has_others=has_others):
                 with self._lock:
                     if not lane.is_met:
                         lane.is_foreign = True
                         self._unmet.pop(lane.eid, None)
         return not self._unmet
 
+    def _is_foreign(self, lane: Lane, now: float, *, has_others: bool) -> bool:
+        """Whether a lane's receiver will not answer any more; ``has_others``: the worker answers for other keys."""
+        if has_others and not is_matched(lane.publisher):
+            return True
+        waited_s = now - lane.unmet_since
+        if has_others and waited_s > STRANGE_S / 2 and self._heard_at - lane.unmet_since <= STRANGE_S / 2:
+            self._ask(now)
+        elif has_others and waited_s > STRANGE_S:
+            return True
+        return waited_s > FOREIGN_S
 
-def _is_foreign(lane: Lane, now: float, *, has_others: bool) -> bool:
-    """Whether a lane's receiver will not answer any more; ``has_others``: the worker answers for other keys."""
-    if has_others and not is_matched(lane.publisher):
-        return True
-    return now - lane.unmet_since > (STRANGE_S if has_others else FOREIGN_S)
+    def _ask(self, now: float) -> None:
+        """Have the worker say something of a key that it has answered for."""
+        with self._lock:
+            known = self._known
+            lowest = None if known is None or now - self._asked_at < ASK_S else known.lowest
+        if known is not None and lowest is not None:
+            self._asked_at = now
+            self._put_start(known, lowest)

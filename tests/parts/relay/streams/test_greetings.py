@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -336,6 +337,38 @@ def test_a_key_that_the_worker_does_not_take_holds_up_no_other(bench: Bench) -> 
     outlet.send(bench.sample("robot1/a"))
     until(lambda: receiver.got == [0, 1], "the next of that key")
     settled(outlet, uncounted=1, waiting=0)
+    outlet.undeclare()
+
+
+def test_a_worker_that_stands_still_between_two_keys_is_no_stranger(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It held the interpreter's lock for a second: samples that it has done went out as if to a recorder."""
+    monkeypatch.setattr(greetings, "STRANGE_S", 0.2)
+    monkeypatch.setattr(greetings, "FOREIGN_S", 60.0)
+    known, other, recorder = (Receiver(bench.other, bench.relay, f"edge1/{key}") for key in "abc")
+    outlet = bench.outlet("robot1/*", "edge1/*")
+    outlet.send(bench.sample("robot1/a"))
+    known.greeted()
+    known.ack(0)
+    until(lambda: known.got == [0], "the key that it has answered for")
+    known.ack(1)
+    settled(outlet, acknowledged=1)
+    before = len(known.starts)
+    outlet.send(bench.sample("robot1/b"))
+    known.greeted(before + 2)  # it is asked again and again, and says nothing
+    time.sleep(0.3)
+    assert other.got == []
+    other.ack(0)
+    until(lambda: other.got == [0], "the other key")
+    other.ack(1)
+    settled(outlet, acknowledged=2, uncounted=0)
+    before = len(other.starts)
+    outlet.send(bench.sample("robot1/c"))
+    other.greeted(before + 1)
+    other.ack(1)  # it says something, and not for this key
+    until(lambda: recorder.got == [0], "what nobody acknowledges")
+    settled(outlet, acknowledged=2, uncounted=1)
     outlet.undeclare()
 
 
