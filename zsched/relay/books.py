@@ -31,7 +31,7 @@ from zsched.wire import codec as wire
 NAME_BYTES: Final = 120
 RECORD: Final = NAME_BYTES + 8
 MAX_CELLS: Final = 511
-"""Inputs that have a cell; of more than these, what came since the last count is not known after a kill."""
+"""Inputs that have a cell; of more that are open at one time, a kill loses what came since the last count unseen."""
 SIZE: Final = (MAX_CELLS + 1) * RECORD
 
 _log = logging.getLogger("zsched.relay")
@@ -59,7 +59,10 @@ class Books:
         self._life = os.urandom(8).hex()
         self._past: dict[str, StreamCount] = {}
         self._written: tuple[StreamCount, ...] | None = None
-        self._cells: dict[str, Cell] = {}
+        self._cells: dict[str, tuple[int, Cell]] = {}
+        """{input: (where its record begins, its cell)}."""
+        self._free: dict[str, None] = {}
+        """Inputs that are closed, the oldest first: their cells go to others when there is no other one left."""
         self._table: memoryview | None = None
         self._has_failed = self._is_closed = False
         if path is not None:
@@ -71,14 +74,32 @@ class Books:
         """Where an input counts what it takes; a stream that comes again goes on in its own."""
         name = stream.encode()
         with self._lock:
+            self._free.pop(stream, None)
             if stream in self._cells:
-                return self._cells[stream]
-            if self._table is None or len(self._cells) >= MAX_CELLS or len(name) > NAME_BYTES:
+                return self._cells[stream][1]
+            is_full = len(self._cells) >= MAX_CELLS
+            if self._table is None or (is_full and not self._free) or len(name) > NAME_BYTES:
                 return None
-            at = (1 + len(self._cells)) * RECORD
-            made = self._cells[stream] = self._table[at + NAME_BYTES : at + RECORD].cast("Q")
-            self._table[at : at + len(name)] = name
+            at = self._given_back() if is_full else (1 + len(self._cells)) * RECORD
+            made = self._table[at + NAME_BYTES : at + RECORD].cast("Q")
+            self._cells[stream] = at, made
+            self._table[at : at + NAME_BYTES] = name.ljust(NAME_BYTES, b"\0")
             return made
+
+    def _given_back(self) -> int:
+        """Where the record begins of an input that is closed; it counts nothing any more."""
+        oldest = next(iter(self._free))
+        del self._free[oldest]
+        at, cell = self._cells.pop(oldest)
+        cell[0] = 0
+        return at
+
+    def leave(self, stream: str) -> None:
+        """An input is closed, and what it has taken stands in the books: its cell is another one's if need be."""
+        with self._lock:
+            if stream in self._cells:
+                self._free.pop(stream, None)
+                self._free[stream] = None
 
     def added(self, counts: tuple[StreamCount, ...]) -> tuple[StreamCount, ...]:
         """Our counters with those of the relays before."""

@@ -32,13 +32,14 @@ class OpenStreams:
         own_ids: frozenset[str],
         local: Session | None = None,
         cells: Cells = lambda _stream: None,
+        leave_cell: Callable[[str], None] = lambda _stream: None,
     ) -> None:
         """``session`` is the fleet's, ``local`` the one of the host's own side, if it has one.
 
-        ``own_ids`` are those of all sessions of this process.
+        ``own_ids`` are those of all sessions of this process; ``leave_cell`` hears that an input counts no more.
         """
         self._session, self._local, self._own_ids = session, local, own_ids
-        self._cells = cells
+        self._cells, self._leave_cell = cells, leave_cell
         self._times = AnswerTimes()
         self.wake: Callable[[], None] = lambda: None
         """Called, in any thread, when the end of an output has come."""
@@ -137,3 +138,4 @@ class OpenStreams:
             add_to(self._closed, closed(one.count()))
         if isinstance(one, InputStream) and (cell := self._cells(stream)) is not None:
             cell[0] = 0  # the books tell nothing of it from now on, so nothing of it is untold
+            self._leave_cell(stream)

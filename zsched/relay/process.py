@@ -397,7 +397,7 @@ class RelayProcess:
                 self._acks,
                 self._application.report,
                 graph,
-                OpenStreams(self._session, self._own_ids, self._local, self._books.cell),
+                OpenStreams(self._session, self._own_ids, self._local, self._books.cell, self._books.leave),
                 self._local,
             )
             self._tasks[name] = task

@@ -141,6 +141,27 @@ def test_more_inputs_than_there_are_cells_go_without(tmp_path: Path) -> None:
     assert made.cell("t0/in/0") is cells[0]
 
 
+def test_the_cells_of_inputs_that_are_closed_go_to_new_ones(tmp_path: Path) -> None:
+    """Over the weeks a relay may have had any number of tasks."""
+    made = Books(Door(tmp_path, "robot1").books)
+    names = [f"task{index}/in/0" for index in range(relay_books.MAX_CELLS)]
+    for name in names:
+        assert made.cell(name) is not None
+    for name in names[:2]:
+        made.leave(name)
+    again = made.cell(names[0])
+    assert again is not None
+    again[0] = 3
+    new = made.cell("new/in/0")
+    assert new is not None, "the second one's"
+    new[0] = 7
+    assert made.cell("other/in/0") is None, "all others are open"
+    streams = tuple(StreamCount(stream=name, in_flight=0) for name in (*names, "new/in/0"))
+    found = Books(Door(tmp_path, "robot1").books).added(streams)
+    lost = {count.stream: count.at_most_lost for count in found if count.at_most_lost}
+    assert lost == {names[0]: 3, "new/in/0": 7}
+
+
 def test_a_task_that_has_left_is_forgotten(tmp_path: Path) -> None:
     first = Life(tmp_path)
     first.take(3)
