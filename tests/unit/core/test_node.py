@@ -19,6 +19,7 @@ from support.states import state_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.electorate.strangers import SHOWN_S
+from zsched.core.executor.handover import HEARS_S
 from zsched.core.executor.sparing import Sparing
 from zsched.core.handlers.work import carry_out
 from zsched.core.membership.identity import QUIET_S
@@ -946,6 +947,17 @@ def test_a_worker_that_runs_by_an_old_recipe_is_started_again_once() -> None:
     batch = edge.handle(ev.RecipeCompared(task="merge", is_old=True), 100.2)
     assert of(batch, do.RenewWorker) == [do.RenewWorker(task="merge")]
     assert of(edge.handle(ev.DeadlineReached(), 100.3), do.RenewWorker) == []
+
+
+def test_a_worker_that_the_next_relay_sees_is_waited_for_no_longer_than_it_takes_to_hear_its_role() -> None:
+    edge = started("edge1")
+    edge.handle(ev.WorkerChanged(task="merge", state=WorkerState.READY), 100.0)
+    executor = edge.executors["merge"]
+    for leased in (False, True):
+        executor.execute(replace(allocation_of(1, "edge1"), leased=leased), ToDo(), 100.1)
+    assert executor.may_work_unleased(200.0), "what it has said went with the relay"
+    edge.handle(ev.WorkerChanged(task="merge", state=WorkerState.READY), 200.0)
+    assert not executor.may_work_unleased(200.0 + HEARS_S)
 
 
 def test_what_a_worker_complains_of_is_in_the_next_profile() -> None:

@@ -53,6 +53,8 @@ MAX_OLD = 3
 """Predecessors that are kept: a plan has to fit into a frame (`zsched.wire.codec`)."""
 LEAVES_S = 1.0
 """A worker that has drained, or that is ready only now, learns within this time that it is idle."""
+HEARS_S = 5.0
+"""A worker that another relay sees has heard from it within this time that it is idle; a busy one hears it late."""
 BEGUN_S = 10.0
 """A worker that is ready has begun with its epoch so long after it was chosen: it waits 2 s for a state by default."""
 
@@ -100,6 +102,8 @@ class Executor:
     """The epoch in which the worker here worked without a lease; ``None`` once it has confirmed its end."""
     _leaves_until: float = -math.inf
     """Until when a worker learns that it is idle that has drained, and so has left its epoch, or is ready only now."""
+    _may_have_said: bool = False
+    """Another relay sees the worker since it was told to leave: the end of its role may be lost with the one before."""
     _has_told: bool = False
     """The worker here has been told a role."""
     _is_owner_gone: bool = False
@@ -279,6 +283,8 @@ class Executor:
     def _become(self, role: Role, todo: ToDo) -> None:
         """Change the role; remember a role without a lease until the worker has stopped."""
         self.role, self._has_told = role, True
+        if role.role is WorkerRole.ACTIVE:
+            self._may_have_said = False
         if role.role is WorkerRole.ACTIVE and role.lease_until_s is None:
             self._unleased_epoch = role.epoch
         todo.add(SetRole(role=role))
@@ -333,6 +339,19 @@ class Executor:
         self._confirm()
         if self._unleased_epoch != before:
             self._leaves_until = now + LEAVES_S
+
+    def on_worker_seen(self, now: float) -> None:
+        """Another relay sees the worker, which was ready all the time; it is told its role by that.
+
+        What it has said of its role's end may be lost with the relay before, and is not said again.
+        """
+        self._may_have_said = self.role.role is not WorkerRole.ACTIVE
+        self._confirm_unsaid(now)
+
+    def _confirm_unsaid(self, now: float) -> None:
+        if self._may_have_said and self.role.role is WorkerRole.IDLE and self._unleased_epoch is not None:
+            self._confirm()
+            self._leaves_until = max(self._leaves_until, now + HEARS_S)
 
     def _confirm(self) -> None:
         """Nobody works in the epoch without a lease any more, unless the worker here may: it was told nothing since."""
@@ -499,5 +518,6 @@ class Executor:
             if self.role.role is WorkerRole.DRAINING:
                 self._leaves_until = now + LEAVES_S
             self._become(Role(task=self.spec.name, role=WorkerRole.IDLE), todo)
+            self._confirm_unsaid(now)
             if self._is_cold:
                 todo.add(StopWorker(task=self.spec.name))

@@ -156,6 +156,8 @@ def _on_worker(node: Stages, event: ev.WorkerChanged, todo: ToDo, now: float) ->
     was_ready = node.worker_states.get(event.task) is WorkerState.READY
     story = node.workers.on_changed(event)
     if story is None:
+        if was_ready and event.state is WorkerState.READY:
+            node.executors[event.task].on_worker_seen(now)
         return
     if event.state is WorkerState.READY:
         node.executors[event.task].on_worker_ready(now)

@@ -12,7 +12,7 @@ import pytest
 from support.allocations import allocation_of
 from support.fleets import task_of
 from support.todos import done
-from zsched.core.executor.handover import BEGUN_S, LEAVES_S, MAX_OLD, ROLE_DRAIN_MARGIN_S, Executor, Phase
+from zsched.core.executor.handover import BEGUN_S, HEARS_S, LEAVES_S, MAX_OLD, ROLE_DRAIN_MARGIN_S, Executor, Phase
 from zsched.core.instructions import ApplyRoutes, Instruction, RecordStory, SetRole, StartWorker, StopWorker
 from zsched.core.todo import ToDo
 from zsched.core.values.fleet import OnIsolation, Standby, StreamRule, TaskSpec, WorkerSpec
@@ -548,6 +548,32 @@ def test_an_owner_that_was_chosen_again_before_its_worker_has_confirmed_hears_it
     assert one.may_work_unleased(1.0)
     done(one.on_role_ended, 1)
     assert not one.may_work_unleased(1.0)
+
+
+def test_an_end_that_was_told_to_a_relay_that_died_is_not_waited_for_for_ever() -> None:
+    """The worker says it once: its node never seemed to be free of work without a lease."""
+    one = edge()
+    done(one.execute, allocation_of(1, "edge1"), 0.0)
+    one.on_worker_seen(0.5)
+    assert one.may_work_unleased(0.5 + HEARS_S), "it works"
+    done(one.execute, replace(allocation_of(1, "edge1"), leased=True), 1.0)
+    assert one.may_work_unleased(100.0), "it has not said that it does not, to the relay that has told it"
+    one.on_worker_seen(100.0)
+    assert one.may_work_unleased(100.0 + HEARS_S - 0.1), "it may hear it only now"
+    assert not one.may_work_unleased(100.0 + HEARS_S)
+
+
+def test_a_worker_that_drains_while_its_relay_dies_is_waited_for_until_it_is_idle() -> None:
+    one = edge()
+    done(one.execute, allocation_of(1, "edge1"), 0.0)
+    done(one.execute, allocation_of(2, "edge2"), 1.0)
+    one.on_worker_seen(1.1)
+    ends_at = one.next_deadline()
+    assert one.is_finishing
+    assert one.may_work_unleased(ends_at)
+    done(one.tick, ends_at)
+    assert one.may_work_unleased(ends_at + HEARS_S - 0.1)
+    assert not one.may_work_unleased(ends_at + HEARS_S)
 
 
 def test_a_worker_that_has_drained_hears_of_its_end_a_little_later() -> None:
