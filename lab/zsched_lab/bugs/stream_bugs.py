@@ -271,7 +271,7 @@ STREAM_BUGS = (
     _bug(
         "a slot that closes does not say so",
         "zsched.relay.streams.answers",
-        "self._acks.leave(self._names)",
+        "self._acks.leave(heard)",
         "self._acks.flush()",
         ("tests/parts/relay/streams/test_answers.py",),
     ),
