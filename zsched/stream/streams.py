@@ -76,8 +76,7 @@ JOIN_S: Final = 0.3
 
 _log = logging.getLogger("zsched.streams")
 
-_Found = tuple[OwnTask, str, InputStream]
-"""A task, the name of one of its inputs, and that input as it was then."""
+_Inputs = tuple[InputStream, ...]
 
 
 class _Here(threading.local):
@@ -101,13 +100,14 @@ class _Here(threading.local):
 
 
 class Publisher:
-    """One key of the application that a task's input takes; `put` from any thread."""
+    """One key of the application that inputs of tasks take; `put` from any thread."""
 
-    def __init__(self, key: str, find: Callable[[str], _Found | None], closing: Latch, here: _Here) -> None:
-        """``find`` says which input of which task takes a key now, if one does."""
+    def __init__(self, key: str, inputs: Callable[[], _Inputs], closing: Latch, here: _Here) -> None:
+        """``inputs`` are those of all tasks as they are now."""
         self.key = key
-        self._find, self._closing, self._here = find, closing, here
-        self._found = find(key)
+        self._inputs, self._closing, self._here = inputs, closing, here
+        self._found: tuple[_Inputs, _Inputs] = ((), ())
+        """(All inputs there were, those of them that take our key)."""
 
     def put(
         self,
@@ -119,7 +119,8 @@ class Publisher:
     ) -> bool:
         """Put one sample on its way to the owner; ``False``: it went nowhere (streams closed, or the rule is gone).
 
-        Class ``reliable`` waits while the queue towards the owner is full, and once for a link that has become full.
+        Where several rules take the key it goes to the owner of each, as from a client of the relay. Class ``reliable``
+        waits while the queue towards the owner is full, and once for a link that has become full.
 
         Raises:
             TypeError: an argument is of another type.
@@ -127,18 +128,33 @@ class Publisher:
         sent, attached, encoded, stamp = put_arguments(payload, attachment, encoding, timestamp)
         given = Given(self.key, sent, encoded or PLAIN, attached, stamp)
         with self._here:
-            return self._give(given) or self._give(given)  # what has closed since we looked may have another place
+            return self._give(given)
 
     def _give(self, given: Given) -> bool:
-        stream = self._stream()
-        return stream is not None and not self._closing.is_set() and stream.give(cast("Sample", given))
+        streams = self._streams()
+        missed = [stream for stream in streams if not self._give_to(stream, given)]
+        if streams and not missed:
+            return True
+        # what has closed since we looked may have another place
+        tasks = {_task_of(stream) for stream in missed}
+        others = [stream for stream in self._streams() if stream not in streams]
+        heirs = [stream for stream in others if not streams or _task_of(stream) in tasks]
+        has_heir = [self._give_to(stream, given) for stream in heirs]
+        return any(has_heir) or len(missed) < len(streams)
 
-    def _stream(self) -> InputStream | None:
-        """The input that takes our key: rules may change their places, and with them names; a task may come again."""
-        found = self._found
-        if found is None or found[0].input(found[1]) is not found[2]:
-            found = self._found = self._find(self.key)
-        return None if found is None else found[2]
+    def _give_to(self, stream: InputStream, given: Given) -> bool:
+        return not self._closing.is_set() and stream.give(cast("Sample", given))
+
+    def _streams(self) -> _Inputs:
+        """The inputs that take our key: rules may change their places, tasks may come, and come again."""
+        there = self._inputs()
+        if there != self._found[0]:
+            self._found = there, tuple(one for one in there if includes(one.route.from_expr, self.key))
+        return self._found[1]
+
+
+def _task_of(stream: InputStream) -> TaskId:
+    return stream.route.stream.partition("/")[0]
 
 
 class Streams:
@@ -239,10 +255,11 @@ class Streams:
         until = monotonic_s() + KNOWN_S
         while monotonic_s() < until and not self._closing.is_set():
             is_told = key in self._taken  # behind the plans
-            if is_told and (found := self._find(key)) is not None:
-                task, stream, _ = found
-                task.wait_fed(stream, FED_S)
-                return Publisher(key, self._find, self._closing, self._here)
+            if is_told and any(includes(one.route.from_expr, key) for one in self._inputs()):
+                fed_by = monotonic_s() + FED_S
+                for task in tuple(self._tasks.values()):
+                    task.wait_fed(key, fed_by)
+                return Publisher(key, self._inputs, self._closing, self._here)
             time.sleep(LOOK_S)
         self._check_open()
         self._forget(key)
@@ -311,10 +328,9 @@ class Streams:
         if self._closing.is_set():
             raise AdapterError(f"the streams of {self.node} are closed")
 
-    def _find(self, key: str) -> _Found | None:
-        """The input that takes a key."""
-        found = ((task, task.input_of(key)) for task in tuple(self._tasks.values()))
-        return next(((task, *one) for task, one in found if one is not None), None)
+    def _inputs(self) -> _Inputs:
+        """Of all tasks, as they are now."""
+        return tuple(stream for task in tuple(self._tasks.values()) for stream in task.inputs())
 
     def _name(self, key: str) -> None:
         with self._lock:

@@ -17,7 +17,7 @@ from zsched.clock import monotonic_s
 from zsched.core.relay_protocol import RelayReport
 from zsched.core.route.keyexpr import includes
 from zsched.core.values.model import NodeId, TaskId
-from zsched.core.values.plan import Route, RoutePlan
+from zsched.core.values.plan import Direction, Route, RoutePlan
 from zsched.relay.graph import GraphMirror
 from zsched.relay.open_streams import OpenStreams
 from zsched.relay.streams.acks import Acks
@@ -83,6 +83,8 @@ class OwnTask(TaskRelay):
     ) -> None:
         """``deliver`` gets every answer, in a thread for each output."""
         self._has_owner = False
+        self._told: tuple[Route, ...] = ()
+        """What is to be open, by the newest word."""
         self._own = OwnStreams(session, deliver)
         self._ends: list[threading.Event] = []
         super().__init__(session, task, tokens, acks, report, NoGraph(session, None, node), self._own)
@@ -91,17 +93,19 @@ class OwnTask(TaskRelay):
         """An input by its stream's name, as it is now."""
         return self._own.inputs.get(stream)
 
-    def input_of(self, key: str) -> tuple[str, InputStream] | None:
-        """The input that takes a key, with its stream's name."""
-        return next((one for one in tuple(self._own.inputs.items()) if includes(one[1].route.from_expr, key)), None)
+    def inputs(self) -> tuple[InputStream, ...]:
+        """All inputs, as they are now."""
+        return tuple(self._own.inputs.values())
 
-    def wait_fed(self, stream: str, timeout_s: float) -> None:
-        """Wait until what is put into an input goes to the owner, where the task has one."""
-        until = monotonic_s() + timeout_s
-        while (source := self.input(stream)) is not None and not source.has_way and monotonic_s() < until:
-            if not self.is_owned:
-                return
+    def wait_fed(self, key: str, until: float) -> None:
+        """Wait until what is put under a key goes to the owner, where the task takes the key and has one."""
+        while monotonic_s() < until and not self._feeds(key):
             time.sleep(LOOK_S)
+
+    def _feeds(self, key: str) -> bool:
+        """Whether every input that is to take a key is there, and fed."""
+        names = {one.stream for one in self._told if one.direction is Direction.INPUT and includes(one.from_expr, key)}
+        return all((one := self.input(name)) is not None and (one.has_way or not self.is_owned) for name in names)
 
     @property
     def is_owned(self) -> bool:
@@ -111,7 +115,14 @@ class OwnTask(TaskRelay):
     def apply(self, plan: RoutePlan) -> None:
         """Take the newest plan."""
         self._has_owner = plan.current is not None
+        if plan.current is not None:
+            self._told = plan.current.routes
         super().apply(plan)
+
+    def listen(self, routes: tuple[Route, ...]) -> None:
+        """Take these inputs from now on."""
+        self._told = routes
+        super().listen(routes)
 
     def under_way(self) -> int:
         """How many samples have been taken and not processed, as far as is known."""

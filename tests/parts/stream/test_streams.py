@@ -509,6 +509,40 @@ def test_a_publisher_follows_its_rule_to_another_place_and_its_task_to_another_l
         assert sorted(bench.taken) == sorted(sent)
 
 
+def _is_matching(own: Streams, task: str) -> bool:
+    source = own._tasks[task].input(f"{task}/in/0")
+    return source is not None and source.is_matching(1)
+
+
+def test_a_key_that_two_tasks_take_goes_to_the_owner_of_each_also_of_one_that_comes_later(bench: Bench) -> None:
+    heard: dict[str, list[bytes]] = {"u": [], "v": []}
+    dials = data_config(listen=(free_endpoint(),), connect=(bench.own,), shared_memory=False)
+
+    def hear(sample: zenoh.Sample) -> None:
+        heard[str(sample.key_expr).split("/")[1]].append(sample.payload.to_bytes())
+
+    def plan(task: str) -> RoutePlan:
+        to_expr = f"edge2/{task}/robot1/*/in"
+        route = replace(IN, stream=f"{task}/in/0", to_expr=to_expr, settings=StreamSettings())
+        current = Slot(epoch=1, owner="edge2", routes=(route,), ready_when=ReadyWhen.MATCHING)
+        return replace(PLAN, task=task, current=current)
+
+    bench.application.plan(plan("u"))
+    with bench.join() as own, zenoh.open(zenoh.Config.from_json5(dials)) as foreign:
+        kept = foreign.declare_subscriber("edge2/*/robot1/*/in", hear)
+        publisher = own.publisher("robot1/front/in")
+        until(lambda: _is_matching(own, "u"), "the other owner is seen")
+        assert publisher.put(b"1")
+        until(lambda: (bench.taken, heard["u"]) == ([b"1"], [b"1"]), "both owners have it", 20)
+        bench.application.plan(plan("v"))
+        until(lambda: "v" in own._tasks, "the task that comes while the application runs")
+        until(lambda: _is_matching(own, "v"), "its owner is seen")
+        assert publisher.put(b"2")
+        both = [b"1", b"2"]
+        until(lambda: (bench.taken, heard["u"], heard["v"]) == (both, both, [b"2"]), "and all three", 20)
+        kept.undeclare()
+
+
 class Others:
     """Files that are opened when a connection is closed: one of them has its descriptor."""
 
@@ -583,8 +617,8 @@ def test_what_is_put_while_its_rule_moves_or_goes_arrives_or_is_refused(
         source = own._tasks["t"].input("t/in/0")
 
         def has_way() -> bool:
-            found = own._find(publisher.key)
-            return found is not None and found[2].has_way
+            found = [one for one in own._inputs() if one.route.from_expr == publisher.key]
+            return bool(found) and all(one.has_way for one in found)
 
         def change_first(stream: InputStream, sample: zenoh.Sample) -> bool:
             if stream is source:
