@@ -84,6 +84,7 @@ class Lane(Sender, kw_only=True, eq=False):
                 source_info=source,
                 congestion_control=CongestionControl.BLOCK,
                 priority=publisher.priority,
+                express=sample.express,
             )
             return
         session.put(
@@ -95,6 +96,7 @@ class Lane(Sender, kw_only=True, eq=False):
             source_info=source,
             congestion_control=CongestionControl.BLOCK,
             priority=publisher.priority,
+            express=sample.express,
         )
 
 

@@ -82,17 +82,17 @@ class Bench:
         """Incarnations that are there; ``None``: all."""
         acks = Acks(relay, KEYS, "robot1", lambda _node, _task, life: self.tokens is None or life in self.tokens)
         self.acks = acks.of("edge1", "t")
-        self._samples: list[zenoh.Sample] = []
-        self._subscriber = relay.declare_subscriber("robot1/**", self._samples.append)
+        self.samples: list[zenoh.Sample] = []
+        self._subscriber = relay.declare_subscriber("robot1/**", self.samples.append)
 
     def outlet(self, from_expr: str, to_expr: str, settings: StreamSettings = RELIABLE, epoch: int = 0) -> Outlet:
         return Outlet(self.relay, from_expr, to_expr, settings, self.acks, epoch=epoch)
 
     def sample(self, key: str = "robot1/in") -> zenoh.Sample:
-        before = len(self._samples)
+        before = len(self.samples)
         self.relay.put(key, b"x")
-        until(lambda: len(self._samples) > before, "a sample")
-        return self._samples[-1]
+        until(lambda: len(self.samples) > before, "a sample")
+        return self.samples[-1]
 
 
 @pytest.fixture
@@ -229,6 +229,36 @@ def test_only_a_life_with_a_token_is_another_life(bench: Bench) -> None:
     receiver.ack(2)  # the last word of one whose token has gone already
     receiver.ack(0, incarnation="2")
     settled(outlet, at_most_lost=1, in_flight=0)
+
+
+def test_what_is_sent_again_has_all_that_it_had_the_first_time(bench: Bench) -> None:
+    receiver = Receiver(bench.other, bench.relay, "edge1/in")
+    got: list[zenoh.Sample] = []
+    kept = bench.other.declare_subscriber("edge1/in", got.append)
+    outlet = bench.outlet("robot1/*", "edge1/*")  # no way of the usual priority
+    before, high = len(bench.samples), zenoh.Priority.DATA_HIGH
+    stamp = bench.relay.new_timestamp()
+    bench.relay.put(
+        "robot1/in", b"1", encoding="image/png;7", attachment=b"2", timestamp=stamp, priority=high, express=True
+    )
+    bench.relay.delete("robot1/in", attachment=b"3", priority=high, express=True)
+    until(lambda: len(bench.samples) == before + 2, "two samples")
+    for sample in bench.samples[before:]:
+        outlet.send(sample)
+    receiver.greeted()
+    receiver.ack(0)
+    until(lambda: cared(outlet) and receiver.got == [0, 1], "both")
+    receiver.ack(0, has_gap=True, until=2)
+    until(lambda: cared(outlet) and receiver.got == [0, 1, 0, 1], "both once more")
+    until(lambda: len(got) == 4, "for the other subscriber, too")
+    said = [
+        (one.kind, one.payload.to_bytes(), str(one.encoding), bytes(one.attachment or b""), str(one.timestamp))
+        for one in got
+    ]
+    assert said[2:] == said[:2]
+    assert [(one.priority, one.express) for one in got] == [(high, True)] * 4
+    kept.undeclare()
+    outlet.undeclare()
 
 
 def test_what_a_stranger_acknowledges_in_the_worker_s_name_is_sent_again(bench: Bench) -> None:
