@@ -87,7 +87,9 @@ class Rewriting:
         Raises:
             ValueError: ``to`` cannot be filled from it.
         """
-        self._rewriters[from_expr] = rewriter(from_expr, self._to)
+        made = rewriter(from_expr, self._to)
+        self._rewriters.pop(from_expr, None)  # one that comes back is the newest again
+        self._rewriters[from_expr] = made
         while len(self._rewriters) > KEPT_OWNERS:
             self._rewriters.pop(next(iter(self._rewriters)))
 

@@ -133,6 +133,15 @@ def test_keys_of_several_owners_lead_to_one_place() -> None:
     assert rewriting.key("edge1/merge/1/robot1/a") is None, "it is forgotten"
 
 
+def test_an_owner_that_comes_back_is_the_newest_and_forgotten_last() -> None:
+    """Without an epoch in its ``from`` an owner has the same one each time."""
+    rewriting = Rewriting("edge0/merge/*", "robot1/merged/*")
+    for number in (*range(1, KEPT_OWNERS), 0, KEPT_OWNERS):
+        rewriting.also_from(f"edge{number}/merge/*")
+    assert rewriting.key("edge0/merge/a") == "robot1/merged/a", "it has just been left, and still sends"
+    assert rewriting.key("edge1/merge/a") is None, "it is forgotten"
+
+
 def test_where_one_key_is_meant_every_owner_s_leads_to_it() -> None:
     rewriting = Rewriting("edge1/merge/1/robot1/map", "robot1/merged")
     rewriting.also_from("edge2/merge/2/robot1/map")
