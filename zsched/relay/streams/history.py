@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections import OrderedDict
 from collections.abc import Callable
 from typing import Final
 
@@ -72,7 +73,7 @@ class HeldValues:
         self.lock = threading.Lock()
         self._newest: dict[_Source, int] = {}  # numbers that came either way
         self._fetched: dict[_Source, int] = {}  # numbers that caches brought
-        self._live: set[str] = set()
+        self._live: OrderedDict[str, None] = OrderedDict()  # keys of what came live without a number, in order
         self._tokens: zenoh.Subscriber[None] | None = None
 
     def start(self) -> None:
@@ -101,7 +102,7 @@ class HeldValues:
         with self.lock:
             info = sample.source_info
             if info is None:
-                self._live.add(str(sample.key_expr))
+                self._note_live(str(sample.key_expr))
             else:
                 source = _source(sample, info)
                 number = self._number(source, info)
@@ -115,6 +116,12 @@ class HeldValues:
         serial: int = info.source_sn
         newest = self._newest.get(source)
         return serial if newest is None else number_near(serial, newest)
+
+    def _note_live(self, key: str) -> None:
+        self._live[key] = None
+        self._live.move_to_end(key)
+        if len(self._live) > MAX_SOURCES:
+            self._live.popitem(last=False)
 
     def _note(self, numbers: dict[_Source, int], source: _Source, number: int) -> None:
         if len(numbers) >= MAX_SOURCES and source not in numbers:

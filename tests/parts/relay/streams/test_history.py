@@ -187,6 +187,19 @@ def test_a_publisher_without_numbers_is_not_taken_for_double(net: Net) -> None:
     until(lambda: net.got == ["same"] * 3, "all three")
 
 
+def test_keys_that_come_and_go_for_weeks_take_no_more_memory(net: Net, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(history, "MAX_SOURCES", 8)
+    net.receive("robot1/*/map")
+    first = net.app.declare_publisher("robot1/0/map")
+    until(lambda: matches(first), "the relay subscribes")
+    for number in range(32):
+        net.app.put(f"robot1/{number}/map", str(number), congestion_control=zenoh.CongestionControl.BLOCK)
+    until(lambda: net.got == [str(number) for number in range(32)], "all of them")
+    held = net.receivers[0]._history
+    assert held is not None
+    assert list(held._live) == [f"robot1/{number}/map" for number in range(24, 32)]
+
+
 class publisher:  # noqa: N801 - reads as a verb in a with statement
     """A process that holds values of the key."""
 
