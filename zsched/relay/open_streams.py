@@ -15,7 +15,7 @@ from zenoh import Session
 from zsched.core.hop.books import add_to, added, closed
 from zsched.core.values.plan import Route, StreamClass, StreamCount
 from zsched.relay.streams.answer_times import AnswerTimes
-from zsched.relay.streams.inputs import InputStream
+from zsched.relay.streams.inputs import InputStream, KeptValues
 from zsched.relay.streams.outputs import OutputStream
 
 _Stream = TypeVar("_Stream", InputStream, OutputStream)
@@ -47,6 +47,8 @@ class OpenStreams:
         self.outputs: dict[str, OutputStream] = {}
         self._closed: dict[str, StreamCount] = {}
         """What streams have counted that were closed, and may come again by the same name..."""
+        self._left: dict[str, KeptValues] = {}
+        """{key expression: what inputs kept that were closed since `keep`}: rules may change places, and settings."""
         self._changing = threading.Lock()
         """...which a reader of counters sees in one of both places."""
 
@@ -76,6 +78,7 @@ class OpenStreams:
             for stream in tuple(streams):
                 if stream not in names:
                     self._end(streams, stream)
+        self._left.clear()
 
     def close(self) -> None:
         """Close all; they stay in the table, and whoever asks now hears their last counts."""
@@ -116,7 +119,13 @@ class OpenStreams:
         if cell is not None:
             before = self._closed.get(route.stream)
             cell[0] = 0 if before is None else before.messages
-        return InputStream(self._session, route, self._own_ids, self._local, self._times, cell=cell)
+        kept = self._kept(route)
+        return InputStream(self._session, route, self._own_ids, self._local, self._times, cell=cell, kept=kept)
+
+    def _kept(self, route: Route) -> KeptValues:
+        """What a stream of the same keys has kept, beside which this one comes, or in its place."""
+        same = (one.kept() for one in self.inputs.values() if one.route.from_expr == route.from_expr)
+        return next((kept for kept in same if kept), ()) or self._left.pop(route.from_expr, ())
 
     def _take_output(self, route: Route) -> OutputStream:
         return OutputStream(self._session, route, self._own_ids, self.wake, self._local, self._times)
@@ -136,6 +145,10 @@ class OpenStreams:
         with self._changing:
             del streams[stream]
             add_to(self._closed, closed(one.count()))
-        if isinstance(one, InputStream) and (cell := self._cells(stream)) is not None:
+        if not isinstance(one, InputStream):
+            return
+        if kept := one.kept():
+            self._left[one.route.from_expr] = kept
+        if (cell := self._cells(stream)) is not None:
             cell[0] = 0  # the books tell nothing of it from now on, so nothing of it is untold
             self._leave_cell(stream)

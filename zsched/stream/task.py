@@ -61,7 +61,8 @@ class OwnStreams(OpenStreams):
             self._hands.pop(stream, None)  # nobody waits for what it will never hand over
 
     def _take_input(self, route: Route) -> InputStream:
-        return InputStream(self._session, route, self._own_ids, None, self._times, is_ours=True)
+        kept = self._kept(route)
+        return InputStream(self._session, route, self._own_ids, None, self._times, is_ours=True, kept=kept)
 
     def _take_output(self, route: Route) -> OutputStream:
         way = self._hands[route.stream] = Hand(route, self._deliver)

@@ -10,7 +10,7 @@ import zenoh
 
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import until
-from zsched.core.values.plan import Direction, Route, StreamCount, StreamSettings
+from zsched.core.values.plan import Direction, Route, StreamClass, StreamCount, StreamSettings
 from zsched.core.values.struct import replace
 from zsched.relay.books import Books
 from zsched.relay.open_streams import OpenStreams
@@ -92,3 +92,45 @@ def test_an_input_that_comes_again_goes_on_in_the_books(
     found = Life(*sessions, tmp_path / "books").told()
     assert (told, found.messages, found.at_most_lost) == (9, 11, 2)
     first.streams.close()
+
+
+LATEST = StreamSettings(stream_class=StreamClass.LATEST, keep_last=2)
+MAP = replace(IN, from_expr="robot1/map", to_expr="edge1/t/map", settings=LATEST)
+SECOND = replace(MAP, stream="t/in/1")
+
+
+@pytest.mark.parametrize(
+    ("before", "behind"),
+    [
+        ((MAP,), (replace(MAP, settings=replace(LATEST, max_hz=5.0)),)),
+        ((MAP,), (IN, SECOND)),
+        ((IN, SECOND), (MAP,)),
+    ],
+    ids=["settings", "moves down", "moves up"],
+)
+def test_kept_values_outlive_a_change_of_their_rule(
+    sessions: tuple[zenoh.Session, zenoh.Session], tmp_path: Path, before: tuple[Route, ...], behind: tuple[Route, ...]
+) -> None:
+    """Their publisher has put them once, and keeps nothing itself: the next owner has them of nobody else."""
+    got: list[str] = []
+    kept = sessions[1].declare_subscriber("edge1/t/map", lambda sample: got.append(sample.payload.to_string()))
+    streams = Life(*sessions, tmp_path / "books").streams
+    for route in before:
+        streams.input_of(route)
+    publisher = sessions[1].declare_publisher(MAP.from_expr)
+    until(lambda: matches(publisher), "the relay subscribes")
+    for number in range(3):
+        publisher.put(str(number))
+    until(lambda: sum(count.messages for count in streams.counts()) == 3, "they are kept")
+    for route in behind:
+        source = streams.input_of(route)
+    streams.keep({route.stream for route in behind})
+    source.open(1, behind[-1])
+    until(lambda: source.is_matching(1), "the owner subscribes")
+    assert source.flip(1) == 2
+    until(lambda: got == ["1", "2"], f"the newest two, not {got}")
+    until(lambda: matches(publisher), "the relay subscribes still")
+    publisher.put("3")
+    until(lambda: got == ["1", "2", "3"], "what comes behind them")
+    streams.close()
+    kept.undeclare()

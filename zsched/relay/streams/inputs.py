@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final
 
 import zenoh
@@ -44,7 +44,9 @@ MAX_PAUSED: Final = QUEUE_DEPTH
 MAX_HELD: Final = MAX_OWED // 2
 """More samples than that are not held either: the next owner's queue has to take them."""
 
-_Kept = tuple[int, Sample, Timestamp | None]
+_Kept = tuple[int, Sample, Timestamp]
+KeptValues = Sequence[tuple[Sample, Timestamp]]
+"""The newest values of each key of class ``latest``, with their timestamps, in the order in which they came."""
 
 
 def _never(_stamp: Timestamp) -> bool:
@@ -87,14 +89,17 @@ class InputStream:
         *,
         is_ours: bool = False,
         cell: memoryview | None = None,
+        kept: KeptValues = (),
     ) -> None:
         """Subscribe on ``local``, the host's own side, if there is one; ``session`` is the fleet's.
 
-        ``is_ours``: nothing is subscribed to, samples come by `give`. ``cell``: see `StreamCounter`.
+        ``is_ours``: nothing is subscribed to, samples come by `give`. ``cell``: see `StreamCounter`. ``kept``: values
+        of these keys that came before, in order.
         """
         self.route = route
         self._times = times
         self._session = session
+        side = self._clock = local or session  # the fleet's may be closed for a moment
         self._lock = threading.Lock()
         self._counter = StreamCounter(route.stream, cell)
         self._slots: dict[int, _InputSlot] = {}
@@ -124,11 +129,13 @@ class InputStream:
         self._number = 0
         self._keep_last = route.settings.keep_last if is_latest else 0
         self._kept: OrderedDict[str, deque[_Kept]] = OrderedDict()
+        for sample, stamp in kept if self._keep_last else ():
+            self._number += 1
+            self._keep(sample, stamp)
         self._closed = Tally()  # what slots that are closed have counted
         self._is_counted = False
         """Some worker has acknowledged what it has processed, or will."""
         self._stamps: Stamps | None = None
-        side = self._clock = local or session  # the fleet's may be closed for a moment
         self._loop_ids = own_ids - {str(side.zid())}
         self._giving = threading.Lock()
         self._in_hand: Outlet | None = None
@@ -472,6 +479,12 @@ class InputStream:
             self._counter.dropped(*slot.outlet.send(sample, stamp))
         slot.sent = self._number
 
+    def kept(self) -> KeptValues:
+        """The values of class ``latest`` that the next owner is owed."""
+        with self._lock:
+            values = [one for line in self._kept.values() for one in line]
+        return [(sample, stamp) for _, sample, stamp in sorted(values, key=lambda one: one[0])]
+
     @property
     def is_still(self) -> bool:
         """Whether no sample has come for a while (`StreamCounter.is_still`)."""
@@ -514,7 +527,7 @@ class InputStream:
                 self._counter.dropped("loop")
                 return
             self._number += 1
-            stamp = self._keep(sample) if self._keep_last else self._stamp(sample)
+            stamp = self._keep(sample, sample.timestamp) if self._keep_last else self._stamp(sample)
             if self._stamps is not None and (known := stamp or sample.timestamp) is not None:
                 self._stamps.note(known)
             pace = self._pace
@@ -577,9 +590,9 @@ class InputStream:
         """With `OnCrash.REPLAY` every sample has a timestamp, by which its answers are known."""
         return sample.timestamp or self._clock.new_timestamp() if self._replays else None
 
-    def _keep(self, sample: Sample) -> Timestamp | None:
+    def _keep(self, sample: Sample, stamp: Timestamp | None) -> Timestamp:
         """Keep a value, with a timestamp of ours where it has none: outputs made of it inherit that, for the gate."""
-        stamp = sample.timestamp or self._clock.new_timestamp()
+        stamp = stamp or self._clock.new_timestamp()
         key = str(sample.key_expr)
         values = self._kept.get(key)
         if values is None:
