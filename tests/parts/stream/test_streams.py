@@ -543,6 +543,23 @@ def test_a_key_that_two_tasks_take_goes_to_the_owner_of_each_also_of_one_that_co
         kept.undeclare()
 
 
+def test_closing_sends_the_newest_value_that_a_rate_holds_back(bench: Bench) -> None:
+    latest = StreamSettings(stream_class=StreamClass.LATEST, max_hz=0.1)
+    route = replace(IN, settings=latest)
+    bench.application.unowned("t", (route,))
+    bench.application.plan(replace(PLAN, current=replace(SLOT, routes=(route, OUT))))
+    with bench.join() as own:
+        publisher = own.publisher("robot1/front/in")
+        until(lambda: not own._tasks["t"].misses_its_worker, "its worker has been warmed up")
+        assert publisher.put("0")
+        until(lambda: bench.taken == [b"0"], "the first")
+        for number in range(1, 4):
+            assert publisher.put(str(number))
+    assert bench.taken == [b"0", b"3"]
+    assert unaccounted(bench.count()) == 0
+    assert dict(bench.count().drops) == {"thinned": 3}
+
+
 class Others:
     """Files that are opened when a connection is closed: one of them has its descriptor."""
 

@@ -13,6 +13,7 @@ with ``replay`` what comes behind a flip is held until its slot has ended, and g
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable, Sequence
@@ -266,6 +267,7 @@ class InputStream:
         ended = threading.Event()
         with self._lock:
             self._has_end, slot = True, self._active
+            self._send_passed_over(math.inf)
         if slot is None:
             ended.set()
         else:
@@ -327,10 +329,12 @@ class InputStream:
             return left
 
     def stop(self) -> None:
-        """Unsubscribe."""
+        """Unsubscribe; what a rate has held back goes out now, for nobody looks after it any more."""
         receiver, self._receiver = self._receiver, None
         if receiver is not None:
             receiver.close()
+        with self._lock:
+            self._send_passed_over(math.inf)
 
     def close(self) -> None:
         """Unsubscribe and close every slot."""
@@ -495,12 +499,16 @@ class InputStream:
         with self._lock:
             if self._next is not None and monotonic_s() > self._hold_until:
                 self._end_hold()
-            if self._pace is not None and self._keep_last and self._active is not None:
-                for sample, stamp in self._pace.overdue(monotonic_s()):
-                    self._counter.repeated += 1  # it has been counted as thinned
-                    self._send(sample, stamp)
+            self._send_passed_over(monotonic_s())
         for slot in tuple(self._slots.values()):
             slot.outlet.look_after()
+
+    def _send_passed_over(self, now: float) -> None:
+        """Send the newest values that the rate has held back till now (under the lock)."""
+        if self._pace is not None and self._keep_last and self._active is not None:
+            for sample, stamp in self._pace.overdue(now):
+                self._counter.repeated += 1  # it has been counted as thinned
+                self._send(sample, stamp)
 
     def count(self) -> StreamCount:
         """The counters now."""

@@ -323,6 +323,23 @@ def test_a_mirrored_input_feeds_both_owners_until_the_old_slot_closes(bench: Ben
         one.undeclare()
 
 
+def test_a_relay_that_ends_sends_the_newest_value_that_a_rate_holds_back(bench: Bench) -> None:
+    got: list[str] = []
+    kept = bench.outside.declare_subscriber("edge1/t/in", lambda sample: got.append(sample.payload.to_string()))
+    route = way_in(StreamClass.LATEST, max_hz=0.1)
+    stream = bench.input(route)
+    stream.open(1, route)
+    until(lambda: stream.is_matching(1), "the target subscribes")
+    stream.flip(1)
+    publisher = bench.publisher("robot1/in")
+    for number in range(3):
+        publisher.put(str(number))
+    until(lambda: drops(stream) == {"thinned": 2}, "two are over the rate")
+    stream.stop()
+    until(lambda: got == ["0", "2"], "the first and the newest", 10)
+    kept.undeclare()
+
+
 @pytest.mark.parametrize("is_counted", [True, False])
 def test_the_newest_value_that_is_given_up_with_a_data_session_comes_again(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, *, is_counted: bool
