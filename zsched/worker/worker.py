@@ -280,10 +280,13 @@ class Worker:
         one is answered "busy". What it raises becomes an error reply. It is only called while this worker is the owner.
 
         Raises:
-            ValueError: the key has another placeholder, or another service of this worker has keys of it.
+            ValueError: ``depth`` is below 1, the key has another placeholder, or another service of this worker has
+                keys of it.
             RuntimeError: this worker is ready already.
         """
         self._check_not_ready("serve")
+        if depth < 1:
+            raise ValueError(f"depth: {depth!r} is not 1 or more")
         expr = self._taken_by_one(self._services, filled(key_expr, self.prefix))
         service = Service(
             self._session,

@@ -249,6 +249,14 @@ def test_an_input_that_could_keep_nothing_is_refused(relay: Relay, tmp_path: Pat
         worker.subscribe("{prefix}/*/in", print, **options)
 
 
+@pytest.mark.parametrize("depth", [0, -1])
+def test_a_service_that_nothing_bounds_is_refused(relay: Relay, tmp_path: Path, depth: int) -> None:
+    with Worker.from_env(environment(relay, tmp_path), handles_signals=False) as worker:
+        with pytest.raises(ValueError, match=f"depth: {depth} is not 1 or more"):
+            worker.serve("{prefix}/*/ask", lambda _request: b"", depth=depth)
+        worker.serve("{prefix}/*/ask", lambda _request: b"", depth=1)
+
+
 def test_without_a_daemon_it_says_how_to_run_by_hand() -> None:
     with pytest.raises(ConfigError, match=r"ZSCHED_NODE.*with --standalone, unset ZSCHED_FLEET$"):
         Worker.from_env({"ZSCHED_FLEET": "test"}, standalone="t")
