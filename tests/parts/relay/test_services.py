@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import pytest
@@ -105,3 +106,48 @@ def test_the_counters_of_a_service_go_on_when_its_rule_changes(bench: Bench) -> 
     assert bench.services.counts() == ()
     bench.open()
     assert bench.services.counts()[0].messages == 3
+
+
+@pytest.mark.parametrize(
+    ("asked", "answered"),
+    [
+        ("robot1/a/job", ["robot1/a/job"]),
+        ("robot1/*/job", ["robot1/a/job", "robot1/b/job"]),
+        ("robot1/**", ["robot1/a/job", "robot1/b/job"]),
+    ],
+)
+def test_who_asks_for_several_keys_gets_the_answer_of_each(bench: Bench, asked: str, answered: list[str]) -> None:
+    """Under keys of their own: of two answers under one key zenoh hands the asker the last."""
+
+    def answer(key: str, query: zenoh.Query) -> None:
+        with query:
+            query.reply(key, key)
+
+    route = replace(SERVICE, from_expr="robot1/*/job", to_expr="edge1/t/*/job", service=ServiceSettings())
+    keys = [f"edge1/t/{name}/job" for name in ("a", "b")]
+    owner = [bench.outside.declare_queryable(key, partial(answer, key)) for key in keys]
+    bench.services.open(1, route)
+    bench.services.flip(1)
+
+    def ask() -> list[tuple[str, str]]:
+        replies = [reply.ok for reply in bench.outside.get(asked, timeout=20.0)]
+        return sorted((str(ok.key_expr), ok.payload.to_string()) for ok in replies if ok is not None)
+
+    found: list[tuple[str, str]] = until(ask, "answers")
+    assert found == [(key, key.replace("robot1", "edge1/t")) for key in answered]
+    for one in owner:
+        one.undeclare()
+
+
+def test_an_answer_whose_key_cannot_be_brought_back_is_given_under_the_key_that_was_asked_for(bench: Bench) -> None:
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            query.reply("edge1/t/job", "done")
+
+    route = replace(SERVICE, from_expr="robot1/*/job", to_expr="edge1/t/job", service=ServiceSettings())
+    owner = bench.outside.declare_queryable("edge1/t/job", answer)
+    bench.services.open(1, route)
+    bench.services.flip(1)
+    replies: list[zenoh.Reply] = until(lambda: list(bench.outside.get("robot1/*/job", timeout=20.0)), "an answer")
+    assert [str(reply.ok.key_expr) for reply in replies if reply.ok is not None] == ["robot1/*/job"]
+    owner.undeclare()

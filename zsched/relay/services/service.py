@@ -37,7 +37,7 @@ from zsched.clock import monotonic_s
 from zsched.core.hop.books import add_to, added, closed
 from zsched.core.relay_protocol import ERROR_ENCODING, REFUSED_ENCODING, ServiceProblem
 from zsched.core.route.keyexpr import is_wild
-from zsched.core.route.wildcards import Rewriter, rewriter
+from zsched.core.route.wildcards import Rewriter, capture_fault, rewriter
 from zsched.core.values.plan import Route, StreamCount
 from zsched.core.values.struct import Struct, field
 from zsched.guard import guarded, note, tolerant
@@ -81,7 +81,9 @@ class _ServiceSlot(Struct, eq=False):
     session: Session
     owner_key: str
     forwards: Rewriter
-    """From a key that was asked for to the owner's."""
+    """From a key that was asked for to the owner's..."""
+    backwards: Rewriter | None
+    """...and back; ``None``: several keys become one on the way."""
     queriers: dict[str, zenoh.Querier] = field(default_factory=dict)
     pending: set[_Asked] = field(default_factory=set)
     is_closed: bool = False
@@ -134,7 +136,9 @@ class ServiceStream:
             zenoh.ZError: ``to`` is no key expression.
         """
         forwards = rewriter(route.from_expr, route.to_expr)
-        slot = _ServiceSlot(session=self._session, owner_key=route.to_expr, forwards=forwards)
+        is_lossy = capture_fault(route.to_expr, route.from_expr) is not None
+        backwards = None if is_lossy else rewriter(route.to_expr, route.from_expr)
+        slot = _ServiceSlot(session=self._session, owner_key=route.to_expr, forwards=forwards, backwards=backwards)
         slot.serves(route.to_expr)  # zenoh learns from now on which servers are there
         with self._lock:
             self._slots[epoch] = slot
@@ -308,7 +312,7 @@ class ServiceStream:
             error = reply.err
             if error is not None and str(error.encoding) == REFUSED_ENCODING and not answers:
                 return _Outcome.REFUSED
-            self._pass_on(query, reply)
+            self._pass_on(query, reply, slot)
             answers += 1
         if replies.has_timed_out:
             outcome = _Outcome.TIMED_OUT
@@ -324,8 +328,9 @@ class ServiceStream:
             self._fail(query, ServiceProblem.BUSY, "the asker is slower than the answers, some of them are missing")
         return _Outcome.ANSWERED
 
-    def _pass_on(self, query: Query, reply: Reply) -> None:
-        key, error, sample = self._asked_key(query), reply.err, reply.ok
+    def _pass_on(self, query: Query, reply: Reply, slot: _ServiceSlot) -> None:
+        error, sample = reply.err, reply.ok
+        key = self._key_for(query, sample, slot)
         if error is not None:
             query.reply_err(error.payload, encoding=error.encoding)
         elif sample is not None and sample.kind == SampleKind.DELETE:
@@ -333,9 +338,19 @@ class ServiceStream:
         elif sample is not None:
             _reply(query, key, sample)
 
-    def _asked_key(self, query: Query) -> str:
-        """The key to answer under: the rule's, or, when that has wildcards, the one that was asked for."""
-        return str(query.key_expr) if is_wild(self.route.from_expr) else self.route.from_expr
+    def _key_for(self, query: Query, sample: Sample | None, slot: _ServiceSlot) -> str:
+        """The key to answer under: the rule's, or, when that has wildcards, the one that was asked for.
+
+        Where that has wildcards itself, it is the answer's own: else the asker could not tell two answers apart, and
+        zenoh would hand it the last one.
+        """
+        asked = str(query.key_expr)
+        if not is_wild(self.route.from_expr):
+            return self.route.from_expr
+        if sample is None or slot.backwards is None or not is_wild(asked):
+            return asked
+        own = slot.backwards(str(sample.key_expr))
+        return own if own is not None and query.key_expr.intersects(own) else asked
 
     def _fail(self, query: Query, problem: ServiceProblem, text: str) -> None:
         with self._lock:
