@@ -27,6 +27,7 @@ from zsched.core.values.fleet import (
     Security,
     StreamRule,
     TaskSpec,
+    WorkerLink,
     WorkerSpec,
     dial_endpoint,
     runs_worker,
@@ -295,6 +296,32 @@ def _sessions(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
         paths = (f"{node}.listen", f"{node}.host") if name in before else (node,)
         for verdict in (_renewed(task) for task in new.tasks if task.name in tasks):
             yield replace(verdict, text=f"{verdict.text}, to dial {name}", paths=paths)
+    yield from _by_gossip(old, new)
+
+
+def _by_gossip(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
+    """They look for robots without an address where there is one: its coming and its going are another session, too."""
+    before, after = _hidden(old), _hidden(new)
+    if before == after:
+        return
+    tasks, stay = {task.name for task in old.tasks}, {node.name for node in old.nodes}
+    name = min(after - before or before - after)
+    node = f"nodes.{name}"
+    is_there = name in stay and any(one.name == name for one in new.nodes)
+    paths = (f"{node}.listen", f"{node}.host", f"{node}.kind") if is_there else (node,)
+    for task in new.tasks:
+        homes = [one.name for one in new.nodes if one.name in stay and runs_worker(task, one.name, one.kind)]
+        differs = any(bool(before - {home}) is not bool(after - {home}) for home in homes)
+        if task.name in tasks and task.worker.link is WorkerLink.PEER and differs:
+            verdict = _renewed(task)
+            text = f"{verdict.text}, to find {name}" if name in after else verdict.text
+            yield replace(verdict, text=text, paths=paths)
+
+
+def _hidden(fleet: Fleet) -> set[NodeId]:
+    """The robots that workers cannot dial by the file, and find by gossip."""
+    robots = [node for node in fleet.nodes if node.kind is NodeKind.ROBOT]
+    return {one.name for one in robots if not (one.listen_data and dial_endpoint(one.listen_data, one.host))}
 
 
 def _access(old: Fleet, new: Fleet) -> Iterator[_Verdict]:

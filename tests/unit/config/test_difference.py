@@ -148,6 +148,32 @@ def test_workers_take_a_new_process_for_all_that_a_process_keeps() -> None:
     ]
 
 
+def test_workers_take_a_new_process_to_find_the_first_robot_without_an_address_and_when_the_last_one_goes() -> None:
+    """Where each robot has an address their sessions look for nobody, and a session keeps what it was opened with."""
+    listen = "listen: {control: tcp/0.0.0.0:7457, data: tcp/0.0.0.0:7458}"
+    old = TEXT
+    for number in (1, 2, 3):
+        old = with_(
+            f"robot{number}: {{kind: robot,", f"robot{number}: {{kind: robot, host: 192.0.2.2{number}, {listen},", old
+        )
+    new = with_("  robot3:", "  robot4: {kind: robot}\n  robot3:", old)
+    restart = "workers of map_merge restart one after another"
+    come, *_ = (one for one in changes(new, old) if one.path == "nodes.robot4")
+    assert come.consequence == f"robot4 may join: start its daemon; {restart}, to find robot4"
+    go, *_ = (one for one in changes(old, new) if one.path == "nodes.robot4")
+    assert go.consequence == f"node robot4 is removed: the others forget it; {restart}"
+    second = with_("  robot3:", "  robot5: {kind: robot}\n  robot3:", new)
+    assert not any(restart in one.consequence for one in changes(second, new)), "they look for others already"
+    relayed = with_("worker:\n", "worker:\n      link: client\n", old)
+    assert (
+        "restart"
+        not in changes(with_("  robot3:", "  robot4: {kind: robot}\n  robot3:", relayed), relayed)[0].consequence
+    )
+    alone = with_("candidates: {kind: edge}", "candidates: [edge2]", old)
+    found = changes(with_("  robot3:", "  robot4: {kind: robot}\n  robot3:", alone), alone)
+    assert [one.danger for one in found if one.danger] == [Danger.PAUSE_TASK]
+
+
 def test_dangers_have_names_and_say_what_is_accepted() -> None:
     extended = add_entries(TEXT, "tasks", f"tasks:\n{EXCLUSIVE}")
     shared = with_("exclusive: true", "exclusive: false", extended)
