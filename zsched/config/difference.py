@@ -270,6 +270,12 @@ def _timing(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
             yield _restart_all("timing.zenoh_lease_s", before, after)
         else:
             yield _set(AT_ONCE, f"timing.{one.name}", before, after)
+    clocks = [(fleet.timing.zenoh_lease_s, fleet.timing.data_signs) for fleet in (old, new)]
+    if clocks[0] != clocks[1]:  # these are in the sessions that workers open
+        field = "zenoh_lease_s" if clocks[0][0] != clocks[1][0] else "lease_s"
+        tasks = {task.name for task in old.tasks}
+        for verdict in (_renewed(task) for task in new.tasks if task.name in tasks):
+            yield replace(verdict, paths=(f"timing.{field}",))
 
 
 def _electors(agreed: tuple[NodeId, ...], wanted: tuple[NodeId, ...]) -> _Verdict:

@@ -16,6 +16,8 @@ from zsched.core.values.fleet import Cell, Fleet, LinkSpec, LocalSide, NodeSpec,
 from zsched.core.values.model import NodeKind, Weights
 from zsched.core.values.profile import LinkSource
 from zsched.runtime.restarts import opens_anew, restarts
+from zsched.sessions.comparison import lacking
+from zsched.sessions.config import worker_config
 
 TEXT = (Path(__file__).parents[3] / "configs" / "fleet.yaml").read_text()
 RULES = "tasks.map_merge.scheduling"
@@ -172,6 +174,27 @@ def test_workers_take_a_new_process_to_find_the_first_robot_without_an_address_a
     alone = with_("candidates: {kind: edge}", "candidates: [edge2]", old)
     found = changes(with_("  robot3:", "  robot4: {kind: robot}\n  robot3:", alone), alone)
     assert [one.danger for one in found if one.danger] == [Danger.PAUSE_TASK]
+
+
+@pytest.mark.parametrize(
+    ("timing", "is_told"),
+    [
+        ("{lease_s: 1.1}", True),  # four signs of life in a lease, no longer three
+        ("{zenoh_lease_s: 2}", True),
+        ("wan", True),
+        ("{lease_s: 0.9}", False),
+        ("{beat_s: 0.1}", False),
+    ],
+)
+def test_workers_take_a_new_process_for_clocks_that_are_in_their_sessions(timing: str, is_told: bool) -> None:
+    new = with_("timing: wifi", f"timing: {timing}")
+    sessions = [worker_config(connect=(), timing=fleet_of(text).timing) for text in (TEXT, new)]
+    assert bool(lacking(*sessions)) is is_told
+    said = [one.consequence for one in changes(new) if one.path == "timing"]
+    assert any("workers of map_merge restart one after another" in text for text in said) is is_told
+    alone = with_("candidates: {kind: edge}", "candidates: [edge2]")
+    found = changes(with_("timing: wifi", f"timing: {timing}", alone), alone)
+    assert [one.danger for one in found if one.danger] == [Danger.PAUSE_TASK] * is_told
 
 
 def test_dangers_have_names_and_say_what_is_accepted() -> None:
