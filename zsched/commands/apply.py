@@ -257,12 +257,11 @@ def _between_cells(old: Fleet, new: Fleet, texts: tuple[str, str]) -> list[tuple
 
 def _restarts(old: Fleet, new: Fleet) -> tuple[tuple[str, str], ...]:
     """(nodes, what of the new fleet their daemons cannot take over); electors and leases change by agreement."""
-    agreed = replace(new, electors=old.electors, timing=replace(new.timing, lease_s=old.timing.lease_s))
     stay = {node.name: node.kind for node in old.nodes}
     who: dict[str, list[str]] = {}
-    for node in agreed.nodes:
+    for node in new.nodes:
         if stay.get(node.name) is node.kind:
-            for sentence in restarts(old, agreed, node.name):
+            for sentence in restarts(old, new, node.name, is_agreed=True):
                 who.setdefault(sentence, []).append(node.name)
     return tuple((", ".join(names), sentence) for sentence, names in who.items())
 

@@ -266,8 +266,9 @@ def _timing(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
         before, after = getattr(old.timing, one.name), getattr(new.timing, one.name)
         if one.name == "name" or before == after:
             continue
-        if one.name == "zenoh_lease_s":
-            yield _restart_all("timing.zenoh_lease_s", before, after)
+        is_more_signs = one.name == "lease_s" and new.timing.data_signs > old.timing.data_signs
+        if one.name == "zenoh_lease_s" or is_more_signs:
+            yield _restart_all(f"timing.{one.name}", before, after)
         else:
             yield _set(AT_ONCE, f"timing.{one.name}", before, after)
     clocks = [(fleet.timing.zenoh_lease_s, fleet.timing.data_signs) for fleet in (old, new)]

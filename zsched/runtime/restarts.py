@@ -37,7 +37,8 @@ def restarts(old: Fleet, new: Fleet, me: NodeId, *, is_agreed: bool = False) -> 
         me: the node.
         is_agreed: electors and leases of ``new`` are those in force.
     """
-    return (*(() if is_agreed else _agreed(old, new)), *_made(old, new, me), *_links(old, new, me))
+    clocks = _signs(old, new) if is_agreed else _agreed(old, new)
+    return (*clocks, *_made(old, new, me), *_links(old, new, me))
 
 
 def opens_anew(old: Fleet, new: Fleet) -> bool:
@@ -92,6 +93,14 @@ def _agreed(old: Fleet, new: Fleet) -> Iterator[str]:
             f"leases of exclusive tasks stay {old.timing.lease_s:g} s ({new.timing.lease_s:g} s from the restart on): "
             "restart all daemons soon, for nodes with leases of different lengths grant each other none"
         )
+
+
+def _signs(old: Fleet, new: Fleet) -> Iterator[str]:
+    """Where open sessions send too few signs of life for a lease that is in force; too many harm nobody."""
+    timing = new.timing
+    if timing.data_signs > old.timing.data_signs and timing.zenoh_lease_s == old.timing.zenoh_lease_s:
+        told = f"`lease_s` of {timing.lease_s:g} s needs {timing.data_signs} signs of life in zenoh's lease"
+        yield f"{told}, and its sessions send {old.timing.data_signs} until they open anew"
 
 
 def _made(old: Fleet, new: Fleet, me: NodeId) -> Iterator[str]:

@@ -213,6 +213,9 @@ def test_what_a_daemon_cannot_take_over_while_it_runs_is_told_with_its_nodes(nod
     assert [(one["nodes"], one["by_itself"]) for one in body["restarts"]] == [(["edge1", "robot1", "robot2"], False)]
     electors = changed(tmp_path, "electorate: [robot1, robot2, edge1]", "electorate: [robot1, edge1]")
     assert json.loads(run("apply", electors, "--plan", "--json").stdout)["restarts"] == [], "they are agreed"
+    lease = changed(tmp_path, "fleet: hall", "timing: {lease_s: 1.1}\nfleet: hall")
+    (told,) = json.loads(run("apply", lease, "--plan", "--json").stdout)["restarts"]
+    assert told["why"].startswith("`lease_s` of 1.1 s needs 4 signs of life"), "it is agreed, and sessions send fewer"
     assert node.changes == []
 
 

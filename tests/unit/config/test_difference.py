@@ -223,6 +223,8 @@ def test_dangers_have_names_and_say_what_is_accepted() -> None:
 
 
 def test_changes_of_sessions_need_a_restart_of_the_daemons_that_have_them() -> None:
+    assert changes(with_("timing: wifi", "timing: {lease_s: 1.1}"))[0].effect is Effect.RESTART
+    assert changes(with_("timing: wifi", "timing: {lease_s: 0.9}"))[0].effect is Effect.AT_ONCE
     moved = with_("tcp/0.0.0.0:7457", "tcp/0.0.0.0:7557")
     assert [one.consequence for one in changes(moved)] == ["the daemon of edge1 must be restarted"]
     assert [one.consequence for one in changes(TEXT + "shared_memory: auto\n")] == ["every daemon must be restarted"]

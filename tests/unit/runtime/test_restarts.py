@@ -107,6 +107,14 @@ def test_agreed_electors_need_no_generation() -> None:
     assert restarts(OLD, replace(OLD, electors=("robot1",)), "robot1", is_agreed=True) == ()
 
 
+def test_a_longer_lease_for_which_open_sessions_send_too_few_signs_of_life_needs_a_restart() -> None:
+    """A frozen worker's link would end before its lease is over: 1 s after the freeze, and the lease has 1.1 s."""
+    longer = replace(OLD, timing=replace(OLD.timing, lease_s=1.1))
+    (told,) = restarts(OLD, longer, "robot1", is_agreed=True)
+    assert told.startswith("`lease_s` of 1.1 s needs 4 signs of life in zenoh's lease")
+    assert restarts(longer, OLD, "robot1", is_agreed=True) == ()
+
+
 def test_who_dials_a_node_that_moves_begins_again_and_nobody_else() -> None:
     there = with_node(addressed("edge2", host="10.9.9.9"))
     assert moved(OLD, there, "robot1") == moved(OLD, there, "robot2") == ("edge2",)
