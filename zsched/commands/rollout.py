@@ -10,13 +10,14 @@ from collections.abc import Iterator, Sequence
 
 from zsched.commands.common import CliError, Json
 from zsched.config.difference import Change, Effect, difference
+from zsched.config.drivers import DRIVER_KEYS
 from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec
 from zsched.core.values.model import MAX_REASON, NodeId
 from zsched.core.values.struct import Struct, replace
 from zsched.exits import EXIT_FAILED, EXIT_USAGE
 
-HELD = ("worker.command", "worker.env")
-"""What of a task may wait: the keys of its worker's process that no other process goes by."""
+HELD = tuple(f"worker.{key}" for key in ("command", "env", *DRIVER_KEYS))
+"""What of a task may wait: the keys of its worker's process that no other goes by; a driver's make a command."""
 
 
 class Wave(Struct, frozen=True, kw_only=True):

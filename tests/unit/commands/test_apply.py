@@ -672,6 +672,18 @@ def test_with_a_pause_the_first_candidates_get_the_changed_worker_and_the_docume
     }
 
 
+def test_with_a_pause_the_key_of_a_driver_is_told_to_wait_as_a_command_is(node: Node, tmp_path: Path) -> None:
+    node.owner, node.drained = "edge1", []
+    node.text = ROLLED.replace("command: [/opt/merge, -a], env: {GAIN: '1'}", "driver: container, image: merge:1")
+    assert "merge:1" in node.text
+    file = tmp_path / "new.yaml"
+    file.write_text(node.text.replace("merge:1", "merge:2"))
+    result = run("apply", file, "--pause-after", 1, "--yes")
+    assert result.exit_code == 0, result.stderr
+    assert "robot1 first; the others wait for `zsched task promote merge`" in result.stdout
+    assert "restart one after another" not in result.stdout
+
+
 def test_those_go_first_that_could_get_the_task_by_name_and_the_owner_last(node: Node, tmp_path: Path) -> None:
     node.owner, node.drained = "edge1", ["robot1"]
     run("apply", rolled(tmp_path, node), "--pause-after", 2, "--yes")
