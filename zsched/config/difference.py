@@ -294,14 +294,15 @@ def _electors(agreed: tuple[NodeId, ...], wanted: tuple[NodeId, ...]) -> _Verdic
 
 
 def _sessions(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
-    """Workers dial every robot that has an address: a new one takes a new session."""
+    """Workers but those of `link: client` dial every robot that has an address: a new one takes a new session."""
     before, tasks = _addresses(old), {task.name for task in old.tasks}
     known = {address for addresses in before.values() for address in addresses}
     come = [name for name, addresses in _addresses(new).items() if addresses - known]
     for name in come:
         node = f"nodes.{name}"
         paths = (f"{node}.listen", f"{node}.host") if name in before else (node,)
-        for verdict in (_renewed(task) for task in new.tasks if task.name in tasks):
+        dialling = (task for task in new.tasks if task.name in tasks and task.worker.link is WorkerLink.PEER)
+        for verdict in map(_renewed, dialling):
             yield replace(verdict, text=f"{verdict.text}, to dial {name}", paths=paths)
     yield from _by_gossip(old, new)
 

@@ -134,6 +134,10 @@ def test_workers_take_a_new_process_for_all_that_a_process_keeps() -> None:
     robot = with_("  robot3:", f"  robot4: {{kind: robot, host: 192.0.2.24, {listen}}}\n  robot3:")
     text = "robot4 may join: start its daemon; workers of map_merge restart one after another, to dial robot4"
     assert ("nodes.robot4", text) in [(one.path, one.consequence) for one in changes(robot)]
+    relayed = [with_("worker:\n", "worker:\n      link: client\n", text) for text in (robot, TEXT)]
+    assert ("nodes.robot4", "robot4 may join: start its daemon") in [
+        (one.path, one.consequence) for one in changes(*relayed)
+    ], "who hangs on the relay dials nobody else"
     own = with_("tcp/0.0.0.0:7458}}", 'tcp/0.0.0.0:7458, streams: "tcp/0.0.0.0:7459"}, labels: {arm: left}}', robot)
     text = "the daemon of robot4 must be restarted; workers of map_merge restart one after another, to dial robot4"
     assert [(one.path, one.consequence) for one in changes(own, robot)] == [
