@@ -376,7 +376,10 @@ def _ask_elsewhere(door: Door, request: Json) -> Json:
 
     if request["verb"] in ONLY_THERE:
         raise CliError(EXIT_USAGE, f"only the machine of a node tells its {request['verb']}: run this there")
-    command = None if request["verb"] == "status" else command_of(request)
+    try:
+        command = None if request["verb"] == "status" else command_of(request)
+    except (TypeError, ValueError, OverflowError) as error:  # a daemon would refuse it in these words
+        raise CliError(EXIT_FAILED, f"{request['verb']}: {error}") from error
     visit = _visit(door.endpoint, door.cell)
     if visit.is_guest and command is not None:
         raise CliError(EXIT_FAILED, _guest_may_not(visit))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import socket
 import threading
 import time
@@ -16,7 +17,7 @@ from zsched import paths as places
 from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.commands import ask
 from zsched.commands.ask import AGAIN_S, Door, ask_door, door_of, find_door
-from zsched.commands.common import CliError
+from zsched.commands.common import CliError, Json
 from zsched.commands.orders import asker, user_name
 from zsched.core.values.fleet import Cell
 from zsched.core.values.messages import CommandOutcome, CommandResult
@@ -339,3 +340,17 @@ def test_an_order_by_an_operator_s_certificate_has_its_name_and_any_other_that_o
     assert asker(Door(socket=Path(), endpoint="tls/robot1:1")) == "ana.operator"
     assert asker(Door(socket=Path(), endpoint="tls/robot1:2")).startswith(f"{user_name()}@")
     assert asker(Door(socket=Path("run/robot1.sock"))) == f"{user_name()}@robot1"
+
+
+@pytest.mark.parametrize(
+    ("request_", "said"),
+    [
+        ({"verb": "explain", "task": "Map Merge"}, "explain: explain.task: 'Map Merge' is not a name"),
+        ({"verb": "change", "text": "#" * (1 << 18), "by": "ada@desk"}, "change: document.text: larger than"),
+    ],
+)
+def test_what_no_node_takes_is_refused_without_a_daemon_here_as_by_one(request_: Json, said: str) -> None:
+    """A wrong word, or a file that is too large, is no fault of the program: no traceback."""
+    with pytest.raises(CliError, match=re.escape(said)) as refused:
+        ask_door(Door(socket=Path(), endpoint="tcp/192.0.2.1:7457"), request_)
+    assert refused.value.code == EXIT_FAILED
