@@ -79,6 +79,8 @@ class _Watch(Struct):
     stays: dict[str, str] = field(default_factory=dict)
     """{task: why it stays, as it was told last}."""
     empty: set[str] = field(default_factory=set)
+    flagged: set[str] = field(default_factory=set)
+    """Nodes of which the flag has been seen in force."""
     kind: str = DRAIN
 
     def tell(self, event: str, text: str, **more: Any) -> None:
@@ -423,6 +425,7 @@ def _look(watch: _Watch, nodes: Sequence[str], revision: int) -> list[str]:
         return list(silent.values())
     if int(first["fleet_revision"]) < revision:
         return [f"{first['node']} has not learnt revision {revision} yet"]
+    _check_flagged(watch, first, nodes)
     _tell_moves(watch, found)
     _tell_stays(watch, found)
     lacks = []
@@ -434,6 +437,37 @@ def _look(watch: _Watch, nodes: Sequence[str], revision: int) -> list[str]:
             watch.tell("empty", f"{name}: empty, and gets nothing new{until}", node=name)
         lacks += missed
     return lacks
+
+
+def _check_flagged(watch: _Watch, status: Json, nodes: Sequence[str]) -> None:
+    """End the watching where the flag of a node that is not empty yet is over: nothing takes its tasks away any more.
+
+    Raises:
+        CliError: somebody has taken it back, or its time is over.
+    """
+    has = {
+        str(node["name"]) for node in status["nodes"] for flag in node.get("flags", ()) if flag["kind"] == watch.kind
+    }
+    gone = [name for name in nodes if name in watch.flagged - watch.empty - has]
+    watch.flagged |= has
+    if gone and in_force(watch.view.door).text:  # without the document it knows no flags
+        raise CliError(EXIT_FAILED, told_over(watch.kind, gone))
+
+
+def check_in_force(door: Door, kind: str, name: str) -> None:
+    """Refuse to go on with a node whose flag somebody has taken back.
+
+    Raises:
+        CliError: it is so, as the node at the door knows, or nobody answers.
+    """
+    held = in_force(door)
+    if held.text and not any((flag["kind"], flag["subject"]) == (kind, name) for flag in held.flags):
+        raise CliError(EXIT_FAILED, told_over(kind, [name]))
+
+
+def told_over(kind: str, names: Sequence[str]) -> str:
+    """That a flag is not in force any more, which a command has gone by so far."""
+    return f"{', '.join(names)}: the {kind} is not in force any more: it was taken back, or its time is over"
 
 
 def _until(status: Json, name: str) -> str:

@@ -30,7 +30,7 @@ from zsched.commands.document import (
     ordered,
 )
 from zsched.commands.entries import DOCUMENT, HERE
-from zsched.commands.flags import LEAVE, NO_OTHER, DrainOrder, drain
+from zsched.commands.flags import LEAVE, NO_OTHER, DrainOrder, check_in_force, drain
 from zsched.commands.membership import Told
 from zsched.commands.orders import OrderView, Row
 from zsched.commands.page import span
@@ -292,6 +292,9 @@ def give_up_the_seat(way: Way) -> None:
     """Wait until this node knows that the electors have settled without it (rule of `may_go`).
 
     By itself an elector that leaves is removed; one that the operator has named is removed by this command.
+
+    Raises:
+        CliError: the leave was taken back, or the deadline has come (5).
     """
     told = ""
     while True:
@@ -300,6 +303,7 @@ def give_up_the_seat(way: Way) -> None:
             why = UNKNOWING
         else:
             value = from_plain(told_now["value"], FleetValue)
+            check_in_force(way.door, LEAVE, way.me)
             if may_go(value, way.me):
                 if told:
                     way.tell(f"{way.me}: no elector any more; electors: {', '.join(value.electorate.names)}")

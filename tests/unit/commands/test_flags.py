@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import json
 import re
 from collections.abc import Callable, Iterator
@@ -364,3 +365,18 @@ def test_the_end_of_a_rehearsals_drain_leaves_one_that_was_given_without_a_reaso
     view = OrderView(door=Door(socket=tmp_path / "robot1.sock"), is_yes=True, reason="rehearsal 7")
     assert verbs.lift_quietly(view, since=1) == ("edge1",)
     assert [flag["subject"] for flag in daemon.flags] == ["edge2"]
+
+
+def test_a_drain_that_is_over_before_its_node_is_empty_is_not_said_to_stay_in_force(daemon: Daemon) -> None:
+    """Somebody has taken it back, or its time is over: nothing empties the node any more."""
+    looks = itertools.count()
+
+    def step() -> None:
+        if daemon.flags and next(looks) == 3:
+            daemon.set_flags([])
+
+    daemon.step = step
+    result = run("drain", "edge1", "--yes", "--deadline", "3s")
+    assert result.exit_code == 1
+    assert "edge1: the drain is not in force any more: it was taken back, or its time is over" in result.stderr
+    assert "stays in force" not in result.stdout

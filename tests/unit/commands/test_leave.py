@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -384,3 +385,29 @@ def test_another_machine_s_daemon_is_left_alone(hall: Hall) -> None:
     wrong = run("--yes", "--state-dir", str(hall.folder / "other"))
     assert (wrong.exit_code, hall.asked) == (1, [])
     assert "no daemon of robot1 runs on this machine" in wrong.stderr
+
+
+@pytest.mark.parametrize("is_empty", [False, True])
+def test_a_leave_that_somebody_takes_back_meanwhile_ends_and_the_node_stays(hall: Hall, is_empty: bool) -> None:
+    """`zsched undrain` in another terminal: the task may move on later, by itself, and the node is no node to go."""
+    looks = itertools.count()
+
+    def answer(request: Json) -> Json:
+        told = hall.answer(request)
+        if hall.flags or hall.asked:
+            look = next(looks)
+            hall.owner = "robot1" if is_empty or look > 12 else "robot3"
+            if look == (18 if is_empty else 8):  # while it gives its seat up, or before its task has moved
+                hall.flags, hall.revision = [], hall.revision + 1
+        return told
+
+    hall.electors = hall.electors if is_empty else ["robot1", "robot2"]
+    hall.seat_goes_after = 1000
+    hall.door.close()
+    hall.door = OperatorSocket(hall.folder / "run" / "robot3.sock", answer)
+    hall.door.open()
+    done = run("--yes", "--deadline", "3s")
+    assert (done.exit_code, hall.asked) == (1, ["robot3 flags leave"])
+    assert "robot3: the leave is not in force any more: it was taken back" in done.stderr
+    assert "  robot3:" in hall.text
+    assert left(hall.folder) == UNTOUCHED
