@@ -8,8 +8,10 @@ an `OSError` with a sentence, like a file that is not there.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
+import secrets
 import stat
 import zlib
 from pathlib import Path
@@ -75,6 +77,41 @@ def write_regular(path: Path, content: bytes) -> None:
         except OSError:
             path.unlink(missing_ok=True)
             raise
+
+
+def replace_regular(path: Path, content: bytes) -> None:
+    """As `write_regular`, but what a file held before stays where it cannot be written whole, or the power goes.
+
+    The new one has its mode and owner. Where only the file may be written, and not its folder, it is as
+    `write_regular`.
+
+    Raises:
+        OSError: as `write_regular`.
+    """
+    try:
+        whole = path.resolve(strict=True)  # a link stays one
+        found = whole.stat()
+    except OSError:
+        return write_regular(path, content)
+    is_ours = os.geteuid() in (0, found.st_uid) and os.access(whole, os.W_OK) and os.access(whole.parent, os.W_OK)
+    if not stat.S_ISREG(found.st_mode) or not is_ours:
+        return write_regular(path, content)
+    part = whole.with_name(f".{whole.name}.{secrets.token_hex(4)}")
+    descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            if (found.st_uid, found.st_gid) != (os.geteuid(), os.getegid()):
+                with contextlib.suppress(PermissionError):  # of a group that this user is not in
+                    os.fchown(file.fileno(), found.st_uid, found.st_gid)
+            os.fchmod(file.fileno(), stat.S_IMODE(found.st_mode))
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(whole)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+    return None
 
 
 def read_packed(path: Path, most_bytes: int) -> bytes:

@@ -21,7 +21,7 @@ from zsched.commands.common import CliError, Json, print_json, say, warn
 from zsched.commands.document import QUESTION, InForce, ask_all, document_text, in_force, status_of
 from zsched.errors import ConfigError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_WOULD_CHANGE
-from zsched.files import write_regular
+from zsched.files import replace_regular
 
 SCHEMA = "zsched.fleet.show/1"
 
@@ -91,7 +91,7 @@ def export(door: Door, file: Path | None) -> int:
         sys.stdout.buffer.flush()
         return EXIT_OK
     try:
-        write_regular(file, text.encode())
+        replace_regular(file, text.encode())
     except OSError as error:
         raise CliError(EXIT_FAILED, f"{file}: {error.strerror}; give a file that can be written") from error
     say(f"{file}: {held.fleet}, revision {held.revision}")

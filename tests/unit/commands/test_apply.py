@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import resource
+import signal
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -509,6 +511,31 @@ def test_a_node_that_is_silent_once_the_change_is_agreed_is_waited_for(
 
 
 # --- export, edit, show ----------------------------------------------------------------------------------------------
+
+
+def test_an_export_that_finds_no_room_leaves_the_fleet_file_as_it_was(node: Node, tmp_path: Path) -> None:
+    """A status advises to export over this machine's own file, without which its daemon does not start again."""
+    own, link = tmp_path / "fleet.yaml", tmp_path / "link.yaml"
+    own.write_text(f"{node.text}# older\n")
+    own.chmod(0o640)
+    link.symlink_to(own)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))  # as a disk that is full in the middle of it
+    try:
+        full = run("fleet", "export", "-o", own)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, ignored)
+    assert full.exit_code == 1
+    assert "File too large" in full.stderr
+    assert own.read_text() == f"{node.text}# older\n"
+    assert run("fleet", "export", "-o", link).exit_code == 0
+    assert (own.read_text(), own.stat().st_mode & 0o777, link.is_symlink()) == (node.text, 0o640, True)
+    assert sorted(one.name for one in tmp_path.iterdir() if one.suffix == ".yaml" or "yaml." in one.name) == [
+        "fleet.yaml",
+        "link.yaml",
+    ]
 
 
 def test_export_gives_the_text_back_byte_for_byte(node: Node, tmp_path: Path) -> None:
