@@ -10,6 +10,7 @@ import logging
 from collections.abc import Callable
 
 from zsched.adapters.network.control_bus import ControlBus
+from zsched.adapters.network.limits import limit_for
 from zsched.adapters.relay.streams import RelayHandle
 from zsched.adapters.workers.supervisor import WorkerSupervisor
 from zsched.core import events as ev
@@ -82,7 +83,7 @@ class Adoption(Struct, kw_only=True):
         self.desk.adopt(fleet.timing)
         is_exclusive = any(task.exclusive for task in fleet.tasks)
         self.sampler.adopt(fleet.node(self.me), fleet.timing.sample_s, is_watched=is_exclusive)
-        self.bus.know(names_of(fleet))
+        self.bus.know(names_of(fleet), limit_for(fleet.timing, len(fleet.tasks)))
         if fleet.security is not None:
             self.bus.take_orders_of(holders_of(fleet, fleet.security))
         if is_exclusive:

@@ -9,6 +9,8 @@ from unittest.mock import Mock
 import pytest
 
 from support.fleets import fleet_of, task_of
+from zsched.adapters.network.control_bus import ControlBus
+from zsched.adapters.network.limits import limit_for
 from zsched.adapters.relay.streams import RelayHandle
 from zsched.core import instructions as do
 from zsched.core.relay_protocol import TaskEnded, WorkerWatch
@@ -52,6 +54,26 @@ def test_orders_count_by_the_fleet_in_force_before_sessions_are_opened_anew(new:
     assert sorted(one.label for one in holders) == then
     assert Holder(name="robot1") in holders
     compared.assert_called_once_with(True, ())  # it begins anew in its turn
+
+
+def test_what_a_peer_may_send_follows_the_tasks_that_come() -> None:
+    """A fleet begins without a task: with the room for none, a vote about fifty would be taken for a flood."""
+    inbox = Inbox()
+    bus = ControlBus(
+        fleet="test",
+        node="robot1",
+        incarnation=1,
+        zenoh_config="{}",
+        post=inbox.post,
+        limit=limit_for(FLEET.timing, 0),
+        names=("robot1", "robot2"),
+    )
+    tasks = tuple(task_of(f"t{number}", ("robot1",)) for number in range(50))
+    adoption_of(FLEET, bus=bus).adopt(replace(FLEET, tasks=tasks))
+    assert bus._buckets is not None
+    wanted = limit_for(FLEET.timing, 50)
+    for buckets in bus._buckets.values():
+        assert sum(buckets.take("robot2", 0.0) for _ in range(2000)) == int(wanted.burst)
 
 
 @pytest.mark.parametrize("is_another_file", [False, True], ids=["the same file", "another file"])

@@ -322,10 +322,10 @@ class ControlBus:
                 if link.zid in names and link.cut():
                     log.warning("%s is gone and its link is up: the link to %s is ended", names[link.zid], link.name)
 
-    def know(self, names: Iterable[str]) -> None:
-        """Give new names of the fleet a bucket of their own."""
+    def know(self, names: Iterable[str], limit: Limit | None = None) -> None:
+        """Give new names of the fleet a bucket of their own; ``limit``: what each name may send from now on."""
         for buckets in (self._buckets or {}).values():
-            buckets.know(names)
+            buckets.know(names, limit)
 
     def take_orders_of(self, holders: Iterable[Holder]) -> None:
         """Of those that are let in let only these give orders from now on.

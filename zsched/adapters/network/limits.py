@@ -69,9 +69,15 @@ class Buckets:
         self._left: dict[str, tuple[float, float]] = dict.fromkeys((EVERYBODY_ELSE, *names), (limit.burst, 0.0))
         """{name: (tokens, when)}."""
 
-    def know(self, names: Iterable[str]) -> None:
-        """Give these names a bucket of their own, too."""
+    def know(self, names: Iterable[str], limit: Limit | None = None) -> None:
+        """Give these names a bucket of their own, too; with a ``limit`` all have that from now on.
+
+        A bucket that was full stays so.
+        """
         with self._lock:
+            if limit is not None:
+                more, self._limit = max(limit.burst - self._limit.burst, 0.0), limit
+                self._left = {name: (tokens + more, at) for name, (tokens, at) in self._left.items()}
             for name in names:
                 self._left.setdefault(name, (self._limit.burst, 0.0))
 

@@ -47,6 +47,18 @@ def test_a_name_that_is_new_in_the_file_gets_a_bucket_and_old_ones_keep_theirs()
     assert not buckets.take("robot1", 0.0)
 
 
+def test_another_limit_counts_at_once_and_gives_nobody_more_than_it_says() -> None:
+    buckets = Buckets(LIMIT, ["robot1", "robot2"])
+    for _ in range(20):
+        buckets.take("robot1", 0.0)
+    buckets.know([], Limit(hz=30, burst=60))
+    assert sum(buckets.take("robot2", 0.0) for _ in range(1000)) == 60, "who was silent has all of it"
+    assert sum(buckets.take("robot1", 0.0) for _ in range(1000)) == 40, "who had sent its part has what came on top"
+    assert sum(buckets.take("robot1", 1.0) for _ in range(1000)) == 30
+    buckets.know([], LIMIT)
+    assert sum(buckets.take("robot1", 100.0) for _ in range(1000)) == 20
+
+
 def test_a_clock_that_stands_still_or_is_behind_gives_nothing() -> None:
     buckets = Buckets(LIMIT, ["robot1"])
     for _ in range(20):
