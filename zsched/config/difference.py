@@ -20,6 +20,7 @@ from zsched.config.reader import Fault, Scalar, read_yaml
 from zsched.config.reader import Mapping as Block
 from zsched.config.rows import rows
 from zsched.core.route.route import named_rules, outputs_of
+from zsched.core.values.certificates import Role, accepted
 from zsched.core.values.fleet import (
     Cell,
     Fleet,
@@ -347,20 +348,37 @@ def _access(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
         return
     if before.nameless() != after.nameless():
         yield _restart_all("security", _plain(before), _plain(after))
-    if _names(before) != _names(after):
+    stay = [node.name for node in new.nodes if any(one.name == node.name for one in old.nodes)]
+    if _let_in(before, stay) != _let_in(after, stay):
         yield _set(anew, "security", _plain(before), _plain(after))
-    nodes, others = ({node.name: (node.kind, node.local is None) for node in fleet.nodes} for fleet in (old, new))
+    nodes, others = ({node.name: (node.kind, _is_on_streams(node)) for node in fleet.nodes} for fleet in (old, new))
     for name in dict.fromkeys((*others, *nodes)):
         if name not in nodes or name not in others:
             yield replace(anew, paths=(f"nodes.{name}",))
         elif nodes[name] != others[name]:
             yield replace(anew, paths=(f"nodes.{name}.kind", f"nodes.{name}.local"))
-    speaking, then = (
-        {task.name: (task.rules, task.candidates) for task in fleet.tasks if task.rules} for fleet in (old, new)
-    )
+    speaking, then = ({task.name: _spoken(fleet, task) for task in fleet.tasks if task.rules} for fleet in (old, new))
     for name in dict.fromkeys((*then, *speaking)):
         if speaking.get(name) != then.get(name):
             yield replace(anew, paths=(f"tasks.{name}",))
+
+
+def _let_in(security: Security, nodes: Sequence[NodeId]) -> tuple[object, ...]:
+    """Whom the section lets in besides, and by which keys each of them and of ``nodes``; another's key says nothing."""
+    people = ((Role.OPERATOR, security.operators), (Role.GUEST, security.guests))
+    named = [(name, role) for role, names in ((Role.NODE, nodes), *people) for name in names]
+    return *people, [accepted(name, role, security.revoked) for name, role in named]
+
+
+def _is_on_streams(node: NodeSpec) -> bool:
+    """Whether a robot's applications are on the fleet's data network: then it speaks under their keys there."""
+    return node.kind is NodeKind.ROBOT and node.local is None
+
+
+def _spoken(fleet: Fleet, task: TaskSpec) -> tuple[object, ...]:
+    """What of a task says who speaks under which keys: its rules' keys, and where its worker may be."""
+    rules = [(one.direction, one.from_template, one.to_template, one.settings.graph) for one in task.rules]
+    return rules, [node.name for node in fleet.nodes if runs_worker(task, node.name, node.kind)]
 
 
 def _in_turns(verdicts: tuple[_Verdict, ...]) -> Iterator[_Verdict]:
@@ -369,11 +387,6 @@ def _in_turns(verdicts: tuple[_Verdict, ...]) -> Iterator[_Verdict]:
     for one in verdicts:
         is_other = begins_again and one.in_turns
         yield replace(one, text=one.in_turns, effect=Effect.STREAMS) if is_other else one
-
-
-def _names(security: Security) -> tuple[tuple[str, ...], ...]:
-    """The names that the section lets in, and the keys that it does not."""
-    return security.operators, security.guests, security.revoked
 
 
 def _addresses(fleet: Fleet) -> dict[NodeId, set[str]]:

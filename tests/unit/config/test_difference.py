@@ -354,6 +354,34 @@ def test_daemons_are_said_to_begin_again_where_they_do_when_it_comes_and_when_it
         assert any("begin again in turns" in text for text in there) is is_anew
 
 
+def test_it_is_said_that_daemons_begin_again_where_they_do_and_nowhere_else() -> None:
+    """Where it is said for nothing, what needs a restart is told as done by itself, and nobody does it."""
+    old = fleet_of(SECURED)
+    (task, *rest), nodes = old.tasks, old.nodes
+    variants: list[Fleet] = differing(old, "name", "nodes", "tasks", "electors")
+    variants += [replace(old, tasks=(one, *rest)) for one in differing(task, "name", "rules")]
+    for at, rule in enumerate(task.rules):
+        rules = [(*task.rules[:at], one, *task.rules[at + 1 :]) for one in differing(rule)]
+        variants += [replace(old, tasks=(replace(task, rules=one), *rest)) for one in rules]
+    for at, node in enumerate(nodes):
+        others = (replace(node, local=LocalSide()), *differing(replace(node, links=(), labels=()), "kind", "links"))
+        variants += [
+            replace(old, nodes=(*nodes[:at], one, *nodes[at + 1 :])) for one in others if one.name == node.name
+        ]
+    assert old.security is not None
+    variants += [
+        replace(old, security=replace(old.security, revoked=(one,))) for one in ("robot9", "robot1", "edge1.k2")
+    ]
+    seen = set()
+    for new in variants:
+        for before, after in ((old, new), (new, old)):
+            found = difference(before, after, (SECURED, SECURED))
+            is_said = any("daemons begin again in turns" in one.consequence for one in found)
+            assert is_said is opens_anew(before, after), [(one.path, one.before, one.after) for one in found]
+            seen.add(is_said)
+    assert seen == {True, False}
+
+
 def test_nobody_has_to_restart_a_daemon_that_begins_again_by_itself() -> None:
     """One of another kind does not: the file names another node than it is."""
     before = with_(ROBOT1, f"{ROBOT1}\n  robot9: {{kind: robot}}", SECURED)
