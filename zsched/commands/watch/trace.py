@@ -52,7 +52,7 @@ def trace(view: TraceView) -> int:
         CliError: nobody answers (3), another machine's log or no address of a collector is meant (2), or the library
             that sends is not there (1).
     """
-    if urlsplit(view.url).scheme not in ("http", "https") or not urlsplit(view.url).netloc:
+    if not _is_collector(view.url):
         raise CliError(EXIT_USAGE, f"--otlp {view.url}: no address of a collector; write it as http://HOST:4318")
     feed = Feed(lambda: find_door(view.runtime_dir, view.node))
     if feed.door().node is not None:
@@ -73,6 +73,15 @@ def trace(view: TraceView) -> int:
         sender.send(span for span in moves.rest() if span.end >= oldest)
     warn(f"{sender.sent} spans sent, {sender.refused} refused")
     return EXIT_FAILED if sender.refused else EXIT_OK
+
+
+def _is_collector(url: str) -> bool:
+    """Whether it can be a collector's address."""
+    try:
+        parts = urlsplit(url)
+    except ValueError:  # half of a bracket
+        return False
+    return parts.scheme in ("http", "https") and bool(parts.netloc)
 
 
 class _Complaints(logging.Handler):

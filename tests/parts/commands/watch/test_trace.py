@@ -151,7 +151,7 @@ def test_a_collector_that_is_not_there_is_told_of_once(folder: Path) -> None:
     assert told.endswith("and not kept 0 spans sent, 2 refused")
 
 
-@pytest.mark.parametrize("url", ["nonsense", "127.0.0.1:4318", "grpc://127.0.0.1:4317", "http://"])
+@pytest.mark.parametrize("url", ["nonsense", "127.0.0.1:4318", "grpc://127.0.0.1:4317", "http://", "http://[::1:4318"])
 def test_what_is_no_address_of_a_collector_is_refused(folder: Path, url: str) -> None:
     assert folder.exists()
     refused = CliRunner().invoke(app, ["trace", "--otlp", url, "--once"])
