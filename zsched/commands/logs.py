@@ -99,14 +99,18 @@ def show_logs(view: LogsView, task: str, whose: str | None) -> int:
         if kept and kept[0]["number"] > 1:
             since = f"in the {len(kept)} lines that its daemon keeps; older ones are in the journal there"
         warn(f"the worker of {task} on {node} has printed nothing{least} {since}")
+    told = ""
     try:
         while view.is_followed:
             time.sleep(PAUSE_S)
             try:
                 lines, after = _all_lines(asked, task, after)
             except CliError as error:
-                warn(f"zsched logs: {error}; asking again until Ctrl-C")
+                if str(error) != told:
+                    warn(f"zsched logs: {error}; asking again until Ctrl-C")
+                told = str(error)
                 continue
+            told = ""
             _print(view, node, task, sieve.of(lines))
     except KeyboardInterrupt:
         pass

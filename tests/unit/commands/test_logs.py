@@ -8,8 +8,10 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import pytest
 from typer.testing import CliRunner, Result
 
 from support.recorded_daemon import Daemon
@@ -89,6 +91,23 @@ def test_logs_followed_prints_what_comes_and_starts_anew_with_another_daemon(fol
             _, error = process.communicate(timeout=60)
     assert first == ["one", "two", "three", "four", "anew"]
     assert (process.returncode, error) == (0, "")
+
+
+def test_logs_followed_says_once_that_nobody_answers(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who follows over night finds what was printed, and not two lines a second of who was away."""
+    daemon.lines = printed("one")
+    steps = iter(["away", "away", "away", "back", "away", "end"])
+
+    def sleep(_s: float) -> None:
+        step = next(steps)
+        if step == "end":
+            raise KeyboardInterrupt
+        daemon.is_here = step == "back"
+
+    monkeypatch.setattr("zsched.commands.logs.time", SimpleNamespace(sleep=sleep))
+    result = run("logs", "echo", "-f")
+    assert result.exit_code == 0
+    assert result.stderr.count("asking again") == 2
 
 
 def test_logs_of_a_level_keep_a_traceback_whole(daemon: Daemon) -> None:

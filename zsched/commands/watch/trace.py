@@ -61,13 +61,14 @@ def trace(view: TraceView) -> int:
     if news.status is None:
         raise CliError(news.code, news.why)
     sender, moves = Sender(view.url, news.status["fleet"], news.status["node"]), Moves()
-    oldest = news.at - (view.since_s or 0.0)
+    oldest, told = news.at - (view.since_s or 0.0), ""
     with stopped_by_signal() as ended:
         sender.send(span for span in moves.take(news.entries) if span.end >= oldest)
         while not view.is_once and not ended.wait(PERIOD_S):
             news = feed.ask()
-            if news.status is None:
+            if news.why and news.why != told:
                 warn(f"zsched trace: {news.why}; asking again")
+            told = news.why
             sender.send((*moves.take(news.entries), *moves.overdue(wall_s())))
     if view.is_once:
         sender.send(span for span in moves.rest() if span.end >= oldest)

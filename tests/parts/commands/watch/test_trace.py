@@ -20,6 +20,7 @@ from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.cli import app
 from zsched.clock import wall_s
 from zsched.commands.watch.spans import trace_id
+from zsched.latch import Latch
 
 STATUS: dict[str, Any] = json.loads(
     (Path(__file__).parents[3] / "unit/commands/watch/recorded/fleet.json").read_text(encoding="utf-8")
@@ -149,6 +150,24 @@ def test_a_collector_that_is_not_there_is_told_of_once(folder: Path) -> None:
     told = " ".join(done.stderr.split())
     assert told.count(f"zsched trace: {url} takes no spans (Connection refused): is it a collector") == 1
     assert told.endswith("and not kept 0 spans sent, 2 refused")
+
+
+def test_a_daemon_that_is_away_is_told_of_once(
+    folder: Path, collector: Collector, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps = iter(["away", "away", "away", "back", "away", "end"])
+
+    def wait(_latch: Latch, _s: float | None = None) -> bool:
+        step, here, gone = next(steps), folder / "robot1.sock", folder / "gone"
+        if step == "away" and here.exists():
+            here.rename(gone)
+        elif step == "back":
+            gone.rename(here)
+        return step == "end"
+
+    monkeypatch.setattr(Latch, "wait", wait)
+    result = CliRunner().invoke(app, ["trace", "--otlp", collector.url])
+    assert result.stderr.count("asking again") == 2
 
 
 @pytest.mark.parametrize("url", ["nonsense", "127.0.0.1:4318", "grpc://127.0.0.1:4317", "http://", "http://[::1:4318"])
