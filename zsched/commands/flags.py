@@ -158,6 +158,8 @@ def eligible(view: OrderView, node: str | None, word: str | None, accepted: tupl
         return _list(view, _status(view.door), INELIGIBLE)
     if word not in ("on", "off"):
         raise CliError(EXIT_USAGE, f"say on or off: `zsched eligible {node} off`")
+    if word == "on" and view.for_s is not None:
+        raise CliError(EXIT_USAGE, f"--for goes with off: `zsched eligible {node} off --for 10m` ends by itself")
     return _set(view, INELIGIBLE, (node,), is_on=word == "off", accepted=accepted)
 
 

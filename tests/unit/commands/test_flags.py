@@ -380,3 +380,12 @@ def test_a_drain_that_is_over_before_its_node_is_empty_is_not_said_to_stay_in_fo
     assert result.exit_code == 1
     assert "edge1: the drain is not in force any more: it was taken back, or its time is over" in result.stderr
     assert "stays in force" not in result.stdout
+
+
+def test_a_time_for_which_a_node_would_get_tasks_is_refused(daemon: Daemon) -> None:
+    """Nothing ends "on": whoever says so would find the node at work after that time."""
+    run("eligible", "edge1", "off", "--yes")
+    refused = run("eligible", "edge1", "on", "--for", "10m", "--yes")
+    assert (refused.exit_code, len(daemon.changes)) == (2, 1)
+    assert "--for goes with off" in refused.stderr
+    assert run("eligible", "edge1", "on", "--yes").exit_code == 0
