@@ -121,7 +121,8 @@ def recover(recovery: Recovery, config: Path, folder: Path, brought: Sequence[Pa
     """Write the document, then the state of the new generation; the state.
 
     Raises:
-        AdapterError: the disk is full or read-only, or a daemon was started meanwhile; the old state is whole.
+        AdapterError: the disk is full or read-only, or a daemon was started meanwhile, though it may have ended since;
+            the old state is whole.
     """
     found = recovery.found
     state = recovery.carry_out(
@@ -131,6 +132,7 @@ def recover(recovery: Recovery, config: Path, folder: Path, brought: Sequence[Pa
         hardware=hardware_id(),
     )
     with StateFile(folder, fleet=found.fleet.name, node=found.me) as file:
+        _check_unchanged(file, found.own)
         store = DocumentStore(folder)
         if recovery.agreed is not None:
             store.save(_document_of(config))
@@ -138,6 +140,16 @@ def recover(recovery: Recovery, config: Path, folder: Path, brought: Sequence[Pa
             store.save(_brought(recovery.before.document, brought))
         file.save(state)
     return state
+
+
+def _check_unchanged(file: StateFile, looked_at: DurableState | None) -> None:
+    """Refuse to take the place of another state than the one that was looked at: it may know more, or have voted.
+
+    Raises:
+        AdapterError: a daemon has run here since.
+    """
+    if file.load().state != looked_at:
+        raise AdapterError(f"{file.path}: nothing was changed, a daemon has run here meanwhile; give the command again")
 
 
 def _brought(document: str, brought: Sequence[Path]) -> Document:
@@ -178,5 +190,6 @@ def rejoin(
         hardware=hardware_id(),
     )
     with StateFile(folder, fleet=fleet.name, node=node) as file:
+        _check_unchanged(file, own)
         file.save(state)
         return file.path, state

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -90,3 +91,19 @@ def test_who_changes_sides_keeps_nothing_but_what_it_may_have_granted(file: Path
     assert (after.joins, after.fleet_register, after.registers) == (value.generation_id, None, ())
     assert after.disk != before.disk
     assert after.lost
+
+
+def test_a_daemon_that_has_run_while_the_operator_thought_about_it_loses_nothing(file: Path) -> None:
+    """The question may stand for minutes; what was agreed here meanwhile is in no table that was shown."""
+    folder = file.parent / "robot1"
+    plan = consider(look(load_fleet(file), "robot1", file, folder, []))
+    assert isinstance(plan, Recovery), plan
+    before = state_at(file, "robot1")
+    side = Sides(generation_id="ab" * 16, generation=0, nodes=("robot2",), recovered_by="robot2", electors=("robot2",))
+    with StateFile(folder, fleet="hall", node="robot1") as daemon:
+        daemon.save(replace(before, votes=before.votes + 1))
+    with pytest.raises(AdapterError, match="a daemon has run here meanwhile"):
+        recover(plan, file, folder, [])
+    with pytest.raises(AdapterError, match="a daemon has run here meanwhile"):
+        rejoin(load_fleet(file), "robot1", folder, before, side)
+    assert state_at(file, "robot1").votes == before.votes + 1
