@@ -512,18 +512,22 @@ def bring_back(fleet: str, node: NodeId, places: Places, *, is_secured: bool) ->
 
 
 def _belongings(places: Places, *, is_purged: bool) -> Iterator[Written]:
-    """The files that make this machine a node, the state last: without it nothing is half a node."""
-    yield from _there(places.config, "the fleet file", is_purged=is_purged)
-    if is_purged:
-        yield from _there(places.config.with_name(f"{places.config.name}{BEFORE}"), "the fleet file of before")
+    """The files that make this machine a node, the state last: without it nothing is half a node.
+
+    The fleet file says where the certificate is: it goes behind that, so that what was broken off is found again.
+    """
     for folder in (_pki_folder(places.config), places.state / PKI_FOLDER):
         if _is_planted(folder, places):
             continue
         for name, what in _WHAT.items():
             yield from _there(folder / name, what, is_purged=is_purged)
     more = (rehearsals.FOLDER_NAME, core_speed.NAME, NEXT_CELL, LIFE_NAME) if is_purged else ()
-    for name in (*more, *LOGS, COPY_NAME, FOLDER_NAME, STATE_NAME):
+    for name in (*more, *LOGS, COPY_NAME, FOLDER_NAME):
         yield from _there(places.state / name, _KEPT.get(name, "the node's records"), is_purged=is_purged)
+    yield from _there(places.config, "the fleet file", is_purged=is_purged)
+    if is_purged:
+        yield from _there(places.config.with_name(f"{places.config.name}{BEFORE}"), "the fleet file of before")
+    yield from _there(places.state / STATE_NAME, _KEPT[STATE_NAME], is_purged=is_purged)
 
 
 def _is_planted(folder: Path, places: Places) -> bool:

@@ -317,6 +317,31 @@ def test_the_number_of_the_last_start_outlives_a_node_unless_all_goes(second: Pl
     assert not (second.state / "life").exists()
 
 
+@pytest.mark.parametrize("is_purged", [True, False])
+def test_a_key_elsewhere_is_found_again_when_the_power_has_gone_while_files_were_put_away(
+    first: Places, monkeypatch: pytest.MonkeyPatch, is_purged: bool
+) -> None:
+    """Only the fleet file says where it is: `leave --purge` says that it has deleted the key."""
+    text = SECURED.replace("security: {}", "security: {folder: ../keys}")
+    papers = Papers(certificate="cert", key="key", trusted="ca")
+    found(text, "robot1", first, is_plan=False, certify=lambda *_: papers)
+    key = first.config.parent.parent / "keys" / "key.pem"
+    assert key.read_text() == "key"
+    put_one = membership._put_one_away
+
+    def one_and_no_more(path: Path, *, is_deleted: bool) -> None:
+        put_one(path, is_deleted=is_deleted)
+        raise PowerCut
+
+    with monkeypatch.context() as patch:
+        patch.setattr(membership, "_put_one_away", one_and_no_more)
+        with pytest.raises(PowerCut):
+            put_away("hall", "robot1", first, is_purged=is_purged)
+    put_away("hall", "robot1", first, is_purged=is_purged)
+    left = [] if is_purged else ["ca.pem.left", "certificate.pem.left", "key.pem.left"]
+    assert sorted(one.name for one in key.parent.iterdir()) == left
+
+
 def test_a_link_in_the_state_folder_never_chooses_whose_keys_are_put_away(
     second: Places, invitation: Invitation, tmp_path: Path
 ) -> None:
