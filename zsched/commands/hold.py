@@ -74,7 +74,7 @@ def hold(view: OrderView, order: HoldOrder, names: Sequence[str], *, is_all: boo
     if code is not None and not (order.is_waiting and is_agreed):
         return code
     results = {name: _give_hold(view, order, known[name]) for name in changing}
-    after = {str(task["name"]): task for task in status_of(view.door)["tasks"]}
+    after = _tasks_now(view)
     # what an earlier order has agreed may be unknown somewhere, too
     revisions = {name: int(results.get(name, known[name])["revision"]) for name in chosen}
     agreed = {name: revisions[name] for name in chosen if results.get(name, {}).get("outcome", "ok") == "ok"}
@@ -93,6 +93,19 @@ def hold(view: OrderView, order: HoldOrder, names: Sequence[str], *, is_all: boo
     return max(code, late)
 
 
+def _tasks_now(view: OrderView) -> dict[str, Json]:
+    """{task: what the daemon says of it after the orders}, for programs; of one that is silent now: nothing.
+
+    What was agreed is told all the same.
+    """
+    if not view.is_json:
+        return {}
+    try:
+        return {str(task["name"]): task for task in status_of(view.door)["tasks"]}
+    except CliError:
+        return {}
+
+
 def _wait_known(view: OrderView, revisions: Mapping[str, int]) -> list[str]:
     """Wait until every node that is alive has learnt what was agreed; what is missing when that takes too long."""
     began = monotonic_s()
@@ -105,7 +118,10 @@ def _wait_known(view: OrderView, revisions: Mapping[str, int]) -> list[str]:
 
 def _not_known(door: Door, revisions: Mapping[str, int]) -> list[str]:
     lacks = []
-    first = status_of(door)
+    try:
+        first = status_of(door)
+    except CliError as error:  # it may be beginning again
+        return [str(error)]
     for node in [str(one["name"]) for one in first["nodes"] if one["state"] == "alive"]:
         try:
             status = first if node == first["node"] else status_of(door.to(node))

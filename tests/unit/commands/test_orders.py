@@ -194,6 +194,27 @@ def test_a_pause_that_some_node_never_learns_says_which(daemon: Daemon, monkeypa
     assert told["missing"] == ["edge2 has not learnt revision 8 of echo"]
 
 
+def test_what_was_agreed_is_told_though_the_daemon_is_silent_afterwards(
+    daemon: Daemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It may begin again just then; whoever is told "nobody answers" would give the order again, or stop."""
+
+    def answer(request: Json) -> Json:
+        told = Daemon.answer(daemon, request)
+        is_silent = request["verb"] == "status" and daemon.orders
+        return {"error": "the decision loop of robot1 did not answer within 3 s"} if is_silent else told
+
+    daemon.answers = answer
+    monkeypatch.setattr("zsched.commands.hold.KNOWN_S", 0.3)
+    result = run("pause", "echo", "--yes")
+    assert (result.exit_code, result.stdout.splitlines()[-1]) == (0, "echo: agreed (revision 8)"), result.output
+    daemon.orders.clear()
+    waited = run("pause", "merge", "--yes", "--wait", "--json")
+    body = json.loads(waited.stdout)
+    assert (waited.exit_code, faults(body), body["tasks"][0]["outcome"]) == (5, [], "ok")
+    assert body["missing"] == ["the decision loop of robot1 did not answer within 3 s"]
+
+
 def test_a_task_that_is_taken_out_right_after_its_pause_is_told_as_it_was(daemon: Daemon) -> None:
     def answer(request: Json) -> Json:
         told = Daemon.answer(daemon, request)
