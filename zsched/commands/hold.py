@@ -76,8 +76,8 @@ def hold(view: OrderView, order: HoldOrder, names: Sequence[str], *, is_all: boo
     results = {name: _give_hold(view, order, known[name]) for name in changing}
     after = _tasks_now(view)
     # what an earlier order has agreed may be unknown somewhere, too
-    revisions = {name: int(results.get(name, known[name])["revision"]) for name in chosen}
-    agreed = {name: revisions[name] for name in chosen if results.get(name, {}).get("outcome", "ok") == "ok"}
+    held = {name: results.get(name, {**known[name], "outcome": "ok"}) for name in chosen}
+    agreed = {name: int(one["revision"]) for name, one in held.items() if one["outcome"] == "ok"}
     lacks = _wait_known(view, agreed) if order.is_waiting else []
     late = EXIT_TIMED_OUT if lacks else EXIT_OK
     if view.is_json:

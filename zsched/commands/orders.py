@@ -218,5 +218,6 @@ def tell_results(results: Mapping[str, Json]) -> int:
         if code != EXIT_OK and len(results) == 1:
             raise refused(name, result)
         word = "agreed" if result["outcome"] == "ok" else str(refused(name, result)).removeprefix(f"{name}: ")
-        say(f"{name}: {word} (revision {result['revision']})")
+        revision = result["revision"]  # none is told of an order of which nobody knows what has become
+        say(f"{name}: {word}{'' if revision is None else f' (revision {revision})'}")
     return max(codes)

@@ -194,6 +194,25 @@ def test_a_pause_that_some_node_never_learns_says_which(daemon: Daemon, monkeypa
     assert told["missing"] == ["edge2 has not learnt revision 8 of echo"]
 
 
+@pytest.mark.parametrize("outcome", ["unknown", "invalid"])
+def test_an_order_of_which_no_revision_is_told_is_no_fault_of_the_program(daemon: Daemon, outcome: str) -> None:
+    """As a daemon answers whose loop is slow, or for another node that is silent."""
+
+    def answer(request: Json) -> Json:
+        told = {"outcome": outcome, "detail": "as told", "revision": None}
+        return told if request["verb"] == "hold" else Daemon.answer(daemon, request)
+
+    daemon.answers = answer
+    code = {"unknown": 5, "invalid": 1}[outcome]
+    one = run("pause", "echo", "--yes")
+    assert (one.exit_code, f"echo: {outcome}: as told" in one.stderr) == (code, True), one.exception
+    every = run("pause", "--all", "--yes")
+    assert (every.exit_code, every.stdout.count(f"{outcome}: as told")) == (code, 2)
+    assert "None" not in every.stdout
+    body = json.loads(run("pause", "echo", "--yes", "--json").stdout)
+    assert (faults(body), body["tasks"][0]["outcome"]) == ([], outcome)
+
+
 def test_what_was_agreed_is_told_though_the_daemon_is_silent_afterwards(
     daemon: Daemon, monkeypatch: pytest.MonkeyPatch
 ) -> None:
