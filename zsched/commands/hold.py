@@ -73,7 +73,7 @@ def hold(view: OrderView, order: HoldOrder, names: Sequence[str], *, is_all: boo
     is_agreed = not changing and not view.is_plan
     if code is not None and not (order.is_waiting and is_agreed):
         return code
-    results = {name: _give_hold(view, order, known[name]) for name in changing}
+    results = _give_holds(view, order, [known[name] for name in changing])
     after = _tasks_now(view)
     # what an earlier order has agreed may be unknown somewhere, too
     held = {name: results.get(name, {**known[name], "outcome": "ok"}) for name in chosen}
@@ -138,6 +138,25 @@ def _warning(order: HoldOrder) -> str:
     if order.hold == "pause":
         return "A dead owner will not be replaced."
     return "Without that node nobody does the task." if order.is_hard else ""
+
+
+def _give_holds(view: OrderView, order: HoldOrder, tasks: Sequence[Json]) -> dict[str, Json]:
+    """{task: what became of its order}; behind one that is agreed an error is the next one's result, and no end.
+
+    Raises:
+        CliError: the first one is refused, or nobody answers it.
+    """
+    results: dict[str, Json] = {}
+    for task in tasks:
+        try:
+            result = _give_hold(view, order, task)
+        except CliError as error:
+            if not results:
+                raise
+            outcome = "invalid" if error.code == EXIT_FAILED else "unknown"
+            result = {"outcome": outcome, "detail": str(error), "revision": None}
+        results[str(task["name"])] = result
+    return results
 
 
 def _give_hold(view: OrderView, order: HoldOrder, task: Json) -> Json:

@@ -213,6 +213,21 @@ def test_an_order_of_which_no_revision_is_told_is_no_fault_of_the_program(daemon
     assert (faults(body), body["tasks"][0]["outcome"]) == ([], outcome)
 
 
+def test_what_all_has_reached_is_told_where_the_daemon_ends_in_the_middle_of_it(daemon: Daemon) -> None:
+    """One task is paused and the other may be: whoever is only told that nobody answers knows of neither."""
+
+    def answer(request: Json) -> Json:
+        is_second = request["verb"] == "hold" and request["task"] == "merge"
+        told = {"error": "the decision loop of robot1 did not answer within 3 s"}
+        return told if is_second else Daemon.answer(daemon, request)
+
+    daemon.answers = answer
+    result = run("pause", "--all", "--yes")
+    assert result.exit_code == 5
+    assert "echo: agreed (revision 8)" in result.stdout
+    assert "merge: unknown: the decision loop of robot1 did not answer" in result.stdout
+
+
 def test_what_was_agreed_is_told_though_the_daemon_is_silent_afterwards(
     daemon: Daemon, monkeypatch: pytest.MonkeyPatch
 ) -> None:
