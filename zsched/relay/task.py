@@ -533,8 +533,10 @@ class TaskRelay:
         # a worker with a token has declared its services before it; of a foreign one only the match tells
         has_services = needs_token or self._services.is_matching(slot.epoch)
         is_ready = (bool(tokens) or not needs_token) and has_services and self._is_matching(slot)
-        parted = [source.take_parted(slot.epoch) for source in self._streams.inputs.values()]
-        is_new = is_ready and ((not state.is_ready and not is_rejoining) or bool(tokens - state.tokens) or any(parted))
+        returned = [source.take_returned(slot.epoch) for source in self._streams.inputs.values()]
+        is_new = is_ready and (
+            (not state.is_ready and not is_rejoining) or bool(tokens - state.tokens) or any(returned)
+        )
         if needs_token and tokens != state.seen:
             state.seen = tokens
             for source in self._streams.inputs.values():

@@ -633,7 +633,7 @@ STREAM_BUGS = (
     _bug(
         "a foreign worker that is back at once gets no kept values",
         TASK,
-        " or any(parted))",
+        " or any(returned))",
         ")",
         _TASK,
     ),

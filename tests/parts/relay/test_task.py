@@ -150,6 +150,7 @@ def test_a_foreign_worker_that_is_back_before_anybody_has_looked_gets_the_kept_v
         life = scene.other.declare_subscriber(LATCHED.to_expr, partial(_take, got))
         until(partial(bool, got), "the map", 5.0)
         undeclare(life)
+        until(lambda: not scene.streams.inputs[IN.stream].is_matching(3), "zenoh tells of its end")
 
 
 BEST = StreamSettings(stream_class=StreamClass.BEST_EFFORT)

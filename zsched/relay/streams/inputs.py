@@ -194,10 +194,10 @@ class InputStream:
         slot = self._slots.get(epoch)
         return slot is not None and slot.outlet.is_matching
 
-    def take_parted(self, epoch: int) -> bool:
-        """Whether nobody subscribed to the slot's keys for a moment since the last time (`Outlet.take_parted`)."""
+    def take_returned(self, epoch: int) -> bool:
+        """Whether somebody subscribed to the slot's keys after nobody did (`Outlet.take_returned`)."""
         slot = self._slots.get(epoch)
-        return slot is not None and slot.outlet.take_parted()
+        return slot is not None and slot.outlet.take_returned()
 
     @property
     def has_way(self) -> bool:

@@ -130,8 +130,8 @@ class Outlet:
         holds = self._is_reliable and acks is not None
         self._greetings = Greetings(self._lock, self._put_start) if holds else None
         self._probe = session.declare_publisher(to_expr)
-        self._has_parted = False
-        """Nobody subscribed for a moment, since that was asked last (of a worker that shows no token)."""
+        self._is_parted = self._has_returned = False
+        """Nobody subscribes; and somebody did again, since that was asked last (of a worker that shows no token)."""
         if acks is None and not has_crowd and settings.stream_class is StreamClass.LATEST:
             seen = zenoh.handlers.Callback(tolerant(self._matched, "matching"), indirect=False)
             self._watch = self._probe.declare_matching_listener(seen)
@@ -168,12 +168,17 @@ class Outlet:
 
     def _matched(self, status: Any) -> None:
         """Somebody subscribes to where this outlet leads, or nobody does any more (zenoh's thread)."""
-        self._has_parted |= not status.matching
+        self._has_returned |= self._is_parted and status.matching
+        self._is_parted = not status.matching
 
-    def take_parted(self) -> bool:
-        """Whether nobody subscribed for a moment since the last time: who does now is another life."""
-        parted, self._has_parted = self._has_parted, False
-        return parted
+    def take_returned(self) -> bool:
+        """Whether somebody subscribed after nobody did, since the last time: who does now is another life.
+
+        Not before: what is sent while nobody subscribes reaches nobody. Zenoh looks a moment after each change, so an
+        absence of less than some milliseconds may not be seen; a program takes longer to start.
+        """
+        returned, self._has_returned = self._has_returned, False
+        return returned
 
     def also_from(self, from_expr: str) -> None:
         """Take samples of another owner, too: its ``from`` captures what fills the wildcards of ``to``.
