@@ -633,8 +633,8 @@ STREAM_BUGS = (
     _bug(
         "a foreign worker that is back at once gets no kept values",
         TASK,
-        " or any(returned))",
-        ")",
+        " or any(returned)",
+        "",
         _TASK,
     ),
     _bug(
