@@ -140,9 +140,7 @@ class Offer:
         elif self._waiting.acquire(blocking=False):
             guarded(self._wait, query, epoch, name="zsched offer", is_lasting=False).start()
         else:
-            _log.warning("a question for the state was refused: %d wait already", MAX_WAITING)
-            with query:
-                query.reply_err("too many questions wait", encoding=ERROR_ENCODING)
+            self._take(query, epoch, "too many questions wait")
 
     def _wait(self, query: zenoh.Query, epoch: int | None) -> None:
         try:
@@ -150,18 +148,20 @@ class Offer:
         finally:
             self._waiting.release()
 
-    def _take(self, query: zenoh.Query, epoch: int | None) -> None:
+    def _take(self, query: zenoh.Query, epoch: int | None, why_not: str = "") -> None:
         try:
             with query:
-                self._answer(query, epoch)
+                if why_not:
+                    self._refuse(query, epoch, why_not)
+                else:
+                    self._answer(query, epoch)
         except zenoh.ZError as error:
             _log.info("a snapshot could not be sent (%s)", error)
 
     def _answer(self, query: zenoh.Query, epoch: int | None) -> None:
         query.reply(self._key, b"", attachment=COMING)
         if why_not := self._book.settle(epoch):
-            _log.info("no state for epoch %s: %s", epoch, why_not)
-            query.reply_err(why_not, encoding=ERROR_ENCODING)
+            self._refuse(query, epoch, why_not)
             return
         try:
             with self._saving:
@@ -176,6 +176,11 @@ class Offer:
             return
         for chunk, part in chunks(content):
             query.reply(self._key, part, attachment=encode_chunk(chunk))
+
+    @staticmethod
+    def _refuse(query: zenoh.Query, epoch: int | None, why_not: str) -> None:
+        _log.info("no state for epoch %s: %s", epoch, why_not)
+        query.reply_err(why_not, encoding=ERROR_ENCODING)
 
 
 def _asked_for(query: zenoh.Query) -> int | None:
