@@ -15,7 +15,6 @@ from zsched.core import instructions as do
 from zsched.core.electorate.numbers import Numbers
 from zsched.core.register.task_register import TaskRegister
 from zsched.core.todo import ToDo
-from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import Accepted, Prepare, Promise, Refusal, Refused, fleet_answer
 from zsched.core.values.model import Ballot, NodeId, TaskId
@@ -120,7 +119,7 @@ class Acceptor:
         if is_prepare and not (self.may_ask(event.asker, now) if may_ask is None else may_ask):
             self.counters["prepare_rate"] += 1
             refusal = Refusal.RATE
-        elif not isinstance(question, Prepare) and not self._is_fit(question.acceptance.value):
+        elif not isinstance(question, Prepare) and not is_fleet_fit(self._numbers.value, question.acceptance.value):
             self.counters["accept_unfit"] += 1
             refusal = Refusal.VALUE
         elif self.is_elector and not self.witness.may_vote(now):
@@ -129,10 +128,6 @@ class Acceptor:
         if answer is not None:
             self.witness.votes += not isinstance(answer, Refused)
             todo.add(do.AnswerFleet(request=event.request, answer=fleet_answer(answer)))
-
-    def _is_fit(self, value: FleetValue) -> bool:
-        known = self._numbers.value
-        return known is None or is_fleet_fit(known, value)
 
     def on_accept(self, event: ev.AcceptAsked, todo: ToDo, now: float, *, park_s: float | None = None) -> None:
         """A proposer asks this elector to accept a value: only under its own ballots.

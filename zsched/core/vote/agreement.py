@@ -422,11 +422,8 @@ class Agreement:
 
     def _tells_unfit(self, answer: Promise[FleetValue] | Promise | Accepted | Refused) -> bool:
         """Whether a refusal brings a fleet value that could not be true."""
-        return isinstance(answer, Refused) and answer.fleet is not None and not self._is_fit(answer.fleet)
-
-    def _is_fit(self, value: FleetValue) -> bool:
-        known = self._numbers.value
-        return known is None or is_fleet_fit(known, value)
+        told = answer.fleet if isinstance(answer, Refused) else None
+        return told is not None and not is_fleet_fit(self._numbers.value, told)
 
     def on_stored(self, event: ev.DocumentStored, todo: ToDo, now: float) -> None:
         """A document is on disk: the value that waits for it is learnt, or an operator's command goes on."""
@@ -614,7 +611,7 @@ class Agreement:
             is_news = self._questions.is_unasked(revision, self.fleet_revision, now)
             self._ask(learnt.node, newer, ASK_AT_ONCE_S, todo, now, is_news=is_news, of_fleet=revision)
             return
-        if learnt.fleet is not None and not self._is_fit(learnt.fleet):
+        if learnt.fleet is not None and not is_fleet_fit(self._numbers.value, learnt.fleet):
             self.counters["learnt_unfit"] += 1
         elif learnt.fleet is not None and self._numbers.learn(learnt.fleet, learnt.node, todo, now):
             self._count_anew(todo)

@@ -40,11 +40,13 @@ def is_fit(fleet: Fleet, value: Allocation, register: TaskRegister, start: int =
     return is_known and value.epoch <= value.revision <= newest + MAX_AHEAD
 
 
-def is_fleet_fit(known: FleetValue, value: FleetValue) -> bool:
-    """Whether a fleet value could be true: neither of its counters is far ahead of the ``known`` one's.
+def is_fleet_fit(known: FleetValue | None, value: FleetValue) -> bool:
+    """Whether a fleet value could be true: neither of its counters is far ahead of the ``known`` one's, if one is.
 
     Behind one that is, every true value would be too old to be learnt, and nothing could be agreed any more.
     """
+    if known is None:
+        return True
     return value.revision <= known.revision + MAX_AHEAD and value.number <= known.number + MAX_AHEAD
 
 
