@@ -14,6 +14,7 @@ import os
 import secrets
 import stat
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
@@ -96,22 +97,36 @@ def replace_regular(path: Path, content: bytes) -> None:
     is_ours = os.geteuid() in (0, found.st_uid) and os.access(whole, os.W_OK) and os.access(whole.parent, os.W_OK)
     if not stat.S_ISREG(found.st_mode) or not is_ours:
         return write_regular(path, content)
-    part = whole.with_name(f".{whole.name}.{secrets.token_hex(4)}")
+
+    def give(descriptor: int) -> None:
+        if (found.st_uid, found.st_gid) != (os.geteuid(), os.getegid()):
+            with contextlib.suppress(PermissionError):  # of a group that this user is not in
+                os.fchown(descriptor, found.st_uid, found.st_gid)
+
+    return put_whole(whole, content, stat.S_IMODE(found.st_mode), give)
+
+
+def put_whole(path: Path, content: bytes, mode: int, give: Callable[[int], None]) -> None:
+    """Put a file with ``content`` and ``mode`` in place; nobody ever sees a part of it, or it with another mode.
+
+    ``give`` hands the open file over to its owner, by its descriptor: the name may lead elsewhere by then.
+
+    Raises:
+        OSError: it cannot be written; what was there is as it was.
+    """
+    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
     descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
     try:
         with os.fdopen(descriptor, "wb") as file:
-            if (found.st_uid, found.st_gid) != (os.geteuid(), os.getegid()):
-                with contextlib.suppress(PermissionError):  # of a group that this user is not in
-                    os.fchown(file.fileno(), found.st_uid, found.st_gid)
-            os.fchmod(file.fileno(), stat.S_IMODE(found.st_mode))
+            give(file.fileno())
+            os.fchmod(file.fileno(), mode)
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
-        part.replace(whole)
+        part.replace(path)
     except BaseException:
         part.unlink(missing_ok=True)
         raise
-    return None
 
 
 def read_packed(path: Path, most_bytes: int) -> bytes:

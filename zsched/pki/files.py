@@ -9,9 +9,10 @@ cannot read.
 from __future__ import annotations
 
 import os
-import secrets
 from pathlib import Path
 from typing import Final
+
+from zsched.files import put_whole
 
 PUBLIC: Final = 0o644
 PRIVATE: Final = 0o600
@@ -41,20 +42,7 @@ def write_whole(path: Path, content: bytes, mode: int, *, is_for_folder: bool = 
     Raises:
         OSError: it cannot be written; the file is as it was.
     """
-    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
-    descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW, mode)
-    try:
-        with os.fdopen(descriptor, "wb") as file:
-            os.fchmod(file.fileno(), mode)
-            if is_for_folder:
-                _give(file.fileno(), path.parent)
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        part.rename(path)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
+    put_whole(path, content, mode, lambda descriptor: _give(descriptor, path.parent) if is_for_folder else None)
     _sync(path.parent)
 
 
