@@ -238,6 +238,20 @@ def warn(text: str, indent: int = 2) -> None:
     sys.stderr.flush()
 
 
+class Away:
+    """What a command that asks again and again says of a daemon that does not answer: once for each reason."""
+
+    def __init__(self, verb: str, until: str = "") -> None:
+        """``until``: how long it goes on, in words."""
+        self._verb, self._until, self._told = verb, f" {until}".rstrip(), ""
+
+    def tell(self, why: str) -> None:
+        """The newest attempt failed for this reason; empty: it did not."""
+        if why and why != self._told:
+            warn(f"zsched {self._verb}: {why}; asking again{self._until}")
+        self._told = why
+
+
 def counted(number: int, plural: str) -> str:
     """A number and what it counts.
 

@@ -453,7 +453,7 @@ def _check_flagged(watch: _Watch, status: Json, nodes: Sequence[str]) -> None:
     gone = [name for name in nodes if name in watch.flagged - watch.empty - has]
     watch.flagged |= has
     if gone and in_force(watch.view.door).text:  # without the document it knows no flags
-        raise CliError(EXIT_FAILED, told_over(watch.kind, gone))
+        raise CliError(EXIT_FAILED, _told_over(watch.kind, gone))
 
 
 def check_in_force(door: Door, kind: str, name: str) -> None:
@@ -464,10 +464,10 @@ def check_in_force(door: Door, kind: str, name: str) -> None:
     """
     held = in_force(door)
     if held.text and not any((flag["kind"], flag["subject"]) == (kind, name) for flag in held.flags):
-        raise CliError(EXIT_FAILED, told_over(kind, [name]))
+        raise CliError(EXIT_FAILED, _told_over(kind, [name]))
 
 
-def told_over(kind: str, names: Sequence[str]) -> str:
+def _told_over(kind: str, names: Sequence[str]) -> str:
     """That a flag is not in force any more, which a command has gone by so far."""
     return f"{', '.join(names)}: the {kind} is not in force any more: it was taken back, or its time is over"
 

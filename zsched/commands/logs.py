@@ -14,7 +14,7 @@ from typing import Final
 
 from zsched.clock import wall_ns
 from zsched.commands.ask import Door, ask_door, find_door
-from zsched.commands.common import CliError, Json, nearest, print_json, warn
+from zsched.commands.common import Away, CliError, Json, nearest, print_json, warn
 from zsched.commands.page import clock_time
 from zsched.core.values.struct import Struct
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE
@@ -99,18 +99,16 @@ def show_logs(view: LogsView, task: str, whose: str | None) -> int:
         if kept and kept[0]["number"] > 1:
             since = f"in the {len(kept)} lines that its daemon keeps; older ones are in the journal there"
         warn(f"the worker of {task} on {node} has printed nothing{least} {since}")
-    told = ""
+    away = Away("logs", "until Ctrl-C")
     try:
         while view.is_followed:
             time.sleep(PAUSE_S)
             try:
                 lines, after = _all_lines(asked, task, after)
             except CliError as error:
-                if str(error) != told:
-                    warn(f"zsched logs: {error}; asking again until Ctrl-C")
-                told = str(error)
+                away.tell(str(error))
                 continue
-            told = ""
+            away.tell("")
             _print(view, node, task, sieve.of(lines))
     except KeyboardInterrupt:
         pass

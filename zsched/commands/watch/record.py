@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, BinaryIO, Final
 
 from zsched.clock import monotonic_s, wall_s
 from zsched.commands.ask import Door, ask_door, find_door
-from zsched.commands.common import CliError, Json, stopped_by_signal, warn
+from zsched.commands.common import Away, CliError, Json, stopped_by_signal, warn
 from zsched.commands.page import size
 from zsched.commands.watch import tracks
 from zsched.commands.watch.feed import Feed
@@ -73,7 +73,7 @@ def record(view: RecordView) -> int:
         tape = stack.enter_context(_taped(view.file, kinds))
         ended = stack.enter_context(stopped_by_signal())
         end = float("inf") if view.for_s is None else monotonic_s() + view.for_s
-        news, told = replace(first, entries=()), ""  # the log of before is no part of the recording
+        news, away = replace(first, entries=()), Away("record")  # the log of before is no part of the recording
         while True:
             if news.status is not None:
                 for message in tracks.of_status(news.status, news.at):
@@ -85,12 +85,10 @@ def record(view: RecordView) -> int:
             if ended.is_set() or monotonic_s() >= end:
                 break
             news = feed.ask()
-            if news.why and news.why != told:
-                warn(f"zsched record: {news.why}; asking again")
-            told = news.why
-    end_of_it = f"{view.file}: {tape.messages} messages of {len(tape.topics)} topics, {size(view.file.stat().st_size)}"
+            away.tell(news.why)
+    told = f"{view.file}: {tape.messages} messages of {len(tape.topics)} topics, {size(view.file.stat().st_size)}"
     missed = f"; {tap.missed} samples came faster than they could be written" if tap is not None and tap.missed else ""
-    warn(f"{end_of_it}{missed}")
+    warn(f"{told}{missed}")
     return EXIT_OK
 
 

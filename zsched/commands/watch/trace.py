@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 
 from zsched.clock import wall_s
 from zsched.commands.ask import find_door
-from zsched.commands.common import CliError, stopped_by_signal, warn
+from zsched.commands.common import Away, CliError, stopped_by_signal, warn
 from zsched.commands.watch.feed import Feed
 from zsched.commands.watch.spans import Moves, Span, trace_id
 from zsched.core.values.struct import Struct
@@ -61,14 +61,12 @@ def trace(view: TraceView) -> int:
     if news.status is None:
         raise CliError(news.code, news.why)
     sender, moves = Sender(view.url, news.status["fleet"], news.status["node"]), Moves()
-    oldest, told = news.at - (view.since_s or 0.0), ""
+    oldest, away = news.at - (view.since_s or 0.0), Away("trace")
     with stopped_by_signal() as ended:
         sender.send(span for span in moves.take(news.entries) if span.end >= oldest)
         while not view.is_once and not ended.wait(PERIOD_S):
             news = feed.ask()
-            if news.why and news.why != told:
-                warn(f"zsched trace: {news.why}; asking again")
-            told = news.why
+            away.tell(news.why)
             sender.send((*moves.take(news.entries), *moves.overdue(wall_s())))
     if view.is_once:
         sender.send(span for span in moves.rest() if span.end >= oldest)
