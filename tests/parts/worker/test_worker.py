@@ -510,7 +510,8 @@ from zsched.worker import Worker
 seen, told = os.pipe()
 def work():
     os.write(told, b"x")
-    time.sleep(60)
+    while True:
+        time.sleep(0.1)  # a signal just before a long sleep would be handled behind it
 with Worker.from_env({}, standalone="t"):
     child = multiprocessing.get_context("fork").Process(target=work)
     child.start()
