@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import zenoh
 
 from support.operators import Operator, Stream
 from support.sessions import matches
@@ -37,6 +41,30 @@ def tasks_of(bed: Testbed, node: str) -> dict[str, str | None]:
     return {str(task["name"]): task["owner"] for task in bed.status(node)["tasks"]}
 
 
+def lossless() -> dict[str, Any]:
+    """A fleet whose stream loses nothing in a planned move."""
+    tree = echo_fleet(edges=2, stream_class="reliable")
+    tree["tasks"][TASK]["outputs"][0]["handover"] = "all"  # by `latest` a move cuts the old owner's late answers off
+    return tree
+
+
+@contextlib.contextmanager
+def streaming(folder: Path, tree: dict[str, Any]) -> Iterator[tuple[Testbed, zenoh.Session, Stream]]:
+    """A settled fleet, and an application of a robot that puts numbers; every one is answered in the end, in order."""
+    with Testbed(folder, tree) as bed:
+        bed.init()
+        bed.start()
+        bed.wait_settled()
+        session = bed.app("robot1")
+        stream = Stream(session)
+        bed.wait(lambda: matches(stream.publisher), 60, "the relay subscribes")
+        stream.start()
+        yield bed, session, stream
+        stream.end()
+        bed.wait(lambda: len(stream.back) >= stream.sent, 60, "every sample is answered")
+        assert stream.back == list(range(stream.sent))
+
+
 def goes_by(bed: Testbed, node: str, revision: int) -> bool:
     """Whether a node has taken a revision over, and its task has no problem."""
     status = bed.status(node)
@@ -49,16 +77,9 @@ def has_more(stream: Stream, than: int) -> bool:
 
 
 def test_a_task_comes_and_goes_by_the_document_while_a_stream_runs(tmp_path: Path) -> None:
-    tree = echo_fleet(edges=2, stream_class="reliable")
-    tree["tasks"][TASK]["outputs"][0]["handover"] = "all"  # by `latest` a move cuts the old owner's late answers off
-    with Testbed(tmp_path, tree) as bed:
-        bed.init()
-        bed.start()
-        bed.wait_settled()
-        operator, session = Operator(bed), bed.app("robot1")
-        stream = Stream(session)
-        bed.wait(lambda: matches(stream.publisher), 60, "the relay subscribes")
-        stream.start()
+    tree = lossless()
+    with streaming(tmp_path, tree) as (bed, session, stream):
+        operator = Operator(bed)
         bed.wait(lambda: len(stream.back) > 20, 60, "the stream flows")
 
         # the first document is the file that runs; another text of it is another document
@@ -99,23 +120,13 @@ def test_a_task_comes_and_goes_by_the_document_while_a_stream_runs(tmp_path: Pat
         assert operator.done("fleet", "export") == left, "the comment above it stays, and every other character"
         reached = len(stream.back)
         bed.wait(lambda: len(stream.back) > reached + 20, 60, "the stream flows on")
-        stream.end()
-        bed.wait(lambda: len(stream.back) >= stream.sent, 60, "every sample is answered")
-        assert stream.back == list(range(stream.sent))
         sub.undeclare()
 
 
 def test_a_task_becomes_exclusive_by_the_document_and_everybody_s_again_while_a_stream_runs(tmp_path: Path) -> None:
-    tree = echo_fleet(edges=2, stream_class="reliable")
-    tree["tasks"][TASK]["outputs"][0]["handover"] = "all"
-    with Testbed(tmp_path, tree) as bed:
-        bed.init()
-        bed.start()
-        bed.wait_settled()
-        operator, session = Operator(bed), bed.app("robot1")
-        stream = Stream(session)
-        bed.wait(lambda: matches(stream.publisher), 60, "the relay subscribes")
-        stream.start()
+    tree = lossless()
+    with streaming(tmp_path, tree) as (bed, _, stream):
+        operator = Operator(bed)
         file = tmp_path / "agreed.yaml"
         for is_exclusive, accepted in ((False, ()), (True, ("make-exclusive",)), (False, ("end-exclusive",))):
             tree["tasks"][TASK]["exclusive"] = is_exclusive
@@ -125,9 +136,6 @@ def test_a_task_becomes_exclusive_by_the_document_and_everybody_s_again_while_a_
             for name in bed.names:
                 bed.wait(partial(goes_by, bed, name, revision), 60, f"{name} goes by it and has no problem")
             bed.wait(partial(has_more, stream, len(stream.back)), 60, "the stream flows on")
-        stream.end()
-        bed.wait(lambda: len(stream.back) >= stream.sent, 60, "every sample is answered")
-        assert stream.back == list(range(stream.sent))
 
 
 def test_up_with_another_file_founds_nothing_where_a_fleet_is(tmp_path: Path) -> None:

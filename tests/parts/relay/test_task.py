@@ -132,13 +132,7 @@ def test_nor_is_one_after_another_data_session_that_has_not_seen_the_worker(
     undeclare(recorder)
 
 
-LATCHED = Route(
-    stream="t/in/0",
-    direction=Direction.INPUT,
-    from_expr="robot1/in",
-    to_expr="edge1/t/robot1/in",
-    settings=StreamSettings(stream_class=StreamClass.LATEST, keep_last=1),
-)
+LATCHED = replace(IN, settings=StreamSettings(stream_class=StreamClass.LATEST, keep_last=1))
 
 
 def test_a_foreign_worker_that_is_back_before_anybody_has_looked_gets_the_kept_values(scene: Scene) -> None:

@@ -10,9 +10,10 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from types import MappingProxyType
 
 import psutil
 import pytest
@@ -85,14 +86,18 @@ def python(code: str, **changes: object) -> WorkerSpec:
 
 @contextmanager
 def supervised(
-    spec: WorkerSpec, policy: RestartPolicy = QUICK, **environment: str
+    spec: WorkerSpec,
+    policy: RestartPolicy = QUICK,
+    made: Mapping[str, str] = MappingProxyType({}),
+    **environment: str,
 ) -> Iterator[tuple[WorkerSupervisor, Recorder]]:
+    """``made``: variables that the test may change."""
     recorder = Recorder()
     supervisor = WorkerSupervisor(
         specs={"merge": spec},
         context=WorkerContext(fleet="hall", node="edge1", incarnation=7),
         events=recorder,
-        environment=lambda task: {"TASK_SEEN": task, **environment},
+        environment=lambda task: {"TASK_SEEN": task, **environment, **made},
         rng=random.Random(1),
         policy=policy,
     )
@@ -566,15 +571,7 @@ def test_a_changed_command_waits_for_the_order_and_then_runs() -> None:
 def test_a_fleet_that_grows_makes_no_worker_old() -> None:
     """zenoh's threads follow the number of nodes and tasks: who runs keeps those of the start."""
     made = {"ZENOH_RUNTIME": "few", "ZSCHED_OUTPUT_KEYS": "{}"}
-    recorder = Recorder()
-    supervisor = WorkerSupervisor(
-        specs={"merge": python(SLEEP)},
-        context=WorkerContext(fleet="hall", node="edge1", incarnation=7),
-        events=recorder,
-        environment=lambda _task: dict(made),
-        policy=QUICK,
-    )
-    try:
+    with supervised(python(SLEEP), made=made) as (supervisor, recorder):
         supervisor.start("merge")
         recorder.wait("started")
         made["ZENOH_RUNTIME"] = "many"
@@ -590,8 +587,6 @@ def test_a_fleet_that_grows_makes_no_worker_old() -> None:
         made["ZSCHED_OUTPUT_KEYS"] = "{1}"
         supervisor.adopt({"merge": python(SLEEP)})
         assert recorder.wait("compared", 3) == ("compared", "merge", True)
-    finally:
-        supervisor.close(within_s=10.0)
 
 
 def test_workers_come_and_go_with_the_file() -> None:
@@ -620,16 +615,9 @@ def test_a_mended_command_is_tried_although_the_one_before_has_failed_for_good()
 
 def test_mended_variables_are_tried_although_the_worker_has_failed_for_good_with_those_before() -> None:
     """What a task says of its deadline and its outputs reaches a worker by its environment alone."""
-    made, recorder = {"ZSCHED_OUTPUT_KEYS": "wrong"}, Recorder()
+    made = {"ZSCHED_OUTPUT_KEYS": "wrong"}
     code = f"import os, time; os.environ['ZSCHED_OUTPUT_KEYS'] != 'wrong' or os._exit(78); {SLEEP}"
-    supervisor = WorkerSupervisor(
-        specs={"merge": python(code)},
-        context=WorkerContext(fleet="hall", node="edge1", incarnation=7),
-        events=recorder,
-        environment=lambda _task: dict(made),
-        policy=QUICK,
-    )
-    try:
+    with supervised(python(code), made=made) as (supervisor, recorder):
         supervisor.start("merge")
         recorder.wait("failed")
         supervisor.adopt({"merge": python(code), "other": python(code)})
@@ -638,8 +626,6 @@ def test_mended_variables_are_tried_although_the_worker_has_failed_for_good_with
         supervisor.adopt({"merge": python(code)})
         recorder.wait("started", 2, timeout_s=10.0)
         assert len([call for call in recorder.calls if call[0] == "reset"]) == 1, "the same recipe is no reason"
-    finally:
-        supervisor.close(within_s=10.0)
 
 
 def test_a_failed_worker_whose_command_goes_is_not_started_without_one() -> None:

@@ -47,6 +47,14 @@ class Bench:
         self.streams.append(stream)
         return stream
 
+    def flowing(self, route: Route) -> InputStream:
+        """An input whose first slot has a target, and carries the stream."""
+        stream = self.input(route)
+        stream.open(1, route)
+        until(lambda: stream.is_matching(1), "the target subscribes")
+        stream.flip(1)
+        return stream
+
     def output(self, route: Route, wake: Callable[[], None] = lambda: None) -> OutputStream:
         stream = OutputStream(self.relay, route, self.own_ids | {str(self.relay.zid())}, wake)
         self.streams.append(stream)
@@ -103,10 +111,7 @@ def drops(stream: InputStream | OutputStream) -> dict[str, int]:
 def test_everything_of_a_sample_goes_on(bench: Bench, stream_class: StreamClass) -> None:
     got: list[zenoh.Sample] = []
     kept = bench.outside.declare_subscriber("edge1/t/in", got.append)
-    stream = bench.input(way_in(stream_class))
-    stream.open(1, way_in(stream_class))
-    until(lambda: stream.is_matching(1), "the target subscribes")
-    stream.flip(1)
+    bench.flowing(way_in(stream_class))
     stamp = bench.outside.new_timestamp()
     publisher = bench.publisher("robot1/in", priority=zenoh.Priority.DATA_HIGH, express=True)
     publisher.put(b"\x00\xff", encoding="image/png;7", attachment=b"\x01\x02", timestamp=stamp)
@@ -262,10 +267,7 @@ def test_no_sample_of_a_burst_is_lost_without_a_counter(
     kept = bench.outside.declare_subscriber("edge1/t/in", lambda s: got.append(s.payload.to_string()))
     route = way_in(stream_class)
     route = replace(route, settings=replace(route.settings, depth=16))
-    stream = bench.input(route)
-    stream.open(1, route)
-    until(lambda: stream.is_matching(1), "the target subscribes")
-    stream.flip(1)
+    stream = bench.flowing(route)
     Burst(bench, stream, "robot1/in").run(200)
     until(lambda: stream.count().messages == 201, f"each in a counter: {stream.count()}")
     until(lambda: got[-1:] == ["200"], "the newest")
@@ -327,10 +329,7 @@ def test_a_relay_that_ends_sends_the_newest_value_that_a_rate_holds_back(bench: 
     got: list[str] = []
     kept = bench.outside.declare_subscriber("edge1/t/in", lambda sample: got.append(sample.payload.to_string()))
     route = way_in(StreamClass.LATEST, max_hz=0.1)
-    stream = bench.input(route)
-    stream.open(1, route)
-    until(lambda: stream.is_matching(1), "the target subscribes")
-    stream.flip(1)
+    stream = bench.flowing(route)
     publisher = bench.publisher("robot1/in")
     for number in range(3):
         publisher.put(str(number))
@@ -385,10 +384,7 @@ def test_a_thinned_stream_ends_with_its_newest_value(bench: Bench) -> None:
     got: list[str] = []
     kept = bench.outside.declare_subscriber("edge1/t/in", lambda s: got.append(s.payload.to_string()))
     route = way_in(StreamClass.LATEST, max_hz=10)
-    stream = bench.input(route)
-    stream.open(1, route)
-    until(lambda: stream.is_matching(1), "the target subscribes")
-    stream.flip(1)
+    stream = bench.flowing(route)
     publisher = bench.publisher("robot1/in")
     began = time.monotonic()
     for number in range(30):

@@ -68,9 +68,20 @@ def make(
     registers: tuple[RegisterState, ...] = (),
     stored: Mapping[str, Fleet] = MappingProxyType({"0d": FLEET}),
     seed: int = 1,
+    lost: str = "",
+    disputed: str = "",
 ) -> Agreement:
     held = None if fleet_value is None else RegisterState(task=FLEET.name, learnt=fleet_value)
-    state = state_of(me, *registers, generation=GENERATION, hardware="h", disk="d1", fleet_register=held)
+    state = state_of(
+        me,
+        *registers,
+        generation=GENERATION,
+        hardware="h",
+        disk="d1",
+        fleet_register=held,
+        lost=lost,
+        disputed=disputed,
+    )
     agreement = Agreement(
         fleet=FLEET,
         me=me,
@@ -501,21 +512,8 @@ def test_an_elector_whose_name_is_disputed_takes_nobody_for_gone() -> None:
 
 @pytest.mark.parametrize("why", ["", "two daemons", "the disk is full"])
 def test_who_has_lost_its_state_and_gets_another_seat_elects_if_nothing_else_forbids_it(why: str) -> None:
-    held = RegisterState(task=FLEET.name, learnt=replace(ADOPTED, settled=True))
     disputed = why if why == "two daemons" else ""
-    state = state_of(
-        "robot1", generation=GENERATION, disk="d1", fleet_register=held, lost="its folder is old", disputed=disputed
-    )
-    agreement = Agreement(
-        fleet=FLEET,
-        me="robot1",
-        durable=state,
-        incarnation=7,
-        electorate="e",
-        rng=Random(1),
-        now=100.0,
-        stored={"0d": FLEET},
-    )
+    agreement = make(replace(ADOPTED, settled=True), lost="its folder is old", disputed=disputed)
     if why and not disputed:
         agreement.on_persist_failed(why)
     gone = replace(WITHOUT_ROBOT1, settled=True)
