@@ -420,12 +420,8 @@ class TaskRelay:
         for stream, route in wanted.items():
             if before.get(stream) != route:
                 self._try_route(slot, route, is_from_start=False)
-        if state.is_flipped:  # those that ran on are there already
-            for sink in self._streams.outputs.values():
-                sink.flip(epoch, drops_held=False)
-            for source in self._streams.inputs.values():
-                source.flip(epoch, has_answer=self._has_answer)
-            self._services.flip(epoch)
+        if state.is_flipped:
+            self._flip_anew(epoch)
 
     def _carry_on(self) -> None:
         """A stream that is another one now, by a changed fleet file, has lost the slot that carries: it goes on there.
@@ -440,11 +436,15 @@ class TaskRelay:
         for route in lost:
             self._try_route(carrier.slot, route, is_from_start=False, is_as_opened=True)
         if lost:
-            for sink in self._streams.outputs.values():
-                sink.flip(epoch, drops_held=False)
-            for source in self._streams.inputs.values():
-                source.flip(epoch, has_answer=self._has_answer)
-            self._services.flip(epoch)
+            self._flip_anew(epoch)
+
+    def _flip_anew(self, epoch: int) -> None:
+        """Streams that were opened anew go to the slot that carries; those that ran on are there already."""
+        for sink in self._streams.outputs.values():
+            sink.flip(epoch, drops_held=False)
+        for source in self._streams.inputs.values():
+            source.flip(epoch, has_answer=self._has_answer)
+        self._services.flip(epoch)
 
     def _has(self, epoch: int, route: Route) -> bool:
         """Whether a route's stream has the slot, or is none any more that could have it."""
