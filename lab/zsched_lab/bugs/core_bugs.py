@@ -930,6 +930,20 @@ VOTE_BUGS = (
         ("tests/unit/core/test_closed_loop.py",),
     ),
     _bug(
+        "a machine on which a task is slow looks fast again from the next one",
+        "zsched.core.gateway.task_speed",
+        "is_there or is_same else speed",
+        "is_there else speed",
+        ("tests/unit/core/gateway/test_task_speed.py", "tests/unit/core/test_closed_loop.py"),
+    ),
+    _bug(
+        "what others used on a full machine is all that they want",
+        "zsched.core.gateway.company",
+        "<= slack + self.taken_cores",
+        "<= slack",
+        ("tests/unit/core/gateway/test_task_speed.py",),
+    ),
+    _bug(
         "median and mean swapped",
         SCORING,
         "if allocation.tuning.aggregate is Aggregate.MEAN",

@@ -51,13 +51,18 @@ class Machine:
     name: str
     cores: float = 4.0
     base: float = 0.4
-    """Ratio in use without the task, of CPU and memory; the signal sits at -60 dBm and falls by 0.4 dB per 1 %."""
+    """Ratio in use without the task, of CPU and memory; the signal falls by 0.4 dB per 1 % of a step."""
+    memory: float | None = None
+    """Ratio of memory in use without the task; ``None``: as the CPU."""
+    signal_dbm: float = -60.0
     step: Callable[[float], float] = NO_STEP
     """Ratio added at a time."""
     noise: float = 0.0
     task_cores: float = 0.0
     """On a machine of speed 1."""
     speed: float = 1.0
+    own_speed: float = 1.0
+    """The task is so many times as quick there as the benchmark says."""
     task_mb: float = 0.0
     shows_worker: bool = True
     job_s: float | None = None
@@ -73,10 +78,11 @@ class Machine:
 
     def sample(self, now: float, rng: Random, *, is_owner: bool) -> tuple[DeviceSample, LinkSample]:
         step = self.step(now)
-        cpu, memory = (self.base + step + rng.uniform(-self.noise, self.noise) for _ in range(2))
+        bases = (self.base, self.base if self.memory is None else self.memory)
+        cpu, memory = (base + step + rng.uniform(-self.noise, self.noise) for base in bases)
         rest = max(cpu, 0.0) * self.cores
         # A full machine gives the task what is left, half a core at least.
-        needs = self.task_cores / self.speed if is_owner and now < self.works_until else 0.0
+        needs = self.task_cores / self._speed if is_owner and now < self.works_until else 0.0
         takes = min(needs, max(self.cores - rest, 0.5), self.most_cores)
         holds = self.task_mb if is_owner else 0.0
         load = load_of(
@@ -89,16 +95,21 @@ class Machine:
             cpu_cores=self.cores,
             cpu_used_cores=min(rest + takes, self.cores),
             memory_mb=MEMORY_MB,
-            memory_used_mb=max(memory, 0.0) * MEMORY_MB + holds,
+            memory_used_mb=min(max(memory, 0.0) * MEMORY_MB + holds, MEMORY_MB),
             workers=(load,),
             speed=self.speed,
             runnable=None if self.threads is None else self.threads + (math.ceil(needs) if takes < needs else takes),
         )
-        return device, LinkSample(source=LinkSource.NL80211, rssi_dbm=-60.0 - 40.0 * step)
+        return device, LinkSample(source=LinkSource.NL80211, rssi_dbm=self.signal_dbm - 40.0 * step)
 
     def __post_init__(self) -> None:
         self.told: WorkerJobs | None = None
         self._done = self._undone = self._now = 0.0
+
+    @property
+    def _speed(self) -> float:
+        """Of the task."""
+        return self.speed * self.own_speed
 
     def _work(self, now: float, needs: float, takes: float) -> None:
         """One worker of one thread, which skips what it cannot do; jobs are a fluid here, and told in whole ones."""
@@ -111,8 +122,8 @@ class Machine:
             self.told = replace(self.told, at_s=now, is_idle=True) if has_ended and self.told is not None else None
             return
         word = self.told or WorkerJobs(task="merge", incarnation=str(now), at_s=now, done=0, wait_s=0.0, age_s=0.0)
-        cpu_s = self.job_s / self.speed * (self.rub if takes < needs else 1.0)
-        wanted_hz = needs / (self.job_s / self.speed)
+        cpu_s = self.job_s / self._speed * (self.rub if takes < needs else 1.0)
+        wanted_hz = needs / (self.job_s / self._speed)
         done_hz = takes / cpu_s
         before, self._done = int(self._done), self._done + elapsed_s * done_hz
         self._undone += elapsed_s * max(wanted_hz - done_hz, 0.0)
@@ -450,8 +461,82 @@ def test_where_nothing_changes_a_task_scored_by_service_comes_to_rest(
 
     A lead that is next to nothing may take minutes to be worth a move.
     """
-    loop = Loop(machines, weights=weights, tuning=BY_SERVICE, learns=True)
-    assert len(loop.run(300.0)) <= len(machines)
+    moves = Loop(machines, weights=weights, tuning=BY_SERVICE, learns=True).run(600.0)
+    assert len([at for at, _ in moves if at <= 300.0]) <= len(machines)
+    assert [at for at, _ in moves if at > 300.0] == []
+
+
+@st.composite
+def tempting_machines(draw: st.DrawFn) -> tuple[Machine, ...]:
+    """Each machine looks better from another one, if only the benchmark's speed counts.
+
+    The second one has more memory or a better link, and seems to have CPU enough. But the task is slower there than the
+    benchmark says, so it is short there, and the first one is then better.
+    """
+    task_cores = draw(st.floats(0.3, 2.5))
+    threads = draw(st.one_of(st.none(), st.floats(0.0, 4.0)))
+    noise = draw(st.sampled_from((0.0, 0.02)))
+
+    def machine(name: str, room: tuple[float, float], own: tuple[float, float], rest: tuple[float, float]) -> Machine:
+        speed, base = draw(st.floats(0.5, 2.0)), draw(st.floats(0.0, 0.6))
+        free_cores = task_cores * draw(st.floats(*room)) / speed
+        return Machine(
+            name=name,
+            cores=free_cores / (1.0 - base),
+            base=base,
+            memory=draw(st.floats(*rest)),
+            signal_dbm=draw(st.floats(-58.0, -50.0)) if name == "edge1" else -48.0,
+            speed=speed,
+            own_speed=draw(st.floats(*own)),
+            task_cores=task_cores,
+            task_mb=300.0,
+            threads=threads,
+            noise=noise,
+        )
+
+    return (
+        machine("edge1", room=(1.2, 3.0), own=(1.0, 1.2), rest=(0.86, 0.925)),
+        machine("edge2", room=(1.0, 1.6), own=(0.35, 0.9), rest=(0.1, 0.5)),
+    )
+
+
+SHORT_OF_MEMORY = (
+    Machine(name="edge1", base=0.1, memory=0.92, task_cores=1.5, task_mb=300.0),
+    Machine(name="edge2", cores=2.0, base=0.1, task_cores=1.5, task_mb=300.0, own_speed=0.6),
+)
+FAR_AWAY = (
+    Machine(name="edge1", base=0.1, signal_dbm=-55.0, task_cores=1.5, task_mb=100.0),
+    Machine(name="edge2", cores=2.0, base=0.1, signal_dbm=-48.0, task_cores=1.5, task_mb=100.0, own_speed=0.6),
+)
+ONE_THREAD = tuple(
+    Machine(name=name, cores=cores, base=0.1, memory=memory, task_cores=0.5, task_mb=300.0, job_s=0.3, own_speed=own)
+    for name, cores, memory, own in (("edge1", 4.0, 0.92, 1.0), ("edge2", 0.6, 0.1, 0.5))
+)
+WITH_NETWORK = Weights(cpu=0.6, memory=0.0, network=0.4)
+
+
+@settings(derandomize=True, database=None, deadline=None, max_examples=12)
+@example(machines=SHORT_OF_MEMORY, weights=BOTH, job_s=None, deadline_ms=None)
+@example(machines=FAR_AWAY, weights=WITH_NETWORK, job_s=None, deadline_ms=None)
+@example(machines=ONE_THREAD, weights=BOTH, job_s=0.3, deadline_ms=None)
+@example(machines=ONE_THREAD, weights=BOTH, job_s=0.05, deadline_ms=400.0)
+@example(machines=ONE_THREAD, weights=BOTH, job_s=0.3, deadline_ms=1000.0)
+@given(
+    machines=tempting_machines(),
+    weights=st.sampled_from((BOTH, WITH_NETWORK, Weights(cpu=0.4, memory=0.3, network=0.3))),
+    job_s=st.one_of(st.none(), st.floats(0.02, 0.6)),
+    deadline_ms=st.sampled_from((None, 150.0, 1000.0)),
+)
+def test_where_the_benchmark_says_little_of_a_task_it_comes_to_rest_all_the_same(
+    machines: tuple[Machine, ...], weights: Weights, job_s: float | None, deadline_ms: float | None
+) -> None:
+    """By the benchmark alone each of the examples is a limit cycle of 38 to 79 moves (docs/decisions/0118)."""
+    for machine in machines:
+        machine.job_s = job_s
+    tuning = replace(BY_SERVICE, deadline_ms=None if job_s is None else deadline_ms)
+    moves = Loop(machines, weights=weights, tuning=tuning, learns=True).run(400.0)
+    assert len(moves) <= 4
+    assert [at for at, _ in moves if at > 200.0] == []
 
 
 FULL = tuple(Machine(name=name, cores=2.0, base=1.0, threads=4.0, task_cores=0.3) for name in ("edge1", "edge2"))
@@ -526,8 +611,9 @@ def test_where_nothing_changes_a_task_whose_worker_tells_of_its_jobs_comes_to_re
     for machine in machines:
         machine.job_s, machine.rub, machine.most_cores = job_s, rub, most_cores
         machine.task_cores = min(machine.task_cores, 1.0)
-    loop = Loop(machines, weights=CPU_ONLY, tuning=tuning, learns=True)
-    assert len(loop.run(300.0)) <= len(machines) + 1
+    moves = Loop(machines, weights=CPU_ONLY, tuning=tuning, learns=True).run(600.0)
+    assert len([at for at, _ in moves if at <= 300.0]) <= len(machines) + 1
+    assert [at for at, _ in moves if at > 300.0] == []
 
 
 @pytest.mark.parametrize("deadline_ms", [60.0, 100.0])

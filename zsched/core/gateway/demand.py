@@ -4,23 +4,26 @@ Knows: the difference between a task's use and its need, also by the task's own 
 age, which node is better.
 
 A need is kept as *work*: cores of a machine of speed 1. Otherwise a task that was measured on a slow machine would seem
-too large for fast ones, and the other way round. With one figure for all machines the view from every owner is the same
-but for a common factor, so an unchanging fleet has no limit cycle.
+too large for fast ones, and the other way round. What a move shows of the task's own speed on a machine is kept for
+that machine (`zsched.core.gateway.task_speed`), so the need there is the same from every owner, and an unchanging fleet
+has no limit cycle (docs/decisions/0118).
 """
 
 from __future__ import annotations
 
+from zsched.core.gateway.company import Company, is_full
+from zsched.core.gateway.task_speed import TaskSpeeds
 from zsched.core.values.fleet import Demand, TaskSpec
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.profile import Jobs, Profile, Renewal, WorkerLoad, WorkerState
 from zsched.core.values.struct import Struct, replace
 
-STARVED_CPU_RATIO = 0.9
-"""On a busier owner a task may get less than it wants: its use is only a lower bound of its need."""
 UNSURE = 1.5
 """Need of a worker that always wants to run and never had enough: this many times its use."""
 SETTLE_S = 4.0
 """After a move, or a worker's start, the smoothed use rises for so long: it is only a lower bound of the need."""
+COMPARED_S = 12.0
+"""What differs so soon after a move is the machine's doing; what changes later is the task's."""
 
 
 CALM_WAIT_RATIO = 0.1
@@ -29,8 +32,6 @@ QUEUE_RATIO = 2.0
 """Until that was seen, a job's age counts as at most this many times its own time."""
 SHORT_RATIO = 0.9
 """A task that gets a smaller part of its forecast has a shortfall on that machine."""
-SAME_RATIO = 0.1
-"""A shortfall is remembered until others' use there changes by this share of the machine."""
 LEAST_FREE_CORES = 0.05
 """A job on a full machine gets at least this much, so that its time is finite."""
 
@@ -65,8 +66,14 @@ class _Shortfall(Struct, frozen=True):
     """The part of the forecast work that it got, at most 1."""
     stretch: float
     """How many times as long its jobs took, at least 1."""
-    others_cores: float
-    """Cores that others used there."""
+    company: Company
+
+
+class _Before(Struct, frozen=True):
+    """What another machine had shown of a task when it came; ``None``: nothing sure."""
+
+    work: float | None = None
+    job_work_s: float | None = None
 
 
 class _Known(Struct, frozen=True):
@@ -75,6 +82,12 @@ class _Known(Struct, frozen=True):
     work: float | None = None
     is_sure: bool = False
     """It was measured with enough CPU; otherwise the need may be larger."""
+    job_work_s: float | None = None
+    """CPU time of a job at speed 1, of all its threads."""
+    before: _Before | None = None
+    """``None``: it has not come from another machine."""
+    seen_at: NodeId | None = None
+    """Where these figures were seen last."""
     memory_mb: float | None = None
     job: JobNeed | None = None
     is_job_old: bool = False
@@ -92,6 +105,7 @@ class Demands:
     def __init__(self) -> None:
         self._known: dict[TaskId, _Known] = {}
         self._shortfalls: dict[tuple[TaskId, NodeId], _Shortfall] = {}
+        self._speeds = TaskSpeeds()
 
     def learn(
         self, task: TaskId, profile: Profile, now: float, fastest: float | None = None, fair_cores: float = 0.0
@@ -119,12 +133,14 @@ class Demands:
             self._known[task] = replace(known, owner=None)
         if load is None or load.state is not WorkerState.READY or profile.cpu_used_cores is None:
             return False
-        found = known if known.owner == profile.node else replace(known, owner=profile.node, since=now)
+        found = known if known.owner == profile.node else _came(known, profile.node, now)
         is_new = now - found.since < SETTLE_S
+        if not is_new and found.before is not None and now - found.since < COMPARED_S:
+            self._compare_jobs(task, profile, load, found.before)
         if load.memory_mb is not None:
             found = replace(found, memory_mb=max(load.memory_mb, (known.memory_mb or 0.0) if is_new else 0.0))
         if load.cpu_cores is not None:
-            speed = speed_of(profile)
+            speed = self._speeds.of(task, profile, is_there=True)
             use, most = load.cpu_cores * speed, (load.wanted_cores or 0.0) * speed
             told = _told(load, speed, max(fastest or speed, speed))
             least = max(use, known.work or 0.0)
@@ -138,7 +154,9 @@ class Demands:
                 found = replace(found, work=least, is_sure=is_held)
             else:
                 found = replace(found, work=use, is_sure=True)
-        found = _with_job(found, load, speed_of(profile), is_new=is_new)
+            if found.before is not None and now - found.since < COMPARED_S:
+                found = self._compared(task, profile, found, found.before, is_new=is_new)
+        found = _with_job(found, load, self._speeds.of(task, profile, is_there=True), is_new=is_new)
         self._known[task] = found
         is_seen = not is_new and self._note_shortfall(task, profile, load, found, fair_cores)
         return is_seen or (found.work, found.memory_mb, found.job) != (known.work, known.memory_mb, known.job)
@@ -146,6 +164,7 @@ class Demands:
     def forget(self, task: TaskId) -> None:
         """Know nothing of a task that is no more: one of the same name that comes later is another one (0043)."""
         self._known.pop(task, None)
+        self._speeds.forget(task)
         self._shortfalls = {key: seen for key, seen in self._shortfalls.items() if key[0] != task}
 
     def expect_another(self, task: TaskId) -> None:
@@ -162,15 +181,36 @@ class Demands:
         is_ready = load is not None and load.state is WorkerState.READY and load.renewal is Renewal.NONE
         return is_ready and known.is_changed and known.is_job_old
 
+    def _compare_jobs(self, task: TaskId, profile: Profile, load: WorkerLoad, before: _Before) -> None:
+        """What a job takes here and took where the task came from tells its speed, also of one that is short."""
+        jobs = load.jobs
+        if jobs is not None and jobs.cpu_s > 0.0 and before.job_work_s is not None:
+            self._speeds.note(task, profile, before.job_work_s / jobs.cpu_s)
+
+    def _compared(self, task: TaskId, profile: Profile, found: _Known, before: _Before, *, is_new: bool) -> _Known:
+        """The need that a task came with, if that was sure: one that is short here for more is slower here.
+
+        While its use still rises, or bursts at its start, what it came with counts. Where it lacks nothing its use may
+        have changed for many reasons, and no machine is judged by it.
+        """
+        if before.work is None or found.work is None or not (is_new or found.work > before.work):
+            return found
+        if not is_new and found.is_sure:
+            return found
+        if not is_new:
+            speed = self._speeds.of(task, profile, is_there=True)
+            self._speeds.note(task, profile, speed * before.work / found.work)
+        return replace(found, work=before.work, is_sure=True)
+
     def _note_shortfall(
         self, task: TaskId, profile: Profile, load: WorkerLoad, found: _Known, fair_cores: float
     ) -> bool:
         """Remember that the task gets less on a machine than forecast, or no longer does; whether that has changed."""
-        jobs, job, used = load.jobs, found.job, profile.cpu_used_cores
-        if jobs is None or job is None or used is None or load.cpu_cores is None or not found.work:
+        jobs, job, company = load.jobs, found.job, Company.of(task, profile)
+        if jobs is None or job is None or company is None or load.cpu_cores is None or not found.work:
             return False
-        speed, others = speed_of(profile), _others_cores(task, profile, used)
-        need, free = found.work / speed, profile.cpu_cores - others
+        speed = self._speeds.of(task, profile, is_there=True)
+        need, free = found.work / speed, profile.cpu_cores - company.others_cores
         most = job.most_cores(speed)
         foreseen = min(free / need, 1.0 if most is None else most / need, 1.0)
         is_lacking = foreseen > 0.0 and _is_told(load) and is_short(load)
@@ -180,7 +220,7 @@ class Demands:
         before = self._shortfalls.pop((task, profile.node), None)
         if share >= SHORT_RATIO and stretch <= 1.0 / SHORT_RATIO:
             return before is not None
-        self._shortfalls[task, profile.node] = _Shortfall(share, stretch, others)
+        self._shortfalls[task, profile.node] = _Shortfall(share, stretch, company)
         return before != self._shortfalls[task, profile.node]
 
     def job(self, task: TaskId) -> JobNeed | None:
@@ -193,28 +233,29 @@ class Demands:
         This counts while others use about as much there, whoever owns the task now. The owner's term is measured, so a
         machine must not look better as soon as the task has left.
         """
-        seen, used = self._shortfalls.get((task, profile.node)), profile.cpu_used_cores
-        if seen is None or used is None:
-            return 1.0, 1.0
-        is_same = abs(_others_cores(task, profile, used) - seen.others_cores) <= SAME_RATIO * profile.cpu_cores
-        return (seen.share, seen.stretch) if is_same else (1.0, 1.0)
+        seen = self._shortfalls.get((task, profile.node))
+        return (seen.share, seen.stretch) if seen and seen.company.is_still(task, profile) else (1.0, 1.0)
+
+    def speed(self, task: TaskId, profile: Profile) -> float:
+        """The task's speed on a node, > 0: the benchmark's, or what was seen when the task came there."""
+        is_there = self._known.get(task, _Known()).owner == profile.node
+        return self._speeds.of(task, profile, is_there=is_there)
 
     def at(self, spec: TaskSpec, profile: Profile) -> Demand:
         """The task's demand on a node: the larger of the fleet file's figure and the learnt one."""
         known = self._known.get(spec.name, _Known())
         return Demand(
-            cpu_cores=max(spec.demand.cpu_cores, (known.work or 0.0) / speed_of(profile)),
+            cpu_cores=max(spec.demand.cpu_cores, (known.work or 0.0) / self.speed(spec.name, profile)),
             memory_mb=max(spec.demand.memory_mb, known.memory_mb or 0.0),
         )
 
 
-def _others_cores(task: TaskId, profile: Profile, used_cores: float) -> float:
-    return max(used_cores - profile.cores_of(task), 0.0)
-
-
-def is_full(profile: Profile) -> bool:
-    """Whether so little CPU is free that a task's use tells no more what it needs."""
-    return profile.cpu_used_cores is not None and profile.cpu_used_cores / profile.cpu_cores >= STARVED_CPU_RATIO
+def _came(known: _Known, node: NodeId, now: float) -> _Known:
+    """It begins to be seen on a node: another one than before, or the same one, where its worker has started again."""
+    before = None
+    if known.seen_at not in (None, node):
+        before = _Before(known.work if known.is_sure else None, known.job_work_s)
+    return replace(known, owner=node, since=now, before=before, seen_at=node)
 
 
 def is_short(load: WorkerLoad) -> bool:
@@ -264,10 +305,11 @@ def _with_job(known: _Known, load: WorkerLoad, speed: float, *, is_new: bool) ->
     """
     is_old = load.renewal is not Renewal.NONE
     if load.jobs is not None:
-        return replace(known, job=_job(load.jobs, speed, known.job), is_job_old=is_old)
+        job = _job(load.jobs, speed, known.job)
+        return replace(known, job=job, job_work_s=load.jobs.cpu_s * speed, is_job_old=is_old)
     if is_old:
         return replace(known, is_job_old=True)
-    return replace(known, job=None, is_job_old=False) if known.is_job_old and not is_new else known
+    return replace(known, job=None, job_work_s=None, is_job_old=False) if known.is_job_old and not is_new else known
 
 
 def _job(jobs: Jobs, speed: float, known: JobNeed | None) -> JobNeed:
@@ -278,8 +320,3 @@ def _job(jobs: Jobs, speed: float, known: JobNeed | None) -> JobNeed:
         queue_ratio = seen if is_calm else min(seen, queue_ratio)
     work_s = jobs.cpu_s if is_serial else min(jobs.cpu_s, jobs.time_s)
     return JobNeed(work_s=work_s * speed, other_s=_other_s(jobs), queue_ratio=queue_ratio, is_serial=is_serial)
-
-
-def speed_of(profile: Profile) -> float:
-    """Speed of the node's cores; 1 where nobody has measured it."""
-    return 1.0 if profile.speed is None else profile.speed

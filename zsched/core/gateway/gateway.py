@@ -84,8 +84,8 @@ class Gateway:
             return
         spec = self._tasks.get(task)
         candidates = () if spec is None else spec.candidates
-        speeds = [known[0].speed for name in candidates if (known := self._profiles.get(name)) is not None]
-        fastest = max((speed for speed in speeds if speed is not None), default=None)
+        known = [self._profiles[name][0] for name in candidates if name in self._profiles]
+        fastest = max((self.demands.speed(task, one) for one in known), default=None)
         if self.demands.is_replaced(task, profile):
             self.forget(task)
         has_share = self._shares.learn(task, profile)

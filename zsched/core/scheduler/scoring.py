@@ -12,7 +12,8 @@ import statistics
 from collections.abc import Iterable, Mapping
 from collections.abc import Set as AbstractSet
 
-from zsched.core.gateway.demand import Demands, is_full, is_short, speed_of
+from zsched.core.gateway.company import is_full
+from zsched.core.gateway.demand import Demands, is_short
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.gateway.sharing import fair_share
 from zsched.core.scheduler.links import pair_link
@@ -362,7 +363,7 @@ def _cpu(
     share, stretch = demands.experience(spec.name, profile)
     if job is None:
         return service_utility(free, demand.cpu_cores, profile.cpu_cores, least=least_cores, share=share)
-    speed = speed_of(profile)
+    speed = demands.speed(spec.name, profile)
     if tuning.deadline_ms is not None:
         share *= on_time(stretch * job.age_s(speed, max(free, fair_cores)) + network_s, tuning.deadline_ms / 1e3)
     most = job.most_cores(speed)
