@@ -81,7 +81,8 @@ class KeyState(Struct):
         source = self.sources.get(publisher)
         if self.sources and source is None and now - self.heard_at < QUIET_S:
             return False
-        count = number_near(serial_of(marker.count), self.last_number + 1)
+        serial = serial_of(marker.count)
+        count = number_near(serial, self.last_number + 1) if source is None else source.number(serial)
         if source is not None and count < source.proven:
             return False
         if self.end is None or (self.end.count, self.end_of) != (count, publisher):
@@ -100,14 +101,24 @@ class KeyState(Struct):
         """True when everything up to the end marker has come, or will not come any more."""
         if self.end is None:
             return False
-        is_known = self.end_of in self.sources or not self.sources or not self.end.count
-        has_come = self.received >= self.end.count or self.last_number + 1 >= self.end.count
-        if not self.sources and answers is not None and self.ender is not None:  # it was forgotten
-            has_come |= answers.has_come(self.ender, self.end.count)
-        is_complete = is_known and has_come
+        is_complete = self._is_complete(self.end, answers)
         if is_complete or now - self.end_at <= END_GRACE_S:
             return is_complete
         return answers is None or self.ender is None or not answers.ask_for(self.ender, self.end.count)
+
+    def _is_complete(self, end: EndMarker, answers: Answers | None) -> bool:
+        """Whether everything before the end has come, of the publisher whose end it is: others say nothing of that."""
+        if (source := self._ending) is not None:
+            return source.arrived >= end.count
+        if self.sources:
+            return not end.count
+        is_forgotten = answers is not None and self.ender is not None and answers.has_come(self.ender, end.count)
+        return is_forgotten or self.received >= end.count or self.last_number + 1 >= end.count
+
+    @property
+    def _ending(self) -> Source | None:
+        """The numbers of the publisher whose end it is."""
+        return None if self.end_of is None else self.sources.get(self.end_of)
 
     def missing(self, answers: Answers | None) -> int:
         """How many samples behind the last one that passed have not come, as far as anybody has said that they are."""
@@ -115,9 +126,11 @@ class KeyState(Struct):
         if answers is not None and (ends or self.end is None):
             passed = {(self.name, *publisher): source.arrived for publisher, source in self.sources.items()}
             return answers.missing(self.name, passed, ends)
-        if self.end is None or self.last_number < 0:
+        source = self._ending
+        newest = self.last_number if source is None else source.arrived - 1
+        if self.end is None or newest < 0:
             return 0
-        return max(0, self.end.count - self.last_number - 1)
+        return max(0, self.end.count - newest - 1)
 
 
 class Feed(Struct, eq=False):
