@@ -29,6 +29,10 @@ from zsched.relay.streams.counter import StreamCounter
 MAX_WAITING: Final = 4096
 MAX_WAITING_BYTES: Final = 32 << 20
 """Early answers of one publisher that wait; further ones are dropped here, and come again."""
+MAX_EARLY: Final = 4096
+"""Publishers of which answers wait..."""
+MAX_EARLY_BYTES: Final = 2 * MAX_WAITING_BYTES
+"""...and what they may weigh together: anybody can put under a name of his own what is early for ever."""
 
 
 class _Resent(Struct, frozen=True):
@@ -45,7 +49,14 @@ class _Resent(Struct, frozen=True):
     kind: SampleKind
 
 
+class _Total(Struct, eq=False):
+    """What waits of all publishers, in bytes."""
+
+    size: int = 0
+
+
 class _Early(Struct):
+    total: _Total
     samples: dict[int, Sample] = field(default_factory=dict)
     size: int = 0
 
@@ -53,14 +64,19 @@ class _Early(Struct):
         """Let a sample wait; ``False`` when there is no room."""
         if number not in self.samples:
             self.samples[number] = sample
-            self.size += len(sample.payload)
-        return len(self.samples) <= MAX_WAITING and self.size <= MAX_WAITING_BYTES
+            self._weigh(len(sample.payload))
+        has_room = len(self.samples) <= MAX_WAITING and self.size <= MAX_WAITING_BYTES
+        return has_room and self.total.size <= MAX_EARLY_BYTES
 
     def pop(self, number: int) -> Sample | None:
         """Take one out, if it is there."""
         sample = self.samples.pop(number, None)
-        self.size -= len(sample.payload) if sample is not None else 0
+        self._weigh(-len(sample.payload) if sample is not None else 0)
         return sample
+
+    def _weigh(self, size: int) -> None:
+        self.size += size
+        self.total.size += size
 
     def forget(self, number: int) -> None:
         """Let go of everything below a number."""
@@ -89,14 +105,17 @@ class Answers:
         self._is_from_start = is_from_start
         self._in_turn = in_turn
         self._early: dict[SourceName, _Early] = {}
+        """Of whom something waits: never empty."""
+        self._total = _Total()
         self._names: dict[str, set[SourceName]] = {}
-        """{key: whose samples of it are known}."""
+        """{key: whose samples of it are known}..."""
+        self._known: dict[SourceName, None] = {}
+        """...and all of them, the oldest first."""
         self._starts = dict(heard)
         self._forgotten: OrderedDict[SourceName, int] = OrderedDict()
         """{source: the number it comes to next}, the oldest first."""
-        for name in heard:
-            self._names.setdefault(name[0], set()).add(name)
         for name, number in heard.items():
+            self._know(name)
             acks.expect(name, number)
             acks.skip(name, number)  # it says that we are back
 
@@ -111,7 +130,7 @@ class Answers:
         if number < expected:
             if self._acks.admit(name, serial_of(number), in_turn=True) is not None:  # a jump is taken back
                 self._acks.processed(name, number, len(sample.payload))
-                self._early.pop(name, None)
+                self._drop_early(name)
                 return (sample,)
             # else it is dropped, and acknowledged once more
             if not is_again and self._in_turn:
@@ -165,13 +184,11 @@ class Answers:
 
         ``passed``: behind the last one of each that went on; ``ends``: behind the last one of all, where that is known.
         """
-        total = 0
-        for name in self._names.get(key, ()):
-            start = self._start_of(name)
-            if start is not None:
-                until = max(ends.get(name, 0), self._acks.arrived(name))
-                total += max(0, until - max(start, passed.get(name, 0)))
-        return total
+        return sum(self._missing_of(one, passed.get(one, 0), ends.get(one, 0)) for one in self._names.get(key, ()))
+
+    def _missing_of(self, name: SourceName, passed: int, end: int) -> int:
+        start = self._start_of(name)
+        return 0 if start is None else max(0, max(end, self._acks.arrived(name)) - max(start, passed))
 
     def first_of(self, name: SourceName) -> int | None:
         """The first number that counts as lost when it does not come; ``None``: the first one that comes."""
@@ -189,23 +206,44 @@ class Answers:
         """Whether something of a key came early and waits."""
         return any(name in self._early for name in self._names.get(key, ()))
 
+    def has_early(self, name: SourceName) -> bool:
+        """Whether something of a source came early and waits."""
+        return name in self._early
+
     def forget(self, key: str) -> None:
         """Keep of a key only how far its sources are: should it come again, what was before is not lost."""
-        for name in self._names.pop(key, ()):
-            self._forgotten[name] = self._acks.arrived(name)
-            self._starts.pop(name, None)
-        while len(self._forgotten) > MAX_SOURCES:
+        for name in tuple(self._names.get(key, ())):
+            self._forget(name)
+
+    def leave(self, name: SourceName, passed: int) -> int:
+        """Forget one source likewise; answers how many numbers of it have not gone on (``passed``: as `missing`)."""
+        missing = self._missing_of(name, passed, 0) if name in self._known else 0
+        self._forget(name)
+        return missing
+
+    def _forget(self, name: SourceName) -> None:
+        if name not in self._known:
+            return
+        del self._known[name]
+        names = self._names[name[0]]
+        names.discard(name)
+        if not names:
+            del self._names[name[0]]
+        self._forgotten[name] = self._acks.arrived(name)
+        self._starts.pop(name, None)
+        if len(self._forgotten) > MAX_SOURCES:
             self._forgotten.popitem(last=False)
 
     def _know(self, name: SourceName) -> None:
         """Something came of a source."""
-        names = self._names.get(name[0])
-        if names is None:
-            names = self._names[name[0]] = set()
-        if name not in names:
-            names.add(name)
-            if (number := self._forgotten.pop(name, None)) is not None:
-                self._starts[name] = number
+        if name in self._known:
+            return
+        self._known[name] = None
+        self._names.setdefault(name[0], set()).add(name)
+        if (number := self._forgotten.pop(name, None)) is not None:
+            self._starts[name] = number
+        if len(self._known) > MAX_SOURCES:
+            self._forget(next(iter(self._known)))
 
     def overdue(self) -> Iterator[tuple[SourceName, Sample]]:
         """What goes on now because the missing ones before it never came."""
@@ -216,10 +254,10 @@ class Answers:
 
     def close(self) -> dict[SourceName, int]:
         """The slot is closed: its workers hear once more how far it came; answers the number each comes to next."""
-        known = [name for names in self._names.values() for name in names]
-        heard = {**self._forgotten, **{name: self._acks.arrived(name) for name in known}}
+        heard = {**self._forgotten, **{name: self._acks.arrived(name) for name in self._known}}
         self._acks.leave(heard)
         self._names.clear()
+        self._known.clear()
         self._forgotten.clear()
         self._early.clear()
         return heard
@@ -231,11 +269,14 @@ class Answers:
             self._acks.skip(name, number)
             self._acks.take(name, number, len(sample.payload))
             return (sample,)
-        early = self._early.setdefault(name, _Early())
+        early = self._early.get(name)
         is_far = number - self._acks.arrived(name) > MAX_WAITING  # more than is ever sent again: it need not wait
-        if is_far or not early.put(number, sample):
+        if early is None and not is_far and len(self._early) < MAX_EARLY:
+            early = self._early[name] = _Early(self._total)
+        if early is not None and (is_far or not early.put(number, sample)):
             early.pop(number)
-        first = min(early.samples, default=number)
+            self._end_wait(name, early)
+        first = number if early is None else min(early.samples, default=number)
         if self._acks.ask_for(name, first) > GIVE_UP_S:
             return self._skip(name, first)
         return ()
@@ -260,6 +301,14 @@ class Answers:
             early.forget(self._acks.arrived(name))
         return self._next_ones(name)
 
+    def _end_wait(self, name: SourceName, early: _Early) -> None:
+        if not early.samples:
+            self._early.pop(name, None)
+
+    def _drop_early(self, name: SourceName) -> None:
+        early = self._early.pop(name, None)
+        self._total.size -= 0 if early is None else early.size
+
     def _next_ones(self, name: SourceName) -> tuple[Sample, ...]:
         """What has waited for the number that has just come."""
         early = self._early.get(name)
@@ -273,6 +322,5 @@ class Answers:
             number += 1
         if early.samples:
             self._acks.ask_for(name, min(early.samples))
-        else:
-            del self._early[name]
+        self._end_wait(name, early)
         return tuple(ready)

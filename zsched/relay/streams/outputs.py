@@ -338,7 +338,7 @@ class OutputStream:
             return feed
         feed.slot = heirs[0]
         heirs[0].feed = feed
-        heirs[0].keys = slot.keys
+        heirs[0].keys, heirs[0].publishers = slot.keys, slot.publishers
         heirs[0].lost += slot.take_lost()
         heirs[0].answers, slot.answers = slot.answers, heirs[0].answers
         for key in heirs[0].keys.values():
@@ -452,6 +452,7 @@ class OutputStream:
         key.heard_at = monotonic_s()
         if number != UNNUMBERED and publisher not in key.sources:
             note_feeder(publisher[0])
+            slot.note_publisher()
         if number == UNNUMBERED or key.take(publisher, number, slot.answers, self._counter):
             if key.end is not None and key.is_past_end(publisher):
                 self._reopen(slot, key)

@@ -3,7 +3,8 @@
 Knows: end markers, how long what is missing before one may take. Does not know: gates, who feeds a slot.
 
 Anybody can put an end marker. One that says less than its publisher has put is none, nor is one of a publisher that is
-not heard while another one is; and one ends nothing any more when something comes from behind it.
+not heard while another one is; and one ends nothing any more when something comes from behind it. And anybody can put
+samples, under any key and as any publisher: of both so many are known, and what has rested longest gives way.
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ from typing import Final
 
 from zenoh import Sample
 
-from zsched.core.hop.receiver import Source, SourceName
+from zsched.clock import monotonic_s
+from zsched.core.hop.receiver import GIVE_UP_S, MAX_SOURCES, Source, SourceName
 from zsched.core.hop.serial import number_near, serial_of
 from zsched.core.relay_protocol import EndMarker
 from zsched.core.route import keyexpr
@@ -26,10 +28,20 @@ END_GRACE_S: Final = 0.1
 """A marker travels behind its data on one link; what is still missing this long after it was dropped on the way."""
 MAX_KEYS: Final = 4096
 """Concrete keys of a slot that are known: they may change over the weeks."""
+MAX_ENDED: Final = 4096
+"""...and so many more that have an end, or wait for something."""
+MAX_PUBLISHERS: Final = MAX_SOURCES
+"""Publishers of a slot that are known, over all its keys: a worker that is restarted in place is another one."""
 FORGET_SHARE: Final = 16
 """This share of them is forgotten at a time: all are looked at for it."""
 QUIET_S: Final = 1.0
 """A worker that has put nothing here (it was restarted) may end others' slots when nothing has come for this long."""
+
+
+class Numbers(Source):
+    """One publisher of a key."""
+
+    heard_at: float = 0.0
 
 
 class KeyState(Struct):
@@ -45,7 +57,7 @@ class KeyState(Struct):
     ender: SourceName | None = None
     """The publisher whose end it is, where it keeps what we have not acknowledged."""
     last_number: int = -1
-    sources: dict[tuple[str, int], Source] = field(default_factory=dict)
+    sources: dict[tuple[str, int], Numbers] = field(default_factory=dict)
     """{publisher: its numbers, as they passed here}; a worker that restarted in place is another publisher."""
 
     def take(self, publisher: tuple[str, int], serial: int, answers: Answers | None, counter: StreamCounter) -> bool:
@@ -55,11 +67,14 @@ class KeyState(Struct):
         """
         source = self.sources.get(publisher)
         if source is not None and source.take(serial):  # the usual case
+            source.heard_at = self.heard_at
             self.last_number = source.arrived - 1
             return True
         if source is None:
             first = None if answers is None else answers.first_of((self.name, *publisher))
-            source = self.sources[publisher] = Source.at(serial if first is None else first)
+            at = serial if first is None else first
+            source = self.sources[publisher] = Numbers(first=at, arrived=at, processed=at)
+        source.heard_at = self.heard_at
         return self._admit(source, source.number(serial), counter, in_order=answers is not None)
 
     def _admit(self, source: Source, number: int, counter: StreamCounter, *, in_order: bool) -> bool:
@@ -115,6 +130,17 @@ class KeyState(Struct):
         is_forgotten = answers is not None and self.ender is not None and answers.has_come(self.ender, end.count)
         return is_forgotten or self.received >= end.count or self.last_number + 1 >= end.count
 
+    def is_over(self, now: float) -> bool:
+        """Whether an end marker came, and what was before it has come or was waited for."""
+        return self.end is not None and (
+            self._is_complete(self.end, None) or now - self.end_at > END_GRACE_S + GIVE_UP_S
+        )
+
+    def forget(self, publisher: tuple[str, int], answers: Answers | None) -> int:
+        """Forget a publisher; answers how many of its samples have not come, for nobody else counts them."""
+        source = self.sources.pop(publisher)
+        return 0 if answers is None else answers.leave((self.name, *publisher), source.arrived)
+
     @property
     def _ending(self) -> Source | None:
         """The numbers of the publisher whose end it is."""
@@ -163,7 +189,11 @@ class OutputSlot(Struct, eq=False):
     is_flipped: bool = False
     is_closed: bool = False
     lost: int = 0
-    """Missing of keys that are forgotten, and not counted yet."""
+    """Missing of keys and publishers that are forgotten, and not counted yet."""
+    publishers: int = 0
+    """Publishers that are known, of all keys."""
+    crowded_at: int = 0
+    """With so many keys some are forgotten again, if they can be."""
 
     def missing(self) -> int:
         """How many samples its owner has put out that did not come (as far as it has said how many there are)."""
@@ -173,30 +203,60 @@ class OutputSlot(Struct, eq=False):
         """What has come on a concrete key; ``None`` when it is none of this slot's."""
         state = self.keys.get(name)
         if state is None and keyexpr.intersects(self.expr, name):
-            if len(self.keys) >= MAX_KEYS:
+            if len(self.keys) >= max(MAX_KEYS, self.crowded_at):
                 self._make_room()
             state = self.keys[name] = KeyState(name=name)
         return state
 
+    def note_publisher(self) -> None:
+        """One more comes to be known."""
+        if self.publishers >= MAX_PUBLISHERS:
+            self._forget_publishers()
+        self.publishers += 1
+
     def _make_room(self) -> None:
         """Forget the keys that have rested longest; what is missing of them is said to be, for nobody else counts it.
 
-        Not those of which something waits, or has yet to come before an end marker.
+        Not those of which something waits, or has yet to come before an end marker, unless there are very many.
         """
-        answers = self.answers
+        answers, share = self.answers, max(1, MAX_KEYS // FORGET_SHARE)
         at_rest = [
             key
             for key in self.keys.values()
             if key.end is None and (answers is None or not answers.is_waiting(key.name))
         ]
         at_rest.sort(key=lambda key: key.heard_at)
-        for key in at_rest[: max(1, MAX_KEYS // FORGET_SHARE)]:
-            self.lost += key.missing(answers)
-            if answers is not None:
-                answers.forget(key.name)
-            del self.keys[key.name]
+        for key in at_rest[:share]:
+            self._forget(key)
+        if len(self.keys) >= MAX_KEYS + MAX_ENDED:
+            now = monotonic_s()
+            for key in sorted(self.keys.values(), key=lambda key: (not key.is_over(now), key.heard_at))[:share]:
+                self._forget(key)
+        self.crowded_at = len(self.keys) + share
+
+    def _forget(self, key: KeyState) -> None:
+        self.lost += key.missing(self.answers)
+        if self.answers is not None:
+            self.answers.forget(key.name)
+        self.publishers -= len(key.sources)
+        del self.keys[key.name]
+
+    def _forget_publishers(self) -> None:
+        """Forget those that have rested longest, as keys are forgotten; not the one whose end a key has."""
+        answers = self.answers
+        known = [
+            (source.heard_at, key.name, publisher)
+            for key in self.keys.values()
+            for publisher, source in key.sources.items()
+            if publisher != key.end_of and (answers is None or not answers.has_early((key.name, *publisher)))
+        ]
+        known.sort()
+        leaving = known[: max(1, MAX_PUBLISHERS // FORGET_SHARE)]
+        for _, name, publisher in leaving:
+            self.lost += self.keys[name].forget(publisher, answers)
+        self.publishers -= len(leaving)
 
     def take_lost(self) -> int:
-        """What was missing of keys that were forgotten since the last time."""
+        """What was missing of keys and publishers that were forgotten since the last time."""
         lost, self.lost = self.lost, 0
         return lost
