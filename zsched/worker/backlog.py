@@ -34,6 +34,10 @@ MAX_BACKLOG: Final = 4096
 MAX_BACKLOG_BYTES: Final = 32 << 20
 """Of such an input, whose output was withheld, that are kept for the day this worker becomes the owner; older ones are
 lost, and said to be."""
+MAX_KEYS: Final = 8192
+"""Keys of which something is kept: a wildcard input hears any number of them, of strangers too..."""
+ROOM_SHARE: Final = 16
+"""...and this share of them gives way at a time: first those of which everything has its result, the oldest first."""
 STALE_S: Final = 2.5
 """What was withheld for this long before a newer epoch begins is given up; until then the robot may still be at
 its slot (as `zsched.worker.epochs.CARRY_S`)."""
@@ -81,6 +85,12 @@ class Done(NamedTuple, Generic[SourceT]):
         """True when it need not be processed again."""
         return self.quiet_at is not None and not (is_restored and now - self.quiet_at < QUIET_S)
 
+    @property
+    def is_lost(self) -> bool:
+        """Whether it is, when it gives way now, and has to be told of."""
+        is_wanted = self.quiet_at is None and self.source.wants(is_whole=self.is_whole)
+        return is_wanted and self.name is not None
+
     def is_open(self, name: SourceName) -> bool:
         """Whether it is this publisher's, and what it was answered was withheld."""
         return self.name == name and self.quiet_at is None
@@ -95,6 +105,7 @@ class StandbyInputs(Generic[SourceT]):
 
     def __init__(self) -> None:
         self._kept: dict[tuple[int, str], deque[Done[SourceT]]] = {}
+        """{input and key: what is kept of it, never nothing}, the key that was heard last at the end."""
         self._bytes = 0
         self._again: deque[Done[SourceT]] = deque()
 
@@ -115,18 +126,27 @@ class StandbyInputs(Generic[SourceT]):
     def keep(self, done: Done[SourceT]) -> list[Done[SourceT]]:
         """Keep a sample; answers those that gave way to it unanswered, and are lost."""
         source = done.source
-        line = self._kept.setdefault((id(source), str(done.sample.key_expr)), deque())
+        name = id(source), str(done.sample.key_expr)
+        line = self._kept.pop(name, deque())
+        self._kept[name] = line
         line.append(done)
         self._bytes += len(done.sample.payload)
         limit = source.newest(is_whole=done.is_whole) or (MAX_BACKLOG if done.quiet_at is None else MAX_WITHHELD)
-        lost = []
+        given_up = []
         while len(line) > limit or (self._bytes > MAX_BACKLOG_BYTES and len(line) > 1):
-            oldest = line.popleft()
-            self._bytes -= len(oldest.sample.payload)
-            is_lost = oldest.quiet_at is None and source.wants(is_whole=oldest.is_whole)
-            if is_lost and oldest.name is not None:
-                lost.append(oldest)
-        return lost
+            given_up.append(line.popleft())
+            self._bytes -= len(given_up[-1].sample.payload)
+        if len(self._kept) > MAX_KEYS:
+            given_up += self._make_room(name)
+        return [one for one in given_up if one.is_lost]
+
+    def _make_room(self, newest: tuple[int, str]) -> list[Done[SourceT]]:
+        """Let go of keys; answers what was kept of them."""
+        others = [name for name in self._kept if name != newest]
+        others.sort(key=lambda name: any(done.quiet_at is None for done in self._kept[name]))
+        gone = [done for name in others[: max(1, MAX_KEYS // ROOM_SHARE)] for done in self._kept.pop(name)]
+        self._bytes -= sum(len(done.sample.payload) for done in gone)
+        return gone
 
     def stale(self, epoch: int, now: float) -> set[SourceName]:
         """The publishers of what is too old to be done in ``epoch``."""
@@ -138,7 +158,11 @@ class StandbyInputs(Generic[SourceT]):
         before = len(self._again) + sum(len(line) for line in self._kept.values())
         self._again = deque(done for done in self._again if not done.is_open(name))
         for key, line in tuple(self._kept.items()):
-            self._kept[key] = left = deque(done for done in line if not done.is_open(name))
+            left = deque(done for done in line if not done.is_open(name))
+            if left:
+                self._kept[key] = left
+            else:
+                del self._kept[key]
             self._bytes -= sum(len(done.sample.payload) for done in line) - sum(len(one.sample.payload) for one in left)
         return before - len(self._again) - sum(len(line) for line in self._kept.values())
 

@@ -153,3 +153,18 @@ def test_what_is_forgotten_makes_room(monkeypatch: pytest.MonkeyPatch) -> None:
         backlog.keep(done(turn, "a"))
     backlog.forget(("a", "zid", 1))
     assert [backlog.keep(done(turn, "b")) for turn in (3, 4)] == [[], []]
+
+
+def test_keys_that_come_and_go_are_not_kept_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of each key the newest was, until the worker became the owner: a standby's memory grew with every key."""
+    monkeypatch.setattr(worker_backlog, "MAX_KEYS", 4)
+    backlog, newest = StandbyInputs[Input](), Input(on_sample=lambda _: None)
+    backlog.keep(done(0, "map", source=newest))
+    for turn in range(1, 100):
+        assert backlog.keep(done(turn, f"key/{turn}", quiet_at=0.0, source=newest)) == []
+    assert len(backlog._kept) == 4
+    lost = [backlog.keep(done(turn, str(turn))._replace(is_whole=True)) for turn in range(100, 103)]
+    assert lost == [[], [], []], "what has its result gives way first"
+    assert backlog.keep(done(103, "103")._replace(is_whole=True)) == [], "of the map nobody is told"
+    (gone,) = backlog.keep(done(104, "104"))
+    assert (gone.turn, backlog._bytes) == (100, 4), "it has no answer, and is lost"
