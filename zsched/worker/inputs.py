@@ -38,6 +38,10 @@ JOIN_S: Final = 0.2
 NAME_S: Final = 0.2
 """The first sample of a source waits this long for the marker that names its slot. That was put before it, but comes in
 another thread of zenoh's."""
+NAME_SHARE: Final = 0.1
+"""Sources that name none, which anybody can be, cost no more than this share of the time..."""
+NAME_BURST: Final = 5
+"""...but for so many at once."""
 MAX_DEAD: Final = 1024
 """So many samples that gave way keep their place in the queue; when more than half are such, they are taken out."""
 
@@ -78,6 +82,9 @@ class Dispatcher:
         self._asked: set[int] = set()
         """Epochs whose end is to be told again if they are over."""
         self._open: dict[SourceName, OpenSource] = {}
+        """What has not ended, the one that was heard last at the end."""
+        self._waits_at = 0.0
+        """All waits for sources that have not named their slot are made up for then."""
         self._slots: dict[SourceName, int] = {}
         """The epochs of sources that have named theirs, the oldest first."""
         self._given_up: dict[SourceName, tuple[float, int]] = {}
@@ -454,15 +461,25 @@ class Dispatcher:
     def _hear(self, name: SourceName, sample: zenoh.Sample) -> int:
         """The epoch that a source belongs to: the one that it has named, else the one in which it is first heard."""
         with self._wake:
-            state = self._open.get(name)
+            state = self._open.pop(name, None)
             if state is None:
                 in_turn = sample.congestion_control == zenoh.CongestionControl.BLOCK
                 if in_turn and self._epoch:  # a standby's answers are withheld, whatever the epoch
-                    self._wake.wait_for(lambda: name in self._slots or self._is_closed, NAME_S)
+                    self._await_name(name)
                 state = OpenSource(epoch=self._slots.get(name) or self._epoch, in_turn=in_turn)
-                if name not in self._given_up:
-                    self._open[name] = state
+            if name not in self._given_up:
+                self._open[name] = state
+                if len(self._open) > MAX_SOURCES:  # a stranger's, or one that has not said a word for long
+                    self._open.pop(next(iter(self._open)))
             return state.epoch
+
+    def _await_name(self, name: SourceName) -> None:
+        """Wait for the marker that names a source's slot (under the lock)."""
+        pause_s = NAME_S / NAME_SHARE
+        if monotonic_s() < self._waits_at - NAME_BURST * pause_s:
+            return
+        if not self._wake.wait_for(lambda: name in self._slots or self._is_closed, NAME_S):
+            self._waits_at = max(self._waits_at, monotonic_s()) + pause_s
 
     def _note(self, waiting: Waiting, name: SourceName, sample: zenoh.Sample) -> Held | None:
         """A numbered sample is processed; where it must not be lost, when its answers have reached the robots.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import cast
@@ -162,3 +163,29 @@ def test_an_epoch_is_over_when_what_nobody_ends_any_more_is_processed(bench: Ben
     bench.gate.set()
     until(lambda: bench.ended, "nobody is there who would end it")
     assert len(bench.taken) == 3
+
+
+def test_sources_that_never_end_are_not_known_for_ever(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Anybody can put as any publisher, and an owner may work in one epoch for months."""
+    monkeypatch.setattr(worker_inputs, "MAX_SOURCES", 20)
+    source = bench.input(keep_last=None)
+    bench.dispatcher.start()
+    for number in range(50):
+        bench.put(source, f"key/{number}", "x", 0)
+        bench.put(source, "relay", "x", number)
+    until(lambda: len(bench.taken) == 100, "all of them")
+    assert len(bench.dispatcher._open) == 20
+    assert ("relay", "a1", 7) in bench.dispatcher._open
+    assert not bench.dispatcher.has_ended(0)
+
+
+def test_sources_that_name_no_slot_hold_up_nobody_for_long(bench: Bench) -> None:
+    """Each first sample of one was waited for, in the thread of all callbacks: five frames a second stopped it."""
+    source = bench.input(keep_last=None)
+    bench.dispatcher.begin(3)
+    bench.dispatcher.start()
+    began = time.monotonic()
+    for number in range(30):
+        bench.put(source, f"key/{number}", "x", 0)
+    until(lambda: len(bench.taken) == 30, "all of them")
+    assert time.monotonic() - began < 3.0, "30 times 0.2 s"
