@@ -105,8 +105,9 @@ class GraphMirror:
             if self._thread is None and all(route.settings.graph is RosGraph.NONE for route in routes):
                 return
             if self._thread is None:
-                self._thread = guarded(self._run, name="ros graph")
-                self._thread.start()
+                thread = guarded(self._run, name="ros graph")
+                thread.start()
+                self._thread = thread
         self._queue.put((task, routes))
 
     # --- the thread --------------------------------------------------------------------------------------------------

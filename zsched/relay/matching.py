@@ -78,8 +78,9 @@ class Matching:
         """Watch a task's worker from now on; asked again, say again what is seen."""
         with self._lock:
             if self._thread is None:
-                self._thread = guarded(self._run, name="matching")
-                self._thread.start()
+                thread = guarded(self._run, name="matching")
+                thread.start()
+                self._thread = thread
         self._queue.put(watch)
 
     def forget(self, task: TaskId) -> None:

@@ -623,7 +623,10 @@ class TaskRelay:
         self._report(SlotFlipped(task=self._task, epoch=epoch, replayed=replayed))
         if olds:  # a stalled old owner may hold these up for a lease: not in this thread
             epochs = [old.slot.epoch for old in olds]
-            guarded(self._send_ends, epochs, name="ends", is_lasting=False).start()
+            try:
+                guarded(self._send_ends, epochs, name="ends", is_lasting=False).start()
+            except RuntimeError:  # no thread is to be had: without their ends nobody would know when they are done
+                self._send_ends(epochs)
 
     def _has_answer(self, stamp: Timestamp) -> bool:
         """Whether the one input with this timestamp has an answer that has passed, on every output that counts.

@@ -223,7 +223,10 @@ class JobBook:
         self._is_asleep = False
         self._wake.set()
         if is_first and not self._closed.is_set():
-            guarded(self._run, name="zsched jobs").start()
+            try:
+                guarded(self._run, name="zsched jobs").start()
+            except RuntimeError:  # no thread is to be had: the next job tries again
+                self._has_thread = False
 
     def _run(self) -> None:
         """Tell, every `TELL_S` while there is work, and once behind it; then sleep until there is some."""

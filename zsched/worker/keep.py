@@ -271,13 +271,19 @@ class Keeper:
         state = SharedSender(limit=max(1, limit), is_whole=is_whole)
         lane = KeptLane(key=key, source_id=source_id, wake=self._wake, state=state)
         with self._lock:
-            self._lanes[source_id.eid] = lane
             if self._subscriber is None:
-                self._subscriber = self._session.declare_subscriber(
-                    self._acks_key, tolerant(self._hear, "acknowledgements")
-                )
-                guarded(self._run, name="zsched keeper").start()
+                self._start()
+            self._lanes[source_id.eid] = lane
         return lane
+
+    def _start(self) -> None:
+        subscriber = self._session.declare_subscriber(self._acks_key, tolerant(self._hear, "acknowledgements"))
+        try:
+            guarded(self._run, name="zsched keeper").start()
+        except RuntimeError:  # no thread is to be had: the next lane tries again
+            subscriber.undeclare()
+            raise
+        self._subscriber = subscriber
 
     def close(self) -> None:
         """End the thread."""

@@ -138,7 +138,11 @@ class Offer:
         if not self._book.must_wait(epoch):
             self._take(query, epoch)
         elif self._waiting.acquire(blocking=False):
-            guarded(self._wait, query, epoch, name="zsched offer", is_lasting=False).start()
+            try:
+                guarded(self._wait, query, epoch, name="zsched offer", is_lasting=False).start()
+            except RuntimeError as error:  # no thread is to be had
+                self._waiting.release()
+                self._take(query, epoch, str(error))
         else:
             self._take(query, epoch, "too many questions wait")
 

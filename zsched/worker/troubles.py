@@ -65,8 +65,10 @@ class Troubles:
                 self._log_at[known] = now + LOG_S
             if self._timer is None and not self._closed.is_set():
                 delay_s = max(self._told_at + TELL_S - now, 0.0)
-                self._timer = guarded(self._send_after, delay_s, name="zsched troubles", is_lasting=False)
-                self._timer.start()
+                timer = guarded(self._send_after, delay_s, name="zsched troubles", is_lasting=False)
+                with contextlib.suppress(RuntimeError):  # no thread is to be had: the next failure tells of this one
+                    timer.start()
+                    self._timer = timer
         if is_worth_a_line:
             so_far = "" if count == 1 else f", {count} times in all; at most one line in {LOG_S:g} s"
             _log.exception("%s: the worker's callback failed%s", where, so_far)

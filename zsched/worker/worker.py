@@ -465,7 +465,10 @@ class Worker:
         token, self._token = self._token, None
         if token is None or self._role.role is WorkerRole.IDLE:
             return
-        guarded(self._undeclare, token, name="zsched token", is_lasting=False).start()
+        try:
+            guarded(self._undeclare, token, name="zsched token", is_lasting=False).start()
+        except RuntimeError:  # no thread is to be had
+            self._undeclare(token)
         ends_at = monotonic_s() + FINISH_S
         while self._signals == 1 and monotonic_s() < ends_at:
             if self._dispatcher.is_still(STILL_S) and not self._debts.is_waiting:

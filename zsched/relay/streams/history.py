@@ -148,8 +148,8 @@ class HeldValues:
             return
         self._asking.notify()
         if self._askers < MAX_ASKERS:
-            self._askers += 1
             guarded(self._fetch, name=f"history {self._expr}", kind="history", is_lasting=False).start()
+            self._askers += 1
 
     def _fetch(self) -> None:
         while (question := self._next()) is not None:
