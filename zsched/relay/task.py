@@ -334,13 +334,15 @@ class TaskRelay:
 
     def _finish(self, finish: Finish) -> None:
         try:
+            self._services.stop()
             for source in self._streams.inputs.values():
                 source.stop()
-            while self._streams.under_way and monotonic_s() < finish.until:
+            while (self._streams.under_way or self._services.is_asked) and monotonic_s() < finish.until:
                 for source in self._streams.inputs.values():
                     source.look_after()
                 sleep(BUSY_S)
             self._streams.close()
+            self._services.finish()
         finally:
             finish.is_done.set()
 

@@ -96,6 +96,48 @@ def test_a_request_whose_session_is_closed_beneath_it_goes_out_by_the_next(
     owner.undeclare()
 
 
+def asked(bench: Bench) -> tuple[threading.Thread, list[str]]:
+    """A request that waits, and what it gets."""
+    heard: list[str] = []
+
+    def ask() -> None:
+        heard.extend(bench.ask())
+
+    before = sum(count.messages for count in bench.services.counts())
+    thread = threading.Thread(target=ask)
+    thread.start()
+    until(lambda: sum(count.messages for count in bench.services.counts()) > before, "the relay has it")
+    return thread, heard
+
+
+def test_a_request_for_which_nobody_is_there_any_more_is_told_so_and_counted_with_its_service(bench: Bench) -> None:
+    """It waited on for an owner that a service that is closed cannot get, and was counted where nobody looks."""
+    bench.open(replace(SERVICE, service=ServiceSettings(hold_s=5.0)))
+    thread, heard = asked(bench)
+    bench.open()
+    (count,) = bench.services.counts()
+    assert (count.messages, dict(count.drops)) == (1, {"no_owner": 1})
+    thread.join(2.0)
+    assert heard == ["no owner: nobody serves robot1/job: it was not done"]
+
+
+@pytest.mark.parametrize("retry", [False, True])
+def test_a_request_at_an_owner_may_have_been_done_whoever_is_asked_next(bench: Bench, *, retry: bool) -> None:
+    """The next owner never came: it was said that nobody had it, and it was not done."""
+    held: list[zenoh.Query] = []
+    bench.open(replace(SERVICE, service=ServiceSettings(retry=retry, timeout_s=1.0)))
+    owner = bench.outside.declare_queryable(SERVICE.to_expr, held.append)
+    bench.services.flip(1)
+    thread, heard = asked(bench)
+    until(lambda: bool(held), "the owner has it")
+    bench.services.close_slot(1)
+    thread.join(10.0)
+    assert heard == ["moved: the task has left edge1/t/robot1/job, which had not answered; it may have been done"]
+    owner.undeclare()
+    for query in held:
+        query.drop()
+
+
 def test_the_counters_of_a_service_go_on_when_its_rule_changes(bench: Bench) -> None:
     for number, hold_s in enumerate((0.0, 0.01, 0.0), start=1):
         bench.open(replace(SERVICE, service=ServiceSettings(hold_s=hold_s)))

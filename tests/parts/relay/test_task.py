@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator
 from functools import partial
@@ -10,8 +11,9 @@ from typing import Any
 import pytest
 import zenoh
 
-from support.sessions import hub_and_neighbour
+from support.sessions import hub_and_neighbour, matches
 from support.waiting import until
+from zsched.clock import monotonic_s
 from zsched.core.relay_protocol import StreamAck, StreamAcks
 from zsched.core.values.plan import (
     Direction,
@@ -202,3 +204,41 @@ def _counts(got: list[bytes], count: int) -> bool:
 
 def _take(got: list[bytes], sample: zenoh.Sample) -> None:
     got.append(sample.payload.to_bytes())
+
+
+@pytest.mark.parametrize("has_owner", [False, True])
+def test_who_waits_for_an_answer_when_the_relay_ends_is_told_so(scene: Scene, *, has_owner: bool) -> None:
+    """The session closed over the request: who had asked got nothing at all."""
+    held: list[zenoh.Query] = []
+    service = Route(
+        stream="t/srv/0",
+        direction=Direction.SERVICE,
+        from_expr="robot1/job",
+        to_expr="edge1/t/robot1/job",
+        settings=StreamSettings(),
+        service=ServiceSettings(),
+    )
+    slot = Slot(epoch=3, owner="edge1", routes=(service,), ready_when=ReadyWhen.TOKEN)
+    if has_owner:
+        owner = scene.other.declare_queryable(service.to_expr, held.append)
+    scene.task.apply(RoutePlan(task="t", phase=RoutePhase.CLOSE, current=slot))
+    asker = scene.other.declare_querier(service.from_expr, timeout=20.0)
+    until(lambda: matches(asker), "the service is there")
+    heard: list[str] = []
+
+    def ask() -> None:
+        heard.extend(reply.err.payload.to_string() for reply in asker.get() if reply.err is not None)
+
+    thread = threading.Thread(target=ask)
+    thread.start()
+    until(lambda: bool(held) if has_owner else scene.count().messages == 1, "the request is under way")
+    assert scene.task.finish(monotonic_s() + 0.1).wait(5.0)
+    assert dict(scene.count().drops) == {"owner_gone" if has_owner else "no_owner": 1}
+    scene.relay.close()
+    thread.join(5.0)
+    gone = "owner gone: no answer from edge1/t/robot1/job; it may have been done"
+    assert heard == [gone if has_owner else "no owner: nobody serves robot1/job: it was not done"]
+    if has_owner:
+        undeclare(owner)
+    for query in held:
+        query.drop()

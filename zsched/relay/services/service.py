@@ -10,7 +10,7 @@ the application gets instead of an answer is an error reply, its first words one
 =============  =======================================================================================================
 busy           ``max_pending`` requests are at the owner already, or this machine has no thread for one more
 no owner       nobody has taken the request within ``hold_s``: it was not carried out
-owner gone     the owner died, or its link did, before it answered
+owner gone     the owner died, or its link or this relay did, before it answered
 moved          the task moved and the old owner's drain time ended before it answered
 timeout        the owner did not answer within ``timeout_s``
 =============  =======================================================================================================
@@ -43,7 +43,7 @@ from zsched.core.values.struct import Struct, field
 from zsched.guard import guarded, note, tolerant
 from zsched.relay.services.replies import Replies
 from zsched.relay.streams.counter import StreamCounter
-from zsched.relay.streams.receive import undeclare
+from zsched.relay.streams.receive import Declared, undeclare
 from zsched.sessions.matching import is_matched
 
 LOOK_AGAIN_S: Final = 0.02
@@ -122,9 +122,10 @@ class ServiceStream:
         self._slots: dict[int, _ServiceSlot] = {}
         self._active: _ServiceSlot | None = None
         self._running = 0
+        self._is_closed = False
         self._ended = threading.Event()
         take = zenoh.handlers.Callback(tolerant(self._take, "asked"), self._ended.set)
-        self._queryable = (local or session).declare_queryable(
+        self._queryable: Declared | None = (local or session).declare_queryable(
             route.from_expr, take, complete=True, allowed_origin=zenoh.Locality.REMOTE
         )
 
@@ -177,6 +178,11 @@ class ServiceStream:
         """Whether nobody has asked for a while (`StreamCounter.is_still`), and nobody waits for an answer."""
         return self._counter.is_still and not self._running
 
+    @property
+    def is_asked(self) -> bool:
+        """Whether somebody waits for an answer."""
+        return self._running > 0
+
     def look_after(self) -> None:
         """End the requests that nobody has been there to answer for `UNSERVED_GRACE_S`."""
         now = monotonic_s()
@@ -208,11 +214,28 @@ class ServiceStream:
         for querier in slot.queriers.values():
             undeclare(querier)
 
-    def close(self) -> None:
-        """Take no more requests and close every slot."""
-        undeclare(self._queryable)
+    def stop(self) -> None:
+        """Take no more requests."""
+        queryable, self._queryable = self._queryable, None
+        if queryable is not None:
+            undeclare(queryable)
+
+    def close(self, *, is_end: bool = False) -> None:
+        """Take no more requests and close every slot; those under way get an error, and are counted, within a moment.
+
+        ``is_end``: this relay ends; the owners do not.
+        """
+        self.stop()
+        with self._lock:
+            self._is_closed = True
+            for slot in self._slots.values() if is_end else ():
+                for asked in slot.pending:
+                    asked.unserved_since = asked.unserved_since or monotonic_s()
         for epoch in tuple(self._slots):
             self.close_slot(epoch)
+        with self._lock:
+            self._lock.notify_all()
+            self._lock.wait_for(lambda: not self._running, JOIN_S)
         self._ended.wait(JOIN_S)
 
     def count(self) -> StreamCount:
@@ -249,16 +272,18 @@ class ServiceStream:
         finally:
             with self._lock:
                 self._running -= 1
+                self._lock.notify_all()
 
     def _answer(self, query: Query) -> None:
         """Ask one owner after the other, as far as that is allowed, until there is an answer or an error."""
         settings = self.route.service
         until = monotonic_s() + settings.timeout_s
         hold_until = until if settings.retry else min(until, monotonic_s() + settings.hold_s)
+        problem = ServiceProblem.NO_OWNER, f"nobody serves {self.route.from_expr}: it was not done"
         while True:
             slot = self._await_owner(str(query.key_expr), hold_until)
             if slot is None:
-                self._fail(query, ServiceProblem.NO_OWNER, f"nobody serves {self.route.from_expr}: it was not done")
+                self._fail(query, *problem)
                 return
             outcome = self._ask(query, slot, max(0.01, until - monotonic_s()))
             if outcome is _Outcome.ANSWERED:
@@ -267,6 +292,8 @@ class ServiceStream:
             if not may_go_on or outcome is _Outcome.TIMED_OUT or monotonic_s() >= hold_until:
                 self._fail(query, *_problem(outcome, slot))
                 return
+            if outcome is not _Outcome.REFUSED:  # an owner had it: nobody may say that it was not done
+                problem = _problem(outcome, slot)
             with self._lock:
                 self._counter.dropped("retried")
                 self._lock.wait(LOOK_AGAIN_S)
@@ -276,6 +303,8 @@ class ServiceStream:
         with self._lock:
             while True:
                 slot = self._active
+                if self._is_closed:
+                    return None
                 if slot is not None and slot.serves(slot.key_for(asked)):
                     return slot
                 left = until - monotonic_s()
@@ -465,6 +494,21 @@ class Services:
         """Close one service's slot of one epoch."""
         if name in self._streams:
             self._streams[name].close_slot(epoch)
+
+    def stop(self) -> None:
+        """Take no more requests."""
+        for stream in self._streams.values():
+            stream.stop()
+
+    @property
+    def is_asked(self) -> bool:
+        """Whether somebody waits for an answer."""
+        return any(stream.is_asked for stream in self._streams.values())
+
+    def finish(self) -> None:
+        """This relay ends: close all; they stay in the table, and who asks now hears their last counts."""
+        for stream in self._streams.values():
+            stream.close(is_end=True)
 
     def keep(self, names: set[str]) -> None:
         """Close the services whose stream is not among ``names``."""
