@@ -22,6 +22,7 @@ class Pace(Generic[T]):
         self._remembers = remembers
         self._period_s = 1.0 / max_hz
         self._due: OrderedDict[str, float] = OrderedDict()
+        """{key: when it may pass again}, the one that has passed last at the end."""
         self._passed_over: dict[str, T] = {}
 
     def passes(self, key: str, value: T, now: float) -> bool:
@@ -32,6 +33,7 @@ class Pace(Generic[T]):
                 self._passed_over[key] = value
             return False
         self._due[key] = max(due, now - self._period_s) + self._period_s
+        self._due.move_to_end(key)
         self._passed_over.pop(key, None)
         if len(self._due) > MAX_KEYS:
             oldest, _ = self._due.popitem(last=False)
@@ -43,4 +45,5 @@ class Pace(Generic[T]):
         keys = [key for key in self._passed_over if now >= self._due.get(key, now)]
         for key in keys:
             self._due[key] = now + self._period_s
+            self._due.move_to_end(key)
         return [self._passed_over.pop(key) for key in keys]

@@ -44,3 +44,16 @@ def test_what_is_remembered_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
         assert made.passes(str(n), n, 0.0)
         made.passes(str(n), n, 0.1)
     assert len(made.overdue(5.0)) <= 4
+
+
+def test_keys_that_come_and_go_take_no_live_key_its_newest_value(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The key that had come first gave way, though it had passed last, and what was held back of it with it."""
+    monkeypatch.setattr(pace, "MAX_KEYS", 3)
+    made: Pace[str] = Pace(1.0, remembers=True)
+    assert made.passes("map", "old", 0.0)
+    for n in range(2):
+        assert made.passes(str(n), "x", 0.5)
+    assert made.passes("map", "newer", 1.0)
+    assert not made.passes("map", "newest", 1.1)
+    assert made.passes("one more", "x", 1.2)
+    assert made.overdue(5.0) == ["newest"]
