@@ -20,15 +20,16 @@ Errand = Callable[[], None]
 class Errands:
     """A queue and a thread; `put` may be called from any thread."""
 
-    def __init__(self, stop: threading.Event) -> None:
-        """Start; failures are of no interest once ``stop`` is set."""
-        self._stop = stop
+    def __init__(self, stop: threading.Event, name: str = "zsched errands", limit: int | None = None) -> None:
+        """Start; failures are of no interest once ``stop`` is set. Where ``limit`` wait already, no more are taken."""
+        self._stop, self._limit = stop, limit
         self._queue: queue.SimpleQueue[Errand | None] = queue.SimpleQueue()
-        guarded(self._run, name="zsched errands").start()
+        guarded(self._run, name=name).start()
 
     def put(self, errand: Errand) -> None:
         """Run this behind everything that waits."""
-        self._queue.put(errand)
+        if self._limit is None or self._queue.qsize() < self._limit:
+            self._queue.put(errand)
 
     def close(self) -> None:
         """End the thread behind what waits."""

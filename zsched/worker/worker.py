@@ -70,6 +70,8 @@ FINISH_S: Final = 2.0
 STILL_S: Final = 0.08
 """It has all of it when nothing has come for so long: relays send nothing more once they miss its token."""
 LOOK_S: Final = 0.01
+MAX_REFUSALS: Final = 1024
+"""Requests that may wait for being refused; of further ones their askers hear nothing but the end."""
 
 _log = logging.getLogger("zsched.worker")
 
@@ -129,6 +131,8 @@ class Worker:
         self._inputs: list[str] = []
         self._services: list[str] = []
         self._errands = Errands(self._stop)
+        self._refusals: Errands | None = None
+        """Requests that are refused: who asks may take nothing of that for a while, and roles must not wait for it."""
         self._token: zenoh.LivelinessToken | None = None
         self._session = open_session(zenoh_config)
         self._state_link = StateLink(self._session, zenoh_config)
@@ -288,12 +292,13 @@ class Worker:
         if depth < 1:
             raise ValueError(f"depth: {depth!r} is not 1 or more")
         expr = self._taken_by_one(self._services, filled(key_expr, self.prefix))
+        self._refusals = self._refusals or Errands(self._stop, "zsched refusals", MAX_REFUSALS)
         service = Service(
             self._session,
             expr,
             handler,
             is_owner=self._is_owner,
-            later=self._errands.put,
+            later=self._refusals.put,
             troubles=self._troubles,
             jobs=self._jobs,
             depth=depth,
@@ -410,7 +415,9 @@ class Worker:
         self._keeper.close()
         for output in tuple(self._outputs.values()):
             output.close()
-        self._errands.close()
+        for errands in (self._errands, self._refusals):
+            if errands is not None:
+                errands.close()
         is_closed = ends_within(CLOSE_S, self._close_session, name="zsched close")
         if not is_closed and self._signals:
             logging.shutdown()

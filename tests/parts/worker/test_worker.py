@@ -32,6 +32,7 @@ from zsched.wire.keyspace import END_CHUNK
 from zsched.worker import Output, Received, Worker
 from zsched.worker import backlog as worker_backlog
 from zsched.worker import inputs as worker_inputs
+from zsched.worker import services as worker_services
 from zsched.worker import worker as worker_module
 from zsched.worker.backlog import MAX_WITHHELD
 from zsched.worker.snapshot import Offer, StateBook
@@ -995,6 +996,35 @@ def test_who_is_left_and_chosen_again_twice_ends_both_epochs(relay: Relay) -> No
         relay.end(epoch)
     until(lambda: len(relay.ends) == 2, "both ends")
     assert [(marker.epoch, marker.count) for _, marker in relay.ends] == [(1, 1), (3, 1)]
+
+
+def test_a_role_does_not_wait_for_one_who_does_not_take_what_it_is_refused(
+    relay: Relay, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A stranger asked very often, and froze: the refusals stood still for 6 s, and the role behind them."""
+    gate, refused = threading.Event(), list[zenoh.Query]()
+
+    def stand_still(query: zenoh.Query, *_: str) -> None:
+        refused.append(query)
+        gate.wait(60)
+        query.drop()
+
+    monkeypatch.setattr(worker_services, "_refuse", stand_still)
+    monkeypatch.setattr(worker_module, "MAX_REFUSALS", 3)
+    with Worker.from_env(environment(relay, tmp_path), handles_signals=False) as worker:
+        worker.serve("{prefix}/job", lambda _request: b"", depth=1)
+        worker.ready()
+        until(lambda: KEYS.worker("edge1", "t", 3) in relay.tokens, "the ready token")
+        ended: list[int] = []
+        for number in range(20):
+            heard: Any = zenoh.handlers.Callback(lambda _: None, partial(ended.append, number), indirect=False)
+            relay.session.get("edge1/t/job", heard, timeout=60.0)
+        until(lambda: len(refused) == 2, "one is refused in each of two threads, and others wait")
+        relay.tell(WorkerRole.ACTIVE, epoch=1)
+        until(lambda: f"{ROLE_KEY}/1" in relay.tokens, "the worker has begun")
+        until(lambda: len(ended) >= 20 - 3 - 3, "those for which there is no room hear the end")
+        gate.set()
+        until(lambda: len(ended) == 20, "all of them")
 
 
 @pytest.mark.usefixtures("echo")
