@@ -80,6 +80,10 @@ class OpenStreams:
                     self._end(streams, stream)
         self._left.clear()
 
+    def keep_inputs(self, names: Collection[str]) -> None:
+        """Close all other inputs."""
+        self.keep({*names, *self.outputs})
+
     def close(self) -> None:
         """Close all; they stay in the table, and whoever asks now hears their last counts."""
         for stream in self.all():

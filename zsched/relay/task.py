@@ -134,7 +134,10 @@ class TaskRelay:
         self._queue.put(plan)
 
     def listen(self, routes: tuple[Route, ...]) -> None:
-        """Take these inputs from now on, so that what comes before the first owner is counted, or kept for it."""
+        """Take these inputs from now on, so that what comes before the first owner is counted, or kept for it.
+
+        While there is none, no others: a rule may have gone.
+        """
         self._queue.put(Unowned(routes))
 
     def wake(self) -> None:
@@ -354,6 +357,8 @@ class TaskRelay:
                 self._streams.input_of(route)
             except (ValueError, zenoh.ZError) as error:
                 self._problem(f"{route.stream}: {route.from_expr}: {error}")
+        if not self._slots:  # else the plans say that, too
+            self._streams.keep_inputs({route.stream for route in routes})
 
     def _take(self, plan: RoutePlan) -> None:
         self._plan = plan

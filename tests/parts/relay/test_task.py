@@ -6,7 +6,8 @@ import threading
 import time
 from collections.abc import Iterator
 from functools import partial
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 import zenoh
@@ -14,7 +15,7 @@ import zenoh
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import until
 from zsched.clock import monotonic_s
-from zsched.core.relay_protocol import StreamAck, StreamAcks
+from zsched.core.relay_protocol import StreamAck, StreamAcks, TaskEnded, WorkerWatch
 from zsched.core.values.plan import (
     Direction,
     ReadyWhen,
@@ -32,6 +33,7 @@ from zsched.ipc.pipe import decode_end
 from zsched.relay import task as task_module
 from zsched.relay.graph import GraphMirror
 from zsched.relay.open_streams import OpenStreams
+from zsched.relay.process import RelayProcess
 from zsched.relay.streams import greetings
 from zsched.relay.streams.acks import Acks
 from zsched.relay.streams.receive import undeclare
@@ -242,3 +244,28 @@ def test_who_waits_for_an_answer_when_the_relay_ends_is_told_so(scene: Scene, *,
         undeclare(owner)
     for query in held:
         query.drop()
+
+
+def test_an_input_whose_rule_has_gone_is_taken_no_more_though_nobody_owns_the_task(scene: Scene) -> None:
+    """It took samples, and showed them as a stream's, until the task had an owner."""
+    other = replace(IN, stream="t/in/1", from_expr="robot1/other", to_expr="edge1/t/robot1/other")
+    scene.task.listen((IN, other))
+    until(lambda: sorted(scene.streams.inputs) == ["t/in/0", "t/in/1"], "both")
+    scene.put(2)
+    scene.task.listen((replace(other, stream=IN.stream),))  # the rule above it has gone
+    until(lambda: sorted(scene.streams.inputs) == ["t/in/0"], "one rule, one stream")
+    assert scene.streams.inputs["t/in/0"].route.from_expr == "robot1/other"
+    scene.task.listen(())
+    until(lambda: not scene.streams.inputs, "none")
+    scene.task.listen((IN,))
+    until(lambda: scene.count().messages == 2, "it goes on with its counters")
+
+
+def test_a_relay_hears_that_a_task_has_no_input_any_more(scene: Scene) -> None:
+    relay = RelayProcess(scene.relay, "test", "robot1", cast("Any", SimpleNamespace(report=lambda _word: None)))
+    relay._do(WorkerWatch(task="t", unowned=(IN,)))
+    streams = relay._tasks["t"]._streams
+    until(lambda: list(streams.inputs) == ["t/in/0"], "the input")
+    relay._do(WorkerWatch(task="t"))
+    until(lambda: not streams.inputs, "its end")
+    relay._do(TaskEnded(task="t"))
