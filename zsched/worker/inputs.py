@@ -42,6 +42,9 @@ NAME_SHARE: Final = 0.1
 """Sources that name none, which anybody can be, cost no more than this share of the time..."""
 NAME_BURST: Final = 5
 """...but for so many at once."""
+MAX_WAITING: Final = 1 << 17
+"""Samples of all inputs that wait; then the oldest give way. Fifty robots' relays send fewer before the first is done,
+but anybody can put under ever new keys."""
 MAX_DEAD: Final = 1024
 """So many samples that gave way keep their place in the queue; when more than half are such, they are taken out."""
 
@@ -145,16 +148,32 @@ class Dispatcher:
             while len(line) > limit:  # more than one where its class was told wrongly
                 self._shed(source, line.popleft())
             self._queue.append(waiting)
+            while len(self._queue) - self._dead > MAX_WAITING:
+                self._shed_oldest()
             self._wake.notify()
         self._jobs.wake()
 
+    def _shed_oldest(self) -> None:
+        """The oldest sample of all gives way."""
+        oldest = self._queue.popleft()
+        if oldest.sample is None:
+            self._dead -= 1
+            return
+        key = str(oldest.sample.key_expr)
+        oldest.source.take_out(key, oldest)
+        self._lose(oldest.source, oldest, is_newest=key not in oldest.source.waiting)
+
     def _shed(self, source: Input, oldest: Waiting) -> None:
+        self._lose(source, oldest)
+        self._note_dead(1)
+
+    def _lose(self, source: Input, oldest: Waiting, *, is_newest: bool = False) -> None:
+        """``is_newest``: nothing newer of its key takes its place."""
         oldest.sample = None
         source.shed += 1
         self._timer.skipped += 1
         self._timer.waiting -= 1
-        self._note_dead(1)
-        if oldest.is_wanted and oldest.name is not None:
+        if (oldest.is_wanted or is_newest) and oldest.name is not None:
             self._acks.shed(oldest.name)
 
     def _note_dead(self, count: int) -> None:

@@ -189,3 +189,25 @@ def test_sources_that_name_no_slot_hold_up_nobody_for_long(bench: Bench) -> None
         bench.put(source, f"key/{number}", "x", 0)
     until(lambda: len(bench.taken) == 30, "all of them")
     assert time.monotonic() - began < 3.0, "30 times 0.2 s"
+
+
+def test_keys_that_wait_are_bounded_and_the_oldest_sample_gives_way(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One sample of each key waited behind a slow callback, of however many keys."""
+    monkeypatch.setattr(worker_inputs, "MAX_WAITING", 10)
+    newest, whole = bench.input(keep_last=1), bench.input(keep_last=None)
+    for number in range(3):
+        bench.put(newest, "a", str(number))
+    for number in range(2):
+        bench.put(whole, "b", str(number), number)
+    for number in range(30):
+        bench.put(newest, f"key/{number}", "x", 0)
+    assert len(bench.dispatcher._queue) - bench.dispatcher._dead == 10
+    assert (newest.shed, whole.shed, whole.waiting) == (2 + 1 + 20, 2, {})
+    assert sorted(newest.waiting) == sorted(f"key/{number}" for number in range(20, 30))
+    assert bench.acks._sources["b", "a1", 7].lost == 2, "what is wanted is told to be lost"
+    assert bench.acks._sources["key/0", "a1", 7].lost == 1, "and what nothing newer replaces"
+    bench.dispatcher.start()
+    until(lambda: len(bench.taken) == 10, "the newest")
+    assert bench.dispatcher._dead == 0
