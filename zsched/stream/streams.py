@@ -241,7 +241,7 @@ class Streams:
         """A key that an input of a task takes, such as ``robot1/jobs``.
 
         Raises:
-            ValueError: it is no key without wildcards, or no input rule of this robot takes it.
+            ValueError: it is no key without wildcards, no input rule of this robot takes it, or there are 256 already.
             AdapterError: the streams are closed.
         """
         self._check_open()
@@ -272,7 +272,7 @@ class Streams:
         ``on_sample`` runs in a thread of the output, one answer after another; what it raises is logged.
 
         Raises:
-            ValueError: it is no key expression, or no output rule of this robot has it.
+            ValueError: it is no key expression, no output rule of this robot has it, or there are 256 keys already.
             AdapterError: the streams are closed.
         """
         self._check_open()
@@ -284,7 +284,12 @@ class Streams:
     def _subscribe(self, key_expr: str, on_sample: Callable[[Received], None]) -> None:
         with self._lock:
             self._callbacks = (*self._callbacks, (key_expr, on_sample))
-        self._name(key_expr)
+        try:
+            self._name(key_expr)
+        except ValueError:
+            with self._lock:
+                self._callbacks = tuple(one for one in self._callbacks if one != (key_expr, on_sample))
+            raise
         with self._changed:
             if self._changed.wait_for(lambda: key_expr in self._taken, KNOWN_S):
                 return
@@ -336,7 +341,9 @@ class Streams:
         with self._lock:
             if key in self._keys:
                 return
-            self._keys = (*self._keys, key)
+            keys = (*self._keys, key)
+            StreamKeys(keys=keys)  # which raises where they are too many: no later relay would let us in
+            self._keys = keys
         self._say_keys()
 
     def _forget(self, key: str) -> None:

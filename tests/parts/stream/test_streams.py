@@ -40,7 +40,7 @@ from zsched.core.values.struct import replace
 from zsched.errors import AdapterError
 from zsched.guard import all_end_within, running
 from zsched.ipc.pipe import write_frame
-from zsched.ipc.protocol import StreamKeys
+from zsched.ipc.protocol import MAX_KEYS, StreamKeys
 from zsched.relay import application
 from zsched.relay.application import Application
 from zsched.relay.streams.inputs import InputStream
@@ -357,6 +357,25 @@ def test_answers_are_the_applications_from_the_moment_it_names_them_until_it_goe
     assert of_relay().messages == 7
     counted = replace(counted, messages=12)
     assert of_relay().messages == 9
+
+
+def test_one_key_too_many_is_refused_and_takes_nothing_from_the_others(bench: Bench) -> None:
+    """It was remembered: no other one was told to the relay, and the next relay was never told of any."""
+    with bench.join() as own:
+        publisher = own.publisher("robot1/front/in")
+        for number in range(MAX_KEYS - 1):
+            own._name(f"robot1/{number}/in")
+        with pytest.raises(ValueError, match=f"{MAX_KEYS + 1} keys, at most {MAX_KEYS}"):
+            own.publisher("robot1/more/in")
+        with pytest.raises(ValueError, match=f"{MAX_KEYS + 1} keys, at most {MAX_KEYS}"):
+            own.subscribe("robot1/out", lambda _answer: None)
+        assert own._callbacks == ()
+        old, bench.application = bench.application, bench.open()
+        assert old._link is not None
+        old._link.hang_up()
+        until(lambda: bench.application._link is not None, "the next relay hears of it")
+        assert publisher.put(b"x")
+        until(lambda: bench.taken == [b"x"], "it is processed")
 
 
 def test_a_second_one_who_closes_waits_until_they_are_closed(bench: Bench) -> None:
