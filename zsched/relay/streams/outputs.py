@@ -302,6 +302,8 @@ class OutputStream:
                 self._counter.dropped("stale_epoch", len(slot.held))  # of a pause
                 self._carrier = None
                 self._promote()
+            elif self._is_paused:
+                self._counter.dropped("stale_epoch", len(slot.held) if slot.is_flipped else 0)
             elif slot.is_flipped and slot.held:
                 self._keep_left(slot, is_cut=is_cut)
             if slot.answers is not None:
@@ -484,6 +486,8 @@ class OutputStream:
             self._counter.dropped("overflow")
 
     def _promote(self) -> None:
+        if self._is_paused:
+            return  # the end of the pause does it
         choose = min if self.route.settings.handover is HandoverRule.ALL else max  # with `ALL` each has its turn
         while flipped := [slot for slot in (*self._left, *self._slots.values()) if slot.is_flipped]:
             slot = choose(flipped, key=lambda slot: slot.epoch)
@@ -499,9 +503,10 @@ class OutputStream:
         self._release(slot)
 
     def _release(self, slot: OutputSlot) -> None:
-        while slot.held:
-            self._forward(slot.held.popleft())
-        slot.held_bytes = 0
+        while slot.held and not self._is_paused:
+            sample = slot.held.popleft()
+            slot.held_bytes -= len(sample.payload)
+            self._forward(sample)
 
     def _forward(self, sample: Sample, size: int | None = None) -> None:
         if self._times is not None:
