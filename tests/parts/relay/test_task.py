@@ -251,6 +251,8 @@ def test_an_input_whose_rule_has_gone_is_taken_no_more_though_nobody_owns_the_ta
     other = replace(IN, stream="t/in/1", from_expr="robot1/other", to_expr="edge1/t/robot1/other")
     scene.task.listen((IN, other))
     until(lambda: sorted(scene.streams.inputs) == ["t/in/0", "t/in/1"], "both")
+    known = scene.other.declare_publisher(IN.from_expr)
+    until(lambda: matches(known), "the relay subscribes")
     scene.put(2)
     scene.task.listen((replace(other, stream=IN.stream),))  # the rule above it has gone
     until(lambda: sorted(scene.streams.inputs) == ["t/in/0"], "one rule, one stream")
