@@ -98,12 +98,18 @@ def replace_regular(path: Path, content: bytes) -> None:
     if not stat.S_ISREG(found.st_mode) or not is_ours:
         return write_regular(path, content)
 
+    return put_whole(whole, content, stat.S_IMODE(found.st_mode), owner_like(found))
+
+
+def owner_like(found: os.stat_result) -> Callable[[int], None]:
+    """For `put_whole`: hands an open file over to the owner of the one that it replaces, where this user may."""
+
     def give(descriptor: int) -> None:
         if (found.st_uid, found.st_gid) != (os.geteuid(), os.getegid()):
             with contextlib.suppress(PermissionError):  # of a group that this user is not in
                 os.fchown(descriptor, found.st_uid, found.st_gid)
 
-    return put_whole(whole, content, stat.S_IMODE(found.st_mode), give)
+    return give
 
 
 def put_whole(path: Path, content: bytes, mode: int, give: Callable[[int], None]) -> None:

@@ -13,6 +13,7 @@ import errno
 import os
 import secrets
 import shutil
+import stat
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -44,7 +45,7 @@ from zsched.core.values.model import NodeId, RegisterState
 from zsched.core.values.struct import Struct, replace
 from zsched.core.vote.generations import blank_state
 from zsched.errors import AdapterError, ConfigError, WireError, ZschedError
-from zsched.files import read_regular
+from zsched.files import owner_like, put_whole, read_regular
 from zsched.pki.files import PRIVATE, PUBLIC, write_whole
 from zsched.runtime.secured import CERTIFICATE, KEY, TRUSTED
 from zsched.runtime.unfinished import Creation, mark_of, unfinished
@@ -630,10 +631,10 @@ def _put_all(
     text = content.text.encode()
     plain = blank_state(fleet, me, generation, None, incarnation=wall_tenths(), hardware=hardware_id(), disk=disk)
     state = replace(plain, registers=(), fleet_register=RegisterState(task=fleet.name, learnt=value))
-    old = _other_text(places.config, text)
+    old, former = _other_text(places.config, text), _former(places.config)
     if old is not None:
-        _put(places.config.with_name(f"{places.config.name}{BEFORE}"), old, PUBLIC_MODE)
-    _put(places.config, text, PUBLIC_MODE)
+        _put(places.config.with_name(f"{places.config.name}{BEFORE}"), old, PUBLIC_MODE, former)
+    _put(places.config, text, PUBLIC_MODE, former)
     if papers is not None and fleet.security is not None:
         _put_papers(Path(fleet.security.folder), papers)
     DocumentStore(places.state).save(content)
@@ -661,15 +662,28 @@ def _other_text(path: Path, text: bytes) -> bytes | None:
     return None if old == text else old
 
 
-def _put(path: Path, content: bytes, mode: int) -> None:
-    """Let a file hold that.
+def _former(path: Path) -> os.stat_result | None:
+    """Whose a file is that is about to be replaced, and who may read it; ``None``: there is none."""
+    try:
+        found_ = path.stat()
+    except OSError:
+        return None
+    return found_ if stat.S_ISREG(found_.st_mode) else None
+
+
+def _put(path: Path, content: bytes, mode: int, former: os.stat_result | None = None) -> None:
+    """Let a file hold that; it gets the mode and the owner of ``former``, else ``mode`` and its folder's owner.
 
     Raises:
         AdapterError: it cannot be written.
     """
     try:
         _make_folder(path.parent)
-        replace_synced(path, path.with_name(f"{path.name}.new"), content, mode)
+        if former is None:
+            replace_synced(path, path.with_name(f"{path.name}.new"), content, mode)
+        else:
+            put_whole(path, content, stat.S_IMODE(former.st_mode), owner_like(former))
+            sync_folder(path.parent)
     except OSError as error:
         raise AdapterError(f"cannot write {path}: {error.strerror}; {_advice(error, path)}") from error
 

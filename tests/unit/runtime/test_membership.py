@@ -249,6 +249,21 @@ def test_another_text_of_the_same_fleet_is_kept_beside(second: Places, invitatio
     assert second.config.with_name(f"fleet.yaml{BEFORE}").read_text() == old
 
 
+def test_a_file_that_only_some_may_read_stays_so_and_so_does_the_copy_of_the_former(
+    second: Places, invitation: Invitation
+) -> None:
+    """The environment of its workers may hold secrets."""
+    second.config.parent.mkdir(parents=True)
+    second.config.write_text(TEXT.replace("robot2", "robot3"))
+    second.config.chmod(0o640)
+    owner = (12, 34) if os.geteuid() == 0 else (os.geteuid(), os.getegid())
+    os.chown(second.config, *owner)
+    join(invitation, second, is_plan=False)
+    for path in (second.config, second.config.with_name(f"fleet.yaml{BEFORE}")):
+        found_ = path.stat()
+        assert (stat.S_IMODE(found_.st_mode), found_.st_uid, found_.st_gid) == (0o640, *owner)
+
+
 def test_a_state_of_another_node_fleet_or_generation_is_left_as_it_is(
     first: Places, second: Places, invitation: Invitation
 ) -> None:
