@@ -1,10 +1,11 @@
 """The share of time in which the GPU worked: by sysfs (Jetson, amdgpu), or by the library of NVIDIA's driver (NVML).
 
-Knows: Jetson's ``load`` (per mille), amdgpu's ``gpu_busy_percent``, four functions of ``libnvidia-ml.so.1``. Of several
+Knows: Jetson's ``load`` (per mille), amdgpu's ``gpu_busy_percent``, five functions of ``libnvidia-ml.so.1``. Of several
 GPUs the freest counts. Does not know: which process uses how much.
 
-On a Jetson NVML finds a GPU and answers "not supported", so sysfs goes first. NVML is called by ctypes: four calls need
-no bindings. The library is loaded only where the driver is.
+On a Jetson NVML finds a GPU and answers "not supported", so sysfs goes first. NVML is called by ctypes: five calls need
+no bindings. The library is loaded only where the driver is. What it has opened tells nothing any more once the driver
+was reset or loaded anew, so it is opened again then.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ JETSON = (
 AMD = "sys/class/drm/card*/device/gpu_busy_percent"
 DRIVER = "proc/driver/nvidia/version"
 LIBRARY = "libnvidia-ml.so.1"
+NOT_SUPPORTED = 3
+"""``NVML_ERROR_NOT_SUPPORTED``: a GPU that is well, and does not tell this."""
 
 
 class Reader:
@@ -39,6 +42,9 @@ class Reader:
         if not loads and (self._root / DRIVER).exists():
             self._nvml = self._nvml or _Nvml(self._library)
             loads = self._nvml.loads()
+            if self._nvml.is_lost:
+                self._nvml.close()
+                self._nvml = None
         return min(loads, default=None)
 
     def _found(self, *patterns: str) -> list[Path]:
@@ -46,7 +52,7 @@ class Reader:
 
 
 class _Nvml:
-    """NVML, from its library's start until the process ends."""
+    """NVML, from its library's start until `close`."""
 
     def __init__(self, library: str) -> None:
         """Raises `OSError` when the library is not there or does not start."""
@@ -60,19 +66,30 @@ class _Nvml:
         self._c: Any = ctypes
         self._rates: Any = Rates
         self._lib: Any = ctypes.CDLL(library)
+        self.is_lost = False
+        """No GPU has told anything at the last question, and not for want of support: it may be open in vain."""
         code = self._lib.nvmlInit_v2()
         if code:
             raise OSError(f"NVML does not start: error {code}")
 
+    def close(self) -> None:
+        """Give back what was opened: else the next start would go on with it."""
+        self._lib.nvmlShutdown()
+
     def loads(self) -> list[float]:
         """Of every GPU that tells it."""
-        count, found = self._c.c_uint(), []
+        count = self._c.c_uint()
         if self._lib.nvmlDeviceGetCount_v2(self._c.byref(count)):
+            self.is_lost = True
             return []
-        for index in range(count.value):
-            device, rates = self._c.c_void_p(), self._rates()
-            if self._lib.nvmlDeviceGetHandleByIndex_v2(self._c.c_uint(index), self._c.byref(device)):
-                continue
-            if not self._lib.nvmlDeviceGetUtilizationRates(device, self._c.byref(rates)):
-                found.append(rates.gpu / 100.0)
+        told = [self._load(index) for index in range(count.value)]
+        found = [busy for code, busy in told if code == 0]
+        self.is_lost = not found and any(code != NOT_SUPPORTED for code, _ in told)
         return found
+
+    def _load(self, index: int) -> tuple[int, float]:
+        """(error, the use) of one GPU."""
+        device, rates = self._c.c_void_p(), self._rates()
+        code = self._lib.nvmlDeviceGetHandleByIndex_v2(self._c.c_uint(index), self._c.byref(device))
+        code = code or self._lib.nvmlDeviceGetUtilizationRates(device, self._c.byref(rates))
+        return int(code), rates.gpu / 100.0

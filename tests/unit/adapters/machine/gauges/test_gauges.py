@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import shutil
 import subprocess
 from pathlib import Path
@@ -16,9 +17,14 @@ from zsched.core.profile.means import STALE_S
 NVML = """
 typedef struct { unsigned gpu, memory; } rates;
 static unsigned use[] = {80, 35, 90};
-int nvmlInit_v2(void) { return INIT; }
-int nvmlDeviceGetCount_v2(unsigned *count) { *count = 3; return 0; }
-int nvmlDeviceGetHandleByIndex_v2(unsigned index, void **device) { *device = use + index; return index == 2; }
+static int opened, resets, seen;
+static int lost(void) { return opened == 0 ? 1 : seen == resets ? 0 : 999; }
+int nvmlInit_v2(void) { if (opened++ == 0) seen = resets; return INIT; }
+int nvmlShutdown(void) { opened--; return 0; }
+void reset(void) { resets++; }
+int nvmlDeviceGetCount_v2(unsigned *count) { *count = 3; return COUNTS ? 0 : lost(); }
+int nvmlDeviceGetHandleByIndex_v2(unsigned index, void **device)
+{ *device = use + index; return lost() ? lost() : index == 2; }
 int nvmlDeviceGetUtilizationRates(void *device, rates *told) { told->gpu = *(unsigned *)device; return RATES; }
 """
 
@@ -102,12 +108,14 @@ def test_of_two_radeons_the_freer_one_counts(tmp_path: Path) -> None:
     assert gpu.Reader(tmp_path).read() == pytest.approx(0.12)
 
 
-def library(folder: Path, init: int = 0, rates: int = 0) -> str:
+def library(folder: Path, init: int = 0, rates: int = 0, *, counts: bool = False) -> str:
+    """``counts``: it counts its GPUs, even if the driver was reset."""
     compiler = shutil.which("cc")
     if compiler is None:
         pytest.skip("no C compiler here to make a library that answers as NVML")
-    (folder / "nvml.c").write_text(NVML.replace("INIT", str(init)).replace("RATES", str(rates)))
-    made = folder / f"nvml{init}{rates}.so"
+    text = NVML.replace("INIT", str(init)).replace("RATES", str(rates)).replace("COUNTS", str(int(counts)))
+    (folder / "nvml.c").write_text(text)
+    made = folder / f"nvml{init}{rates}{int(counts)}.so"
     subprocess.run([compiler, "-shared", "-fPIC", "-o", made, folder / "nvml.c"], check=True)
     return str(made)
 
@@ -129,6 +137,18 @@ def test_nvml_that_is_not_there_does_not_start_or_tells_nothing_is_no_reading(tm
     watch = GaugeWatch(tmp_path)
     zone(tmp_path, 0, "cpu", "40000")
     assert watch.look() == (("temperature_c", 40.0),), "one gauge that fails is one gauge that is not measured"
+
+
+@pytest.mark.parametrize("counts", [False, True])
+def test_nvml_is_opened_anew_once_the_driver_was_reset(tmp_path: Path, counts: bool) -> None:
+    """What was opened before tells errors only; it must be given back, or it is not opened again."""
+    tree(tmp_path, proc__driver__nvidia__version="NVRM\n")
+    name = library(tmp_path, counts=counts)
+    reader = gpu.Reader(tmp_path, name)
+    assert reader.read() == pytest.approx(0.35)
+    ctypes.CDLL(name).reset()
+    assert reader.read() is None
+    assert reader.read() == pytest.approx(0.35)
 
 
 def test_readings_of_a_thread_that_hangs_grow_old(tmp_path: Path) -> None:
