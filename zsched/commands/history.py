@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from typing import Final
 
 from zsched.commands.ask import Door, ask_door
-from zsched.commands.common import CliError, Json, nearest, print_json, say, warn
+from zsched.commands.common import Away, CliError, Json, nearest, print_json, say
 from zsched.commands.page import span
 from zsched.commands.report import millis, printable
 from zsched.core.values.struct import Struct
@@ -179,7 +179,7 @@ def events(door: Door, view: EventsView) -> int:
     _, now, entries, cursor = read_log(door, is_moves=False)
     since = None if view.since_s is None else now - view.since_s
     _print([entry for entry in entries if since is None or entry["at"] >= since], view)
-    is_away = False
+    away = Away("events", "until Ctrl-C")
     try:
         while view.is_following:
             time.sleep(FOLLOW_S)
@@ -188,11 +188,9 @@ def events(door: Door, view: EventsView) -> int:
             except CliError as error:
                 if error.code != EXIT_UNREACHABLE:
                     raise
-                if not is_away:
-                    warn(f"zsched events: {error}; asking again until Ctrl-C")
-                is_away = True
+                away.tell(str(error))
             else:
-                is_away = False
+                away.tell("")
                 _print(entries, view)
     except KeyboardInterrupt:
         pass
