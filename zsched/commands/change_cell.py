@@ -32,7 +32,7 @@ from zsched.commands.document import (
     wait_until_settled,
 )
 from zsched.commands.entries import HERE
-from zsched.commands.flags import LEAVE, NO_OTHER, DrainOrder, check_drain, drain, undrain
+from zsched.commands.flags import LEAVE, NO_OTHER, DrainOrder, check_drain, check_in_force, drain, undrain
 from zsched.commands.lacks import UselessError, wait_for
 from zsched.commands.leave import (
     DANGERS,
@@ -138,6 +138,7 @@ def change_cells(order: LeaveOrder, word: str) -> int:
         return code
     give_up_the_seat(way)
     _wait_for_the_next(way, going)
+    check_in_force(way.door, LEAVE, me)
     stop_daemon(way, fleet, f"{me} has handed over what it does")
     return _arrive(way, going)
 

@@ -453,21 +453,27 @@ def _check_flagged(watch: _Watch, status: Json, nodes: Sequence[str]) -> None:
     gone = [name for name in nodes if name in watch.flagged - watch.empty - has]
     watch.flagged |= has
     if gone and in_force(watch.view.door).text:  # without the document it knows no flags
-        raise CliError(EXIT_FAILED, _told_over(watch.kind, gone))
+        raise CliError(EXIT_FAILED, told_over(watch.kind, gone))
 
 
-def check_in_force(door: Door, kind: str, name: str) -> None:
-    """Refuse to go on with a node whose flag somebody has taken back.
+def check_in_force(door: Door, kind: str, name: str) -> InForce:
+    """Refuse to go on with a node whose flag somebody has taken back; what was looked at.
 
     Raises:
         CliError: it is so, as the node at the door knows, or nobody answers.
     """
     held = in_force(door)
-    if held.text and not any((flag["kind"], flag["subject"]) == (kind, name) for flag in held.flags):
-        raise CliError(EXIT_FAILED, _told_over(kind, [name]))
+    if held.text and not has_flag(held, kind, name):
+        raise CliError(EXIT_FAILED, told_over(kind, [name]))
+    return held
 
 
-def _told_over(kind: str, names: Sequence[str]) -> str:
+def has_flag(held: InForce, kind: str, name: str) -> bool:
+    """Whether a flag of a node is in force."""
+    return any((flag["kind"], flag["subject"]) == (kind, name) for flag in held.flags)
+
+
+def told_over(kind: str, names: Sequence[str]) -> str:
     """That a flag is not in force any more, which a command has gone by so far."""
     return f"{', '.join(names)}: the {kind} is not in force any more: it was taken back, or its time is over"
 

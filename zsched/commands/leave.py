@@ -30,7 +30,7 @@ from zsched.commands.document import (
     ordered,
 )
 from zsched.commands.entries import DOCUMENT, HERE
-from zsched.commands.flags import LEAVE, NO_OTHER, DrainOrder, check_in_force, drain
+from zsched.commands.flags import LEAVE, NO_OTHER, DrainOrder, check_in_force, drain, has_flag, told_over
 from zsched.commands.membership import Told
 from zsched.commands.orders import OrderView, Row
 from zsched.commands.page import span
@@ -56,6 +56,10 @@ STOP_S: Final = 20.0
 """How long a daemon may take to end: it hands over, and stops its workers and its relay."""
 LEARN_S: Final = 10.0
 """How long the other nodes may take to learn that this one is gone."""
+
+
+class _OverError(CliError):
+    """The leave was taken back: going on does not help."""
 
 
 class LeaveOrder(Struct, frozen=True, kw_only=True):
@@ -208,8 +212,7 @@ def _take_leave(way: Way, status: Json) -> int:
         return _planned(way, held.fleet)
     if order.is_plan or code != EXIT_OK:
         return EXIT_WOULD_CHANGE if order.is_plan and code == EXIT_OK else code
-    give_up_the_seat(way)
-    _note(way, held.fleet, _go_out(way))
+    _note(way, held.fleet, _go_out(way, give_up_the_seat(way)))
     return EXIT_OK
 
 
@@ -288,8 +291,8 @@ def without(text: str, me: str) -> str:
     return shorter
 
 
-def give_up_the_seat(way: Way) -> None:
-    """Wait until this node knows that the electors have settled without it (rule of `may_go`).
+def give_up_the_seat(way: Way) -> int:
+    """Wait until this node knows that the electors have settled without it (rule of `may_go`); its revision then.
 
     By itself an elector that leaves is removed; one that the operator has named is removed by this command.
 
@@ -303,12 +306,12 @@ def give_up_the_seat(way: Way) -> None:
             why = UNKNOWING
         else:
             value = from_plain(told_now["value"], FleetValue)
-            check_in_force(way.door, LEAVE, way.me)
+            held = check_in_force(way.door, LEAVE, way.me)
             if may_go(value, way.me):
                 if told:
                     way.tell(f"{way.me}: no elector any more; electors: {', '.join(value.electorate.names)}")
-                return
-            why = _ask_for_the_seat(way, in_force(way.door))
+                return held.revision
+            why = _ask_for_the_seat(way, held)  # on the revision at which the leave is in force
         if why != told:
             told = why
             way.tell(f"{way.me} is an elector still: {why}")
@@ -329,16 +332,22 @@ def _ask_for_the_seat(way: Way, held: InForce) -> str:
     return "it is removed"
 
 
-def _go_out(way: Way) -> int:
+def _go_out(way: Way, since: int) -> int:
     """Have this node taken out of the document, and wait until the others know; the revision without it.
 
     One of them proposes it: this node would not store a document that does not name it.
+    ``since``: a revision that has the leave.
+
+    Raises:
+        CliError: the leave was taken back, or the deadline has come (5).
     """
     for count in itertools.count():
         others = _alive(way)
         try:
             held = in_force(way.door.to(others[count % len(others)]) if others else way.door)
-            revision = _left_out(way, held)
+            revision = _left_out(way, held, since)
+        except _OverError:
+            raise
         except CliError as error:
             way.check_time(str(error))
             time.sleep(PAUSE_S)
@@ -349,14 +358,22 @@ def _go_out(way: Way) -> int:
     return revision
 
 
-def _left_out(way: Way, held: InForce) -> int:
+def _left_out(way: Way, held: InForce, since: int) -> int:
     """Have the node that told ``held`` propose it without this one; the revision that is without it.
 
     It may be so already: the answer of the try before was lost, or somebody else was first.
+
+    Raises:
+        _OverError: the leave was taken back.
+        CliError: it is not agreed, or that node is behind.
     """
     text = document_text(held)
     if way.me not in _nodes_of(text):
         return held.revision
+    if not has_flag(held, LEAVE, way.me):
+        if held.revision >= since:
+            raise _OverError(EXIT_FAILED, told_over(LEAVE, [way.me]))
+        raise CliError(EXIT_FAILED, f"{held.node} does not know yet that {way.me} leaves")
     flags = [flag for flag in held.flags if flag["subject"] != way.me]
     what = {"text": without(text, way.me), "flags": flags, "rollouts": list(held.rollouts)}
     answer = change(way.door.to(held.node), {**what, "base_revision": held.revision, **_ordered(way)})

@@ -665,3 +665,20 @@ def test_a_secured_cell_s_invitation_is_kept_for_the_next_try(site: Site, monkey
     invitation.unlink()
     assert run("--to", "hall-b", "--yes").exit_code == 0
     assert whose(site.folder / "state") == ("hall-b", ME)
+
+
+def test_what_somebody_takes_back_while_the_next_cell_is_asked_goes_no_further(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`zsched undrain` in another terminal, while this machine waits to be let in."""
+    wait, here = change_cell._wait_for_the_next, site.cells["hall-a"]
+
+    def taken_back(*given: Any) -> None:
+        wait(*given)
+        if here.flags:
+            here.flags, here.revision = [], here.revision + 1
+
+    monkeypatch.setattr(change_cell, "_wait_for_the_next", taken_back)
+    ended = run("--to", "hall-b", "--yes")
+    assert (ended.exit_code, site.running, here.done) == (1, "hall-a", ["leave"])
+    assert "the leave is not in force any more: it was taken back" in ended.stderr

@@ -411,3 +411,33 @@ def test_a_leave_that_somebody_takes_back_meanwhile_ends_and_the_node_stays(hall
     assert "robot3: the leave is not in force any more: it was taken back" in done.stderr
     assert "  robot3:" in hall.text
     assert left(hall.folder) == UNTOUCHED
+
+
+@pytest.mark.parametrize("electorate", ["", "electorate: [robot1, robot2, robot3]\n"])
+@pytest.mark.parametrize("looks", range(1, 9))
+def test_nothing_of_a_leave_is_agreed_after_it_was_taken_back(hall: Hall, electorate: str, looks: int) -> None:
+    """At whichever look at what is in force that is: the next step goes by the revision that the look told."""
+    hall.text = f"{TEXT}{electorate}"
+    left_to_take_back = looks
+
+    def answer(request: Json) -> Json:
+        nonlocal left_to_take_back
+        if request["verb"] == "change" and request["base_revision"] != hall.revision:
+            return {"outcome": "conflict", "detail": "another change came first", "revision": hall.revision}
+        told = copy.deepcopy(hall.answer(request))
+        if request["verb"] == "fleet" and hall.flags:
+            left_to_take_back -= 1
+            if left_to_take_back == 0:
+                hall.flags, hall.revision = [], hall.revision + 1
+                hall.asked.append("taken back")
+        return told
+
+    hall.door.close()
+    hall.door = OperatorSocket(hall.folder / "run" / "robot3.sock", answer)
+    hall.door.open()
+    done = run("--yes", "--deadline", "3s")
+    if "taken back" in hall.asked:
+        assert hall.asked[-1] == "taken back"
+        assert done.exit_code == 1
+        assert "the leave is not in force any more: it was taken back" in done.stderr
+        assert left(hall.folder) == UNTOUCHED
