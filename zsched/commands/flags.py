@@ -16,6 +16,7 @@ from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, nearest, print_json, say, told_task
 from zsched.commands.document import InForce, change_over, document_text, in_force, ordered
+from zsched.commands.entries import DOCUMENT
 from zsched.commands.orders import (
     OrderView,
     Row,
@@ -29,6 +30,8 @@ from zsched.commands.orders import (
 from zsched.commands.page import span
 from zsched.commands.report import millis, told_flag
 from zsched.commands.wait import Condition, missing
+from zsched.config.difference import names_electors, unseated
+from zsched.config.load import check_bytes
 from zsched.core.values.struct import Struct, field
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE
 
@@ -42,6 +45,10 @@ STAYS_S: Final = 3.0
 """A task that has not left after this time is reported, with the reason; again when the reason changes."""
 NO_OTHER: Final = "no-other-candidate"
 """The danger: a task would have no candidate left that may get it."""
+SEAT_AGAIN: Final = (
+    "`zsched fleet export -o FILE`, then `zsched apply FILE --accept change-electors` gives the seat back"
+)
+"""Where a document names an elector that is none."""
 NOTHING: Final = "-"
 TITLES: Final = ("WHAT", "KIND", "NOW", "AFTER")
 BLANK: Final[Json] = dict.fromkeys(
@@ -181,8 +188,25 @@ def _set(view: OrderView, kind: str, nodes: tuple[str, ...], *, is_on: bool, acc
     revision = _commit(view, held, after, f"{verb} {', '.join(nodes)}")
     left = [name for name in nodes if not is_on and any(flag["subject"] == name for flag in after)]
     more = "".join(f" {name} still gets nothing new: `zsched {_way_out(after, name)}`." for name in left)
+    gone = _seats_lost(view.door, held, nodes) if kind == DRAIN and not is_on else []
+    more += "".join(f" {lack}." for lack in gone)
     text = f"It is agreed{_endless(held.flags, after)}.{more}"
-    return tell(view, "agreed", text, after_s=0.0, nodes=nodes, revision=revision)
+    return tell(view, "agreed", text, after_s=0.0, nodes=nodes, revision=revision, missing=gone)
+
+
+def _seats_lost(door: Door, held: InForce, nodes: Sequence[str]) -> list[str]:
+    """What nodes lack whose leave was taken back too late: a seat that the document names does not come by itself."""
+    left = [name for name in nodes if has_flag(held, LEAVE, name)]
+    if not left or not names_electors(held.text):
+        return []
+    fleet = check_bytes(held.text.encode(), DOCUMENT).fleet
+    try:
+        agreed = [name for name, _ in in_force(door).electors]
+    except CliError:  # it is agreed all the same
+        agreed = [name for name, _ in held.electors]
+    lost = () if fleet is None else unseated(held.text, fleet, agreed)
+    told = f"is no elector any more, and the document names it as one: {SEAT_AGAIN}"
+    return [f"{name} {told}" for name in left if name in lost]
 
 
 def _endless(before: Sequence[Json], after: Sequence[Json]) -> str:

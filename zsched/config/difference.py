@@ -143,6 +143,19 @@ def wanted_electors(agreed: Sequence[NodeId], new: Fleet, text: str) -> tuple[No
     return tuple(sorted(name for name in agreed if name in nodes))
 
 
+def unseated(text: str, fleet: Fleet, agreed: Sequence[NodeId]) -> tuple[NodeId, ...]:
+    """The electors that a document names, and that the fleet has not agreed as such, sorted.
+
+    A leave that was taken back, and a recovery, leave some: they become electors once the document is applied again.
+
+    Args:
+        text: the document.
+        fleet: what it says.
+        agreed: the electors in force.
+    """
+    return tuple(name for name in wanted_electors(agreed, fleet, text) if name not in agreed)
+
+
 def difference(
     old: Fleet,
     new: Fleet,

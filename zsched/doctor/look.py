@@ -17,7 +17,7 @@ from zsched.adapters.host.operator_client import ask
 from zsched.adapters.host.state_file import StateFile
 from zsched.adapters.network.fleet_poll import ask_fleet
 from zsched.clock import monotonic_s
-from zsched.config.difference import warnings_in_force
+from zsched.config.difference import unseated, warnings_in_force
 from zsched.config.load import CheckResult, check_bytes, check_file
 from zsched.core.electorate.numbers import in_force
 from zsched.core.report import snapshot_json
@@ -65,7 +65,7 @@ def look(machine: Machine, *, is_fleet: bool) -> Scene:
     socket, node = places.socket_path(machine.runtime_folder, machine.node), machine.node
     own, refusal = _own(socket)
     door = None if own is None else socket
-    document, text, revision = _agreed(machine, reading.fleet, door)
+    document, text, revision, without_seat = _agreed(machine, reading.fleet, door)
     known = reading.fleet if document is None else document.fleet
     asked = _Asked(statuses={}, answered_s={})
     if is_fleet:
@@ -79,6 +79,7 @@ def look(machine: Machine, *, is_fleet: bool) -> Scene:
         document=document,
         text=text,
         revision=revision,
+        unseated=without_seat,
         node=node,
         relay_code=_relay_code(machine.runtime_folder, node),
         state_folder=machine.state_folder,
@@ -91,20 +92,25 @@ def look(machine: Machine, *, is_fleet: bool) -> Scene:
     )
 
 
-def _agreed(machine: Machine, by_file: Fleet | None, door: Path | None) -> tuple[CheckResult | None, str, int]:
-    """(what the agreed document says with the electors in force, its text, its revision), from daemon or disk.
+def _agreed(
+    machine: Machine, by_file: Fleet | None, door: Path | None
+) -> tuple[CheckResult | None, str, int, tuple[NodeId, ...]]:
+    """(what the agreed document says with the electors in force, its text, its revision, electors that are none).
+
+    From daemon or disk.
 
     Without the first: no document is agreed, or none that can be read here.
     """
     held = _by_disk(machine, by_file) if door is None else _by_daemon(door)
     if held is None:
-        return None, "", 0
+        return None, "", 0, ()
     text, value = held
     result = check_bytes(text.encode("utf-8", "replace"), str(machine.file.parent / "the fleet's document"))
     if result.fleet is None:
-        return None, text, value.revision
+        return None, text, value.revision, ()
     warnings = warnings_in_force(text, result.warnings)
-    return replace(result, fleet=in_force(result.fleet, value), warnings=warnings), text, value.revision
+    agreed = replace(result, fleet=in_force(result.fleet, value), warnings=warnings)
+    return agreed, text, value.revision, unseated(text, result.fleet, value.electorate.names)
 
 
 def _by_daemon(door: Path) -> tuple[str, FleetValue] | None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from enum import IntEnum, StrEnum
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Final, TypeAlias
 
 from zsched.config.load import CheckResult
 from zsched.core.values.fleet import Fleet, NodeSpec
@@ -28,6 +28,8 @@ class Verdict(StrEnum):
     FAIL = "FAIL"
 
 
+SEAT_AGAIN: Final = "while {names} run: zsched fleet export -o FILE, zsched apply FILE --accept change-electors"
+"""Of electors that the document names, and that are none."""
 _ORDER = (Verdict.SKIP, Verdict.PASS, Verdict.WARN, Verdict.FAIL)
 
 
@@ -109,6 +111,8 @@ class Scene(Struct, frozen=True, kw_only=True):
     """The document itself."""
     revision: int = 0
     """Of the fleet value that has this document."""
+    unseated: tuple[NodeId, ...] = ()
+    """The electors that the document names, and that are none."""
     own: Json | None = None
     """The status of the daemon on this machine; ``None`` when it does not answer."""
     refusal: str = ""

@@ -23,6 +23,13 @@ from zsched.commands.orders import OrderView
 from zsched.commands.report import render_status
 
 TEXT = "fleet: lab\n"
+TWO_NODES = """\
+fleet: lab
+nodes:
+  edge1: {kind: edge, host: 127.0.0.1, listen: {control: tcp/127.0.0.1:7457, data: tcp/127.0.0.1:7458}}
+  robot1: {kind: robot}
+tasks: {}
+"""
 NODES = ("edge1", "edge2", "robot1")
 ROLLOUT: Json = {"task": "echo", "first": ["edge1"], "command": ["/opt/echo"]}
 """A changed worker that waits for a look: no flag ends that."""
@@ -47,7 +54,7 @@ class Daemon:
         self.status: Json = {**STATUS, "fleet": "lab", "node": "robot1", "nodes": nodes, "fleet_revision": 4}
         self.status["tasks"] = [task("echo", "edge1"), task("merge", "edge1")]
         self.flags: list[Json] = []
-        self.document = "ab" * 16
+        self.document, self.text, self.electors = "ab" * 16, TEXT, list[Json]()
         self.changes: list[Json] = []
         self.outcome = "ok"
         self.overtaken = 0
@@ -69,7 +76,7 @@ class Daemon:
             return {**body, "node": name, **({"tasks": []} if name in self.behind else {})}
         if request["verb"] == "fleet":
             body = {"node": "robot1", "fleet": "lab", "revision": self.status["fleet_revision"], "number": 2}
-            told = {"settled": True, "electors": [], "document": self.document, "text": TEXT}
+            told = {"settled": True, "electors": self.electors, "document": self.document, "text": self.text}
             # as a daemon tells them: what is as by default is left out
             told["flags"] = [{key: said for key, said in flag.items() if said not in (None, "")} for flag in self.flags]
             told["rollouts"] = [ROLLOUT]
@@ -318,6 +325,34 @@ def test_undrain_takes_only_the_drain_back_and_says_what_is_left(daemon: Daemon)
     assert daemon.flags == []
     assert run("undrain", "edge1", "--yes").stdout.endswith("Nothing would change.\n")
     assert [one["event"] for one in events("undrain", "edge1", "--yes")] == ["unchanged"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "named", "agreed", "lacks"),
+    [
+        ("leave", "electorate: [edge1, robot1]\n", "robot1", ["edge1"]),
+        ("leave", "electorate: [edge1, robot1]\n", "edge1", []),
+        ("leave", "", "robot1", []),
+        ("drain", "electorate: [edge1, robot1]\n", "robot1", []),
+    ],
+)
+def test_a_leave_that_is_taken_back_too_late_says_how_its_node_gets_its_seat_again(
+    daemon: Daemon, kind: str, named: str, agreed: str, lacks: list[str]
+) -> None:
+    """Electors that a document names do not come by themselves, and nothing else would tell that one is missing."""
+    daemon.text = f"{TWO_NODES}{named}"
+    daemon.electors = [{"name": agreed, "disk": "01"}]
+    said = {"by": "ada@robot1", "reason": "", "for_s": None, "revision": 2, "subject": "edge1"}
+    for is_json in (False, True):
+        daemon.set_flags([{"kind": kind, **said}])
+        if is_json:
+            told = events("undrain", "edge1", "--yes")[-1]["missing"]
+        else:
+            told = [line for line in run("undrain", "edge1", "--yes").stdout.splitlines() if "no elector" in line]
+        assert len(told) == len(lacks)
+        for line, name in zip(told, lacks, strict=True):
+            assert f"{name} is no elector any more, and the document names it as one: `zsched fleet export" in line
+            assert "-o FILE`, then `zsched apply FILE --accept change-electors` gives the seat back" in line
 
 
 def test_the_verbs_list_and_every_page_shows_the_flags(daemon: Daemon) -> None:

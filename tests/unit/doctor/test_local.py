@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from support.clinic import FLEET, answer, assert_finds, make_state, run, scene_of
+from support.clinic import FLEET, answer, assert_finds, make_state, run, scene_of, status_of
 from support.fleet_values import fleet_value_of
 from support.planted_faults import found_in
 from zsched.adapters.host.document_store import DocumentStore
@@ -132,11 +132,11 @@ def test_a_file_that_is_not_the_agreed_document_is_no_fault(tmp_path: Path) -> N
 AGREED = FLEET.replace("  robot3: {kind: robot}\n", "  robot3: {kind: robot}\n  robot4: {kind: robot}\n")
 
 
-def agreed_on(folder: Path) -> FleetValue:
+def agreed_on(folder: Path, text: str = AGREED) -> FleetValue:
     """The state and the document of edge1, as agreed: robot4 has come, and only edge1 elects."""
     file = folder / "agreed.yaml"
-    file.write_text(AGREED)
-    content = Document(text=Text(AGREED))
+    file.write_text(text)
+    content = Document(text=Text(text))
     DocumentStore(folder / "state").save(content)
     value = fleet_value_of(9, Elector(name="edge1", disk="01", joining=1), document=document_hash(content))
     make_state(load_fleet(file), "edge1", folder / "state", fleet_register=RegisterState(task="hall", learnt=value))
@@ -172,6 +172,22 @@ def test_where_a_document_is_agreed_it_counts_and_not_the_file(tmp_path: Path) -
     found = run("fleet.files", other)
     assert_finds(found, FAIL, "the agreed document (revision 9) here has")
     assert "zsched fleet show" in found.fix
+
+
+def test_an_elector_that_only_the_document_names_is_found(tmp_path: Path) -> None:
+    """It gave its seat up, and its leave was taken back: nothing else tells that one machine less may be away."""
+    by_file = scene_of(tmp_path)
+    agreed_on(tmp_path, f"{AGREED}electorate: [edge1, robot1, robot2]\n")
+    seen = look(machine_of(by_file, tmp_path), is_fleet=False)
+    assert run("state.elector", seen).verdict is PASS
+    assert seen.unseated == ("robot1", "robot2")
+    there = replace(seen, node="robot2")
+    told = "robot2 is no elector, and the agreed document (revision 9) names it as one"
+    assert_finds(run("state.elector", there), WARN, told)
+    found = run("fleet.electors", replace(seen, is_fleet=True, statuses={"edge1": status_of(seen.fleet, "edge1")}))
+    assert_finds(found, WARN, "names electors that are none: robot1, robot2")
+    assert "while robot1, robot2 run: zsched fleet export" in found.fix
+    assert "zsched apply FILE --accept change-electors" in found.fix
 
 
 def _seen(scene: Scene, by_file: Scene) -> Scene:
