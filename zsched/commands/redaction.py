@@ -8,6 +8,7 @@ What no name gives away stays: a text with secrets in a comment keeps them.
 from __future__ import annotations
 
 import itertools
+import json
 import re
 from collections.abc import Iterable, Iterator
 from typing import Any, Final
@@ -22,8 +23,14 @@ _PLAIN: Final = "passwd|password|passphrase|secret|token|credential"
 """Words that stand for nothing else, wherever they are in a name (``PGPASSWORD``, ``apiToken``)."""
 NAME: Final = re.compile(rf"(?:^|[_-])(?:{_WORDS})(?:[_-]|\d|$)|{_PLAIN}", re.IGNORECASE)
 _PAIR: Final = re.compile(
-    r"""(?P<name>["']?[A-Za-z_][\w-]*["']?)(?P<sep>\s*:\s+)(?P<value>"(?:[^"\\]|\\.)*"|'[^']*'|[^\s,{}\[\]#][^,}\n#]*)"""
+    r"""(?P<name>["']?[A-Za-z_][\w-]*["']?)(?P<sep>\s*:\s+)"""
+    r"""(?P<value>"(?:[^"\\]|\\.)*"|'(?:[^']|'')*'|[^\s,{}\[\]#][^,}\n#]*)"""
 )
+_WORD_AFTER: Final = re.compile(
+    r"""(?P<name>["']?--[A-Za-z_][\w-]*["']?)(?P<sep>[ \t]*,\s*|[ \t]*\n[ \t]*-[ \t]+)"""
+    r"""(?P<value>"(?:[^"\\]|\\.)*"|'(?:[^']|'')*'|[^\s,{}\[\]#"'][^,\]\n#]*)"""
+)
+"""An option in a list of words, and the word behind it."""
 _OPTION: Final = re.compile(r"(?P<name>(?:--)?[A-Za-z_][\w-]*)(?P<sep>=)(?P<value>\"[^\"]*\"|'[^']*'|[^\s,;&\]\"']+)")
 _URL: Final = re.compile(r"(?P<head>\b[a-z][a-z0-9+.-]*://)[^/\s@\"']+@")
 _PEM: Final = re.compile(r"-----BEGIN ([A-Z ]*PRIVATE KEY)-----.*?-----END \1-----", re.DOTALL)
@@ -37,10 +44,17 @@ def secrets_of(fleet: Fleet | None) -> tuple[str, ...]:
     for task in fleet.tasks if fleet is not None else ():
         found.update(value for name, value in task.worker.env if NAME.search(name))
         words = [word.removeprefix("--arg=").removeprefix("--option=") for word in task.worker.command]  # of drivers
-        found.update(after for word, after in itertools.pairwise(words) if _is_option(word))
+        found.update(after for word, after in itertools.pairwise(words) if _is_option(word) and "=" not in word)
         found.update(word.partition("=")[2] for word in words if _is_option(word.partition("=")[0]))
-    lines = {line.strip() for value in found for line in value.splitlines()}
+    plain = {line.strip() for value in found for line in value.splitlines()}
+    lines = {form for line in plain for form in _forms(line)}
     return tuple(sorted((line for line in lines if len(line) >= LEAST), key=lambda line: (-len(line), line)))
+
+
+def _forms(secret: str) -> tuple[str, ...]:
+    """As it is, and as JSON and both kinds of YAML's quotes write it: the log is JSON, a fleet file may have any."""
+    quoted = (json.dumps(secret, ensure_ascii=is_ascii)[1:-1] for is_ascii in (False, True))
+    return (secret, *quoted, secret.replace("'", "''"))
 
 
 def _is_option(word: str) -> bool:
@@ -61,7 +75,7 @@ def clean(text: str, secrets: Iterable[str] = ()) -> str:
 
 def clean_yaml(text: str, secrets: Iterable[str] = ()) -> str:
     """The same of a fleet file, whose values also follow ``name: `` or stand in a block below it."""
-    lines = _lines(clean(text, secrets).split("\n"))
+    lines = _lines(_WORD_AFTER.sub(_without_value, clean(text, secrets)).split("\n"))
     return "\n".join(_PAIR.sub(_without_value, line) for line in lines)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 
 from support.clinic import FLEET
@@ -52,6 +54,42 @@ def test_words_of_a_driver_s_program_are_looked_at_like_any_other_command_s() ->
     fleet = check_bytes(text.encode()).fleet
     assert fleet is not None
     assert leaks(clean_yaml(text, secrets_of(fleet))) == []
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "command: [slam, --api-key, abcd1234, --mode, fast]",
+        "command: [slam, '--api-key', 'abcd''1234', --mode, fast]",
+        'command: ["slam", "--api-key", "abcd\\"1234", "--mode", "fast"]',
+        'command:\n        - slam\n        - --api-key\n        - "abcd1234"\n        - --mode\n        - fast',
+        "command: [slam]\n      env: {DB_PASSWORD: 'abcd''1234'}\n      args: [--mode, fast]",
+    ],
+)
+def test_a_fleet_file_with_faults_loses_what_stands_behind_an_option_too(words: str) -> None:
+    """Nobody can read it to the end, so nothing but its own text tells which words are secrets."""
+    text = clean_yaml(f"fleet: lab\nnodes: {{}}\ntasks:\n  merge:\n    worker:\n      {words}\n")
+    assert ("abcd" in text, "1234" in text, "REMOVED" in text) == (False, False, True), text
+    assert "fast" in text
+
+
+@pytest.mark.parametrize("secret", ["p\u00e4ss-word", 'with"quote', "back\\slash", "o'hara-99"])
+def test_a_secret_goes_however_a_fleet_file_or_the_log_writes_it(secret: str) -> None:
+    for form in (json.dumps(secret), json.dumps(secret, ensure_ascii=False), "'" + secret.replace("'", "''") + "'"):
+        worker = f"worker: {{command: [slam, --token, {form}], env: {{TOKEN: {form}}}}}"
+        text = FLEET.replace("worker: {command: [python, -m, zsched.tasks.echo]}", worker)
+        fleet = check_bytes(text.encode()).fleet
+        assert fleet is not None, form
+        secrets = secrets_of(fleet)
+        for is_ascii in (False, True):
+            line = json.dumps({"text": f"a {secret} b"}, ensure_ascii=is_ascii)
+            assert clean(line, secrets) == line.replace(json.dumps(secret, ensure_ascii=is_ascii)[1:-1], "REMOVED")
+        assert form[1:-1] not in clean_yaml(text, secrets)
+
+
+def test_what_stands_behind_an_option_with_its_value_is_no_secret() -> None:
+    text = FLEET.replace("zsched.tasks.echo]", "zsched.tasks.echo, --auth-token=abcd1234, --mode=fast]")
+    assert secrets_of(check_bytes(text.encode()).fleet) == ("abcd1234",)
 
 
 def test_a_fleet_file_with_faults_loses_them_too() -> None:
