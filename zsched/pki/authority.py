@@ -273,11 +273,21 @@ class Authority:
         """
         left = self.left()
         if not left:
-            former = self._folder / key_name(self.record.number - 1)
             self._save(replace(self.record, trusted=self.record.trusted[:1], lives=()))
-            with contextlib.suppress(OSError):
-                former.unlink(missing_ok=True)
+            self._drop_former()
         return left
+
+    def _drop_former(self) -> None:
+        """Delete the key of the authority before, unless that is trusted still."""
+        if not self.is_rotating:
+            with contextlib.suppress(OSError):
+                (self._folder / key_name(self.record.number - 1)).unlink(missing_ok=True)
+
+    def mend(self) -> None:
+        """Bring what hangs on the record to what it says, as far as that can be written: a full disk came between."""
+        with contextlib.suppress(AdapterError):
+            self._copy()
+            self._drop_former()
 
     def destroy(self) -> None:
         """Delete all of it: of an authority whose certificates nobody has got.
@@ -368,6 +378,17 @@ class Authority:
         body = {"format": FORMAT, **asdict(replace(record, entries=tuple(sorted(record.entries, key=_by_label))))}
         self._write(RECORD, (json.dumps(body, indent=1) + "\n").encode(), PUBLIC)
         self.record = record
+        try:
+            self._copy()
+        except AdapterError as error:
+            told = f"the record is changed, and {TRUSTED} is not: bring that file nowhere"
+            raise AdapterError(f"{error}; {told}; make room, and give `zsched pki show`: it writes it") from error
+
+    def _copy(self) -> None:
+        """Let ``ca.pem`` hold what the record trusts; where it does nothing is written, which could fail."""
+        with contextlib.suppress(OSError):
+            if read_regular(self._folder / TRUSTED, MAX_BYTES) == self.trusted:
+                return
         self._write(TRUSTED, self.trusted, PUBLIC)
 
     def _write(self, name: str, content: bytes, mode: int) -> None:
@@ -418,7 +439,9 @@ def opened(folder: Path, fleet: str) -> Iterator[Authority]:
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
         record = _record(json.loads(read_regular(folder / RECORD, MAX_BYTES)))  # what the one before us has changed
-        yield Authority(folder, record)
+        authority = Authority(folder, record)
+        authority.mend()
+        yield authority
     finally:
         os.close(descriptor)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import errno
 import json
 import os
 import stat
@@ -18,6 +19,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from zsched.core.values.certificates import Role
 from zsched.errors import AdapterError
+from zsched.pki import authority as module
 from zsched.pki import certificates as made
 from zsched.pki.authority import RECORD, TRUSTED, Authority, create, key_name, opened
 from zsched.pki.files import write_whole
@@ -280,6 +282,45 @@ def test_a_rotation_trusts_both_until_no_certificate_is_of_the_former(authority:
     assert not (authority.folder / key_name(1)).exists()
     with pytest.raises(AdapterError, match="no rotation"):
         authority.finish()
+
+
+def no_room_for(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
+    """The disk is full when one of these files is to be written."""
+
+    def write(path: Path, content: bytes, mode: int) -> None:
+        if path.name in names:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+        write_whole(path, content, mode)
+
+    monkeypatch.setattr(module, "write_whole", write)
+
+
+@pytest.mark.parametrize("is_end", [False, True])
+def test_a_rotation_that_a_full_disk_has_cut_is_whole_once_there_is_room(
+    authority: Authority, monkeypatch: pytest.MonkeyPatch, is_end: bool
+) -> None:
+    """Operators bring `ca.pem` to every machine: by an old one nobody would let in who has a new certificate."""
+    if is_end:
+        authority.rotate(b"", NOW)
+    with monkeypatch.context() as patch:
+        no_room_for(patch, TRUSTED)
+        told = "No space left on device; the record is changed, and ca.pem is not: bring that file nowhere"
+        with pytest.raises(AdapterError, match=told):
+            authority.finish() if is_end else authority.rotate(b"", NOW)
+        with opened(authority.folder, FLEET) as still:
+            assert (authority.folder / TRUSTED).read_bytes() != still.trusted
+    with opened(authority.folder, FLEET) as again:
+        assert (again.record.number, again.is_rotating) == (2, not is_end)
+        assert (authority.folder / TRUSTED).read_bytes() == again.trusted
+    assert (authority.folder / key_name(1)).exists() is not is_end
+
+
+def test_a_certificate_is_issued_though_its_authority_s_copy_cannot_be_written(
+    authority: Authority, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It says nothing new; the key would be lost, and its number with it."""
+    no_room_for(monkeypatch, TRUSTED)
+    assert issue(authority)
 
 
 def test_what_was_done_is_there_when_it_is_opened_again(authority: Authority) -> None:
