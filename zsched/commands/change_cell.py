@@ -355,11 +355,11 @@ def _invited(way: Way, there: _Next, going: Change | None) -> Change:
             wait_until_settled(there.door, int(answer["revision"]))
             way.tell(f"{there.fleet}: revision {answer['revision']} is agreed, and {way.me} may join")
         invitation = invitation_for(there.door, Guest(name=way.me), b"")
-    if going is not None and going.invitation == invitation:
-        return going
-    text = document_text(in_force(way.door))
+    text, state = document_text(in_force(way.door)), way.order.places.state
     fleet = _parsed(text, way.order.places.config)
-    return next_cell.begin(way.order.places.state, fleet, text, invitation)
+    if going is not None and going.invitation == invitation:
+        return next_cell.refreshed(state, fleet, text, going)
+    return next_cell.begin(state, fleet, text, invitation)
 
 
 def _parsed(text: str, file: Path) -> Fleet:

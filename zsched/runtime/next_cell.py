@@ -82,15 +82,29 @@ def begin(state: Path, fleet: Fleet, text: str, invitation: Invitation) -> Chang
     return change
 
 
+def refreshed(state: Path, fleet: Fleet, text: str, change: Change) -> Change:
+    """The same change, by which the former cell is asked with what this machine has of it now.
+
+    A change that is broken off may wait for weeks: the certificate is renewed, or the authority is another one.
+
+    Raises:
+        AdapterError: as of `begin`.
+    """
+    folder = state / NEXT_CELL
+    try:
+        with _opened(folder) as held:
+            _fill_former(held, fleet, text)
+            _check_folder(held / FORMER / FILE)
+            return _change(folder, held, change.invitation)
+    except OSError as error:
+        raise AdapterError(f"{error.filename or folder}: {error.strerror}; run this as root") from error
+
+
 def _fill(folder: Path, fleet: Fleet, text: str, invitation: Invitation) -> None:
     for name in (FORMER, NEXT):
         (folder / name / PKI_FOLDER).mkdir(parents=True, mode=PRIVATE_FOLDER)
-    _write(folder / FORMER / FILE, text.encode())
+    _fill_former(folder, fleet, text)
     _write(folder / NEXT / FILE, invitation.document.text.encode())
-    if fleet.security is not None:
-        files = files_of(fleet.security)
-        for name, path in ((CERTIFICATE, files.certificate), (KEY, files.key), (TRUSTED, files.trusted)):
-            _write(folder / FORMER / PKI_FOLDER / name, read_regular(path, MAX_FILE_BYTES))
     papers = invitation.papers
     if papers is not None:
         for name, pem in ((CERTIFICATE, papers.certificate), (KEY, papers.key), (TRUSTED, papers.trusted)):
@@ -98,6 +112,14 @@ def _fill(folder: Path, fleet: Fleet, text: str, invitation: Invitation) -> None
     for name in (FORMER, NEXT):
         _check_folder(folder / name / FILE)
     _write(folder / INVITATION, encode_invitation(invitation).encode())
+
+
+def _fill_former(folder: Path, fleet: Fleet, text: str) -> None:
+    _write(folder / FORMER / FILE, text.encode())
+    if fleet.security is not None:
+        files = files_of(fleet.security)
+        for name, path in ((CERTIFICATE, files.certificate), (KEY, files.key), (TRUSTED, files.trusted)):
+            _write(folder / FORMER / PKI_FOLDER / name, read_regular(path, MAX_FILE_BYTES))
 
 
 @contextlib.contextmanager

@@ -682,3 +682,15 @@ def test_what_somebody_takes_back_while_the_next_cell_is_asked_goes_no_further(
     ended = run("--to", "hall-b", "--yes")
     assert (ended.exit_code, site.running, here.done) == (1, "hall-a", ["leave"])
     assert "the leave is not in force any more: it was taken back" in ended.stderr
+
+
+def test_a_change_that_has_waited_goes_by_what_the_former_cell_says_now(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nodes of the former cell may have got other addresses since, and the machine is to be forgotten by one."""
+    here, kept_file = site.cells["hall-a"], site.folder / "state" / "next-cell" / "former" / "fleet.yaml"
+    broken_off(site, monkeypatch, "give_up_the_seat", "--to", "hall-b")
+    assert kept_file.read_text() == here.text
+    here.text = here.text.replace("tcp/127.0.0.1:7457", "tcp/127.0.0.1:8457")
+    broken_off(site, monkeypatch, "give_up_the_seat", "--to", "hall-b")
+    assert "tcp/127.0.0.1:8457" in kept_file.read_text()

@@ -406,6 +406,29 @@ def test_a_link_in_place_of_the_next_cell_s_folder_is_not_gone_by(
         next_cell.under_way(first.state)
 
 
+def test_a_former_cell_whose_authority_is_another_one_since_is_asked_by_that(
+    first: Places, invitation: Invitation
+) -> None:
+    """A change that was broken off may wait for weeks: by the old certificate the former cell lets nobody in."""
+    first.config.write_text(SECURED)
+    fleet, pki = load_fleet(first.config), first.config.parent / "pki"
+    pki.mkdir()
+
+    def install(age: str) -> None:
+        for name in ("certificate.pem", "key.pem", "ca.pem"):
+            (pki / name).write_text(f"{age} {name}")
+
+    install("old")
+    change = next_cell.begin(first.state, fleet, SECURED, invitation)
+    install("new")
+    again = next_cell.refreshed(first.state, fleet, SECURED.replace("7457", "7557"), change)
+    assert again == next_cell.under_way(first.state) == change
+    assert "7557" in change.former_file.read_text()
+    held = change.former_file.parent / "pki"
+    assert {path.read_text() for path in held.iterdir()} == {f"new {path.name}" for path in pki.iterdir()}
+    assert {stat.S_IMODE(path.stat().st_mode) for path in held.iterdir()} == {0o600}
+
+
 @pytest.mark.parametrize("is_link", [True, False])
 @pytest.mark.parametrize("at", range(1, 4))
 def test_what_takes_the_place_of_the_next_cell_s_folder_while_it_is_written_gets_nothing(
