@@ -482,44 +482,52 @@ class Stage:
         began, why = monotonic_s(), "it takes too long"
         while self._has_drained and monotonic_s() - began < BACK_S:
             try:
-                is_lifted = self.lift_once()
-                if is_lifted or not self._is_unsure or monotonic_s() - began >= UNSURE_S:
+                why, is_lifted = self._lifted()
+                if not why and (is_lifted or not self._is_unsure or monotonic_s() - began >= UNSURE_S):
                     return ""
-                time.sleep(LOOK_S)
-            except CliError as error:
-                why = str(error)
                 time.sleep(LOOK_S)
             except KeyboardInterrupt:
                 _say("the drain is ended first")
         if not self._has_drained:
             return ""
+        why = why or "it takes too long"
         ends = f"it ends by itself within {self._drains.for_s or 0.0:.0f} s"
         return f"a node may still be drained: {why}; `zsched maint` tells, and {ends}"
+
+    def _lifted(self) -> tuple[str, bool]:
+        """(why the drains cannot be ended now, whether there were any)."""
+        try:
+            return "", self.lift_once()
+        except CliError as error:
+            return str(error), False
 
     def go_back(self) -> str:
         """Bring the task back to the node that had it, if it is elsewhere; what became of that."""
         owner = self._base.owner
         if not self._base.moved or not owner:
             return "nothing has changed"
-        began = monotonic_s()
-        why = ""
+        began, why = monotonic_s(), ""
         while monotonic_s() - began < BACK_S:
             try:
-                look = self.look()
-                if look.owner == owner:
+                is_back, why = self._moved_back(owner)
+                if is_back:
                     return f"{self._order.task} is on {owner} again, where it was"
-                why = "; ".join(look.lacks)
-                if not look.lacks:
-                    result = self._move(owner)
-                    why = "" if result["outcome"] in ("ok", "unchanged") else str(result["detail"])
-                time.sleep(LOOK_S)
-            except CliError as error:
-                why = str(error)
                 time.sleep(LOOK_S)
             except KeyboardInterrupt:
                 why = "interrupted"
                 break
         return f"{self._order.task} is not back on {owner}: {why or 'it takes too long'}; `zsched move` brings it there"
+
+    def _moved_back(self, owner: str) -> tuple[bool, str]:
+        """(whether the task is where it was, why it cannot go there now); it is moved if it can."""
+        try:
+            look = self.look()
+            if look.owner == owner or look.lacks:
+                return look.owner == owner, "; ".join(look.lacks)
+            result = self._move(owner)
+        except CliError as error:
+            return False, str(error)
+        return False, "" if result["outcome"] in ("ok", "unchanged") else str(result["detail"])
 
     def keep(self, body: Json) -> str:
         """Have the outcome kept; the node that keeps it, or empty."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import json
 import signal
 import threading
@@ -25,7 +26,7 @@ from zsched.commands.rehearse import RehearseOrder, Stage, parse_steps
 from zsched.commands.rehearse_report import table
 from zsched.core.rehearsal.programme import Do, Over, Programme
 from zsched.core.values.rehearsal import Step
-from zsched.exits import EXIT_TIMED_OUT
+from zsched.exits import EXIT_DEGRADED, EXIT_TIMED_OUT
 
 PROMISED = {
     "move": {"step": "move", "gap_s": 0.3, "decide_s": 1.0, "whole": ["echo/in/0"]},
@@ -263,6 +264,32 @@ def test_an_interrupted_drain_is_lifted(
     assert [one["verb"] for one in daemon.done][:2] == ["change", "change"], "drained, and undrained"
     assert daemon.flags == []
     assert signal.getsignal(number) is before
+
+
+def test_a_second_ctrl_c_while_nobody_answers_tells_what_is_left(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It comes where the way back waits, which is nearly always: who is left with a drained node must hear of it."""
+    seconds = iter([0.0])
+
+    def pause(_s: float) -> None:
+        if next(seconds, None) is not None:
+            raise KeyboardInterrupt
+
+    def refuse() -> None:
+        raise CliError(EXIT_DEGRADED, "no majority of the electors answers")
+
+    assert stage.act(DRAIN)[1] == ""
+    now = itertools.count(0.0, 5.0)
+    monkeypatch.setattr(stage, "lift_once", refuse)
+    monkeypatch.setattr("zsched.commands.rehearse.time.sleep", pause)
+    monkeypatch.setattr(rehearse, "monotonic_s", lambda: next(now))
+    told = stage.lift()
+    assert told.startswith("a node may still be drained: no majority of the electors answers; `zsched maint` tells")
+    assert "the drain is ended first" in capsys.readouterr().err
+    monkeypatch.setattr(stage, "look", refuse)
+    seconds = iter([0.0])
+    assert "echo is not back on edge1: interrupted; `zsched move` brings it there" in stage.go_back()
 
 
 # --- kept ones -------------------------------------------------------------------------------------------------------
