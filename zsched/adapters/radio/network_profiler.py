@@ -160,6 +160,8 @@ class WifiReader:
             self.problem = f"{self._spec.value}: {error}" + (f"; {other}" if other else " (read /proc/net/wireless)")
             return sample
         self.problem = None
+        if station.signal_dbm is None:
+            self.problem = f"{self._spec.value}: its driver tells no signal of {station.mac}"
         before, self._before = self._before, station
         return LinkSample(
             source=LinkSource.NL80211,

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from zsched.adapters.radio import network_profiler
 from zsched.adapters.radio.network_profiler import (
     MAX_TRACE_BYTES,
     LinkReader,
@@ -17,7 +18,7 @@ from zsched.adapters.radio.network_profiler import (
     retry_ratio,
     wireless_dbm,
 )
-from zsched.adapters.radio.nl80211 import GenericNetlink, Nl80211Error, Station
+from zsched.adapters.radio.nl80211 import GenericNetlink, Interface, Nl80211Error, Station
 from zsched.core.values.fleet import LinkSpec, NodeSpec
 from zsched.core.values.model import NodeKind
 from zsched.core.values.profile import LinkSample, LinkSource
@@ -100,6 +101,29 @@ def test_wifi_falls_back_to_the_wireless_file_and_says_so(tmp_path: Path) -> Non
     assert reader.problem is not None
     assert "nl80211" in reader.problem
     reader.close()
+
+
+@pytest.mark.parametrize("signal_dbm", [None, -61.0])
+def test_a_driver_that_tells_no_signal_is_a_problem(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, signal_dbm: float | None
+) -> None:
+    """Without a signal the link counts as not measured, and the status must say why."""
+
+    class Netlink:
+        def interfaces(self) -> list[Interface]:
+            return [Interface(index=3, name="wlan0")]
+
+        def stations(self, _index: int) -> list[Station]:
+            return [Station(mac="0a:00:00:00:00:01", signal_dbm=signal_dbm)]
+
+        def close(self) -> None:
+            pass
+
+    monkeypatch.setattr(network_profiler, "GenericNetlink", Netlink)
+    (reader,) = readers_for(node(LinkSpec(source=LinkSource.NL80211, value="wlan0")), root=tmp_path)
+    assert reader.read().rssi_dbm == signal_dbm
+    told = "wlan0: its driver tells no signal of 0a:00:00:00:00:01"
+    assert reader.problem == (told if signal_dbm is None else None)
 
 
 def test_station_is_chosen_by_address_or_the_weakest() -> None:
