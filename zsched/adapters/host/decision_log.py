@@ -348,7 +348,8 @@ def without_figures(line: bytes) -> bytes:
 def read_page(folder: Path, cursor: str, most_bytes: int = PAGE_BYTES) -> tuple[list[bytes], str, bool]:
     """(whole lines, where they end, whether there are more) from ``cursor`` on; ``""``: from the oldest line on.
 
-    A cursor whose file is gone goes on with the oldest line that is left. A log that is not there is empty.
+    A cursor whose file is gone, or shorter by now, goes on with the oldest line that is left. A log that is not there
+    is empty.
 
     Raises:
         OSError: a file cannot be read.
@@ -357,8 +358,10 @@ def read_page(folder: Path, cursor: str, most_bytes: int = PAGE_BYTES) -> tuple[
     with contextlib.ExitStack() as stack:
         found = {str(os.fstat(file.fileno()).st_ino): file for file in _opened(folder, stack)}
         marks = list(found)
+        offset = int(offset_text) if mark in marks and offset_text.isdecimal() else 0
+        if offset > (os.fstat(found[mark].fileno()).st_size if mark in marks else 0):
+            mark, offset = "", 0  # another file has its number by now, or somebody has emptied it
         first = marks.index(mark) if mark in marks else 0
-        offset = int(offset_text) if mark in marks and offset_text.isdigit() else 0
         for here in marks[first:]:
             found[here].seek(offset)
             data = found[here].read(most_bytes)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import queue
 import resource
 import time
@@ -148,6 +149,19 @@ def test_a_reader_goes_on_where_it_was_over_a_rotation(tmp_path: Path) -> None:
         page, cursor, has_more = read_page(tmp_path, cursor)
         seen += [json.loads(line)["text"].split()[0] for line in page]
     assert seen == [*map(str, range(20)), "end"]
+
+
+def test_a_reader_whose_file_is_shorter_by_now_begins_with_what_is_left(tmp_path: Path) -> None:
+    """Somebody has emptied it, or a new file has the number of the one that is gone: `events --follow` went silent."""
+    kept = Kept(tmp_path)
+    kept.write(*(story(f"old {number}") for number in range(5)))
+    _, cursor, _ = read_page(tmp_path, "")
+    os.truncate(tmp_path / NAME, 0)
+    assert read_page(tmp_path, cursor)[0] == []
+    kept.write(story("new"))
+    page, cursor, _ = read_page(tmp_path, cursor)
+    assert [json.loads(line)["text"].split()[0] for line in page] == ["new", "end"]
+    assert read_page(tmp_path, cursor) == ([], cursor, False)
 
 
 def test_a_page_read_while_the_newer_file_is_set_aside_leaves_nothing_out_and_tells_nothing_twice(
