@@ -237,8 +237,8 @@ def show_rates(view: StreamView, word: str | None, verb: str) -> int:
             found = _window(tap, view.window_s, carry)
             code = EXIT_OK if found else EXIT_FAILED
             _print_rates(view, verb, found, tap.missed)
-            # a gap across two windows counts in the later one
-            carry = {name: KeyStats(last_at=stats.last_at) for name, stats in found.items()} or carry
+            # a gap across windows counts in the last one; other keys may have come in those between
+            carry |= {name: KeyStats(last_at=stats.last_at) for name, stats in found.items()}
     return code
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, Self
 
 import pytest
 import zenoh
@@ -14,8 +16,9 @@ from support.fleets import fleet_of, node_of
 from support.schemas import faults
 from zsched.adapters.network.stream_tap import Tapped
 from zsched.cli import app
+from zsched.commands import stream as stream_verb
 from zsched.commands.common import CliError
-from zsched.commands.stream import KeyStats, StreamView, _print_rates, _print_sample, keys_for, rates
+from zsched.commands.stream import KeyStats, StreamView, _print_rates, _print_sample, keys_for, rates, show_rates
 from zsched.core.values.fleet import LocalSide
 from zsched.runtime.access import StreamAccess
 
@@ -108,6 +111,32 @@ def test_one_message_has_no_gap() -> None:
     stats = KeyStats()
     stats.add(5, 1.0)
     assert (stats.as_json(1.0)["min_gap_s"], stats.as_json(1.0)["max_gap_s"]) == (None, None)
+
+
+def test_a_gap_of_one_key_counts_though_another_has_come_meanwhile(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A stream that was away for two windows looked as even as ever."""
+    windows = iter([[("scan", 0.9), ("odom", 0.9)], [("odom", 1.9)], [("odom", 2.9)], [("scan", 3.9), ("odom", 3.9)]])
+
+    class Tap:
+        missed = 0
+
+        def __enter__(self) -> Self:
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            pass
+
+        def until(self, _at: float) -> Iterator[SimpleNamespace]:
+            for key, at in next(windows):
+                yield SimpleNamespace(side="fleet", key=key, size=10, at=at)
+
+    monkeypatch.setattr(stream_verb, "_tap", lambda _view, _word: Tap())
+    view = StreamView(runtime_dir=None, node=None, is_json=True, window_s=1.0, count=4)
+    assert show_rates(view, None, "hz") == 0
+    last = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert {one["key"]: one["max_gap_s"] for one in last["keys"]} == pytest.approx({"odom": 1.0, "scan": 3.0})
 
 
 # --- the way to the data ---------------------------------------------------------------------------------------------
