@@ -90,8 +90,10 @@ class Library:
             if isinstance(order, do.StoreDocument):
                 self._accept(order.content, order.request)
             elif isinstance(order, do.FetchDocument):
-                self._bring(order)
-                self._wanted.discard(order.document)
+                try:
+                    self._bring(order)
+                finally:  # else nobody would fetch it any more, whatever has failed
+                    self._wanted.discard(order.document)
             elif isinstance(order, do.AmendDocument):
                 self._amend(order)
             else:

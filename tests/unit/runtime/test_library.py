@@ -106,6 +106,26 @@ def test_what_nobody_has_is_asked_for_again(desk: Desk) -> None:
     assert event.document == wanted
 
 
+def test_a_document_whose_fetch_has_failed_is_fetched_again(desk: Desk) -> None:
+    """By a bug, or for want of memory: the thread goes on, and so must the document come."""
+    failures = iter([MemoryError()])
+
+    def fetch(_peer: NodeId, _document: str, _deadline_s: float) -> bytes | None:
+        for failure in failures:
+            raise failure
+        return encode(document())
+
+    desk.library.fetch = fetch
+    order = do.FetchDocument(document=document_hash(document()), peers=("robot1",))
+    desk.library.order(order)
+    desk.library.order(do.StoreDocument(request=1, content=document("# another\n")))
+    desk.next()  # the fetch before it has ended
+    desk.library.order(order)
+    event = desk.next()
+    assert isinstance(event, ev.DocumentStored)
+    assert event.document == order.document
+
+
 @pytest.mark.parametrize(
     ("text", "why"),
     [
