@@ -16,12 +16,13 @@ from typing import Final
 from zsched.clock import wall_ns
 from zsched.core.membership.refused import SHOWN_S
 from zsched.core.values.fleet import Security
-from zsched.doctor.model import Result, Scene, failed, joined, passed, skipped, warned
+from zsched.doctor.model import Result, Scene, Verdict, failed, joined, passed, skipped, warned
+from zsched.doctor.state import is_hidden
 from zsched.errors import ConfigError
 from zsched.files import read_regular
 from zsched.runtime.own_addresses import Address, addresses_at
 from zsched.runtime.sealing import seals_of
-from zsched.runtime.secured import CERTIFICATE, files_of, require_own
+from zsched.runtime.secured import CERTIFICATE, files_by, require_own
 from zsched.runtime.tls import ENCRYPTED, PLAIN, operator_json5, plain_text_problem, protocol_of
 from zsched.sessions.certificate import validities
 from zsched.sessions.config import tls_files
@@ -84,7 +85,20 @@ def certificates_last(scene: Scene, now: datetime | None = None) -> Result:
     ]
     if security is not None:
         found += _own(scene, security)
+        if (hidden := _hidden_one(scene, security, now)) is not None:
+            rest = [one for one in found if one.fix and hidden not in one.evidence]
+            later = f"a later one may be in {scene.state_folder}: run the doctor as root"
+            return joined(rest, skipped(f"{hidden}; {later}"))
     return joined(found, passed())
+
+
+def _hidden_one(scene: Scene, security: Security, now: datetime) -> str | None:
+    """What is told of a certificate that ends, where this user may not see whether another took its place."""
+    path = files_by(security, scene.state_folder).certificate
+    if not is_hidden(scene.state_folder):
+        return None
+    result = _certificate("certificate", path, now, OWN_SOON, "")
+    return result.evidence[0] if result.verdict in (Verdict.WARN, Verdict.FAIL) else None
 
 
 def _named_files(scene: Scene) -> dict[str, str]:
@@ -92,7 +106,7 @@ def _named_files(scene: Scene) -> dict[str, str]:
     security = scene.fleet.security
     if security is None:
         return tls_files(operator_json5(scene.fleet))
-    files = files_of(security)
+    files = files_by(security, scene.state_folder)
     return {"certificate": str(files.certificate), "key": str(files.key), "authority": str(files.trusted)}
 
 

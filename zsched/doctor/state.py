@@ -27,7 +27,7 @@ LOW_FILES: Final = 16
 def valid(scene: Scene) -> Result:
     """Whether there is a state, whole and this node's own."""
     folder = scene.state_folder
-    if _is_hidden(folder):
+    if is_hidden(folder):
         return skipped(f"user {os.geteuid()} may not look into {folder}: run the doctor as root")
     found = StateFile(folder, fleet=scene.fleet.name, node=scene.node).load()
     if found.state is not None:
@@ -50,7 +50,7 @@ def makes_an_elector(scene: Scene) -> Result:
         return warned(told, fix=SEAT_AGAIN.format(names=scene.node))
     if scene.node not in scene.fleet.electors:
         return skipped(f"{scene.node} is no elector")
-    if _is_hidden(scene.state_folder):
+    if is_hidden(scene.state_folder):
         return skipped(f"user {os.geteuid()} may not look into {scene.state_folder}: run the doctor as root")
     state = StateFile(scene.state_folder, fleet=scene.fleet.name, node=scene.node).load().state
     if state is None:
@@ -126,7 +126,7 @@ def judged_space(folder: Path, *, free: int, files: int | None, is_read_only: bo
     return warned(told, fix=fix) if free < LOW_BYTES else passed(told)
 
 
-def _is_hidden(folder: Path) -> bool:
+def is_hidden(folder: Path) -> bool:
     """Whether this user may not see what is in the folder."""
     try:
         return folder.exists() and not os.access(folder, os.R_OK | os.X_OK)

@@ -30,7 +30,7 @@ from zsched.core.values.struct import Struct
 from zsched.errors import AdapterError, WireError
 from zsched.files import read_regular
 from zsched.runtime.membership import NEXT_CELL, Places, Written, bring_back, is_joined, join, put_away, whose
-from zsched.runtime.secured import CERTIFICATE, KEY, TRUSTED, files_of
+from zsched.runtime.secured import CERTIFICATE, KEY, TRUSTED, files_by
 from zsched.wire.codec import decode_state
 from zsched.wire.invitation import MAX_BYTES, Invitation, decode_invitation, encode_invitation
 
@@ -73,7 +73,7 @@ def begin(state: Path, fleet: Fleet, text: str, invitation: Invitation) -> Chang
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True, mode=PRIVATE_FOLDER)
         with _opened(folder) as held:
-            _fill(held, fleet, text, invitation)
+            _fill(held, fleet, text, invitation, state)
             change = _change(folder, held, invitation)
             if not os.path.samestat(held.stat(), folder.lstat()):
                 raise AdapterError(f"{folder} was moved away while it was written; look who did so, and begin again")
@@ -93,17 +93,17 @@ def refreshed(state: Path, fleet: Fleet, text: str, change: Change) -> Change:
     folder = state / NEXT_CELL
     try:
         with _opened(folder) as held:
-            _fill_former(held, fleet, text)
+            _fill_former(held, fleet, text, state)
             _check_folder(held / FORMER / FILE)
             return _change(folder, held, change.invitation)
     except OSError as error:
         raise AdapterError(f"{error.filename or folder}: {error.strerror}; run this as root") from error
 
 
-def _fill(folder: Path, fleet: Fleet, text: str, invitation: Invitation) -> None:
+def _fill(folder: Path, fleet: Fleet, text: str, invitation: Invitation, state: Path) -> None:
     for name in (FORMER, NEXT):
         (folder / name / PKI_FOLDER).mkdir(parents=True, mode=PRIVATE_FOLDER)
-    _fill_former(folder, fleet, text)
+    _fill_former(folder, fleet, text, state)
     _write(folder / NEXT / FILE, invitation.document.text.encode())
     papers = invitation.papers
     if papers is not None:
@@ -114,10 +114,10 @@ def _fill(folder: Path, fleet: Fleet, text: str, invitation: Invitation) -> None
     _write(folder / INVITATION, encode_invitation(invitation).encode())
 
 
-def _fill_former(folder: Path, fleet: Fleet, text: str) -> None:
+def _fill_former(folder: Path, fleet: Fleet, text: str, state: Path) -> None:
     _write(folder / FORMER / FILE, text.encode())
     if fleet.security is not None:
-        files = files_of(fleet.security)
+        files = files_by(fleet.security, state)
         for name, path in ((CERTIFICATE, files.certificate), (KEY, files.key), (TRUSTED, files.trusted)):
             _write(folder / FORMER / PKI_FOLDER / name, read_regular(path, MAX_FILE_BYTES))
 

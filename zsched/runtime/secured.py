@@ -67,6 +67,11 @@ def files_of(security: Security, env: Mapping[str, str] = os.environ) -> Files:
     return Files(certificate=certificate, key=place(KEY), trusted=trusted)
 
 
+def files_by(security: Security, state: Path) -> Files:
+    """As `files_of`, of a machine whose state folder is that, whatever names it: an option may have."""
+    return files_of(security, {**os.environ, "ZSCHED_STATE_DIR": str(state)})
+
+
 def renewed_in(state: Path) -> Path:
     """Where a daemon keeps the certificate that was sent to it: what `zsched join` has written is not its to change."""
     return state / "pki" / CERTIFICATE

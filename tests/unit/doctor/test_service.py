@@ -16,6 +16,7 @@ from support.certificates import make_tls
 from support.clinic import FLEET, assert_finds, run, scene_of
 from zsched.doctor import security
 from zsched.doctor.model import Scene, Verdict
+from zsched.pki.authority import opened
 from zsched.sessions.certificate import validities
 
 ROOT = Path(__file__).parents[3]
@@ -166,6 +167,33 @@ def test_the_fleets_own_certificates_are_told_of_a_week_before_they_end(own: Sce
     assert_finds(run("tls.certificates", own), FAIL, "is robot1's, and this node is edge1")
     (tmp_path / "pki" / "certificate.pem").unlink()
     assert_finds(run("tls.certificates", own), FAIL, "certificate.pem: No such file")
+
+
+def test_a_certificate_that_was_sent_into_a_state_folder_of_another_place_counts(own: Scene, tmp_path: Path) -> None:
+    """The doctor is told of that folder by an option, and the daemon goes by what lies there."""
+    now = datetime.now(UTC)
+    with opened(tmp_path / "authority", "hall") as authority:
+        sent = authority.renew("edge1", None, b"", b"", now + timedelta(days=20)).certificate
+    (own.state_folder / "pki").mkdir()
+    (own.state_folder / "pki" / "certificate.pem").write_bytes(sent)
+    result = security.certificates_last(own, now + timedelta(days=31))
+    assert result.verdict is PASS
+    assert str(own.state_folder / "pki" / "certificate.pem") in "\n".join(result.evidence)
+
+
+def test_who_may_not_see_a_certificate_that_was_sent_is_told_of_no_end(
+    own: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The state folder is the service's alone, and the one that was brought at first ends a month later."""
+    late = datetime.now(UTC) + timedelta(days=31)
+    assert security.certificates_last(own, late).verdict is FAIL
+    monkeypatch.setattr("zsched.doctor.state.os.access", lambda *_: False)
+    result = security.certificates_last(own, late)
+    assert result.verdict is Verdict.SKIP
+    assert f"a later one may be in {own.state_folder}: run the doctor as root" in result.evidence[0]
+    assert security.certificates_last(own).verdict is PASS
+    (tmp_path / "pki" / "ca.pem").write_text("none")
+    assert_finds(security.certificates_last(own, late), FAIL, "ca.pem")
 
 
 def test_a_key_that_others_may_read_is_found(own: Scene, secured: Scene, tmp_path: Path) -> None:

@@ -8,10 +8,12 @@ import stat
 import subprocess
 from collections.abc import Callable
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
 
+from support.authorities import install, make_authority
 from zsched.adapters.host import state_file
 from zsched.adapters.host.document_store import DocumentStore
 from zsched.adapters.host.state_file import StateFile, replace_synced
@@ -20,6 +22,7 @@ from zsched.core.values.document import Document
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet, fleet_hash
 from zsched.errors import AdapterError, ConfigError
+from zsched.pki.authority import opened
 from zsched.runtime import membership, next_cell, unfinished
 from zsched.runtime.init import init_state
 from zsched.runtime.membership import (
@@ -404,6 +407,20 @@ def test_a_link_in_place_of_the_next_cell_s_folder_is_not_gone_by(
     link.symlink_to(theirs / "mine")
     with pytest.raises(AdapterError, match="is none that this command has made"):
         next_cell.under_way(first.state)
+
+
+def test_a_former_cell_is_asked_by_the_certificate_that_was_sent_here(
+    first: Places, invitation: Invitation, tmp_path: Path
+) -> None:
+    """It lies in the state folder, which an option may have named."""
+    first.config.write_text(SECURED)
+    install(make_authority(tmp_path / "authority", "hall"), first.config.parent / "pki", "robot1")
+    with opened(tmp_path / "authority", "hall") as authority:
+        sent = authority.renew("robot1", None, b"", b"", datetime.now(UTC) + timedelta(days=20)).certificate
+    (first.state / "pki").mkdir()
+    (first.state / "pki" / "certificate.pem").write_bytes(sent)
+    change = next_cell.begin(first.state, load_fleet(first.config), SECURED, invitation)
+    assert (change.former_file.parent / "pki" / "certificate.pem").read_bytes() == sent
 
 
 def test_a_former_cell_whose_authority_is_another_one_since_is_asked_by_that(
