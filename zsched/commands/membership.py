@@ -44,7 +44,16 @@ from zsched.errors import WireError, ZschedError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
 from zsched.files import read_regular
 from zsched.pki.files import write_whole
-from zsched.runtime.membership import Places, Written, belongings, found, is_joined, is_of_a_later_key, put_away
+from zsched.runtime.membership import (
+    Places,
+    Written,
+    belongings,
+    found,
+    is_joined,
+    is_of_a_later_key,
+    put_away,
+    usable,
+)
 from zsched.runtime.membership import join as join_here
 from zsched.runtime.own_addresses import addresses_at
 from zsched.runtime.unfinished import unfinished
@@ -505,6 +514,7 @@ def join(file: str, where: Places, *, is_plan: bool, is_json: bool) -> int:
             said = f"{where.state}: this machine is {node} of fleet {fleet} already: nothing to do"
             Told(fleet=fleet, node=node, outcome="unchanged", said=said).tell(is_json=is_json)
             return EXIT_OK
+        usable(invitation, where)  # before the files go by which it is a node now
         if is_plan:
             said = f"{fleet}: this machine would join as {node} once more, with the key of this later invitation"
             old = belongings(where, is_purged=False)

@@ -242,12 +242,8 @@ def join(invitation: Invitation, places: Places, *, is_plan: bool) -> tuple[Flee
         AdapterError: the machine has files of another fleet, or a file cannot be written.
         ConfigError: the document cannot be used here.
     """
-    fleet = _read(invitation.document.text, places.config)
-    if fleet.name != invitation.fleet or all(node.name != invitation.node for node in fleet.nodes):
-        raise ConfigError(f"the invitation's document has no node {invitation.node!r} in fleet {invitation.fleet!r}")
+    fleet = usable(invitation, places)
     _check_file(places.config, fleet.name)
-    if invitation.papers is not None and fleet.security is None:
-        raise ConfigError("the invitation has a certificate, and its document has no `security:` section")
     _check_papers(fleet, invitation)
     me, content, papers = invitation.node, invitation.document, invitation.papers
     listed = () if papers is None else (CERTIFICATE, TRUSTED, *((KEY,) if papers.key else ()))
@@ -257,6 +253,22 @@ def join(invitation: Invitation, places: Places, *, is_plan: bool) -> tuple[Flee
         with StateFile(places.state, fleet=fleet.name, node=me) as file:
             _put_all(file, fleet, me, value, content, places, disk, generation=generation, papers=papers)
     return fleet, written
+
+
+def usable(invitation: Invitation, places: Places) -> Fleet:
+    """The fleet of an invitation by which a machine can join, as far as it tells by itself.
+
+    Raises:
+        ConfigError: the document, or the certificate, cannot be used here.
+    """
+    fleet = _read(invitation.document.text, places.config)
+    if fleet.name != invitation.fleet or all(node.name != invitation.node for node in fleet.nodes):
+        raise ConfigError(f"the invitation's document has no node {invitation.node!r} in fleet {invitation.fleet!r}")
+    if invitation.papers is not None and fleet.security is None:
+        raise ConfigError("the invitation has a certificate, and its document has no `security:` section")
+    if why := papers_problem(invitation):
+        raise ConfigError(f"the invitation's {why}")
+    return fleet
 
 
 def is_of_a_later_key(invitation: Invitation, places: Places) -> bool:
@@ -296,11 +308,9 @@ def _check_file(path: Path, fleet: str) -> None:
 
 
 def _check_papers(fleet: Fleet, invitation: Invitation) -> None:
-    """Refuse certificates that are not this node's, and to take the place of somebody else's."""
+    """Refuse to take the place of somebody else's certificate, or of a key that was not asked for."""
     if invitation.papers is None or fleet.security is None:
         return
-    if why := papers_problem(invitation):
-        raise ConfigError(f"the invitation's {why}")
     if not invitation.papers.key:
         _check_own_key(Path(fleet.security.folder) / KEY, invitation)
     path = Path(fleet.security.folder) / CERTIFICATE

@@ -646,6 +646,25 @@ def test_a_machine_that_joined_by_an_earlier_invitation_takes_the_key_of_a_later
     require_own(fleet, fleet.security, "robot2")
 
 
+def test_a_later_invitation_that_cannot_be_used_leaves_the_machine_the_node_that_it_is(
+    node: Node, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A robot's clock may be wrong at its start: its files would be put away, and it would be no node any more."""
+    secured(tmp_path, node)
+    first, second, folder = tmp_path / "1.invite", tmp_path / "2.invite", tmp_path / "robot2"
+    words = ("invite", "robot2", "--yes", "-o")
+    assert run(*words, first, "--address", "192.0.2.12").exit_code == 0
+    assert run(*words, second).exit_code == 0
+    assert run("join", first, *here(folder)).exit_code == 0
+    before = sorted(str(path) for path in folder.rglob("*"))
+    moment = int((datetime.now(UTC) - timedelta(days=400)).timestamp() * 1e9)
+    monkeypatch.setattr("zsched.runtime.membership.wall_ns", lambda: moment)
+    for more in (("--plan",), ()):
+        refused = run("join", second, *more, *here(folder))
+        assert (refused.exit_code, "and this machine's clock says" in refused.stderr) == (78, True)
+        assert sorted(str(path) for path in folder.rglob("*")) == before
+
+
 def test_a_request_for_the_same_key_is_answered_again(node: Node, tmp_path: Path) -> None:
     secured(tmp_path, node)
     folder, csr, file = tmp_path / "robot2", tmp_path / "robot2.csr", tmp_path / "robot2.invite"
