@@ -3,7 +3,8 @@
 Knows: which adapter exists for what, and in which order things start and stop. Does not know: how anything is decided.
 
 ``python -m zsched.daemon --config FILE --node NAME``; `zsched up` becomes this process. Exit codes: 0 stopped,
-1 failed, 75 the node's name is alive elsewhere, 78 the fleet file or the node's name is wrong, 79 it has left its fleet.
+1 failed, 75 the node's name is alive elsewhere, 78 the fleet file or the node's name is wrong, 79 the node has left its
+fleet.
 """
 
 from __future__ import annotations
