@@ -45,9 +45,7 @@ STAYS_S: Final = 3.0
 """A task that has not left after this time is reported, with the reason; again when the reason changes."""
 NO_OTHER: Final = "no-other-candidate"
 """The danger: a task would have no candidate left that may get it."""
-SEAT_AGAIN: Final = (
-    "`zsched fleet export -o FILE`, then `zsched apply FILE --accept change-electors` gives the seat back"
-)
+SEAT_AGAIN: Final = "`zsched fleet export -o FILE`, then `zsched apply FILE --accept change-electors` mends that"
 """Where a document names an elector that is none."""
 NOTHING: Final = "-"
 TITLES: Final = ("WHAT", "KIND", "NOW", "AFTER")

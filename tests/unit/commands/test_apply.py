@@ -638,6 +638,21 @@ def test_show_names_the_electors_and_who_goes_by_something_else(node: Node) -> N
     assert faults(json.loads(run("fleet", "show", "--json").stdout)) == []
 
 
+def test_an_elector_that_only_the_document_names_is_shown_and_gets_its_seat_by_what_is_said(
+    node: Node, tmp_path: Path
+) -> None:
+    """It has left, and that was taken back; or the fleet was recovered. What is exported differs in nothing else."""
+    node.electors = ["edge1", "robot1"]
+    shown = " ".join(run("fleet", "show").stdout.split())
+    assert "electors by the document only: robot2; once they run: `zsched fleet export -o FILE`" in shown
+    file = tmp_path / "exported.yaml"
+    assert run("fleet", "export", "-o", file).exit_code == 0
+    done = run("apply", file, "--accept", "change-electors", "--yes")
+    assert done.exit_code == 0, done.stderr
+    assert [(one.get("add_elector"), one.get("text")) for one in node.changes] == [("robot2", None)]
+    assert "by the document only" not in run("fleet", "show").stdout
+
+
 def test_show_does_not_take_who_may_not_be_asked_for_who_is_away(node: Node, monkeypatch: pytest.MonkeyPatch) -> None:
     """An operator's laptop asks one node of a secured fleet, and no other one through it."""
     assert node.states["edge1"] == "alive"

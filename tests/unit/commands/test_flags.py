@@ -352,7 +352,7 @@ def test_a_leave_that_is_taken_back_too_late_says_how_its_node_gets_its_seat_aga
         assert len(told) == len(lacks)
         for line, name in zip(told, lacks, strict=True):
             assert f"{name} is no elector any more, and the document names it as one: `zsched fleet export" in line
-            assert "-o FILE`, then `zsched apply FILE --accept change-electors` gives the seat back" in line
+            assert "-o FILE`, then `zsched apply FILE --accept change-electors` mends that" in line
 
 
 def test_the_verbs_list_and_every_page_shows_the_flags(daemon: Daemon) -> None:
