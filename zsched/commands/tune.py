@@ -10,9 +10,10 @@ from enum import StrEnum
 from typing import Any, Final
 
 from zsched.commands.ask import ask_door
-from zsched.commands.common import CliError, Json, nearest, print_json, say
+from zsched.commands.common import CliError, Json, nearest, print_json, say, warn
 from zsched.commands.orders import CODES, OrderView, begin, check_name, check_said, status_of, tell_results
 from zsched.commands.weight_words import NAMES, shares
+from zsched.core.values.deadline import TELLS_NOTHING, DeadlineFault, deadline_fault
 from zsched.core.values.fleet import TUNED_LINKS, TUNED_RULES, default_patience
 from zsched.core.values.model import Aggregate, PairReading, Reach, ScoreForm, Tuning, Weights
 from zsched.core.values.struct import replace
@@ -112,6 +113,8 @@ def tune(view: OrderView, name: str | None, pairs: Sequence[str]) -> int:
         for key in KEYS
         if flat_before.get(key, 0.0) != flat_after.get(key, 0.0)
     ]
+    if flat_after["deadline_ms"] not in (None, flat_before["deadline_ms"]) and task.get("tells_no_jobs"):
+        warn(f"{name}: {TELLS_NOTHING}")
     told = {"task": name, "revision": task["revision"], "tuning": flat_after, "file": _flat(_file_tuning(task))}
     planned = {**told, "outcome": "planned" if rows else "unchanged", "detail": ""}
     code = begin(view, rows, {"schema": TUNING_SCHEMA, "tasks": [planned]}, is_change=bool(rows))
@@ -150,12 +153,21 @@ def _checked(after: Json, file: Json) -> Json:
     nu, rho = tuning.nu_dbm, tuning.rho_dbm
     if nu is not None and rho is not None and nu >= rho:
         raise CliError(EXIT_USAGE, f"nu_dbm ({nu:g}) must be below rho_dbm ({rho:g}); nothing was changed")
-    if tuning.deadline_ms is not None and tuning.score is ScoreForm.PAPER:
-        raise CliError(EXIT_USAGE, "the paper's score knows no deadlines: score=service, or deadline_ms=null")
+    check_deadline(after)
     by_file = {**file, "patience": _file_patience(after, file)}
     kept: dict[str, Any] = {key: None for key in OF_THE_FILE if after.get(key) == by_file.get(key)}
     body: Json = as_plain(replace(tuning, **kept))
     return body
+
+
+_INSTEAD: Final = {DeadlineFault.PAPER: "score=service", DeadlineFault.NO_CPU: "a weight for cpu"}
+
+
+def check_deadline(tuning: Json) -> None:
+    """Raise `CliError` (2) where a tuning has a deadline that could not count, as a fleet file is refused for it."""
+    fault = deadline_fault(ScoreForm(tuning.get("score", ScoreForm.PAPER)), shares(tuning["weights"])["cpu"])
+    if tuning.get("deadline_ms") is not None and fault is not None:
+        raise CliError(EXIT_USAGE, f"{fault}: {_INSTEAD[fault]}, or deadline_ms=null; nothing was changed")
 
 
 def _own(after: Json) -> Json:

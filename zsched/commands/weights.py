@@ -49,6 +49,10 @@ def weights(view: OrderView, name: str | None, pairs: Sequence[str]) -> int:
         return EXIT_OK
     task = tasks[name]
     before = shares(task["tuning"]["weights"])
+    if task["tuning"].get("deadline_ms") is not None:
+        from zsched.commands.tune import check_deadline  # noqa: PLC0415 - most tasks have none, and need no rule of it
+
+        check_deadline({**task["tuning"], "weights": wanted})
     keys = [key for key in NAMES if before.get(key, 0.0) != wanted.get(key, 0.0)]
     rows: list[Row] = [(name, key, f"{before.get(key, 0.0):g}", f"{wanted.get(key, 0.0):g}") for key in keys]
     plan = {"schema": SCHEMA, "task": name, "weights": wanted, "revision": task["revision"]}

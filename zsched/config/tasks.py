@@ -17,6 +17,7 @@ from zsched.config.rulecheck import RuleConflict, rule_conflicts
 from zsched.core.route.route import NOBODY, PLACEHOLDERS, named_rules, placeholders
 from zsched.core.route.templates import merges_keys, rule_fault, shared_key_fault, template_fault
 from zsched.core.scheduler.patience import FIRST_PATIENCE
+from zsched.core.values.deadline import TELLS_NOTHING, DeadlineFault, deadline_fault, tells_jobs
 from zsched.core.values.fleet import (
     DEFAULT_BONUS,
     DEFAULT_COOL_DOWN_S,
@@ -151,6 +152,12 @@ def _tuning(given: Section, out: Collector) -> Tuning | None:
     return scheduling.build(Tuning, out, weights=weights, **more, **dict.fromkeys(TUNED_RULES))
 
 
+_INSTEAD_OF_A_DEADLINE: Final = {
+    DeadlineFault.PAPER: "score: service, or objective: service without deadline_ms",
+    DeadlineFault.NO_CPU: "a weight for cpu, or objective: service without deadline_ms",
+}
+
+
 def _deadline(scheduling: Section, score: ScoreForm, weights: Weights, out: Collector) -> dict[str, float | None]:
     """``deadline_ms`` as the tuning has it, which is the objective at the same time."""
     objective = scheduling.values.get("objective", Objective.SERVICE)
@@ -161,12 +168,8 @@ def _deadline(scheduling: Section, score: ScoreForm, weights: Weights, out: Coll
     elif objective is Objective.SERVICE and deadline_ms is not None:
         message = "deadline_ms counts for objective latency only, and this task has objective service"
         out.error(scheduling.where("deadline_ms"), message, "add objective: latency, or delete it")
-    elif objective is Objective.LATENCY and score is ScoreForm.PAPER:
-        message = "the paper's score knows no deadlines: objective latency goes with score service"
-        out.error(scheduling.where("objective"), message, "score: service, or objective: service without deadline_ms")
-    elif objective is Objective.LATENCY and not weights.cpu:
-        message = "jobs are in time or late by the CPU of a machine, and this task gives the CPU no weight"
-        out.error(scheduling.where("objective"), message, "a weight for cpu, or objective: service")
+    elif objective is Objective.LATENCY and (fault := deadline_fault(score, weights.cpu)) is not None:
+        out.error(scheduling.where("objective"), fault.value, _INSTEAD_OF_A_DEADLINE[fault])
     else:
         return {"deadline_ms": deadline_ms}
     return {"deadline_ms": None}
@@ -258,11 +261,11 @@ def _advise_ready(given: Section, worker: WorkerSpec, streams: tuple[Located[Str
 
 
 def _advise_deadline(tuning: Tuning, worker: WorkerSpec, given: Section, out: Collector) -> None:
-    if tuning.deadline_ms is not None and worker.ready_when is ReadyWhen.MATCHING:
-        message = "only a worker that uses zsched.worker tells how long its jobs take; this one (ready: matching) does "
-        message += "not, so its machines are judged by service, whatever the deadline"
+    if tuning.deadline_ms is not None and not tells_jobs(worker):
         scheduling: Section = given.get("scheduling")
-        out.warn(scheduling.where("objective"), message, "use zsched.worker (ready: token), or objective: service")
+        out.warn(
+            scheduling.where("objective"), TELLS_NOTHING, "use zsched.worker (ready: token), or objective: service"
+        )
 
 
 def _advise_network(tuning: Tuning, given: Section, cast: Cast, out: Collector) -> None:

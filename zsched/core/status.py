@@ -14,6 +14,7 @@ from zsched.core.scheduler.judge import by
 from zsched.core.scheduler.rounds import TaskRound
 from zsched.core.scheduler.scoring import joined, may_get
 from zsched.core.stages import Stages, Unready
+from zsched.core.values.deadline import tells_jobs
 from zsched.core.values.decision import Explanation
 from zsched.core.values.document import Flag
 from zsched.core.values.fleet import NodeSpec, TaskSpec
@@ -383,6 +384,7 @@ def _task_status(node: Stages, spec: TaskSpec, now: float) -> TaskStatus:
         file_tuning=spec.in_force(spec.tuning),
         switched_s=executor.switched_s,
         gap_s=_move_gap(node, executor),
+        tells_no_jobs=not tells_jobs(spec.worker),
         streams=tuple(
             _with_flow(_with_keys(_with_age(count, node.missed, now), routes.get(count.stream)), node, now)
             for count in node.stream_counts

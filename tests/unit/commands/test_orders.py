@@ -518,6 +518,35 @@ def test_a_setting_that_cannot_be_is_refused_before_anybody_is_asked(daemon: Dae
     assert says in result.stderr, result.stderr
 
 
+def test_a_deadline_that_could_not_count_is_refused_as_the_fleet_file_refuses_it(daemon: Daemon) -> None:
+    """Whichever of the settings comes last, and whichever command brings it."""
+    for words in (("deadline_ms=100", "cpu=0", "memory=1"), ("deadline_ms=100", "score=paper")):
+        result = run("tune", "echo", *words, "--yes")
+        assert (result.exit_code, daemon.orders) == (2, [])
+    assert "the paper's score knows no deadlines" in result.stderr
+    daemon.status["tasks"][0]["tuning"] = {**TUNING, "deadline_ms": 100.0}
+    for verb in ("tune", "weights"):
+        result = run(verb, "echo", "cpu=0", "memory=1", "--yes")
+        assert (result.exit_code, daemon.orders) == (2, [])
+        assert "this task gives the CPU no weight" in result.stderr
+    assert run("tune", "echo", "cpu=0", "memory=1", "deadline_ms=null", "--yes").exit_code == 0
+
+
+def test_a_deadline_of_a_worker_that_tells_nothing_is_tuned_with_a_word(daemon: Daemon) -> None:
+    said = "judged by service, whatever the deadline"
+    assert said not in run("tune", "echo", "deadline_ms=100", "--plan").stderr, "an older program does not tell"
+    for is_mute, words, is_said in (
+        (False, ("deadline_ms=100",), False),
+        (True, ("bonus=0.2",), False),
+        (True, ("deadline_ms=100",), True),
+    ):
+        daemon.status["tasks"][0]["tells_no_jobs"] = is_mute
+        result = run("tune", "echo", *words, "--yes")
+        assert (result.exit_code, said in result.stderr) == (0, is_said), result.output
+    daemon.status["tasks"][0]["tuning"] = {**TUNING, "deadline_ms": 100.0}
+    assert said not in run("tune", "echo", "bonus=0.2", "--yes").stderr, "that is not what is changed"
+
+
 def test_every_setting_can_be_set_back() -> None:
     other = {**TUNING, "weights": {"cpu": 1.0, "memory": 0.0, "network": 0.0}, "bonus": 0.9, "score": "paper"}
     assert tuned(other, OWN, [f"{key}=null" for key in KEYS]) == OWN

@@ -29,7 +29,7 @@ from zsched.core.values.document import Flag, FlagKind
 from zsched.core.values.fleet import Fleet, OnIsolation, Security, Standby, WorkerSpec, electorate_hash, lease_terms
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import PeerState, ScoreForm
-from zsched.core.values.plan import StreamCount
+from zsched.core.values.plan import ReadyWhen, StreamCount
 from zsched.core.values.profile import DeviceSample, Echo, Jobs, LinkSample, LinkSource, WorkerState
 from zsched.core.values.snapshot import SCHEMA, Snapshot
 from zsched.core.values.words import OWN_CERTIFICATE, RESTARTING, TAKEN_OUT, WAS_READY, told_of_worker
@@ -415,6 +415,15 @@ def test_the_way_there_and_back_is_told_of_a_task_with_a_deadline(deadline_ms: f
         node.round_trips.note_heard(replace(ours, node=name, echoes=(echo,)), 7, 101.0)
     told = {task.name: task.round_trips for task in build_snapshot(node, 101.0).tasks}
     assert told == {"merge": () if deadline_ms is None else (("edge1", 0.5),), "merge2": ()}
+
+
+def test_a_task_tells_whether_its_worker_could_tell_of_jobs() -> None:
+    node = make()
+    assert {task.tells_no_jobs for task in build_snapshot(node, 100.0).tasks} == {False}
+    foreign = replace(FLEET.tasks[0], worker=replace(FLEET.tasks[0].worker, ready_when=ReadyWhen.MATCHING))
+    node.handle(ev.FleetChanged(fleet=replace(FLEET, tasks=(foreign, *FLEET.tasks[1:]))), 100.1)
+    (first, *others) = snapshot_json(build_snapshot(node, 100.2))["tasks"]
+    assert (first["tells_no_jobs"], {task["tells_no_jobs"] for task in others}) == (True, {False})
 
 
 def test_an_explanation_says_whether_jobs_are_known_that_a_deadline_needs() -> None:

@@ -180,6 +180,8 @@ class TaskStatus(Struct, frozen=True, kw_only=True):
     gap_s: float | None = None
     """The longest time, over this robot's output streams, between the last answer of the owner before and the first
     one of this owner; ``None``: this owner has not answered yet, no other one answered before, or it is an edge."""
+    tells_no_jobs: bool = False
+    """Whether its worker cannot tell of its jobs, without which no deadline counts; an older program does not say."""
 
 
 class QuorumStatus(Struct, frozen=True, kw_only=True):
