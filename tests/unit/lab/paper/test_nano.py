@@ -469,7 +469,9 @@ def test_schemes_stand_where_they_stand_behind_what_moves_cost() -> None:
     assert moves_text(results_of([{**one, "moves": 0} for one in the_runs()])) == ""
 
 
-@pytest.mark.parametrize(("block", "told"), [("matrix", "10 %"), ("heavy", "17 %"), ("nano", "")])
+@pytest.mark.parametrize(
+    ("block", "told"), [("matrix", "10 %"), ("heavy", "17 %"), ("heavy_again", "15 %"), ("nano", "")]
+)
 def test_the_floor_stands_below_the_goals_for_the_latency(block: str, told: str) -> None:
     runs = [{**one, "block": block, "task_latency_s": 30.0} for one in the_runs()]
     text = floors_text({block: runs})
