@@ -236,8 +236,15 @@ def _limit_told(gauge: Gauge) -> str:
 WEIGHTS: Final = Record(
     "the weights section",
     {
-        "cpu": Field(_SHARE, "Weight of free CPU (Eq. 1). All weights sum to 1.", default="`0`"),
-        "memory": Field(_SHARE, "Weight of free memory (Eq. 2).", default="`0`"),
+        "cpu": Field(
+            _SHARE,
+            "Weight of the CPU: of the share of its work that the task gets done with it; with `score: paper` of what "
+            "is free (Eq. 1). All weights sum to 1.",
+            default="`0`",
+        ),
+        "memory": Field(
+            _SHARE, "Weight of the memory: likewise; with `score: paper` of what is free (Eq. 2).", default="`0`"
+        ),
         "network": Field(_SHARE, "Weight of the radio link (Eq. 3).", default="`0`"),
         **{gauge.name: Field(_SHARE, _weight_told(gauge), default="`0`") for gauge in GAUGES},
     },
@@ -289,8 +296,10 @@ SCHEDULING: Final = Record(
         **keys(TaskSpec, "reach", "memory_floor_ratio", "max_moves_per_minute"),
         "patience": Field(
             Number(0, MAX_PATIENCE),
-            "What staying may cost before the task moves. Staying costs the best candidate's lead in utility, times "
-            "the seconds that it lasts: 0.3 is a lead of 0.1 for 3 s. `0`: the first lead that is seen is followed.",
+            "What staying may cost before the task moves. A second of staying costs what the best candidate's lead in "
+            f"utility has beyond the bonus: with a bonus of {DEFAULT_BONUS:g} a lead of 0.1 costs "
+            f"{0.1 - DEFAULT_BONUS:g}, and reaches 0.3 in {0.3 / (0.1 - DEFAULT_BONUS):g} s. `0`: the first lead that "
+            "is seen is followed.",
             default=f"learnt, {CHOICES[0]:g} to {CHOICES[-1]:g}; `{RADIO_PATIENCE:g}` with a weight for the network; "
             f"`{PAPER_PATIENCE:g}` with `score: paper`",
         ),
@@ -298,7 +307,7 @@ SCHEDULING: Final = Record(
     removed={
         "time_to_trigger_s": Removed(
             why="a timer follows a big lead as late as a small one, and patience loses less under every load",
-            instead="delete it: the task learns its patience; or patience: 0.3, lead times seconds",
+            instead="delete it: the task learns its patience; or patience: 0.3, lead beyond the bonus times seconds",
         ),
         "pays_off_in_s": Removed(
             why="it gained only where a move costs ten seconds and more, and no more than a larger bonus does there",
@@ -363,7 +372,9 @@ TASK: Final = Record(
         "candidates": Field(_NODES, "The nodes that may own the task: names, or a selection.", required=True),
         "weights": Field(
             WEIGHTS,
-            "How much CPU, memory, network and gauges count in a candidate's score (Eq. 4); their sum is 1.",
+            "How much CPU, memory, network and gauges count in a candidate's score; their sum is 1. Their terms are "
+            "multiplied, each to the power of its weight over the largest weight; with `score: paper` they are added, "
+            "each times its weight (Eq. 4).",
             required=True,
         ),
         "limits": Field(LIMITS, "How far a candidate's gauges may go."),
