@@ -9,12 +9,14 @@ import pytest
 from support.fleets import task_of, tuning_of
 from zsched.commands.rules import LONGEST_S, left_after_s, told
 from zsched.config.schema import LINK_LIMITS, SCHEDULING
+from zsched.core.scheduler.utility import total_utility
 from zsched.core.values.fleet import LinkLimits, TaskSpec, Timing
-from zsched.core.values.model import PairReading, ScoreForm
+from zsched.core.values.model import PairReading, ScoreForm, Weights
 
 TIMING = Timing()
 RADIO = tuning_of(cpu=0.5, memory=0.2, network=0.3, score=ScoreForm.SERVICE, bonus=0.05)
 SPEC = task_of(tuning=RADIO, patience=0.3)
+GAUGED = task_of(tuning=replace(RADIO, weights=Weights.of({"cpu": 0.4, "battery": 0.4, "gpu": 0.2})))
 
 
 def words(spec: TaskSpec) -> str:
@@ -40,6 +42,16 @@ def test_every_setting_is_named_with_its_key() -> None:
         (replace(SPEC, limits=LinkLimits(foresee_s=3.0)), "as they will be in 3 s, at most 6 dB away (link.foresee_s)"),
         (replace(SPEC, limits=LinkLimits(pair=PairReading.WEAKER)), "the weaker of the two ways counts"),
         (SPEC, "(objective: service)"),
+        (SPEC, "staying has cost 0.3 s of its work (patience); a second costs the lead beyond the bonus"),
+        (SPEC, "by 1 % for cpu, 0.4 % for memory, 0.6 % for network (weights: cpu 0.5, memory 0.2, network 0.3)"),
+        (replace(SPEC, tuning=replace(RADIO, score=ScoreForm.PAPER)), "the terms are added, each times its weight"),
+        (SPEC, "smoothing and patience alone: sampling, gathering, the vote and the commit come on top"),
+        (replace(SPEC, tuning=replace(RADIO, deadline_ms=80.0)), "its fair share if that is more"),
+        (GAUGED, "by 1 % for cpu, 1 % for battery, 0.5 % for gpu (weights: cpu 0.4, memory 0, network 0, battery 0.4"),
+        (GAUGED, "the term of gpu is the use of the freest GPU, 1 at 0 % and 0 at 100 %; a machine where it is not"),
+        (GAUGED, "not measured cannot have the task while another one has it"),
+        (GAUGED, "the term of battery is the battery's charge, 1 at 100 % and 0 at 0 %; a machine where it is not"),
+        (GAUGED, "not measured counts 1"),
     ],
 )
 def test_a_setting_is_told_by_what_it_does(spec: TaskSpec, said: str) -> None:
@@ -61,3 +73,26 @@ def test_the_time_to_leave_grows_with_patience_and_smoothing_and_falls_with_the_
 
 def test_a_lead_that_is_added_up_for_ever_is_told_as_an_hour() -> None:
     assert left_after_s(0.0501, 0.05, 1000.0, TIMING) == pytest.approx(LONGEST_S, abs=1.0)
+
+
+def test_what_a_weight_does_is_what_the_score_does() -> None:
+    """By how many percent the worth falls with a term, as it is told."""
+    weights = Weights.of({"cpu": 0.5, "memory": 0.2, "network": 0.3})
+    measured = frozenset({"cpu", "memory", "network"})
+    terms = {"cpu": 0.8, "memory": 0.6, "network": 0.7}
+    for name, told_falls in (("cpu", 1.0), ("memory", 0.4), ("network", 0.6)):
+        values = []
+        for one in (terms, {**terms, name: 0.99 * terms[name]}):
+            cpu, memory, network = one["cpu"], one["memory"], one["network"]
+            form = ScoreForm.SERVICE
+            value = total_utility(weights, cpu=cpu, memory=memory, network=network, measured=measured, form=form)
+            assert value is not None
+            values.append(value)
+        was, is_now = values
+        assert 100.0 * (1.0 - is_now / was) == pytest.approx(told_falls, rel=0.01)
+
+
+def test_the_lead_that_a_second_of_staying_costs_is_that_beyond_the_bonus() -> None:
+    """The example of the fleet file's reference: 0.1 under a bonus of 0.05 reaches 0.3 in 6 s."""
+    at_once = replace(TIMING, smoothing_s=0.001)
+    assert left_after_s(0.1, 0.05, 0.3, at_once) == pytest.approx(6.0, abs=0.1)
