@@ -23,7 +23,7 @@ from zenoh import SampleKind
 
 from zsched.adapters.network.control_bus import ControlBus
 from zsched.core import events as ev
-from zsched.core.hop.receiver import MAX_REPLAYED, RETURN, Source
+from zsched.core.hop.receiver import MAX_REPLAYED, RETURN
 from zsched.core.hop.sender import Sender, near
 from zsched.core.hop.serial import serial_of
 from zsched.core.hop.shared import MAX_RECEIVERS, SharedSender
@@ -34,7 +34,7 @@ from zsched.core.values.model import MAX_COUNTER
 from zsched.core.values.words import NAME
 from zsched.hop.acknowledger import Acknowledger
 from zsched.ipc.pipe import decode_chunk, decode_end, encode_chunk, encode_end
-from zsched.relay.streams.slots import KeyState
+from zsched.relay.streams.slots import KeyState, Numbers
 from zsched.relay.tokens import Tokens
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import Keyspace, counter, parse
@@ -299,7 +299,7 @@ class KeyFuzz:
                 is_taken = key.take_end(named, self._rng.choice((publisher, ("b2", 7))), 1.0)
                 assert not is_taken or key.end_of == publisher or number == 0
             key.received += 1
-            assert key.sources.setdefault(publisher, Source.at(0)).take(number)
+            assert key.sources.setdefault(publisher, Numbers(first=0, arrived=0, processed=0)).take(number)
             key.last_number = number
             key.heard_at = 1.0
             if key.is_past_end(publisher):
