@@ -4,11 +4,13 @@ Knows: which of our profiles another node has, and for how long. Does not know: 
 
 Every node's profile names the newest profile that it has of each other node, and for how long it has held it (as NTP
 does, and RTCP's DLSR, RFC 3550). The time since we sent that profile, less the hold, is the round trip, whatever the
-clocks show. A busy daemon takes a frame late, so the least of the last few counts.
+clocks show. A busy daemon takes a frame late, so the least of the last few counts. A way that becomes longer is seen
+that many profiles later. After a break the first one counts alone: what was before tells of another time.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Mapping
 
@@ -21,6 +23,8 @@ SENT = 64
 """Number of our own profiles that may be echoed; an older one says nothing."""
 ECHO_S = 10.0
 """A profile that was held for longer is not echoed."""
+BREAK_S = 10.0
+"""A round trip that comes so long after the last one begins anew."""
 
 
 class RoundTrips:
@@ -33,6 +37,8 @@ class RoundTrips:
         self._heard: dict[NodeId, tuple[int, int, float]] = {}
         """{node: (incarnation, sequence, when) of its newest profile}."""
         self._known: dict[NodeId, deque[float]] = {}
+        self._known_at: dict[NodeId, float] = {}
+        """{node: when its last round trip was measured}."""
 
     def note_sent(self, profile: Profile, now: float) -> None:
         """Our own profile leaves."""
@@ -49,7 +55,13 @@ class RoundTrips:
                 continue
             round_trip_s = now - sent_at - echo.held_s
             if round_trip_s >= 0.0:  # or its clock runs ahead
-                self._known.setdefault(profile.node, deque(maxlen=KEPT)).append(round_trip_s)
+                self._note(profile.node, round_trip_s, now)
+
+    def _note(self, node: NodeId, round_trip_s: float, now: float) -> None:
+        if now - self._known_at.get(node, -math.inf) > BREAK_S:
+            self._known[node] = deque(maxlen=KEPT)
+        self._known[node].append(round_trip_s)
+        self._known_at[node] = now
 
     def echoes(self, now: float) -> tuple[Echo, ...]:
         """The echoes for our next profile."""

@@ -1,13 +1,15 @@
-"""SCHEDULER, the radio: what one robot's link to one candidate is worth (Eq. 3).
+"""SCHEDULER, the radio: what one robot's link to one candidate is worth (Eq. 3), and how far away it counts.
 
-Knows: links that were measured directly, the two ways of a pair that meet at an access point, trends. Does not know:
-weights, who may have the task, how signals are smoothed.
+Knows: links that were measured directly, the two ways of a pair that meet at an access point, trends, ways that nobody
+has measured yet. Does not know: weights, who may have the task, how signals are smoothed.
 
 Whether a candidate is *reached* is always a matter of the weaker way as measured: a path with a dead end is dead, and
 nothing foreseen makes it so. What it is *worth* depends on the task's reading of a pair (docs/decisions/0018).
 """
 
 from __future__ import annotations
+
+from collections.abc import Collection, Mapping
 
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.utility import network_utility
@@ -88,3 +90,24 @@ def foreseen(link: Link, lead_s: float) -> float:
     assert link.rssi_dbm is not None
     step_db = lead_s * (link.trend_db_s or 0.0)
     return link.rssi_dbm + min(max(step_db, -FORESEE_MOST_DB), FORESEE_MOST_DB)
+
+
+def way_s(
+    voter: NodeId,
+    candidate: NodeId,
+    candidates: Collection[NodeId],
+    round_trips: Mapping[NodeId, float],
+    gateway: Gateway,
+    now: float,
+) -> float:
+    """Seconds from a robot to a candidate and back.
+
+    A way that is not measured yet counts as the longest to another candidate that is heard: it must not be better by
+    that. Where none is measured, none counts.
+    """
+    if candidate == voter:
+        return 0.0
+    if candidate in round_trips:
+        return round_trips[candidate]
+    heard = (name for name in candidates if name in round_trips and gateway.fresh(name, now) is not None)
+    return max((round_trips[name] for name in heard), default=0.0)

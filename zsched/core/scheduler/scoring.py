@@ -16,7 +16,7 @@ from zsched.core.gateway.company import is_full
 from zsched.core.gateway.demand import Demands, is_short
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.gateway.sharing import fair_share
-from zsched.core.scheduler.links import pair_link
+from zsched.core.scheduler.links import pair_link, way_s
 from zsched.core.scheduler.utility import (
     cpu_utility,
     memory_service,
@@ -140,7 +140,7 @@ def score(
         if link is not None and not link.is_reached:
             unreachable.append(candidate)
             continue
-        network_s = round_trips.get(candidate, 0.0)
+        network_s = way_s(voter, candidate, spec.candidates, round_trips, gateway, now)
         load = profile.worker(spec.name)
         # what an owner that is short gets is measured
         is_measured = candidate == allocation.owner and load is not None and is_short(load)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from support.profiles import profile_of
-from zsched.core.gateway.round_trips import ECHO_S, KEPT, SENT, RoundTrips
+from zsched.core.gateway.round_trips import BREAK_S, ECHO_S, KEPT, SENT, RoundTrips
 from zsched.core.values.profile import Echo
 
 MINE = profile_of("robot1", incarnation=7, sequence=0, memory_mb=100.0, memory_used_mb=1.0)
@@ -36,6 +36,20 @@ def test_the_least_of_the_last_ones_counts() -> None:
     for sequence in range(10, 10 + KEPT):
         exchange(mine, 0.05, 0.2, 0.05, sequence)
     assert round(mine.seconds()["edge1"], 6) == 0.1, "and it can rise"
+
+
+def test_what_was_measured_before_a_break_counts_until_the_next_one_and_no_longer() -> None:
+    """A machine that was away for an hour, or a deadline that was taken off for one, comes back another way."""
+    mine = RoundTrips("robot1")
+    for sequence in range(KEPT):
+        exchange(mine, 0.01, 0.2, 0.01, sequence)
+    later = 100.22 + BREAK_S
+    exchange(mine, 0.3, 0.0, 0.3, KEPT, later - 0.6)
+    assert round(mine.seconds()["edge1"], 6) == 0.02, "no break yet"
+    exchange(mine, 0.3, 0.0, 0.3, KEPT + 1, later + BREAK_S)
+    assert round(mine.seconds()["edge1"], 6) == 0.6
+    exchange(mine, 0.3, 0.0, 0.2, KEPT + 2, later + BREAK_S + 1.0)
+    assert round(mine.seconds()["edge1"], 6) == 0.5, "and the least counts again"
 
 
 def test_echoes_that_mean_nothing_change_nothing() -> None:

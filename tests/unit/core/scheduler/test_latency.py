@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import pytest
@@ -12,7 +13,7 @@ from support.allocations import allocation_of
 from support.fleets import fleet_of, task_of, tuning_of
 from support.profiles import load_of, profile_of
 from zsched.core.gateway.gateway import Gateway
-from zsched.core.scheduler.scoring import score
+from zsched.core.scheduler.scoring import NOTHING_HELD, score
 from zsched.core.scheduler.utility import on_time, service_utility
 from zsched.core.values.fleet import Demand, WorkerSpec
 from zsched.core.values.model import PeerState, ScoreForm, Tuning
@@ -31,10 +32,13 @@ def worth(
     used: tuple[float, float] = (1.0, 1.0),
     away_s: tuple[float | None, float | None] = (0.0, 0.0),
     runnable: tuple[float | None, float | None] = (None, None),
+    away: Mapping[str, float] = NOTHING_HELD,
+    candidates: tuple[str, ...] = EDGES,
+    voter: str = "robot1",
 ) -> tuple[float, float]:
     """What the owner edge1 and the candidate edge2 are worth, behind the owner's settling."""
-    spec = task_of(candidates=EDGES, tuning=tuning, worker=WorkerSpec(command=("x",)), demand=Demand())
-    gateway = Gateway(fleet_of(spec, of=(*EDGES, "robot1")))
+    spec = task_of(candidates=candidates, tuning=tuning, worker=WorkerSpec(command=("x",)), demand=Demand())
+    gateway = Gateway(fleet_of(spec, of=(*candidates, "robot1")))
     for sequence, now in ((1, 0.0), (2, 10.0)):
         for name, speed, cores, threads in zip(EDGES, speeds, used, runnable, strict=True):
             told = jobs or JOBS
@@ -53,9 +57,9 @@ def worth(
             assert gateway.absorb(profile, now) is None
         gateway.learn_demand("merge", "edge1", now)
     allocation = allocation_of(tuning=tuning)
-    states = dict.fromkeys((*EDGES, "robot1"), PeerState.ALIVE)
-    trips = {name: trip_s for name, trip_s in zip(EDGES, away_s, strict=True) if trip_s is not None}
-    vector = score(spec, allocation, "robot1", gateway, states, 10.0, round_trips=trips)
+    states = dict.fromkeys((*candidates, "robot1"), PeerState.ALIVE)
+    trips = {name: trip_s for name, trip_s in zip(EDGES, away_s, strict=True) if trip_s is not None} | dict(away)
+    vector = score(spec, allocation, voter, gateway, states, 10.0, round_trips=trips)
     found = {one.candidate: one.value for one in vector.utilities}
     return found["edge1"], found["edge2"]
 
@@ -77,8 +81,26 @@ def test_the_way_counts_as_a_job_s_own_time_does() -> None:
     assert worth(away_s=(0.05, 0.05))[0] < near
 
 
-def test_a_way_that_nobody_has_measured_counts_nothing() -> None:
-    assert worth(away_s=(0.0, None)) == worth(away_s=(0.0, 0.0))
+@pytest.mark.parametrize("known_s", [0.0, 0.03, 0.15])
+def test_a_way_that_is_not_measured_yet_counts_as_the_longest_that_is(known_s: float) -> None:
+    """A candidate is not better because a figure of it is missing, and an owner no worse than what is known."""
+    assert worth(away_s=(known_s, None)) == worth(away_s=(known_s, known_s))
+    assert worth(away_s=(None, known_s)) == worth(away_s=(known_s, known_s))
+
+
+def test_where_no_way_is_measured_none_counts() -> None:
+    assert worth(away_s=(None, None)) == worth(away_s=(0.0, 0.0))
+
+
+def test_of_ways_only_those_to_candidates_that_are_heard_count_for_others() -> None:
+    """Neither what is no candidate, nor who is gone for a day, says how far away a candidate is."""
+    assert worth(away_s=(0.03, None), away={"robot1": 9.0, "robot2": 9.0}) == worth(away_s=(0.03, 0.03))
+    three = ("edge0", *EDGES)
+    assert worth(away_s=(0.03, None), away={"edge0": 9.0}, candidates=three) == worth(away_s=(0.03, 0.03))
+
+
+def test_a_robot_that_is_a_candidate_is_no_way_from_itself() -> None:
+    assert worth(away_s=(0.03, None), voter="edge2") == worth(away_s=(0.03, 0.0), voter="edge2")
 
 
 def test_a_candidate_with_nothing_free_stretches_the_job() -> None:
