@@ -1,19 +1,23 @@
 """GATEWAY: the newest profile of every node, with its age (the paper's ``edge_data``, Alg. 1).
 
-Knows: which profile is newer, how old is too old, the task's demand. Does not know: which node is better.
+Knows: which profile is newer, how old is too old, what a node measured before its reader failed, the task's demand.
+Does not know: which node is better.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 from zsched.core.gateway.demand import Demands
 from zsched.core.gateway.sharing import Shares
 from zsched.core.sequence import Order, Track
 from zsched.core.values.fleet import Demand, Fleet, TaskSpec
+from zsched.core.values.gauges import BY_NAME, possible
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.profile import Profile
 from zsched.core.values.struct import Struct
+from zsched.core.values.words import GaugeName
 
 
 class EdgeData(Struct, frozen=True, kw_only=True):
@@ -29,6 +33,8 @@ class Gateway:
     def __init__(self, fleet: Fleet) -> None:
         self._profiles: dict[NodeId, tuple[Profile, float]] = {}
         self._tracks: dict[NodeId, Track] = {}
+        self._readings: dict[NodeId, dict[GaugeName, float]] = {}
+        """{node: the last readings in this life of its gauges without which it may have a task}."""
         self.demands = Demands()
         """What tasks need, as this node has learnt it."""
         self._shares = Shares()
@@ -41,7 +47,7 @@ class Gateway:
         self._names = frozenset(node.name for node in fleet.nodes)
         self._ttl_s = fleet.timing.profile_ttl_s
         self._tasks = {task.name: task for task in fleet.tasks}
-        for known in (self._profiles, self._tracks):
+        for known in (self._profiles, self._tracks, self._readings):
             for name in [name for name in known if name not in self._names]:
                 del known[name]
         self.version += 1
@@ -58,9 +64,20 @@ class Gateway:
         order = track.judge(profile.incarnation, profile.sequence, now, may_begin=is_over)
         if order is not Order.NEW:
             return "stale" if order is Order.OLD else "doubtful"
-        self._profiles[profile.node] = (profile, now)
+        known = self._profiles.get(profile.node)
+        last = {} if known is None or known[0].incarnation != profile.incarnation else self._readings[profile.node]
+        seen = {name: reading for name, reading in possible(profile.gauges) if not BY_NAME[name].is_needed}
+        self._profiles[profile.node], self._readings[profile.node] = (profile, now), last | seen
         self.version += 1
         return None
+
+    def readings(self, profile: Profile) -> Mapping[GaugeName, float]:
+        """A node's gauges by its newest profile; what it does not measure any more is as it was last, in this life.
+
+        A reader that fails must not make its node better, and a node without a battery counts as full. Not so the
+        gauges that a task needs (`Gauge.is_needed`): a node without them cannot have it.
+        """
+        return self._readings.get(profile.node, {}) | dict(possible(profile.gauges))
 
     def newest(self, node: NodeId, now: float) -> EdgeData | None:
         """The newest profile of ``node`` whatever its age, or ``None`` when it never sent one."""

@@ -43,6 +43,7 @@ from zsched.core.values.model import (
 from zsched.core.values.profile import Profile, WorkerLoad, WorkerState
 from zsched.core.values.quorum import majority
 from zsched.core.values.struct import Struct, field, replace
+from zsched.core.values.words import GaugeName
 
 Bookings = Mapping[NodeId, tuple[TaskSpec, ...]]
 """{owner: its tasks}: of a task that has just come, profiles show nothing yet."""
@@ -132,7 +133,8 @@ def score(
             continue
         demand, unseen = gateway.demand(spec, profile), _unseen(spec, profile, bookings, gateway)
         use = _predicted(spec, allocation, profile, demand, unseen)
-        reason = _refusal(spec, allocation, profile, demand, use)
+        gauges = _readings(spec, allocation, profile, gateway)
+        reason = _refusal(spec, allocation, profile, demand, use, gauges)
         if reason:
             refused.append((candidate, reason))
             continue
@@ -148,8 +150,8 @@ def score(
         least = 0.0 if is_measured else fair
         cpu = _cpu(spec, profile, demand, use, allocation.tuning, gateway.demands, network_s, least, fair)
         memory = _memory(spec, profile, demand, use, form)
-        gauges = _gauges(spec, allocation, profile)
-        terms[candidate] = _Terms(cpu, memory, None if link is None else link.utility, gauges)
+        weighed = _gauges(allocation, gauges)
+        terms[candidate] = _Terms(cpu, memory, None if link is None else link.utility, weighed)
     if len(terms) > 1 and all(term.network is None for name, term in terms.items() if name != voter):
         # A robot always reaches itself: nobody measures that.
         terms = {name: replace(term, network=None) for name, term in terms.items()}
@@ -284,7 +286,14 @@ def may_get(spec: TaskSpec, state: WorkerState | None) -> bool:
     return state is WorkerState.READY or (starts_then and state is not WorkerState.FAILED)
 
 
-def _refusal(spec: TaskSpec, allocation: Allocation, profile: Profile, demand: Demand, use: _Use) -> str:
+def _refusal(
+    spec: TaskSpec,
+    allocation: Allocation,
+    profile: Profile,
+    demand: Demand,
+    use: _Use,
+    gauges: Mapping[GaugeName, float],
+) -> str:
     """Why the node may not have the task; empty when it may."""
     if profile.draining:
         return "draining"
@@ -301,36 +310,37 @@ def _refusal(spec: TaskSpec, allocation: Allocation, profile: Profile, demand: D
     used = use.memory_mb
     if used is not None and used > profile.memory_mb:
         return f"needs {demand.memory_mb:.0f} MiB, has {max(profile.memory_mb - used + demand.memory_mb, 0.0):.0f} free"
-    return _beyond_limits(spec, profile, is_owner=is_owner)
+    return _beyond_limits(spec, profile, gauges, is_owner=is_owner)
 
 
-def _beyond_limits(spec: TaskSpec, profile: Profile, *, is_owner: bool) -> str:
+def _beyond_limits(spec: TaskSpec, profile: Profile, gauges: Mapping[GaugeName, float], *, is_owner: bool) -> str:
     """Why the machine's gauges forbid the task; empty: they do not."""
-    readings = _readings(spec, profile, is_owner=is_owner) if spec.gauge_limits else {}
+    told = dict(possible(profile.gauges)) if spec.gauge_limits else {}
     added = {"gpu"} if spec.demand.gpu and not is_owner else set[str]()
     faults = (
-        BY_NAME[name].fault(readings.get(name), limit, is_owner=is_owner, is_reckoned=name in added)
+        BY_NAME[name].fault(
+            gauges.get(name), limit, is_owner=is_owner, is_reckoned=name in added, is_old=name not in told
+        )
         for name, limit in spec.gauge_limits
     )
     return next((fault for fault in faults if fault), "")
 
 
-def _readings(spec: TaskSpec, profile: Profile, *, is_owner: bool) -> dict[str, float]:
-    """The node's gauges, predicted as if it had the task."""
-    readings = dict(possible(profile.gauges))
-    need = spec.demand.gpu
+def _readings(spec: TaskSpec, allocation: Allocation, profile: Profile, gateway: Gateway) -> Mapping[GaugeName, float]:
+    """The node's gauges, predicted as if it had the task; none where the task goes by none."""
+    if not (spec.gauge_limits or allocation.tuning.weights.gauges):
+        return {}
+    readings, need = dict(gateway.readings(profile)), spec.demand.gpu
     if need and "gpu" in readings:  # by the fleet file: no driver tells which process uses how much
-        readings["gpu"] = predicted_use(readings["gpu"], need if is_owner else 0.0, need)
+        own = need if profile.node == allocation.owner else 0.0
+        readings["gpu"] = predicted_use(readings["gpu"], own, need)
     return readings
 
 
-def _gauges(spec: TaskSpec, allocation: Allocation, profile: Profile) -> dict[str, float]:
+def _gauges(allocation: Allocation, gauges: Mapping[GaugeName, float]) -> dict[str, float]:
     """The terms of the weighed gauges that this node measures."""
     weighed = {name for name, _ in allocation.tuning.weights.gauges}
-    if not weighed:
-        return {}
-    readings = _readings(spec, profile, is_owner=profile.node == allocation.owner)
-    return {name: BY_NAME[name].term(reading) for name, reading in readings.items() if name in weighed}
+    return {name: BY_NAME[name].term(reading) for name, reading in gauges.items() if name in weighed}
 
 
 def _is_assumed(name: str) -> bool:

@@ -52,7 +52,9 @@ class Gauge(Struct, frozen=True, kw_only=True):
         """
         return f"{reading * 100:.0f} %" if not self.unit else f"{reading:.0f} {self.unit}"
 
-    def fault(self, reading: float | None, limit: float, *, is_owner: bool, is_reckoned: bool = False) -> str:
+    def fault(
+        self, reading: float | None, limit: float, *, is_owner: bool, is_reckoned: bool = False, is_old: bool = False
+    ) -> str:
         """Why a node with this reading may not have a task with this limit; empty: it may.
 
         Args:
@@ -60,6 +62,7 @@ class Gauge(Struct, frozen=True, kw_only=True):
             limit: the task's.
             is_owner: whether it has the task: it is left at the limit, and got back inside the margin only.
             is_reckoned: whether the reading has what the task would add.
+            is_old: whether it is the last one, of a reader that has failed since.
 
         >>> battery = GAUGES[1]
         >>> battery.fault(0.18, 0.2, is_owner=True)
@@ -73,7 +76,7 @@ class Gauge(Struct, frozen=True, kw_only=True):
             return ""  # no reading is beyond it: it only asks for the gauge
         sign = 1.0 if self.is_floor else -1.0
         inside = sign * (reading - limit)
-        at = f"{'would be' if is_reckoned else 'is'} at {self.shown(reading)}"
+        at = f"{'would be' if is_reckoned else 'was last' if is_old else 'is'} at {self.shown(reading)}"
         if inside < 0.0:
             return f"{self.name} {at}, limit {self.shown(limit)}"
         back = limit + sign * self.margin

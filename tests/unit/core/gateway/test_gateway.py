@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 
@@ -54,6 +55,26 @@ def test_each_new_figure_is_one_more_version() -> None:
     gateway.learn_demand("merge", "edge1", 0.0)
     gateway.learn_demand("merge", "edge1", 0.0)
     assert gateway.version == before + 1, "the second look found nothing new"
+
+
+def test_a_battery_is_remembered_for_its_node_s_life_and_for_as_long_as_the_node_is_in_the_fleet() -> None:
+    full = replace(profile(0), gauges=(("battery", 0.6), ("gpu", 0.3), ("wind", 5.0)))
+    gateway = gateway_with(full)
+    assert gateway.readings(full) == {"battery": 0.6, "gpu": 0.3}
+    for sequence, gauges, known in (
+        (1, (), {"battery": 0.6}),
+        (2, (("battery", 7.0),), {"battery": 0.6}),  # a driver's fault
+        (3, (("battery", 0.5),), {"battery": 0.5}),
+        (4, (("temperature_c", 50.0),), {"battery": 0.5, "temperature_c": 50.0}),
+    ):
+        one = replace(profile(sequence), gauges=gauges)
+        assert gateway.absorb(one, float(sequence)) is None
+        assert gateway.readings(one) == known
+    gateway.adopt(fleet_of(TASK, of=("edge2", "robot1"), electors=("robot1",)))
+    gateway.adopt(FLEET)
+    assert gateway.readings(profile(5)) == {}
+    assert gateway.absorb(profile(6), 20.0) is None
+    assert gateway.readings(profile(6)) == {}
 
 
 # --- newest, fresh -------------------------------------------------------------------------------------------------

@@ -522,6 +522,39 @@ def test_a_node_without_a_gpu_cannot_have_a_task_that_weighs_it_and_one_without_
     assert terms_of(vector) == {"edge1": {"battery": 0.5}, "edge2": {"battery": 1.0}}
 
 
+def failing(*profiles: Profile, spec: TaskSpec = SPEC, agreed: Allocation, life: int = 0) -> UtilityVector:
+    """The profiles arrive, then each node's next one without any gauge, from the ``life``-th life after."""
+    gateway = Gateway(fleet_of(spec, of=("edge1", "edge2", "edge3", "robot1"), electors=("robot1",)))
+    for one in profiles:
+        assert gateway.absorb(one, 0.0) is None
+        without = replace(one, gauges=(), sequence=1, incarnation=one.incarnation + life)
+        assert gateway.absorb(without, 0.1, without.incarnation) is None
+    states = dict.fromkeys(("edge1", "edge2", "edge3"), PeerState.ALIVE)
+    return score(spec, agreed, "robot1", gateway, states, 0.1)
+
+
+def test_a_node_whose_battery_is_not_read_any_more_has_its_last_charge() -> None:
+    """Otherwise it would be worth more than one that tells of 60 %; a restarted one has no battery, or reads it."""
+    agreed, told = weighed(cpu=0.5, battery=0.5), (gauged("edge1", battery=0.6), gauged("edge2", battery=0.1))
+    assert terms_of(failing(*told, agreed=agreed)) == {"edge1": {"battery": 0.6}, "edge2": {"battery": 0.1}}
+    assert terms_of(failing(*told, agreed=agreed, life=1)) == {"edge1": {}, "edge2": {}}
+
+
+def test_a_node_whose_gpu_is_not_read_any_more_has_none() -> None:
+    agreed = weighed(cpu=0.5, gpu=0.5)
+    assert terms_of(failing(gauged("edge1", gpu=0.5), agreed=agreed)) == {"edge1": {}}
+
+
+def test_a_limit_holds_also_for_a_reader_that_has_failed() -> None:
+    spec = replace(SPEC, gauge_limits=(("battery", 0.2), ("temperature_c", 85.0)))
+    told = (gauged("edge1", battery=0.15), gauged("edge2", temperature_c=91.0), gauged("edge3", battery=0.9))
+    vector = failing(*told, spec=spec, agreed=allocation())
+    assert dict(vector.refused) == {
+        "edge1": "battery was last at 15 %, limit 20 %",
+        "edge2": "temperature_c was last at 91 °C, limit 85 °C",
+    }
+
+
 def test_a_gauge_that_nobody_measures_is_left_out() -> None:
     with_weight = scored(gauged("edge1"), gauged("edge2"), agreed=weighed(cpu=0.5, gpu=0.3, battery=0.2))
     assert [one.value for one in with_weight.utilities] == [one.value for one in scored(gauged("edge1")).utilities] * 2
