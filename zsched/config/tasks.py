@@ -72,6 +72,7 @@ def read_tasks(section: Section, cast: Cast, out: Collector) -> tuple[TaskSpec, 
             tasks.append(task)
             _advise_network(task.tuning, entry.value, cast, out)
             _advise_deadline(task.tuning, task.worker, entry.value, out)
+            _advise_gpu(task, entry.value, out)
     split = frozenset(node.name for node in cast.nodes if node.local is not None)
     for conflict in rule_conflicts(tasks, cast.of_kind(NodeKind.ROBOT), split):
         _report(conflict, places, out)
@@ -266,6 +267,22 @@ def _advise_deadline(tuning: Tuning, worker: WorkerSpec, given: Section, out: Co
         out.warn(
             scheduling.where("objective"), TELLS_NOTHING, "use zsched.worker (ready: token), or objective: service"
         )
+
+
+def _advise_gpu(task: TaskSpec, given: Section, out: Collector) -> None:
+    """The GPU counts, and how much of it the task uses is not said; a limit of all of it only asks for a GPU."""
+    gpu = BY_NAME["gpu"]
+    is_weighed = bool(dict(task.tuning.weights.gauges).get(gpu.name))
+    is_limited = dict(task.gauge_limits).get(gpu.name, gpu.high) < gpu.high
+    if task.demand.gpu or not (is_weighed or is_limited):
+        return
+    section: Section = given.get("weights" if is_weighed else "limits")
+    message = (
+        f"the GPU has a {'weight' if is_weighed else 'limit'}, but nothing says how much of it the task uses, and "
+    )
+    message += "no driver tells: the GPU counts where the task begins, and the task does not leave its owner for it"
+    hint = "demand: {gpu: 0.3} (its share of one GPU; `zsched status` shows a machine's use with and without the task)"
+    out.warn(section.where(gpu.name), message, hint)
 
 
 def _advise_network(tuning: Tuning, given: Section, cast: Cast, out: Collector) -> None:

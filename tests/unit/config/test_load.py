@@ -822,6 +822,29 @@ tasks: {t: {candidates: [r1], weights: {cpu: 0.5, network: 0.5}}}
     assert "it will not count" in result.report()
 
 
+@pytest.mark.parametrize(
+    ("settings", "word"),
+    [
+        ("weights: {cpu: 0.5, gpu: 0.5}", "the GPU has a weight"),
+        ("weights: {cpu: 1}, limits: {gpu: 0.9}", "the GPU has a limit"),
+        ("weights: {cpu: 0.5, gpu: 0.5}, demand: {gpu: 0.3}", ""),
+        ("weights: {cpu: 1}, limits: {gpu: 0.9}, demand: {gpu: 0.3}", ""),
+        ("weights: {cpu: 1}, limits: {gpu: 1}", ""),
+        ("weights: {cpu: 0.5, battery: 0.5}, limits: {battery: 0.2}", ""),
+    ],
+)
+def test_a_gpu_that_counts_without_the_task_s_use_of_it_is_a_warning(settings: str, word: str) -> None:
+    text = f"fleet: f\nnodes: {{r1: {{kind: robot}}}}\ntasks: {{t: {{candidates: [r1], {settings}}}}}\n"
+    result = check(text)
+    assert result.fleet is not None, "a running fleet may have such a file"
+    found = [one for one in result.warnings if "GPU" in one.message]
+    assert len(found) == bool(word)
+    for warning in found:
+        assert word in warning.message
+        assert "demand: {gpu: 0.3}" in warning.hint
+        assert text.splitlines()[warning.line - 1][: warning.col - 1].endswith("gpu: ")
+
+
 # --- the price -------------------------------------------------------------------------------------------------------
 
 

@@ -152,6 +152,7 @@ def score(
         memory = _memory(spec, profile, demand, use, form)
         weighed = _gauges(allocation, gauges)
         terms[candidate] = _Terms(cpu, memory, None if link is None else link.utility, weighed)
+    _spare_gpu(spec, allocation, terms)
     if len(terms) > 1 and all(term.network is None for name, term in terms.items() if name != voter):
         # A robot always reaches itself: nobody measures that.
         terms = {name: replace(term, network=None) for name, term in terms.items()}
@@ -314,14 +315,20 @@ def _refusal(
 
 
 def _beyond_limits(spec: TaskSpec, profile: Profile, gauges: Mapping[GaugeName, float], *, is_owner: bool) -> str:
-    """Why the machine's gauges forbid the task; empty: they do not."""
+    """Why the machine's gauges forbid the task; empty: they do not.
+
+    An owner whose GPU may be busy with the task alone, for all that is known, is not left for that.
+    """
     told = dict(possible(profile.gauges)) if spec.gauge_limits else {}
     added = {"gpu"} if spec.demand.gpu and not is_owner else set[str]()
+    limits = dict(spec.gauge_limits)
+    if is_owner and "gpu" in limits and not spec.demand.gpu:
+        limits["gpu"] = BY_NAME["gpu"].high
     faults = (
         BY_NAME[name].fault(
             gauges.get(name), limit, is_owner=is_owner, is_reckoned=name in added, is_old=name not in told
         )
-        for name, limit in spec.gauge_limits
+        for name, limit in limits.items()
     )
     return next((fault for fault in faults if fault), "")
 
@@ -341,6 +348,20 @@ def _gauges(allocation: Allocation, gauges: Mapping[GaugeName, float]) -> dict[s
     """The terms of the weighed gauges that this node measures."""
     weighed = {name for name, _ in allocation.tuning.weights.gauges}
     return {name: BY_NAME[name].term(reading) for name, reading in gauges.items() if name in weighed}
+
+
+def _spare_gpu(spec: TaskSpec, allocation: Allocation, terms: dict[NodeId, _Terms]) -> None:
+    """Of a task whose use of the GPU nobody knows: let the owner's be worth as much as the best of the others'.
+
+    Else it would look worse by the task's own work, which would follow the task wherever it goes (0120).
+    """
+    owner = allocation.owner
+    if owner is None or owner not in terms or spec.demand.gpu:
+        return
+    own = terms[owner]
+    if "gpu" in own.gauges:
+        best = max(term.gauges["gpu"] for term in terms.values() if "gpu" in term.gauges)
+        terms[owner] = replace(own, gauges={**own.gauges, "gpu": best})
 
 
 def _is_assumed(name: str) -> bool:

@@ -5,12 +5,14 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 
 from support.allocations import allocation_of
 from support.fleets import fleet_of, task_of
 from support.profiles import load_of, profile_of
 from zsched.core.gateway.gateway import Gateway
-from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts, compare, score
+from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts, compare, pick, score
 from zsched.core.scheduler.utility import NEARLY_FULL, service_utility
 from zsched.core.values.fleet import DEFAULT_BONUS, Demand, LinkLimits, Standby, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.model import (
@@ -565,6 +567,78 @@ def test_a_demand_of_the_gpu_is_predicted_for_every_candidate_alike() -> None:
     spec = replace(SPEC, demand=Demand(gpu=0.4))
     vector = scored(gauged("edge1", gpu=0.4), gauged("edge2", gpu=0.0), spec=spec, agreed=weighed(cpu=0.5, gpu=0.5))
     assert terms_of(vector) == {"edge1": {"gpu": 0.6}, "edge2": {"gpu": 0.6}}
+
+
+@st.composite
+def gpu_worlds(draw: st.DrawFn) -> tuple[dict[str, tuple[float, float]], float]:
+    """{machine: (cores, GPU) in use without the task}, and what of a GPU the task uses."""
+    share = st.floats(0.0, 1.0).map(lambda value: round(value, 2))
+    return {name: (4.0 * draw(share), draw(share)) for name in SPEC.candidates}, draw(share)
+
+
+@given(
+    world=gpu_worlds(),
+    weights=st.sampled_from(({"gpu": 1.0}, {"cpu": 0.5, "gpu": 0.5})),
+    form=st.sampled_from(ScoreForm),
+)
+@example(
+    world=(dict.fromkeys(SPEC.candidates, (0.4, 0.1)), 0.5),
+    weights={"cpu": 0.5, "gpu": 0.5},
+    form=ScoreForm.SERVICE,
+)
+def test_a_task_whose_use_of_the_gpu_nobody_knows_does_not_chase_itself(
+    world: tuple[dict[str, tuple[float, float]], float], weights: dict[str, float], form: ScoreForm
+) -> None:
+    """Where nothing changes but what it uses itself, it comes to rest, without bonus, patience and cool-down."""
+    machines, used = world
+    spec, owner, left = replace(SPEC, demand=Demand(cpu_cores=0.4)), "edge1", set[str]()
+    while owner not in left:
+        seen = [
+            replace(
+                profile(name, cpu=cores + 0.4 * (name == owner), own=(0.4 * (name == owner), 0.0)),
+                gauges=(("gpu", min(gpu + used * (name == owner), 1.0)),),
+            )
+            for name, (cores, gpu) in machines.items()
+        ]
+        tuning = Tuning(weights=Weights.of(weights), score=form)
+        vector = scored(*seen, spec=spec, agreed=allocation_of(7, owner, epoch=3, tuning=tuning))
+        best = pick(values(vector), owner)
+        if best == owner or best is None:
+            return
+        left.add(owner)
+        owner = best
+    pytest.fail(f"it comes back to {owner}")
+
+
+def test_without_its_demand_the_gpu_says_where_a_task_begins_and_where_it_goes_that_must_leave() -> None:
+    agreed, others = weighed(cpu=0.5, gpu=0.5), {"edge2": {"gpu": 0.75}, "edge3": {"gpu": 0.5}}
+    told = (gauged("edge1", gpu=0.875), gauged("edge2", gpu=0.25), gauged("edge3", gpu=0.5))
+    assert terms_of(scored(*told, agreed=replace(agreed, owner=None))) == {"edge1": {"gpu": 0.125}, **others}
+    assert terms_of(scored(*told, agreed=agreed)) == {"edge1": {"gpu": 0.75}, **others}
+    freest = gauged("edge1", gpu=0.0625)
+    assert terms_of(scored(freest, *told[1:], agreed=agreed)) == {"edge1": {"gpu": 0.9375}, **others}
+    assert terms_of(scored(gauged("edge1"), *told[1:], agreed=agreed)) == others, "it must have one"
+    by_file = replace(SPEC, demand=Demand(gpu=0.25))
+    assert terms_of(scored(*told, agreed=agreed, spec=by_file))["edge1"] == {"gpu": 0.125}
+
+
+@pytest.mark.parametrize(
+    ("limit", "gpu", "refused"),
+    [
+        (0.9, {"edge1": 1.0, "edge2": 0.95, "edge3": 0.85}, {"edge2", "edge3"}),
+        (0.9, {"edge2": 0.5}, {"edge1", "edge3"}),
+        (1.0, {"edge1": 1.0, "edge2": 1.0}, {"edge3"}),
+    ],
+)
+def test_without_its_demand_a_limit_of_the_gpu_keeps_a_task_away_and_does_not_drive_it_off(
+    limit: float, gpu: dict[str, float], refused: set[str]
+) -> None:
+    """Else it would leave each machine that it has come to; one without a GPU cannot have it."""
+    spec = replace(SPEC, gauge_limits=(("gpu", limit),))
+    told = [gauged(name, gpu=gpu[name]) if name in gpu else gauged(name) for name in SPEC.candidates]
+    assert {name for name, _ in scored(*told, spec=spec).refused} == refused
+    known = replace(spec, demand=Demand(gpu=0.1))
+    assert ("edge1" in dict(scored(*told, spec=known).refused)) == (limit < gpu.get("edge1", 2.0))
 
 
 def test_a_limit_of_the_gpu_tells_what_the_task_would_make_of_it() -> None:
