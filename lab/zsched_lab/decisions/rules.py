@@ -2,9 +2,10 @@
 
 Knows: when each rule looks, and which node it then chooses. Does not know: the truth, what a choice is worth.
 
-`CoreRule` is the production's decision: one `Judge` per robot, a called vote, the tally, flap damping. It does what
-`zsched.core.scheduler.rounds` does when no message is lost; `tests/unit/lab/decisions/test_same_as_nodes.py` holds the
-two together. `TimedJudge` is what the production decided by before patience: a yardstick.
+`CoreRule` is the production's decision: `zsched.core.scheduler.decision` at each robot, a called vote, the tally, flap
+damping. It does what `zsched.core.scheduler.rounds` does when no message is lost;
+`tests/unit/lab/decisions/test_same_as_nodes.py` holds the two together. `TimedJudge` is what the production decided by
+before patience: a yardstick.
 """
 
 from __future__ import annotations
@@ -16,8 +17,10 @@ from random import Random
 from typing import Any, Protocol
 
 from zsched.core.scheduler.damping import Damping
-from zsched.core.scheduler.judge import Judge, Judgement, Outcome, escape_reason
+from zsched.core.scheduler.decision import decide_by, rules_of
+from zsched.core.scheduler.judge import Judge, Judgement, Outcome
 from zsched.core.scheduler.scoring import Standing, pick
+from zsched.core.values.decision import Figures, Rules
 from zsched.core.values.fleet import PAPER_PATIENCE, TaskSpec
 from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, Tuning
 from zsched.core.vote.tally import VoteOutcome, tally
@@ -98,9 +101,11 @@ class CoreRule:
     _settled_at: float = -math.inf
     _due: float = math.inf
     _spec: TaskSpec = field(init=False)
+    _rules: Rules = field(init=False)
 
     def __post_init__(self) -> None:
         self._spec = replace(self.view.spec, patience=self.patience, learns_patience=self.learns_patience)
+        self._rules = rules_of(self._spec)
         self._judges = [self._new_judge() for _ in self.view.fleet.voters]
         self._allocation = Allocation(task=self._spec.name, revision=0, epoch=0, owner=None, tuning=self.tuning)
 
@@ -123,20 +128,23 @@ class CoreRule:
             self._wake_when_due(seat, judgement, now)
 
     def _judge(self, seat: int, standing: Standing, now: float, *, is_called: bool) -> Judgement:
-        owner, allocation = self._allocation.owner, self._allocation
-        escape = None
-        if owner is not None:
-            profile = self.view.gateway.fresh(owner, now)
-            escape = escape_reason(self._spec, allocation, PeerState.ALIVE, profile, standing, 0.0)
-        return self._judges[seat].judge(
-            standing,
-            allocation,
-            settled_for_s=now - self._settled_at,
-            escape=escape,
-            is_called=is_called,
+        owner, voters, electors = self._allocation.owner, self.view.fleet.voters, self.view.fleet.electors
+        figures = Figures(
+            task=self._spec.name,
             now=now,
-            damping=self._damping,
+            rules=self._rules,
+            allocation=self._allocation,
+            voters=voters,
+            present=voters,
+            vectors=standing.vectors,
+            electors=electors,
+            electors_heard=electors,
+            settled_for_s=now - self._settled_at,
+            owner_state=PeerState.ALIVE,
+            owner_profile=None if owner is None else self.view.gateway.fresh(owner, now),
+            is_called=is_called,
         )
+        return decide_by(standing, self._judges[seat], self._damping, figures).judgement
 
     def _wake_when_due(self, seat: int, judgement: Judgement, now: float) -> None:
         """A lead that only waits for a time-to-trigger and the cool-down is judged when they end."""
@@ -172,7 +180,7 @@ class CoreRule:
             judge.reset(is_new_owner=won)
         if counted.winner is None or not won:
             return
-        self._damping.note_move(owner, has_failed=False, now=now)
+        self._damping.note_move(owner, has_failed=False, is_escape=counted.is_escape, now=now)
         self._settled_at = now + COMMIT_S
         self._allocation = Allocation(
             task=self._spec.name, revision=0, epoch=self._allocation.epoch + 1, owner=counted.winner, tuning=self.tuning

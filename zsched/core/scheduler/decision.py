@@ -40,8 +40,13 @@ class Decided(Struct, frozen=True, kw_only=True):
 
 def decide(judge: Judge, damping: Damping, figures: Figures) -> Decided:
     """Judge by ``figures``; ``judge`` and ``damping`` hold the memory of which the figures have a copy."""
+    vectors = {vector.voter: vector for vector in figures.vectors}
+    return decide_by(compare(judge.spec, figures.allocation, vectors), judge, damping, figures)
+
+
+def decide_by(compared: Standing, judge: Judge, damping: Damping, figures: Figures) -> Decided:
+    """`decide` by the vectors of ``figures`` as `compare` has joined them: once for all who have the same."""
     allocation = figures.allocation
-    compared = compare(judge.spec, allocation, {vector.voter: vector for vector in figures.vectors})
     standing = _keep_out(compared, figures)
     escape = _escape(judge, standing, figures)
     if escape is not None and escape == short_of_memory(judge.spec, allocation, figures.owner_profile):

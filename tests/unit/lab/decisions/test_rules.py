@@ -17,7 +17,7 @@ from zsched_lab.decisions import entries
 from zsched_lab.decisions.replay import Entry, replay
 from zsched_lab.decisions.report import STARS
 from zsched_lab.decisions.rules import BlindRule, CoreRule, Move, PickRule, drawn, first_match, fixed
-from zsched_lab.decisions.view import Feed, Look, View
+from zsched_lab.decisions.view import START_S, Feed, Look, View
 from zsched_lab.decisions.world import DT_S, EVEN, World, equal_world, loaded_world
 
 STEP_AT_S = 60.0
@@ -59,6 +59,39 @@ def test_a_step_of_thirty_percent_is_followed_in_time(seed: int) -> None:
         assert move.left == "edge001"
         assert move.at_s - STEP_AT_S >= trigger_s - timing.decide_s, entry.name
         assert move.at_s - STEP_AT_S <= trigger_s + 0.6 * timing.smoothing_s + 1.1 * timing.decide_s, entry.name
+
+
+def short_of_memory(*ratios: float) -> World:
+    """So much of each edge's memory is in use, from the 20th second on; before it the first edge is the idler one."""
+    world = equal_world(seed=1, hours=0.02, half_width=0.0)
+    memory, cpu = world.memory.copy(), world.cpu.copy()
+    start = round(20.0 / DT_S)
+    cpu[:start, 1:] += 0.3
+    memory[start:] = ratios
+    return replace(world, cpu=cpu, cpu_read=cpu, memory=memory, memory_read=memory)
+
+
+def test_no_rule_of_ours_flees_for_memory_to_a_machine_that_would_lack_it_too() -> None:
+    """As in the product: the owner cannot be scored, and is left for that, by a planned move."""
+    for entry in entries.ours(short_of_memory(0.96, 0.92)):
+        ((move,), (fled,)) = (only(short_of_memory(0.96, ratio), entry) for ratio in (0.92, 0.4))
+        assert (fled.is_escape, move.is_escape) == (True, False), entry.name
+        assert move.at_s > fled.at_s, entry.name
+
+
+def test_an_escape_is_kept_apart_from_planned_moves() -> None:
+    """Else six of them in a minute would hold every planned move back."""
+    world = short_of_memory(0.97, 0.4)
+    view = View(world, feed := Feed(world, Look()))
+    rule = CoreRule(view, Tuning(weights=EVEN))
+    for step in range(world.steps):
+        feed.step(step)
+        rule.round((0,) if step % 5 == 0 else (), step * DT_S, now := START_S + step * DT_S)
+        if len(rule.moves) == 2:
+            break
+    (first, fled) = rule.moves
+    assert (first.owner, fled.left, fled.is_escape) == ("edge001", "edge001", True)
+    assert [rule._damping.moves_within(60.0, now, escapes=is_escape) for is_escape in (True, False)] == [1, 0]
 
 
 def test_after_a_move_the_cool_down_holds() -> None:
