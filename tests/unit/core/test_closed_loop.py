@@ -22,9 +22,12 @@ from support.proposals import proposal_of
 from zsched.core.events import WorkerJobs
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.profile.profile import Profiler
-from zsched.core.scheduler.judge import Judge, Judgement, Outcome, escape_reason
+from zsched.core.scheduler.damping import Damping
+from zsched.core.scheduler.decision import decide, rules_of
+from zsched.core.scheduler.judge import Judge, Judgement, Outcome
 from zsched.core.scheduler.patience import CHOICES
-from zsched.core.scheduler.scoring import compare, score
+from zsched.core.scheduler.scoring import score
+from zsched.core.values.decision import Figures
 from zsched.core.values.fleet import (
     DEFAULT_BONUS,
     DEFAULT_COOL_DOWN_S,
@@ -219,20 +222,23 @@ class Loop:
             robot: score(self.spec, self.allocation, robot, gateway, self.states, now)
             for robot, gateway in self.gateways.items()
         }
-        standing = compare(self.spec, self.allocation, vectors)
-        profile = self.gateways[self.robots[0]].fresh(owner, now)
-        escape = escape_reason(self.spec, self.allocation, PeerState.ALIVE, profile, standing, 0.0)
-        return {
-            robot: judge.judge(
-                standing,
-                self.allocation,
-                settled_for_s=now - self.settled_at,
-                escape=escape,
-                is_called=is_called,
-                now=now,
-            )
-            for robot, judge in self.judges.items()
-        }
+        figures = Figures(
+            task=self.spec.name,
+            now=now,
+            rules=rules_of(self.spec),
+            allocation=self.allocation,
+            voters=self.robots,
+            present=self.robots,
+            vectors=tuple(vectors.values()),
+            electors=self.robots,
+            electors_heard=self.robots,
+            settled_for_s=now - self.settled_at,
+            owner_state=PeerState.ALIVE,
+            owner_profile=self.gateways[self.robots[0]].fresh(owner, now),
+            is_called=is_called,
+        )
+        # without a record of moves: the cap must not hide a cycle
+        return {robot: decide(judge, Damping(), figures).judgement for robot, judge in self.judges.items()}
 
     def _vote(self, judgements: dict[str, Judgement], now: float) -> None:
         proposals = {
