@@ -37,6 +37,8 @@ SCHEMA = "zsched.event/1"
 NAME, OLD_NAME = "decisions.ndjson", "decisions.1.ndjson"
 NAMES = OLD_NAME, NAME
 FILE_BYTES = 2 * 1024 * 1024
+MAX_DIGITS = 15
+"""No file is longer than such a number of bytes; a cursor's offset of more digits is none."""
 PAGE_BYTES = 512 * 1024
 """One answer tells of at most this much of a file, so that a question keeps a daemon busy for milliseconds only."""
 TOLD_BYTES = 64 * 1024
@@ -358,7 +360,8 @@ def read_page(folder: Path, cursor: str, most_bytes: int = PAGE_BYTES) -> tuple[
     with contextlib.ExitStack() as stack:
         found = {str(os.fstat(file.fileno()).st_ino): file for file in _opened(folder, stack)}
         marks = list(found)
-        offset = int(offset_text) if mark in marks and offset_text.isdecimal() else 0
+        is_place = mark in marks and offset_text.isdecimal() and len(offset_text) <= MAX_DIGITS
+        offset = int(offset_text) if is_place else 0
         if offset > (os.fstat(found[mark].fileno()).st_size if mark in marks else 0):
             mark, offset = "", 0  # another file has its number by now, or somebody has emptied it
         first = marks.index(mark) if mark in marks else 0

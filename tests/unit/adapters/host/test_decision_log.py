@@ -164,6 +164,13 @@ def test_a_reader_whose_file_is_shorter_by_now_begins_with_what_is_left(tmp_path
     assert read_page(tmp_path, cursor) == ([], cursor, False)
 
 
+@pytest.mark.parametrize("offset", ["", "-1", "x", "9" * 5000, "\u00b2"])
+def test_a_place_that_is_none_begins_with_the_oldest_line(tmp_path: Path, offset: str) -> None:
+    Kept(tmp_path).write(story("one"))
+    first, cursor, _ = read_page(tmp_path, "")
+    assert read_page(tmp_path, f"{cursor.partition(':')[0]}:{offset}")[0] == first != []
+
+
 def test_a_page_read_while_the_newer_file_is_set_aside_leaves_nothing_out_and_tells_nothing_twice(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
