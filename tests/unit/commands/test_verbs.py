@@ -86,7 +86,10 @@ def test_check_tells_the_hash_by_which_a_daemon_names_the_file(tmp_path: Path) -
         ("{patience: 0.7}", ["staying has cost 0.7 s of its work (patience)"]),
         ("{score: paper}", ["Eq. 1 and 2", "0.55 utility seconds", "less than 5 % of its memory free is left at once"]),
         ("{max_moves_per_minute: 9, reach: all, aggregate: median}", ["9 times", "all robots reach", "median decides"]),
-        ("{objective: latency, deadline_ms: 80}", ["of the work that it gets done there the share counts that is expected within 80 ms"]),
+        (
+            "{objective: latency, deadline_ms: 80}",
+            ["of the work that it gets done there the share counts that is expected within 80 ms"],
+        ),
         ("{memory_floor_ratio: 0.2}", ["less than 20 %"]),
     ],
 )
