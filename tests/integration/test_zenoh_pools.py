@@ -50,7 +50,7 @@ def test_a_daemon_gives_itself_its_relay_and_its_workers_a_thread_for_every_link
     relay = bed.relay_pid("edge1")
     assert relay is not None
     assert environment(relay)["ZENOH_RUNTIME"] == daemon_pools(NODES), "its daemon's, until it sets its own:"
-    assert has_threads(relay, rx=count, tx=count, net=count, acc=1)
+    assert has_threads(relay, rx=count, tx=count, net=count, acc=count)
     workers = descendants_running(bed.pid("edge1"), "zsched.tasks.echo")
     assert workers
     for worker in workers:

@@ -349,13 +349,14 @@ def worker_pools(nodes: int, tasks: int) -> str:
 
 
 def relay_pools(threads: int) -> str:
-    """The value of ``ZENOH_RUNTIME`` for a relay: ``threads`` that receive, transmit, and close links, each.
+    """The value of ``ZENOH_RUNTIME`` for a relay: ``threads`` that receive, transmit, dial, and accept, each.
 
-    One stalled target holds one thread that transmits, and later the one that closes its link. ``net`` has as many as
-    ``rx``, because a socket is read by the pool that opened it: ``net`` also receives on every link that this process
-    has dialled (docs/decisions/0016).
+    One stalled target holds one thread that transmits, and later the one that closes its link. ``net`` and ``acc`` have
+    as many as ``rx``, because a socket is read by the pool that opened it: ``net`` also receives on every link that
+    this process has dialled, ``acc`` on those of its worker and its applications, which have dialled it. A machine that
+    dies while it shakes hands holds a thread of ``acc`` for zenoh's SO_LINGER, 10 s (docs/decisions/0016).
     """
-    return _pools(rx=threads, tx=threads, net=threads)
+    return _pools(rx=threads, tx=threads, net=threads, acc=threads)
 
 
 def _pools(**threads: int) -> str:

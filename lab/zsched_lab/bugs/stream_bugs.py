@@ -320,8 +320,15 @@ STREAM_BUGS = (
     _bug(
         "a relay closes links, and reads those it has dialled, with a single thread",
         "zsched.sessions.config",
+        "return _pools(rx=threads, tx=threads, net=threads, acc=threads)",
+        "return _pools(rx=threads, tx=threads, acc=threads)",
+        ("tests/unit/sessions/test_config.py", "tests/integration/test_zenoh_pools.py"),
+    ),
+    _bug(
+        "a relay accepts, and reads those that have dialled it, with a single thread",
+        "zsched.sessions.config",
+        "return _pools(rx=threads, tx=threads, net=threads, acc=threads)",
         "return _pools(rx=threads, tx=threads, net=threads)",
-        "return _pools(rx=threads, tx=threads)",
         ("tests/unit/sessions/test_config.py", "tests/integration/test_zenoh_pools.py"),
     ),
     _bug(

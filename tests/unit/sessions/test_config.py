@@ -140,8 +140,8 @@ def test_a_daemon_has_one_pool_with_a_thread_for_every_link() -> None:
 
 
 def test_a_relay_reads_the_links_that_it_has_dialled_with_as_many_threads_as_those_that_dial_it() -> None:
-    """zenoh gives a socket to the pool that opened it: ``net`` where we dial, ``rx`` where we are dialled."""
-    assert relay_pools(7) == "(rx: (worker_threads: 7), tx: (worker_threads: 7), net: (worker_threads: 7))"
+    """zenoh gives a socket to the pool that opened it: ``net`` where we dial, ``acc`` where we are dialled."""
+    assert relay_pools(7) == f"({', '.join(f'{pool}: (worker_threads: 7)' for pool in ('rx', 'tx', 'net', 'acc'))})"
 
 
 @pytest.mark.parametrize("profile", PROFILES)
