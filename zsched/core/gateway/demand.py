@@ -12,7 +12,7 @@ has no limit cycle (docs/decisions/0118).
 from __future__ import annotations
 
 from zsched.core.gateway.company import Company, is_full
-from zsched.core.gateway.task_speed import TaskSpeeds
+from zsched.core.gateway.task_speed import TaskSpeeds, speed_of
 from zsched.core.values.fleet import Demand, TaskSpec
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.profile import Jobs, Profile, Renewal, WorkerLoad, WorkerState
@@ -24,6 +24,8 @@ SETTLE_S = 4.0
 """After a move, or a worker's start, the smoothed use rises for so long: it is only a lower bound of the need."""
 COMPARED_S = 12.0
 """What differs so soon after a move is the machine's doing; what changes later is the task's."""
+RECENT_S = 60.0
+"""Older figures say nothing of the machine to which a task has come: the task may have changed since."""
 
 
 CALM_WAIT_RATIO = 0.1
@@ -83,11 +85,13 @@ class _Known(Struct, frozen=True):
     is_sure: bool = False
     """It was measured with enough CPU; otherwise the need may be larger."""
     job_work_s: float | None = None
-    """CPU time of a job at speed 1, of all its threads."""
+    """CPU time of a job at speed 1, of all its threads; ``None``: its worker is silent."""
     before: _Before | None = None
     """``None``: it has not come from another machine."""
     seen_at: NodeId | None = None
-    """Where these figures were seen last."""
+    """Where these figures were seen last..."""
+    seen_s: float = 0.0
+    """...and when."""
     memory_mb: float | None = None
     job: JobNeed | None = None
     is_job_old: bool = False
@@ -133,9 +137,9 @@ class Demands:
             self._known[task] = replace(known, owner=None)
         if load is None or load.state is not WorkerState.READY or profile.cpu_used_cores is None:
             return False
-        found = known if known.owner == profile.node else _came(known, profile.node, now)
+        found = replace(known if known.owner == profile.node else _came(known, profile.node, now), seen_s=now)
         is_new = now - found.since < SETTLE_S
-        if not is_new and found.before is not None and now - found.since < COMPARED_S:
+        if found.before is not None and now - found.since < COMPARED_S:
             self._compare_jobs(task, profile, load, found.before)
         if load.memory_mb is not None:
             found = replace(found, memory_mb=max(load.memory_mb, (known.memory_mb or 0.0) if is_new else 0.0))
@@ -155,7 +159,8 @@ class Demands:
             else:
                 found = replace(found, work=use, is_sure=True)
             if found.before is not None and now - found.since < COMPARED_S:
-                found = self._compared(task, profile, found, found.before, is_new=is_new)
+                has_jobs = load.jobs is not None
+                found = self._compared(task, profile, found, found.before, is_new=is_new, has_jobs=has_jobs)
         found = _with_job(found, load, self._speeds.of(task, profile, is_there=True), is_new=is_new)
         self._known[task] = found
         is_seen = not is_new and self._note_shortfall(task, profile, load, found, fair_cores)
@@ -182,20 +187,28 @@ class Demands:
         return is_ready and known.is_changed and known.is_job_old
 
     def _compare_jobs(self, task: TaskId, profile: Profile, load: WorkerLoad, before: _Before) -> None:
-        """What a job takes here and took where the task came from tells its speed, also of one that is short."""
+        """What a job takes here and took where the task came from tells its speed, also of one that is short.
+
+        It is never faster than the benchmark says. A job that takes less here may do so because others slowed it down
+        where it came from, or because its worker begins with nothing. Then all other machines would seem too slow for
+        as long as the task stays, and nothing but a move would tell.
+        """
         jobs = load.jobs
         if jobs is not None and jobs.cpu_s > 0.0 and before.job_work_s is not None:
-            self._speeds.note(task, profile, before.job_work_s / jobs.cpu_s)
+            self._speeds.note(task, profile, min(before.job_work_s / jobs.cpu_s, speed_of(profile)))
 
-    def _compared(self, task: TaskId, profile: Profile, found: _Known, before: _Before, *, is_new: bool) -> _Known:
+    def _compared(
+        self, task: TaskId, profile: Profile, found: _Known, before: _Before, *, is_new: bool, has_jobs: bool
+    ) -> _Known:
         """The need that a task came with, if that was sure: one that is short here for more is slower here.
 
         While its use still rises, or bursts at its start, what it came with counts. Where it lacks nothing its use may
-        have changed for many reasons, and no machine is judged by it.
+        have changed for many reasons, and no machine is judged by it. Nor where it ``has_jobs``: these tell the speed,
+        and it may be short for there being more of them.
         """
         if before.work is None or found.work is None or not (is_new or found.work > before.work):
             return found
-        if not is_new and found.is_sure:
+        if not is_new and (found.is_sure or has_jobs):
             return found
         if not is_new:
             speed = self._speeds.of(task, profile, is_there=True)
@@ -253,7 +266,7 @@ class Demands:
 def _came(known: _Known, node: NodeId, now: float) -> _Known:
     """It begins to be seen on a node: another one than before, or the same one, where its worker has started again."""
     before = None
-    if known.seen_at not in (None, node):
+    if known.seen_at not in (None, node) and now - known.seen_s <= RECENT_S:
         before = _Before(known.work if known.is_sure else None, known.job_work_s)
     return replace(known, owner=node, since=now, before=before, seen_at=node)
 
@@ -306,10 +319,13 @@ def _with_job(known: _Known, load: WorkerLoad, speed: float, *, is_new: bool) ->
     is_old = load.renewal is not Renewal.NONE
     if load.jobs is not None:
         job = _job(load.jobs, speed, known.job)
-        return replace(known, job=job, job_work_s=load.jobs.cpu_s * speed, is_job_old=is_old)
+        # a worker that has just come may begin with nothing, and its first jobs be small by that
+        job_work_s = known.job_work_s if is_new and known.before is not None else load.jobs.cpu_s * speed
+        return replace(known, job=job, job_work_s=job_work_s, is_job_old=is_old)
+    silent = known if is_new else replace(known, job_work_s=None)
     if is_old:
-        return replace(known, is_job_old=True)
-    return replace(known, job=None, job_work_s=None, is_job_old=False) if known.is_job_old and not is_new else known
+        return replace(silent, is_job_old=True)
+    return replace(silent, job=None, is_job_old=False) if known.is_job_old and not is_new else silent
 
 
 def _job(jobs: Jobs, speed: float, known: JobNeed | None) -> JobNeed:

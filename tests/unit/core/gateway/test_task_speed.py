@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from support.profiles import load_of, profile_of
-from zsched.core.gateway.demand import COMPARED_S, SETTLE_S, Demands
+from zsched.core.gateway.demand import COMPARED_S, RECENT_S, SETTLE_S, Demands
 from zsched.core.gateway.task_speed import MOST_RATIO, TaskSpeeds
 from zsched.core.values.fleet import Demand
 from zsched.core.values.profile import Jobs, Profile, WorkerState
@@ -151,6 +151,84 @@ def test_what_a_job_takes_tells_the_speed_whether_the_task_is_short_or_not() -> 
         assert job.work_s == pytest.approx(0.2)
         stay(demands, replace(there, workers=(load_of(cpu_cores=cores, jobs=jobs_of(0.8)),)), at)
         assert demands.speed("merge", there) == pytest.approx(0.5), "by then the jobs have grown"
+
+
+@pytest.mark.parametrize(
+    ("home", "away"),
+    [
+        pytest.param(profile("edge1", cores=1.0, others=2.9, jobs=jobs_of(0.2)), jobs_of(0.1), id="others slowed it"),
+        pytest.param(profile("edge1", cores=2.0, jobs=jobs_of(0.4)), jobs_of(0.05), id="begins with an empty map"),
+    ],
+)
+def test_a_job_that_takes_less_than_where_it_came_from_makes_no_machine_fast(home: Profile, away: Jobs) -> None:
+    """Else the task needs too much everywhere else, by its own growth or once others are gone, and stays for that."""
+    demands = Demands()
+    at = stay(demands, home, 0.0)
+    there = profile(cores=5.0 * away.cpu_s, jobs=away)
+    at = stay(demands, there, at)
+    assert demands.speed("merge", there) == 1.0
+    grown = profile(cores=2.0, jobs=jobs_of(0.4))
+    stay(demands, grown, at)
+    assert demands.at(NOTHING, profile("edge1")).cpu_cores == pytest.approx(2.0)
+
+
+def test_a_machine_that_was_slow_beside_others_is_as_fast_as_ever_once_the_task_was_there_alone() -> None:
+    demands, calm = Demands(), profile("edge1", cores=0.5, jobs=jobs_of(0.1))
+    at = stay(demands, calm, 0.0)
+    for others, cpu_s, speed in ((2.0, 0.2, 0.5), (0.0, 0.1, 1.0)):
+        there = profile(cores=5.0 * cpu_s, others=others, jobs=jobs_of(cpu_s))
+        at = stay(demands, there, at)
+        assert demands.speed("merge", there) == pytest.approx(speed)
+        at = stay(demands, calm, at)
+        assert demands.speed("merge", calm) == pytest.approx(1.0)
+
+
+def test_more_jobs_of_the_same_kind_make_no_machine_slow_though_it_is_short() -> None:
+    demands = Demands()
+    at = stay(demands, profile("edge1", cores=0.2, jobs=jobs_of(0.1)), 0.0)
+    there = profile(cores=0.9, others=3.1, jobs=jobs_of(0.1, wanted_hz=10.0, done_hz=9.0))
+    stay(demands, there, at)
+    assert demands.speed("merge", there) == 1.0
+    assert demands.at(NOTHING, profile("edge1")).cpu_cores == pytest.approx(1.0)
+
+
+def test_figures_from_long_before_it_was_seen_again_tell_nothing_of_the_machine() -> None:
+    """A robot that was out of reach, or a task that nobody had: it may have changed since."""
+    homes = profile("edge1", cores=0.5, jobs=jobs_of(0.1)), profile("edge1", cores=0.5)
+    theres = profile(cores=2.0, jobs=jobs_of(0.4)), profile(cores=3.6, others=0.4, wanted=4.0)
+    for home, there in zip(homes, theres, strict=True):
+        for away_s, is_told in ((RECENT_S / 2, True), (RECENT_S + 1.0, False)):
+            demands = Demands()
+            at = stay(demands, home, 0.0)
+            stay(demands, there, at + away_s)
+            assert (demands.speed("merge", there) < 1.0) is is_told
+
+
+def test_jobs_of_a_worker_that_has_been_silent_since_tell_nothing_of_the_next_machine() -> None:
+    demands = Demands()
+    at = stay(demands, profile("edge1", cores=0.5, jobs=jobs_of(0.1)), 0.0)
+    at = stay(demands, profile("edge1", cores=0.0), at)
+    there = profile(cores=2.0, jobs=jobs_of(0.4))
+    stay(demands, there, at)
+    assert demands.speed("merge", there) == 1.0
+
+
+def test_a_machine_that_the_task_leaves_at_once_has_shown_how_slow_it_is() -> None:
+    """The machine before is not fast by that: it is as it was."""
+    demands, home = Demands(), profile("edge1", cores=0.5, jobs=jobs_of(0.1))
+    at = stay(demands, home, 0.0)
+    there = profile(cores=0.5, jobs=jobs_of(0.4))
+    at = stay(demands, there, at, SETTLE_S - 1.0)
+    stay(demands, home, at)
+    assert (demands.speed("merge", home), demands.speed("merge", there)) == pytest.approx((1.0, 0.25))
+
+
+def test_a_machine_that_has_the_task_again_at_once_is_not_judged_by_a_start_elsewhere() -> None:
+    demands, home = Demands(), profile("edge1", cores=0.5, jobs=jobs_of(0.1))
+    at = stay(demands, home, 0.0)
+    at = stay(demands, profile(cores=0.1, jobs=jobs_of(0.02)), at, SETTLE_S - 1.0)
+    stay(demands, home, at)
+    assert demands.speed("merge", home) == 1.0
 
 
 def test_a_task_whose_input_has_stopped_makes_no_machine_fast() -> None:
