@@ -12,6 +12,7 @@ import zenoh
 
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import until
+from zsched.core.relay_protocol import REFUSED_ENCODING
 from zsched.core.values.plan import Direction, Route, ServiceSettings, StreamSettings
 from zsched.core.values.struct import replace
 from zsched.relay.services import service
@@ -134,6 +135,30 @@ def test_a_request_at_an_owner_may_have_been_done_whoever_is_asked_next(bench: B
     thread.join(10.0)
     assert heard == ["moved: the task has left edge1/t/robot1/job, which had not answered; it may have been done"]
     owner.undeclare()
+    for query in held:
+        query.drop()
+
+
+def test_a_request_that_an_owner_had_may_have_been_done_though_the_next_ones_refuse_it(bench: Bench) -> None:
+    """Refused until its time was over, it was said that it was not done."""
+    held: list[zenoh.Query] = []
+    rule = replace(SERVICE, service=ServiceSettings(retry=True, timeout_s=1.0))
+    bench.open(rule)
+    owner = bench.outside.declare_queryable(SERVICE.to_expr, held.append)
+    bench.services.flip(1)
+    thread, heard = asked(bench)
+    until(lambda: bool(held), "the owner has it")
+    refuses = bench.outside.declare_queryable(
+        "edge2/t/robot1/job", lambda query: query.reply_err("not now", encoding=REFUSED_ENCODING)
+    )
+    bench.services.open(2, replace(rule, to_expr="edge2/t/robot1/job"))
+    bench.services.flip(2)
+    bench.services.close_slot(1)
+    thread.join(10.0)
+    assert [text.partition(":")[0] for text in heard] == ["moved"]
+    assert heard[0].endswith("it may have been done")
+    owner.undeclare()
+    refuses.undeclare()
     for query in held:
         query.drop()
 

@@ -280,6 +280,7 @@ class ServiceStream:
         until = monotonic_s() + settings.timeout_s
         hold_until = until if settings.retry else min(until, monotonic_s() + settings.hold_s)
         problem = ServiceProblem.NO_OWNER, f"nobody serves {self.route.from_expr}: it was not done"
+        has_had_owner = False
         while True:
             slot = self._await_owner(str(query.key_expr), hold_until)
             if slot is None:
@@ -288,12 +289,14 @@ class ServiceStream:
             outcome = self._ask(query, slot, max(0.01, until - monotonic_s()))
             if outcome is _Outcome.ANSWERED:
                 return
-            may_go_on = outcome is _Outcome.REFUSED or settings.retry
-            if not may_go_on or outcome is _Outcome.TIMED_OUT or monotonic_s() >= hold_until:
-                self._fail(query, *_problem(outcome, slot))
-                return
-            if outcome is not _Outcome.REFUSED:  # an owner had it: nobody may say that it was not done
+            is_refused = outcome is _Outcome.REFUSED
+            if not (is_refused and has_had_owner):  # else nobody may say that it was not done
                 problem = _problem(outcome, slot)
+            has_had_owner |= not is_refused
+            may_go_on = is_refused or settings.retry
+            if not may_go_on or outcome is _Outcome.TIMED_OUT or monotonic_s() >= hold_until:
+                self._fail(query, *problem)
+                return
             with self._lock:
                 self._counter.dropped("retried")
                 self._lock.wait(LOOK_AGAIN_S)
