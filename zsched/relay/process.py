@@ -379,9 +379,8 @@ class RelayProcess:
             task.end()
 
     def _listen(self, task: TaskId, routes: tuple[Route, ...], graph: GraphMirror) -> None:
-        if routes:
-            self._application.unowned(task, routes)
         if routes or task in self._tasks:
+            self._application.unowned(task, routes)
             self._task(task, graph).listen(routes)
 
     def _apply(self, plan: RoutePlan, graph: GraphMirror) -> None:

@@ -107,7 +107,7 @@ class Shares(Struct, eq=False):
 
     def _of_unowned(self, task: TaskId) -> tuple[Told, ...]:
         routes = self._own(self.unowned[task])
-        if not routes:
+        if not routes and task not in self.told:
             return ()
         self.told.add(task)
         return (WorkerWatch(task=task, unowned=routes),)

@@ -74,6 +74,16 @@ def test_other_tasks_are_not_told_of_and_a_known_one_is_when_its_routes_go() -> 
     assert made.note_plan(plan(*ALL)) == ()
     made.name(("robot1/jobs",))
     assert made.note_plan(plan(SCANS)) == (plan(),), "its last route is closed by that"
+
+
+def test_an_application_hears_that_its_last_input_is_none_any_more_though_nobody_owns_the_task() -> None:
+    """Else it took what it was told before, and kept it for the first owner."""
+    made = Shares(keys=("robot1/jobs",))
+    assert made.note_unowned("t", (JOBS, SCANS)) == (WorkerWatch(task="t", unowned=(JOBS,)),)
+    for left in ((SCANS,), ()):
+        assert made.note_unowned("t", left) == (WorkerWatch(task="t"),)
+        assert made.taken() == ()
+    assert made.note_unowned("another", (SCANS,)) == ()
     assert made.end("t")
     assert not made.end("t")
 
