@@ -12,7 +12,7 @@ has no limit cycle (docs/decisions/0118).
 from __future__ import annotations
 
 from zsched.core.gateway.company import Company, is_full
-from zsched.core.gateway.task_speed import TaskSpeeds, speed_of
+from zsched.core.gateway.task_speed import MOST_RATIO, TaskSpeeds, speed_of
 from zsched.core.values.fleet import Demand, TaskSpec
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.profile import Jobs, Profile, Renewal, WorkerLoad, WorkerState
@@ -204,15 +204,18 @@ class Demands:
 
         While its use still rises, or bursts at its start, what it came with counts. Where it lacks nothing its use may
         have changed for many reasons, and no machine is judged by it. Nor where it ``has_jobs``: these tell the speed,
-        and it may be short for there being more of them.
+        and it may be short for there being more of them. Nor by more than a machine can differ: it came with nothing to
+        do.
         """
         if before.work is None or found.work is None or not (is_new or found.work > before.work):
             return found
         if not is_new and (found.is_sure or has_jobs):
             return found
         if not is_new:
-            speed = self._speeds.of(task, profile, is_there=True)
-            self._speeds.note(task, profile, speed * before.work / found.work)
+            speed = self._speeds.of(task, profile, is_there=True) * before.work / found.work
+            if speed * MOST_RATIO < speed_of(profile):
+                return found
+            self._speeds.note(task, profile, speed)
         return replace(found, work=before.work, is_sure=True)
 
     def _note_shortfall(

@@ -231,6 +231,19 @@ def test_a_machine_that_has_the_task_again_at_once_is_not_judged_by_a_start_else
     assert demands.speed("merge", home) == 1.0
 
 
+@pytest.mark.parametrize("idle_cores", [0.0, 0.01])
+def test_a_task_that_came_idle_and_begins_to_work_makes_no_machine_slow(idle_cores: float) -> None:
+    """It was drained at night, and back before its robots began; then the machine was an eighth as fast for good."""
+    demands = Demands()
+    at = stay(demands, profile("edge1", cores=idle_cores), 0.0)
+    at = stay(demands, profile(cores=idle_cores), at, SETTLE_S)
+    busy = profile(cores=0.95, wanted=1.0)
+    demands.learn("merge", busy, at)
+    assert demands.at(NOTHING, busy).cpu_cores == pytest.approx(1.0), "it needs that now"
+    stay(demands, busy, at)
+    assert demands.speed("merge", busy) == 1.0
+
+
 def test_a_task_whose_input_has_stopped_makes_no_machine_fast() -> None:
     demands = Demands()
     at = stay(demands, profile("edge1", cores=1.5), 0.0)
