@@ -92,6 +92,12 @@ def test_a_figure_that_cannot_be_is_bounded(seen: float, counts: float) -> None:
     assert speeds.of("merge", profile()) == counts
 
 
+def test_beside_whom_nobody_has_measured_nothing_is_seen() -> None:
+    speeds = TaskSpeeds()
+    speeds.note("merge", replace(profile(), cpu_used_cores=None), 0.5)
+    assert speeds.of("merge", profile()) == 1.0
+
+
 def test_a_task_that_is_no_more_is_forgotten_alone() -> None:
     speeds = TaskSpeeds()
     for task in ("merge", "track"):
