@@ -92,22 +92,14 @@ def foreseen(link: Link, lead_s: float) -> float:
     return link.rssi_dbm + min(max(step_db, -FORESEE_MOST_DB), FORESEE_MOST_DB)
 
 
-def way_s(
-    voter: NodeId,
-    candidate: NodeId,
-    candidates: Collection[NodeId],
-    round_trips: Mapping[NodeId, float],
-    gateway: Gateway,
-    now: float,
-) -> float:
-    """Seconds from a robot to a candidate and back.
+def ways(
+    voter: NodeId, candidates: Collection[NodeId], round_trips: Mapping[NodeId, float], gateway: Gateway, now: float
+) -> dict[NodeId, float]:
+    """Seconds from a robot to each candidate and back.
 
     A way that is not measured yet counts as the longest to another candidate that is heard: it must not be better by
     that. Where none is measured, none counts.
     """
-    if candidate == voter:
-        return 0.0
-    if candidate in round_trips:
-        return round_trips[candidate]
     heard = (name for name in candidates if name in round_trips and gateway.fresh(name, now) is not None)
-    return max((round_trips[name] for name in heard), default=0.0)
+    longest_s = max((round_trips[name] for name in heard), default=0.0)
+    return {name: 0.0 if name == voter else round_trips.get(name, longest_s) for name in candidates}

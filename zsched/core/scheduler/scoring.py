@@ -16,7 +16,7 @@ from zsched.core.gateway.company import is_full
 from zsched.core.gateway.demand import Demands, is_short
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.gateway.sharing import fair_share
-from zsched.core.scheduler.links import pair_link, way_s
+from zsched.core.scheduler.links import pair_link, ways
 from zsched.core.scheduler.utility import (
     cpu_utility,
     memory_service,
@@ -109,6 +109,9 @@ def score(
     seconds to each candidate and back, where measured (`zsched.core.gateway.round_trips`).
     """
     form = allocation.tuning.score
+    away_s = NOTHING_HELD
+    if allocation.tuning.deadline_ms is not None:
+        away_s = ways(voter, spec.candidates, round_trips, gateway, now)
     terms: dict[NodeId, _Terms] = {}
     unreachable: list[NodeId] = []
     refused: list[tuple[NodeId, str]] = []
@@ -142,12 +145,12 @@ def score(
         if link is not None and not link.is_reached:
             unreachable.append(candidate)
             continue
-        network_s = way_s(voter, candidate, spec.candidates, round_trips, gateway, now)
         load = profile.worker(spec.name)
         # what an owner that is short gets is measured
         is_measured = candidate == allocation.owner and load is not None and is_short(load)
         fair = gateway.share(spec, profile, demand.cpu_cores, unseen.cpu_cores)
         least = 0.0 if is_measured else fair
+        network_s = away_s.get(candidate, 0.0)
         cpu = _cpu(spec, profile, demand, use, allocation.tuning, gateway.demands, network_s, least, fair)
         memory = _memory(spec, profile, demand, use, form)
         weighed = _gauges(allocation, gauges)
