@@ -139,8 +139,9 @@ class Demands:
             return False
         found = replace(known if known.owner == profile.node else _came(known, profile.node, now), seen_s=now)
         is_new = now - found.since < SETTLE_S
-        if found.before is not None and now - found.since < COMPARED_S:
-            self._compare_jobs(task, profile, load, found.before)
+        before = found.before if now - found.since < COMPARED_S else None
+        if before is not None:
+            self._compare_jobs(task, profile, load, before)
         if load.memory_mb is not None:
             found = replace(found, memory_mb=max(load.memory_mb, (known.memory_mb or 0.0) if is_new else 0.0))
         if load.cpu_cores is not None:
@@ -158,9 +159,9 @@ class Demands:
                 found = replace(found, work=least, is_sure=is_held)
             else:
                 found = replace(found, work=use, is_sure=True)
-            if found.before is not None and now - found.since < COMPARED_S:
+            if before is not None:
                 has_jobs = load.jobs is not None
-                found = self._compared(task, profile, found, found.before, is_new=is_new, has_jobs=has_jobs)
+                found = self._compared(task, profile, found, before, is_new=is_new, has_jobs=has_jobs)
         found = _with_job(found, load, self._speeds.of(task, profile, is_there=True), is_new=is_new)
         self._known[task] = found
         is_seen = not is_new and self._note_shortfall(task, profile, load, found, fair_cores)
@@ -207,16 +208,18 @@ class Demands:
         and it may be short for there being more of them. Nor by more than a machine can differ: it came with nothing to
         do.
         """
-        if before.work is None or found.work is None or not (is_new or found.work > before.work):
+        if before.work is None or found.work is None:
             return found
-        if not is_new and (found.is_sure or has_jobs):
+        as_before = replace(found, work=before.work, is_sure=True)
+        if is_new:
+            return as_before
+        if found.is_sure or has_jobs or found.work <= before.work:
             return found
-        if not is_new:
-            speed = self._speeds.of(task, profile, is_there=True) * before.work / found.work
-            if speed * MOST_RATIO < speed_of(profile):
-                return found
-            self._speeds.note(task, profile, speed)
-        return replace(found, work=before.work, is_sure=True)
+        speed = self._speeds.of(task, profile, is_there=True) * before.work / found.work
+        if speed * MOST_RATIO < speed_of(profile):
+            return found
+        self._speeds.note(task, profile, speed)
+        return as_before
 
     def _note_shortfall(
         self, task: TaskId, profile: Profile, load: WorkerLoad, found: _Known, fair_cores: float
