@@ -6,6 +6,7 @@ agreed (`zsched.commands.document`), what a robot makes of a flag (`zsched.core.
 
 from __future__ import annotations
 
+import contextlib
 import shlex
 import sys
 import time
@@ -30,9 +31,9 @@ from zsched.commands.orders import (
 from zsched.commands.page import span
 from zsched.commands.report import millis, told_flag
 from zsched.commands.wait import Condition, missing
-from zsched.config.difference import names_electors, unseated
+from zsched.config.difference import SEAT_AGAIN, names_electors, unseated
 from zsched.config.load import check_bytes
-from zsched.core.values.struct import Struct, field
+from zsched.core.values.struct import Struct, field, replace
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE
 
 SCHEMA: Final = "zsched.drain/1"
@@ -45,7 +46,7 @@ STAYS_S: Final = 3.0
 """A task that has not left after this time is reported, with the reason; again when the reason changes."""
 NO_OTHER: Final = "no-other-candidate"
 """The danger: a task would have no candidate left that may get it."""
-SEAT_AGAIN: Final = "`zsched fleet export -o FILE`, then `zsched apply FILE --accept change-electors` mends that"
+SEAT_ADVICE: Final = ", then ".join(f"`{command}`" for command in SEAT_AGAIN) + " mends that"
 """Where a document names an elector that is none."""
 NOTHING: Final = "-"
 TITLES: Final = ("WHAT", "KIND", "NOW", "AFTER")
@@ -197,14 +198,17 @@ def _seats_lost(door: Door, held: InForce, nodes: Sequence[str]) -> list[str]:
     left = [name for name in nodes if has_flag(held, LEAVE, name)]
     if not left or not names_electors(held.text):
         return []
-    fleet = check_bytes(held.text.encode(), DOCUMENT).fleet
-    try:
-        agreed = [name for name, _ in in_force(door).electors]
-    except CliError:  # it is agreed all the same
-        agreed = [name for name, _ in held.electors]
-    lost = () if fleet is None else unseated(held.text, fleet, agreed)
-    told = f"is no elector any more, and the document names it as one: {SEAT_AGAIN}"
+    with contextlib.suppress(CliError):  # it is agreed all the same
+        held = replace(held, electors=in_force(door).electors)
+    lost = without_seat(held)
+    told = f"is no elector any more, and the document names it as one: {SEAT_ADVICE}"
     return [f"{name} {told}" for name in left if name in lost]
+
+
+def without_seat(held: InForce) -> tuple[str, ...]:
+    """The electors that the document names, and that are none; of one that cannot be read here nobody knows."""
+    fleet = check_bytes(held.text.encode(), DOCUMENT).fleet if held.text else None
+    return () if fleet is None else unseated(held.text, fleet, [name for name, _ in held.electors])
 
 
 def _endless(before: Sequence[Json], after: Sequence[Json]) -> str:

@@ -19,10 +19,7 @@ from zsched.commands.apply import ApplyView, apply, read_text
 from zsched.commands.ask import PASSES_ON, Door
 from zsched.commands.common import CliError, Json, print_json, say, warn
 from zsched.commands.document import QUESTION, InForce, ask_all, document_text, in_force, status_of
-from zsched.commands.entries import DOCUMENT
-from zsched.commands.flags import SEAT_AGAIN
-from zsched.config.difference import unseated
-from zsched.config.load import check_bytes
+from zsched.commands.flags import SEAT_ADVICE, without_seat
 from zsched.errors import ConfigError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_WOULD_CHANGE
 from zsched.files import replace_regular
@@ -63,17 +60,11 @@ def _text(held: InForce, told: list[Json]) -> str:
     goes_by = f"document {held.document[:12]}" if held.document else "no document: each node goes by its own file"
     electors = ", ".join(f"{name} (disk {disk[:8]})" if disk else name for name, disk in held.electors)
     lines = [f"{held.fleet}: revision {held.revision}, number {held.number}, {state}", goes_by, f"electors: {electors}"]
-    if lacking := _without_seat(held):
-        lines.append(f"electors by the document only: {', '.join(lacking)}; once they run: {SEAT_AGAIN}")
+    if lacking := without_seat(held):
+        lines.append(f"electors by the document only: {', '.join(lacking)}; once they run: {SEAT_ADVICE}")
     wide = max((len(one["name"]) for one in told), default=0)
     lines += [f"  {one['name']:{wide}}  {_said(held, one, told)}" for one in told]
     return "\n".join(lines) + "\n"
-
-
-def _without_seat(held: InForce) -> tuple[str, ...]:
-    """The electors that the document names, and that are none; of one that cannot be read here nobody knows."""
-    fleet = check_bytes(held.text.encode(), DOCUMENT).fleet if held.text else None
-    return () if fleet is None else unseated(held.text, fleet, [name for name, _ in held.electors])
 
 
 def _said(held: InForce, one: Json, told: list[Json]) -> str:

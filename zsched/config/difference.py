@@ -143,6 +143,10 @@ def wanted_electors(agreed: Sequence[NodeId], new: Fleet, text: str) -> tuple[No
     return tuple(sorted(name for name in agreed if name in nodes))
 
 
+SEAT_AGAIN: Final = ("zsched fleet export -o FILE", "zsched apply FILE --accept change-electors")
+"""What gives an elector its seat again that a document names, and that is none."""
+
+
 def unseated(text: str, fleet: Fleet, agreed: Sequence[NodeId]) -> tuple[NodeId, ...]:
     """The electors that a document names, and that the fleet has not agreed as such, sorted.
 

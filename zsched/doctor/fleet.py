@@ -12,7 +12,7 @@ from typing import Final
 
 from zsched.core.values.fleet import fleet_hash
 from zsched.doctor.daemon import judged_lag
-from zsched.doctor.model import SEAT_AGAIN, Json, Result, Scene, counted, failed, joined, passed, skipped, warned
+from zsched.doctor.model import SEAT_ADVICE, Json, Result, Scene, counted, failed, joined, passed, skipped, warned
 from zsched.doctor.network import addresses, connected
 
 HASH_DIGITS: Final = 8
@@ -155,7 +155,7 @@ def have_electors(scene: Scene) -> Result:
     if scene.unseated:
         names = ", ".join(scene.unseated)
         told = f"{scene.source} names electors that are none: {names}"
-        found.append(warned(told, fix=SEAT_AGAIN.format(names=names)))
+        found.append(warned(told, fix=SEAT_ADVICE.format(names=names)))
     missing = [name for name in electors if name not in scene.statuses]
     if missing:
         enough = len(electors) - len(missing) > len(electors) // 2

@@ -10,6 +10,7 @@ from enum import IntEnum, StrEnum
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
+from zsched.config.difference import SEAT_AGAIN
 from zsched.config.load import CheckResult
 from zsched.core.values.fleet import Fleet, NodeSpec
 from zsched.core.values.model import NodeId
@@ -28,7 +29,7 @@ class Verdict(StrEnum):
     FAIL = "FAIL"
 
 
-SEAT_AGAIN: Final = "while {names} run: zsched fleet export -o FILE, zsched apply FILE --accept change-electors"
+SEAT_ADVICE: Final = f"while {{names}} run: {', '.join(SEAT_AGAIN)}"
 """Of electors that the document names, and that are none."""
 _ORDER = (Verdict.SKIP, Verdict.PASS, Verdict.WARN, Verdict.FAIL)
 

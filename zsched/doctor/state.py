@@ -14,7 +14,7 @@ from typing import Final
 from zsched.adapters.host.state_file import StateFile
 from zsched.clock import monotonic_s
 from zsched.core.values.fleet import electorate_hash
-from zsched.doctor.model import SEAT_AGAIN, Result, Scene, failed, passed, skipped, warned
+from zsched.doctor.model import SEAT_ADVICE, Result, Scene, failed, passed, skipped, warned
 
 SYNC_TRIES: Final = 5
 SLOW_SYNC_S: Final = 0.05
@@ -47,7 +47,7 @@ def makes_an_elector(scene: Scene) -> Result:
     """Whether the state is one of these electors, not lost and not disputed."""
     if scene.node in scene.unseated:
         told = f"{scene.node} is no elector, and {scene.source} names it as one"
-        return warned(told, fix=SEAT_AGAIN.format(names=scene.node))
+        return warned(told, fix=SEAT_ADVICE.format(names=scene.node))
     if scene.node not in scene.fleet.electors:
         return skipped(f"{scene.node} is no elector")
     if is_hidden(scene.state_folder):
