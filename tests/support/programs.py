@@ -1,11 +1,13 @@
-"""Modules of ours as processes."""
+"""Programs as processes: modules of ours, and such as answer line by line."""
 
 from __future__ import annotations
 
 import contextlib
+import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 
 
 @contextlib.contextmanager
@@ -21,3 +23,25 @@ def running(*commands: list[str]) -> Iterator[list[subprocess.Popen[bytes]]]:
         for process in processes:
             process.kill()
             process.wait()
+
+
+@contextlib.contextmanager
+def process(command: Sequence[str | Path], **environment: str) -> Iterator[Callable[[str], str]]:
+    """What to say to it, and what it answers; it has begun."""
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env={**os.environ, **environment}) as made:
+        assert made.stdin is not None
+        assert made.stdout is not None
+        made.stdout.readline()
+
+        def ask(line: str) -> str:
+            assert made.stdin is not None
+            assert made.stdout is not None
+            made.stdin.write(line + "\n")
+            made.stdin.flush()
+            return made.stdout.readline().strip()
+
+        try:
+            yield ask
+        finally:
+            made.kill()

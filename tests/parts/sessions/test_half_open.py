@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
 import socket
-import subprocess
 import sys
 import threading
-from collections.abc import Iterator, Sequence
-from pathlib import Path
 
 import pytest
 import zenoh
 
+from support.programs import process
 from support.waiting import until
 from zsched.core.values.fleet import Timing
 from zsched.sessions.config import data_config, pool_threads, relay_pools
@@ -55,7 +51,7 @@ sys.stdin.readline()
 
 
 def first_words() -> bytes:
-    """What a session says first to whom it dials."""
+    """The first bytes that a session sends to the address that it dials."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(20.0)
         port = server.getsockname()[1]
@@ -67,31 +63,6 @@ def first_words() -> bytes:
     opening.join(20.0)
     assert not opening.is_alive()
     return said
-
-
-@contextlib.contextmanager
-def started(command: Sequence[str | Path], pools: str | None = None) -> Iterator[subprocess.Popen[str]]:
-    """A program that has said its first line."""
-    pipe, pool = subprocess.PIPE, {} if pools is None else {"ZENOH_RUNTIME": pools}
-    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env={**os.environ, **pool}) as made:
-        try:
-            heard(made)
-            yield made
-        finally:
-            made.kill()
-
-
-def heard(program: subprocess.Popen[str]) -> str:
-    assert program.stdout is not None
-    return program.stdout.readline()
-
-
-def said(program: subprocess.Popen[str]) -> str:
-    """Its answer to a line."""
-    assert program.stdin is not None
-    program.stdin.write("\n")
-    program.stdin.flush()
-    return heard(program)
 
 
 @pytest.mark.root
@@ -108,14 +79,14 @@ def test_a_machine_that_dies_while_it_shakes_hands_silences_no_application_of_th
         application = network.wrap("robot", [sys.executable, "-c", APPLICATION, dials])
         peer = [sys.executable, "-c", DYING, network.address("robot"), str(PORT), greeting.hex()]
         with (
-            started(relay, relay_pools(pool_threads(1, 1))) as one,
-            started(application),
-            started(network.wrap("dying", peer)) as other,
+            process(relay, ZENOH_RUNTIME=relay_pools(pool_threads(1, 1))) as ask_relay,
+            process(application),
+            process(network.wrap("dying", peer)) as ask_dying,
         ):
-            until(lambda: int(said(one).split()[0]) > 5, "the application is heard")
+            until(lambda: int(ask_relay("heard").split()[0]) > 5, "the application is heard")
             network.deafen("dying")  # it hears no answer, as if it were gone
-            said(other)
+            ask_dying("speak")
             threading.Event().wait(BESIDE_S)
-            count, longest_s = said(one).split()
+            count, longest_s = ask_relay("heard").split()
             print(f"{count} samples, longest silence {float(longest_s):.2f} s")
             assert float(longest_s) < MOST_S

@@ -5,9 +5,8 @@ from __future__ import annotations
 import contextlib
 import json
 import socket
-import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
@@ -16,6 +15,7 @@ import pytest
 import zenoh
 
 from support.certificates import make_tls
+from support.programs import process
 from support.waiting import free_endpoint, until
 from zsched.core.hop.room import OWN, SMALL
 from zsched.sessions import link_buffers
@@ -51,28 +51,6 @@ for line in sys.stdin:
         publisher.put(bytes(int(line)))
     print(*(link.send_buffer() for link in sockets.links()), flush=True)
 """
-
-
-@contextlib.contextmanager
-def process(command: Sequence[str | Path]) -> Iterator[Callable[[str], str]]:
-    """What to say to it, and what it answers; it has begun."""
-    pipe = subprocess.PIPE
-    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as made:
-        assert made.stdin is not None
-        assert made.stdout is not None
-        made.stdout.readline()
-
-        def ask(line: str) -> str:
-            assert made.stdin is not None
-            assert made.stdout is not None
-            made.stdin.write(line + "\n")
-            made.stdin.flush()
-            return made.stdout.readline().strip()
-
-        try:
-            yield ask
-        finally:
-            made.kill()
 
 
 def _listener(config: str) -> list[str | Path]:

@@ -616,16 +616,22 @@ def test_a_machine_that_is_invited_again_gets_another_key_and_the_former_one_is_
             require_own(fleet, fleet.security, "robot2")
 
 
-def test_a_machine_that_joined_by_an_earlier_invitation_takes_the_key_of_a_later_one(
-    node: Node, tmp_path: Path
-) -> None:
-    """Nobody lets it in by the earlier key, and it cannot leave: the others do not hear it."""
+def invited_twice(tmp_path: Path, node: Node) -> tuple[Path, Path, Path]:
+    """robot2's two invitations, and its folder, where it has joined by the first one."""
     secured(tmp_path, node)
     first, second, folder = tmp_path / "1.invite", tmp_path / "2.invite", tmp_path / "robot2"
     words = ("invite", "robot2", "--yes", "-o")
     assert run(*words, first, "--address", "192.0.2.12").exit_code == 0
     assert run(*words, second).exit_code == 0
     assert run("join", first, *here(folder)).exit_code == 0
+    return first, second, folder
+
+
+def test_a_machine_that_joined_by_an_earlier_invitation_takes_the_key_of_a_later_one(
+    node: Node, tmp_path: Path
+) -> None:
+    """Nobody lets it in by the earlier key, and it cannot leave: the others do not hear it."""
+    first, second, folder = invited_twice(tmp_path, node)
     earlier = (folder / "pki" / "key.pem").read_bytes()
     planned = run("join", second, "--plan", *here(folder))
     assert (planned.exit_code, (folder / "pki" / "key.pem").read_bytes()) == (10, earlier), planned.stderr
@@ -650,12 +656,7 @@ def test_a_later_invitation_that_cannot_be_used_leaves_the_machine_the_node_that
     node: Node, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A robot's clock may be wrong at its start: its files would be put away, and it would be no node any more."""
-    secured(tmp_path, node)
-    first, second, folder = tmp_path / "1.invite", tmp_path / "2.invite", tmp_path / "robot2"
-    words = ("invite", "robot2", "--yes", "-o")
-    assert run(*words, first, "--address", "192.0.2.12").exit_code == 0
-    assert run(*words, second).exit_code == 0
-    assert run("join", first, *here(folder)).exit_code == 0
+    _, second, folder = invited_twice(tmp_path, node)
     before = sorted(str(path) for path in folder.rglob("*"))
     moment = int((datetime.now(UTC) - timedelta(days=400)).timestamp() * 1e9)
     monkeypatch.setattr("zsched.runtime.membership.wall_ns", lambda: moment)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 
+from support.threads import no_threads
 from support.waiting import until
 from zsched.core.relay_protocol import WorkerMatched, WorkerWatch
 from zsched.core.values.plan import Direction, RosGraph, Route, StreamSettings
@@ -24,17 +22,6 @@ ROS = Route(
     to_expr="0/edge1/chatter/**",
     settings=StreamSettings(graph=RosGraph.RMW_ZENOH),
 )
-
-
-def none(_self: threading.Thread) -> None:
-    raise RuntimeError("can't start new thread")
-
-
-@contextmanager
-def no_threads() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(threading.Thread, "start", none)
-        yield
 
 
 def test_workers_are_watched_later() -> None:

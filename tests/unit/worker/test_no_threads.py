@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
+from support.threads import no_threads
 from support.waiting import until
 from zsched.worker.jobs import JobBook
 from zsched.worker.keep import Debts, Keeper
@@ -18,17 +17,6 @@ from zsched.worker.troubles import Troubles
 
 if TYPE_CHECKING:
     from zsched.core.events import WorkerJobs
-
-
-def none(_self: threading.Thread) -> None:
-    raise RuntimeError("can't start new thread")
-
-
-@contextmanager
-def no_threads() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(threading.Thread, "start", none)
-        yield
 
 
 def test_failures_are_told_of_later() -> None:
