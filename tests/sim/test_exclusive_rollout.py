@@ -247,6 +247,23 @@ def test_an_owner_that_needs_a_lease_no_more_waits_for_the_one_of_its_life_befor
     assert rollout.sim.machines[rollout.owner() or ""].roles[TASK].lease_until_s is None
 
 
+def test_a_new_generation_of_a_task_that_is_exclusive_no_more_waits_for_the_lease_of_the_one_before() -> None:
+    """Found by the simulator (seed 340006050): its owner there has not heard of either."""
+    slow = replace(NEW.timing, lease_s=6.0)  # a first placement waits for 3 s anyway
+    rollout = Rollout(1, replace(NEW, timing=slow))
+    sim, owner = rollout.sim, rollout.owner() or ""
+    others = rollout.others(owner)
+    sim.cut((owner,), others)
+    for name in others:
+        sim.crash(name)
+        sim.machines[name].fleet = replace(OLD, timing=slow)
+        sim.initialise(sim.machines[name], incarnation=sim.wall_count, generation=1)
+    sim.start(*others)
+    assert rollout.run(10.0) == 0.0  # the simulator raises, too, when two work and one of them has a lease
+    (successor,) = rollout.at_work() - {owner}
+    assert sim.machines[successor].roles[TASK].lease_until_s is None
+
+
 def forgetful(rollout: Rollout, fleet: Fleet, state: DurableState | None, *laggards: NodeId) -> float:
     """An owner with the old file is left, and the task becomes exclusive; then that machine forgets, and hears only
     the laggards, who have been cut off from before the move on. For how long two were at work since.

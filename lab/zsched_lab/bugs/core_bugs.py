@@ -467,6 +467,13 @@ LEASE_BUGS = (
         seed=2140,
     ),
     _bug(
+        "a new generation waits for the leases of exclusive tasks only",
+        LEASE,
+        "(value.leased or _is_first(value))",
+        "value.leased",
+        _ROLLOUT,
+    ),
+    _bug(
         "restart forgets a longer lease",
         LEASE,
         "hold_s(max(self.fleet.timing.lease_s, self.granted_s))",

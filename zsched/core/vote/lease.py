@@ -19,6 +19,8 @@ own.
 * An elector that granted refuses an accept for another owner until L(1+rho)/(1-rho) after its last grant on its own
   clock, or until the owner released. An elector that has just started does so for the same time with every owner but
   that of its persisted accepted value, and echoes no owner: it may have granted to an earlier life of that owner.
+  With the first value of a generation it does so for every task. One that is not exclusive any more may have been it in
+  the generation before, and its owner there may still work by a lease.
 * An elector that refuses stops echoing the present owner (for at most twice that time, or until it accepts or learns a
   newer revision), and its beats ask that owner to leave. The owner drains and releases all numbers up to now, which are
   never granted again. Without this a planned move would never happen.
@@ -291,6 +293,11 @@ class BeatParts(Struct, frozen=True, kw_only=True):
     asked_to_leave: tuple[tuple[TaskId, NodeId, int], ...]
 
 
+def _is_first(value: Allocation) -> bool:
+    """Whether nobody has agreed on an owner yet in this value's generation."""
+    return value.owner is None and value.revision > 0
+
+
 @dataclass(slots=True)
 class Leases:
     """Both sides of every exclusive task at one node.
@@ -333,7 +340,7 @@ class Leases:
         self._granters, self._grants = {}, bool(self.standing)
         for task in self.fleet.tasks:
             value = self.standing.get(task.name)
-            is_leased = task.exclusive or (value is not None and value.leased)
+            is_leased = task.exclusive or (value is not None and (value.leased or _is_first(value)))
             if is_leased and task.name in self.standing:
                 self._watch(task.name, None if value is None else value.owner, self.over_at)
 
