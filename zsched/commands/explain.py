@@ -357,7 +357,7 @@ def _tuning(page: Page, body: Json) -> None:
     if tuning["deadline_ms"] is not None:
         deadline = [(f"deadline {tuning['deadline_ms']:g} ms", "")]
         if body["knows_jobs"] is False:
-            deadline.append(("which does not count yet: its worker has not told of a job", "yellow"))
+            deadline.append(("which does not count yet: how long a job takes is not known", "yellow"))
     page.block(
         "TUNING",
         (weights, ""),

@@ -285,7 +285,7 @@ SCHEDULING: Final = Record(
         "deadline_ms": Field(
             Number(MIN_DEADLINE_MS, MAX_DEADLINE_MS, "ms"),
             "For `objective: latency`: a job that takes longer, from input to output and the network included, "
-            "comes too late.",
+            "comes too late. Of a worker without the library, answers with their input's timestamp tell how long.",
             default="none",
         ),
         "aggregate": Field(

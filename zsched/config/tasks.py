@@ -265,7 +265,9 @@ def _advise_deadline(tuning: Tuning, worker: WorkerSpec, given: Section, out: Co
     if tuning.deadline_ms is not None and not tells_jobs(worker):
         scheduling: Section = given.get("scheduling")
         out.warn(
-            scheduling.where("objective"), TELLS_NOTHING, "use zsched.worker (ready: token), or objective: service"
+            scheduling.where("objective"),
+            TELLS_NOTHING,
+            "put the input's timestamp on each answer (docs/guide/worker.md), or use zsched.worker (ready: token)",
         )
 
 

@@ -17,7 +17,7 @@ from typing import Any
 from zsched.core import instructions as do
 from zsched.core.electorate.numbers import known_at_start
 from zsched.core.events import SlotReady
-from zsched.core.executor.handover import Executor
+from zsched.core.executor.handover import Executor, Phase
 from zsched.core.executor.progress import HangWatch
 from zsched.core.executor.renewing import Renewing
 from zsched.core.executor.rollouts import Rollouts
@@ -36,6 +36,7 @@ from zsched.core.membership.peers import Membership
 from zsched.core.membership.refused import RefusedKeys
 from zsched.core.membership.relink import Introductions, MuteLinks
 from zsched.core.membership.solitude import Solitude
+from zsched.core.profile.answers import Answers
 from zsched.core.profile.profile import Profiler
 from zsched.core.profile.relay_ends import RelayEnds
 from zsched.core.route.gaps import StreamGaps
@@ -46,6 +47,7 @@ from zsched.core.scheduler.rounds import Rounds
 from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts
 from zsched.core.scheduler.unseen import Unseen
 from zsched.core.todo import ToDo
+from zsched.core.values.deadline import tells_jobs
 from zsched.core.values.document import Flag
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet, TaskSpec, file_hash, fleet_hash
@@ -154,6 +156,7 @@ class Stages:
         # PROFILE, GATEWAY
         self.profiler = Profiler(me, incarnation, fleet.timing)
         self.relay_ends = RelayEnds()
+        self.answers = Answers()
         self.gateway = Gateway(fleet)
         self.round_trips = RoundTrips(me)
         # SCHEDULER, VOTE
@@ -238,6 +241,21 @@ class Stages:
     def has_deadlines(self) -> bool:
         """Whether the way to other nodes counts in any score: by the agreed tunings, for operators change them."""
         return any(value.tuning.deadline_ms is not None for value in self.values().values())
+
+    def timed(self) -> Mapping[TaskId, NodeId]:
+        """{task: owner} of the tasks with a deadline whose worker tells nothing of its jobs, where streams flow to it.
+
+        During a handover, and while this robot works alone, no answer tells of the owner.
+        """
+        values, found = self.values(), {}
+        for spec in self.fleet.tasks:
+            if tells_jobs(spec.worker) or values[spec.name].tuning.deadline_ms is None:
+                continue
+            executor = self.executors[spec.name]
+            is_steady = executor.has_streams and executor.phase is Phase.SETTLED and not executor.is_local
+            if executor.owner is not None and is_steady:
+                found[spec.name] = executor.owner
+        return found
 
     def owned(self) -> tuple[TaskId, ...]:
         """The tasks that this node owns, as far as it has learnt."""

@@ -295,8 +295,8 @@ def _with_times(count: StreamCount, before: StreamCount | None) -> StreamCount:
     if before is None:
         return count
     gaps = [one.gap_s for one in (before, count) if one.gap_s is not None]
-    answer_s = before.answer_s if count.answer_s is None else count.answer_s
-    return replace(count, gap_s=max(gaps, default=None), answer_s=answer_s)
+    newest = before if count.answer_s is None else count
+    return replace(count, gap_s=max(gaps, default=None), answer_s=newest.answer_s, paired_hz=newest.paired_hz)
 
 
 def _listening(path: Path) -> socket.socket:

@@ -951,6 +951,20 @@ VOTE_BUGS = (
         ("tests/unit/core/gateway/test_task_speed.py",),
     ),
     _bug(
+        "the wait for a full machine's CPU follows a foreign worker to the next one",
+        "zsched.core.gateway.job_need",
+        "        if is_starved:",
+        "        if speed < 0.0:",
+        ("tests/unit/core/gateway/test_job_need.py",),
+    ),
+    _bug(
+        "a robot's way counts twice in the time of an answer",
+        "zsched.core.profile.answers",
+        "round_trips.get(owner, 0.0)",
+        "round_trips.get(task, 0.0)",
+        ("tests/unit/core/profile/test_answers.py",),
+    ),
+    _bug(
         "median and mean swapped",
         SCORING,
         "if allocation.tuning.aggregate is Aggregate.MEAN",

@@ -167,7 +167,7 @@ def test_a_deadline_that_does_not_count_yet_is_said(
     assert asked() == 0
     told = " ".join(capsys.readouterr().out.split())
     assert "deadline 100 ms" in told
-    assert ("does not count yet: its worker has not told of a job" in told) is is_said
+    assert ("does not count yet: how long a job takes is not known" in told) is is_said
     assert asked(is_json=True) == 0
     body = json.loads(capsys.readouterr().out)
     assert (faults(body), body["knows_jobs"]) == ([], knows)

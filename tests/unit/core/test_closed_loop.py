@@ -37,7 +37,8 @@ from zsched.core.values.fleet import (
     WorkerSpec,
 )
 from zsched.core.values.model import PeerState, ScoreForm, Tuning, Weights
-from zsched.core.values.profile import DeviceSample, LinkSample, LinkSource, WorkerState
+from zsched.core.values.plan import ReadyWhen
+from zsched.core.values.profile import AnswerTime, DeviceSample, LinkSample, LinkSource, WorkerState
 from zsched.core.vote.tally import VoteOutcome, tally
 
 HOUR_S = 3600.0
@@ -70,6 +71,10 @@ class Machine:
     shows_worker: bool = True
     job_s: float | None = None
     """Its worker tells of its jobs, of so many CPU seconds at speed 1; ``None``: it does not."""
+    is_foreign: bool = False
+    """Its worker tells nothing: robots see how long its answers take."""
+    waits_s: float = 0.0
+    """Of such an answer, for other things than a CPU."""
     rub: float = 1.0
     """A job takes so many times the CPU time when the machine is full."""
     most_cores: float = math.inf
@@ -107,6 +112,8 @@ class Machine:
 
     def __post_init__(self) -> None:
         self.told: WorkerJobs | None = None
+        self.answers: tuple[float, float] | None = None
+        """(seconds of an answer, answers per second) of a foreign worker."""
         self._done = self._undone = self._now = 0.0
 
     @property
@@ -131,6 +138,10 @@ class Machine:
         before, self._done = int(self._done), self._done + elapsed_s * done_hz
         self._undone += elapsed_s * max(wanted_hz - done_hz, 0.0)
         jobs, time_s = int(self._done) - before, max(1.0 / done_hz, cpu_s) if takes < needs else cpu_s
+        self.answers = (self.waits_s + time_s, done_hz)
+        if self.is_foreign:
+            self.told = None
+            return
         self.told = replace(
             word,
             at_s=now,
@@ -168,7 +179,9 @@ class Loop:
             demand=self.demand,
             patience=self.patience,
             learns_patience=self.learns,
-            worker=WorkerSpec(command=("worker",)),
+            worker=WorkerSpec(
+                command=("worker",), ready_when=ReadyWhen.MATCHING if self.machines[0].is_foreign else ReadyWhen.TOKEN
+            ),
         )
         fleet = fleet_of(self.spec, of=(*names, *self.robots), timing=self.timing)
         self.allocation = allocation_of(owner=names[0], tuning=self.spec.tuning)
@@ -197,16 +210,25 @@ class Loop:
             if machine.told is not None:
                 self.profilers[machine.name].note_jobs(machine.told, now)
             self.profilers[machine.name].absorb(device, (link,) if self.weights.network > 0.0 else (), now)
-        if self.weights.network > 0.0:
+        if self.weights.network > 0.0 or self.machines[0].is_foreign:
             device = DeviceSample(cpu_cores=4.0, cpu_used_cores=1.0, memory_mb=MEMORY_MB, memory_used_mb=1000.0)
             link = LinkSample(source=LinkSource.NL80211, rssi_dbm=-45.0)
             for robot in self.robots:
                 self.profilers[robot].absorb(device, (link,), now)
-        for profiler in self.profilers.values():
-            profile = profiler.publishable(READY, is_draining=False, now=now)
+        for name, profiler in self.profilers.items():
+            answers = self._answers() if name in self.robots else ()
+            profile = profiler.publishable(READY, is_draining=False, now=now, answers=answers)
             if profile is not None:
                 for gateway in self.gateways.values():
                     assert gateway.absorb(profile, now) is None
+
+    def _answers(self) -> tuple[AnswerTime, ...]:
+        """What a robot sees of the owner's answers."""
+        owner = next(machine for machine in self.machines if machine.name == self.allocation.owner)
+        if not owner.is_foreign or owner.answers is None:
+            return ()
+        age_s, hz = owner.answers
+        return (AnswerTime(task="merge", owner=owner.name, age_s=age_s, hz=hz / len(self.robots)),)
 
     def _round(self, now: float) -> None:
         judgements = self._judge(now, is_called=False)
@@ -633,6 +655,57 @@ def test_a_task_with_a_deadline_goes_where_its_jobs_are_quicker_though_it_loses_
     assert Loop(machines, weights=CPU_ONLY, tuning=BY_SERVICE, learns=True).run(60.0) == []
     ((_, where),) = Loop(machines, weights=CPU_ONLY, tuning=by_latency, learns=True).run(60.0)
     assert where == "edge2"
+
+
+FOREIGN = (
+    Machine(name="edge1", base=0.1, task_cores=0.3, job_s=0.1, is_foreign=True),
+    Machine(name="edge2", base=0.1, speed=2.0, task_cores=0.3, job_s=0.1, is_foreign=True),
+)
+
+
+@pytest.mark.parametrize("robots", [("robot1",), ("robot1", "robot2", "robot3")])
+def test_so_does_a_task_whose_worker_tells_nothing_and_whose_robots_see_its_answers(robots: tuple[str, ...]) -> None:
+    by_latency = replace(BY_SERVICE, deadline_ms=100.0)
+    assert Loop(FOREIGN, weights=CPU_ONLY, tuning=BY_SERVICE, learns=True, robots=robots).run(60.0) == []
+    ((_, where),) = Loop(FOREIGN, weights=CPU_ONLY, tuning=by_latency, learns=True, robots=robots).run(60.0)
+    assert where == "edge2"
+
+
+def test_a_foreign_worker_that_waits_for_other_things_is_as_late_on_a_faster_machine() -> None:
+    machines = tuple(replace(one, job_s=0.005, waits_s=0.15) for one in FOREIGN)
+    by_latency = replace(BY_SERVICE, deadline_ms=100.0)
+    assert Loop(machines, weights=CPU_ONLY, tuning=by_latency, learns=True).run(60.0) == []
+
+
+def test_a_foreign_worker_s_late_answers_on_a_full_machine_are_fled_and_it_does_not_come_back() -> None:
+    """It gets all the CPU that it needs on the mean, and each of its jobs three times as late: by service it stays."""
+    full = Machine(name="edge1", base=0.1, step=lambda now: 0.85 if now >= 20.0 else 0.0, threads=4.0, is_foreign=True)
+    machines = tuple(
+        replace(one, task_cores=0.4, job_s=0.1) for one in (full, Machine(name="edge2", base=0.2, is_foreign=True))
+    )
+    late = replace(BY_SERVICE, deadline_ms=200.0)
+    ((at, where),) = Loop(machines, weights=CPU_ONLY, tuning=late, learns=True).run(200.0)
+    assert where == "edge2"
+    assert 20.0 < at < 30.0
+
+
+@settings(derandomize=True, database=None, deadline=None, max_examples=12)
+@given(
+    machines=st.one_of(tempting_machines(), constant_machines()),
+    weights=st.sampled_from((BOTH, WITH_NETWORK, CPU_ONLY)),
+    job_s=st.floats(0.02, 0.6),
+    waits_s=st.sampled_from((0.0, 0.05)),
+    deadline_ms=st.sampled_from((150.0, 1000.0)),
+)
+def test_where_nothing_changes_a_task_whose_answers_are_timed_comes_to_rest(
+    machines: tuple[Machine, ...], weights: Weights, job_s: float, waits_s: float, deadline_ms: float
+) -> None:
+    for machine in machines:
+        machine.is_foreign, machine.job_s, machine.waits_s = True, job_s, waits_s
+    tuning = replace(BY_SERVICE, deadline_ms=deadline_ms)
+    moves = Loop(machines, weights=weights, tuning=tuning, learns=True).run(600.0)
+    assert len([at for at, _ in moves if at <= 300.0]) <= 4
+    assert [at for at, _ in moves if at > 300.0] == []
 
 
 def test_a_deadline_that_both_machines_keep_moves_nothing() -> None:

@@ -19,7 +19,7 @@ from support.states import state_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.electorate.strangers import SHOWN_S
-from zsched.core.executor.handover import HEARS_S
+from zsched.core.executor.handover import HEARS_S, Phase
 from zsched.core.executor.sparing import Sparing
 from zsched.core.handlers.work import carry_out
 from zsched.core.membership.identity import QUIET_S
@@ -51,7 +51,7 @@ from zsched.core.values.messages import (
 )
 from zsched.core.values.model import Acceptance, Allocation, Asked, Ballot, PeerState, RegisterState
 from zsched.core.values.plan import Direction, ReadyWhen, RoutePhase, StreamCount, WorkerRole
-from zsched.core.values.profile import Echo, WorkerState
+from zsched.core.values.profile import AnswerTime, Echo, WorkerState
 
 T = TypeVar("T")
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
@@ -1222,6 +1222,43 @@ def test_a_gap_at_a_move_is_in_the_story_of_its_task_once() -> None:
     told = [one for batch in batches for one in of(batch, do.RecordStory) if one.gap_s is not None]
     assert [(one.stage, one.task, one.epoch, one.gap_s) for one in told] == [("route", "merge", 2, 0.25)]
     assert told[0].text.startswith("merge/out/0: 250 ms")
+
+
+TIMED = (StreamCount(stream="merge/out/0", answer_s=0.2, paired_hz=5.0),)
+
+
+def timed(*, ready_when: ReadyWhen = ReadyWhen.MATCHING, deadline_ms: float | None = 100.0) -> Node:
+    """robot1, whose streams edge1's worker has served for a while."""
+    node = started()
+    worker = WorkerSpec(command=("merge",), ready_when=ready_when)
+    file = replace(FLEET, tasks=(replace(FLEET.tasks[0], worker=worker),))
+    node.handle(ev.FleetChanged(fleet=file), 100.5)
+    value = allocation_of(1, "edge1", tuning=tuning_of(deadline_ms=deadline_ms))
+    node.handle(learnt_from("robot2", value), 101.0)
+    for event in (ev.SlotReady(task="merge", epoch=1), ev.SlotFlipped(task="merge", epoch=1)):
+        node.handle(event, 102.0)
+    assert node.executors["merge"].phase is Phase.SETTLED
+    return node
+
+
+def told_of_answers(node: Node, now: float) -> tuple[AnswerTime, ...]:
+    node.handle(ev.StreamsCounted(counts=TIMED), now)
+    node.handle(ev.ProfileSampled(device=SAMPLE), now)
+    (profile,) = [one.profile for one in of(node.handle(ev.DeadlineReached(), now + 5.0), do.PublishProfile)]
+    return profile.answers
+
+
+def test_a_robot_times_the_answers_of_a_worker_that_tells_nothing_where_a_deadline_needs_it() -> None:
+    assert told_of_answers(timed(), 103.0) == (AnswerTime(task="merge", owner="edge1", age_s=0.2, hz=5.0),)
+    assert told_of_answers(timed(deadline_ms=None), 103.0) == ()
+    assert told_of_answers(timed(ready_when=ReadyWhen.TOKEN), 103.0) == ()
+
+
+def test_during_a_handover_no_answer_tells_of_the_owner() -> None:
+    node = timed()
+    value = allocation_of(2, "edge2", 2, tuning=tuning_of(deadline_ms=100.0))
+    node.handle(learnt_from("robot2", value), 102.5)
+    assert told_of_answers(node, 103.0) == ()
 
 
 @pytest.mark.parametrize(("epoch", "waits"), [(1, False), (2, True)])

@@ -12,10 +12,11 @@ has no limit cycle (docs/decisions/0118).
 from __future__ import annotations
 
 from zsched.core.gateway.company import Company, is_full
+from zsched.core.gateway.job_need import Heard, JobNeed, other_s, told_job
 from zsched.core.gateway.task_speed import MOST_RATIO, TaskSpeeds, speed_of
 from zsched.core.values.fleet import Demand, TaskSpec
 from zsched.core.values.model import NodeId, TaskId
-from zsched.core.values.profile import Jobs, Profile, Renewal, WorkerLoad, WorkerState
+from zsched.core.values.profile import Profile, Renewal, WorkerLoad, WorkerState
 from zsched.core.values.struct import Struct, replace
 
 UNSURE = 1.5
@@ -26,39 +27,8 @@ COMPARED_S = 12.0
 """What differs so soon after a move is the machine's doing; what changes later is the task's."""
 RECENT_S = 60.0
 """Older figures say nothing of the machine to which a task has come: the task may have changed since."""
-
-
-CALM_WAIT_RATIO = 0.1
-"""Jobs that wait for a CPU for a smaller part of their time show their usual wait in the queue."""
-QUEUE_RATIO = 2.0
-"""Until that was seen, a job's age counts as at most this many times its own time."""
 SHORT_RATIO = 0.9
 """A task that gets a smaller part of its forecast has a shortfall on that machine."""
-LEAST_FREE_CORES = 0.05
-"""A job on a full machine gets at least this much, so that its time is finite."""
-
-
-class JobNeed(Struct, frozen=True):
-    """One job's need, as the worker reported it where it ran."""
-
-    work_s: float
-    """CPU time at speed 1."""
-    other_s: float
-    """Its wait for things other than a CPU, the same on every machine."""
-    queue_ratio: float
-    """Time from arrival to end over its own time where nothing is short; at least 1."""
-    is_serial: bool
-    """One thread does it, so it uses at most one core at a time."""
-
-    def most_cores(self, speed: float) -> float | None:
-        """What the worker can use at a time on a machine of ``speed``; ``None``: any amount."""
-        cpu_s = self.work_s / speed
-        return cpu_s / (cpu_s + self.other_s) if self.is_serial and cpu_s > 0.0 else None
-
-    def age_s(self, speed: float, free_cores: float) -> float:
-        """Expected seconds from arrival to end where a job gets this many cores while it runs, at most one."""
-        stretch = 1.0 / min(max(free_cores, LEAST_FREE_CORES), 1.0)
-        return self.queue_ratio * (self.other_s + stretch * self.work_s / speed)
 
 
 class _Shortfall(Struct, frozen=True):
@@ -94,6 +64,7 @@ class _Known(Struct, frozen=True):
     """...and when."""
     memory_mb: float | None = None
     job: JobNeed | None = None
+    """What its worker has reported, or what robots see of its answers; ``None``: nothing so far."""
     is_job_old: bool = False
     """The job is a worker's that is to start again, by a changed recipe."""
     is_changed: bool = False
@@ -112,7 +83,13 @@ class Demands:
         self._speeds = TaskSpeeds()
 
     def learn(
-        self, task: TaskId, profile: Profile, now: float, fastest: float | None = None, fair_cores: float = 0.0
+        self,
+        task: TaskId,
+        profile: Profile,
+        now: float,
+        fastest: float | None = None,
+        fair_cores: float = 0.0,
+        heard: Heard | None = None,
     ) -> bool:
         """Learn the task's need from its owner's profile; whether the need has changed.
 
@@ -129,6 +106,7 @@ class Demands:
             now: monotonic seconds.
             fastest: the highest speed among the candidates (``None``: the owner's).
             fair_cores: what a fair scheduler gives the task there while a job runs, >= 0; 0: nobody counts threads.
+            heard: what robots see of the answers of a worker that reports no jobs; ``None``: nothing.
         """
         load = profile.worker(task)
         known = self._known.get(task, _Known())
@@ -141,7 +119,7 @@ class Demands:
         is_new = now - found.since < SETTLE_S
         before = found.before if now - found.since < COMPARED_S else None
         if before is not None:
-            self._compare_jobs(task, profile, load, before)
+            self._compare_jobs(task, profile, _job_cpu_s(load, None if is_new else heard), before)
         if load.memory_mb is not None:
             found = replace(found, memory_mb=max(load.memory_mb, (known.memory_mb or 0.0) if is_new else 0.0))
         if load.cpu_cores is not None:
@@ -162,9 +140,13 @@ class Demands:
             if before is not None:
                 has_jobs = load.jobs is not None
                 found = self._compared(task, profile, found, before, is_new=is_new, has_jobs=has_jobs)
-        found = _with_job(found, load, self._speeds.of(task, profile, is_there=True), is_new=is_new)
+        speed = self._speeds.of(task, profile, is_there=True)
+        if heard is not None and load.jobs is None and not is_new:
+            found = _with_heard(found, profile, load, heard, speed)
+        else:
+            found = _with_job(found, load, speed, is_new=is_new)
         self._known[task] = found
-        is_seen = not is_new and self._note_shortfall(task, profile, load, found, fair_cores)
+        is_seen = not is_new and self._note_shortfall(task, profile, load, found, fair_cores, heard)
         return is_seen or (found.work, found.memory_mb, found.job) != (known.work, known.memory_mb, known.job)
 
     def forget(self, task: TaskId) -> None:
@@ -187,16 +169,15 @@ class Demands:
         is_ready = load is not None and load.state is WorkerState.READY and load.renewal is Renewal.NONE
         return is_ready and known.is_changed and known.is_job_old
 
-    def _compare_jobs(self, task: TaskId, profile: Profile, load: WorkerLoad, before: _Before) -> None:
+    def _compare_jobs(self, task: TaskId, profile: Profile, cpu_s: float, before: _Before) -> None:
         """What a job takes here and took where the task came from tells its speed, also of one that is short.
 
         It is never faster than the benchmark says. A job that takes less here may do so because others slowed it down
         where it came from, or because its worker begins with nothing. Then all other machines would seem too slow for
         as long as the task stays, and nothing but a move would tell.
         """
-        jobs = load.jobs
-        if jobs is not None and jobs.cpu_s > 0.0 and before.job_work_s is not None:
-            self._speeds.note(task, profile, min(before.job_work_s / jobs.cpu_s, speed_of(profile)))
+        if cpu_s > 0.0 and before.job_work_s is not None:
+            self._speeds.note(task, profile, min(before.job_work_s / cpu_s, speed_of(profile)))
 
     def _compared(
         self, task: TaskId, profile: Profile, found: _Known, before: _Before, *, is_new: bool, has_jobs: bool
@@ -222,11 +203,18 @@ class Demands:
         return as_before
 
     def _note_shortfall(
-        self, task: TaskId, profile: Profile, load: WorkerLoad, found: _Known, fair_cores: float
+        self,
+        task: TaskId,
+        profile: Profile,
+        load: WorkerLoad,
+        found: _Known,
+        fair_cores: float,
+        heard: Heard | None,
     ) -> bool:
         """Remember that the task gets less on a machine than forecast, or no longer does; whether that has changed."""
-        jobs, job, company = load.jobs, found.job, Company.of(task, profile)
-        if jobs is None or job is None or company is None or load.cpu_cores is None or not found.work:
+        job, company = found.job, Company.of(task, profile)
+        age_s = _age_s(load, heard)
+        if age_s is None or job is None or company is None or load.cpu_cores is None or not found.work:
             return False
         speed = self._speeds.of(task, profile, is_there=True)
         need, free = found.work / speed, profile.cpu_cores - company.others_cores
@@ -234,7 +222,6 @@ class Demands:
         foreseen = min(free / need, 1.0 if most is None else most / need, 1.0)
         is_lacking = foreseen > 0.0 and _is_told(load) and is_short(load)
         share = min(load.cpu_cores / need / foreseen, 1.0) if is_lacking else 1.0
-        age_s = jobs.time_s if jobs.age_s is None else jobs.age_s
         stretch = max(age_s / max(job.age_s(speed, max(free, fair_cores)), 1e-9), 1.0)
         before = self._shortfalls.pop((task, profile.node), None)
         if share >= SHORT_RATIO and stretch <= 1.0 / SHORT_RATIO:
@@ -287,6 +274,21 @@ def is_short(load: WorkerLoad) -> bool:
     return is_hungry or (jobs is not None and jobs.done_hz < SHORT_RATIO * jobs.wanted_hz)
 
 
+def _age_s(load: WorkerLoad, heard: Heard | None) -> float | None:
+    """From a job's arrival to its end: by the worker's report, else by its answers; ``None``: nobody knows."""
+    jobs = load.jobs
+    if jobs is None:
+        return None if heard is None else heard.age_s
+    return jobs.time_s if jobs.age_s is None else jobs.age_s
+
+
+def _job_cpu_s(load: WorkerLoad, heard: Heard | None) -> float:
+    """CPU time of a job: by the worker's report, else by its answers; 0: nobody knows."""
+    if load.jobs is not None:
+        return load.jobs.cpu_s
+    return 0.0 if heard is None or load.cpu_cores is None else heard.cpu_s(load.cpu_cores)
+
+
 def _is_told(load: WorkerLoad) -> bool:
     """Whether the worker's report shows its lack of CPU, and not only its undone work."""
     jobs = load.jobs
@@ -306,15 +308,19 @@ def _told(load: WorkerLoad, speed: float, fastest: float) -> float | None:
     undone_hz = jobs.wanted_hz - jobs.done_hz
     if jobs.wait_s is None:
         return min(use + max(undone_hz, 0.0) * jobs.cpu_s, max(load.wanted_cores or 0.0, use)) * speed
-    alone_s = _other_s(jobs) + jobs.cpu_s * speed / fastest
+    alone_s = other_s(jobs) + jobs.cpu_s * speed / fastest
     if alone_s > 0.0:
         undone_hz = min(undone_hz, max(1.0 / alone_s - jobs.done_hz, 0.0))
     return max(use + undone_hz * jobs.cpu_s, 0.0) * speed
 
 
-def _other_s(jobs: Jobs) -> float:
-    """A job's wait for things other than a CPU, the same on every machine; 0 where the kernel does not report it."""
-    return 0.0 if jobs.wait_s is None else max(jobs.time_s - jobs.wait_s - jobs.cpu_s, 0.0)
+def _with_heard(known: _Known, profile: Profile, load: WorkerLoad, heard: Heard, speed: float) -> _Known:
+    """With the job of the owner's worker as robots see it; where its use is not measured it stays what it was."""
+    use = load.cpu_cores
+    if use is None:
+        return known
+    job = heard.job(use, speed, known.job, is_starved=is_full(profile))
+    return replace(known, job=job, job_work_s=job.work_s, is_job_old=load.renewal is not Renewal.NONE)
 
 
 def _with_job(known: _Known, load: WorkerLoad, speed: float, *, is_new: bool) -> _Known:
@@ -324,7 +330,7 @@ def _with_job(known: _Known, load: WorkerLoad, speed: float, *, is_new: bool) ->
     """
     is_old = load.renewal is not Renewal.NONE
     if load.jobs is not None:
-        job = _job(load.jobs, speed, known.job)
+        job = told_job(load.jobs, speed, known.job)
         # a worker that has just come may begin with nothing, and its first jobs be small by that
         job_work_s = known.job_work_s if is_new and known.before is not None else load.jobs.cpu_s * speed
         return replace(known, job=job, job_work_s=job_work_s, is_job_old=is_old)
@@ -332,13 +338,3 @@ def _with_job(known: _Known, load: WorkerLoad, speed: float, *, is_new: bool) ->
     if is_old:
         return replace(silent, is_job_old=True)
     return replace(silent, job=None, is_job_old=False) if known.is_job_old and not is_new else silent
-
-
-def _job(jobs: Jobs, speed: float, known: JobNeed | None) -> JobNeed:
-    is_serial, queue_ratio = jobs.wait_s is not None, QUEUE_RATIO if known is None else known.queue_ratio
-    if jobs.age_s is not None and jobs.time_s > 0.0:
-        seen = max(jobs.age_s / jobs.time_s, 1.0)
-        is_calm = jobs.wait_s is not None and jobs.wait_s <= CALM_WAIT_RATIO * jobs.time_s
-        queue_ratio = seen if is_calm else min(seen, queue_ratio)
-    work_s = jobs.cpu_s if is_serial else min(jobs.cpu_s, jobs.time_s)
-    return JobNeed(work_s=work_s * speed, other_s=_other_s(jobs), queue_ratio=queue_ratio, is_serial=is_serial)

@@ -30,6 +30,7 @@ def publish_profile(node: Stages, todo: ToDo, now: float) -> None:
         reasons=node.workers.told(now),
         echoes=node.round_trips.echoes(now),
         relay=node.relay_ends.told(now),
+        answers=node.answers.told(now),
         renewals=node.renewing.told,
         beats_now=todo.must_beat or now >= node.beat_at,
     )

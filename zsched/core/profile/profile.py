@@ -26,6 +26,7 @@ from zsched.core.values.profile import (
     MAX_MEMORY_MB,
     MAX_RUNNABLE,
     MAX_TREND_DB_S,
+    AnswerTime,
     DeviceSample,
     Echo,
     Link,
@@ -226,6 +227,7 @@ class Profiler:
         reasons: Mapping[TaskId, str] = NO_REASONS,
         echoes: tuple[Echo, ...] = (),
         relay: str = "",
+        answers: tuple[AnswerTime, ...] = (),
         renewals: Mapping[TaskId, Renewal] = NO_RENEWALS,
         beats_now: bool = False,
     ) -> Profile | None:
@@ -239,6 +241,7 @@ class Profiler:
             reasons: why workers are not ready.
             echoes: which profiles this node has of others; they are no reason to send one.
             relay: what is wrong with this node's relay.
+            answers: how long those of foreign workers take; they are no reason to send one.
             renewals: which workers run by an old recipe.
             beats_now: a beat leaves at once: a profile that is nearly due goes with it, in the same packet.
         """
@@ -255,8 +258,8 @@ class Profiler:
             profile = replace(profile, progress=progress, relay=relay)
         if not is_due and self._sent is not None and not _differs(profile, self._sent):
             return None
-        if echoes:
-            profile = replace(profile, echoes=echoes)
+        if echoes or answers:
+            profile = replace(profile, echoes=echoes, answers=answers)
         self._sequence += 1
         self.has_news = self._sent is None or _kinds(profile) != _kinds(self._sent)
         self._sent, self._sent_at = profile, now

@@ -169,4 +169,4 @@ class Explanation(Struct, frozen=True, kw_only=True):
     age_s: float = 0.0
     vote: VoteStatus | None = None
     knows_jobs: bool | None = None
-    """Whether this node knows what a job of the task takes, which a deadline needs; ``None``: it does not say."""
+    """Whether this node knows how long a job of the task takes, which a deadline needs; ``None``: it does not say."""

@@ -219,7 +219,10 @@ class StreamCount(Struct, frozen=True, kw_only=True):
     """Inputs: sent to a worker that acknowledges nothing (a foreign one): nobody knows what came of them."""
     answer_s: float | None = None
     """Outputs: mean seconds from inputs to their answers since the count before, network included. An answer without
-    its input's timestamp counts since the newest input before it: a lower bound."""
+    its input's timestamp counts since the newest input before it: a lower bound, told where no other is known."""
+    paired_hz: float | None = None
+    """Outputs: answers per second since then that had their input's timestamp, from which ``answer_s`` is; ``None``:
+    none had."""
     gap_s: float | None = None
     """Outputs: the longest time between two answers that passed, since the count before; ``None``: no two have passed.
     The status tells the longest of the last seconds (`zsched.core.route.gaps`)."""

@@ -157,6 +157,23 @@ class TaskProgress(Struct, frozen=True, kw_only=True):
         check_counter("progress.epoch", self.epoch)
 
 
+class AnswerTime(Struct, frozen=True, kw_only=True):
+    """How long the answers of a worker that tells nothing of its jobs take, as a robot's relay measures them."""
+
+    task: TaskId
+    owner: NodeId
+    age_s: float
+    """From an input at the owner to its answer there: without the robot's way, as far as that is measured."""
+    hz: float
+    """Such answers per second, of the robot's own inputs."""
+
+    def __post_init__(self) -> None:
+        check_name("answer.task", self.task)
+        check_name("answer.owner", self.owner)
+        check_range("answer.age_s", self.age_s, 0.0, MAX_JOB_S)
+        check_range("answer.hz", self.hz, 0.0, MAX_JOBS_HZ)
+
+
 class DeviceSample(Struct, frozen=True, kw_only=True):
     """One raw reading of this machine by the device profiler.
 
@@ -237,6 +254,8 @@ class Profile(Struct, frozen=True, kw_only=True):
     """What is wrong with its relay (`zsched.core.profile.relay_ends`); at most `MAX_REASON` long; empty: nothing."""
     gauges: Readings = ()
     """Smoothed readings of its gauges (`zsched.core.values.gauges`)."""
+    answers: tuple[AnswerTime, ...] = ()
+    """Robots: of tasks with a deadline whose workers tell nothing of their jobs (`zsched.core.profile.answers`)."""
 
     def __post_init__(self) -> None:
         check_name("profile.node", self.node)

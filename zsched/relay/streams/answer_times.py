@@ -38,9 +38,11 @@ class AnswerTimes:
                 if len(self._sent) > MAX_SENT:
                     self._sent.popitem(last=False)
 
-    def answered(self, stamp: Timestamp | None) -> float | None:
-        """An output has come: seconds since its input; ``None`` when there was none."""
+    def answered(self, stamp: Timestamp | None) -> tuple[float, bool] | None:
+        """An output has come: (seconds since its input, whether it had its timestamp); ``None`` without any input."""
         now = monotonic_s()
         with self._lock:
-            at = self._newest_at if stamp is None else self._sent.get(stamp, self._newest_at)
-        return None if at is None else now - at
+            sent_at, newest_at = None if stamp is None else self._sent.get(stamp), self._newest_at
+        if sent_at is not None:
+            return now - sent_at, True
+        return None if newest_at is None else (now - newest_at, False)

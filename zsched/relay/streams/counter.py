@@ -5,9 +5,19 @@ Knows: `StreamCount`. Does not know: zenoh, routes. Its owner's lock guards it.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from zsched.clock import monotonic_s
 from zsched.core.values.plan import STILL_S, StreamCount
 from zsched.relay.streams.tally import Tally
+
+
+@dataclass(slots=True)
+class _Answers:
+    """Answers of one kind since the last count."""
+
+    count: int = 0
+    sum_s: float = 0.0
 
 
 class StreamCounter:
@@ -27,8 +37,9 @@ class StreamCounter:
         self.replayed = 0
         self.repeated = 0
         self.unsent = 0
-        self._answers = 0
-        self._answers_s = 0.0
+        self._answers: tuple[_Answers, _Answers] = _Answers(), _Answers()
+        """Those without their input's timestamp, and those with it."""
+        self._answers_since = monotonic_s()
         self._passed_at: float | None = None
         self._passed_epoch = 0
         self._gap_s: float | None = None
@@ -43,11 +54,11 @@ class StreamCounter:
         self._bytes += size
         self._last_seen = monotonic_s()
 
-    def answered(self, took_s: float | None) -> None:
-        """An answer has come, ``took_s`` after its input."""
-        if took_s is not None:
-            self._answers += 1
-            self._answers_s += took_s
+    def answered(self, took_s: float, *, is_paired: bool) -> None:
+        """An answer has come, ``took_s`` after its input; ``is_paired``: it has that input's timestamp."""
+        answers = self._answers[is_paired]
+        answers.count += 1
+        answers.sum_s += took_s
 
     def passed(self, epoch: int, now: float) -> None:
         """An answer of the owner of ``epoch`` went on to the applications at ``now`` (monotonic seconds)."""
@@ -86,8 +97,7 @@ class StreamCounter:
             more = {"error": drops.get("error", 0) + said.errors, "uncounted": said.uncounted}
             drops = {**drops, **{reason: count for reason, count in more.items() if count}}
         age = None if self._last_seen is None else round(max(0.0, monotonic_s() - self._last_seen), 3)
-        answer_s = round(self._answers_s / self._answers, 4) if self._answers else None
-        self._answers, self._answers_s = 0, 0.0
+        answer_s, paired_hz = self._take_answers(monotonic_s())
         gap_s, self._gap_s = self._gap_s, None
         return StreamCount(
             stream=self.stream,
@@ -106,7 +116,17 @@ class StreamCounter:
             unsent=self.unsent,
             unconfirmed=said.unconfirmed,
             answer_s=answer_s,
+            paired_hz=paired_hz,
             gap_s=None if gap_s is None else round(gap_s, 4),
             move_gap_s=None if self._move_gap_s is None else round(self._move_gap_s, 4),
             move_epoch=self._move_epoch,
         )
+
+    def _take_answers(self, now: float) -> tuple[float | None, float | None]:
+        """(mean seconds of the answers since the last time, how many a second were paired), and begin anew."""
+        any_one, paired = self._answers
+        elapsed_s, self._answers_since = now - self._answers_since, now
+        self._answers = _Answers(), _Answers()
+        told = paired if paired.count else any_one
+        answer_s = round(told.sum_s / told.count, 4) if told.count else None
+        return answer_s, round(paired.count / elapsed_s, 3) if paired.count and elapsed_s > 0.0 else None

@@ -509,8 +509,9 @@ class OutputStream:
             self._forward(sample)
 
     def _forward(self, sample: Sample, size: int | None = None) -> None:
-        if self._times is not None:
-            self._counter.answered(self._times.answered(sample.timestamp))
+        answer = None if self._times is None else self._times.answered(sample.timestamp)
+        if answer is not None:
+            self._counter.answered(answer[0], is_paired=answer[1])
         if self._is_latest:
             stamp = sample.timestamp
             if stamp is not None and not self._fence.passes(self._outlet.key_of(sample), stamp):

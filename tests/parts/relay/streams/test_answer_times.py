@@ -9,6 +9,7 @@ import zenoh
 
 from support.sessions import hub_and_neighbour
 from zsched.relay.streams import answer_times
+from zsched.relay.streams import counter as counters
 from zsched.relay.streams.answer_times import MAX_SENT, AnswerTimes
 from zsched.relay.streams.counter import StreamCounter
 
@@ -37,11 +38,11 @@ def test_an_answer_with_its_input_s_timestamp_is_told_exactly(at: Callable[[floa
     at(10.3)
     times.sent(two)
     at(10.5)
-    assert times.answered(one) == pytest.approx(0.5)
-    assert times.answered(two) == pytest.approx(0.2)
-    assert times.answered(two) == pytest.approx(0.2), "an input may have several answers"
-    assert times.answered(stranger) == pytest.approx(0.2), "at least as old as the newest input"
-    assert times.answered(None) == pytest.approx(0.2)
+    assert times.answered(one) == pytest.approx((0.5, True))
+    assert times.answered(two) == pytest.approx((0.2, True))
+    assert times.answered(two) == pytest.approx((0.2, True)), "an input may have several answers"
+    assert times.answered(stranger) == pytest.approx((0.2, False)), "at least as old as the newest input"
+    assert times.answered(None) == pytest.approx((0.2, False))
 
 
 def test_inputs_without_timestamps_and_very_many_of_them_cost_no_memory(at: Callable[[float], None]) -> None:
@@ -53,13 +54,29 @@ def test_inputs_without_timestamps_and_very_many_of_them_cost_no_memory(at: Call
     times.sent(None)
     assert len(times._sent) == MAX_SENT
     at(MAX_SENT + 1.0)
-    assert times.answered(first) == pytest.approx(1.0), "it was forgotten: the newest one counts"
+    assert times.answered(first) == pytest.approx((1.0, False)), "it was forgotten: the newest one counts"
 
 
 def test_a_count_tells_the_mean_since_the_one_before() -> None:
     counter = StreamCounter("merge/out/0")
     assert counter.value().answer_s is None
-    for took_s in (0.1, None, 0.3):
-        counter.answered(took_s)
-    assert counter.value().answer_s == pytest.approx(0.2)
+    for took_s in (0.1, 0.3):
+        counter.answered(took_s, is_paired=False)
+    told = counter.value()
+    assert (told.answer_s, told.paired_hz) == pytest.approx((0.2, None))
     assert counter.value().answer_s is None
+
+
+def test_with_answers_that_have_their_input_s_timestamp_a_count_tells_of_these_only(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(counters, "monotonic_s", lambda: 10.0)
+    counter = StreamCounter("merge/out/0")
+    for took_s, is_paired in ((0.1, False), (0.5, True), (0.7, True)):
+        counter.answered(took_s, is_paired=is_paired)
+    monkeypatch.setattr(counters, "monotonic_s", lambda: 14.0)
+    told = counter.value()
+    assert (told.answer_s, told.paired_hz) == pytest.approx((0.6, 0.5))
+    monkeypatch.setattr(counters, "monotonic_s", lambda: 15.0)
+    told = counter.value()
+    assert (told.answer_s, told.paired_hz) == (None, None), "each count begins anew"

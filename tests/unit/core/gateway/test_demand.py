@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from support.fleets import fleet_of, task_of
 from support.profiles import load_of, profile_of
 from zsched.core.gateway.company import STARVED_CPU_RATIO
-from zsched.core.gateway.demand import QUEUE_RATIO, SETTLE_S, SHORT_RATIO, UNSURE, Demands, is_short
+from zsched.core.gateway.demand import SETTLE_S, SHORT_RATIO, UNSURE, Demands, is_short
 from zsched.core.gateway.gateway import Gateway
+from zsched.core.gateway.job_need import QUEUE_RATIO
 from zsched.core.values.fleet import Demand
 from zsched.core.values.profile import Jobs, Profile, Renewal, WorkerLoad, WorkerState
 

@@ -1,0 +1,100 @@
+"""GATEWAY: what one job of a task takes, as its worker tells it, or as robots see it of a foreign one.
+
+Knows: work and waits of a job, what of a time was which. Does not know: what a task needs on the mean
+(`zsched.core.gateway.demand`), how answers are measured (`zsched.core.profile.answers`).
+
+A foreign worker tells nothing. Its processes are measured, so CPU time per answer is known. The rest of an answer's
+time is a wait for other things, the same on every machine, if the owner had CPU to spare. On a full machine the rest is
+also a wait for a CPU. There the wait for other things counts as it was seen before, and what an answer takes longer
+than foreseen is remembered of that machine.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Iterable
+
+from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.profile import AnswerTime, Jobs, Profile
+from zsched.core.values.struct import Struct
+
+CALM_WAIT_RATIO = 0.1
+"""Jobs that wait for a CPU for a smaller part of their time show their usual wait in the queue."""
+QUEUE_RATIO = 2.0
+"""Until that was seen, a job's age counts as at most this many times its own time."""
+LEAST_FREE_CORES = 0.05
+"""A job on a full machine gets at least this much, so that its time is finite."""
+LEAST_HZ = 0.01
+"""Fewer answers a second do not tell the CPU time of one."""
+
+
+class JobNeed(Struct, frozen=True):
+    """One job's need, as the worker reported it where it ran."""
+
+    work_s: float
+    """CPU time at speed 1."""
+    other_s: float
+    """Its wait for things other than a CPU, the same on every machine."""
+    queue_ratio: float
+    """Time from arrival to end over its own time where nothing is short; at least 1."""
+    is_serial: bool
+    """One thread does it, so it uses at most one core at a time."""
+
+    def most_cores(self, speed: float) -> float | None:
+        """What the worker can use at a time on a machine of ``speed``; ``None``: any amount."""
+        cpu_s = self.work_s / speed
+        return cpu_s / (cpu_s + self.other_s) if self.is_serial and cpu_s > 0.0 else None
+
+    def age_s(self, speed: float, free_cores: float) -> float:
+        """Expected seconds from arrival to end where a job gets this many cores while it runs, at most one."""
+        stretch = 1.0 / min(max(free_cores, LEAST_FREE_CORES), 1.0)
+        return self.queue_ratio * (self.other_s + stretch * self.work_s / speed)
+
+
+def other_s(jobs: Jobs) -> float:
+    """A job's wait for things other than a CPU, the same on every machine; 0 where the kernel does not report it."""
+    return 0.0 if jobs.wait_s is None else max(jobs.time_s - jobs.wait_s - jobs.cpu_s, 0.0)
+
+
+def told_job(jobs: Jobs, speed: float, known: JobNeed | None) -> JobNeed:
+    """A job by its worker's report, on a machine of ``speed``; ``known``: what was known before."""
+    is_serial, queue_ratio = jobs.wait_s is not None, QUEUE_RATIO if known is None else known.queue_ratio
+    if jobs.age_s is not None and jobs.time_s > 0.0:
+        seen = max(jobs.age_s / jobs.time_s, 1.0)
+        is_calm = jobs.wait_s is not None and jobs.wait_s <= CALM_WAIT_RATIO * jobs.time_s
+        queue_ratio = seen if is_calm else min(seen, queue_ratio)
+    work_s = jobs.cpu_s if is_serial else min(jobs.cpu_s, jobs.time_s)
+    return JobNeed(work_s=work_s * speed, other_s=other_s(jobs), queue_ratio=queue_ratio, is_serial=is_serial)
+
+
+class Heard(Struct, frozen=True):
+    """The answers of one task's owner, by all robots."""
+
+    age_s: float
+    """From an input to its answer at the owner: the median of the robots', so that one bad link says nothing."""
+    hz: float
+    """Answers per second to all robots; each counts those of its own inputs."""
+
+    def cpu_s(self, use_cores: float) -> float:
+        """CPU seconds per answer; of several threads at once, at most the answer's time."""
+        return min(use_cores / self.hz, self.age_s)
+
+    def job(self, use_cores: float, speed: float, known: JobNeed | None, *, is_starved: bool) -> JobNeed:
+        """A job by its answers, on a machine of ``speed`` where the worker uses ``use_cores``.
+
+        ``known``: what was known before. ``is_starved``: the machine has nothing to spare.
+        """
+        cpu_s = self.cpu_s(use_cores)
+        waits_s = self.age_s - cpu_s
+        if is_starved:
+            waits_s = min(waits_s, 0.0 if known is None else known.other_s)
+        return JobNeed(work_s=cpu_s * speed, other_s=waits_s, queue_ratio=1.0, is_serial=False)
+
+
+def heard_of(task: TaskId, owner: NodeId, profiles: Iterable[Profile]) -> Heard | None:
+    """What these profiles tell of the answers of the task's owner; ``None``: nothing, or too little."""
+    told: list[AnswerTime] = [
+        one for profile in profiles for one in profile.answers if (one.task, one.owner) == (task, owner)
+    ]
+    hz = sum(one.hz for one in told)
+    return Heard(statistics.median([one.age_s for one in told]), hz) if hz >= LEAST_HZ else None
