@@ -138,7 +138,7 @@ class Demands:
             else:
                 found = replace(found, work=use, is_sure=True)
             if before is not None:
-                has_jobs = load.jobs is not None
+                has_jobs = load.jobs is not None or heard is not None
                 found = self._compared(task, profile, found, before, is_new=is_new, has_jobs=has_jobs)
         speed = self._speeds.of(task, profile, is_there=True)
         if heard is not None and load.jobs is None and not is_new:

@@ -8,6 +8,7 @@ import pytest
 
 from support.profiles import load_of, profile_of
 from zsched.core.gateway.demand import COMPARED_S, RECENT_S, SETTLE_S, Demands
+from zsched.core.gateway.job_need import Heard
 from zsched.core.gateway.task_speed import MOST_RATIO, TaskSpeeds
 from zsched.core.values.fleet import Demand
 from zsched.core.values.profile import Jobs, Profile, WorkerState
@@ -36,11 +37,13 @@ def jobs_of(cpu_s: float, *, wanted_hz: float = 5.0, done_hz: float = 5.0) -> Jo
     return Jobs(time_s=cpu_s, cpu_s=cpu_s, wait_s=0.0, age_s=cpu_s, done_hz=done_hz, wanted_hz=wanted_hz, backlog=0)
 
 
-def stay(demands: Demands, one: Profile, begin: float, lasts_s: float = 2 * COMPARED_S) -> float:
+def stay(
+    demands: Demands, one: Profile, begin: float, lasts_s: float = 2 * COMPARED_S, heard: Heard | None = None
+) -> float:
     """The task is on the node of ``one``, which looks the same for so long; answers when that ends."""
     at = begin
     while at <= begin + lasts_s:
-        demands.learn("merge", one, at)
+        demands.learn("merge", one, at, heard=heard)
         at += 0.5
     return at
 
@@ -196,6 +199,16 @@ def test_more_jobs_of_the_same_kind_make_no_machine_slow_though_it_is_short() ->
     stay(demands, there, at)
     assert demands.speed("merge", there) == 1.0
     assert demands.at(NOTHING, profile("edge1")).cpu_cores == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("hz", "speed"), [(9.0, 1.0), (2.25, 0.25)])
+def test_answers_of_a_worker_that_tells_nothing_tell_the_speed_as_jobs_do(hz: float, speed: float) -> None:
+    """It is short on the next machine: for more jobs of the same kind, or for jobs that take longer there."""
+    demands = Demands()
+    at = stay(demands, profile("edge1", cores=0.2), 0.0, heard=Heard(age_s=0.3, hz=2.0))
+    there = profile(cores=0.9, others=3.1, wanted=1.0)
+    stay(demands, there, at, heard=Heard(age_s=1.0, hz=hz))
+    assert demands.speed("merge", there) == pytest.approx(speed)
 
 
 def test_figures_from_long_before_it_was_seen_again_tell_nothing_of_the_machine() -> None:
