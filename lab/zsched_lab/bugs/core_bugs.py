@@ -469,8 +469,8 @@ LEASE_BUGS = (
     _bug(
         "a new generation waits for the leases of exclusive tasks only",
         LEASE,
-        "(value.leased or _is_first(value))",
-        "value.leased",
+        "value.leased) or _is_first(value)",
+        "value.leased)",
         _ROLLOUT,
     ),
     _bug(

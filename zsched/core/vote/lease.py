@@ -293,9 +293,9 @@ class BeatParts(Struct, frozen=True, kw_only=True):
     asked_to_leave: tuple[tuple[TaskId, NodeId, int], ...]
 
 
-def _is_first(value: Allocation) -> bool:
+def _is_first(value: Allocation | None) -> bool:
     """Whether nobody has agreed on an owner yet in this value's generation."""
-    return value.owner is None and value.revision > 0
+    return value is not None and value.owner is None and value.revision > 0
 
 
 @dataclass(slots=True)
@@ -340,7 +340,7 @@ class Leases:
         self._granters, self._grants = {}, bool(self.standing)
         for task in self.fleet.tasks:
             value = self.standing.get(task.name)
-            is_leased = task.exclusive or (value is not None and (value.leased or _is_first(value)))
+            is_leased = task.exclusive or (value is not None and value.leased) or _is_first(value)
             if is_leased and task.name in self.standing:
                 self._watch(task.name, None if value is None else value.owner, self.over_at)
 
@@ -430,7 +430,8 @@ class Leases:
         leased = {task.name for task in fleet.tasks if task.exclusive}
         leased |= {task for task, value in standing.items() if value is not None and value.leased}
         until = math.inf if self.is_in_doubt else now + hold_s(max(self.lease_s, self.granted_s, self.guard_lease_s))
-        for task in [task for task in self._granters if task not in leased or task not in standing]:
+        kept = leased | {task for task, value in standing.items() if _is_first(value)}  # it waits for the one before
+        for task in [task for task in self._granters if task not in kept or task not in standing]:
             del self._granters[task]
         for task, value in standing.items():
             if task in leased and task not in self._granters:

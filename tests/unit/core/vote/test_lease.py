@@ -74,6 +74,16 @@ def test_a_task_that_is_leased_for_everybody_is_watched_whatever_the_elector_s_f
     assert restarted.may_accept("guard", "r3", 0.1) is may
 
 
+def test_the_first_value_of_a_generation_waits_for_the_one_before_also_over_a_reload() -> None:
+    """By the file the task is not exclusive any more; it may have been in the generation before."""
+    first = Allocation(task="guard", revision=1 << 32, epoch=1 << 32, owner=None, tuning=tuning_of())
+    one = elector(OPEN, first)
+    assert not one.may_accept("guard", "r3", 0.1)
+    one.adopt(OPEN, {"guard": first}, 0.2)
+    assert not one.may_accept("guard", "r3", 0.3)
+    assert one.may_accept("guard", "r3", HOLD_S)
+
+
 def test_a_task_that_becomes_leased_is_granted_from_then_on_and_not_in_doubt() -> None:
     one = elector(OPEN)
     assert not one.on_beat(beat(), ACCEPTED, 10.0)
