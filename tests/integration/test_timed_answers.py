@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from support.feeding import fed
 from support.verbs import command
 from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 
@@ -32,19 +32,8 @@ def fleet_of(folder: Path, *, keeps_stamp: bool) -> Iterator[Testbed]:
         bed.init()
         bed.start()
         assert bed.wait_settled() == "edge1"
-        publisher, stop = bed.app("robot1").declare_publisher("robot1/in"), threading.Event()
-
-        def feed() -> None:
-            while not stop.wait(1.0 / RATE_HZ):
-                publisher.put("x")
-
-        thread = threading.Thread(target=feed)
-        thread.start()
-        try:
+        with fed(bed, RATE_HZ):
             yield bed
-        finally:
-            stop.set()
-            thread.join()
 
 
 def out(bed: Testbed) -> dict[str, Any]:
@@ -62,8 +51,14 @@ def knows_jobs(bed: Testbed) -> bool:
 def test_answers_with_their_input_s_timestamp_tell_how_long_a_job_takes(tmp_path: Path) -> None:
     with fleet_of(tmp_path, keeps_stamp=True) as bed:
         bed.wait(lambda: knows_jobs(bed), 60, "the deadline counts")
-        bed.wait(lambda: out(bed)["paired_hz"] is not None, 30, "it is shown")
-        assert (out(bed)["answer_s"] or WAIT_S) >= WAIT_S
+
+        def shown() -> dict[str, Any] | None:
+            count = out(bed)
+            return None if count["paired_hz"] is None else count
+
+        told = bed.wait(shown, 30, "it is shown")
+        assert told is not None
+        assert told["answer_s"] >= WAIT_S
         assert "which does not count yet" not in command(bed, "explain", TASK)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from support.feeding import fed
 from support.fleets import task_of, tuning_of
 from support.profiles import profile_of
 from support.waiting import between
@@ -52,24 +52,6 @@ def busy_loops(count: int) -> Iterator[None]:
             loop.wait()
 
 
-@contextlib.contextmanager
-def fed(bed: Testbed) -> Iterator[None]:
-    """The robot's application publishes at its rate."""
-    publisher, stop = bed.app("robot1").declare_publisher("robot1/in"), threading.Event()
-
-    def feed() -> None:
-        while not stop.wait(1.0 / RATE_HZ):
-            publisher.put("x")
-
-    thread = threading.Thread(target=feed)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join()
-
-
 def shown(bed: Testbed) -> dict[str, Any]:
     """The edge as the robot shows it."""
     found: dict[str, Any] = next(one for one in bed.status("robot1")["nodes"] if one["name"] == "edge1")
@@ -104,7 +86,7 @@ def needed(bed: Testbed, for_s: float) -> tuple[float, float, float]:
 def test_a_worker_s_jobs_take_longer_beside_a_load_and_its_need_stays(bed: Testbed) -> None:
     bed.start()
     assert bed.wait_settled() == "edge1"
-    with fed(bed):
+    with fed(bed, RATE_HZ):
         bed.wait(lambda: shown(bed)["workers"][0]["jobs"] is not None, 60, "the worker's word reaches the robot")
         time.sleep(3.0)
         calm_need, _, calm_s = needed(bed, 5.0)
