@@ -469,9 +469,16 @@ LEASE_BUGS = (
     _bug(
         "a new generation waits for the leases of exclusive tasks only",
         LEASE,
-        "value.leased) or _is_first(value)",
-        "value.leased)",
+        "(is_leased or _is_first(value)) and task.name",
+        "is_leased and task.name",
         _ROLLOUT,
+    ),
+    _bug(
+        "a clock in doubt holds up tasks that are not exclusive",
+        LEASE,
+        "            del self._granters[value.task]\n        elif",
+        "            granter.on_newer_value()\n        elif",
+        ("tests/unit/core/vote/test_lease.py",),
     ),
     _bug(
         "restart forgets a longer lease",

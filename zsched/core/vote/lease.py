@@ -71,6 +71,8 @@ class Granter:
     lease_s: float
     until: float
     standing: NodeId | None
+    is_for_first: bool = False
+    """The task has no lease: this guards the first value of a generation from a lease of the one before."""
     _last: Grant | None = None
     _granted_at: float = -math.inf
     _hold_s: float = 0.0
@@ -340,12 +342,15 @@ class Leases:
         self._granters, self._grants = {}, bool(self.standing)
         for task in self.fleet.tasks:
             value = self.standing.get(task.name)
-            is_leased = task.exclusive or (value is not None and value.leased) or _is_first(value)
-            if is_leased and task.name in self.standing:
-                self._watch(task.name, None if value is None else value.owner, self.over_at)
+            is_leased = task.exclusive or (value is not None and value.leased)
+            if (is_leased or _is_first(value)) and task.name in self.standing:
+                owner = None if value is None else value.owner
+                self._watch(task.name, owner, self.over_at, is_for_first=not is_leased)
 
-    def _watch(self, task: TaskId, standing: NodeId | None, until: float) -> None:
-        self._granters[task] = Granter(task=task, lease_s=self.lease_s, until=until, standing=standing)
+    def _watch(self, task: TaskId, standing: NodeId | None, until: float, *, is_for_first: bool = False) -> None:
+        self._granters[task] = Granter(
+            task=task, lease_s=self.lease_s, until=until, standing=standing, is_for_first=is_for_first
+        )
 
     def _counts_like_us(self, beat: Beat) -> bool:
         """Whether a beat's sender counts by our number of our generation; by a fleet file there is neither."""
@@ -436,6 +441,8 @@ class Leases:
         for task, value in standing.items():
             if task in leased and task not in self._granters:
                 self._watch(task, None if value is None else value.owner, until)
+            elif task in leased:
+                self._granters[task].is_for_first = False
         # Nothing is released: the worker of a task that goes may still be at work.
         names = {task.name for task in fleet.tasks}
         self._holders = {task: holder for task, holder in self._holders.items() if task in names}
@@ -451,8 +458,13 @@ class Leases:
 
     def on_newer_value(self, value: Allocation) -> None:
         """A newer revision was accepted or learnt."""
-        if value.task in self._granters:
-            self._granters[value.task].on_newer_value()
+        granter = self._granters.get(value.task)
+        if granter is not None and granter.is_for_first and value.owner is not None and not value.leased:
+            # A majority has waited: the generation before has no lease any more, and this task never had one.
+            del self._granters[value.task]
+        elif granter is not None:
+            granter.is_for_first = granter.is_for_first and not value.leased
+            granter.on_newer_value()
         elif value.leased and value.task in self.standing:
             # Not leased until now: nothing was granted.
             self._watch(value.task, None, math.inf if self.is_in_doubt else -math.inf)

@@ -84,6 +84,30 @@ def test_the_first_value_of_a_generation_waits_for_the_one_before_also_over_a_re
     assert one.may_accept("guard", "r3", HOLD_S)
 
 
+def test_once_a_generation_has_an_owner_no_clock_in_doubt_holds_up_a_task_that_is_not_exclusive() -> None:
+    first = Allocation(task="guard", revision=1 << 32, epoch=1 << 32, owner=None, tuning=tuning_of())
+    one = elector(OPEN, first)
+    owned = value(leased=False)
+    one.on_newer_value(owned)
+    one.doubt({"guard": owned})
+    assert one.may_accept("guard", "r3", 2 * HOLD_S)
+
+
+@pytest.mark.parametrize("is_agreed", [True, False])
+def test_a_generation_s_task_that_becomes_exclusive_before_its_first_owner_is_watched(*, is_agreed: bool) -> None:
+    """Its file says so, or whoever has proposed the owner."""
+    first = Allocation(task="guard", revision=1 << 32, epoch=1 << 32, owner=None, tuning=tuning_of())
+    one = elector(OPEN, first)
+    if is_agreed:
+        one.on_newer_value(value())
+    else:
+        one.adopt(FLEET, {"guard": first}, 0.2)
+    owned = value(leased=is_agreed)
+    one.on_newer_value(owned)
+    one.doubt({"guard": owned})
+    assert not one.may_accept("guard", "r3", 2 * HOLD_S)
+
+
 def test_a_task_that_becomes_leased_is_granted_from_then_on_and_not_in_doubt() -> None:
     one = elector(OPEN)
     assert not one.on_beat(beat(), ACCEPTED, 10.0)
