@@ -247,15 +247,25 @@ class Stages:
 
         During a handover, and while this robot works alone, no answer tells of the owner.
         """
-        values, found = self.values(), {}
-        for spec in self.fleet.tasks:
-            if tells_jobs(spec.worker) or values[spec.name].tuning.deadline_ms is None:
-                continue
-            executor = self.executors[spec.name]
+        found = {}
+        for task in self._timed():
+            executor = self.executors[task]
             is_steady = executor.has_streams and executor.phase is Phase.SETTLED and not executor.is_local
             if executor.owner is not None and is_steady:
-                found[spec.name] = executor.owner
+                found[task] = executor.owner
         return found
+
+    def timed_here(self) -> tuple[TaskId, ...]:
+        """Those of them that this node owns, in any phase."""
+        return tuple(task for task in self._timed() if self.executors[task].owner == self.me)
+
+    def _timed(self) -> tuple[TaskId, ...]:
+        values = self.values()
+        return tuple(
+            spec.name
+            for spec in self.fleet.tasks
+            if not tells_jobs(spec.worker) and values[spec.name].tuning.deadline_ms is not None
+        )
 
     def owned(self) -> tuple[TaskId, ...]:
         """The tasks that this node owns, as far as it has learnt."""

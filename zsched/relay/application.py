@@ -265,7 +265,7 @@ class Application:
                     self._tell(self._shares.name(word.keys))
                     continue
                 if isinstance(word, StreamsCounted):
-                    self._shares.note_counts(word.counts)
+                    self._shares.note_counts(word.counts, monotonic_s())
                     continue
                 heard = self._shares.heard(word)
             for one in heard:

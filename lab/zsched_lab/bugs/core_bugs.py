@@ -960,8 +960,15 @@ VOTE_BUGS = (
     _bug(
         "the wait for a full machine's CPU follows a foreign worker to the next one",
         "zsched.core.gateway.job_need",
-        "        if is_starved:",
+        "        if not is_calm:",
         "        if speed < 0.0:",
+        ("tests/unit/core/gateway/test_job_need.py",),
+    ),
+    _bug(
+        "a robot that repeats itself counts each time",
+        "zsched.core.gateway.job_need",
+        "(task, owner)][:1]",
+        "(task, owner)]",
         ("tests/unit/core/gateway/test_job_need.py",),
     ),
     _bug(

@@ -21,6 +21,7 @@ from support.profiles import load_of
 from support.proposals import proposal_of
 from zsched.core.events import WorkerJobs
 from zsched.core.gateway.gateway import Gateway
+from zsched.core.profile.answers import Answers
 from zsched.core.profile.profile import Profiler
 from zsched.core.scheduler.damping import Damping
 from zsched.core.scheduler.decision import decide, rules_of
@@ -37,8 +38,8 @@ from zsched.core.values.fleet import (
     WorkerSpec,
 )
 from zsched.core.values.model import PeerState, ScoreForm, Tuning, Weights
-from zsched.core.values.plan import ReadyWhen
-from zsched.core.values.profile import AnswerTime, DeviceSample, LinkSample, LinkSource, WorkerState
+from zsched.core.values.plan import ReadyWhen, StreamCount
+from zsched.core.values.profile import DeviceSample, LinkSample, LinkSource, WorkerState
 from zsched.core.vote.tally import VoteOutcome, tally
 
 HOUR_S = 3600.0
@@ -75,6 +76,8 @@ class Machine:
     """Its worker tells nothing: robots see how long its answers take."""
     waits_s: float = 0.0
     """Of such an answer, for other things than a CPU."""
+    in_bursts: bool = False
+    """It works on one whole job after the other, on one core, and rests in between."""
     rub: float = 1.0
     """A job takes so many times the CPU time when the machine is full."""
     most_cores: float = math.inf
@@ -99,6 +102,9 @@ class Machine:
             wanted_cores=math.ceil(needs) if self.shows_worker and takes < needs else None,
         )
         self._work(now, needs, takes)
+        if self.in_bursts:
+            load = replace(load, cpu_cores=self._burst(takes))
+            takes = load.cpu_cores or 0.0
         device = DeviceSample(
             cpu_cores=self.cores,
             cpu_used_cores=min(rest + takes, self.cores),
@@ -115,6 +121,17 @@ class Machine:
         self.answers: tuple[float, float] | None = None
         """(seconds of an answer, answers per second) of a foreign worker."""
         self._done = self._undone = self._now = 0.0
+        self._owed_s, self._is_at_work = 0.0, False
+
+    def _burst(self, mean_cores: float) -> float:
+        """Cores in use by a worker that does whole jobs, and uses so much on the mean."""
+        assert self.job_s is not None
+        period_s = Timing().sample_s
+        self._owed_s += period_s * mean_cores
+        self._is_at_work = self._owed_s >= (period_s if self._is_at_work else self.job_s / self._speed)
+        spent_s = min(period_s, self._owed_s) if self._is_at_work else 0.0
+        self._owed_s -= spent_s
+        return spent_s / period_s
 
     @property
     def _speed(self) -> float:
@@ -188,9 +205,11 @@ class Loop:
         self.gateways = {robot: Gateway(fleet) for robot in self.robots}
         self.judges = {robot: Judge(spec=self.spec) for robot in self.robots}
         self.profilers = {name: Profiler(name, 1, self.timing) for name in (*names, *self.robots)}
+        self.answers = {robot: Answers() for robot in self.robots}
         self.states = dict.fromkeys(self.profilers, PeerState.ALIVE)
         self.rng = Random(self.seed)
         self.settled_at = 0.0
+        self.counts = 0
 
     def run(self, until_s: float) -> list[tuple[float, str]]:
         """(when, where to) of every move."""
@@ -207,6 +226,7 @@ class Loop:
         for machine in self.machines:
             is_owner = machine.name == self.allocation.owner
             device, link = machine.sample(now, self.rng, is_owner=is_owner)
+            self.profilers[machine.name].watch_use(("merge",) if is_owner and machine.is_foreign else (), now)
             if machine.told is not None:
                 self.profilers[machine.name].note_jobs(machine.told, now)
             self.profilers[machine.name].absorb(device, (link,) if self.weights.network > 0.0 else (), now)
@@ -215,20 +235,25 @@ class Loop:
             link = LinkSample(source=LinkSource.NL80211, rssi_dbm=-45.0)
             for robot in self.robots:
                 self.profilers[robot].absorb(device, (link,), now)
+        if self.machines[0].is_foreign and now >= self.counts:
+            self.counts += 1
+            self._count_answers(now)
         for name, profiler in self.profilers.items():
-            answers = self._answers() if name in self.robots else ()
+            answers = self.answers[name].told(now) if name in self.answers else ()
             profile = profiler.publishable(READY, is_draining=False, now=now, answers=answers)
             if profile is not None:
                 for gateway in self.gateways.values():
                     assert gateway.absorb(profile, now) is None
 
-    def _answers(self) -> tuple[AnswerTime, ...]:
-        """What a robot sees of the owner's answers."""
+    def _count_answers(self, now: float) -> None:
+        """What the robots' relays count of the owner's answers, once a second."""
         owner = next(machine for machine in self.machines if machine.name == self.allocation.owner)
-        if not owner.is_foreign or owner.answers is None:
-            return ()
-        age_s, hz = owner.answers
-        return (AnswerTime(task="merge", owner=owner.name, age_s=age_s, hz=hz / len(self.robots)),)
+        age_s, hz = (None, None) if owner.answers is None else owner.answers
+        count = StreamCount(
+            stream="merge/out/0", answer_s=age_s, paired_hz=None if hz is None else hz / len(self.robots)
+        )
+        for answers in self.answers.values():
+            answers.absorb({"merge": owner.name}, (count,), {}, now)
 
     def _round(self, now: float) -> None:
         judgements = self._judge(now, is_called=False)
@@ -675,6 +700,21 @@ def test_a_foreign_worker_that_waits_for_other_things_is_as_late_on_a_faster_mac
     machines = tuple(replace(one, job_s=0.005, waits_s=0.15) for one in FOREIGN)
     by_latency = replace(BY_SERVICE, deadline_ms=100.0)
     assert Loop(machines, weights=CPU_ONLY, tuning=by_latency, learns=True).run(60.0) == []
+
+
+@pytest.mark.parametrize("hz", [1.0, 2.0, 3.0])
+def test_a_foreign_worker_of_few_large_jobs_stays_where_all_machines_are_alike(hz: float) -> None:
+    """Its use swings between nothing and a core: no moment of it tells what a job takes, or how fast a machine is."""
+    machines = tuple(
+        Machine(name=f"edge{n}", base=0.1, task_cores=0.15 * hz, job_s=0.15, is_foreign=True, in_bursts=True)
+        for n in (1, 2, 3)
+    )
+    by_latency = replace(BY_SERVICE, deadline_ms=160.0)
+    loop = Loop(machines, weights=CPU_ONLY, tuning=by_latency, learns=True)
+    assert loop.run(300.0) == []
+    job = loop.gateways["robot1"].demands.job("merge")
+    assert job is not None
+    assert job.work_s == pytest.approx(0.15, rel=0.1)
 
 
 def test_a_foreign_worker_s_late_answers_on_a_full_machine_are_fled_and_it_does_not_come_back() -> None:

@@ -1227,9 +1227,9 @@ def test_a_gap_at_a_move_is_in_the_story_of_its_task_once() -> None:
 TIMED = (StreamCount(stream="merge/out/0", answer_s=0.2, paired_hz=5.0),)
 
 
-def timed(*, ready_when: ReadyWhen = ReadyWhen.MATCHING, deadline_ms: float | None = 100.0) -> Node:
-    """robot1, whose streams edge1's worker has served for a while."""
-    node = started()
+def timed(me: str = "robot1", *, ready_when: ReadyWhen = ReadyWhen.MATCHING, deadline_ms: float | None = 100.0) -> Node:
+    """A node; edge1's worker has served its streams for a while, if it has any."""
+    node = started(me)
     worker = WorkerSpec(command=("merge",), ready_when=ready_when)
     file = replace(FLEET, tasks=(replace(FLEET.tasks[0], worker=worker),))
     node.handle(ev.FleetChanged(fleet=file), 100.5)
@@ -1237,13 +1237,14 @@ def timed(*, ready_when: ReadyWhen = ReadyWhen.MATCHING, deadline_ms: float | No
     node.handle(learnt_from("robot2", value), 101.0)
     for event in (ev.SlotReady(task="merge", epoch=1), ev.SlotFlipped(task="merge", epoch=1)):
         node.handle(event, 102.0)
-    assert node.executors["merge"].phase is Phase.SETTLED
+    assert me != "robot1" or node.executors["merge"].phase is Phase.SETTLED
     return node
 
 
 def told_of_answers(node: Node, now: float) -> tuple[AnswerTime, ...]:
-    node.handle(ev.StreamsCounted(counts=TIMED), now)
-    node.handle(ev.ProfileSampled(device=SAMPLE), now)
+    for at in (now, now + 1.0):  # the first count may still tell of an owner before
+        node.handle(ev.StreamsCounted(counts=TIMED), at)
+    node.handle(ev.ProfileSampled(device=SAMPLE), now + 1.0)
     (profile,) = [one.profile for one in of(node.handle(ev.DeadlineReached(), now + 5.0), do.PublishProfile)]
     return profile.answers
 
@@ -1252,6 +1253,29 @@ def test_a_robot_times_the_answers_of_a_worker_that_tells_nothing_where_a_deadli
     assert told_of_answers(timed(), 103.0) == (AnswerTime(task="merge", owner="edge1", age_s=0.2, hz=5.0),)
     assert told_of_answers(timed(deadline_ms=None), 103.0) == ()
     assert told_of_answers(timed(ready_when=ReadyWhen.TOKEN), 103.0) == ()
+
+
+@pytest.mark.parametrize(
+    ("me", "ready_when", "deadline_ms", "is_told"),
+    [
+        ("edge1", ReadyWhen.MATCHING, 100.0, True),
+        ("edge1", ReadyWhen.MATCHING, None, False),
+        ("edge1", ReadyWhen.TOKEN, 100.0, False),
+        ("edge2", ReadyWhen.MATCHING, 100.0, False),
+    ],
+)
+def test_its_owner_tells_what_it_uses_on_the_mean(
+    me: str, ready_when: ReadyWhen, deadline_ms: float | None, *, is_told: bool
+) -> None:
+    node = timed(me, ready_when=ready_when, deadline_ms=deadline_ms)
+    node.handle(ev.WorkerChanged(task="merge", state=WorkerState.READY), 102.0)
+    sample = replace(SAMPLE, workers=(load_of(cpu_cores=0.5),))
+    for step in range(40):
+        node.handle(ev.ProfileSampled(device=sample), 103.0 + 0.2 * step)
+    (profile,) = [one.profile for one in of(node.handle(ev.DeadlineReached(), 113.0), do.PublishProfile)]
+    load = profile.worker("merge")
+    assert load is not None
+    assert load.mean_cores == (0.5 if is_told else None)
 
 
 def test_during_a_handover_no_answer_tells_of_the_owner() -> None:

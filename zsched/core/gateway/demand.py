@@ -11,8 +11,10 @@ has no limit cycle (docs/decisions/0118).
 
 from __future__ import annotations
 
+import math
+
 from zsched.core.gateway.company import Company, is_full
-from zsched.core.gateway.job_need import Heard, JobNeed, other_s, told_job
+from zsched.core.gateway.job_need import CALM_S, Heard, JobNeed, other_s, told_job
 from zsched.core.gateway.task_speed import MOST_RATIO, TaskSpeeds, speed_of
 from zsched.core.values.fleet import Demand, TaskSpec
 from zsched.core.values.model import NodeId, TaskId
@@ -27,6 +29,8 @@ COMPARED_S = 12.0
 """What differs so soon after a move is the machine's doing; what changes later is the task's."""
 RECENT_S = 60.0
 """Older figures say nothing of the machine to which a task has come: the task may have changed since."""
+SAME_JOB_RATIO = 0.8
+"""CPU times per answer count as the same up to this quotient: both are means of some answers."""
 SHORT_RATIO = 0.9
 """A task that gets a smaller part of its forecast has a shortfall on that machine."""
 
@@ -72,6 +76,8 @@ class _Known(Struct, frozen=True):
     owner: NodeId | None = None
     since: float = 0.0
     """When it was first looked at there, with its worker ready."""
+    full_at: float = -math.inf
+    """When the owner's machine last had no CPU to spare."""
 
 
 class Demands:
@@ -116,10 +122,14 @@ class Demands:
         if load is None or load.state is not WorkerState.READY or profile.cpu_used_cores is None:
             return False
         found = replace(known if known.owner == profile.node else _came(known, profile.node, now), seen_s=now)
+        if is_full(profile):
+            found = replace(found, full_at=now)
         is_new = now - found.since < SETTLE_S
         before = found.before if now - found.since < COMPARED_S else None
         if before is not None:
-            self._compare_jobs(task, profile, _job_cpu_s(load, None if is_new else heard), before)
+            self._compare_jobs(
+                task, profile, _job_cpu_s(load, heard, now - found.since), before, is_told=load.jobs is not None
+            )
         if load.memory_mb is not None:
             found = replace(found, memory_mb=max(load.memory_mb, (known.memory_mb or 0.0) if is_new else 0.0))
         if load.cpu_cores is not None:
@@ -142,7 +152,7 @@ class Demands:
                 found = self._compared(task, profile, found, before, is_new=is_new, has_jobs=has_jobs)
         speed = self._speeds.of(task, profile, is_there=True)
         if heard is not None and load.jobs is None and not is_new:
-            found = _with_heard(found, profile, load, heard, speed)
+            found = _with_heard(found, load, heard, speed, now)
         else:
             found = _with_job(found, load, speed, is_new=is_new)
         self._known[task] = found
@@ -169,15 +179,21 @@ class Demands:
         is_ready = load is not None and load.state is WorkerState.READY and load.renewal is Renewal.NONE
         return is_ready and known.is_changed and known.is_job_old
 
-    def _compare_jobs(self, task: TaskId, profile: Profile, cpu_s: float, before: _Before) -> None:
+    def _compare_jobs(
+        self, task: TaskId, profile: Profile, cpu_s: float | None, before: _Before, *, is_told: bool
+    ) -> None:
         """What a job takes here and took where the task came from tells its speed, also of one that is short.
 
         It is never faster than the benchmark says. A job that takes less here may do so because others slowed it down
         where it came from, or because its worker begins with nothing. Then all other machines would seem too slow for
         as long as the task stays, and nothing but a move would tell.
         """
-        if cpu_s > 0.0 and before.job_work_s is not None:
-            self._speeds.note(task, profile, min(before.job_work_s / cpu_s, speed_of(profile)))
+        if not cpu_s or not before.job_work_s:
+            return
+        speed, benchmark = before.job_work_s / cpu_s, speed_of(profile)
+        if not is_told and speed >= SAME_JOB_RATIO * benchmark:
+            speed = benchmark
+        self._speeds.note(task, profile, min(speed, benchmark))
 
     def _compared(
         self, task: TaskId, profile: Profile, found: _Known, before: _Before, *, is_new: bool, has_jobs: bool
@@ -261,7 +277,7 @@ def _came(known: _Known, node: NodeId, now: float) -> _Known:
     before = None
     if known.seen_at not in (None, node) and now - known.seen_s <= RECENT_S:
         before = _Before(known.work if known.is_sure else None, known.job_work_s)
-    return replace(known, owner=node, since=now, before=before, seen_at=node)
+    return replace(known, owner=node, since=now, before=before, seen_at=node, full_at=-math.inf)
 
 
 def is_short(load: WorkerLoad) -> bool:
@@ -282,11 +298,16 @@ def _age_s(load: WorkerLoad, heard: Heard | None) -> float | None:
     return jobs.time_s if jobs.age_s is None else jobs.age_s
 
 
-def _job_cpu_s(load: WorkerLoad, heard: Heard | None) -> float:
-    """CPU time of a job: by the worker's report, else by its answers; 0: nobody knows."""
+def _job_cpu_s(load: WorkerLoad, heard: Heard | None, since_s: float) -> float | None:
+    """CPU time of a job: by the worker's report, else by its answers since it has settled; ``None``: nobody knows.
+
+    ``since_s``: for how long the task has been there.
+    """
     if load.jobs is not None:
         return load.jobs.cpu_s
-    return 0.0 if heard is None or load.cpu_cores is None else heard.cpu_s(load.cpu_cores)
+    if heard is None or load.mean_cores is None or not heard.tells_cpu(since_s - SETTLE_S):
+        return None
+    return heard.cpu_s(load.mean_cores)
 
 
 def _is_told(load: WorkerLoad) -> bool:
@@ -314,13 +335,13 @@ def _told(load: WorkerLoad, speed: float, fastest: float) -> float | None:
     return max(use + undone_hz * jobs.cpu_s, 0.0) * speed
 
 
-def _with_heard(known: _Known, profile: Profile, load: WorkerLoad, heard: Heard, speed: float) -> _Known:
-    """With the job of the owner's worker as robots see it; where its use is not measured it stays what it was."""
-    use = load.cpu_cores
-    if use is None:
+def _with_heard(known: _Known, load: WorkerLoad, heard: Heard, speed: float, now: float) -> _Known:
+    """With the job of the owner's worker as robots see it; where too little is known yet it stays what it was."""
+    cpu_s = _job_cpu_s(load, heard, now - known.since)
+    if cpu_s is None or load.mean_cores is None:
         return known
-    job = heard.job(use, speed, known.job, is_starved=is_full(profile))
-    return replace(known, job=job, job_work_s=job.work_s, is_job_old=load.renewal is not Renewal.NONE)
+    job = heard.job(load.mean_cores, speed, known.job, is_calm=now - known.full_at > CALM_S)
+    return replace(known, job=job, job_work_s=cpu_s * speed, is_job_old=load.renewal is not Renewal.NONE)
 
 
 def _with_job(known: _Known, load: WorkerLoad, speed: float, *, is_new: bool) -> _Known:

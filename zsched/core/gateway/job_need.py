@@ -4,9 +4,9 @@ Knows: work and waits of a job, what of a time was which. Does not know: what a 
 (`zsched.core.gateway.demand`), how answers are measured (`zsched.core.profile.answers`).
 
 A foreign worker tells nothing. Its processes are measured, so CPU time per answer is known. The rest of an answer's
-time is a wait for other things, the same on every machine, if the owner had CPU to spare. On a full machine the rest is
-also a wait for a CPU. There the wait for other things counts as it was seen before, and what an answer takes longer
-than foreseen is remembered of that machine.
+time is a wait for other things, the same on every machine, if the owner has had CPU to spare for some seconds. On a
+full machine, and soon after, the rest is also a wait for a CPU. There the wait for other things counts as it was seen
+before, and what an answer takes longer than foreseen is remembered of that machine.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import statistics
 from collections.abc import Iterable
 
 from zsched.core.values.model import NodeId, TaskId
-from zsched.core.values.profile import AnswerTime, Jobs, Profile
+from zsched.core.values.profile import MEAN_S, AnswerTime, Jobs, Profile
 from zsched.core.values.struct import Struct
 
 CALM_WAIT_RATIO = 0.1
@@ -24,12 +24,14 @@ QUEUE_RATIO = 2.0
 """Until that was seen, a job's age counts as at most this many times its own time."""
 LEAST_FREE_CORES = 0.05
 """A job on a full machine gets at least this much, so that its time is finite."""
-LEAST_HZ = 0.01
-"""Fewer answers a second do not tell the CPU time of one."""
+CALM_S = 6.0
+"""For so long the machine must have had CPU to spare: answers' time is a mean that follows later than the machine's."""
+LEAST_ANSWERS = 5.0
+"""Fewer answers than that do not tell the CPU time of one."""
 
 
 class JobNeed(Struct, frozen=True):
-    """One job's need, as the worker reported it where it ran."""
+    """One job's need, by its worker's report or by its answers, where it ran."""
 
     work_s: float
     """CPU time at speed 1."""
@@ -73,28 +75,32 @@ class Heard(Struct, frozen=True):
     age_s: float
     """From an input to its answer at the owner: the median of the robots', so that one bad link says nothing."""
     hz: float
-    """Answers per second to all robots; each counts those of its own inputs."""
+    """Answers per second to all robots, on the mean (`MEAN_S`), > 0; each counts those of its own inputs."""
 
-    def cpu_s(self, use_cores: float) -> float:
-        """CPU seconds per answer; of several threads at once, at most the answer's time."""
-        return min(use_cores / self.hz, self.age_s)
+    def tells_cpu(self, for_s: float) -> bool:
+        """Whether there were enough answers in ``for_s`` for a mean."""
+        return self.hz * min(for_s, MEAN_S) >= LEAST_ANSWERS
 
-    def job(self, use_cores: float, speed: float, known: JobNeed | None, *, is_starved: bool) -> JobNeed:
-        """A job by its answers, on a machine of ``speed`` where the worker uses ``use_cores``.
+    def cpu_s(self, mean_cores: float) -> float:
+        """CPU seconds per answer, of all threads."""
+        return mean_cores / self.hz
 
-        ``known``: what was known before. ``is_starved``: the machine has nothing to spare.
+    def job(self, mean_cores: float, speed: float, known: JobNeed | None, *, is_calm: bool) -> JobNeed:
+        """A job by its answers, on a machine of ``speed`` where the worker uses ``mean_cores`` on the mean.
+
+        ``known``: what was known before. ``is_calm``: the machine has had CPU to spare for `CALM_S`.
         """
-        cpu_s = self.cpu_s(use_cores)
+        cpu_s = min(self.cpu_s(mean_cores), self.age_s)  # several threads at once work for no longer
         waits_s = self.age_s - cpu_s
-        if is_starved:
+        if not is_calm:
             waits_s = min(waits_s, 0.0 if known is None else known.other_s)
         return JobNeed(work_s=cpu_s * speed, other_s=waits_s, queue_ratio=1.0, is_serial=False)
 
 
 def heard_of(task: TaskId, owner: NodeId, profiles: Iterable[Profile]) -> Heard | None:
     """What these profiles tell of the answers of the task's owner; ``None``: nothing, or too little."""
-    told: list[AnswerTime] = [
-        one for profile in profiles for one in profile.answers if (one.task, one.owner) == (task, owner)
-    ]
+    told: list[AnswerTime] = []
+    for profile in profiles:
+        told += [one for one in profile.answers if (one.task, one.owner) == (task, owner)][:1]  # each robot counts once
     hz = sum(one.hz for one in told)
-    return Heard(statistics.median([one.age_s for one in told]), hz) if hz >= LEAST_HZ else None
+    return Heard(statistics.median([one.age_s for one in told]), hz) if hz > 0.0 else None

@@ -67,10 +67,14 @@ def closed(count: StreamCount, untold: int = 0) -> StreamCount:
 
 
 def together(first: StreamCount, other: StreamCount) -> StreamCount:
-    """The counters of both; times are those of the one that has them, the first before the other."""
+    """The counters of both; times are those of the one that has them, the first before the other.
+
+    Times of answers are those of the one whose answers had their inputs' timestamps.
+    """
     drops = dict(first.drops)
     for reason, count in other.drops:
         drops[reason] = drops.get(reason, 0) + count
+    timed = min(first, other, key=lambda one: (one.paired_hz is None, one.answer_s is None))  # the first, of two alike
     return replace(
         first,
         **{name: getattr(first, name) + getattr(other, name) for name in _SUMS},
@@ -78,8 +82,8 @@ def together(first: StreamCount, other: StreamCount) -> StreamCount:
         acknowledged=_both(first.acknowledged, other.acknowledged),
         in_flight=_both(first.in_flight, other.in_flight),
         last_seen_s=min((s for s in (first.last_seen_s, other.last_seen_s) if s is not None), default=None),
-        answer_s=other.answer_s if first.answer_s is None else first.answer_s,
-        paired_hz=other.paired_hz if first.answer_s is None else first.paired_hz,
+        answer_s=timed.answer_s,
+        paired_hz=timed.paired_hz,
         gap_s=other.gap_s if first.gap_s is None else first.gap_s,
         move_gap_s=other.move_gap_s if first.move_gap_s is None else first.move_gap_s,
         move_epoch=max(first.move_epoch, other.move_epoch),

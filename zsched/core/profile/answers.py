@@ -1,13 +1,16 @@
 """PROFILE: how long a foreign worker's answers take, as this robot's relay measures them.
 
 Knows: the counters of the relay's outputs, the owner that they come from. Does not know: streams, what a job needs of a
-machine (`zsched.core.gateway.heard`).
+machine (`zsched.core.gateway.job_need`).
 
 A worker without the library tells nothing of its jobs, so nobody but the robots can say how long they take. An answer
 counts that carries its input's timestamp. Any other one is at least as old as the newest input before it, which says
 the less the faster inputs come: it is shown and decides nothing.
 
 The robot's own way to the owner and back is taken off: it is another one for every candidate, and counts apart.
+
+Their rate is a mean over `MEAN_S`, as the owner's CPU in use beside it is (`WorkerLoad.mean_cores`): the quotient of
+both is the CPU time of an answer, also where answers are few.
 """
 
 from __future__ import annotations
@@ -15,13 +18,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from zsched.core.profile.means import STALE_S, Ewma
+from zsched.core.profile.means import STALE_S, Ewma, RunningMean
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.plan import StreamCount
-from zsched.core.values.profile import MAX_JOB_S, MAX_JOBS_HZ, AnswerTime
+from zsched.core.values.profile import MAX_JOB_S, MAX_JOBS_HZ, MEAN_S, AnswerTime
 
 SMOOTHING_S = 2.0
-"""Time constant: the relay counts once a second."""
+"""Time constant of their age: the relay counts once a second."""
+STALE_ANSWERS = 3.0
+"""After so many times as long as answers come apart, none is to be expected any more."""
 
 
 @dataclass(slots=True)
@@ -30,8 +35,9 @@ class _Seen:
 
     owner: NodeId
     age_s: Ewma
-    hz: Ewma
-    at: float
+    hz: RunningMean
+    until: float
+    """When the age counts no more."""
 
 
 class Answers:
@@ -58,26 +64,29 @@ class Answers:
         before, self._seen = self._seen, {}
         for task, owner in owners.items():
             seen = before.get(task)
-            if seen is None or seen.owner != owner:
-                seen = _Seen(owner, Ewma(SMOOTHING_S), Ewma(SMOOTHING_S), now)
+            if seen is None or seen.owner != owner:  # what this count tells may be of the owner before
+                self._seen[task] = _Seen(owner, Ewma(SMOOTHING_S), RunningMean(MEAN_S, now), now)
+                continue
+            self._seen[task] = seen
             prefix = f"{task}/out/"
             paired = [
                 (count.answer_s, count.paired_hz)
                 for count in counts
-                if count.stream.startswith(prefix) and count.answer_s is not None and count.paired_hz
+                if count.stream.startswith(prefix) and count.answer_s is not None and (count.paired_hz or 0.0) > 0.0
             ]
+            hz = min(max((hz or 0.0 for _, hz in paired), default=0.0), MAX_JOBS_HZ)
+            seen.hz.update(hz, now)
+            if now > seen.until:
+                seen.age_s.value = None  # what was before a break is another time
             if paired:  # a job ends with the last of its answers
                 away_s = round_trips.get(owner, 0.0)
                 seen.age_s.update(min(max(max(age_s for age_s, _ in paired) - away_s, 0.0), MAX_JOB_S), now)
-                seen.hz.update(min(max(hz for _, hz in paired), MAX_JOBS_HZ), now)
-                seen.at = now
-            if now - seen.at <= STALE_S:
-                self._seen[task] = seen
+                seen.until = now + max(STALE_S, STALE_ANSWERS / max(seen.hz.value or 0.0, STALE_ANSWERS / MEAN_S))
 
     def told(self, now: float) -> tuple[AnswerTime, ...]:
         """What this robot's profile tells; nothing of a task whose answers have ceased."""
         return tuple(
             AnswerTime(task=task, owner=seen.owner, age_s=round(seen.age_s.value, 4), hz=round(seen.hz.value, 3))
             for task, seen in sorted(self._seen.items())
-            if now - seen.at <= STALE_S and seen.age_s.value is not None and seen.hz.value is not None
+            if now <= seen.until and seen.age_s.value is not None and seen.hz.value is not None
         )

@@ -23,6 +23,8 @@ from zsched.core.values.plan import Direction, Route, RoutePlan, Slot, StreamCou
 from zsched.core.values.struct import Struct, field, replace
 
 MAX_PARTS: Final = 8
+TIMES_S: Final = 3.0
+"""Times that an application has told count for so long: one that stands still tells no others."""
 
 Told = RoutePlan | WorkerWatch
 Word = SlotDrained | SlotLost
@@ -54,7 +56,9 @@ class Shares(Struct, eq=False):
     past: dict[str, StreamCount] = field(default_factory=dict)
     """What applications that have gone have counted, by stream."""
     counted: dict[str, StreamCount] = field(default_factory=dict)
-    """What the one that is there has counted."""
+    """What the one that is there has counted..."""
+    counted_at: float = 0.0
+    """...and when it last told that (monotonic seconds)."""
     newest: dict[str, float] = field(default_factory=dict)
     """When applications that have gone last had a sample of a stream (monotonic seconds)."""
     relays: dict[str, StreamCount] = field(default_factory=dict)
@@ -193,8 +197,9 @@ class Shares(Struct, eq=False):
 
     # --- counters ----------------------------------------------------------------------------------------------------
 
-    def note_counts(self, counts: tuple[StreamCount, ...]) -> None:
-        """What the application has counted; of streams that are not its own nothing is taken."""
+    def note_counts(self, counts: tuple[StreamCount, ...], now: float) -> None:
+        """What the application has counted by ``now``; of streams that are not its own nothing is taken."""
+        self.counted_at = now
         own = {route.stream for route in self._own(self._routes())} | set(self.counted)
         for count in counts:
             if count.stream in own:
@@ -211,7 +216,10 @@ class Shares(Struct, eq=False):
 
     def added(self, counts: tuple[StreamCount, ...], now: float) -> tuple[StreamCount, ...]:
         """The relay's counters with those of applications; ``now``: monotonic seconds."""
-        total = added(self.settled(counts), self.counted)
+        own = self.counted
+        if now - self.counted_at > TIMES_S:
+            own = {stream: replace(count, answer_s=None, paired_hz=None) for stream, count in own.items()}
+        total = added(self.settled(counts), own)
         return tuple(self._seen(count, now) for count in total)
 
     def _seen(self, count: StreamCount, now: float) -> StreamCount:

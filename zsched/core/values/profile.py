@@ -25,6 +25,9 @@ MIN_SPEED, MAX_SPEED = 0.001, 1000.0
 MAX_RUNNABLE = 1e6
 MAX_TREND_DB_S = 100.0
 MAX_JOBS_HZ, MAX_JOB_S = 1e6, 1e6
+MEAN_S = 60.0
+"""Time constant of the CPU in use and the answers of a worker that tells nothing: their quotient is exact to some
+per cent when there were ten answers."""
 MAX_HELD_S = 3600.0
 """Bounds that no machine or link exceeds: a larger figure is a fault of its sender."""
 
@@ -134,6 +137,8 @@ class WorkerLoad(Struct, frozen=True, kw_only=True):
     unended_s: float | None = None
     """For how long it has had work without a break, and has ended no job; ``None``: not for long, or it does not
     report its jobs."""
+    mean_cores: float | None = None
+    """``cpu_cores`` on the mean of `MEAN_S`, or since soon after the task came; ``None``: nobody times its answers."""
 
     def __post_init__(self) -> None:
         check_name("worker.task", self.task)
@@ -143,6 +148,7 @@ class WorkerLoad(Struct, frozen=True, kw_only=True):
         check_range("worker.cpu_cores", self.cpu_cores, 0.0, MAX_CPU_CORES)
         check_range("worker.memory_mb", self.memory_mb, 0.0, MAX_MEMORY_MB)
         check_range("worker.wanted_cores", self.wanted_cores, 0.0, MAX_CPU_CORES)
+        check_range("worker.mean_cores", self.mean_cores, 0.0, MAX_CPU_CORES)
 
 
 class TaskProgress(Struct, frozen=True, kw_only=True):

@@ -3,7 +3,8 @@
 Knows: timestamps, times. Does not know: workers, what follows.
 
 An answer that has its input's timestamp (the library's do, and a foreign worker's that copies it) is measured exactly,
-the network included. Any other one is at least as old as the newest input before it.
+the network included. Any other one is at least as old as the newest input before it. What a worker says again under a
+timestamp that a stream has had is no answer: a program that publishes at a rate of its own would seem later and later.
 """
 
 from __future__ import annotations
@@ -25,24 +26,32 @@ class AnswerTimes:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._sent: OrderedDict[Timestamp, float] = OrderedDict()
+        self._sent: OrderedDict[Timestamp, tuple[float, set[str]]] = OrderedDict()
+        """{timestamp of an input: (when it left, the streams that had its answer)}."""
         self._newest_at: float | None = None
 
     def sent(self, stamp: Timestamp | None) -> None:
-        """An input leaves for the owner."""
+        """An input leaves for the owner, maybe once more: for another one, or for a worker that has started again."""
         now = monotonic_s()
         with self._lock:
             self._newest_at = now
             if stamp is not None:
-                self._sent[stamp] = now
+                self._sent[stamp] = now, set()
                 if len(self._sent) > MAX_SENT:
                     self._sent.popitem(last=False)
 
-    def answered(self, stamp: Timestamp | None) -> tuple[float, bool] | None:
-        """An output has come: (seconds since its input, whether it had its timestamp); ``None`` without any input."""
+    def answered(self, stamp: Timestamp | None, stream: str) -> tuple[float, bool] | None:
+        """An output of ``stream`` has come: (seconds since its input, whether it had its timestamp).
+
+        ``None``: without any input, or said again.
+        """
         now = monotonic_s()
         with self._lock:
-            sent_at, newest_at = None if stamp is None else self._sent.get(stamp), self._newest_at
-        if sent_at is not None:
-            return now - sent_at, True
+            sent, newest_at = None if stamp is None else self._sent.get(stamp), self._newest_at
+            if sent is not None:
+                sent_at, streams = sent
+                if stream in streams:
+                    return None
+                streams.add(stream)
+                return now - sent_at, True
         return None if newest_at is None else (now - newest_at, False)

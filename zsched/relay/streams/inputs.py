@@ -616,6 +616,8 @@ class InputStream:
         if slot.lacks_newest:
             owed |= {values[-1][0]: values[-1] for values in lines}
         for _, (_, sample, stamp) in sorted(owed.items()):
+            if self._times is not None:
+                self._times.sent(stamp)
             self._counter.dropped(*slot.outlet.send(sample, stamp))
         slot.sent, slot.lacks_newest = self._number, False
         self._counter.replayed += len(owed)

@@ -509,7 +509,7 @@ class OutputStream:
             self._forward(sample)
 
     def _forward(self, sample: Sample, size: int | None = None) -> None:
-        answer = None if self._times is None else self._times.answered(sample.timestamp)
+        answer = None if self._times is None else self._times.answered(sample.timestamp, self._counter.stream)
         if answer is not None:
             self._counter.answered(answer[0], is_paired=answer[1])
         if self._is_latest:

@@ -8,10 +8,15 @@ import pytest
 import zenoh
 
 from support.sessions import hub_and_neighbour
+from support.waiting import until
+from zsched.core.values.plan import Direction, Route, StreamClass, StreamSettings
 from zsched.relay.streams import answer_times
 from zsched.relay.streams import counter as counters
 from zsched.relay.streams.answer_times import MAX_SENT, AnswerTimes
 from zsched.relay.streams.counter import StreamCounter
+from zsched.relay.streams.inputs import InputStream
+
+A, B = "merge/out/0", "merge/out/1"
 
 
 @pytest.fixture
@@ -33,16 +38,55 @@ def test_an_answer_with_its_input_s_timestamp_is_told_exactly(at: Callable[[floa
     one, two, stranger = stamps(3)
     times = AnswerTimes()
     at(10.0)
-    assert times.answered(one) is None, "nothing was sent"
+    assert times.answered(one, A) is None, "nothing was sent"
     times.sent(one)
     at(10.3)
     times.sent(two)
     at(10.5)
-    assert times.answered(one) == pytest.approx((0.5, True))
-    assert times.answered(two) == pytest.approx((0.2, True))
-    assert times.answered(two) == pytest.approx((0.2, True)), "an input may have several answers"
-    assert times.answered(stranger) == pytest.approx((0.2, False)), "at least as old as the newest input"
-    assert times.answered(None) == pytest.approx((0.2, False))
+    assert times.answered(one, A) == pytest.approx((0.5, True))
+    assert times.answered(two, A) == pytest.approx((0.2, True))
+    assert times.answered(two, B) == pytest.approx((0.2, True)), "an input may have an answer on each stream"
+    assert times.answered(stranger, A) == pytest.approx((0.2, False)), "at least as old as the newest input"
+    assert times.answered(None, A) == pytest.approx((0.2, False))
+
+
+def test_what_a_worker_says_again_is_no_answer(at: Callable[[float], None]) -> None:
+    """It publishes at a rate of its own, with the timestamp of its newest input."""
+    (one,) = stamps(1)
+    times = AnswerTimes()
+    at(10.0)
+    times.sent(one)
+    at(10.1)
+    assert times.answered(one, A) == pytest.approx((0.1, True))
+    at(100.0)
+    assert times.answered(one, A) is None
+    times.sent(one)
+    at(100.2)
+    assert times.answered(one, A) == pytest.approx((0.2, True)), "a kept value was sent anew: to another worker"
+
+
+def test_a_kept_value_that_another_worker_gets_is_timed_from_then_on(at: Callable[[float], None]) -> None:
+    settings = StreamSettings(stream_class=StreamClass.LATEST, depth=100)
+    route = Route(
+        stream="t/in/0", direction=Direction.INPUT, from_expr="robot1/map", to_expr="edge1/t/map", settings=settings
+    )
+    with hub_and_neighbour() as (relay, outside):
+        heard: list[zenoh.Sample] = []
+        outside.declare_subscriber("edge1/t/map", heard.append)
+        times = AnswerTimes()
+        at(10.0)
+        stream = InputStream(relay, route, frozenset({str(relay.zid())}), times=times)
+        try:
+            until(lambda: outside.put("robot1/map", "x") or stream.count().messages, "the relay's subscription")
+            stream.open(1, route)
+            until(lambda: stream.is_matching(1), "the worker's subscription")
+            at(3610.0)
+            assert stream.warm_up(1) == 1
+            until(lambda: heard, "the kept value")
+            at(3610.1)
+            assert times.answered(heard[0].timestamp, A) == pytest.approx((0.1, True))
+        finally:
+            stream.close()
 
 
 def test_inputs_without_timestamps_and_very_many_of_them_cost_no_memory(at: Callable[[float], None]) -> None:
@@ -54,7 +98,7 @@ def test_inputs_without_timestamps_and_very_many_of_them_cost_no_memory(at: Call
     times.sent(None)
     assert len(times._sent) == MAX_SENT
     at(MAX_SENT + 1.0)
-    assert times.answered(first) == pytest.approx((1.0, False)), "it was forgotten: the newest one counts"
+    assert times.answered(first, A) == pytest.approx((1.0, False)), "it was forgotten: the newest one counts"
 
 
 def test_a_count_tells_the_mean_since_the_one_before() -> None:

@@ -13,7 +13,7 @@ from support.profiles import load_of, profile_of
 from zsched.core.gateway.company import STARVED_CPU_RATIO
 from zsched.core.gateway.demand import SETTLE_S, SHORT_RATIO, UNSURE, Demands, is_short
 from zsched.core.gateway.gateway import Gateway
-from zsched.core.gateway.job_need import QUEUE_RATIO
+from zsched.core.gateway.job_need import CALM_S, QUEUE_RATIO, Heard
 from zsched.core.values.fleet import Demand
 from zsched.core.values.profile import Jobs, Profile, Renewal, WorkerLoad, WorkerState
 
@@ -38,6 +38,32 @@ def profile(
         workers=(load_of(state=state, cpu_cores=cores, memory_mb=mb, wanted_cores=wanted, jobs=jobs),),
         speed=speed,
     )
+
+
+def test_waits_for_a_cpu_are_no_other_waits_where_a_machine_is_hardly_ever_calm() -> None:
+    """Its load swings about the bound, and answers' time follows behind: one look says little."""
+    demands = Demands()
+
+    def stay(used: float, age_s: float, begin: float, for_s: float) -> float:
+        one = profile_of(cpu_used_cores=used, workers=(load_of(cpu_cores=0.4, mean_cores=0.4),))
+        at = begin
+        while at < begin + for_s:
+            demands.learn("merge", one, at, heard=Heard(age_s, hz=4.0), fair_cores=1.0)
+            at += 0.5
+        return at
+
+    at = stay(1.0, 0.1, 0.0, 2 * CALM_S)
+    for _ in range(5):
+        at = stay(3.9, 0.9, at, 3.0)
+        at = stay(0.89 * 4.0, 0.9, at, CALM_S - 1.0)
+        job = demands.job("merge")
+        assert job is not None
+        assert job.other_s == pytest.approx(0.0)
+        assert demands.experience("merge", profile_of(cpu_used_cores=3.9, workers=(load_of(cpu_cores=0.4),)))[1] > 5.0
+    stay(1.0, 0.9, at, 2 * CALM_S)
+    job = demands.job("merge")
+    assert job is not None
+    assert job.other_s == pytest.approx(0.8), "it waits for something else after all"
 
 
 def learnt(*profiles: Profile, there: Profile | None = None, every_s: float = EVERY_S) -> Demand:

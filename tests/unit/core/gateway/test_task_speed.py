@@ -27,9 +27,10 @@ def profile(
     wanted: float | None = None,
     jobs: Jobs | None = None,
     state: WorkerState = WorkerState.READY,
+    mean: float | None = None,
 ) -> Profile:
-    """A machine of four cores, of which the task uses ``cores`` and others ``others``."""
-    load = load_of(state=state, cpu_cores=cores, wanted_cores=wanted, jobs=jobs)
+    """A machine of four cores, of which the task uses ``cores`` (on the mean ``mean``) and others ``others``."""
+    load = load_of(state=state, cpu_cores=cores, wanted_cores=wanted, jobs=jobs, mean_cores=mean)
     return profile_of(node, cpu_cores=4.0, cpu_used_cores=cores + others, workers=(load,), speed=speed)
 
 
@@ -205,10 +206,35 @@ def test_more_jobs_of_the_same_kind_make_no_machine_slow_though_it_is_short() ->
 def test_answers_of_a_worker_that_tells_nothing_tell_the_speed_as_jobs_do(hz: float, speed: float) -> None:
     """It is short on the next machine: for more jobs of the same kind, or for jobs that take longer there."""
     demands = Demands()
-    at = stay(demands, profile("edge1", cores=0.2), 0.0, heard=Heard(age_s=0.3, hz=2.0))
-    there = profile(cores=0.9, others=3.1, wanted=1.0)
+    at = stay(demands, profile("edge1", cores=0.2, mean=0.2), 0.0, heard=Heard(age_s=0.3, hz=2.0))
+    there = profile(cores=0.9, others=3.1, wanted=1.0, mean=0.9)
     stay(demands, there, at, heard=Heard(age_s=1.0, hz=hz))
     assert demands.speed("merge", there) == pytest.approx(speed)
+
+
+@pytest.mark.parametrize(("age_s", "next_s"), [(0.0, 0.003), (0.002, 0.008)])
+def test_answers_that_took_hardly_longer_than_the_way_tell_no_speed_by_their_age(age_s: float, next_s: float) -> None:
+    """A robot's way is taken off their age, and is not known better than to some milliseconds."""
+    demands = Demands()
+    at = stay(demands, profile("edge1", cores=0.8, mean=0.8), 0.0, heard=Heard(age_s, hz=100.0))
+    stay(demands, profile(cores=0.8, mean=0.8), at, heard=Heard(next_s, hz=100.0))
+    assert demands.speed("merge", profile()) == 1.0
+    assert demands.at(NOTHING, profile("edge1")).cpu_cores == pytest.approx(0.8)
+
+
+@pytest.mark.parametrize(("mean", "speed"), [(0.24, 1.0), (0.16, 1.0), (0.3, 2 / 3)])
+def test_means_of_some_answers_differ_by_chance(mean: float, speed: float) -> None:
+    demands = Demands()
+    at = stay(demands, profile("edge1", cores=0.2, mean=0.2), 0.0, heard=Heard(age_s=0.1, hz=2.0))
+    stay(demands, profile(cores=0.2, mean=mean), at, heard=Heard(age_s=0.1, hz=2.0))
+    assert demands.speed("merge", profile()) == pytest.approx(speed)
+
+
+def test_too_few_answers_tell_no_speed() -> None:
+    demands = Demands()
+    at = stay(demands, profile("edge1", cores=0.2, mean=0.2), 0.0, 60.0, heard=Heard(age_s=0.3, hz=0.5))
+    stay(demands, profile(cores=0.2, mean=0.8), at, heard=Heard(age_s=0.3, hz=0.5))
+    assert demands.speed("merge", profile()) == 1.0
 
 
 def test_figures_from_long_before_it_was_seen_again_tell_nothing_of_the_machine() -> None:

@@ -75,6 +75,15 @@ def test_what_only_one_of_two_has_counted_is_the_sum() -> None:
     assert together(unknown, unknown).acknowledged is None
 
 
+@pytest.mark.parametrize("answers", [{"answer_s": 0.1}, {}])
+def test_of_two_the_answers_with_their_inputs_timestamps_tell_the_time(answers: dict[str, float]) -> None:
+    """An application that has an output itself knows more of it than its relay, or less."""
+    timed = StreamCount(stream="merge/out/0", answer_s=0.4, paired_hz=2.0)
+    other = StreamCount(stream="merge/out/0", **answers)
+    for both in (together(timed, other), together(other, timed)):
+        assert (both.answer_s, both.paired_hz) == (0.4, 2.0)
+
+
 def test_a_reason_for_which_nothing_is_left_is_not_named() -> None:
     part = StreamCount(stream="merge/in/0", drops=(("overflow", 4), ("no_route", 1)))
     assert without(WHOLE, part).drops == (("no_route", 5),)

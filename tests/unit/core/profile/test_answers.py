@@ -18,9 +18,17 @@ def out(answer_s: float | None, paired_hz: float | None, stream: str = "merge/ou
 
 
 def told(*counts: StreamCount, away_s: dict[str, float] = NEAR) -> tuple[AnswerTime, ...]:
-    answers = Answers()
+    answers = begun()
     answers.absorb(OWNERS, counts, away_s, 100.0)
     return answers.told(100.0)
+
+
+def begun(at: float = 99.0) -> Answers:
+    """Its first count may still tell of an owner before, and counts nothing."""
+    answers = Answers()
+    answers.absorb(OWNERS, (out(77.0, 77.0),), NEAR, at)
+    assert answers.told(at) == ()
+    return answers
 
 
 def test_an_answer_with_its_input_s_timestamp_is_told_without_the_robot_s_way() -> None:
@@ -45,27 +53,43 @@ def test_figures_beyond_all_bounds_are_told_as_the_bounds() -> None:
     assert (one.age_s, one.hz) == (MAX_JOB_S, MAX_JOBS_HZ)
 
 
+def test_what_no_relay_counts_is_no_answer() -> None:
+    """An application counts its own streams, and may count nonsense."""
+    assert told(out(0.1, -1.0)) == ()
+    assert told(out(-0.1, 1.0))[0].age_s == 0.0
+
+
 def test_it_is_smoothed_and_ends_when_answers_cease() -> None:
-    answers = Answers()
+    answers = begun()
     answers.absorb(OWNERS, (out(0.1, 5.0),), NEAR, 100.0)
     answers.absorb(OWNERS, (out(0.3, 5.0),), NEAR, 101.0)
     (one,) = answers.told(101.0)
     assert 0.1 < one.age_s < 0.3
+    assert one.hz == pytest.approx(5.0)
     for at in (102.0, 101.0 + STALE_S):
         answers.absorb(OWNERS, (out(None, None),), NEAR, at)
-        assert answers.told(at) == (one,)
+        assert answers.told(at)[0].age_s == one.age_s
     assert answers.told(101.1 + STALE_S) == ()
-    answers.absorb(OWNERS, (out(0.7, 1.0),), NEAR, 108.0)
-    assert answers.told(108.0)[0].age_s < 0.7
-    answers.absorb(OWNERS, (), NEAR, 108.1 + STALE_S)
     answers.absorb(OWNERS, (out(0.7, 1.0),), NEAR, 120.0)
     assert answers.told(120.0)[0].age_s == 0.7, "what was before the break is another time"
 
 
+@pytest.mark.parametrize("apart_s", [1, 4, 12])
+def test_rare_answers_are_told_as_rare_as_they_are_and_are_awaited_for_as_long(apart_s: int) -> None:
+    answers = begun(0.0)
+    for at in range(1, 10 * apart_s + 1):
+        answers.absorb(OWNERS, (out(2.0, 1.0) if at % apart_s == 0 else out(None, None),), NEAR, float(at))
+        assert (at < apart_s) is (answers.told(at) == ())
+    (one,) = answers.told(10 * apart_s)
+    assert (one.age_s, one.hz) == (2.0, pytest.approx(1.0 / apart_s, rel=0.2))
+
+
 def test_another_owner_s_answers_begin_anew_and_what_does_not_count_is_forgotten() -> None:
-    answers = Answers()
+    answers = begun()
     answers.absorb(OWNERS, (out(0.1, 5.0),), NEAR, 100.0)
-    answers.absorb({"merge": "edge2"}, (out(0.5, 5.0),), NEAR, 101.0)
-    assert answers.told(101.0) == (AnswerTime(task="merge", owner="edge2", age_s=0.5, hz=5.0),)
-    answers.absorb({}, (out(0.5, 5.0),), NEAR, 102.0)
-    assert answers.told(102.0) == ()
+    answers.absorb({"merge": "edge2"}, (out(0.1, 5.0),), NEAR, 101.0)
+    assert answers.told(101.0) == (), "the first count may be of the owner before"
+    answers.absorb({"merge": "edge2"}, (out(0.5, 3.0),), NEAR, 102.0)
+    assert answers.told(102.0) == (AnswerTime(task="merge", owner="edge2", age_s=0.5, hz=3.0),)
+    answers.absorb({}, (out(0.5, 5.0),), NEAR, 103.0)
+    assert answers.told(103.0) == ()

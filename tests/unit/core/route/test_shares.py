@@ -7,7 +7,7 @@ from typing import Any
 from zsched.core.events import SlotDrained
 from zsched.core.hop.books import unaccounted
 from zsched.core.relay_protocol import SlotLost, WorkerWatch
-from zsched.core.route.shares import Shares
+from zsched.core.route.shares import TIMES_S, Shares
 from zsched.core.values.plan import (
     Direction,
     ReadyWhen,
@@ -144,7 +144,7 @@ def count(messages: int, acknowledged: int, in_flight: int, stream: str = "t/in/
 def test_counters_add_up_and_the_books_balance_also_when_an_application_dies() -> None:
     made, relays = shares("robot1/jobs"), (count(10, 8, 2), StreamCount(stream="t/out/0", messages=5))
     assert made.added(relays, NOW) == relays
-    made.note_counts((count(100, 90, 7, lost=1, drops=(("overflow", 2),)),))
+    made.note_counts((count(100, 90, 7, lost=1, drops=(("overflow", 2),)),), NOW)
     total = made.added(relays, NOW)[0]
     assert (total.messages, total.acknowledged, total.in_flight, total.lost) == (110, 98, 9, 1)
     assert total.drops == (("overflow", 2),)
@@ -154,10 +154,10 @@ def test_counters_add_up_and_the_books_balance_also_when_an_application_dies() -
     assert (total.messages, total.in_flight, total.at_most_lost) == (110, 2, 7)
     assert unaccounted(total) == 0
     made.name(("robot1/jobs",))
-    made.note_counts((count(3, 3, 0),))
+    made.note_counts((count(3, 3, 0),), NOW)
     made.go(NOW)
     made.name(("robot1/jobs",))
-    made.note_counts((count(1, 0, 1),))
+    made.note_counts((count(1, 0, 1),), NOW)
     total = made.added(relays, NOW)[0]
     assert (total.messages, total.acknowledged, total.in_flight, total.at_most_lost) == (114, 101, 3, 7)
     assert unaccounted(total) == 0
@@ -165,26 +165,36 @@ def test_counters_add_up_and_the_books_balance_also_when_an_application_dies() -
 
 def test_an_application_that_goes_with_answers_only_has_lost_none_that_are_known() -> None:
     made = shares("robot1/plan")
-    made.note_counts((StreamCount(stream="t/out/0", messages=5),))
+    made.note_counts((StreamCount(stream="t/out/0", messages=5),), NOW)
     assert made.go(NOW) == ()
 
 
 def test_counters_of_streams_that_are_not_its_own_are_not_taken() -> None:
     made = shares("robot1/jobs")
-    made.note_counts((count(5, 5, 0, stream="t/in/1"), count(5, 5, 0, stream="u/in/0")))
+    made.note_counts((count(5, 5, 0, stream="t/in/1"), count(5, 5, 0, stream="u/in/0")), NOW)
     relays = (count(1, 1, 0, stream="t/in/1"),)
     assert made.added(relays, NOW) == relays
 
 
 def test_the_last_sample_of_an_application_is_remembered_when_it_has_gone() -> None:
     made, relays = shares("robot1/jobs"), (count(0, 0, 0),)
-    made.note_counts((count(10, 10, 0, last_seen_s=0.5),))
+    made.note_counts((count(10, 10, 0, last_seen_s=0.5),), NOW)
     made.go(NOW)
     assert made.added(relays, NOW + 60.0)[0].last_seen_s == 60.5
     later = (count(1, 1, 0, last_seen_s=2.0),)
     assert made.added(later, NOW + 60.0)[0].last_seen_s == 2.0, "the newest"
     made.end("t")
     assert made.added(relays, NOW + 60.0) == relays
+
+
+def test_times_that_an_application_told_long_ago_are_nobody_s() -> None:
+    """One that stands still tells no others, and the next owner is not as late as the one before."""
+    made, relays = shares("robot1/plan"), (StreamCount(stream="t/out/0", messages=5),)
+    made.note_counts((StreamCount(stream="t/out/0", answer_s=0.4, paired_hz=2.0),), NOW)
+    told = made.added(relays, NOW + TIMES_S)[0]
+    assert (told.answer_s, told.paired_hz) == (0.4, 2.0)
+    told = made.added(relays, NOW + TIMES_S + 0.1)[0]
+    assert (told.answer_s, told.paired_hz, told.messages) == (None, None, 5)
 
 
 def answers(messages: int, **more: Any) -> StreamCount:
@@ -202,18 +212,18 @@ def test_an_answer_that_the_application_has_itself_is_counted_once() -> None:
 
     assert told(answers(5, lost=1)) == (5, 1), "before the application came"
     made.name(("robot1/plan",))
-    made.note_counts((answers(20),))
+    made.note_counts((answers(20),), NOW)
     assert told(answers(25, lost=30)) == (25, 1), "both had the 20, and the relay alone lost 29"
     made.go(NOW)
     assert told(answers(25, lost=30)) == (25, 1)
     assert told(answers(28, lost=31)) == (28, 2), "the relay's own again"
     made.name(("robot1/plan",))
-    made.note_counts((answers(2),))
+    made.note_counts((answers(2),), NOW)
     assert told(answers(30, lost=31)) == (30, 2)
 
 
 def test_an_output_that_the_application_does_not_have_is_the_relays() -> None:
     made = shares("robot1/jobs")
-    made.note_counts((count(3, 3, 0),))
+    made.note_counts((count(3, 3, 0),), NOW)
     relays = (answers(5, lost=2),)
     assert made.added(made.apart(relays), NOW) == relays
