@@ -481,6 +481,13 @@ LEASE_BUGS = (
         ("tests/unit/core/vote/test_lease.py",),
     ),
     _bug(
+        "what a generation's first owner was granted is forgotten",
+        LEASE,
+        "granter.is_for_first = granter.is_for_first and not value.leased",
+        "granter.is_for_first = granter.is_for_first",
+        ("tests/unit/core/vote/test_lease.py",),
+    ),
+    _bug(
         "restart forgets a longer lease",
         LEASE,
         "hold_s(max(self.fleet.timing.lease_s, self.granted_s))",
@@ -967,8 +974,8 @@ VOTE_BUGS = (
     _bug(
         "a robot that repeats itself counts each time",
         "zsched.core.gateway.job_need",
-        "(task, owner)][:1]",
-        "(task, owner)]",
+        "told.setdefault(profile.node, one)",
+        'told[f"{profile.node}{len(told)}"] = one',
         ("tests/unit/core/gateway/test_job_need.py",),
     ),
     _bug(

@@ -134,6 +134,11 @@ class Machine:
         return spent_s / period_s
 
     @property
+    def finished(self) -> int:
+        """Jobs that it has done."""
+        return int(self._done)
+
+    @property
     def _speed(self) -> float:
         """Of the task."""
         return self.speed * self.own_speed
@@ -209,7 +214,7 @@ class Loop:
         self.states = dict.fromkeys(self.profilers, PeerState.ALIVE)
         self.rng = Random(self.seed)
         self.settled_at = 0.0
-        self.counts = 0
+        self.counts = self.counted = 0
 
     def run(self, until_s: float) -> list[tuple[float, str]]:
         """(when, where to) of every move."""
@@ -226,7 +231,7 @@ class Loop:
         for machine in self.machines:
             is_owner = machine.name == self.allocation.owner
             device, link = machine.sample(now, self.rng, is_owner=is_owner)
-            self.profilers[machine.name].watch_use(("merge",) if is_owner and machine.is_foreign else (), now)
+            self.profilers[machine.name].watch_use(("merge",) if is_owner and machine.is_foreign else ())
             if machine.told is not None:
                 self.profilers[machine.name].note_jobs(machine.told, now)
             self.profilers[machine.name].absorb(device, (link,) if self.weights.network > 0.0 else (), now)
@@ -246,14 +251,14 @@ class Loop:
                     assert gateway.absorb(profile, now) is None
 
     def _count_answers(self, now: float) -> None:
-        """What the robots' relays count of the owner's answers, once a second."""
+        """What the robots' relays count of the owner's answers, once a second; the robots ask in turn."""
         owner = next(machine for machine in self.machines if machine.name == self.allocation.owner)
-        age_s, hz = (None, None) if owner.answers is None else owner.answers
-        count = StreamCount(
-            stream="merge/out/0", answer_s=age_s, paired_hz=None if hz is None else hz / len(self.robots)
-        )
-        for answers in self.answers.values():
+        age_s = None if owner.answers is None else owner.answers[0]
+        for turn, answers in enumerate(self.answers.values()):
+            had, has = ((done + turn) // len(self.robots) for done in (self.counted, owner.finished))
+            count = StreamCount(stream="merge/out/0", answer_s=age_s, paired_hz=float(has - had) if has > had else None)
             answers.absorb({"merge": owner.name}, (count,), {}, now)
+        self.counted = owner.finished
 
     def _round(self, now: float) -> None:
         judgements = self._judge(now, is_called=False)

@@ -1250,7 +1250,7 @@ def told_of_answers(node: Node, now: float) -> tuple[AnswerTime, ...]:
 
 
 def test_a_robot_times_the_answers_of_a_worker_that_tells_nothing_where_a_deadline_needs_it() -> None:
-    assert told_of_answers(timed(), 103.0) == (AnswerTime(task="merge", owner="edge1", age_s=0.2, hz=5.0),)
+    assert told_of_answers(timed(), 103.0) == (AnswerTime(task="merge", owner="edge1", age_s=0.2, count=5.0),)
     assert told_of_answers(timed(deadline_ms=None), 103.0) == ()
     assert told_of_answers(timed(ready_when=ReadyWhen.TOKEN), 103.0) == ()
 
@@ -1264,7 +1264,7 @@ def test_a_robot_times_the_answers_of_a_worker_that_tells_nothing_where_a_deadli
         ("edge2", ReadyWhen.MATCHING, 100.0, False),
     ],
 )
-def test_its_owner_tells_what_it_uses_on_the_mean(
+def test_its_owner_tells_what_its_worker_has_spent(
     me: str, ready_when: ReadyWhen, deadline_ms: float | None, *, is_told: bool
 ) -> None:
     node = timed(me, ready_when=ready_when, deadline_ms=deadline_ms)
@@ -1275,7 +1275,7 @@ def test_its_owner_tells_what_it_uses_on_the_mean(
     (profile,) = [one.profile for one in of(node.handle(ev.DeadlineReached(), 113.0), do.PublishProfile)]
     load = profile.worker("merge")
     assert load is not None
-    assert load.mean_cores == (0.5 if is_told else None)
+    assert load.spent_s == (pytest.approx(0.5 * 0.2 * 39 + 0.5 * 3.0, abs=0.11) if is_told else None)
 
 
 def test_during_a_handover_no_answer_tells_of_the_owner() -> None:

@@ -15,6 +15,7 @@ import math
 
 from zsched.core.gateway.company import Company, is_full
 from zsched.core.gateway.job_need import CALM_S, Heard, JobNeed, other_s, told_job
+from zsched.core.gateway.spending import Spending
 from zsched.core.gateway.task_speed import MOST_RATIO, TaskSpeeds, speed_of
 from zsched.core.values.fleet import Demand, TaskSpec
 from zsched.core.values.model import NodeId, TaskId
@@ -87,6 +88,8 @@ class Demands:
         self._known: dict[TaskId, _Known] = {}
         self._shortfalls: dict[tuple[TaskId, NodeId], _Shortfall] = {}
         self._speeds = TaskSpeeds()
+        self._spending: dict[TaskId, tuple[tuple[NodeId, float], Spending]] = {}
+        """{task: ((its owner, since when), what its worker has spent there on answers)}."""
 
     def learn(
         self,
@@ -126,10 +129,9 @@ class Demands:
             found = replace(found, full_at=now)
         is_new = now - found.since < SETTLE_S
         before = found.before if now - found.since < COMPARED_S else None
+        job_cpu_s = self._job_cpu_s(task, load, heard, found, now)
         if before is not None:
-            self._compare_jobs(
-                task, profile, _job_cpu_s(load, heard, now - found.since), before, is_told=load.jobs is not None
-            )
+            self._compare_jobs(task, profile, job_cpu_s, before, is_told=load.jobs is not None)
         if load.memory_mb is not None:
             found = replace(found, memory_mb=max(load.memory_mb, (known.memory_mb or 0.0) if is_new else 0.0))
         if load.cpu_cores is not None:
@@ -148,11 +150,11 @@ class Demands:
             else:
                 found = replace(found, work=use, is_sure=True)
             if before is not None:
-                has_jobs = load.jobs is not None or heard is not None
+                has_jobs = job_cpu_s is not None
                 found = self._compared(task, profile, found, before, is_new=is_new, has_jobs=has_jobs)
         speed = self._speeds.of(task, profile, is_there=True)
         if heard is not None and load.jobs is None and not is_new:
-            found = _with_heard(found, load, heard, speed, now)
+            found = _with_heard(found, load, heard, job_cpu_s, speed, now)
         else:
             found = _with_job(found, load, speed, is_new=is_new)
         self._known[task] = found
@@ -162,6 +164,7 @@ class Demands:
     def forget(self, task: TaskId) -> None:
         """Know nothing of a task that is no more: one of the same name that comes later is another one (0043)."""
         self._known.pop(task, None)
+        self._spending.pop(task, None)
         self._speeds.forget(task)
         self._shortfalls = {key: seen for key, seen in self._shortfalls.items() if key[0] != task}
 
@@ -178,6 +181,20 @@ class Demands:
         known, load = self._known.get(task, _Known()), profile.worker(task)
         is_ready = load is not None and load.state is WorkerState.READY and load.renewal is Renewal.NONE
         return is_ready and known.is_changed and known.is_job_old
+
+    def _job_cpu_s(
+        self, task: TaskId, load: WorkerLoad, heard: Heard | None, found: _Known, now: float
+    ) -> float | None:
+        """CPU time of a job: by the worker's report, else by its answers since its start is over; ``None``: unknown."""
+        if load.jobs is not None:
+            return load.jobs.cpu_s
+        if heard is None or load.spent_s is None or found.owner is None or now - found.since < SETTLE_S:
+            return None
+        place, known = (found.owner, found.since), self._spending.get(task)
+        if known is None or known[0] != place:
+            known = self._spending[task] = place, Spending()
+        known[1].absorb(load.spent_s, heard.counts, now)
+        return known[1].per_answer_s
 
     def _compare_jobs(
         self, task: TaskId, profile: Profile, cpu_s: float | None, before: _Before, *, is_told: bool
@@ -298,18 +315,6 @@ def _age_s(load: WorkerLoad, heard: Heard | None) -> float | None:
     return jobs.time_s if jobs.age_s is None else jobs.age_s
 
 
-def _job_cpu_s(load: WorkerLoad, heard: Heard | None, since_s: float) -> float | None:
-    """CPU time of a job: by the worker's report, else by its answers since it has settled; ``None``: nobody knows.
-
-    ``since_s``: for how long the task has been there.
-    """
-    if load.jobs is not None:
-        return load.jobs.cpu_s
-    if heard is None or load.mean_cores is None or not heard.tells_cpu(since_s - SETTLE_S):
-        return None
-    return heard.cpu_s(load.mean_cores)
-
-
 def _is_told(load: WorkerLoad) -> bool:
     """Whether the worker's report shows its lack of CPU, and not only its undone work."""
     jobs = load.jobs
@@ -335,13 +340,13 @@ def _told(load: WorkerLoad, speed: float, fastest: float) -> float | None:
     return max(use + undone_hz * jobs.cpu_s, 0.0) * speed
 
 
-def _with_heard(known: _Known, load: WorkerLoad, heard: Heard, speed: float, now: float) -> _Known:
+def _with_heard(known: _Known, load: WorkerLoad, heard: Heard, cpu_s: float | None, speed: float, now: float) -> _Known:
     """With the job of the owner's worker as robots see it; where too little is known yet it stays what it was."""
-    cpu_s = _job_cpu_s(load, heard, now - known.since)
-    if cpu_s is None or load.mean_cores is None:
-        return known
-    job = heard.job(load.mean_cores, speed, known.job, is_calm=now - known.full_at > CALM_S)
-    return replace(known, job=job, job_work_s=cpu_s * speed, is_job_old=load.renewal is not Renewal.NONE)
+    is_old = load.renewal is not Renewal.NONE
+    if cpu_s is None:
+        return replace(known, is_job_old=known.is_job_old or is_old)
+    job = heard.job(cpu_s, speed, known.job, is_calm=now - known.full_at > CALM_S)
+    return replace(known, job=job, job_work_s=cpu_s * speed, is_job_old=is_old)
 
 
 def _with_job(known: _Known, load: WorkerLoad, speed: float, *, is_new: bool) -> _Known:

@@ -15,7 +15,7 @@ import statistics
 from collections.abc import Iterable
 
 from zsched.core.values.model import NodeId, TaskId
-from zsched.core.values.profile import MEAN_S, AnswerTime, Jobs, Profile
+from zsched.core.values.profile import AnswerTime, Jobs, Profile
 from zsched.core.values.struct import Struct
 
 CALM_WAIT_RATIO = 0.1
@@ -26,8 +26,6 @@ LEAST_FREE_CORES = 0.05
 """A job on a full machine gets at least this much, so that its time is finite."""
 CALM_S = 6.0
 """For so long the machine must have had CPU to spare: answers' time is a mean that follows later than the machine's."""
-LEAST_ANSWERS = 5.0
-"""Fewer answers than that do not tell the CPU time of one."""
 
 
 class JobNeed(Struct, frozen=True):
@@ -70,27 +68,19 @@ def told_job(jobs: Jobs, speed: float, known: JobNeed | None) -> JobNeed:
 
 
 class Heard(Struct, frozen=True):
-    """The answers of one task's owner, by all robots."""
+    """The answers of one task's owner, by all robots that tell of any."""
 
     age_s: float
     """From an input to its answer at the owner: the median of the robots', so that one bad link says nothing."""
-    hz: float
-    """Answers per second to all robots, on the mean (`MEAN_S`), > 0; each counts those of its own inputs."""
+    counts: tuple[tuple[NodeId, float], ...]
+    """(robot, how many answers to its own inputs it has counted)."""
 
-    def tells_cpu(self, for_s: float) -> bool:
-        """Whether there were enough answers in ``for_s`` for a mean."""
-        return self.hz * min(for_s, MEAN_S) >= LEAST_ANSWERS
-
-    def cpu_s(self, mean_cores: float) -> float:
-        """CPU seconds per answer, of all threads."""
-        return mean_cores / self.hz
-
-    def job(self, mean_cores: float, speed: float, known: JobNeed | None, *, is_calm: bool) -> JobNeed:
-        """A job by its answers, on a machine of ``speed`` where the worker uses ``mean_cores`` on the mean.
+    def job(self, cpu_s: float, speed: float, known: JobNeed | None, *, is_calm: bool) -> JobNeed:
+        """A job by its answers, which take ``cpu_s`` each on a machine of ``speed``.
 
         ``known``: what was known before. ``is_calm``: the machine has had CPU to spare for `CALM_S`.
         """
-        cpu_s = min(self.cpu_s(mean_cores), self.age_s)  # several threads at once work for no longer
+        cpu_s = min(cpu_s, self.age_s)  # several threads at once work for no longer
         waits_s = self.age_s - cpu_s
         if not is_calm:
             waits_s = min(waits_s, 0.0 if known is None else known.other_s)
@@ -98,9 +88,13 @@ class Heard(Struct, frozen=True):
 
 
 def heard_of(task: TaskId, owner: NodeId, profiles: Iterable[Profile]) -> Heard | None:
-    """What these profiles tell of the answers of the task's owner; ``None``: nothing, or too little."""
-    told: list[AnswerTime] = []
+    """What these profiles tell of the answers of the task's owner; ``None``: nothing."""
+    told: dict[NodeId, AnswerTime] = {}
     for profile in profiles:
-        told += [one for one in profile.answers if (one.task, one.owner) == (task, owner)][:1]  # each robot counts once
-    hz = sum(one.hz for one in told)
-    return Heard(statistics.median([one.age_s for one in told]), hz) if hz > 0.0 else None
+        for one in profile.answers:
+            if (one.task, one.owner) == (task, owner):
+                told.setdefault(profile.node, one)  # each robot counts once
+    if not told:
+        return None
+    age_s = statistics.median([one.age_s for one in told.values()])
+    return Heard(age_s, tuple((robot, one.count) for robot, one in sorted(told.items())))

@@ -48,7 +48,7 @@ def _look_for_hangs(node: Stages, todo: ToDo, now: float) -> None:
 
 
 def _on_sampled(node: Stages, event: ev.ProfileSampled, _todo: ToDo, now: float) -> None:
-    node.profiler.watch_use(node.timed_here(), now)
+    node.profiler.watch_use(node.timed_here())
     node.profiler.absorb(event.device, event.links, now)
 
 

@@ -45,32 +45,3 @@ class Ewma:
         if self.value is not None:
             part.update(0.0, self._at)
         return part
-
-
-class RunningMean:
-    """Mean of a rate since it began; what is older than the time constant hardly counts.
-
-    No sample counts for more than its own time, and nothing is taken as known before the first (the bias correction of
-    Kingma and Ba 2015, section 3). So two such means of the same time tell the quotient of what they have counted.
-    """
-
-    __slots__ = ("_at", "_sum", "_weight", "tau_s")
-
-    def __init__(self, tau_s: float, now: float) -> None:
-        self.tau_s = tau_s
-        self._at = now
-        self._sum = self._weight = 0.0
-
-    def update(self, rate: float, now: float) -> None:
-        """Take in what the rate was since the last time, on the mean; what was before the begin counts nothing."""
-        if now <= self._at:
-            return
-        kept = math.exp(-(now - self._at) / self.tau_s)
-        self._sum = kept * self._sum + (1.0 - kept) * rate
-        self._weight = kept * self._weight + 1.0 - kept
-        self._at = now
-
-    @property
-    def value(self) -> float | None:
-        """The mean; ``None`` before the first sample."""
-        return self._sum / self._weight if self._weight > 0.0 else None

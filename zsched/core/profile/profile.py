@@ -16,7 +16,7 @@ from collections.abc import Mapping
 
 from zsched.core.events import WorkerJobs
 from zsched.core.profile.jobs import JobMeter
-from zsched.core.profile.means import STALE_S, Ewma, RunningMean
+from zsched.core.profile.means import STALE_S, Ewma
 from zsched.core.values.fleet import Timing
 from zsched.core.values.gauges import possible
 from zsched.core.values.model import NodeId, TaskId
@@ -26,7 +26,6 @@ from zsched.core.values.profile import (
     MAX_MEMORY_MB,
     MAX_RUNNABLE,
     MAX_TREND_DB_S,
-    MEAN_S,
     AnswerTime,
     DeviceSample,
     Echo,
@@ -48,8 +47,6 @@ JOB_SMOOTHING_S = 1.0
 """Least time constant for jobs: one or two in a sample are no rate."""
 JOB_CHANGE = 0.2
 """This change of the share of done jobs, or this relative change of time per job, sends a profile at once."""
-START_S = 4.0
-"""What a worker does so soon after its task has come (kept values, caches) is no usual use."""
 GAUGE_SMOOTHING_S = 2.0
 """Least time constant of a gauge: a GPU's use jumps between 0 and 1 with every job."""
 RSSI_CHANGE_DB = 1.0
@@ -131,7 +128,7 @@ class Profiler:
         self._signals: dict[NodeId | None, SignalFilter] = {}
         self._worker_cpu: dict[TaskId, Ewma] = {}
         self._worker_memory: dict[TaskId, Ewma] = {}
-        self._mean_cpu: dict[TaskId, RunningMean] = {}
+        self._spent_s: dict[TaskId, float] = {}
         self._jobs: dict[TaskId, JobMeter] = {}
         self._device: DeviceSample | None = None
         self._sampled_at = -math.inf
@@ -163,13 +160,15 @@ class Profiler:
 
     def absorb(self, device: DeviceSample, links: tuple[LinkSample, ...], now: float) -> None:
         """Take one reading of the machine and its links in."""
+        elapsed_s = now - self._sampled_at
         self._device, self._sampled_at, self._is_new = device, now, True
         worker_cpu = {load.task: load.cpu_cores for load in device.workers}
         worker_memory = {load.task: load.memory_mb for load in device.workers}
         _absorb_use(self._cpu, self._worker_cpu, device.cpu_used_cores, worker_cpu, MAX_CPU_CORES, now)
         _absorb_use(self._memory, self._worker_memory, device.memory_used_mb, worker_memory, MAX_MEMORY_MB, now)
-        for task, mean in self._mean_cpu.items():
-            mean.update(_possible(worker_cpu.get(task), MAX_CPU_CORES) or 0.0, now)
+        if elapsed_s <= STALE_S:
+            for task in self._spent_s:
+                self._spent_s[task] += elapsed_s * (_possible(worker_cpu.get(task), MAX_CPU_CORES) or 0.0)
         _absorb_known(self._pressure, device.cpu_pressure, 1.0, now)
         _absorb_known(self._runnable, device.runnable, MAX_RUNNABLE, now)
         self._absorb_gauges(possible(device.gauges), now)
@@ -184,9 +183,9 @@ class Profiler:
         for name, reading in readings:
             self._gauges[name].update(reading, now)
 
-    def watch_use(self, tasks: tuple[TaskId, ...], now: float) -> None:
-        """Of these tasks' workers here the use on the mean is told: their answers are timed."""
-        self._mean_cpu = {task: self._mean_cpu.get(task) or RunningMean(MEAN_S, now + START_S) for task in tasks}
+    def watch_use(self, tasks: tuple[TaskId, ...]) -> None:
+        """Tell from now on what the workers of these tasks, and of no others, have used: their answers are timed."""
+        self._spent_s = {task: self._spent_s.get(task, 0.0) for task in tasks}
 
     def note_jobs(self, report: WorkerJobs, now: float) -> bool:
         """Take a worker's report of its jobs in; whether it is possible."""
@@ -299,7 +298,7 @@ class Profiler:
                 jobs=loads[task].jobs if task in loads else None,
                 renewal=renewals.get(task, Renewal.NONE),
                 unended_s=loads[task].unended_s if task in loads else None,
-                mean_cores=self._mean_cores(task) if task in loads and loads[task].cpu_cores is not None else None,
+                spent_s=self._spent(loads.get(task)),
             )
             for task in sorted(states)
         )
@@ -320,9 +319,10 @@ class Profiler:
             gauges=self._readings() if is_measured else (),
         )
 
-    def _mean_cores(self, task: TaskId) -> float | None:
-        mean = self._mean_cpu.get(task)
-        return None if mean is None or mean.value is None else round(mean.value, 4)
+    def _spent(self, load: WorkerLoad | None) -> float | None:
+        if load is None or load.cpu_cores is None or load.task not in self._spent_s:
+            return None
+        return round(self._spent_s[load.task], 3)
 
     def _readings(self) -> Readings:
         """The means of all gauges, in as many digits as tell something."""

@@ -25,9 +25,7 @@ MIN_SPEED, MAX_SPEED = 0.001, 1000.0
 MAX_RUNNABLE = 1e6
 MAX_TREND_DB_S = 100.0
 MAX_JOBS_HZ, MAX_JOB_S = 1e6, 1e6
-MEAN_S = 60.0
-"""Time constant of the CPU in use and the answers of a worker that tells nothing: their quotient is exact to some
-per cent when there were ten answers."""
+MAX_SUM = 1e12
 MAX_HELD_S = 3600.0
 """Bounds that no machine or link exceeds: a larger figure is a fault of its sender."""
 
@@ -137,8 +135,8 @@ class WorkerLoad(Struct, frozen=True, kw_only=True):
     unended_s: float | None = None
     """For how long it has had work without a break, and has ended no job; ``None``: not for long, or it does not
     report its jobs."""
-    mean_cores: float | None = None
-    """``cpu_cores`` on the mean of `MEAN_S`, or since soon after the task came; ``None``: nobody times its answers."""
+    spent_s: float | None = None
+    """CPU seconds that it has used since some moment, if it is an owner's whose answers are timed; else ``None``."""
 
     def __post_init__(self) -> None:
         check_name("worker.task", self.task)
@@ -148,7 +146,7 @@ class WorkerLoad(Struct, frozen=True, kw_only=True):
         check_range("worker.cpu_cores", self.cpu_cores, 0.0, MAX_CPU_CORES)
         check_range("worker.memory_mb", self.memory_mb, 0.0, MAX_MEMORY_MB)
         check_range("worker.wanted_cores", self.wanted_cores, 0.0, MAX_CPU_CORES)
-        check_range("worker.mean_cores", self.mean_cores, 0.0, MAX_CPU_CORES)
+        check_range("worker.spent_s", self.spent_s, 0.0, MAX_SUM)
 
 
 class TaskProgress(Struct, frozen=True, kw_only=True):
@@ -170,14 +168,14 @@ class AnswerTime(Struct, frozen=True, kw_only=True):
     owner: NodeId
     age_s: float
     """From an input at the owner to its answer there: without the robot's way, as far as that is measured."""
-    hz: float
-    """Such answers per second, of the robot's own inputs."""
+    count: float
+    """Such answers of this owner to the robot's own inputs, since some moment."""
 
     def __post_init__(self) -> None:
         check_name("answer.task", self.task)
         check_name("answer.owner", self.owner)
         check_range("answer.age_s", self.age_s, 0.0, MAX_JOB_S)
-        check_range("answer.hz", self.hz, 0.0, MAX_JOBS_HZ)
+        check_range("answer.count", self.count, 0.0, MAX_SUM)
 
 
 class DeviceSample(Struct, frozen=True, kw_only=True):

@@ -36,6 +36,7 @@ class AnswerTimes:
         with self._lock:
             self._newest_at = now
             if stamp is not None:
+                self._sent.pop(stamp, None)  # a value that is sent again is a newest one
                 self._sent[stamp] = now, set()
                 if len(self._sent) > MAX_SENT:
                     self._sent.popitem(last=False)

@@ -45,10 +45,10 @@ def test_waits_for_a_cpu_are_no_other_waits_where_a_machine_is_hardly_ever_calm(
     demands = Demands()
 
     def stay(used: float, age_s: float, begin: float, for_s: float) -> float:
-        one = profile_of(cpu_used_cores=used, workers=(load_of(cpu_cores=0.4, mean_cores=0.4),))
         at = begin
         while at < begin + for_s:
-            demands.learn("merge", one, at, heard=Heard(age_s, hz=4.0), fair_cores=1.0)
+            one = profile_of(cpu_used_cores=used, workers=(load_of(cpu_cores=0.4, spent_s=0.4 * at),))
+            demands.learn("merge", one, at, heard=Heard(age_s, (("robot1", 4.0 * at),)), fair_cores=1.0)
             at += 0.5
         return at
 
@@ -64,6 +64,15 @@ def test_waits_for_a_cpu_are_no_other_waits_where_a_machine_is_hardly_ever_calm(
     job = demands.job("merge")
     assert job is not None
     assert job.other_s == pytest.approx(0.8), "it waits for something else after all"
+
+
+def test_a_program_of_few_answers_is_old_as_soon_as_it_is_told_so() -> None:
+    demands, heard = Demands(), Heard(0.1, (("robot1", 1.0),))
+    demands.expect_another("merge")
+    for at in range(10):
+        renewal = Renewal.DUE if at > 5 else Renewal.NONE
+        demands.learn("merge", profile_of(workers=(load_of(cpu_cores=0.4, renewal=renewal),)), float(at), heard=heard)
+    assert demands.is_replaced("merge", profile_of(workers=(load_of(cpu_cores=0.4),)))
 
 
 def learnt(*profiles: Profile, there: Profile | None = None, every_s: float = EVERY_S) -> Demand:

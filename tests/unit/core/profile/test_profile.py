@@ -7,14 +7,13 @@ import pytest
 
 from support.profiles import load_of
 from zsched.core.events import WorkerJobs
-from zsched.core.profile.means import STALE_S, Ewma, RunningMean
+from zsched.core.profile.means import STALE_S, Ewma
 from zsched.core.profile.profile import (
     GAUGE_SMOOTHING_S,
     RATIO_CHANGE,
     RSSI_CHANGE_DB,
     RSSI_OUTLIER_DB,
     SIGNAL_SMOOTHING_S,
-    START_S,
     Profiler,
     SignalFilter,
 )
@@ -257,42 +256,38 @@ def test_a_worker_that_was_never_measured_has_no_figure() -> None:
     assert profile.cores_of("merge") == 0.0
 
 
-def test_the_use_of_a_worker_whose_answers_are_timed_is_told_on_the_mean_without_its_start() -> None:
-    """It works in bursts: a second in three, of a core."""
-    profiler, now = make_profiler(), 0.0
+def test_what_a_worker_whose_answers_are_timed_has_spent_is_told() -> None:
+    """Half a core in every other sample; samples come as they come."""
+    profiler, now, spent_s = make_profiler(), 0.0, 0.0
     told: list[float | None] = []
-    while now < START_S + 30.0:
-        profiler.watch_use(("merge",), now)
-        burst = 1.0 if int(now) % 3 == 0 else 0.0
-        profiler.absorb(device(2.0, 1000.0, load(3.0 if now < START_S else burst)), (), now)
+    for step in range(100):
+        is_watched = 20 <= step < 90
+        profiler.watch_use(("merge",) if is_watched else ())
+        period_s, cores = (0.2 if step % 3 else 1.0), (0.5 if step % 2 else 0.0)
+        now += period_s
+        profiler.absorb(device(2.0, 1000.0, load(cores)), (), now)
+        spent_s += period_s * cores if is_watched else 0.0
         profile = profiler.publishable(READY, is_draining=False, now=now)
-        told += [] if profile is None else [profile.workers[0].mean_cores]
-        now += 0.2
-    assert told[0] is None, "its start"
-    assert told[-1] == pytest.approx(1 / 3, abs=0.05)
-    profiler.watch_use((), now)
-    assert taken(profiler, now + 1.0).workers[0].mean_cores is None
+        if profile is not None:
+            told.append(profile.workers[0].spent_s)
+            assert told[-1] == (pytest.approx(spent_s, abs=0.001) if is_watched else None)
+    assert [one for one in told if one is not None][-1] > 5.0
 
 
-def test_what_nobody_measures_has_no_mean_either() -> None:
+def test_nothing_was_spent_while_nobody_looked_for_long() -> None:
+    profiler = make_profiler()
+    for at in (0.0, 1.0, 2.0, 100.0, 101.0):
+        profiler.watch_use(("merge",))
+        profiler.absorb(device(2.0, 1000.0, load(0.5)), (), at)
+    assert taken(profiler, 101.0).workers[0].spent_s == pytest.approx(1.5)
+
+
+def test_what_nobody_measures_has_spent_nothing_known() -> None:
     profiler = make_profiler()
     for step in range(100):
-        profiler.watch_use(("merge",), 0.2 * step)
+        profiler.watch_use(("merge",))
         profiler.absorb(device(2.0, 1000.0, load(None)), (), 0.2 * step)
-    assert taken(profiler, 20.0).workers[0].mean_cores is None
-
-
-def test_two_means_of_a_time_tell_the_quotient_of_what_they_counted_from_the_first_moment_on() -> None:
-    one, other = RunningMean(60.0, 10.0), RunningMean(60.0, 12.0)
-    assert one.value is None
-    one.update(7.0, 9.0)
-    assert one.value is None, "before it began"
-    for step in range(1, 200):
-        one.update(0.3, 10.0 + step)
-        other.update(3.0, 12.0 + 2 * step)
-        assert (one.value, other.value) == pytest.approx((0.3, 3.0))
-    one.update(0.6, 210.0 + 60.0)
-    assert one.value == pytest.approx(0.6 - 0.3 * math.exp(-1.0), rel=0.02)
+    assert taken(profiler, 20.0).workers[0].spent_s is None
 
 
 def test_states_come_from_the_node_not_from_the_sample() -> None:

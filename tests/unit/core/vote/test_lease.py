@@ -108,6 +108,14 @@ def test_a_generation_s_task_that_becomes_exclusive_before_its_first_owner_is_wa
     assert not one.may_accept("guard", "r3", 2 * HOLD_S)
 
 
+def test_what_was_granted_under_a_generation_s_first_owner_is_remembered_when_it_needs_no_lease_any_more() -> None:
+    one = elector(OPEN, Allocation(task="guard", revision=1 << 32, epoch=1 << 32, owner=None, tuning=tuning_of()))
+    one.on_newer_value(value())
+    assert one.on_beat(beat(), ACCEPTED, HOLD_S)
+    one.on_newer_value(value(leased=False))
+    assert not one.may_accept("guard", "r3", HOLD_S + 0.1)
+
+
 def test_a_task_that_becomes_leased_is_granted_from_then_on_and_not_in_doubt() -> None:
     one = elector(OPEN)
     assert not one.on_beat(beat(), ACCEPTED, 10.0)
