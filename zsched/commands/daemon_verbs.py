@@ -109,7 +109,7 @@ def recover(
 
 def rejoin(
     generation: Annotated[
-        str, typer.Argument(metavar="GENERATION", help="The beginning of its id; needed where there are several.")
+        str, typer.Argument(metavar="[GENERATION]", help="The beginning of its id; needed where there are several.")
     ] = "",
     config: ConfigOption = None,
     node: NameOption = None,

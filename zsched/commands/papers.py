@@ -103,7 +103,8 @@ class FirstPapers:
             f"move the folder {self._folder} to a stick, and name it to `zsched invite` and `zsched pki` by --authority"
         )
         last = (
-            "certificates last 30 days: where the key is, `zsched pki renew --deliver` renews them (zsched-renew.timer)"
+            "certificates last 30 days: on the machine with the key `systemctl enable --now zsched-renew.timer` lets "
+            "them be renewed in time, else `zsched pki renew --deliver` there"
         )
         return f"{said}. To take it offline, {how}; {last}"
 
