@@ -260,12 +260,9 @@ class Stages:
         return tuple(task for task in self._timed() if self.executors[task].owner == self.me)
 
     def _timed(self) -> tuple[TaskId, ...]:
-        values = self.values()
-        return tuple(
-            spec.name
-            for spec in self.fleet.tasks
-            if not tells_jobs(spec.worker) and values[spec.name].tuning.deadline_ms is not None
-        )
+        silent = [spec.name for spec in self.fleet.tasks if not tells_jobs(spec.worker)]
+        values = self.values() if silent else {}  # most fleets have none, and every sample asks
+        return tuple(task for task in silent if values[task].tuning.deadline_ms is not None)
 
     def owned(self) -> tuple[TaskId, ...]:
         """The tasks that this node owns, as far as it has learnt."""

@@ -88,8 +88,8 @@ class Demands:
         self._known: dict[TaskId, _Known] = {}
         self._shortfalls: dict[tuple[TaskId, NodeId], _Shortfall] = {}
         self._speeds = TaskSpeeds()
-        self._spending: dict[TaskId, tuple[tuple[NodeId, float], Spending]] = {}
-        """{task: ((its owner, since when), what its worker has spent there on answers)}."""
+        self._spending: dict[TaskId, Spending] = {}
+        """What the task's worker has spent on answers where the task is."""
 
     def learn(
         self,
@@ -124,12 +124,15 @@ class Demands:
             self._known[task] = replace(known, owner=None)
         if load is None or load.state is not WorkerState.READY or profile.cpu_used_cores is None:
             return False
-        found = replace(known if known.owner == profile.node else _came(known, profile.node, now), seen_s=now)
+        if known.owner != profile.node:
+            known = _came(known, profile.node, now)
+            self._spending.pop(task, None)
+        found = replace(known, seen_s=now)
         if is_full(profile):
             found = replace(found, full_at=now)
         is_new = now - found.since < SETTLE_S
         before = found.before if now - found.since < COMPARED_S else None
-        job_cpu_s = self._job_cpu_s(task, load, heard, found, now)
+        job_cpu_s = self._job_cpu_s(task, load, None if is_new else heard, now)
         if before is not None:
             self._compare_jobs(task, profile, job_cpu_s, before, is_told=load.jobs is not None)
         if load.memory_mb is not None:
@@ -182,19 +185,16 @@ class Demands:
         is_ready = load is not None and load.state is WorkerState.READY and load.renewal is Renewal.NONE
         return is_ready and known.is_changed and known.is_job_old
 
-    def _job_cpu_s(
-        self, task: TaskId, load: WorkerLoad, heard: Heard | None, found: _Known, now: float
-    ) -> float | None:
-        """CPU time of a job: by the worker's report, else by its answers since its start is over; ``None``: unknown."""
+    def _job_cpu_s(self, task: TaskId, load: WorkerLoad, heard: Heard | None, now: float) -> float | None:
+        """CPU time of a job: by the worker's report, else by its answers so far; ``None``: unknown."""
         if load.jobs is not None:
             return load.jobs.cpu_s
-        if heard is None or load.spent_s is None or found.owner is None or now - found.since < SETTLE_S:
+        if heard is None or load.spent_s is None:
             return None
-        place, known = (found.owner, found.since), self._spending.get(task)
-        if known is None or known[0] != place:
-            known = self._spending[task] = place, Spending()
-        known[1].absorb(load.spent_s, heard.counts, now)
-        return known[1].per_answer_s
+        if (spending := self._spending.get(task)) is None:
+            spending = self._spending[task] = Spending()
+        spending.absorb(load.spent_s, heard.counts, now)
+        return spending.per_answer_s
 
     def _compare_jobs(
         self, task: TaskId, profile: Profile, cpu_s: float | None, before: _Before, *, is_told: bool
