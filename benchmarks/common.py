@@ -7,8 +7,7 @@ import statistics
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import psutil
@@ -73,26 +72,6 @@ def ask(process: subprocess.Popen[str], word: str) -> str:
     process.stdin.write(word + "\n")
     process.stdin.flush()
     return read(process)
-
-
-@contextmanager
-def at_pace(hz: float, act: Callable[[], object]) -> Iterator[None]:
-    """Do something so often, in a thread of its own."""
-    stop = threading.Event()
-
-    def run() -> None:
-        due = time.monotonic()
-        while not stop.wait(max(0.0, due - time.monotonic())):
-            due = max(due + 1 / hz, time.monotonic() - 1.0)
-            act()
-
-    thread = threading.Thread(target=run, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join()
 
 
 class Pinger:

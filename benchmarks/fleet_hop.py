@@ -24,8 +24,9 @@ from typing import Any
 
 import psutil
 
-from benchmarks.common import at_pace, cpu_s, machine
+from benchmarks.common import cpu_s, machine
 from zsched.sessions.config import client_config
+from zsched_lab.fleet.pace import at_pace
 from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
 APPLICATION = """

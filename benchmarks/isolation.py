@@ -20,9 +20,10 @@ from typing import Any
 import psutil
 import zenoh
 
-from benchmarks.common import at_pace, machine, percentile
+from benchmarks.common import machine, percentile
 from zsched import paths as places
 from zsched.adapters.host.operator_client import ask
+from zsched_lab.fleet.pace import at_pace
 from zsched_lab.fleet.testbed import ECHO, Testbed, echo_fleet
 
 CLASSES = ("best_effort", "latest", "reliable")

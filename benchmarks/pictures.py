@@ -22,10 +22,10 @@ from PIL import Image
 
 REPO = Path(__file__).parents[1]
 sys.path.insert(0, str(REPO / "tests"))
-from benchmarks.common import at_pace  # noqa: E402 - the browser is the tests'
 from benchmarks.panels import PROMETHEUS, answers, prometheus  # noqa: E402 - as above
 from benchmarks.web import web_server  # noqa: E402 - as above
 from support import browser  # noqa: E402 - as above
+from zsched_lab.fleet.pace import at_pace  # noqa: E402 - the browser is the tests'
 from zsched_lab.fleet.testbed import TASK, Json, Testbed, echo_fleet  # noqa: E402 - as above
 
 SIGNALS = {"robot1": (-57, -61, -65), "robot2": (-66, -70, -74), "robot3": (-73, -77, -81)}

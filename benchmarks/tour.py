@@ -36,10 +36,11 @@ from typing import Any, Final
 import typer
 import zenoh
 
-from benchmarks.common import at_pace, machine
+from benchmarks.common import machine
 from zsched.cli import app
 from zsched.sessions.config import client_config
 from zsched_lab.fleet.hall import Hall, block_of_ports
+from zsched_lab.fleet.pace import at_pace
 
 NODES: Final = ("robot1", "robot2", "robot3", "edge1", "edge2", "edge3")
 ASKS_HZ: Final = 10.0
