@@ -965,6 +965,20 @@ VOTE_BUGS = (
         ("tests/unit/core/gateway/test_task_speed.py",),
     ),
     _bug(
+        "a task's own thread takes from its share where it runs",
+        "zsched.core.gateway.sharing",
+        "profile.runnable - own",
+        "profile.runnable",
+        ("tests/unit/core/gateway/test_sharing.py", "tests/unit/core/test_closed_loop.py"),
+    ),
+    _bug(
+        "answers are compared with what was spent since they were counted",
+        "zsched.core.gateway.spending",
+        "if not risen or not (self._clock is None or self._clock in risen or is_silent):",
+        "if not counts:",
+        ("tests/unit/core/gateway/test_spending.py",),
+    ),
+    _bug(
         "the wait for a full machine's CPU follows a foreign worker to the next one",
         "zsched.core.gateway.job_need",
         "        if not is_calm:",

@@ -94,16 +94,18 @@ class Machine:
         rest = max(cpu, 0.0) * self.cores
         # A full machine gives the task what is left, half a core at least.
         needs = self.task_cores / self._speed if is_owner and now < self.works_until else 0.0
-        takes = min(needs, max(self.cores - rest, 0.5), self.most_cores)
+        room = max(self.cores - rest, 0.5)
+        takes = min(needs, room, self.most_cores)
+        is_short = takes < needs
         holds = self.task_mb if is_owner else 0.0
         load = load_of(
             cpu_cores=takes if self.shows_worker else None,
             memory_mb=holds if self.shows_worker else None,
-            wanted_cores=math.ceil(needs) if self.shows_worker and takes < needs else None,
+            wanted_cores=math.ceil(needs) if self.shows_worker and is_short else None,
         )
         self._work(now, needs, takes)
         if self.in_bursts:
-            load = replace(load, cpu_cores=self._burst(takes))
+            load = replace(load, cpu_cores=self._burst(takes, min(room, self.most_cores, 1.0)))
             takes = load.cpu_cores or 0.0
         device = DeviceSample(
             cpu_cores=self.cores,
@@ -112,7 +114,7 @@ class Machine:
             memory_used_mb=min(max(memory, 0.0) * MEMORY_MB + holds, MEMORY_MB),
             workers=(load,),
             speed=self.speed,
-            runnable=None if self.threads is None else self.threads + (math.ceil(needs) if takes < needs else takes),
+            runnable=None if self.threads is None else self.threads + (math.ceil(needs) if is_short else takes),
         )
         return device, LinkSample(source=LinkSource.NL80211, rssi_dbm=self.signal_dbm - 40.0 * step)
 
@@ -123,13 +125,13 @@ class Machine:
         self._done = self._undone = self._now = 0.0
         self._owed_s, self._is_at_work = 0.0, False
 
-    def _burst(self, mean_cores: float) -> float:
-        """Cores in use by a worker that does whole jobs, and uses so much on the mean."""
+    def _burst(self, mean_cores: float, most_cores: float) -> float:
+        """Cores in use by a worker that does whole jobs, by ``most_cores`` each, and uses so much on the mean."""
         assert self.job_s is not None
         period_s = Timing().sample_s
         self._owed_s += period_s * mean_cores
         self._is_at_work = self._owed_s >= (period_s if self._is_at_work else self.job_s / self._speed)
-        spent_s = min(period_s, self._owed_s) if self._is_at_work else 0.0
+        spent_s = min(period_s * most_cores, self._owed_s) if self._is_at_work else 0.0
         self._owed_s -= spent_s
         return spent_s / period_s
 
@@ -734,23 +736,73 @@ def test_a_foreign_worker_s_late_answers_on_a_full_machine_are_fled_and_it_does_
     assert 20.0 < at < 30.0
 
 
+QUICK_AND_FULL = (
+    Machine(name="edge1", cores=1.0, base=0.96, speed=1.18, threads=0.5, task_cores=0.012, task_mb=800.0),
+    Machine(name="edge2", base=0.09, speed=0.74, threads=8.5, task_cores=0.012, task_mb=100.0),
+)
+LARGE = tuple(
+    Machine(
+        name=name,
+        cores=cores,
+        base=0.0,
+        memory=memory,
+        noise=0.02,
+        speed=speed,
+        own_speed=own,
+        threads=4.0,
+        task_cores=2.19,
+        task_mb=300.0,
+    )
+    for name, cores, memory, speed, own in (("edge1", 11.07, 0.9, 0.58, 1.1), ("edge2", 1.67, 0.21, 1.34, 0.77))
+)
+ONE, THREE = ("robot1",), ("robot1", "robot2", "robot3")
+
+
 @settings(derandomize=True, database=None, deadline=None, max_examples=12)
+@example(machines=QUICK_AND_FULL, weights=CPU_ONLY, job_s=0.136, waits_s=0.0, deadline_ms=150.0, whole=True, robots=ONE)
+@example(machines=LARGE, weights=BOTH, job_s=0.27, waits_s=0.0, deadline_ms=1000.0, whole=False, robots=THREE)
 @given(
     machines=st.one_of(tempting_machines(), constant_machines()),
     weights=st.sampled_from((BOTH, WITH_NETWORK, CPU_ONLY)),
     job_s=st.floats(0.02, 0.6),
     waits_s=st.sampled_from((0.0, 0.05)),
     deadline_ms=st.sampled_from((150.0, 1000.0)),
+    whole=st.booleans(),
+    robots=st.sampled_from((ONE, THREE)),
 )
 def test_where_nothing_changes_a_task_whose_answers_are_timed_comes_to_rest(
-    machines: tuple[Machine, ...], weights: Weights, job_s: float, waits_s: float, deadline_ms: float
+    machines: tuple[Machine, ...],
+    weights: Weights,
+    job_s: float,
+    waits_s: float,
+    deadline_ms: float,
+    whole: bool,
+    robots: tuple[str, ...],
 ) -> None:
+    """Whether its worker does a little all the time or ``whole`` jobs now and then."""
     for machine in machines:
         machine.is_foreign, machine.job_s, machine.waits_s = True, job_s, waits_s
+        machine.in_bursts = whole and machine.task_cores <= 1.0
     tuning = replace(BY_SERVICE, deadline_ms=deadline_ms)
-    moves = Loop(machines, weights=weights, tuning=tuning, learns=True).run(600.0)
+    moves = Loop(machines, weights=weights, tuning=tuning, learns=True, robots=robots).run(600.0)
     assert len([at for at, _ in moves if at <= 300.0]) <= 4
     assert [at for at, _ in moves if at > 300.0] == []
+
+
+@pytest.mark.parametrize("is_foreign", [False, True])
+@pytest.mark.parametrize(("base", "deadline_ms"), [(0.7, 150.0), (0.7, 300.0), (0.9, 150.0)])
+def test_a_task_with_a_deadline_stays_where_machines_are_alike_and_somebody_else_works_on_each(
+    is_foreign: bool, base: float, deadline_ms: float
+) -> None:
+    """It has a fair share on both; its own thread on its owner takes nothing from it."""
+    machines = tuple(
+        Machine(name=name, cores=1.0, base=base, memory=0.2, threads=1.0, task_cores=0.28, job_s=0.1)
+        for name in ("edge1", "edge2")
+    )
+    for machine in machines:
+        machine.is_foreign = is_foreign
+    by_latency = replace(BY_SERVICE, deadline_ms=deadline_ms)
+    assert Loop(machines, weights=CPU_ONLY, tuning=by_latency, learns=True).run(120.0) == []
 
 
 def test_a_deadline_that_both_machines_keep_moves_nothing() -> None:

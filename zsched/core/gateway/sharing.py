@@ -63,13 +63,14 @@ class Shares:
 
         Args:
             task: which one.
-            profile: of a node that does not have the task. At its owner the task's own threads count among the
-                others, so the share is a little too small.
+            profile: of the node. Where the task runs its own threads are among the runnable ones, and no others.
             need_cores: of the task there. A task without a known lack of CPU runs this many threads, at least one.
             coming_cores: of other tasks that have just moved there and do not show yet.
         """
         if profile.runnable is None:
             return 0.0
         threads = self._threads.get(task, max(need_cores, 1.0))
-        fair = fair_share(profile.cpu_cores, threads, profile.runnable + coming_cores)
+        load = profile.worker(task)
+        own = 0.0 if load is None else (load.cpu_cores if load.wanted_cores is None else load.wanted_cores) or 0.0
+        fair = fair_share(profile.cpu_cores, threads, max(profile.runnable - own, 0.0) + coming_cores)
         return self._kept.get((task, profile.node), 1.0) * fair

@@ -13,6 +13,11 @@ from zsched.core.gateway.sharing import Shares, fair_share
 from zsched.core.values.profile import Profile, WorkerState
 
 
+def idle(node: str = "edge1", *, runnable: float = 8.0) -> Profile:
+    """Of a node where the task's worker is ready and does nothing."""
+    return profile(runnable=runnable, got=0.0, node=node)
+
+
 def profile(
     *, runnable: float | None = 8.0, got: float | None = 1.0, wanted: float | None = None, node: str = "edge1"
 ) -> Profile:
@@ -23,11 +28,11 @@ def profile(
 
 def test_by_its_need_until_it_was_seen_to_lack_cpu_then_by_its_threads() -> None:
     shares = Shares()
-    assert shares.at("merge", profile(), 2.0) == pytest.approx(4.0 * 2 / 10)
-    assert shares.at("merge", profile(), 0.3) == pytest.approx(4.0 / 9), "one thread at least"
+    assert shares.at("merge", idle("edge2"), 2.0) == pytest.approx(4.0 * 2 / 10)
+    assert shares.at("merge", idle("edge2"), 0.3) == pytest.approx(4.0 / 9), "one thread at least"
     assert not shares.learn("merge", profile(got=0.7)), "it has what it wants"
     assert shares.learn("merge", profile(got=2.0, wanted=4.0))
-    assert shares.at("merge", profile(node="edge2"), 0.3) == pytest.approx(4.0 * 4 / 12)
+    assert shares.at("merge", idle("edge2"), 0.3) == pytest.approx(4.0 * 4 / 12)
 
 
 @pytest.mark.parametrize("state", [WorkerState.STARTING, WorkerState.STOPPED, WorkerState.FAILED])
@@ -35,15 +40,15 @@ def test_a_worker_that_starts_again_tells_nothing_of_the_task_s_threads(state: W
     """It loads a model by one thread for some seconds; its four threads are as many afterwards."""
     shares = Shares()
     shares.learn("merge", profile(got=2.0, wanted=4.0))
-    before = shares.at("merge", profile(node="edge2"), 4.0), shares.at("merge", profile(), 4.0)
+    before = shares.at("merge", idle("edge2"), 4.0)
     starting = profile(got=0.1, wanted=1.0)
     load = replace(starting.workers[0], state=state)
     assert not shares.learn("merge", replace(starting, workers=(load,)))
-    assert before == (shares.at("merge", profile(node="edge2"), 4.0), shares.at("merge", profile(), 4.0))
+    assert before == shares.at("merge", idle("edge2"), 4.0)
 
 
 def test_what_comes_shares_as_well_and_nobody_counted_is_nothing() -> None:
-    assert Shares().at("merge", profile(), 2.0, coming_cores=6.0) == pytest.approx(4.0 * 2 / 16)
+    assert Shares().at("merge", idle("edge2"), 2.0, coming_cores=6.0) == pytest.approx(4.0 * 2 / 16)
     assert Shares().at("merge", profile(runnable=None), 2.0) == 0.0
     assert not Shares().learn("merge", profile(runnable=None, wanted=3.0))
 
@@ -53,10 +58,10 @@ def test_where_it_got_less_than_its_share_that_is_believed_of_this_machine_only(
     shares = Shares()
     shares.learn("merge", profile(got=0.5, wanted=4.0))
     fair = 4.0 * 4 / 12
-    assert shares.at("merge", profile(), 4.0) == pytest.approx(fair / 4)
-    assert shares.at("merge", profile(node="edge2"), 4.0) == pytest.approx(fair)
+    assert shares.at("merge", idle(), 4.0) == pytest.approx(fair / 4)
+    assert shares.at("merge", idle("edge2"), 4.0) == pytest.approx(fair)
     shares.learn("merge", profile(got=9.0, wanted=4.0))
-    assert shares.at("merge", profile(), 4.0) == pytest.approx(fair), "the newest counts, and no more than is fair"
+    assert shares.at("merge", idle(), 4.0) == pytest.approx(fair), "the newest counts, and no more than is fair"
 
 
 def test_the_same_again_is_no_news() -> None:
@@ -68,14 +73,30 @@ def test_the_same_again_is_no_news() -> None:
 def test_what_it_got_counts_as_a_part_of_what_as_many_threads_would_get_by_fairness() -> None:
     shares = Shares()
     shares.learn("merge", profile(got=0.25, wanted=0.95))
-    assert shares.at("merge", profile(node="edge2"), 0.25) == pytest.approx(4.0 / 9), "one thread, never less"
-    assert shares.at("merge", profile(), 0.25) == pytest.approx(4.0 / 9 / 2), "beside seven others half a core is fair"
+    assert shares.at("merge", idle("edge2"), 0.25) == pytest.approx(4.0 / 9), "one thread, never less"
+    assert shares.at("merge", idle(), 0.25) == pytest.approx(4.0 / 9 / 2), "beside seven others half a core is fair"
     shares.learn("merge", profile(runnable=2.0, got=2.0, wanted=4.0))
-    assert shares.at("merge", profile(runnable=0.0), 0.25) == pytest.approx(2.0), "the machine is the task's alone"
+    assert shares.at("merge", idle(runnable=0.0), 0.25) == pytest.approx(2.0), "the machine is the task's alone"
 
 
 def test_nothing_is_learnt_of_a_worker_whose_use_nobody_measured() -> None:
     assert not Shares().learn("merge", profile(got=None, wanted=3.0))
+
+
+@pytest.mark.parametrize("need_cores", [0.3, 2.0])
+def test_where_the_task_runs_it_does_not_count_among_the_others(need_cores: float) -> None:
+    """Else the same machine would give it less as soon as it has the task, and another one like it be better."""
+    alone = Shares().at("merge", idle(runnable=3.0), need_cores)
+    assert Shares().at("merge", profile(runnable=3.0 + 0.6, got=0.6), need_cores) == pytest.approx(alone)
+    assert Shares().at("merge", profile(runnable=0.2, got=0.6), 2.0) == pytest.approx(2.0), "there are no others"
+
+
+@given(st.floats(0.0, 100.0), st.floats(0.1, 20.0), st.floats(0.01, 4.0))
+def test_of_an_owner_that_is_short_the_share_is_what_it_gets(others: float, wanted: float, got: float) -> None:
+    shares, threads = Shares(), max(wanted, 1.0)
+    owner = profile(runnable=threads + others, got=min(got, fair_share(4.0, threads, others)), wanted=threads)
+    shares.learn("merge", owner)
+    assert shares.at("merge", owner, 0.3) == pytest.approx(owner.cores_of("merge"))
 
 
 @given(st.floats(0.1, 4096.0), st.floats(1.0, 1e4), st.floats(0.0, 1e6), st.floats(0.0, 1e3))
