@@ -21,6 +21,8 @@ SESSION_SUFFIX = ".zenoh.json5"
 """Of a worker's session file, ``<node>-<task>`` before it; other files of the worker stand beside it."""
 PID_SUFFIX = ".pid"
 ENVIRONMENT_SUFFIX = ".env"
+AUTHORITY_RECORD = "authority.json"
+"""What is in every authority's folder."""
 
 
 def beside_session(session: Path, suffix: str) -> Path:
@@ -76,7 +78,16 @@ def authority_folder(given: Path | None, env: Mapping[str, str], fleet: str) -> 
         return given
     if env.get("ZSCHED_AUTHORITY"):
         return Path(env["ZSCHED_AUTHORITY"])
-    return Path(env.get("XDG_DATA_HOME") or Path.home() / ".local" / "share") / "zsched" / "authority" / fleet
+    return _authorities(env) / fleet
+
+
+def authority_folders(env: Mapping[str, str]) -> list[Path]:
+    """All that lie below the user's own data, of whatever fleet."""
+    return [record.parent for record in sorted(_authorities(env).glob(f"*/{AUTHORITY_RECORD}"))]
+
+
+def _authorities(env: Mapping[str, str]) -> Path:
+    return Path(env.get("XDG_DATA_HOME") or Path.home() / ".local" / "share") / "zsched" / "authority"
 
 
 def _folder(given: Path | None, env: Mapping[str, str], own: str, systemd: str, system: Path, xdg: str) -> Path:

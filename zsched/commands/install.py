@@ -10,7 +10,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Final
@@ -19,6 +19,7 @@ from zsched.commands.common import CliError, say
 from zsched.commands.completion import SCRIPTS, script_file
 from zsched.core.values.struct import Struct
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_WOULD_CHANGE
+from zsched.paths import authority_folders
 
 UNITS: Final = ("zsched.service", "zsched-web.service", "zsched-renew.service", "zsched-renew.timer")
 DROP_INS: Final = ("zsched.service.d/10-user.conf", "zsched-web.service.d/10-user.conf")
@@ -156,10 +157,20 @@ def uninstall(root: Path, *, is_plan: bool) -> int:
     _print(f"left {piece.path}: not zsched's" for piece in pieces if piece.is_in_the_way())
     _reload(root)
     _print(["nothing of it was there"] if not ours else [])
-    kept = [path for path in ("/etc/zsched", "/var/lib/zsched", str(prefix)) if Path(path).exists()]
-    if _is_this_machine(root) and kept:
-        _print([f"what is left: {', '.join(kept)}, and the user {USER}; docs/guide/install.md says how it goes, too"])
+    if _is_this_machine(root):
+        _print(left([Path("/etc/zsched"), Path("/var/lib/zsched"), prefix], os.environ))
     return EXIT_OK
+
+
+def left(folders: Iterable[Path], env: Mapping[str, str]) -> list[str]:
+    """What an uninstallation leaves behind, of these folders and of this user's authorities, as it is told."""
+    kept = ", ".join([str(path) for path in folders if path.exists()])
+    said = [f"what is left: {kept}, and the user {USER}; docs/guide/install.md says how it goes, too"] if kept else []
+    return said + [
+        f"what is left: {folder}, the authority of fleet {folder.name}; without its key nobody joins that fleet, and "
+        "no certificate is renewed, so keep it as long as that fleet runs"
+        for folder in authority_folders(env)
+    ]
 
 
 def _check(prefix: Path, root: Path) -> None:

@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from zsched.pki.authority import Authority, Entry, Issued  # imports cryptography
 
 SCHEMA: Final = "zsched.pki.show/1"
-RECORD: Final = "authority.json"
-"""What is in every authority's folder."""
 PASSPHRASE: Final = "ZSCHED_AUTHORITY_PASSPHRASE"
 HANDED: Final = "passphrase"
 """Of systemd (``LoadCredential=``, systemd.exec(5)): a unit's environment is told to everybody on the machine."""
@@ -133,7 +131,7 @@ def begin_for(fleet: Fleet, node: str, given: Path | None, *, asks_passphrase: b
 def holds_authority(fleet: str, given: Path | None) -> Path | None:
     """The folder of a fleet's authority on this machine; ``None``: there is none."""
     folder = places.authority_folder(given, os.environ, fleet)
-    return folder if (folder / RECORD).exists() else None
+    return folder if (folder / places.AUTHORITY_RECORD).exists() else None
 
 
 def is_left_of(creation: str, fleet: str, node: str, given: Path | None, *, is_destroyed: bool = False) -> bool:

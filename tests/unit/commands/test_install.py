@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from zsched.cli import app
-from zsched.commands.install import SYSTEM_FOLDERS
+from zsched.commands.install import SYSTEM_FOLDERS, left
 
 REPO = Path(__file__).parents[3]
 
@@ -67,6 +67,18 @@ def test_uninstall_takes_away_all_of_it(prefix: Path, root: Path) -> None:
     assert folders - {*SYSTEM_FOLDERS, "usr", "usr/local"} == set(), "no empty folder is left either"
     assert "usr/local/share/man" in folders, "every system has it"
     assert "nothing of it was there" in run("uninstall", root).output
+
+
+def test_what_is_left_names_the_authoritys_key_that_a_fleet_needs(tmp_path: Path) -> None:
+    env, authority = {"XDG_DATA_HOME": str(tmp_path / "data")}, tmp_path / "data/zsched/authority/field"
+    assert left([tmp_path / "none"], env) == []
+    authority.mkdir(parents=True)
+    (tmp_path / "etc").mkdir()
+    (only,) = left([tmp_path / "etc", tmp_path / "none"], env)
+    assert f"{tmp_path}/etc, and the user" in only
+    (authority / "authority.json").touch()
+    (said,) = left([tmp_path / "none"], env)
+    assert f"{authority}, the authority of fleet field" in said
 
 
 def test_uninstall_leaves_a_folder_with_somebody_elses_file(prefix: Path, root: Path) -> None:
