@@ -69,6 +69,8 @@ class Machine:
     own_speed: float = 1.0
     """The task is so many times as quick there as the benchmark says."""
     task_mb: float = 0.0
+    hidden_mb: float = 0.0
+    """Beside that, and not in its worker's figure."""
     shows_worker: bool = True
     job_s: float | None = None
     """Its worker tells of its jobs, of so many CPU seconds at speed 1; ``None``: it does not."""
@@ -84,11 +86,17 @@ class Machine:
     """The task gets no more there, though the machine's figures say that more is free."""
     threads: float | None = None
     """Of others, that want to run; ``None``: nobody counts."""
+    takes_turns: bool = False
+    """Its one thread waits for its turn among them: a job takes longer there, and wants to run all that time."""
+    frees_at: float = math.inf
+    """From then on nobody else is there."""
     works_until: float = math.inf
     """From then on its worker has nothing to do."""
 
     def sample(self, now: float, rng: Random, *, is_owner: bool) -> tuple[DeviceSample, LinkSample]:
         step = self.step(now)
+        if now >= self.frees_at:
+            self.base, self.threads = 0.0, None if self.threads is None else 0.0
         bases = (self.base, self.base if self.memory is None else self.memory)
         cpu, memory = (base + step + rng.uniform(-self.noise, self.noise) for base in bases)
         rest = max(cpu, 0.0) * self.cores
@@ -97,24 +105,31 @@ class Machine:
         room = max(self.cores - rest, 0.5)
         takes = min(needs, room, self.most_cores)
         is_short = takes < needs
+        wanted = math.ceil(needs) if is_short else None
+        runnable = math.ceil(needs) if is_short else takes
+        if self.takes_turns and needs > 0.0:
+            takes, runnable = self._in_turns(needs, self.cores - rest)
+            is_short, wanted = takes < needs, 1.0 if runnable >= 0.9 else None
         holds = self.task_mb if is_owner else 0.0
         load = load_of(
             cpu_cores=takes if self.shows_worker else None,
             memory_mb=holds if self.shows_worker else None,
-            wanted_cores=math.ceil(needs) if self.shows_worker and is_short else None,
+            wanted_cores=wanted if self.shows_worker else None,
+            runnable=runnable if self.shows_worker else None,
         )
-        self._work(now, needs, takes)
+        self._work(now, needs, takes, runnable)
         if self.in_bursts:
-            load = replace(load, cpu_cores=self._burst(takes, min(room, self.most_cores, 1.0)))
-            takes = load.cpu_cores or 0.0
+            takes = self._burst(takes, min(room, self.most_cores, 1.0))
+            runnable = runnable if is_short else takes
+            load = replace(load, cpu_cores=takes, runnable=runnable)
         device = DeviceSample(
             cpu_cores=self.cores,
             cpu_used_cores=min(rest + takes, self.cores),
             memory_mb=MEMORY_MB,
-            memory_used_mb=min(max(memory, 0.0) * MEMORY_MB + holds, MEMORY_MB),
+            memory_used_mb=min(max(memory, 0.0) * MEMORY_MB + holds + (self.hidden_mb if is_owner else 0.0), MEMORY_MB),
             workers=(load,),
             speed=self.speed,
-            runnable=None if self.threads is None else self.threads + (math.ceil(needs) if is_short else takes),
+            runnable=None if self.threads is None else self.threads + runnable,
         )
         return device, LinkSample(source=LinkSource.NL80211, rssi_dbm=self.signal_dbm - 40.0 * step)
 
@@ -124,6 +139,15 @@ class Machine:
         """(seconds of an answer, answers per second) of a foreign worker."""
         self._done = self._undone = self._now = 0.0
         self._owed_s, self._is_at_work = 0.0, False
+
+    def _in_turns(self, needs: float, free_cores: float) -> tuple[float, float]:
+        """(cores in use, threads that run or wait): while it has a job its thread runs at a fair share."""
+        assert self.job_s is not None
+        assert self.threads is not None
+        rate = min(max(free_cores, self.cores / max(self.threads + 1.0, self.cores)), 1.0)
+        cpu_s = self.job_s / self._speed
+        done_hz = min(needs / cpu_s, 1.0 / (self.waits_s + cpu_s / rate))
+        return done_hz * cpu_s, done_hz * cpu_s / rate
 
     def _burst(self, mean_cores: float, most_cores: float) -> float:
         """Cores in use by a worker that does whole jobs, by ``most_cores`` each, and uses so much on the mean."""
@@ -145,7 +169,7 @@ class Machine:
         """Of the task."""
         return self.speed * self.own_speed
 
-    def _work(self, now: float, needs: float, takes: float) -> None:
+    def _work(self, now: float, needs: float, takes: float, runnable: float) -> None:
         """One worker of one thread, which skips what it cannot do; jobs are a fluid here, and told in whole ones."""
         before_s, self._now = self._now, now
         elapsed_s = max(now - before_s, 0.0)
@@ -162,6 +186,8 @@ class Machine:
         before, self._done = int(self._done), self._done + elapsed_s * done_hz
         self._undone += elapsed_s * max(wanted_hz - done_hz, 0.0)
         jobs, time_s = int(self._done) - before, max(1.0 / done_hz, cpu_s) if takes < needs else cpu_s
+        if self.takes_turns:
+            time_s = runnable / done_hz
         self.answers = (self.waits_s + time_s, done_hz)
         if self.is_foreign:
             self.told = None
@@ -171,10 +197,10 @@ class Machine:
             at_s=now,
             done=word.done + jobs,
             skipped=int(self._undone),
-            time_s=word.time_s + jobs * time_s,
+            time_s=word.time_s + jobs * (time_s + (self.waits_s if self.takes_turns else 0.0)),
             cpu_s=word.cpu_s + jobs * cpu_s,
             wait_s=(word.wait_s or 0.0) + jobs * (time_s - cpu_s),
-            age_s=(word.age_s or 0.0) + jobs * time_s,
+            age_s=(word.age_s or 0.0) + jobs * (time_s + (self.waits_s if self.takes_turns else 0.0)),
         )
 
 
@@ -803,6 +829,80 @@ def test_a_task_with_a_deadline_stays_where_machines_are_alike_and_somebody_else
         machine.is_foreign = is_foreign
     by_latency = replace(BY_SERVICE, deadline_ms=deadline_ms)
     assert Loop(machines, weights=CPU_ONLY, tuning=by_latency, learns=True).run(120.0) == []
+
+
+@pytest.mark.parametrize("is_foreign", [False, True])
+@pytest.mark.parametrize(
+    ("cores", "base", "threads", "task_cores", "job_s", "waits_s", "deadline_ms"),
+    [
+        (1.0, 1.0, 1.0, 0.4, 0.1, 0.0, 200.0),
+        (1.0, 0.7, 1.0, 0.28, 0.1, 0.0, 150.0),
+        (2.0, 1.0, 4.0, 0.3, 0.1, 0.0, 300.0),
+        (1.0, 1.0, 1.0, 0.6, 0.06, 0.02, None),
+        (1.0, 1.0, 1.0, 0.6, 0.06, 0.04, None),
+        (1.0, 1.0, 1.0, 0.6, 0.06, 0.04, 200.0),
+    ],
+)
+def test_a_task_that_waits_for_its_turn_comes_to_rest_where_machines_are_alike(
+    is_foreign: bool,
+    cores: float,
+    base: float,
+    threads: float,
+    task_cores: float,
+    job_s: float,
+    waits_s: float,
+    deadline_ms: float | None,
+) -> None:
+    """A wait in the queue is no other's thread, and what it gets between its pauses is all that it will get there."""
+    machine = Machine(
+        name="edge1", cores=cores, base=base, memory=0.2, threads=threads, task_cores=task_cores, takes_turns=True
+    )
+    machine = replace(machine, job_s=job_s, waits_s=waits_s, is_foreign=is_foreign)
+    by_latency = replace(BY_SERVICE, deadline_ms=deadline_ms)
+    loop = Loop((machine, replace(machine, name="edge2")), weights=CPU_ONLY, tuning=by_latency, learns=True)
+    moves = loop.run(150.0)
+    assert len(moves) <= 1
+    assert [at for at, _ in moves if at > 30.0] == []
+
+
+@pytest.mark.parametrize("is_foreign", [False, True])
+@pytest.mark.parametrize("task_cores", [0.15, 0.3])
+@pytest.mark.parametrize("deadline_ms", [150.0, 250.0])
+def test_jobs_that_a_load_held_up_are_no_reason_to_leave_when_it_has_ended(
+    is_foreign: bool, task_cores: float, deadline_ms: float
+) -> None:
+    """They count in the mean for some seconds; the other machine is free at the same moment, and as quick."""
+    machine = Machine(name="edge1", cores=1.0, base=1.0, memory=0.2, threads=8.0, frees_at=30.0, takes_turns=True)
+    machine = replace(machine, task_cores=task_cores, job_s=0.1, is_foreign=is_foreign)
+    by_latency = replace(BY_SERVICE, deadline_ms=deadline_ms)
+    loop = Loop((machine, replace(machine, name="edge2")), weights=CPU_ONLY, tuning=by_latency, learns=True)
+    assert loop.run(60.0) == []
+
+
+@pytest.mark.parametrize("base", [0.7, 1.0])
+def test_a_task_whose_worker_somebody_else_starts_rests_where_machines_are_alike(base: float) -> None:
+    machine = Machine(
+        name="edge1", cores=1.0, base=base, memory=0.2, threads=1.0, task_cores=0.28, job_s=0.1, takes_turns=True
+    )
+    machine = replace(machine, shows_worker=False)
+    by_latency = replace(BY_SERVICE, deadline_ms=150.0)
+    loop = Loop(
+        (machine, replace(machine, name="edge2")),
+        weights=CPU_ONLY,
+        tuning=by_latency,
+        learns=True,
+        demand=Demand(cpu_cores=0.28),
+    )
+    assert loop.run(150.0) == []
+
+
+@pytest.mark.parametrize("hidden_mb", [1400.0, 1900.0])
+def test_memory_that_a_worker_holds_and_does_not_show_counts_once(hidden_mb: float) -> None:
+    """A GPU's on a board where that is the machine's memory; the fleet file says what the task needs of it."""
+    machine = Machine(name="edge1", base=0.2, task_cores=0.4, task_mb=100.0, hidden_mb=hidden_mb)
+    machines = (machine, replace(machine, name="edge2"))
+    demand = Demand(cpu_cores=0.4, memory_mb=100.0 + hidden_mb)
+    assert Loop(machines, tuning=BY_SERVICE, learns=True, demand=demand).run(60.0) == []
 
 
 def test_a_deadline_that_both_machines_keep_moves_nothing() -> None:

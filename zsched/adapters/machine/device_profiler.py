@@ -272,7 +272,8 @@ class _ProcessTrees:
         before = self._seen.get(task)
         cpu_cores = None if before is None else _cores(before[1], tree, now - before[0], now)
         appetite = self._appetites.setdefault(task, Appetite())
-        if not self._is_at_rest(task, now):
+        is_looked_at = not self._is_at_rest(task, now)
+        if is_looked_at:
             appetite.look(self._threads(tree), now)
             self._looked_at[task] = now
         if cpu_cores is None or cpu_cores >= RESTING_CORES or appetite.wanted_cores() is not None:
@@ -286,6 +287,7 @@ class _ProcessTrees:
             cpu_cores=cpu_cores,
             memory_mb=sum(times.rss_mb for times in tree.values()),
             wanted_cores=appetite.wanted_cores(),
+            runnable=appetite.runnable if is_looked_at else cpu_cores,  # at rest it hardly runs, and waits for nothing
         )
 
     def _is_at_rest(self, task: TaskId, now: float) -> bool:

@@ -32,8 +32,18 @@ RECENT_S = 60.0
 """Older figures say nothing of the machine to which a task has come: the task may have changed since."""
 SAME_JOB_RATIO = 0.8
 """CPU times per answer count as the same up to this quotient: both are means of some answers."""
+LAGS_S = 4.0
+"""Time constant of the age that is foretold: jobs' ages are means that follow later than the machine's figures."""
 SHORT_RATIO = 0.9
 """A task that gets a smaller part of its forecast has a shortfall on that machine."""
+
+
+class _Foretold(Struct, frozen=True):
+    """How long a task's jobs were to take on a machine, on the mean of the last seconds."""
+
+    node: NodeId
+    age_s: float
+    at: float
 
 
 class _Shortfall(Struct, frozen=True):
@@ -87,6 +97,7 @@ class Demands:
     def __init__(self) -> None:
         self._known: dict[TaskId, _Known] = {}
         self._shortfalls: dict[tuple[TaskId, NodeId], _Shortfall] = {}
+        self._foretold: dict[TaskId, _Foretold] = {}
         self._speeds = TaskSpeeds()
         self._spending: dict[TaskId, Spending] = {}
         """What the task's worker has spent on answers where the task is."""
@@ -161,13 +172,14 @@ class Demands:
         else:
             found = _with_job(found, load, speed, is_new=is_new)
         self._known[task] = found
-        is_seen = not is_new and self._note_shortfall(task, profile, load, found, fair_cores, heard)
+        is_seen = not is_new and self._note_shortfall(task, profile, load, found, fair_cores, heard, now)
         return is_seen or (found.work, found.memory_mb, found.job) != (known.work, known.memory_mb, known.job)
 
     def forget(self, task: TaskId) -> None:
         """Know nothing of a task that is no more: one of the same name that comes later is another one (0043)."""
         self._known.pop(task, None)
         self._spending.pop(task, None)
+        self._foretold.pop(task, None)
         self._speeds.forget(task)
         self._shortfalls = {key: seen for key, seen in self._shortfalls.items() if key[0] != task}
 
@@ -243,6 +255,7 @@ class Demands:
         found: _Known,
         fair_cores: float,
         heard: Heard | None,
+        now: float,
     ) -> bool:
         """Remember that the task gets less on a machine than forecast, or no longer does; whether that has changed."""
         job, company = found.job, Company.of(task, profile)
@@ -255,12 +268,25 @@ class Demands:
         foreseen = min(free / need, 1.0 if most is None else most / need, 1.0)
         is_lacking = foreseen > 0.0 and _is_told(load) and is_short(load)
         share = min(load.cpu_cores / need / foreseen, 1.0) if is_lacking else 1.0
-        stretch = max(age_s / max(job.age_s(speed, max(free, fair_cores)), 1e-9), 1.0)
+        foretold_s = self._foretell(task, profile.node, job.age_s(speed, max(free, fair_cores)), now)
+        stretch = max(age_s / max(foretold_s, 1e-9), 1.0)
         before = self._shortfalls.pop((task, profile.node), None)
         if share >= SHORT_RATIO and stretch <= 1.0 / SHORT_RATIO:
             return before is not None
         self._shortfalls[task, profile.node] = _Shortfall(share, stretch, company)
         return before != self._shortfalls[task, profile.node]
+
+    def _foretell(self, task: TaskId, node: NodeId, age_s: float, now: float) -> float:
+        """The age that jobs' mean age is compared with: this one, or what was foretold of those that ended before.
+
+        When a load ends the jobs that it held up count in their mean for some seconds.
+        """
+        known = self._foretold.get(task)
+        if known is None or known.node != node:
+            known = _Foretold(node, age_s, now)
+        mean_s = age_s + (known.age_s - age_s) * math.exp(-max(now - known.at, 0.0) / LAGS_S)
+        self._foretold[task] = _Foretold(node, mean_s, now)
+        return max(age_s, mean_s)
 
     def job(self, task: TaskId) -> JobNeed | None:
         """One job's need; ``None``: its worker has never reported any."""

@@ -10,8 +10,11 @@ both promise more than they give would pass the task back and forth for ever.
 
 from __future__ import annotations
 
+from zsched.core.gateway.company import is_full
+from zsched.core.gateway.demand import is_short
+from zsched.core.gateway.job_need import CALM_WAIT_RATIO
 from zsched.core.values.model import NodeId, TaskId
-from zsched.core.values.profile import Profile, WorkerState
+from zsched.core.values.profile import Profile, WorkerLoad, WorkerState
 
 
 def fair_share(capacity: float, threads: float, others: float) -> float:
@@ -44,10 +47,11 @@ class Shares:
         load = profile.worker(task)
         if load is None or load.state is not WorkerState.READY:
             return False
-        if load.wanted_cores is None or load.cpu_cores is None or profile.runnable is None:
+        if load.cpu_cores is None or profile.runnable is None or not (_is_hungry(load) or _is_held_up(profile, load)):
             return False
-        threads = max(load.wanted_cores, 1.0)
-        fair = fair_share(profile.cpu_cores, threads, max(profile.runnable - threads, 0.0))
+        threads = max(threads_of(load) if load.wanted_cores is None else load.wanted_cores, 1.0)
+        own = threads if load.runnable is None else threads_of(load)
+        fair = fair_share(profile.cpu_cores, threads, max(profile.runnable - own, 0.0))
         kept = min(load.cpu_cores / fair, 1.0)
         before = self._threads.get(task), self._kept.get((task, profile.node))
         self._threads[task], self._kept[task, profile.node] = threads, kept
@@ -71,6 +75,32 @@ class Shares:
             return 0.0
         threads = self._threads.get(task, max(need_cores, 1.0))
         load = profile.worker(task)
-        own = 0.0 if load is None else (load.cpu_cores if load.wanted_cores is None else load.wanted_cores) or 0.0
+        own = 0.0 if load is None else threads_of(load)
         fair = fair_share(profile.cpu_cores, threads, max(profile.runnable - own, 0.0) + coming_cores)
         return self._kept.get((task, profile.node), 1.0) * fair
+
+
+def _is_hungry(load: WorkerLoad) -> bool:
+    """Whether some of its threads always want to run."""
+    return load.wanted_cores is not None
+
+
+def _is_held_up(profile: Profile, load: WorkerLoad) -> bool:
+    """Whether it leaves jobs undone for waits for a CPU, though none of its threads always wants to run."""
+    jobs = load.jobs
+    if jobs is None or jobs.wait_s is None or not is_full(profile):
+        return False
+    return is_short(load) and jobs.wait_s > CALM_WAIT_RATIO * jobs.time_s
+
+
+def threads_of(load: WorkerLoad) -> float:
+    """A worker's threads that run or wait, on the mean, >= 0.
+
+    Of one that somebody else started only its jobs tell (Little's law: how many come, times how long each stays).
+    """
+    if load.runnable is not None:
+        return max(load.runnable, load.cpu_cores or 0.0)  # threads that live for a moment are missed
+    if load.cpu_cores is not None:
+        return load.cpu_cores if load.wanted_cores is None else load.wanted_cores
+    jobs = load.jobs
+    return 0.0 if jobs is None else jobs.done_hz * (jobs.cpu_s + (jobs.wait_s or 0.0))

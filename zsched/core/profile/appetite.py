@@ -27,6 +27,8 @@ class Appetite:
         self._times: Mapping[Thread, tuple[float, float]] = {}
         self._shares: dict[Thread, tuple[Ewma, Ewma]] = {}
         """{thread: share of the time that it ran, and that it ran or waited}."""
+        self.runnable: float | None = None
+        """How many of them ran or waited between the last two looks, on the mean; ``None``: there were not two."""
 
     def look(self, times: Mapping[Thread, tuple[float, float]], now: float) -> None:
         """Take in how long every thread has run, and has waited to run, in seconds since it began.
@@ -38,6 +40,7 @@ class Appetite:
         if elapsed_s <= 0.0:
             return
         shares = {}
+        spent_s = 0.0
         for thread, (run_s, wait_s) in times.items():
             if thread not in self._times:
                 continue
@@ -46,6 +49,8 @@ class Appetite:
             ran, wanted = shares[thread] = known or (_from_nothing(self._at), _from_nothing(self._at))
             ran.update(max(run_s - run_before_s, 0.0) / elapsed_s, now)
             wanted.update(max(run_s + wait_s - run_before_s - wait_before_s, 0.0) / elapsed_s, now)
+            spent_s += max(run_s + wait_s - run_before_s - wait_before_s, 0.0)
+        self.runnable = spent_s / elapsed_s if shares else None
         self._at, self._times, self._shares = now, times, shares
 
     def wanted_cores(self) -> float | None:

@@ -128,6 +128,7 @@ class Profiler:
         self._signals: dict[NodeId | None, SignalFilter] = {}
         self._worker_cpu: dict[TaskId, Ewma] = {}
         self._worker_memory: dict[TaskId, Ewma] = {}
+        self._worker_runnable: dict[TaskId, Ewma] = {}
         self._spent_s: dict[TaskId, float] = {}
         self._jobs: dict[TaskId, JobMeter] = {}
         self._device: DeviceSample | None = None
@@ -148,7 +149,7 @@ class Profiler:
         None begins anew: until a worker's share had risen again, the worker would look like other programs' load.
         """
         self._timing = timing
-        shares = (*self._worker_cpu.values(), *self._worker_memory.values())
+        shares = (*self._worker_cpu.values(), *self._worker_memory.values(), *self._worker_runnable.values())
         for mean in (self._cpu, self._memory, self._pressure, self._runnable, *shares):
             mean.tau_s = timing.smoothing_s
         for mean in self._gauges.values():
@@ -170,7 +171,11 @@ class Profiler:
             for task in self._spent_s:
                 self._spent_s[task] += elapsed_s * (_possible(worker_cpu.get(task), MAX_CPU_CORES) or 0.0)
         _absorb_known(self._pressure, device.cpu_pressure, 1.0, now)
-        _absorb_known(self._runnable, device.runnable, MAX_RUNNABLE, now)
+        worker_runnable = {load.task: load.runnable for load in device.workers}
+        if _possible(device.runnable, MAX_RUNNABLE) is None:  # nobody counts any more
+            self._runnable.value = None
+            self._worker_runnable.clear()
+        _absorb_use(self._runnable, self._worker_runnable, device.runnable, worker_runnable, MAX_RUNNABLE, now)
         self._absorb_gauges(possible(device.gauges), now)
         self._links = tuple(self._link(sample, now) for sample in links)
         for meter in self._jobs.values():
@@ -211,6 +216,7 @@ class Profiler:
 
     def _worker(self, load: WorkerLoad) -> WorkerLoad:
         cpu, memory = self._worker_cpu.get(load.task), self._worker_memory.get(load.task)
+        runnable = self._worker_runnable.get(load.task)
         meter = self._jobs.get(load.task)
         return WorkerLoad(
             task=load.task,
@@ -218,6 +224,7 @@ class Profiler:
             cpu_cores=None if cpu is None else cpu.value,
             memory_mb=None if memory is None else memory.value,
             wanted_cores=_possible(load.wanted_cores, MAX_CPU_CORES),
+            runnable=None if runnable is None else runnable.value,
             jobs=None if meter is None else meter.value,
             unended_s=None if meter is None else meter.unended_s(self._sampled_at),
         )
@@ -294,6 +301,7 @@ class Profiler:
                 cpu_cores=loads[task].cpu_cores if task in loads else None,
                 memory_mb=loads[task].memory_mb if task in loads else None,
                 wanted_cores=loads[task].wanted_cores if task in loads else None,
+                runnable=loads[task].runnable if task in loads else None,
                 reason=reasons.get(task, ""),
                 jobs=loads[task].jobs if task in loads else None,
                 renewal=renewals.get(task, Renewal.NONE),

@@ -134,7 +134,13 @@ def score(
         if profile is None:
             refused.append((candidate, "no fresh profile"))
             continue
+        load = profile.worker(spec.name)
+        # what an owner that is short gets is measured
+        is_owner = candidate == allocation.owner
+        is_measured = is_owner and load is not None and is_short(load)
         demand, unseen = gateway.demand(spec, profile), _unseen(spec, profile, bookings, gateway)
+        if is_owner and form is ScoreForm.SERVICE:
+            demand = _as_held(demand, load)
         use = _predicted(spec, allocation, profile, demand, unseen)
         gauges = _readings(spec, allocation, profile, gateway)
         reason = _refusal(spec, allocation, profile, demand, use, gauges)
@@ -145,9 +151,6 @@ def score(
         if link is not None and not link.is_reached:
             unreachable.append(candidate)
             continue
-        load = profile.worker(spec.name)
-        # what an owner that is short gets is measured
-        is_measured = candidate == allocation.owner and load is not None and is_short(load)
         fair = gateway.share(spec, profile, demand.cpu_cores, unseen.cpu_cores)
         least = 0.0 if is_measured else fair
         network_s = away_s.get(candidate, 0.0)
@@ -237,6 +240,15 @@ class _Use(Struct, frozen=True):
     memory_mb: float | None
 
 
+def _as_held(demand: Demand, load: WorkerLoad | None) -> Demand:
+    """The demand on its owner, which has the task's memory in use, whatever the fleet file says that the task needs.
+
+    Not all that it holds shows as its own (a GPU's, where that is the machine's, or files that it maps). The rest shows
+    as somebody else's, and by the file's figure it would count once more: no machine could keep such a task.
+    """
+    return demand if load is None or load.memory_mb is None else replace(demand, memory_mb=load.memory_mb)
+
+
 def _predicted(spec: TaskSpec, allocation: Allocation, profile: Profile, demand: Demand, unseen: Demand) -> _Use:
     cpu, memory = profile.cpu_used_cores, profile.memory_used_mb
     own = _own(spec, allocation, profile, demand)
@@ -312,6 +324,8 @@ def _refusal(
     if not is_owner and not may_get(spec, state):
         return f"worker {state}{why}"
     used = use.memory_mb
+    if spec.demand.memory_mb > profile.memory_mb:
+        return f"needs {spec.demand.memory_mb:.0f} MiB, has {profile.memory_mb:.0f} in all"
     if used is not None and used > profile.memory_mb:
         return f"needs {demand.memory_mb:.0f} MiB, has {max(profile.memory_mb - used + demand.memory_mb, 0.0):.0f} free"
     return _beyond_limits(spec, profile, gauges, is_owner=is_owner)

@@ -135,6 +135,8 @@ class WorkerLoad(Struct, frozen=True, kw_only=True):
     unended_s: float | None = None
     """For how long it has had work without a break, and has ended no job; ``None``: not for long, or it does not
     report its jobs."""
+    runnable: float | None = None
+    """How many of its threads run or wait for a CPU, on the mean; ``None``: unknown."""
     spent_s: float | None = None
     """CPU seconds that it has used since some moment, if it is an owner's whose answers are timed; else ``None``."""
 
@@ -146,6 +148,7 @@ class WorkerLoad(Struct, frozen=True, kw_only=True):
         check_range("worker.cpu_cores", self.cpu_cores, 0.0, MAX_CPU_CORES)
         check_range("worker.memory_mb", self.memory_mb, 0.0, MAX_MEMORY_MB)
         check_range("worker.wanted_cores", self.wanted_cores, 0.0, MAX_CPU_CORES)
+        check_range("worker.runnable", self.runnable, 0.0, MAX_RUNNABLE)
         check_range("worker.spent_s", self.spent_s, 0.0, MAX_SUM)
 
 

@@ -257,6 +257,22 @@ def test_a_thread_that_always_wants_to_run_wants_a_core_and_one_that_rests_what_
     assert seen[-1] == pytest.approx(1.2, abs=0.02)
 
 
+def test_a_worker_tells_how_many_of_its_threads_run_or_wait_also_those_with_pauses(
+    tmp_path: Path, clock: Clock
+) -> None:
+    profiler = machine(tmp_path, **process(10, 1, own=0), **queued(10, (0.0, 0.0), (0.0, 0.0)))
+    workers = {"merge": (WorkerState.READY, 10)}
+    assert profiler.sample(workers).workers[0].runnable is None
+    for step in range(1, 20):
+        clock.now += 0.2
+        write(tmp_path, process(10, 1, own=10 * step) | queued(10, (0.1 * step, 0.04 * step), (0.0, 0.02 * step)))
+        assert profiler.sample(workers).workers[0].runnable == pytest.approx(0.8)
+    for _ in range(3):
+        clock.now += 0.2
+        load = profiler.sample(workers).workers[0]
+    assert load.runnable == load.cpu_cores == 0.0, "it rests"
+
+
 def test_a_worker_with_pauses_wants_nothing_beyond_what_it_uses(tmp_path: Path, clock: Clock) -> None:
     """Jobs of 0.6 s a second, half of it in the queue."""
     profiler = machine(tmp_path, **process(10, 1, own=0), **queued(10, (0.0, 0.0)))

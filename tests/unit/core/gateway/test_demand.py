@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -467,6 +468,23 @@ def test_jobs_that_take_longer_than_foreseen_are_remembered_though_all_of_them_a
     for now in (0.0, EVERY_S):
         demands.learn("merge", slow, now)
     assert demands.experience("merge", slow) == pytest.approx((1.0, 1.5))
+
+
+def test_jobs_that_a_load_held_up_tell_nothing_of_the_machine_when_it_has_ended() -> None:
+    """Their mean age follows within seconds, the machine's figures at once."""
+    demands, lag_s, calm_s, held_up_s = Demands(), 1.5, 0.1, 0.4
+    for step in range(60):
+        now, ended_for_s = 0.5 * step, 0.5 * (step - 20)
+        is_over = ended_for_s >= 0.0
+        age_s = calm_s + (held_up_s - calm_s) * math.exp(-ended_for_s / lag_s) if is_over else held_up_s
+        jobs = Jobs(time_s=age_s, cpu_s=0.1, wait_s=age_s - 0.1, age_s=age_s, done_hz=2.0, wanted_hz=2.0)
+        one = profile(0.2, cpu=0.3 if is_over else 4.0, jobs=jobs)
+        demands.learn("merge", one, now, fair_cores=4.0 if is_over else 0.25)
+        assert demands.experience("merge", one) == (1.0, 1.0)
+    jobs = Jobs(time_s=0.3, cpu_s=0.1, wait_s=0.2, age_s=0.3, done_hz=2.0, wanted_hz=2.0)
+    slow = profile(0.2, cpu=0.3, jobs=jobs)
+    demands.learn("merge", slow, 30.0, fair_cores=4.0)
+    assert demands.experience("merge", slow)[1] == pytest.approx(3.0, rel=0.1), "which nothing explains"
 
 
 @pytest.mark.parametrize(

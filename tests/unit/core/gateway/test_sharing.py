@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from support.profiles import load_of, profile_of
 from zsched.core.gateway.sharing import Shares, fair_share
-from zsched.core.values.profile import Profile, WorkerState
+from zsched.core.values.profile import Jobs, Profile, WorkerLoad, WorkerState
 
 
 def idle(node: str = "edge1", *, runnable: float = 8.0) -> Profile:
@@ -89,6 +89,40 @@ def test_where_the_task_runs_it_does_not_count_among_the_others(need_cores: floa
     alone = Shares().at("merge", idle(runnable=3.0), need_cores)
     assert Shares().at("merge", profile(runnable=3.0 + 0.6, got=0.6), need_cores) == pytest.approx(alone)
     assert Shares().at("merge", profile(runnable=0.2, got=0.6), 2.0) == pytest.approx(2.0), "there are no others"
+
+
+def of(load: WorkerLoad, runnable: float, *, used: float = 4.0) -> Profile:
+    return profile_of("edge1", cpu_used_cores=used, workers=(load,), runnable=runnable)
+
+
+TOLD = Jobs(time_s=0.2, cpu_s=0.1, wait_s=0.1, done_hz=4.0, wanted_hz=4.0)
+
+
+@pytest.mark.parametrize(
+    "load",
+    [
+        load_of(cpu_cores=0.4, runnable=0.8),
+        load_of(cpu_cores=0.8, runnable=0.3),  # its children end too soon to be counted
+        load_of(jobs=TOLD),  # somebody else has started it
+    ],
+)
+def test_its_threads_that_wait_are_no_others_either(load: WorkerLoad) -> None:
+    assert Shares().at("merge", of(load, 3.8), 0.4) == Shares().at("merge", idle(runnable=3.0), 0.4)
+
+
+def test_what_a_task_gets_that_lacks_cpu_between_its_pauses_is_believed_of_this_machine() -> None:
+    """No thread of it always wants to run: it waits for other things in between."""
+    jobs = Jobs(time_s=0.14, cpu_s=0.06, wait_s=0.06, done_hz=7.0, wanted_hz=10.0)
+    held_up = of(load_of(cpu_cores=0.4, runnable=0.84, jobs=jobs), 8.84)
+    shares = Shares()
+    assert shares.learn("merge", held_up)
+    assert shares.at("merge", held_up, 0.6) == pytest.approx(0.4)
+    assert shares.at("merge", idle(), 0.6) == pytest.approx(0.4)
+    for calm in (replace(jobs, wait_s=0.005), replace(jobs, wait_s=None), replace(jobs, wanted_hz=7.0)):
+        assert not Shares().learn("merge", of(load_of(cpu_cores=0.4, runnable=0.84, jobs=calm), 8.84))
+    assert not Shares().learn("merge", of(load_of(cpu_cores=0.4, runnable=0.84, jobs=jobs), 8.84, used=3.0)), (
+        "others leave it a CPU"
+    )
 
 
 @given(st.floats(0.0, 100.0), st.floats(0.1, 20.0), st.floats(0.01, 4.0))

@@ -24,6 +24,17 @@ def test_a_thread_that_runs_or_waits_all_the_time_wants_a_core_and_the_others_wh
     assert looked(20).wanted_cores() == pytest.approx(1.1, abs=0.01)
 
 
+def test_who_runs_or_waits_counts_as_of_the_last_look() -> None:
+    assert Appetite().runnable is None
+    assert looked(1).runnable is None, "since when nobody knows"
+    assert looked(2).runnable == pytest.approx(1.1)
+    assert looked(20).runnable == pytest.approx(1.1)
+    assert looked(20, with_new=True).runnable == pytest.approx(1.1)
+    appetite = looked(20)
+    appetite.look({HUNGRY: (11.0, 10.0)}, 22.0)
+    assert appetite.runnable == pytest.approx(0.5), "one has ended, and the other one rests since a second"
+
+
 def test_a_thread_that_has_been_busy_for_a_moment_wants_no_core_yet() -> None:
     assert looked(1).wanted_cores() is None
     assert looked(1 + round(APPETITE_S)).wanted_cores() is None

@@ -492,6 +492,24 @@ def test_a_profile_carries_the_trend_of_a_radio_and_none_of_a_cable() -> None:
     assert links[1].trend_db_s is None
 
 
+def test_the_threads_of_a_worker_are_smoothed_in_step_with_those_of_its_machine() -> None:
+    """So the rest, all others, stays what it is while the worker starts, works and ends."""
+    profiler = make_profiler()
+    for step, own in enumerate((None, None, 0.0, 2.0, 1.0, 3.0, 0.0, None, None)):
+        load = load_of(runnable=own)
+        sample = replace(device(), runnable=4.0 + (own or 0.0), workers=() if own is None else (load,))
+        profiler.absorb(sample, (), now=0.2 * step)
+        profiler.owe(0.2 * step)
+        told = taken(profiler, 0.2 * step + TIMING.beat_s)
+        mine = told.worker("merge")
+        assert told.runnable is not None
+        if mine is not None and mine.runnable is not None:
+            assert told.runnable - mine.runnable == pytest.approx(4.0)
+    profiler.absorb(replace(device(), workers=(load_of(runnable=2.0),)), (), now=9.0)
+    load = taken(profiler, 9.0).worker("merge")
+    assert load is None or load.runnable is None, "nobody counts the machine's"
+
+
 def test_who_wants_to_run_is_smoothed_and_unknown_at_once_where_nobody_counts() -> None:
     profiler = make_profiler()
     for at_s, runnable in ((0.0, 2.0), (TIMING.smoothing_s, 10.0)):

@@ -108,7 +108,7 @@ def test_a_full_machine_is_worth_the_fair_share_of_it_to_all_but_an_owner_that_l
     agreed = allocation_of(7, epoch=3, tuning=Tuning(weights=CPU, score=ScoreForm.SERVICE))
     full = [
         replace(profile(name, cpu=4.0, own=(0.2 if name == "edge1" else 0.0, 0.0)), runnable=runnable)
-        for name, runnable in (("edge1", 4.0), ("edge2", 4.0))
+        for name, runnable in (("edge1", 4.2), ("edge2", 4.0))  # its own is among them
     ]
     told = values(scored(ROBOT, *full, spec=spec, agreed=agreed))
     untold = values(scored(ROBOT, *(replace(one, runnable=None) for one in full), spec=spec, agreed=agreed))
@@ -136,6 +136,21 @@ def test_a_task_that_has_its_memory_counts_a_full_machine_less_and_not_for_nothi
         "a full one is worth a move, a half full one late"
     )
     assert nothing == pytest.approx(enough * (1.0 - NEARLY_FULL), abs=0.01)
+
+
+def test_an_owner_has_the_memory_that_it_holds_though_not_all_of_it_shows_as_its_own() -> None:
+    """2000 of 4000 MiB are the task's, of which its processes show 100; the others have 800."""
+    half = Weights(cpu=0.5, memory=0.5, network=0.0)
+    demand = Demand(cpu_cores=0.4, memory_mb=2000.0)
+    spec = replace(SPEC, candidates=("edge1", "edge2"), demand=demand, memory_floor_ratio=0.05)
+    agreed = allocation_of(7, epoch=3, tuning=Tuning(weights=half, score=ScoreForm.SERVICE))
+    owner = profile("edge1", memory=2800.0, own=(0.0, 100.0))
+    vector = scored(owner, profile("edge2", memory=800.0), spec=spec, agreed=agreed)
+    assert vector.refused == ()
+    first, second = vector.utilities
+    assert first.memory == second.memory
+    too_small = scored(owner, spec=replace(spec, demand=Demand(memory_mb=5000.0)), agreed=agreed)
+    assert dict(too_small.refused)["edge1"] == "needs 5000 MiB, has 4000 in all"
 
 
 # --- who is scored -------------------------------------------------------------------------------------------------
