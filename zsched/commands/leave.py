@@ -30,9 +30,19 @@ from zsched.commands.document import (
     ordered,
 )
 from zsched.commands.entries import DOCUMENT, HERE
-from zsched.commands.flags import LEAVE, NO_OTHER, DrainOrder, check_in_force, drain, has_flag, told_over
+from zsched.commands.flags import (
+    LEAVE,
+    NO_OTHER,
+    NOTHING,
+    TITLES,
+    DrainOrder,
+    check_in_force,
+    drain,
+    has_flag,
+    told_over,
+)
 from zsched.commands.membership import Told
-from zsched.commands.orders import OrderView, Row
+from zsched.commands.orders import OrderView, Row, begin, show_rows
 from zsched.commands.page import span
 from zsched.config.difference import names_electors
 from zsched.config.editing import remove_node
@@ -130,21 +140,23 @@ def leave(order: LeaveOrder) -> int:
     except CliError as error:
         if error.code != EXIT_UNREACHABLE:
             raise
+        rows: tuple[Row, ...] = ()
         if not is_out(fleet, me, order.places.state):
             _accept(order, NOT_TOLD, f"{error}. The others are not told: `zsched node forget {me}` tells them")
+            rows = ((me, "member", fleet, NOTHING),)
         elif not order.is_json:
             say(f"{me} is no node of {fleet} any more, and its daemon has ended")
-        return _end(order, fleet, me, files)
+        code = _asked(_view(order, Door(socket=Path())), order, fleet, me, files, rows)
+        return _end(order, fleet, me) if code is None else code
     if (status["fleet"], status["node"]) != (fleet, me):
         other = f"{status['node']} of fleet {status['fleet']}"
         raise CliError(EXIT_USAGE, f"the daemon here is {other}, and {order.places.state} is {me}'s; give --state-dir")
-    view = OrderView(door=door, is_json=order.is_json, is_yes=order.is_yes, is_plan=order.is_plan, reason=order.reason)
-    way = Way(order=order, view=view, me=me, began=monotonic_s(), files=files)
+    way = Way(order=order, view=_view(order, door), me=me, began=monotonic_s(), files=files)
     code = _take_leave(way, status)
     if code != EXIT_OK:
         return code
     stop_daemon(way, fleet, f"{me} has left {fleet}")
-    return _end(order, fleet, me, files, is_last=[str(one["name"]) for one in status["nodes"]] == [me])
+    return _end(order, fleet, me, is_last=[str(one["name"]) for one in status["nodes"]] == [me])
 
 
 def own_door(order: LeaveOrder, me: str) -> Door:
@@ -157,6 +169,33 @@ def own_door(order: LeaveOrder, me: str) -> Door:
     if door.node is not None:
         raise CliError(EXIT_UNREACHABLE, f"no daemon of {me} runs on this machine")
     return door
+
+
+def _view(order: LeaveOrder, door: Door) -> OrderView:
+    return OrderView(door=door, is_json=order.is_json, is_yes=order.is_yes, is_plan=order.is_plan, reason=order.reason)
+
+
+def _asked(
+    view: OrderView, order: LeaveOrder, fleet: str, me: str, files: tuple[Written, ...], rows: tuple[Row, ...]
+) -> int | None:
+    """Show what becomes of this machine, and ask, where no drain does so; the exit code when nothing is to be done now.
+
+    ``rows``: what is lost beside the files.
+
+    Raises:
+        CliError: off a terminal, without --yes.
+    """
+    if order.is_plan:
+        if not order.is_json:
+            show_rows(TITLES, rows)
+        _told(order, fleet, me, files, "planned", f"{me} would leave {fleet}")
+        return EXIT_WOULD_CHANGE
+    return begin(view, (*rows, *map(_file_row, files)), {}, is_change=True, titles=TITLES)
+
+
+def _file_row(one: Written) -> Row:
+    what, _, fate = one.what.rpartition(", ")
+    return str(one.path), "file", what, fate
 
 
 def _accept(order: LeaveOrder, name: str, means: str) -> None:
@@ -179,23 +218,16 @@ def _take_leave(way: Way, status: Json) -> int:
     order, me = way.order, way.me
     if any(TAKEN_OUT in str(problem) for problem in status["problems"]):  # the others may not answer it any more
         way.tell(f"{me} is no node of {status['fleet']} any more: it was taken out")
-        if order.is_plan:
-            return _planned(way, str(status["fleet"]))
-        _note(way, str(status["fleet"]), int(status["fleet_revision"]) + 1)
-        return EXIT_OK
+        return _go_alone(way, str(status["fleet"]), int(status["fleet_revision"]) + 1)
     held = _newest(way, status)
     members = members_of(held, status)
     danger = _danger(way, status, held, members)
     if danger is not None:
         _accept(order, *danger)
+        return _go_alone(way, held.fleet, None)
     if me not in members:
         way.tell(f"{me} is no node of {held.fleet} since revision {held.revision}")
-    if danger is not None or me not in members:
-        if order.is_plan:
-            return _planned(way, held.fleet)
-        if me not in members:
-            _note(way, held.fleet, held.revision)
-        return EXIT_OK
+        return _go_alone(way, held.fleet, held.revision)
     without(document_text(held), me)  # its faults come before anything is done
     rows: tuple[Row, ...] = ((me, "member", held.fleet, "-"),)
     if any(name == me for name, _ in held.electors):
@@ -214,6 +246,19 @@ def _take_leave(way: Way, status: Json) -> int:
         return EXIT_WOULD_CHANGE if order.is_plan and code == EXIT_OK else code
     _note(way, held.fleet, _go_out(way, give_up_the_seat(way)))
     return EXIT_OK
+
+
+def _go_alone(way: Way, fleet: str, out: int | None) -> int:
+    """Where the others agree nothing: ask, and note that they are without this node; the exit code.
+
+    ``out``: the revision from which on they are; ``None``: they are not.
+    """
+    me = way.me
+    rows: tuple[Row, ...] = () if out is not None else ((me, "member", fleet, NOTHING),)
+    code = _asked(way.view, way.order, fleet, me, way.files, (*rows, (me, "daemon", "runs", "ended")))
+    if code is None and out is not None:
+        _note(way, fleet, out)
+    return EXIT_OK if code is None else code
 
 
 def _note(way: Way, fleet: str, revision: int) -> None:
@@ -436,11 +481,8 @@ def stop_daemon(way: Way, fleet: str, done: str) -> None:
             return
 
 
-def _end(order: LeaveOrder, fleet: str, me: str, files: tuple[Written, ...], *, is_last: bool = False) -> int:
+def _end(order: LeaveOrder, fleet: str, me: str, *, is_last: bool = False) -> int:
     """Put the files away; ``is_last``: the fleet had no other node."""
-    if order.is_plan:
-        _told(order, fleet, me, files, "planned", f"{me} would leave {fleet}")
-        return EXIT_WOULD_CHANGE
     done = put_away(fleet, me, order.places, is_purged=order.is_purged)
     back = f"it comes back by `zsched invite {me}` on another node"
     if is_last:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import io
 import itertools
 import json
 from collections.abc import Iterator
@@ -322,6 +323,60 @@ def test_where_no_daemon_runs_the_files_go_and_the_others_are_not_told(hall: Hal
     gone = run("--yes", "--accept", "not-told")
     assert gone.exit_code == 1
     assert "is not there: this machine is in no fleet" in gone.stderr
+
+
+class Terminal(io.StringIO):
+    """Somebody types there."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize("why", ["taken out", "told so", "last-node", "not-told", "no daemon", "it ended"])
+def test_whatever_the_others_agree_it_asks_before_it_puts_files_away(
+    hall: Hall, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], why: str
+) -> None:
+    words, rest = ["--purge"], UNTOUCHED
+    hall.is_told_gone = why in ("taken out", "it ended")
+    if why in ("taken out", "it ended"):
+        hall.text = TEXT.replace("  robot3: {kind: robot}\n", "")
+    elif why == "told so":
+        hall.problems = ["fleet/document: the document names no node 'robot3': this machine was taken out, and goes on"]
+    else:
+        words += ["--accept", why if why == "last-node" else "not-told"]
+        hall.text, hall.quorum_ok = ALONE if why == "last-node" else TEXT, why != "not-told"
+    if why == "it ended":
+        with StateFile(hall.folder / "state", fleet="hall", node="robot3"), monkeypatch.context() as patch:
+            patch.setattr(leave, "STOP_S", 0.0)
+            assert run(*words, "--yes").exit_code == 5
+        rest = sorted([*UNTOUCHED, "out"])
+    if why in ("it ended", "no daemon"):
+        hall.door.close()
+    before = list(hall.asked)
+
+    for more in ((), ("--json",)):
+        refused = run(*words, *more)
+        assert (refused.exit_code, hall.asked, left(hall.folder)) == (2, before, rest)
+        assert "nothing was done, for nobody can be asked here; to do it:\nzsched " in refused.stderr
+        assert refused.stderr.endswith(" --yes\n")
+    assert refused.stdout == "", "programs read no table"
+    plan = run(*words, "--plan")
+    assert (plan.exit_code, hall.asked, left(hall.folder)) == (10, before, rest)
+    rows = [line.split() for line in plan.stdout.splitlines()]
+    assert (["robot3", "member", "hall", "-"] in rows) is ("--accept" in words)
+    assert (["robot3", "daemon", "runs", "ended"] in rows) is (why not in ("it ended", "no daemon"))
+
+    for answer, code in (("n\n", 1), ("y\n", 0)):
+        assert (hall.asked, left(hall.folder)) == (before, rest)
+        monkeypatch.setattr("sys.stdin", Terminal(answer))
+        with pytest.raises(SystemExit) as ended:
+            app(["leave", *words])
+        assert ended.value.code == code
+        table, _, after = capsys.readouterr().out.partition("Do it? [y/N] ")
+        assert [hall.folder.name in line for line in table.splitlines() if "the fleet file" in line] == [True]
+        assert ["the", "fleet", "file", "deleted"] in [line.split()[2:] for line in table.splitlines()]
+        assert ("Nothing was done." in after) is (code == 1)
+    assert left(hall.folder) == ["lock"]
 
 
 def test_a_document_that_needs_the_node_is_changed_first(hall: Hall) -> None:
