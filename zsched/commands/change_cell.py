@@ -38,6 +38,8 @@ from zsched.commands.leave import (
     DANGERS,
     LeaveOrder,
     Way,
+    accept,
+    authority_danger,
     give_up_the_seat,
     members_of,
     others_of,
@@ -57,6 +59,7 @@ from zsched.commands.membership import (
 )
 from zsched.commands.orders import OrderView, Row, begin
 from zsched.commands.papers import refuse_open_network
+from zsched.commands.renewing import authority_here, bring_advice
 from zsched.config.editing import add_entries, add_names, is_list, node_entry
 from zsched.config.load import check_bytes
 from zsched.config.security import ENCRYPTED
@@ -255,6 +258,7 @@ def _agreed(way: Way, status: Json, there: _Next) -> int | None:
     without(document_text(held), me)  # its faults come before anything is done
     if there.held is not None and not there.is_invited:
         _text_with(way, there.held)
+    accept(order, *authority_danger(order, held.fleet, held.text))
     rows: tuple[Row, ...] = ((me, "member", held.fleet, there.fleet),)
     if not there.is_invited:
         rows = (*rows, (me, f"invited by {there.fleet}", "-", "yes"))
@@ -436,9 +440,11 @@ def _arrive(way: Way, going: Change) -> int:
     if lack:
         told = f"{me} is ready in {fleet}, and {going.former} still names it: {lack}"
         raise CliError(EXIT_TIMED_OUT, f"{told}; give `{order.verb}` again, or there: zsched node forget {me}")
+    folder = authority_here(going.former, going.former_file)
+    advice = () if folder is None else (bring_advice(folder, going.former),)
     next_cell.end(order.places.state)
     said = f"{me} has left {going.former}, and is ready in {fleet}"
-    Told(fleet=fleet, node=me, outcome="joined", said=said).tell(is_json=order.is_json, is_line=True)
+    Told(fleet=fleet, node=me, outcome="joined", said=said, next=advice).tell(is_json=order.is_json, is_line=True)
     return EXIT_OK
 
 

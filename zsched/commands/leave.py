@@ -44,6 +44,7 @@ from zsched.commands.flags import (
 from zsched.commands.membership import Told
 from zsched.commands.orders import OrderView, Row, begin, show_rows
 from zsched.commands.page import span
+from zsched.commands.renewing import HOLDS_AUTHORITY, authority_here, bring_advice, left_behind
 from zsched.config.difference import names_electors
 from zsched.config.editing import remove_node
 from zsched.config.load import check_bytes
@@ -60,7 +61,7 @@ LAST: Final = "last-node"
 """The danger: the fleet has no other node, and ends."""
 NOT_TOLD: Final = "not-told"
 """The danger: the others cannot be told, and count this node until somebody has them forget it."""
-DANGERS: Final = (NO_OTHER, LAST, NOT_TOLD)
+DANGERS: Final = (NO_OTHER, LAST, NOT_TOLD, HOLDS_AUTHORITY)
 PAUSE_S: Final = 0.2
 STOP_S: Final = 20.0
 """How long a daemon may take to end: it hands over, and stops its workers and its relay."""
@@ -142,10 +143,13 @@ def leave(order: LeaveOrder) -> int:
             raise
         rows: tuple[Row, ...] = ()
         if not is_out(fleet, me, order.places.state):
-            _accept(order, NOT_TOLD, f"{error}. The others are not told: `zsched node forget {me}` tells them")
+            told = f"{error}. The others are not told: `zsched node forget {me}` tells them"
+            accept(order, (NOT_TOLD, told), *authority_danger(order, fleet))
             rows = ((me, "member", fleet, NOTHING),)
-        elif not order.is_json:
-            say(f"{me} is no node of {fleet} any more, and its daemon has ended")
+        else:
+            if not order.is_json:
+                say(f"{me} is no node of {fleet} any more, and its daemon has ended")
+            _warn(order, authority_danger(order, fleet))  # it has happened: there is nothing to accept
         code = _asked(_view(order, Door(socket=Path())), order, fleet, me, files, rows)
         return _end(order, fleet, me) if code is None else code
     if (status["fleet"], status["node"]) != (fleet, me):
@@ -198,16 +202,31 @@ def _file_row(one: Written) -> Row:
     return str(one.path), "file", what, fate
 
 
-def _accept(order: LeaveOrder, name: str, means: str) -> None:
-    """Go on only if a danger is accepted by its name.
+def accept(order: LeaveOrder, *dangers: tuple[str, str]) -> None:
+    """Go on only if each danger is accepted by its name; each is a name and what it means.
 
     Raises:
-        CliError: it is not.
+        CliError: one is not.
     """
-    if name not in order.accepted and not order.is_plan:
-        raise CliError(EXIT_FAILED, f"nothing was changed; if this may be, --accept {name}: {means}")
+    missing = [f"--accept {name}: {means}" for name, means in dangers if name not in order.accepted]
+    if missing and not order.is_plan:
+        raise CliError(EXIT_FAILED, f"nothing was changed; if this may be, {'; and '.join(missing)}")
+    _warn(order, dangers)
+
+
+def _warn(order: LeaveOrder, dangers: tuple[tuple[str, str], ...]) -> None:
     if not order.is_json:
-        warn(f"{name}: {means}")
+        for name, means in dangers:
+            warn(f"{name}: {means}")
+
+
+def authority_danger(order: LeaveOrder, fleet: str, text: str = "") -> tuple[tuple[str, str], ...]:
+    """The danger that nobody renews the certificates of a fleet that goes on; empty: there is none.
+
+    ``text``: its document.
+    """
+    folder = authority_here(fleet, order.places.config, text)
+    return () if folder is None else ((HOLDS_AUTHORITY, left_behind(folder, fleet)),)
 
 
 # --- while the daemon runs -------------------------------------------------------------------------------------------
@@ -223,12 +242,14 @@ def _take_leave(way: Way, status: Json) -> int:
     members = members_of(held, status)
     danger = _danger(way, status, held, members)
     if danger is not None:
-        _accept(order, *danger)
+        more = () if danger[0] == LAST else authority_danger(order, held.fleet, held.text)
+        accept(order, danger, *more)
         return _go_alone(way, held.fleet, None)
     if me not in members:
         way.tell(f"{me} is no node of {held.fleet} since revision {held.revision}")
         return _go_alone(way, held.fleet, held.revision)
     without(document_text(held), me)  # its faults come before anything is done
+    accept(order, *authority_danger(order, held.fleet, held.text))
     rows: tuple[Row, ...] = ((me, "member", held.fleet, "-"),)
     if any(name == me for name, _ in held.electors):
         rows = (*rows, (me, "elector", ", ".join(name for name, _ in held.electors), others_of(held, me)))
@@ -254,6 +275,8 @@ def _go_alone(way: Way, fleet: str, out: int | None) -> int:
     ``out``: the revision from which on they are; ``None``: they are not.
     """
     me = way.me
+    if out is not None:
+        _warn(way.order, authority_danger(way.order, fleet))
     rows: tuple[Row, ...] = () if out is not None else ((me, "member", fleet, NOTHING),)
     code = _asked(way.view, way.order, fleet, me, way.files, (*rows, (me, "daemon", "runs", "ended")))
     if code is None and out is not None:
@@ -483,20 +506,28 @@ def stop_daemon(way: Way, fleet: str, done: str) -> None:
 
 def _end(order: LeaveOrder, fleet: str, me: str, *, is_last: bool = False) -> int:
     """Put the files away; ``is_last``: the fleet had no other node."""
+    folder = None if is_last else authority_here(fleet, order.places.config)
     done = put_away(fleet, me, order.places, is_purged=order.is_purged)
     back = f"it comes back by `zsched invite {me}` on another node"
     if is_last:
         back = f"{fleet} has no node any more; `zsched fleet create NAME` makes a new fleet"
-    _told(order, fleet, me, done, "left", f"{me} has left {fleet}", back)
+    advice = (back,) if folder is None else (bring_advice(folder, fleet), back)
+    _told(order, fleet, me, done, "left", f"{me} has left {fleet}", advice)
     return EXIT_OK
 
 
 def _told(
-    order: LeaveOrder, fleet: str, me: str, files: tuple[Written, ...], outcome: str, said: str, back: str = ""
+    order: LeaveOrder,
+    fleet: str,
+    me: str,
+    files: tuple[Written, ...],
+    outcome: str,
+    said: str,
+    advice: tuple[str, ...] = (),
 ) -> None:
-    """The end of it; ``back``: how the machine becomes a node again."""
+    """The end of it; ``advice``: what is to be done then."""
     is_service = order.places.config == paths.SYSTEM_CONFIG
     service = ("sudo systemctl disable zsched: it would find no fleet at the next boot",) if is_service else ()
-    more = () if order.is_plan else (*service, back)
+    more = () if order.is_plan else (*service, *advice)
     told = Told(fleet=fleet, node=me, outcome=outcome, said=said, files=files, next=more)
     told.tell(is_json=order.is_json, is_line=True)

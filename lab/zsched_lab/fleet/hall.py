@@ -90,7 +90,8 @@ class Hall:
         home.mkdir(exist_ok=True)
         more = {"CONFIG": home / "etc" / "fleet.yaml", "STATE_DIR": home / "state", "RUNTIME_DIR": home / "run"}
         env = {**os.environ, **{f"ZSCHED_{name}": str(path) for name, path in more.items()}, "ZSCHED_NODE": node}
-        env["ZSCHED_AUTHORITY"] = str(self.folder / "stick")
+        if words[0] != "leave":  # the stick is in whichever machine it is needed at, and none takes it away
+            env["ZSCHED_AUTHORITY"] = str(self.folder / "stick")
         command = self._on(node, [sys.executable, "-m", "zsched.cli", *words])
         return subprocess.run(command, capture_output=True, text=True, timeout=90, check=False, env=env, cwd=home)
 

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner, Result
 
+from support.authorities import install, make_authority
 from support.fleet_values import fleet_value_of
 from support.schemas import faults
 from support.slices import slices
@@ -204,6 +205,7 @@ def keep_state(folder: Path, *electors: str) -> None:
 def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
     for name, place in (("CONFIG", "etc/fleet.yaml"), ("STATE_DIR", "state"), ("RUNTIME_DIR", "run")):
         monkeypatch.setenv(f"ZSCHED_{name}", str(tmp_path / place))
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     monkeypatch.delenv("ZSCHED_NODE", raising=False)
     for module in (flags, leave, lacks):
         monkeypatch.setattr(module, "PAUSE_S", 0.001)
@@ -532,6 +534,25 @@ def test_an_invitation_with_a_certificate_that_nobody_would_take_moves_nothing(s
     assert refused.exit_code == 1
     assert "its certificate names None, and its node is robot3" in " ".join(refused.stderr.split())
     assert (here.done, there.done, site.running) == ([], [], "hall-a")
+
+
+def test_who_takes_the_authority_of_its_cell_away_says_so_first(
+    site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here, stick = site.cells["hall-a"], tmp_path / "stick"
+    monkeypatch.setenv("ZSCHED_AUTHORITY", str(stick))
+    here.text = A.partition("site:")[0].replace("tcp/", "tls/") + f"security: {{}}\nsite:{A.partition('site:')[2]}"
+    (tmp_path / "etc" / "fleet.yaml").write_text(here.text)
+    install(make_authority(stick, "hall-a"), tmp_path / "etc" / "pki", ME)
+    plan = run("--to", "hall-b", "--plan")
+    assert (plan.exit_code, f"holds-authority: {stick} holds the authority of hall-a" in plan.stderr) == (10, True)
+    refused = run("--to", "hall-b", "--yes")
+    assert (refused.exit_code, here.done, site.cells["hall-b"].done) == (1, [], [])
+    assert f"nothing was changed; if this may be, --accept holds-authority: {stick} holds" in refused.stderr
+    done = run("--to", "hall-b", "--yes", "--accept", "holds-authority")
+    assert done.exit_code == 0, done.stderr
+    check_arrived(site)
+    assert f"next: move {stick} to /root/.local/share/zsched/authority/hall-a on another node of hall-a" in done.stdout
 
 
 def membership_invitation(folder: Path) -> Path:

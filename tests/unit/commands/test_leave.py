@@ -12,12 +12,14 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
+from support.authorities import make_authority
 from support.fleet_values import fleet_value_of
 from support.schemas import faults
 from zsched.adapters.host.operator_socket import Json, OperatorSocket
 from zsched.adapters.host.state_file import StateFile
 from zsched.cli import app
 from zsched.commands import flags, leave
+from zsched.commands.renewing import UNIT_FOLDER
 from zsched.config.load import load_fleet
 from zsched.core.values.electorate import Elector
 from zsched.core.vote.generations import blank_state
@@ -33,6 +35,7 @@ nodes:
 tasks:
   merge: {candidates: {kind: robot}, weights: {cpu: 0.5, memory: 0.5}}
 """
+SECURED = f"{TEXT.replace('tcp/', 'tls/')}security: {{}}\n"
 ALONE = "fleet: hall\nnodes:\n  robot3: {kind: robot}\ntasks: {}\n"
 
 
@@ -144,6 +147,8 @@ def hall(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hall]:
     for name, folder in (("CONFIG", "fleet.yaml"), ("STATE_DIR", "state"), ("RUNTIME_DIR", "run")):
         monkeypatch.setenv(f"ZSCHED_{name}", str(tmp_path / folder))
     monkeypatch.delenv("ZSCHED_NODE", raising=False)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    monkeypatch.delenv("ZSCHED_AUTHORITY", raising=False)
     for module in (flags, leave):
         monkeypatch.setattr(module, "PAUSE_S", 0.001)
     (tmp_path / "fleet.yaml").write_text(TEXT)
@@ -171,7 +176,7 @@ def run(*words: str) -> Result:
 def left(folder: Path) -> list[str]:
     """The names of files that a machine keeps."""
     kept = [path for part in (folder, folder / "state") for path in part.iterdir()]
-    return sorted(path.name for path in kept if path.name not in ("run", "state", "lock") or path.is_file())
+    return sorted(path.name for path in kept if path.name not in ("run", "state", "lock", "data") or path.is_file())
 
 
 RENAMED = ["decisions.ndjson.left", "documents.left", "fleet.yaml.left", "lock", "state.left"]
@@ -496,3 +501,75 @@ def test_nothing_of_a_leave_is_agreed_after_it_was_taken_back(hall: Hall, electo
         assert done.exit_code == 1
         assert "the leave is not in force any more: it was taken back" in done.stderr
         assert left(hall.folder) == UNTOUCHED
+
+
+# --- the fleet's authority -------------------------------------------------------------------------------------------
+
+
+def hold_authority(hall: Hall, fleet: str = "hall") -> Path:
+    """Where `zsched fleet create` makes it."""
+    hall.text = SECURED
+    (hall.folder / "fleet.yaml").write_text(SECURED)
+    folder = hall.folder / "data" / "zsched" / "authority" / fleet
+    make_authority(folder, fleet)
+    return folder
+
+
+def test_the_place_that_is_named_is_the_one_where_the_unit_looks() -> None:
+    unit = (Path(__file__).parents[3] / "systemd" / "zsched-renew.service").read_text()
+    assert f"ConditionPathExistsGlob={UNIT_FOLDER}/*/authority.json\n" in unit
+
+
+@pytest.mark.parametrize("way", ["agreed", "not-told", "no daemon"])
+def test_a_machine_that_holds_the_authority_says_so_before_it_leaves(hall: Hall, way: str) -> None:
+    folder, others = hold_authority(hall), () if way == "agreed" else ("--accept", "not-told")
+    hall.quorum_ok = way != "not-told"
+    if way == "no daemon":
+        hall.door.close()
+    refused = run("--yes", *others)
+    assert (refused.exit_code, hall.asked, left(hall.folder)) == (1, [], UNTOUCHED)
+    assert f"--accept holds-authority: {folder} holds the authority of hall" in refused.stderr
+    assert "end within 30 days" in refused.stderr
+    if others:
+        both = run("--yes")
+        assert ("--accept not-told: " in both.stderr, "; and --accept holds-authority: " in both.stderr) == (True, True)
+    plan = run("--plan")
+    assert (plan.exit_code, f"holds-authority: {folder}" in plan.stderr) == (10, True)
+    done = run("--yes", *others, "--accept", "holds-authority")
+    assert (done.exit_code, left(hall.folder)) == (0, RENAMED), done.stderr
+    (said,) = [line for line in done.stdout.splitlines() if str(folder) in line]
+    assert said.startswith(f"next: move {folder} to /root/.local/share/zsched/authority/hall on another node of hall")
+    assert "there `sudo systemctl enable --now zsched-renew.timer`" in said
+    assert "here `sudo systemctl disable --now zsched-renew.timer`" in said
+    assert (folder / "ca-1.key").exists()
+
+
+def test_one_that_is_out_already_is_told_of_the_authority_and_leaves(hall: Hall) -> None:
+    folder = hold_authority(hall)
+    hall.problems = ["fleet/document: the document names no node 'robot3': this machine was taken out, and goes on"]
+    done = run("--yes")
+    assert (done.exit_code, left(hall.folder)) == (0, RENAMED), done.stderr
+    assert f"holds-authority: {folder}" in done.stderr
+    assert f"next: move {folder} to " in done.stdout
+
+
+@pytest.mark.parametrize("why", ["in plain text", "another fleet's", "of the last node", "moved away"])
+def test_an_authority_that_nobody_needs_here_is_no_danger(
+    hall: Hall, monkeypatch: pytest.MonkeyPatch, why: str
+) -> None:
+    words = ["--yes"]
+    folder = hold_authority(hall, "yard" if why == "another fleet's" else "hall")
+    if why == "in plain text":
+        hall.text = TEXT
+        (hall.folder / "fleet.yaml").write_text(TEXT)
+    elif why == "another fleet's":
+        monkeypatch.setenv("ZSCHED_AUTHORITY", str(folder))
+    elif why == "of the last node":
+        hall.text = ALONE
+        words += ["--accept", "last-node"]
+    else:
+        folder.rename(hall.folder / "data" / "moved")
+    done = run(*words)
+    assert done.exit_code == 0, done.stderr
+    assert "authority" not in done.stderr
+    assert "zsched-renew" not in done.stdout
