@@ -1,7 +1,8 @@
 """`zsched install` and `zsched uninstall`: what a machine's system finds of a pip installation, and takes away again.
 
-Knows: where systemd, the shells and man look, what of it is ours. Does not know: what the units do, the fleet, the
-state (`zsched uninstall` leaves both). The Debian package brings the same to other places (`package/deb/build.py`).
+Knows: where systemd, the shells and man look, what of it is ours. Does not know: what the units do, the fleet
+(`zsched uninstall` leaves it and the state, and says which node this machine still is). The Debian package brings the
+same to other places (`package/deb/build.py`).
 """
 
 from __future__ import annotations
@@ -15,11 +16,15 @@ from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Final
 
+from zsched.adapters.host.state_file import STATE_NAME
 from zsched.commands.common import CliError, say
 from zsched.commands.completion import SCRIPTS, script_file
+from zsched.commands.renewing import TIMER, UNIT_FOLDER
 from zsched.core.values.struct import Struct
+from zsched.errors import AdapterError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_WOULD_CHANGE
-from zsched.paths import authority_folders
+from zsched.paths import authority_folders, is_there
+from zsched.runtime.membership import whose
 
 UNITS: Final = ("zsched.service", "zsched-web.service", "zsched-renew.service", "zsched-renew.timer")
 DROP_INS: Final = ("zsched.service.d/10-user.conf", "zsched-web.service.d/10-user.conf")
@@ -140,11 +145,18 @@ def uninstall(root: Path, *, is_plan: bool) -> int:
     pieces = list(_pieces(prefix, root))
     pieces += [Piece(path=path, what=OLD_PAGE, target=path.readlink()) for path in _old_pages(prefix, root, pieces)]
     ours = [piece for piece in pieces if piece.is_ours()]
+    stays = [f"{piece.path}: not zsched's" for piece in pieces if piece.is_in_the_way()]
+    stays += [f"{path}: a drop-in that zsched has not made" for path in _other_drop_ins(root, pieces)]
+    kept = [Path("/etc/zsched"), Path("/var/lib/zsched"), prefix]
     if is_plan:
+        _print(_still_a_node(root / "var/lib/zsched"))
         _print(f"would stop, disable and remove {piece.path}" for piece in ours if piece.path.suffix == ".service")
         _print(f"would remove {piece.path}" for piece in ours if piece.path.suffix != ".service")
+        _print(f"would leave {one}" for one in stays)
+        _print(left(kept, os.environ) if _is_this_machine(root) else [])
         return EXIT_WOULD_CHANGE if ours else EXIT_OK
     _need_rights(root)
+    _print(_still_a_node(root / "var/lib/zsched"))
     if _has_systemd(root):
         found = [piece.path.name for piece in ours if piece.path.name in UNITS]
         if found:
@@ -154,12 +166,29 @@ def uninstall(root: Path, *, is_plan: bool) -> int:
         _print([f"removed {piece.path}"])
     for folder in {piece.path.parent for piece in ours}:
         _remove_empty(folder, root)
-    _print(f"left {piece.path}: not zsched's" for piece in pieces if piece.is_in_the_way())
+    _print(f"left {one}" for one in stays)
     _reload(root)
     _print(["nothing of it was there"] if not ours else [])
-    if _is_this_machine(root):
-        _print(left([Path("/etc/zsched"), Path("/var/lib/zsched"), prefix], os.environ))
+    _print(left(kept, os.environ) if _is_this_machine(root) else [])
     return EXIT_OK
+
+
+def _still_a_node(state: Path) -> list[str]:
+    """That a fleet counts on this machine, by its state folder."""
+    if not is_there(state / STATE_NAME):
+        return []
+    try:
+        fleet, me = whose(state)
+    except AdapterError as error:
+        return [f"nobody knows whether this machine is still a node of a fleet: {error}"]
+    return [f"still {me} of fleet {fleet}: `sudo zsched leave` first, or elsewhere `zsched node forget {me}`"]
+
+
+def _other_drop_ins(root: Path, pieces: Iterable[Piece]) -> list[Path]:
+    """What operators have written for our units (`systemctl edit`)."""
+    known = {piece.path for piece in pieces}
+    found = (sorted((root / "etc/systemd/system" / f"{unit}.d").glob("*.conf")) for unit in UNITS)
+    return [path for paths in found for path in paths if path not in known]
 
 
 def left(folders: Iterable[Path], env: Mapping[str, str]) -> list[str]:
@@ -168,7 +197,8 @@ def left(folders: Iterable[Path], env: Mapping[str, str]) -> list[str]:
     said = [f"what is left: {kept}, and the user {USER}; docs/guide/install.md says how it goes, too"] if kept else []
     return said + [
         f"what is left: {folder}, the authority of fleet {folder.name}; without its key nobody joins that fleet, and "
-        "no certificate is renewed, so keep it as long as that fleet runs"
+        f"no certificate is renewed, so keep it as long as that fleet runs. {TIMER}, which renews them from here, goes "
+        f"with the program: move the folder to {UNIT_FOLDER / folder.name} on another node, and enable {TIMER} there"
         for folder in authority_folders(env)
     ]
 

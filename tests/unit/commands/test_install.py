@@ -9,8 +9,11 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
+from zsched.adapters.host.state_file import StateFile
 from zsched.cli import app
 from zsched.commands.install import SYSTEM_FOLDERS, left
+from zsched.config.load import check_bytes
+from zsched.core.vote.generations import blank_state
 
 REPO = Path(__file__).parents[3]
 
@@ -79,6 +82,55 @@ def test_what_is_left_names_the_authoritys_key_that_a_fleet_needs(tmp_path: Path
     (authority / "authority.json").touch()
     (said,) = left([tmp_path / "none"], env)
     assert f"{authority}, the authority of fleet field" in said
+    assert "zsched-renew.timer, which renews them from here, goes with the program" in said
+    assert "to /root/.local/share/zsched/authority/field on another node, and enable zsched-renew.timer there" in said
+
+
+def test_a_plan_lists_what_stays_too(prefix: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    authority = tmp_path / "data/zsched/authority/field"
+    authority.mkdir(parents=True)
+    (authority / "authority.json").touch()
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    monkeypatch.setattr("zsched.commands.install.HIDDEN", ())
+    said = run("uninstall", Path("/"), "--plan").output
+    assert f"{prefix}, and the user zsched" in said
+    assert f"what is left: {authority}, the authority of fleet field" in said
+
+
+def test_uninstall_says_first_that_the_machine_is_still_a_node(prefix: Path, root: Path) -> None:
+    assert prefix.exists()
+    run("install", root)
+    assert "still" not in run("uninstall", root, "--plan").output
+    state = root / "var/lib/zsched"
+    fleet = check_bytes(b"fleet: hall\nnodes: {robot2: {kind: robot}}\ntasks: {}\n").fleet
+    assert fleet is not None
+    with StateFile(state, fleet="hall", node="robot2") as file:
+        file.create(blank_state(fleet, "robot2", 0, None, incarnation=1, hardware="", disk="01"))
+    still = "still robot2 of fleet hall: `sudo zsched leave` first, or elsewhere `zsched node forget robot2`"
+    for options, code in ((("--plan",), 10), ((), 0)):
+        result = run("uninstall", root, *options)
+        assert (result.exit_code, result.output.splitlines()[0]) == (code, still)
+    (state / "state").write_text("what a power cut left")
+    first = run("uninstall", root).output.splitlines()[0]
+    assert first.startswith("nobody knows whether this machine is still a node of a fleet: ")
+    (state / "state").rename(state / "state.left")
+    assert run("uninstall", root).output == "nothing of it was there\n", "it has left"
+
+
+def test_uninstall_names_the_drop_ins_that_operators_have_written(prefix: Path, root: Path) -> None:
+    assert prefix.exists()
+    run("install", root)
+    units = root / "etc/systemd/system"
+    mine = [units / "zsched.service.d/override.conf", units / "zsched-renew.service.d/passphrase.conf"]
+    for path in mine:
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("[Service]\n")
+    told = [f"leave {path}: a drop-in that zsched has not made" for path in mine]
+    plan = run("uninstall", root, "--plan").output.splitlines()
+    assert [line for line in plan if "would leave" in line] == [f"would {one}" for one in told]
+    done = run("uninstall", root).output.splitlines()
+    assert [line for line in done if "drop-in" in line] == [one.replace("leave", "left", 1) for one in told]
+    assert files_in(root) == {path.relative_to(root).as_posix() for path in mine}
 
 
 def test_uninstall_leaves_a_folder_with_somebody_elses_file(prefix: Path, root: Path) -> None:
