@@ -257,9 +257,7 @@ def create(view: CreateView) -> int:
         outcome=outcome,
         said=f"would be written; {said}" if view.is_plan else said,
         files=files if papers is None else (*files, *papers.files),
-        next=()
-        if view.is_plan
-        else (*how_to_start(view.node, view.places), more, *([papers.advice] if papers else [])),
+        next=() if view.is_plan else (*how_to_start(view.node, view.places), more, *(papers.advice if papers else ())),
     )
     told.tell(is_json=view.is_json)
     return EXIT_WOULD_CHANGE if view.is_plan else EXIT_OK

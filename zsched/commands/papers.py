@@ -26,6 +26,7 @@ from zsched.commands.pki import (
     passphrase_for,
     supersede,
 )
+from zsched.commands.renewing import renew_advice
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId
 from zsched.errors import AdapterError
@@ -95,18 +96,15 @@ class FirstPapers:
         return (Written(path=self._folder / FIRST_KEY, what=what),)
 
     @property
-    def advice(self) -> str:
-        """How the key goes offline."""
-        lock = "" if self._begun is not None and self._begun.is_locked else ", not locked (--passphrase does that)"
+    def advice(self) -> tuple[str, ...]:
+        """How the key goes offline, and how certificates are renewed."""
+        is_locked = self._begun is not None and self._begun.is_locked
+        lock = "" if is_locked else ", not locked (--passphrase does that)"
         said = f"the authority's key lies on this machine{lock}; no daemon needs it"
         how = (
             f"move the folder {self._folder} to a stick, and name it to `zsched invite` and `zsched pki` by --authority"
         )
-        last = (
-            "certificates last 30 days: on the machine with the key `systemctl enable --now zsched-renew.timer` lets "
-            "them be renewed in time, else `zsched pki renew --deliver` there"
-        )
-        return f"{said}. To take it offline, {how}; {last}"
+        return f"{said}. To take it offline, {how}", renew_advice(self._folder, self._fleet, is_locked=is_locked)
 
 
 def key_to_papers(fleet: Fleet, authority: Path | None) -> bytes:

@@ -1,13 +1,14 @@
-"""Who renews a fleet's certificates: where its authority's folder is looked for, and what is said when it stays behind.
+"""Who renews a fleet's certificates: what the timer needs for an authority, and what is said when one stays behind.
 
-Knows: the place at which zsched-renew.service looks. Does not know: how certificates are made (`zsched.pki`), which
-verb asks.
+Knows: the place at which zsched-renew.service looks, what it cannot see, how its drop-in is written. Does not know: how
+certificates are made (`zsched.pki`), which verb asks.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
+import shlex
 from pathlib import Path
 from typing import Final
 
@@ -15,11 +16,13 @@ from zsched.commands.pki import holds_authority
 from zsched.config.load import check_bytes
 from zsched.config.reader import MAX_FILE_BYTES
 from zsched.files import read_regular
-from zsched.paths import AUTHORITY_RECORD
+from zsched.paths import AUTHORITY_RECORD, authority_folder
 
 TIMER: Final = "zsched-renew.timer"
 UNIT_FOLDER: Final = Path("/root/.local/share/zsched/authority")
 """Where the timer's unit looks for the folder of each fleet."""
+SERVICE: Final = "zsched-renew.service"
+UNSEEN: Final = ("/home", "/tmp", "/var/tmp")  # noqa: S108 - what that unit hides
 HOLDS_AUTHORITY: Final = "holds-authority"
 """The danger: the machine holds the authority of a fleet that goes on without it."""
 MAX_RECORD: Final = 4 << 20
@@ -57,6 +60,48 @@ def bring_advice(folder: Path, fleet: str) -> str:
         f"move {folder} to {UNIT_FOLDER / fleet} on another node of {fleet}, there `sudo systemctl enable --now "
         f"{TIMER}`, here `sudo systemctl disable --now {TIMER}`: else the certificates of {fleet} end within 30 days"
     )
+
+
+def renew_advice(folder: Path, fleet: str, *, is_locked: bool) -> str:
+    """How the certificates of a new authority are renewed in time: by the timer, what its unit needs first, by hand."""
+    folder = folder.absolute()
+    words = ["zsched", "pki", "renew", "--deliver"]
+    if folder != authority_folder(None, {}, fleet).absolute():
+        words += ["--authority", str(folder)]
+    first = _first(folder, fleet, is_locked=is_locked)
+    return (
+        f"certificates last 30 days: {f'{first}; then ' if first else ''}on the machine with the key `sudo systemctl "
+        f"enable --now {TIMER}` lets them be renewed in time, else `{shlex.join(words)}` there"
+    )
+
+
+def _first(folder: Path, fleet: str, *, is_locked: bool) -> str:
+    """What the timer's unit needs beside what it is shipped with; empty: nothing."""
+    steps, lines = [], []
+    if folder != UNIT_FOLDER / fleet and any(folder.is_relative_to(place) for place in UNSEEN):
+        steps.append(f"move {folder} to {UNIT_FOLDER / fleet}, for {SERVICE} does not see it")
+    elif folder != UNIT_FOLDER / fleet:
+        lines += ["[Unit]", "ConditionPathExistsGlob=", f"ConditionPathExists={_literal(folder)}/{AUTHORITY_RECORD}"]
+        lines += ["[Service]", f"Environment={_word(f'ZSCHED_AUTHORITY={folder}')}", f"ReadWritePaths={_word(folder)}"]
+    if is_locked:
+        steps.append("write the passphrase to /root/FILE, which only root may read")
+        lines += [*([] if lines else ["[Service]"]), "LoadCredential=passphrase:/root/FILE"]
+    if lines:
+        steps.append(f"`sudo systemctl edit {SERVICE}` with the lines {' '.join(f'`{line}`' for line in lines)}")
+    return ", then ".join(steps)
+
+
+def _literal(text: object) -> str:
+    """As a unit writes it without a specifier of systemd's (systemd.unit(5))."""
+    return str(text).replace("%", "%%")
+
+
+def _word(text: object) -> str:
+    """The same as one word (systemd.syntax(7))."""
+    literal = _literal(text)
+    if shlex.quote(literal.replace("%", "")) == literal.replace("%", ""):
+        return literal
+    return '"{}"'.format(literal.replace("\\", "\\\\").replace('"', '\\"'))
 
 
 def _is_secured(text: str, config: Path) -> bool:

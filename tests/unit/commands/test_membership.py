@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import shlex
 import shutil
 import signal
 import stat
@@ -27,6 +29,7 @@ from zsched.commands import membership, papers
 from zsched.commands.common import CliError
 from zsched.commands.membership import Address, address_of, dial_order, how_to_start, own_address
 from zsched.commands.pki import begin_for
+from zsched.commands.renewing import UNIT_FOLDER, renew_advice
 from zsched.config.load import check_bytes, load_fleet
 from zsched.core.values.certificates import Role
 from zsched.core.values.document import Document, Rollout, Text
@@ -243,6 +246,43 @@ def test_a_locked_authority_takes_its_passphrase(tmp_path: Path, monkeypatch: py
     monkeypatch.setenv("ZSCHED_AUTHORITY_PASSPHRASE", "another")
     issued = run("pki", "renew", "edge1", "--config", tmp_path / "fleet.yaml")
     assert "the passphrase is wrong" in issued.stderr
+
+
+def test_what_the_timer_needs_to_renew_by_an_authority_is_said_when_it_is_made(
+    tmp_path: Path, authority: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The pytest folder is in /tmp, which the timer's unit does not see."""
+    words = ("fleet", "create", "hall", "--node", "edge1", "--kind", "edge", "--address", "127.0.0.1")
+    for count, (folder, more) in enumerate(((authority, ()), (tmp_path / "a stick", ("--authority",)))):
+        given = [*more, folder] if more else []
+        result = run(*words, *given, *here(tmp_path / str(count)))
+        (said,) = [line for line in result.stdout.splitlines() if "certificates last 30 days: " in line]
+        assert f"move {folder} to /root/.local/share/zsched/authority/hall, for zsched-renew.service does not" in said
+        assert said.endswith(
+            f"else `{shlex.join(('zsched', 'pki', 'renew', '--deliver', '--authority', str(folder)))}` there"
+        )
+        assert "LoadCredential" not in said
+    monkeypatch.setattr("zsched.commands.renewing.UNSEEN", ("/home",))
+    result = run(*words, "--authority", tmp_path / "100%", "--passphrase", *here(tmp_path / "3"), stdin="s\ns\n")
+    (said,) = [line for line in result.stdout.splitlines() if "certificates last 30 days: " in line]
+    text = "\n".join(re.findall(r"`([^`]*)`", said.partition("with the lines ")[2].partition(";")[0])) + "\n"
+    assert text == (
+        f"[Unit]\nConditionPathExistsGlob=\nConditionPathExists={tmp_path}/100%%/authority.json\n"
+        f"[Service]\nEnvironment=ZSCHED_AUTHORITY={tmp_path}/100%%\nReadWritePaths={tmp_path}/100%%\n"
+        "LoadCredential=passphrase:/root/FILE\n"
+    )
+    assert "write the passphrase to /root/FILE, which only root may read, then `sudo systemctl edit" in said
+
+
+def test_where_the_timer_looks_it_needs_nothing_but_a_passphrase(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", "/root")
+    plain = renew_advice(UNIT_FOLDER / "hall", "hall", is_locked=False)
+    assert plain.startswith("certificates last 30 days: on the machine with the key `sudo systemctl enable --now")
+    assert plain.endswith("else `zsched pki renew --deliver` there")
+    locked = renew_advice(UNIT_FOLDER / "hall", "hall", is_locked=True)
+    assert "with the lines `[Service]` `LoadCredential=passphrase:/root/FILE`; then on the machine" in locked
+    spaced = renew_advice(Path("/mnt/a stick"), "hall", is_locked=False)
+    assert '`Environment="ZSCHED_AUTHORITY=/mnt/a stick"` `ReadWritePaths="/mnt/a stick"`; then' in spaced
 
 
 def test_a_fleet_that_cannot_be_written_leaves_no_authority(tmp_path: Path, authority: Path) -> None:
