@@ -6,6 +6,7 @@ what other machines have.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import stat
 from collections.abc import Iterator
@@ -15,6 +16,7 @@ from typing import Final
 
 from zsched.clock import wall_ns
 from zsched.core.membership.refused import SHOWN_S
+from zsched.core.values.certificates import Role, parse_common_name
 from zsched.core.values.fleet import Security
 from zsched.doctor.model import Result, Scene, Verdict, failed, joined, passed, skipped, warned
 from zsched.doctor.state import is_hidden
@@ -24,7 +26,7 @@ from zsched.runtime.own_addresses import Address, addresses_at
 from zsched.runtime.sealing import seals_of
 from zsched.runtime.secured import CERTIFICATE, files_by, require_own
 from zsched.runtime.tls import ENCRYPTED, PLAIN, operator_json5, plain_text_problem, protocol_of
-from zsched.sessions.certificate import validities
+from zsched.sessions.certificate import common_names, validities
 from zsched.sessions.config import tls_files
 
 SOON: Final = timedelta(days=30)
@@ -126,10 +128,20 @@ def _own(scene: Scene, security: Security) -> list[Result]:
 def _renewal(scene: Scene, name: str, path: str) -> str:
     if scene.fleet.security is None or name != "certificate":
         return f"renew {path} ({name}), then restart the daemon"
+    label = _label(scene, Path(path))
     return (
-        f"`zsched pki renew {scene.node}` where the fleet's authority is, and bring {scene.node}/{CERTIFICATE} to "
+        f"`zsched pki renew {label}` where the fleet's authority is, and bring {label}/{CERTIFICATE} to "
         f"{scene.fleet.security.folder} here; the daemon looks every 30 s"
     )
+
+
+def _label(scene: Scene, path: Path) -> str:
+    """What `zsched pki` calls the key of this certificate; the node's name where that cannot be read."""
+    with contextlib.suppress(OSError, ValueError):
+        holder = parse_common_name(common_names(read_regular(path, MAX_BYTES))[0], scene.fleet.name)
+        if holder is not None and (holder.name, holder.role) == (scene.node, Role.NODE):
+            return holder.label
+    return scene.node
 
 
 def _certificate(name: str, path: Path, now: datetime, soon: timedelta, fix: str) -> Result:

@@ -92,10 +92,10 @@ def problem(fleet: Fleet, now: datetime) -> str | None:
             f"this node's certificate ends on {day}, and its links with it: `zsched pki renew --deliver` where the "
             "fleet's authority is, or is this machine's clock wrong?"
         )
-    name = own.holder.name
+    label = own.holder.label  # of the key: a name may have had several
     return (
         f"this node's certificate has ended on {day}, and its links with it, so nothing can be sent here: "
-        f"`zsched pki renew {name}` where the fleet's authority is, and bring {name}/{CERTIFICATE} to "
+        f"`zsched pki renew {label}` where the fleet's authority is, and bring {label}/{CERTIFICATE} to "
         f"{fleet.security.folder} here; or is this machine's clock wrong?"
     )
 

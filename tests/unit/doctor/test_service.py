@@ -169,6 +169,18 @@ def test_the_fleets_own_certificates_are_told_of_a_week_before_they_end(own: Sce
     assert_finds(run("tls.certificates", own), FAIL, "certificate.pem: No such file")
 
 
+def test_a_certificate_that_ends_is_renewed_by_the_name_of_its_key(own: Scene, tmp_path: Path) -> None:
+    late = datetime.now(UTC) + timedelta(days=31)
+    assert "`zsched pki renew edge1` " in security.certificates_last(own, late).fix
+    with opened(tmp_path / "authority", "hall") as authority:
+        authority.revoke("edge1", datetime.now(UTC))
+        install(authority, tmp_path / "pki", "edge1")
+    fix = security.certificates_last(own, late).fix
+    assert "`zsched pki renew edge1.k2` where the fleet's authority is, and bring edge1.k2/certificate.pem to" in fix
+    (tmp_path / "pki" / "certificate.pem").write_text("something else")
+    assert "`zsched pki renew edge1` " in security.certificates_last(own).fix, "nobody knows its key"
+
+
 def test_a_certificate_that_was_sent_into_a_state_folder_of_another_place_counts(own: Scene, tmp_path: Path) -> None:
     """The doctor is told of that folder by an option, and the daemon goes by what lies there."""
     now = datetime.now(UTC)

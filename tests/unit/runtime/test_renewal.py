@@ -173,6 +173,15 @@ def test_a_certificate_that_has_ended_is_told_to_be_brought_for_nothing_can_be_s
     assert f"bring robot1/certificate.pem to {fleet.security.folder} here" in told
 
 
+def test_a_later_key_is_renewed_by_its_own_name(fleet: Fleet, authority: Authority, tmp_path: Path) -> None:
+    """The name of the node is that of its first key, which is revoked."""
+    authority.revoke("robot1", NOW)
+    install(authority, tmp_path / "pki", "robot1")
+    told = problem(fleet, NOW + timedelta(days=31)) or ""
+    assert "`zsched pki renew robot1.k2`" in told
+    assert "bring robot1.k2/certificate.pem to " in told
+
+
 def test_a_certificate_that_has_not_begun_is_the_clocks_fault(fleet: Fleet) -> None:
     """The robot's clock began in 1970: its status blamed the key, and the cure for that revoked a good one."""
     told = problem(fleet, NOW - timedelta(days=400)) or ""
