@@ -73,7 +73,7 @@ class ApplyView(Struct, frozen=True, kw_only=True):
     pause_after: int | None = None
     """The number of candidates of each task that run a changed worker while the others wait; ``None``: none waits."""
     where: tuple[str, ...] = ()
-    """The words that say which daemon is asked."""
+    """The words that say which daemon is asked, and by which files of this machine."""
 
     @property
     def out(self) -> TextIO:

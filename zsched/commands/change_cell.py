@@ -221,13 +221,15 @@ def _found(way: Way, fleet: str, word: str, going: Change | None) -> _Next:
             raise CliError(EXIT_USAGE, f"{told}, and this machine is {me} of {fleet}: zsched invite {me} in the other")
         papers = invitation.papers
         if fleet_of(invitation.document.text).security is not None and (papers is None or not papers.key):
-            raise CliError(EXIT_FAILED, f"{word} holds no certificate with its key; {_invite(invitation.fleet, me)}")
+            raise CliError(
+                EXIT_FAILED, f"{word} holds no certificate with its key; {_invite(way.order, invitation.fleet, me)}"
+            )
         if why := papers_problem(invitation):
-            raise CliError(EXIT_FAILED, f"{word}: its {why}; {_invite(invitation.fleet, me)}")
+            raise CliError(EXIT_FAILED, f"{word}: its {why}; {_invite(way.order, invitation.fleet, me)}")
         return _Next(fleet=invitation.fleet, invitation=invitation, is_invited=True)
     if is_closed:
         told = f"{cell.name} is secured, and takes {me} by an invitation"
-        raise CliError(EXIT_FAILED, f"{told}; {_invite(cell.name, me)}")
+        raise CliError(EXIT_FAILED, f"{told}; {_invite(way.order, cell.name, me)}")
     door = door_of(cell, fleet, way.door)
     status = status_of(door)
     state = next((str(one["state"]) for one in status["nodes"] if one["name"] == me), None)
@@ -242,9 +244,10 @@ def _found(way: Way, fleet: str, word: str, going: Change | None) -> _Next:
     return _Next(fleet=cell.name, door=door, held=held, invitation=kept, is_invited=is_invited)
 
 
-def _invite(fleet: str, me: NodeId) -> str:
+def _invite(order: LeaveOrder, fleet: str, me: NodeId) -> str:
     file = f"{me}{INVITE}"
-    return f"where {fleet}'s authority is: zsched invite {me} > {file}; then here: sudo zsched leave --to {file}"
+    again = f"sudo {order.leaving_for(file)}"
+    return f"where {fleet}'s authority is: zsched invite {me} > {file}; then here: {again}"
 
 
 def _agreed(way: Way, status: Json, there: _Next) -> int | None:
@@ -341,7 +344,7 @@ def _text_with(way: Way, held: InForce) -> str:
         text = add_names(text, ("seeds",), [*(name for name in dial_order(fleet) if name not in known), way.me])
     result = check_bytes(text.encode(), f"the document of {held.fleet} with {way.me}")
     if result.fleet is None:
-        advice = f"invite it by hand there, and give the invitation: zsched leave --to {way.me}{INVITE}"
+        advice = f"invite it by hand there, and give the invitation: {way.order.leaving_for(f'{way.me}{INVITE}')}"
         raise ConfigError(f"nothing was changed: {result.report()}\n{advice}")
     return text
 
@@ -389,7 +392,7 @@ def _wait_for_the_next(way: Way, going: Change) -> None:
             raise _TakenError(EXIT_FAILED, _taken(fleet, way.me, state))
         return "" if state is not None else f"{status['node']} of {fleet} does not name {way.me}"
 
-    back = f"{way.me} works on in {going.former}; `zsched leave --to {going.former}` takes back what was begun"
+    back = f"{way.me} works on in {going.former}; `{way.order.leaving_for(going.former)}` takes back what was begun"
     asked = f"{fleet} is asked to let {way.me} in, for at most {REACH_S:g} s"
     try:
         lack = wait_for(look, REACH_S, lambda lack, _left_s: way.tell(f"{asked}: {lack}"), is_told_once=True)
@@ -429,7 +432,7 @@ def _arrive(way: Way, going: Change) -> int:
     lack = wait_for(lambda: "" if _runs(way, fleet) else "its daemon does not run", _left_s(way))
     if lack:
         start = "; ".join(how_to_start(me, order.places))
-        again = f"then give `{order.verb}` again, or `zsched leave --to {going.former}` to go back"
+        again = f"then give `{order.verb}` again, or `{order.leaving_for(going.former)}` to go back"
         raise CliError(EXIT_TIMED_OUT, f"{me}: {lack}: {start}; {again}")
     way.tell(f"{me}: its daemon runs in {fleet}")
     lack = wait_for(lambda: _not_taken(way, fleet), TAKE_S)
@@ -542,7 +545,7 @@ def _go_back(way: Way, going: Change, why: str) -> int:
     order, me, fleet = way.order, way.me, going.invitation.fleet
     if _has_forgotten(way, going):
         told = f"{going.former} names {me} no more, so there is no way back"
-        raise CliError(EXIT_FAILED, f"{me}: {why}; {told}; give `zsched leave --to {fleet}` again once that is mended")
+        raise CliError(EXIT_FAILED, f"{me}: {why}; {told}; give `{order.leaving_for(fleet)}` again once that is mended")
     warn(f"{me}: {why}; it goes back to {going.former}")
     if _runs(way, fleet):
         there = Way(order=order, view=OrderView(door=_own(way)), me=me, began=way.began, files=())

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import shlex
 import time
 from pathlib import Path
 from typing import Final
@@ -86,8 +87,19 @@ class LeaveOrder(Struct, frozen=True, kw_only=True):
     is_plan: bool = False
     is_yes: bool = False
     is_json: bool = False
-    verb: str = "zsched leave"
-    """The command as it is to be given again."""
+    to: str = ""
+    """The cell that it leaves for, or an invitation's file; empty: it leaves for none."""
+    options: tuple[str, ...] = ()
+    """Those that were given and that the command needs again."""
+
+    @property
+    def verb(self) -> str:
+        """The command as it is to be given again."""
+        return self.leaving_for(self.to)
+
+    def leaving_for(self, cell: str) -> str:
+        """The command to another cell, or (empty) to none."""
+        return shlex.join(("zsched", "leave", *(("--to", cell) if cell else ()), *self.options))
 
 
 class Way(Struct, frozen=True, kw_only=True):

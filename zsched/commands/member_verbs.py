@@ -7,7 +7,7 @@ the verb that runs).
 from __future__ import annotations
 
 import os
-import shlex
+from collections.abc import Iterable
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -50,6 +50,11 @@ class Profile(StrEnum):
     WIRED = "wired"
     WIFI = "wifi"
     WAN = "wan"
+
+
+def _given(options: Iterable[tuple[str, object]]) -> tuple[str, ...]:
+    """The words of those options that have a value."""
+    return tuple(word for option, value in options if value is not None for word in (option, str(value)))
 
 
 AddressHelp = "HOST or HOST:PORT of its control session; its data session has the next port."
@@ -158,15 +163,13 @@ def invite(
     from zsched.commands.membership import Guest  # noqa: PLC0415 - as above
     from zsched.commands.membership import invite as bring  # noqa: PLC0415 - as above
     from zsched.core.values.model import NodeKind  # noqa: PLC0415 - as above
+    from zsched.core.values.struct import replace  # noqa: PLC0415 - as above
 
     tasks = tuple(candidate_for or ())
-    words = ["invite", name, *(["--kind", kind.value] if kind is not None else [])]
-    words += ["--address", address] if address is not None else []
-    words += [word for task in tasks for word in ("--candidate-for", task)]
-    words += ["--output", str(output)] if output is not None else []
-    words += ["--csr", str(csr)] if csr is not None else []
+    options: list[tuple[str, object]] = [("--kind", None if kind is None else kind.value), ("--address", address)]
+    options += [*(("--candidate-for", task) for task in tasks), ("--output", output), ("--csr", csr)]
     view = view_of(
-        tuple(words),
+        ("invite", name, *_given(options)),
         plan=plan,
         yes=yes,
         revision=revision,
@@ -176,6 +179,7 @@ def invite(
         is_data=True,
         at=(node, runtime_dir, connect),
     )
+    view = replace(view, where=(*_given([("--authority", authority)]), *view.where))  # no word of the fleet's history
     said = None if kind is None else NodeKind(kind.value)
     guest = Guest(name=name, kind=said, address=address, tasks=tasks, authority=authority, request=csr)
     raise typer.Exit(bring(find_door(runtime_dir, node, connect=connect), view, guest, output))
@@ -252,6 +256,13 @@ def leave(
 
     if to is not None and purge:
         raise CliError(EXIT_USAGE, "--purge does not go with --to: until it is over, the files are the way back")
+    options: list[tuple[str, object]] = [("--accept", name) for name in accept or ()]
+    options += [
+        ("-m", reason or None),
+        ("--config", config),
+        ("--state-dir", state_dir),
+        ("--runtime-dir", runtime_dir),
+    ]
     order = LeaveOrder(
         places=_places(config, state_dir),
         runtime_dir=runtime_dir,
@@ -262,7 +273,8 @@ def leave(
         is_plan=plan,
         is_yes=yes,
         is_json=json_,
-        verb="zsched leave" if to is None else shlex.join(("zsched", "leave", "--to", to)),
+        to=to or "",
+        options=(*(["--purge"] if purge else []), *_given(options)),
     )
     if to is not None:
         from zsched.commands.change_cell import change_cells  # noqa: PLC0415 - as above

@@ -319,7 +319,7 @@ def invite(door: Door, view: ApplyView, guest: Guest, file: Path | None) -> int:
     """
     check_name(guest.name)
     if file is None and sys.stdout.isatty() and not view.is_plan:
-        raise CliError(EXIT_USAGE, f"the invitation is a file: zsched invite {guest.name} > {guest.name}.invite")
+        raise CliError(EXIT_USAGE, f"the invitation is a file: {view.again()} > {guest.name}.invite")
     if file is not None and not os.access(file.parent, os.W_OK):
         raise CliError(EXIT_FAILED, f"{file}: that folder takes no file; nothing was done, name another one")
     if file is None and not view.is_plan:

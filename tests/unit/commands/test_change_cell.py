@@ -536,6 +536,20 @@ def test_an_invitation_with_a_certificate_that_nobody_would_take_moves_nothing(s
     assert (here.done, there.done, site.running) == ([], [], "hall-a")
 
 
+def test_the_way_back_is_told_with_the_options_that_were_given(
+    site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lacks, "LONG_S", 0.0)
+    there = site.cells["hall-b"]
+    there.text = B.replace("tasks:", f"  {ME}: {{kind: robot}}\ntasks:")
+    invitation = membership_invitation(tmp_path)
+    there.text = B
+    monkeypatch.delenv("ZSCHED_STATE_DIR")
+    refused = run("--to", str(invitation), "--yes", "--state-dir", str(tmp_path / "state"))
+    assert refused.exit_code == 1
+    assert f"`zsched leave --to hall-a --state-dir {tmp_path / 'state'}` takes back what was begun" in refused.stderr
+
+
 def test_who_takes_the_authority_of_its_cell_away_says_so_first(
     site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -6,6 +6,7 @@ import copy
 import io
 import itertools
 import json
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -272,6 +273,21 @@ def test_at_the_deadline_the_leave_stays_in_force_and_says_what_it_waits_for(hal
     hall.seat_goes_after = 0
     assert run("--yes").exit_code == 0, "the same command goes on"
     assert hall.asked == ["robot3 flags leave", "robot1 writes", "leave"]
+
+
+def test_the_command_to_give_again_has_the_options_that_were_given(hall: Hall, monkeypatch: pytest.MonkeyPatch) -> None:
+    hall.seat_goes_after = 1e9
+    options = ["--purge", "--accept", "last-node", "--accept", "not-told", "-m", "it was sold"]
+    for option, name, place in (
+        ("--config", "CONFIG", "fleet.yaml"),
+        ("--state-dir", "STATE_DIR", "state"),
+        ("--runtime-dir", "RUNTIME_DIR", "run"),
+    ):
+        monkeypatch.delenv(f"ZSCHED_{name}")
+        options += [option, str(hall.folder / place)]
+    late = run(*options, "--yes", "--deadline", "1s")
+    assert late.exit_code == 5
+    assert f"give `{shlex.join(['zsched', 'leave', *options])}` again to go on" in late.stderr
 
 
 def test_a_machine_that_was_taken_out_only_stops(hall: Hall) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import re
 import shlex
@@ -608,6 +610,40 @@ def test_in_a_secured_fleet_the_certificate_and_its_key_come_along(node: Node, t
     again = run("invite", "robot2")
     assert again.exit_code == 1
     assert "is a node of the fleet" in again.stderr
+
+
+def test_the_command_to_give_again_has_every_option_that_was_given(
+    node: Node, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, authority: Path
+) -> None:
+    secured(tmp_path, node)
+    monkeypatch.delenv("ZSCHED_AUTHORITY")
+    given = ["--kind", "robot", "--address", "192.0.2.12", "--candidate-for", "merge", "--output", str(tmp_path / "i")]
+    given += ["-m", "more hands", "--revision", "7", "--authority", str(authority), "--runtime-dir", str(tmp_path)]
+    refused = run("invite", "robot2", *given)
+    assert refused.exit_code == 2
+    command = refused.stderr.splitlines()[-1]
+    assert command == shlex.join(["zsched", "invite", "robot2", *given, "--yes"])
+    assert run(*shlex.split(command)[1:]).exit_code == 0
+    assert "certificate" in (tmp_path / "i").read_text(), "the authority was found by it"
+    assert "--authority" not in node.changes[-1]["reason"], "where it lies is nobody else's"
+
+
+class Screen(io.StringIO):
+    """Somebody looks at it."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.usefixtures("node")
+def test_who_would_print_an_invitation_is_told_the_same_command_into_a_file(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    words = ["invite", "robot2", "--address", "192.0.2.12", "--authority", "stick"]
+    with contextlib.redirect_stdout(Screen()), pytest.raises(SystemExit) as ended:
+        app(words)
+    assert ended.value.code == 2
+    assert f"the invitation is a file: {shlex.join(['zsched', *words])} > robot2.invite\n" in capsys.readouterr().err
 
 
 def test_who_had_the_invitations_file_open_before_reads_no_key(node: Node, tmp_path: Path) -> None:
