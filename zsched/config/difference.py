@@ -498,7 +498,7 @@ def _tuning(old: TaskSpec, new: TaskSpec, path: str) -> Iterator[_Verdict]:
         if before != after:
             key = "weights" if one.name == "weights" else f"scheduling.{one.name}"
             yield _set(AT_ONCE, f"{path}.{key}", _plain(before), _plain(after))
-    for name in ("reach", "memory_floor_ratio", "max_moves_per_minute"):
+    for name in ("reach", "memory_floor_ratio", "cpu_floor_ratio", "max_moves_per_minute"):
         if getattr(old, name) != getattr(new, name):
             yield _set(AT_ONCE, f"{path}.scheduling.{name}", getattr(old, name), getattr(new, name))
     patience, other = ("learnt" if task.learns_patience else task.patience for task in (old, new))

@@ -293,7 +293,7 @@ SCHEDULING: Final = Record(
             "How the robots' utilities become one; `median` resists a liar.",
             default=f"`{Aggregate.MEAN}`",
         ),
-        **keys(TaskSpec, "reach", "memory_floor_ratio", "max_moves_per_minute"),
+        **keys(TaskSpec, "reach", "memory_floor_ratio", "cpu_floor_ratio", "max_moves_per_minute"),
         "patience": Field(
             Number(0, MAX_PATIENCE),
             "What staying may cost before the task moves. A second of staying costs what the best candidate's lead in "

@@ -967,8 +967,8 @@ VOTE_BUGS = (
     _bug(
         "what a task's processes do not show of its memory counts twice",
         SCORING,
-        "replace(demand, memory_mb=load.memory_mb)",
-        "demand",
+        "(memory is None or allocation.tuning.score is ScoreForm.SERVICE)",
+        "memory is None",
         ("tests/unit/core/scheduler/test_scoring.py", "tests/unit/core/test_closed_loop.py"),
     ),
     _bug(

@@ -106,7 +106,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "deadline_ms": (1.0, 3.6e6),
     "for_s": (1.0, model.MAX_FOR_S),
     "max_moves_per_minute": (1, model.MAX_MOVES_PER_MINUTE),
-    "memory_floor_ratio": (0.0, model.MAX_MEMORY_FLOOR),
+    "memory_floor_ratio": (0.0, model.MAX_FLOOR),
     "nu_dbm": (-120.0, 0.0),
     "rho_dbm": (-120.0, 0.0),
 }

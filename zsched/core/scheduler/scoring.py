@@ -24,6 +24,7 @@ from zsched.core.scheduler.utility import (
     on_time,
     predicted_use,
     service_utility,
+    spare_factor,
     total_utility,
 )
 from zsched.core.values.fleet import Demand, Standby, TaskSpec
@@ -139,8 +140,6 @@ def score(
         is_owner = candidate == allocation.owner
         is_measured = is_owner and load is not None and is_short(load)
         demand, unseen = gateway.demand(spec, profile), _unseen(spec, profile, bookings, gateway)
-        if is_owner and form is ScoreForm.SERVICE:
-            demand = _as_held(demand, load)
         use = _predicted(spec, allocation, profile, demand, unseen)
         gauges = _readings(spec, allocation, profile, gateway)
         reason = _refusal(spec, allocation, profile, demand, use, gauges)
@@ -240,15 +239,6 @@ class _Use(Struct, frozen=True):
     memory_mb: float | None
 
 
-def _as_held(demand: Demand, load: WorkerLoad | None) -> Demand:
-    """The demand on its owner, which has the task's memory in use, whatever the fleet file says that the task needs.
-
-    Not all that it holds shows as its own (a GPU's, where that is the machine's, or files that it maps). The rest shows
-    as somebody else's, and by the file's figure it would count once more: no machine could keep such a task.
-    """
-    return demand if load is None or load.memory_mb is None else replace(demand, memory_mb=load.memory_mb)
-
-
 def _predicted(spec: TaskSpec, allocation: Allocation, profile: Profile, demand: Demand, unseen: Demand) -> _Use:
     cpu, memory = profile.cpu_used_cores, profile.memory_used_mb
     own = _own(spec, allocation, profile, demand)
@@ -262,16 +252,18 @@ def _own(spec: TaskSpec, allocation: Allocation, profile: Profile, demand: Deman
     """What of a node's use is the task's own.
 
     Nobody measures a worker that somebody else started. At the owner its demand is taken for its use, or the owner
-    would look worse by the task's own work.
+    would look worse by the task's own work. So is a demand of memory, whatever is measured: not all of it shows in the
+    worker's processes (a GPU's, where that is the machine's, or files that it maps), and no machine could keep a task
+    whose memory counts twice there. Eq. 2 goes by what shows.
     """
     load = profile.worker(spec.name)
     cpu, memory = (None, None) if load is None else (load.cpu_cores, load.memory_mb)
     is_at_work = profile.node == allocation.owner and (load is None or load.state is WorkerState.READY)
     if cpu is None:
         cpu = _likely_cores(profile, load, demand) if is_at_work else 0.0
-    if memory is None:
-        memory = min(profile.memory_used_mb or 0.0, demand.memory_mb) if is_at_work else 0.0
-    return Demand(cpu_cores=cpu, memory_mb=memory)
+    if is_at_work and (memory is None or allocation.tuning.score is ScoreForm.SERVICE):
+        memory = max(memory or 0.0, min(profile.memory_used_mb or 0.0, demand.memory_mb))
+    return Demand(cpu_cores=cpu, memory_mb=memory or 0.0)
 
 
 def _likely_cores(profile: Profile, load: WorkerLoad | None, demand: Demand) -> float:
@@ -324,8 +316,6 @@ def _refusal(
     if not is_owner and not may_get(spec, state):
         return f"worker {state}{why}"
     used = use.memory_mb
-    if spec.demand.memory_mb > profile.memory_mb:
-        return f"needs {spec.demand.memory_mb:.0f} MiB, has {profile.memory_mb:.0f} in all"
     if used is not None and used > profile.memory_mb:
         return f"needs {demand.memory_mb:.0f} MiB, has {max(profile.memory_mb - used + demand.memory_mb, 0.0):.0f} free"
     return _beyond_limits(spec, profile, gauges, is_owner=is_owner)
@@ -409,6 +399,7 @@ def _cpu(
         return cpu_utility(profile.cpu_cores, used)
     free, job = profile.cpu_cores - used + demand.cpu_cores, demands.job(spec.name)
     share, stretch = demands.experience(spec.name, profile)
+    share *= spare_factor(profile.cpu_cores - used, profile.cpu_cores, spec.cpu_floor_ratio)
     if job is None:
         return service_utility(free, demand.cpu_cores, profile.cpu_cores, least=least_cores, share=share)
     speed = demands.speed(spec.name, profile)

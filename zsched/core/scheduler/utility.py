@@ -128,7 +128,22 @@ def on_time(job_s: float, deadline_s: float) -> float:
 
 
 NEARLY_FULL = 0.15
-"""This part of the memory's term goes where nothing is left beside the task: enough to leave for, in some seconds."""
+"""This part of a term goes where nothing is left beside the task: enough to leave for, in some seconds."""
+
+
+def spare_factor(left: float, capacity: float, floor_ratio: float) -> float:
+    """What of a term counts where a task leaves so much free: less below the floor, down to 1 - `NEARLY_FULL`.
+
+    Args:
+        left: free beside the task; below 0 counts as 0.
+        capacity: of the machine, in the same unit, > 0.
+        floor_ratio: of the machine, in [0, 1); 0: it counts whole.
+
+    >>> [round(spare_factor(left, 4.0, 0.1), 3) for left in (-1.0, 0.0, 0.2, 0.4)]
+    [0.85, 0.85, 0.925, 1.0]
+    """
+    floor = floor_ratio * capacity
+    return 1.0 - NEARLY_FULL * clamp(1.0 - left / floor) if floor > 0.0 else 1.0
 
 
 def memory_service(free: float, demand: float, capacity: float, floor_ratio: float) -> float:
@@ -145,9 +160,7 @@ def memory_service(free: float, demand: float, capacity: float, floor_ratio: flo
     >>> round(memory_service(free=400.0, demand=300.0, capacity=4000.0, floor_ratio=0.05), 3)
     0.883
     """
-    floor = floor_ratio * capacity
-    depth = clamp(1.0 - (free - demand) / floor) if floor > 0.0 else 0.0
-    return service_utility(free, demand, capacity) * (1.0 - NEARLY_FULL * depth)
+    return service_utility(free, demand, capacity) * spare_factor(free - demand, capacity, floor_ratio)
 
 
 def network_utility(signal_dbm: float, nu_dbm: float, rho_dbm: float) -> float:

@@ -19,8 +19,8 @@ from zsched.core.values.document import Rollout
 from zsched.core.values.gauges import check_limits
 from zsched.core.values.limits import Range, check_ranges, key
 from zsched.core.values.model import (
+    MAX_FLOOR,
     MAX_FORESEE_S,
-    MAX_MEMORY_FLOOR,
     MAX_MOVES_PER_MINUTE,
     RSSI_MAX_DBM,
     RSSI_MIN_DBM,
@@ -240,7 +240,13 @@ class TaskSpec:
         0.05,
         "Where a task leaves less memory free than this share, its memory counts up to 15 % less "
         "(`score: paper`: an owner that has less is left).",
-        Range(0, MAX_MEMORY_FLOOR),
+        Range(0, MAX_FLOOR),
+    )
+    cpu_floor_ratio: float = key(
+        0.0,
+        "Where a task leaves less CPU free than this share, the machine's CPU counts up to 15 % less: for programs "
+        "there that are no tasks, such as a robot's SLAM. `0`: by what the task itself gets. Not with `score: paper`.",
+        Range(0, MAX_FLOOR),
     )
     max_moves_per_minute: int = key(
         6, "Hard cap of planned moves; escapes are bounded too, at 60.", Range(1, MAX_MOVES_PER_MINUTE)
@@ -532,7 +538,13 @@ _PATHS = frozenset({("Fleet", "zenoh_config"), ("LinkSpec", "value"), ("Security
 
 
 _LATER = frozenset(
-    {("Weights", "gauges"), ("Demand", "gpu"), ("TaskSpec", "gauge_limits"), ("TaskSpec", "rollout")}
+    {
+        ("Weights", "gauges"),
+        ("Demand", "gpu"),
+        ("TaskSpec", "gauge_limits"),
+        ("TaskSpec", "rollout"),
+        ("TaskSpec", "cpu_floor_ratio"),
+    }
     | {("Fleet", "cells"), ("NodeSpec", "listen_streams")}
     | {("Tuning", name) for name in (*TUNED_RULES, *TUNED_LINKS)}
 )

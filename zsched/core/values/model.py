@@ -149,7 +149,7 @@ class Weights(Struct, frozen=True, kw_only=True):
 
 
 MIN_DEADLINE_MS, MAX_DEADLINE_MS = 1.0, 3.6e6
-MAX_PATIENCE, MAX_MOVES_PER_MINUTE, MAX_MEMORY_FLOOR, MAX_FORESEE_S = 1000.0, 100_000, 0.9, 30.0
+MAX_PATIENCE, MAX_MOVES_PER_MINUTE, MAX_FLOOR, MAX_FORESEE_S = 1000.0, 100_000, 0.9, 30.0
 
 
 class Tuning(Struct, frozen=True, kw_only=True):
@@ -188,7 +188,7 @@ class Tuning(Struct, frozen=True, kw_only=True):
         check_range("cool_down_s", self.cool_down_s, 0.0, 86400.0)
         check_range("patience", self.patience, 0.0, MAX_PATIENCE)
         check_range("max_moves_per_minute", self.max_moves_per_minute, 1, MAX_MOVES_PER_MINUTE)
-        check_range("memory_floor_ratio", self.memory_floor_ratio, 0.0, MAX_MEMORY_FLOOR)
+        check_range("memory_floor_ratio", self.memory_floor_ratio, 0.0, MAX_FLOOR)
         check_range("nu_dbm", self.nu_dbm, RSSI_MIN_DBM, RSSI_MAX_DBM)
         check_range("rho_dbm", self.rho_dbm, RSSI_MIN_DBM, RSSI_MAX_DBM)
         check_range("foresee_s", self.foresee_s, 0.0, MAX_FORESEE_S)

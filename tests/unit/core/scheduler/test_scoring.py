@@ -138,6 +138,28 @@ def test_a_task_that_has_its_memory_counts_a_full_machine_less_and_not_for_nothi
     assert nothing == pytest.approx(enough * (1.0 - NEARLY_FULL), abs=0.01)
 
 
+def test_a_machine_that_a_task_fills_counts_less_where_others_are_to_have_their_cpu() -> None:
+    """It gets all that it needs on both; on the second one programs that are no tasks would have nothing left."""
+    agreed = allocation_of(7, epoch=3, tuning=Tuning(weights=CPU, score=ScoreForm.SERVICE))
+
+    def lead(floor: float, used: float, owner: str = "edge1") -> float:
+        spec = replace(SPEC, candidates=("edge1", "edge2"), demand=Demand(cpu_cores=0.4), cpu_floor_ratio=floor)
+        own = {name: 0.4 if name == owner else 0.0 for name in spec.candidates}
+        free = profile("edge1", cpu=0.4 + own["edge1"], own=(own["edge1"], 0.0))
+        full = profile("edge2", cpu=used + own["edge2"], own=(own["edge2"], 0.0))
+        told = values(scored(ROBOT, free, full, spec=spec, agreed=replace(agreed, owner=owner)))
+        return told["edge1"] - told["edge2"]
+
+    assert lead(0.0, used=3.6) < DEFAULT_BONUS
+    assert (
+        lead(0.1, used=3.6)
+        == lead(0.1, used=3.6, owner="edge2")
+        == pytest.approx(NEARLY_FULL + lead(0.0, 3.6), abs=0.02)
+    )
+    assert lead(0.1, used=3.6) > lead(0.1, used=3.3) > lead(0.0, used=3.3), "7 % would be left"
+    assert lead(0.1, used=3.0) == lead(0.0, used=3.0)
+
+
 def test_an_owner_has_the_memory_that_it_holds_though_not_all_of_it_shows_as_its_own() -> None:
     """2000 of 4000 MiB are the task's, of which its processes show 100; the others have 800."""
     half = Weights(cpu=0.5, memory=0.5, network=0.0)
@@ -150,7 +172,7 @@ def test_an_owner_has_the_memory_that_it_holds_though_not_all_of_it_shows_as_its
     first, second = vector.utilities
     assert first.memory == second.memory
     too_small = scored(owner, spec=replace(spec, demand=Demand(memory_mb=5000.0)), agreed=agreed)
-    assert dict(too_small.refused)["edge1"] == "needs 5000 MiB, has 4000 in all"
+    assert dict(too_small.refused)["edge1"] == "needs 5000 MiB, has 4000 free"
 
 
 # --- who is scored -------------------------------------------------------------------------------------------------
