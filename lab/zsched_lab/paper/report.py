@@ -50,6 +50,9 @@ GAINS_SAY = (
     "Eq. 1 and 2 at every moment.\n"
 )
 BEST_SAY = "zsched against the best fixed scheme of each figure, which is known only afterwards:\n"
+ENDED_SAY = (
+    "Done, yet counted as not done, since the last robot's word came a moment after the end that was kept of the run"
+)
 RANKED = ("zsched", "dyna_both", "oracle")
 """The schemes in the table of gains."""
 EXHAUSTED = 0.95
@@ -89,6 +92,7 @@ def report(results: Json, pictures: Sequence[str]) -> str:
         better_text(groups),
         "## All schemes\n",
         uneven_text(main),
+        ended_text(main, scenario),
         schemes_text(main),
         others_text(main),
         *coverage_parts(main),
@@ -233,6 +237,25 @@ def uneven_text(runs: Sequence[Json]) -> str:
     )
 
 
+def ended_text(runs: Sequence[Json], scenario: Json) -> str:
+    """Which runs of before 2026-11-28 were done and count as not done; else empty.
+
+    Only robots that hold the target end a run before its time. Such a run's end was taken a moment before the last
+    robot's word was read, so that this word came after the end.
+    """
+    whole_s = float(scenario.get("duration_s", 0.0))
+    ended = [one for one in runs if not one.get("is_done", True) and float(one.get("duration_s", whole_s)) < whole_s]
+    told = []
+    for figures in ended:
+        name = figures["scheme"]
+        own = [one for one in runs if one["scheme"] == name]
+        done = sum(bool(one["is_done"]) for one in own) + sum(one["scheme"] == name for one in ended)
+        told.append(f"run {figures['run']} of {name} ({figures['duration_s']:.1f} s; *done* is {done / len(own):.2f})")
+    if not told:
+        return ""
+    return f"{ENDED_SAY}: {', '.join(told)}.\n"
+
+
 def others_text(runs: Sequence[Json]) -> str:
     """How far the schemes that the table of gains leaves out are from the mean of the fixed ones; empty without any."""
     rows: Gains = {(name,): over_fixed(runs, name) for name in SCHEMES if name not in (*FIXED_SCHEMES, *RANKED)}
@@ -309,7 +332,8 @@ def blocks_parts(results: Json, pictures: Sequence[str] = ()) -> list[str]:
             notes.append(f"* `{name}`: {says}. {f'Left out: {why}' if why else 'Not run'}.")
         elif is_whole(own) or coverage_parts(own):
             picture = [shown(f"{name}.png")] if f"{name}.png" in pictures else []
-            alone += [f"## Block {name}\n", f"As the matrix, but for: {says}.\n", schemes_text(own), others_text(own)]
+            alone += [f"## Block {name}\n", f"As the matrix, but for: {says}.\n"]
+            alone += [ended_text(own, results["scenario"]), schemes_text(own), others_text(own)]
             alone += [*coverage_parts(own), *picture]
         else:
             notes.append(f"* `{name}`: {says}.")

@@ -231,7 +231,8 @@ class CellRun:
             if now < end_s:
                 parts.loads.tick(now)
                 if self._inputs.robots.ends_when_covered and seen.is_covered():
-                    end_s = now
+                    # What was read now may be younger than `now`: a run ends no sooner than what ended it.
+                    end_s = min(monotonic_s() - self._zero_s, end_s)
             self._sample(parts, now)
             time.sleep(TICK_S)
         return end_s

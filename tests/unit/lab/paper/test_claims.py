@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import json
 import math
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -23,11 +25,13 @@ from zsched_lab.paper.figures import save_all, save_gains, save_panels, save_rad
 from zsched_lab.paper.report import (
     blocks_parts,
     claims_text,
+    ended_text,
     gains_parts,
     groups_of,
     in_block,
     is_whole,
     judged_groups,
+    main_runs,
     memory_text,
     others_text,
     radio_text,
@@ -36,6 +40,7 @@ from zsched_lab.paper.report import (
 from zsched_lab.paper.schemes import FIXED_SCHEMES, PAPER_SCHEMES, SCHEMES
 from zsched_lab.paper.snippet import snippet
 
+EVALUATION = Path(__file__).parents[4] / "docs" / "evaluation"
 HIGHER = Claim(source="paper", says="x", metric="map_hz", mine=("a",), theirs=("b",), target=0.2)
 LOWER = Claim(source="paper", says="x", metric="task_latency_s", mine=("a",), theirs=("b",), target=-0.28)
 FIGURES = {
@@ -192,6 +197,25 @@ def test_each_table_says_how_far_a_scheme_is_from_the_fixed_ones() -> None:
     assert others_text(runs) == "", "zsched is in the table of gains, and two runs of random say nothing"
     runs += [a_run("random", 2, map_hz=2.0)]
     assert "| random | 3 |" in others_text(runs)
+
+
+@pytest.mark.parametrize(
+    ("file", "told"),
+    [
+        ("results.json", "run 3 of fixed_e2 (19.6 s; *done* is 1.00)"),
+        ("heavy-again.json", "run 7 of fixed_e2 (35.4 s; *done* is 0.88)"),
+    ],
+)
+def test_a_run_that_ended_because_it_was_done_is_named_where_it_counts_as_not_done(file: str, told: str) -> None:
+    results = json.loads((EVALUATION / file).read_text(encoding="utf-8"))
+    runs = main_runs(results)
+    said = ended_text(runs, results["scenario"])
+
+    assert said.endswith(f": {told}.\n")
+    page = EVALUATION / ("report.md" if file == "results.json" else "heavy-again.md")
+    assert said in page.read_text(encoding="utf-8")
+    longest = [{**one, "duration_s": results["scenario"]["duration_s"]} for one in runs]
+    assert ended_text(longest, results["scenario"]) == "", "of those whose time was over nothing is known"
 
 
 def a_block(name: str, schemes: tuple[str, ...], runs: int = 3) -> list[dict[str, Any]]:

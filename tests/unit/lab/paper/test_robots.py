@@ -1,15 +1,24 @@
 from __future__ import annotations
 
+import math
+import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
+from zsched.clock import monotonic_s
 from zsched.config.load import load_fleet
 from zsched_lab.explore.robot import parse as parse_explorer
+from zsched_lab.fleet.children import Children
+from zsched_lab.fleet.limits import LimitKind, NodeLimits
 from zsched_lab.fleet.recorder import Recorder
 from zsched_lab.maps.laser_log import malaga_path
+from zsched_lab.paper import run as paper_run
 from zsched_lab.paper.cells import Cell
+from zsched_lab.paper.load import Loads
 from zsched_lab.paper.node_state import is_calm, ready_workers
 from zsched_lab.paper.places import robots_scenario_path, scenario_path
 from zsched_lab.paper.robots import ExploreRobots, LogRobots, Place
@@ -88,6 +97,40 @@ def test_the_task_is_over_when_every_robot_has_said_so(tmp_path: Path) -> None:
         recorder.write("robot2", {"kind": "covered", "t_s": 2.0})
         assert seen.is_covered()
         assert seen.is_covered()
+
+
+class SlowLoads(Loads):
+    """Loads whose start takes a moment; meanwhile every robot finds that its map covers the target."""
+
+    said_s = math.inf
+
+    def tick(self, t_s: float) -> None:
+        super().tick(t_s)
+        if self.said_s < math.inf:
+            return
+        time.sleep(0.02)
+        self.said_s = monotonic_s()
+        with Recorder(self._records) as recorder:
+            for robot in ("robot1", "robot2", "robot3"):
+                recorder.write(robot, {"kind": "covered", "t_s": self.said_s})
+
+
+def test_a_run_ends_no_sooner_than_the_word_that_ended_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else the last robot's word comes after the end, and a run that ended because it was done counts as not done."""
+    monkeypatch.setattr(paper_run, "SETTLE_S", 0.0)
+    scenario = load_scenario(scenario_path())
+    robots = ExploreRobots(world="office", speed=1.0)
+    cell = Cell(scheme=SCHEMES["zsched"], level=scenario.level, run=0)
+    run: Any = CellRun(scenario, cell, Inputs(robots=robots), tmp_path)  # its loop by itself, without any fleet
+    run._next_sample_s = math.inf
+    level, limits = scenario.levels[scenario.level], NodeLimits(LimitKind.NONE, "no shares")
+    with Children(tmp_path / "logs") as children:
+        loads = SlowLoads((), level, 1.0, children, limits, tmp_path / "records", print)
+        parts = SimpleNamespace(fleet=run.write_fleet(), loads=loads)
+        run._zero_s = zero_s = monotonic_s()
+        end_s = run._drive(children, parts)
+
+    assert 0.0 < loads.said_s - zero_s <= end_s < scenario.duration_s
 
 
 def test_each_robot_hears_the_others_where_the_scenario_says_so(tmp_path: Path) -> None:
