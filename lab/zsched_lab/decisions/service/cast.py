@@ -20,7 +20,7 @@ from zsched.core.values.fleet import (
     TaskSpec,
 )
 from zsched.core.values.model import ScoreForm, Tuning, Weights
-from zsched_lab.decisions.entries import PAPER_COST, RAW
+from zsched_lab.decisions.entries import CPU_ONLY, MEMORY_ONLY, PAPER_COST, RAW
 from zsched_lab.decisions.rules import CoreRule, PickRule, Rule
 from zsched_lab.decisions.service.replay import Player, is_of_task
 from zsched_lab.decisions.view import Look, Sight
@@ -36,6 +36,8 @@ def players() -> tuple[Player, ...]:
     return (
         zsched("service"),
         zsched("paper", score=ScoreForm.PAPER),
+        _picks("dyna_cpu", CPU_ONLY, PAPER_COST),
+        _picks("dyna_mem", MEMORY_ONLY, PAPER_COST),
         _picks("dyna_both", EVEN, PAPER_COST),
         _picks("dyna_net", RADIO_ONLY, PAPER_COST),
         _picks("argmax", EVEN, 0.0),

@@ -23,6 +23,8 @@ STYLES: Final = {
     "present": ("#555555", ":", ""),
     "paper": ("#c0392b", "-", "o"),
     "service": ("#2e8b57", "-", "o"),
+    "dyna_cpu": ("#1b3f6e", "-", "<"),
+    "dyna_mem": ("#5b8fc9", "-", ">"),
     "dyna_both": ("#2c6fbb", "-", "s"),
     "dyna_net": ("#74b3e0", "-", "v"),
     "argmax": ("#e08e0b", "-", "^"),

@@ -16,13 +16,14 @@ from zsched.core.values.model import ScoreForm, Utility, UtilityVector, Weights
 from zsched_lab.decisions import __main__ as package
 from zsched_lab.decisions import entries
 from zsched_lab.decisions.loads import Spikes
-from zsched_lab.decisions.rules import CoreRule, TimedJudge
+from zsched_lab.decisions.rules import CoreRule, PickRule, TimedJudge
 from zsched_lab.decisions.service import cast, command, picture, study, tables
 from zsched_lab.decisions.service import replay as closed
 from zsched_lab.decisions.service.history import MEASURED, History, build
 from zsched_lab.decisions.service.replay import Player, Scene, TaskView, replay
 from zsched_lab.decisions.view import START_S
 from zsched_lab.decisions.world import DT_S, loaded_world
+from zsched_lab.paper.schemes import PAPER_PERIOD_S, PAPER_SCHEMES, SCHEMES
 
 HOURS = 0.03
 ZSCHED = cast.players()[0]
@@ -116,6 +117,26 @@ def test_the_service_rule_is_what_a_fleet_file_gets_that_says_nothing() -> None:
     made = ZSCHED.make(TaskView(scene(build(seed=3, hours=HOURS, load_s=0.0), 1.0, None), spec_of(3)))
     assert isinstance(made, CoreRule)
     assert [judge.spec.learns_patience for judge in made._judges] == [True] * 3
+
+
+@pytest.mark.parametrize("name", [*PAPER_SCHEMES, "dyna_net"])
+def test_every_scheme_of_the_paper_takes_part_with_the_weights_that_it_has_on_real_daemons(name: str) -> None:
+    player = {one.name: one for one in cast.players()}[name]
+    weights = player.tuning.weights
+
+    assert (weights.cpu, weights.memory, weights.network) == SCHEMES[name].weights
+    assert (player.tuning.score, player.look, player.is_told) == (ScoreForm.PAPER, entries.RAW, True)
+    made = player.make(TaskView(scene(build(seed=3, hours=HOURS, load_s=0.0), 1.0, None, player), spec_of(3)))
+    assert isinstance(made, PickRule)
+    assert (made.cost, made.period_s) == (entries.PAPER_COST, PAPER_PERIOD_S)
+    assert name in picture.STYLES
+
+
+def test_the_papers_schemes_are_three_rules() -> None:
+    history = build(seed=100, hours=0.05, load_s=10.0)
+    players = {one.name: one for one in cast.players()}
+    moves = [[(move.at_s, move.owner) for move in replay(history, players[name], 100)[0]] for name in PAPER_SCHEMES]
+    assert moves[0] != moves[1] != moves[2] != moves[0]
 
 
 def spec_of(seed: int) -> TaskSpec:
