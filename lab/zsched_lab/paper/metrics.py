@@ -12,6 +12,7 @@ import heapq
 import itertools
 import json
 import statistics
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
@@ -328,14 +329,16 @@ def grid_of(payload: bytes) -> Grid | None:
 
 
 def move_figures(run: Mapping[str, Any], streams: Streams, owners: Sequence[tuple[float, NodeId]]) -> Json:
-    """Moves, wasted ones, the silence around each, and what was lost in the streams.
+    """Moves, wasted ones, the silence around each, and what was lost and dropped in the streams.
 
     The relays count losses from their start on, so they are shared out over all moves, earlier ones included.
+    ``drops`` is {reason: messages}: some reasons are by the rules, such as ``cut``, the old owner's behind a move.
     """
     moves = [start for start, _ in owners[1:]]
     in_all = max(len(run["allocations"]) - 1, 0)
     gaps = [gap for t_s in moves if (gap := gap_around(streams, t_s, float(run["duration_s"]))) is not None]
     counts = [count for node in run["robots"] for count in (run["streams"].get(node) or [])]
+    drops = sum((Counter(count.get("drops") or {}) for count in counts), Counter[str]())
     lost = sum(int(count.get("lost") or 0) + int(count.get("at_most_lost") or 0) for count in counts)
     return {
         "moves": len(moves),
@@ -345,7 +348,8 @@ def move_figures(run: Mapping[str, Any], streams: Streams, owners: Sequence[tupl
         "gap_max_s": max((gap for maps in streams.maps.values() for gap in silences(maps)), default=None),
         "lost": lost,
         "lost_per_move": lost / in_all if in_all else None,
-        "dropped": sum(sum((count.get("drops") or {}).values()) for count in counts),
+        "dropped": drops.total(),
+        "drops": dict(sorted(drops.items())),
         "owners": [[round(start, 3), node] for start, node in owners],
     }
 

@@ -31,6 +31,7 @@ from zsched_lab.paper.tables import (
     gains_table,
     head_of,
     known_columns,
+    losses_table,
     mean_text,
     scheme_rows,
     schemes_text,
@@ -52,6 +53,11 @@ GAINS_SAY = (
 BEST_SAY = "zsched against the best fixed scheme of each figure, which is known only afterwards:\n"
 ENDED_SAY = (
     "Done, yet counted as not done, since the last robot's word came a moment after the end that was kept of the run"
+)
+DROPS_SAY = (
+    "Of the task's streams, counted by the robots' relays since the daemons started. Lost: or at most lost. Dropped: "
+    "taken by a relay, and thrown away for a reason; `cut` are the old owner's answers behind a move, in whose place "
+    "the new owner's come. Schemes without any are left out."
 )
 RANKED = ("zsched", "dyna_both", "oracle")
 """The schemes in the table of gains."""
@@ -101,6 +107,8 @@ def report(results: Json, pictures: Sequence[str]) -> str:
         sweep_text(runs, scenario),
         *[shown(name) for name in pictures if name == "sweep.png"],
         *blocks_parts(results, pictures),
+        "## Lost and dropped messages\n",
+        losses_text(groups_of(results)),
         "## What was run\n",
         conditions_text(results),
     ]
@@ -367,6 +375,11 @@ def is_whole(runs: Sequence[Json]) -> bool:
     schemes = (*FIXED_SCHEMES, *PAPER_SCHEMES, "zsched")
     counts = [sum(bool(figures["scheme"] == name) for figures in runs) for name in schemes]
     return min(counts) >= LEAST_RUNS
+
+
+def losses_text(groups: Mapping[str, Sequence[Json]]) -> str:
+    """What was lost in the task's streams, and what was dropped, by reason."""
+    return f"{DROPS_SAY}\n\n{losses_table(groups) or 'Nothing was lost or dropped.'}".rstrip() + "\n"
 
 
 def conditions_text(results: Json) -> str:

@@ -6,6 +6,7 @@ Knows: Markdown, columns, digits. Does not know: which runs belong together, wha
 from __future__ import annotations
 
 import statistics
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -42,6 +43,8 @@ SMALL_COLUMNS = tuple(
     column for column in COLUMNS if column[0] in (*SMALL, "moves", "move_gap_max_s", "lost_per_move", "regret")
 )
 """The columns of blocks that run only some schemes."""
+DROP_COLUMNS = (("moves", "moves in all", 0), ("lost", "lost in all", 0), ("dropped", "dropped in all, by reason", 0))
+UNKNOWN_DROP = "reason not kept"
 TITLES = {metric: title for metric, title, _ in COLUMNS}
 
 
@@ -71,6 +74,35 @@ def scheme_rows(runs: Sequence[Json], columns: Sequence[tuple[str, str, int]], b
             cells = [mean_text([figures.get(metric) for figures in own], digits) for metric, _, digits in columns]
             lines.append(f"{before}| {name} | {len(own)} | {' | '.join(cells)} |")
     return lines
+
+
+def losses_table(groups: Mapping[str, Sequence[Json]]) -> str:
+    """What each scheme's runs lost and dropped in all, by reason; only schemes that did. Empty where nobody did."""
+    lines = []
+    for where, runs in groups.items():
+        for name in SCHEMES:
+            own = [figures for figures in runs if figures["scheme"] == name]
+            lost, dropped = (sum(int(figures.get(key) or 0) for figures in own) for key in ("lost", "dropped"))
+            if lost or dropped:
+                moves = sum(int(figures["moves"]) for figures in own)
+                lines.append(f"| {where} | {name} | {len(own)} | {moves} | {lost} | {drops_text(own)} |")
+    if not lines:
+        return ""
+    return "\n".join([*head_of(("where", "scheme"), DROP_COLUMNS), *lines]) + "\n"
+
+
+def drops_text(runs: Sequence[Json]) -> str:
+    """What runs dropped, by reason, the most first; runs of before reasons were kept have their sum alone.
+
+    >>> drops_text([{"dropped": 4, "drops": {"cut": 3, "overflow": 1}}, {"dropped": 3}])
+    'cut 3, reason not kept 3, overflow 1'
+    >>> drops_text([{"dropped": 0}])
+    '0'
+    """
+    drops: Counter[str] = Counter()
+    for figures in runs:
+        drops.update(figures.get("drops") or {UNKNOWN_DROP: int(figures.get("dropped") or 0)})
+    return ", ".join(f"{reason} {count}" for reason, count in drops.most_common() if count) or "0"
 
 
 def gains_table(titles: Sequence[str], rows: Gains) -> str:

@@ -31,6 +31,7 @@ from zsched_lab.paper.report import (
     in_block,
     is_whole,
     judged_groups,
+    losses_text,
     main_runs,
     memory_text,
     others_text,
@@ -197,6 +198,22 @@ def test_each_table_says_how_far_a_scheme_is_from_the_fixed_ones() -> None:
     assert others_text(runs) == "", "zsched is in the table of gains, and two runs of random say nothing"
     runs += [a_run("random", 2, map_hz=2.0)]
     assert "| random | 3 |" in others_text(runs)
+
+
+def test_what_was_dropped_stands_beside_what_was_lost_by_reason() -> None:
+    runs = [a_run("zsched", 0, lost=1, dropped=4, drops={"cut": 3, "overflow": 1})]
+    runs += [a_run("zsched", 1, lost=0, dropped=6, drops={"cut": 6}), a_run("fixed_e1", 0, lost=0, dropped=0, drops={})]
+    runs += [a_run("dyna_both", 0, lost=2, dropped=3)]  # of before reasons were kept
+    text = losses_text({"matrix (one)": runs})
+
+    assert "| matrix (one) | zsched | 2 | 4 | 1 | cut 9, overflow 1 |" in text
+    assert "| matrix (one) | dyna_both | 1 | 2 | 2 | reason not kept 3 |" in text
+    assert "fixed_e1" not in text
+    assert losses_text({"matrix (one)": runs[2:3]}).endswith("\n\nNothing was lost or dropped.\n")
+    results = json.loads((EVALUATION / "results.json").read_text(encoding="utf-8"))
+    said = losses_text(groups_of(results))
+    assert said in (EVALUATION / "report.md").read_text(encoding="utf-8")
+    assert said in report(results, [])
 
 
 @pytest.mark.parametrize(

@@ -118,8 +118,17 @@ def test_a_runs_figures_by_their_definitions(tmp_path: Path, scenario: Scenario)
     assert figures["wasted_moves"] == 0
     assert figures["move_gap_max_s"] == pytest.approx(1.0)
     assert (figures["lost"], figures["lost_per_move"], figures["dropped"]) == (3, 3.0, 3)
+    assert figures["drops"] == {"full": 3}
     assert figures["held_ssim_rebased"] < figures["ssim_rebased"] <= 1.0
     assert brief(figures).startswith("0.90 maps/s")
+
+
+def test_what_was_dropped_keeps_its_reasons(tmp_path: Path, scenario: Scenario) -> None:
+    """Else nobody can tell an old owner's answers behind a move from a queue that was full."""
+    both: dict[str, Any] = {"robot1": [{"drops": {"cut": 2}}, {"drops": {"overflow": 1, "cut": 1}}], "robot2": [{}]}
+    figures = measure(write_run(tmp_path, streams=both), scenario, Truth(a_room()))
+    assert figures["drops"] == {"cut": 3, "overflow": 1}
+    assert (figures["dropped"], figures["lost"]) == (4, 0)
 
 
 def test_a_nodes_figures_are_its_own(tmp_path: Path, scenario: Scenario) -> None:
