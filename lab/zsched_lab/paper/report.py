@@ -14,6 +14,7 @@ from zsched_lab.paper.claims import (
     Difference,
     Verdict,
     better_than_ours,
+    compared,
     judged,
     over_best_fixed,
     over_fixed,
@@ -21,6 +22,7 @@ from zsched_lab.paper.claims import (
 )
 from zsched_lab.paper.coverage_report import coverage_parts
 from zsched_lab.paper.plan import merge_text
+from zsched_lab.paper.remarks import declared_parts, ended_text, losses_text
 from zsched_lab.paper.scenario import MATRIX, MergeTask
 from zsched_lab.paper.schemes import FIXED_SCHEMES, PAPER_SCHEMES, SCHEMES
 from zsched_lab.paper.tables import (
@@ -31,7 +33,6 @@ from zsched_lab.paper.tables import (
     gains_table,
     head_of,
     known_columns,
-    losses_table,
     mean_text,
     scheme_rows,
     schemes_text,
@@ -51,14 +52,7 @@ GAINS_SAY = (
     "Eq. 1 and 2 at every moment.\n"
 )
 BEST_SAY = "zsched against the best fixed scheme of each figure, which is known only afterwards:\n"
-ENDED_SAY = (
-    "Done, yet counted as not done, since the last robot's word came a moment after the end that was kept of the run"
-)
-DROPS_SAY = (
-    "Of the task's streams, counted by the robots' relays since the daemons started. Lost: or at most lost. Dropped: "
-    "taken by a relay, and thrown away for a reason; `cut` are the old owner's answers behind a move, in whose place "
-    "the new owner's come. Schemes without any are left out."
-)
+COUNTED = {6: "six", 8: "eight"}
 RANKED = ("zsched", "dyna_both", "oracle")
 """The schemes in the table of gains."""
 EXHAUSTED = 0.95
@@ -96,6 +90,7 @@ def report(results: Json, pictures: Sequence[str]) -> str:
         NOT_COMPARED,
         "## No scheme of the paper better than ours?\n",
         better_text(groups),
+        *declared_parts(groups_of(results), scenario),
         "## All schemes\n",
         uneven_text(main),
         ended_text(main, scenario),
@@ -231,7 +226,7 @@ def better_text(groups: Mapping[str, Sequence[Json]]) -> str:
             lines.append(f"* {name}: zsched was run less than {LEAST_RUNS} times: no verdict.")
             continue
         found = [f"{scheme} {TITLES[metric]} {one.text()}" for scheme, metric, one in better_than_ours(runs)]
-        says = "; ".join(found) or "none, on none of the six metrics, beyond the interval"
+        says = "; ".join(found) or f"none, on none of the {COUNTED[len(compared(runs))]} metrics, beyond the interval"
         lines.append(f"* {name}, against zsched: {says}.")
     return "\n".join(lines) + "\n"
 
@@ -243,25 +238,6 @@ def uneven_text(runs: Sequence[Json]) -> str:
     return (
         "Means over each scheme's runs. Where the numbers of runs differ, so do the worlds: compare by differences.\n"
     )
-
-
-def ended_text(runs: Sequence[Json], scenario: Json) -> str:
-    """Which runs of before 2026-11-28 were done and count as not done; else empty.
-
-    Only robots that hold the target end a run before its time. Such a run's end was taken a moment before the last
-    robot's word was read, so that this word came after the end.
-    """
-    whole_s = float(scenario.get("duration_s", 0.0))
-    ended = [one for one in runs if not one.get("is_done", True) and float(one.get("duration_s", whole_s)) < whole_s]
-    told = []
-    for figures in ended:
-        name = figures["scheme"]
-        own = [one for one in runs if one["scheme"] == name]
-        done = sum(bool(one["is_done"]) for one in own) + sum(one["scheme"] == name for one in ended)
-        told.append(f"run {figures['run']} of {name} ({figures['duration_s']:.1f} s; *done* is {done / len(own):.2f})")
-    if not told:
-        return ""
-    return f"{ENDED_SAY}: {', '.join(told)}.\n"
 
 
 def others_text(runs: Sequence[Json]) -> str:
@@ -375,11 +351,6 @@ def is_whole(runs: Sequence[Json]) -> bool:
     schemes = (*FIXED_SCHEMES, *PAPER_SCHEMES, "zsched")
     counts = [sum(bool(figures["scheme"] == name) for figures in runs) for name in schemes]
     return min(counts) >= LEAST_RUNS
-
-
-def losses_text(groups: Mapping[str, Sequence[Json]]) -> str:
-    """What was lost in the task's streams, and what was dropped, by reason."""
-    return f"{DROPS_SAY}\n\n{losses_table(groups) or 'Nothing was lost or dropped.'}".rstrip() + "\n"
 
 
 def conditions_text(results: Json) -> str:

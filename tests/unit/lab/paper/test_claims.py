@@ -22,16 +22,15 @@ from zsched_lab.paper.claims import (
     verdict,
 )
 from zsched_lab.paper.figures import save_all, save_gains, save_panels, save_radio
+from zsched_lab.paper.remarks import ended_text, losses_text
 from zsched_lab.paper.report import (
     blocks_parts,
     claims_text,
-    ended_text,
     gains_parts,
     groups_of,
     in_block,
     is_whole,
     judged_groups,
-    losses_text,
     main_runs,
     memory_text,
     others_text,

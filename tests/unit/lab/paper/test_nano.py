@@ -17,7 +17,16 @@ from zsched_lab.explore.slam_worker import main as slam_worker
 from zsched_lab.paper.arrivals import Arrival, Streams
 from zsched_lab.paper.bench import BenchOptions, InputsOf, planned
 from zsched_lab.paper.cells import Cell, cells_of
-from zsched_lab.paper.claims import GAINS, best_fixed, over_best_fixed, over_fixed
+from zsched_lab.paper.claims import (
+    GAINS,
+    SIX,
+    best_fixed,
+    better_than_ours,
+    compared,
+    declared,
+    over_best_fixed,
+    over_fixed,
+)
 from zsched_lab.paper.coverage_report import coverage_parts, coverage_table, roles_table, save_coverage
 from zsched_lab.paper.latency_floor import ceiling_of, floor_of, tell_ceiling
 from zsched_lab.paper.latency_floor import main as latency_floor
@@ -25,7 +34,9 @@ from zsched_lab.paper.led_metrics import coverage_figures, led_of, merge_cpu_s, 
 from zsched_lab.paper.matrix import invalid_reason
 from zsched_lab.paper.places import robots_scenario_path, scenario_path, shipped_names, shipped_scenario
 from zsched_lab.paper.plan import AROUND_S, cell_s, plan_text
+from zsched_lab.paper.remarks import declared_parts
 from zsched_lab.paper.report import (
+    better_text,
     blocks_parts,
     floors_text,
     gains_parts,
@@ -408,6 +419,49 @@ def test_the_best_fixed_scheme_stands_beside_the_mean_of_all() -> None:
     assert f"| nano | 3 | {best.text()} |" in text, "against the best one"
     assert GAINS[0] == "coverage_mean"
     assert {"received_mb_s", "throughput_mb_s"} <= set(GAINS)
+
+
+def test_what_was_declared_of_led_robots_is_printed_and_has_a_verdict_when_all_runs_are_done() -> None:
+    runs = the_runs(5)
+    told = dict(declared(runs))
+    assert list(told) == ["the mean of the fixed schemes", "the best fixed one, fixed_e2", "dyna_both"]
+    assert told["dyna_both"].runs == 5
+    assert told["dyna_both"].high < 0.0 < told["the best fixed one, fixed_e2"].low
+    assert declared([{**one, "stopped_ratio": None} for one in runs]) == [], "nobody leads them"
+
+    results = results_of(runs)
+    results["scenario"]["blocks"]["nano"]["runs"] = 5
+    text = report(results, [])
+    mean, both = (told[name] for name in ("the mean of the fixed schemes", "dyna_both"))
+    row = f"| 5 of 5 | {mean.mine:.3f} | {mean.theirs:.3f} | {mean.text()} | **better** |"
+    assert f"| nano | the mean of the fixed schemes {row}" in text
+    assert f"{both.text()} | **worse** |" in text
+    level = [{**one, "coverage_mean": 0.5 + 0.1 * (one["run"] % 2)} for one in runs]
+    assert "| not told apart |" in "\n".join(declared_parts({"nano": level}, results["scenario"]))
+    early = "\n".join(declared_parts({"nano": the_runs(3)}, results["scenario"]))
+    assert "| 3 of 5 |" in early
+    assert early.count("no verdict: too few runs") == 3
+    assert declared_parts({"nano": []}, results["scenario"]) == []
+
+
+def test_of_led_robots_no_scheme_of_the_paper_is_to_cover_more_or_stand_less() -> None:
+    runs = the_runs()
+    assert set(compared(runs)) - set(SIX) == {"coverage_mean", "stopped_ratio"}
+    assert compared([{**one, "stopped_ratio": None} for one in runs]) == SIX
+    stood = [{**one, "stopped_ratio": 0.1 if one["scheme"] == "fixed_e3" else 0.2 + 0.01 * one["run"]} for one in runs]
+    better = {(scheme, metric) for scheme, metric, _ in better_than_ours(stood)}
+    assert ("dyna_both", "coverage_mean") in better
+    assert ("fixed_e3", "stopped_ratio") in better, "it is less that is better"
+    assert not {metric for scheme, metric in better if scheme == "fixed_e1"} & {"coverage_mean", "stopped_ratio"}
+    assert "dyna_both covered on the way +" in report(results_of(stood), [])
+    never = [{**one, "stopped_ratio": 0.03 * (one["run"] == 0 and one["scheme"] == "zsched")} for one in runs]
+    assert not [name for _, name, _ in better_than_ours(never) if name == "stopped_ratio"], (
+        "one run of three says little"
+    )
+    assert "fixed_e3 stood -11 % [" in better_text({"nano": stood})
+    assert "] of the time" in better_text({"nano": stood})
+    alike = [{**one, "coverage_mean": 0.5, "map_hz": 1.0} for one in runs]
+    assert "none of the eight metrics" in better_text({"nano": alike})
 
 
 def test_coverage_is_told_with_intervals_and_without_one_of_one_run() -> None:
