@@ -70,6 +70,34 @@ def test_robots_are_not_in_step_wherever_they_are_mapped(world: World, *, has_sl
     assert first == pytest.approx([0.0, MAP_PERIOD_S / 3, 2 * MAP_PERIOD_S / 3], abs=0.01)
 
 
+def test_merges_come_at_the_task_s_own_rate_and_only_with_something_new(world: World) -> None:
+    """Robots send a map twice a second, each at a moment of its own: more than six merges a second have nothing new."""
+    counts = {}
+    for period_s in (0.5, 0.25, 0.05):
+        plan = VirtualRun(world=world, seed=1, target=1.0, longest_s=10.0, merge_period_s=period_s)
+        counts[period_s] = len(run_virtual(plan).coverage)
+    assert counts[0.5] == 20
+    assert 38 <= counts[0.25] <= 40
+    assert 55 <= counts[0.05] <= 60
+
+
+def test_maps_have_the_task_s_own_cells(world: World) -> None:
+    result = run_virtual(VirtualRun(world=world, seed=1, longest_s=5.0, resolution_m=0.02))
+    assert result.merged is not None
+    assert result.merged.resolution == 0.02
+
+
+def test_robots_stand_and_are_merged_until_the_warm_up_is_over(world: World, fresh: list[VirtualResult]) -> None:
+    result = run_virtual(VirtualRun(world=world, seed=1, warm_up_s=5.0))
+    for path in result.paths.values():
+        assert {(pose.x, pose.y) for pose in path[:10]} == {(path[0].x, path[0].y)}, "twice a second, for 5 s"
+        assert path[-1] != path[0]
+    assert result.coverage[0][0] == -5.0
+    assert result.time_s is not None
+    assert fresh[0].time_s is not None
+    assert 0.0 < result.time_s < fresh[0].time_s + 5.0, "times count from the drive on"
+
+
 def test_without_any_merged_map_no_robot_moves(world: World) -> None:
     result = run_virtual(VirtualRun(world=world, seed=1, delay_s=100.0, longest_s=10.0))
     assert (result.time_s, result.merged, result.way_m, result.goals) == (None, None, 0.0, 0)
