@@ -176,15 +176,25 @@ def begin(
             say("Nothing would change.")
             return EXIT_OK
         return None
+    check_can_ask(view)
     if view.is_yes:
         return None
-    if not sys.stdin.isatty() or view.is_json:
-        command = shlex.join(["zsched", *sys.argv[1:], "--yes"])
-        raise CliError(EXIT_USAGE, f"nothing was done, for nobody can be asked here; to do it:\n{command}")
     if not says_yes(f"{warning}{' ' if warning else ''}Do it?", sys.stdout):
         say("Nothing was done.")
         return EXIT_FAILED
     return None
+
+
+def check_can_ask(view: OrderView, told: str = "") -> None:
+    """Refuse where nobody can be asked and nobody has said --yes; ``told``: what there is to say beside that.
+
+    Raises:
+        CliError: off a terminal, or with JSON.
+    """
+    if view.is_yes or (sys.stdin.isatty() and not view.is_json):
+        return
+    command = shlex.join(["zsched", *sys.argv[1:], "--yes"])
+    raise CliError(EXIT_USAGE, f"{told}nothing was done, for nobody can be asked here; to do it:\n{command}")
 
 
 def show_rows(titles: Row, rows: Sequence[Row]) -> None:

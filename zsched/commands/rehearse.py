@@ -21,7 +21,7 @@ from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, ends_as_by_ctrl_c, nearest, print_json, say, told_task, warn
 from zsched.commands.document import IN_FORCE_S, document_text, in_force
 from zsched.commands.flags import drain_quietly, is_given_for, lift_quietly
-from zsched.commands.orders import OrderView, Row, asker, begin
+from zsched.commands.orders import OrderView, Row, asker, begin, check_can_ask
 from zsched.commands.page import counted
 from zsched.commands.rehearse_report import SCHEMA, as_json, table
 from zsched.commands.wait import Condition, missing
@@ -145,9 +145,14 @@ def rehearse(view: OrderView, order: RehearseOrder, runtime: Path) -> int:
     warning = f"This disturbs the running fleet {order.rounds} x {len(doable)} times; it stops at the first surprise."
     plan = {"schema": SCHEMA, "node": stage.first["node"], "names": [], "rehearsal": None}
     plan["plan"] = [{"step": step.value, "left_out": why or None} for step, why in planned.items()]
+    if not doable and not view.is_plan:
+        told = f"{order.task}: no step can be done: " + "; ".join(f"{step}: {why}" for step, why in planned.items())
+        check_can_ask(view, f"{told}\n")
+        raise CliError(EXIT_FAILED, f"{told}; nothing was done")
     code = begin(view, rows, plan, is_change=bool(doable), warning=warning)
     if code is not None:
         return code
+    stage.refused = {step: why for step, why in planned.items() if why}
     return _play(view, order, stage)
 
 
@@ -200,7 +205,8 @@ def _play(view: OrderView, order: RehearseOrder, stage: Stage) -> int:
         sys.stdout.write(table(body, screen_width()))
     if over.is_kept:
         return EXIT_OK
-    return EXIT_FAILED if any(result.broken for result in programme.results) and not interrupted else EXIT_TIMED_OUT
+    is_told = programme.is_all_left_out or any(result.broken for result in programme.results)
+    return EXIT_FAILED if is_told and not interrupted else EXIT_TIMED_OUT
 
 
 def _run(programme: Programme, stage: Stage) -> Over:
@@ -302,6 +308,8 @@ class Stage:
         )
         self._has_drained = self._is_unsure = False
         self._since = 0
+        self.refused: Mapping[Step, str] = {}
+        """{step that was shown as left out: why}: nobody has agreed to it, so it stays out when it becomes possible."""
 
     # --- looking -----------------------------------------------------------------------------------------------------
 
@@ -433,6 +441,8 @@ class Stage:
     def act(self, do: Do) -> tuple[float, str]:
         """Do a step: (when it began, why it was not done)."""
         at = monotonic_s()
+        if why := self.refused.get(do.step, ""):
+            return at, why
         if do.step is Step.MOVE:
             result = self._move(do.target)
             if result["outcome"] == "ok":

@@ -24,9 +24,10 @@ from zsched.commands.common import CliError
 from zsched.commands.orders import OrderView
 from zsched.commands.rehearse import RehearseOrder, Stage, parse_steps
 from zsched.commands.rehearse_report import table
-from zsched.core.rehearsal.programme import Do, Over, Programme
+from zsched.core.rehearsal.programme import MIN_CALM_S, Do, Over, Programme
 from zsched.core.values.rehearsal import Step
-from zsched.exits import EXIT_DEGRADED, EXIT_TIMED_OUT
+from zsched.core.values.struct import replace
+from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_TIMED_OUT
 
 PROMISED = {
     "move": {"step": "move", "gap_s": 0.3, "decide_s": 1.0, "whole": ["echo/in/0"]},
@@ -160,6 +161,74 @@ def test_a_plan_says_what_is_left_out_and_does_nothing(daemon: Daemon) -> None:
     assert (move["step"], move["left_out"]) == ("move", None)
     assert "give it another node by --connect" in killed["left_out"]
     assert daemon.done == []
+
+
+@pytest.fixture
+def refusing(daemon: Daemon) -> Daemon:
+    """The one daemon that this rehearsal could look through is its owner's."""
+    daemon.task["owner"], daemon.task["candidates"] = "robot1", ["robot1", "edge1"]
+    return daemon
+
+
+@pytest.mark.parametrize("more", [(), ("--json",)])
+def test_where_every_step_is_refused_nothing_is_done_without_consent_either(
+    refusing: Daemon, more: tuple[str, ...]
+) -> None:
+    """With --json there was no question, and what had become possible meanwhile was done."""
+    result = run("echo", "--steps", "daemon", *more)
+    assert result.exit_code == 2, result.output
+    assert "echo: no step can be done: daemon: this rehearsal looks at the fleet through robot1" in result.stderr
+    assert "nobody can be asked here" in result.stderr
+    assert refusing.done == []
+
+
+@pytest.mark.parametrize("more", [(), ("--json",)])
+def test_where_every_step_is_refused_no_promise_was_kept(refusing: Daemon, more: tuple[str, ...]) -> None:
+    result = run("echo", "--steps", "daemon", "--yes", *more)
+    assert result.exit_code == 1, result.output
+    assert "no step can be done" in result.stderr
+    assert "every promise was kept" not in result.output
+    assert refusing.done == []
+    planned = run("echo", "--steps", "daemon", "--plan")
+    assert (planned.exit_code, refusing.done) == (0, []), "nothing would be done"
+
+
+def test_only_steps_that_were_shown_as_possible_are_played(refusing: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The kill was left out at the question, and is possible when its turn comes."""
+
+    def play(_programme: Programme, stage: Stage) -> Over:
+        monkeypatch.setattr(Stage, "_has_other_eye", lambda _self, _owner: True)
+        for step in (Step.DAEMON, Step.WORKER):
+            _, why = stage.act(Do(round=1, step=step, node="robot1", target="edge1"))
+            played.append((step, why.partition(":")[0]))
+        return Over(is_kept=True, why="every step is done")
+
+    played: list[tuple[Step, str]] = []
+    monkeypatch.setattr(rehearse, "_run", play)
+    monkeypatch.setattr(Stage, "go_back", lambda _self: "")
+    result = run("echo", "--steps", "daemon,worker", "--yes")
+    assert result.exit_code == 0, result.output
+    assert played == [(Step.DAEMON, "this rehearsal looks at the fleet through robot1"), (Step.WORKER, "")]
+    assert [one["step"] for one in refusing.done if one["verb"] == "strike"] == ["worker"]
+
+
+def test_a_rehearsal_of_which_every_step_was_left_out_does_not_end_as_a_kept_one(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The owner's daemon refuses what it has let be planned."""
+
+    def play(programme: Programme, at: Stage) -> Over:
+        look = at.look()
+        *_, action = [programme.advance(replace(look, now=now)) for now in (0.0, 1.0, MIN_CALM_S + 1.0)]
+        assert action == DRAIN
+        programme.leave_out("edge1 has an order already")
+        over = programme.advance(replace(look, now=MIN_CALM_S + 2.0))
+        assert isinstance(over, Over)
+        return over
+
+    monkeypatch.setattr(rehearse, "_run", play)
+    order = RehearseOrder(task="echo", steps=(Step.DRAIN,), pause_s=MIN_CALM_S)
+    assert rehearse._play(stage._view, order, stage) == EXIT_FAILED
 
 
 # --- the drain -------------------------------------------------------------------------------------------------------

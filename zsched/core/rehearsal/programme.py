@@ -224,6 +224,11 @@ class Programme:
         self._left.pop(0)
         self._next = None
 
+    @property
+    def is_all_left_out(self) -> bool:
+        """Whether the programme is through, and no step was done."""
+        return not self._left and self._struck is None and all(result.left_out for result in self.results)
+
     # --- before a step -----------------------------------------------------------------------------------------------
 
     def _rest(self, look: Look) -> Action:
@@ -237,6 +242,8 @@ class Programme:
                 return self._end(is_kept=False, why=why)
             return Lift(nodes=look.drained)
         if not self._left:
+            if self.is_all_left_out:  # a promise that was not tried was not kept
+                return self._end(is_kept=False, why="every step was left out")
             return self._end(is_kept=True, why="every step is done")
         if look.hold:
             return self._end(is_kept=False, why=look.hold)
