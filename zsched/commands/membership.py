@@ -47,12 +47,11 @@ from zsched.pki.files import write_whole
 from zsched.runtime.membership import (
     Places,
     Written,
-    belongings,
     found,
     is_joined,
     is_of_a_later_key,
-    put_away,
-    usable,
+    mend,
+    take_later_key,
 )
 from zsched.runtime.membership import join as join_here
 from zsched.runtime.own_addresses import addresses_at
@@ -509,25 +508,52 @@ def join(file: str, where: Places, *, is_plan: bool, is_json: bool) -> int:
     fleet, node = invitation.fleet, invitation.node
     if is_joined(invitation, where):
         if not is_of_a_later_key(invitation, where):
-            said = f"{where.state}: this machine is {node} of fleet {fleet} already: nothing to do"
-            Told(fleet=fleet, node=node, outcome="unchanged", said=said).tell(is_json=is_json)
-            return EXIT_OK
-        usable(invitation, where)  # before the files go by which it is a node now
-        if is_plan:
-            said = f"{fleet}: this machine would join as {node} once more, with the key of this later invitation"
-            old = belongings(where, is_purged=False)
-            Told(fleet=fleet, node=node, outcome="planned", said=said, files=old).tell(is_json=is_json)
-            return EXIT_WOULD_CHANGE
-        put_away(fleet, node, where, is_purged=False)
-        if not is_json:
+            return _complete(invitation, where, is_plan=is_plan, is_json=is_json)
+        with uninterrupted():  # after a power cut the same join goes on
+            read, former, files = take_later_key(invitation, where, is_plan=is_plan)
+        if not is_json and not is_plan:
             warn(f"{node} had the key of an earlier invitation: its files are named *.left, and it joins once more")
-    read, files = join_here(invitation, where, is_plan=is_plan)
+        more, files = " once more, with the key of this later invitation", (*former, *files)
+    else:
+        with uninterrupted():
+            read, files = join_here(invitation, where, is_plan=is_plan)
+        more = f" (generation {invitation.value.generation_id[:8]})"
     would = "would become" if is_plan else "is"
-    said = f"{fleet}: this machine {would} {node} (generation {invitation.value.generation_id[:8]})"
-    follow = () if is_plan else (*_lacking(read, invitation), *how_to_start(node, where), *_look(invitation))
+    said = f"{fleet}: this machine {would} {node}{more}"
+    return _tell_joined(invitation, where, read, said, files, is_plan=is_plan, is_json=is_json)
+
+
+def _tell_joined(
+    invitation: Invitation,
+    where: Places,
+    fleet: Fleet,
+    said: str,
+    files: tuple[Written, ...],
+    *,
+    is_plan: bool,
+    is_json: bool,
+) -> int:
+    """Say what was written, or would be, and what comes next; the exit code."""
+    node = invitation.node
+    follow = () if is_plan else (*_lacking(fleet, invitation), *how_to_start(node, where), *_look(invitation))
     outcome = "planned" if is_plan else "joined"
-    Told(fleet=fleet, node=node, outcome=outcome, said=said, files=files, next=follow).tell(is_json=is_json)
+    told = Told(fleet=invitation.fleet, node=node, outcome=outcome, said=said, files=files, next=follow)
+    told.tell(is_json=is_json)
     return EXIT_WOULD_CHANGE if is_plan else EXIT_OK
+
+
+def _complete(invitation: Invitation, where: Places, *, is_plan: bool, is_json: bool) -> int:
+    """Bring back what this machine, which has its state, lacks beside that: its system may have been installed anew."""
+    fleet, node = invitation.fleet, invitation.node
+    with uninterrupted():
+        read, files = mend(invitation, where, is_plan=is_plan)
+    if not files:
+        said = f"{where.state}: this machine is {node} of fleet {fleet} already: nothing to do"
+        Told(fleet=fleet, node=node, outcome="unchanged", said=said).tell(is_json=is_json)
+        return EXIT_OK
+    would = "would be" if is_plan else "is"
+    said = f"{fleet}: this machine {would} {node} again, with what was missing; its state is here, and stays"
+    return _tell_joined(invitation, where, read, said, files, is_plan=is_plan, is_json=is_json)
 
 
 def request(name: str, where: Places, out: Path | None, *, is_json: bool) -> int:

@@ -14,7 +14,7 @@ import os
 import secrets
 import shutil
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
@@ -36,7 +36,7 @@ from zsched.config.load import check_bytes
 from zsched.config.reader import MAX_FILE_BYTES, render_all
 from zsched.config.schema import PKI_FOLDER
 from zsched.core.electorate.founding import created
-from zsched.core.values.certificates import Role, parse_common_name
+from zsched.core.values.certificates import Holder, Role, accepted, parse_common_name
 from zsched.core.values.document import Document, Text
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import FleetValue
@@ -274,7 +274,8 @@ def usable(invitation: Invitation, places: Places) -> Fleet:
 def is_of_a_later_key(invitation: Invitation, places: Places) -> bool:
     """Whether an invitation brings this machine, which is its node already, a key of a higher number than it has.
 
-    The others let nobody in by the key of an earlier invitation.
+    The others let nobody in by the key of an earlier invitation. Where the certificate is gone, the document that the
+    state names tells: by a key that it does not let in yet the daemon would not start.
 
     Raises:
         ConfigError: the document cannot be used here.
@@ -282,13 +283,185 @@ def is_of_a_later_key(invitation: Invitation, places: Places) -> bool:
     fleet, papers = _read(invitation.document.text, places.config), invitation.papers
     if papers is None or not papers.key or fleet.security is None:
         return False
-    own = b""
-    with contextlib.suppress(OSError):
-        own = read_regular(Path(fleet.security.folder) / CERTIFICATE, MAX_FILE_BYTES)
-    offered, held = (parse_common_name(_named(pem) or "", fleet.name) for pem in (papers.certificate.encode(), own))
-    if offered is None or held is None or (held.name, held.role) != (offered.name, offered.role):
+    offered = parse_common_name(_named(papers.certificate.encode()) or "", fleet.name)
+    if offered is None:
         return False
-    return held.key < offered.key
+    held = parse_common_name(_named(_held(Path(fleet.security.folder))) or "", fleet.name)
+    if held is not None:
+        return (held.name, held.role) == (offered.name, offered.role) and held.key < offered.key
+    if os.path.lexists(Path(fleet.security.folder) / CERTIFICATE):
+        return False
+    return offered.key > max((one.key for one in _let_in(invitation, places)), default=offered.key)
+
+
+def _held(folder: Path) -> bytes:
+    """This machine's certificate; empty: there is none.
+
+    Where putting it away was broken off, the key still lies beside the certificate's new name.
+    """
+    from zsched.pki.certificates import is_key_of  # noqa: PLC0415 - imports cryptography
+
+    with contextlib.suppress(OSError):
+        return read_regular(folder / CERTIFICATE, MAX_FILE_BYTES)
+    with contextlib.suppress(OSError, ValueError):
+        pem = read_regular(folder / f"{CERTIFICATE}{LEFT}", MAX_FILE_BYTES)
+        return pem if is_key_of(read_regular(folder / KEY, MAX_FILE_BYTES), pem) else b""
+    return b""
+
+
+def _let_in(invitation: Invitation, places: Places) -> tuple[Holder, ...]:
+    """The keys by which the document that this machine's state names lets it in; empty: it does not tell."""
+    found_ = _agreed_here(invitation, places)
+    fleet = None if found_ is None else check_bytes(found_[1].text.encode(), str(places.config)).fleet
+    if fleet is None or fleet.security is None:
+        return ()
+    return accepted(invitation.node, Role.NODE, fleet.security.revoked)
+
+
+def _agreed_here(invitation: Invitation, places: Places) -> tuple[int, Document] | None:
+    """(revision, document) that this machine's state names; ``None``: it names none, or that is not stored here."""
+    state = StateFile(places.state, fleet=invitation.fleet, node=invitation.node).load().state
+    value = None if state is None or state.fleet_register is None else state.fleet_register.learnt
+    content = None if value is None else DocumentStore(places.state).load(value.document)
+    return None if value is None or content is None else (value.revision, content)
+
+
+def mend(invitation: Invitation, places: Places, *, is_plan: bool) -> tuple[Fleet, tuple[Written, ...]]:
+    """Write what this machine, which is an invitation's node by its state, lacks beside that; ``is_plan``: only say it.
+
+    The state stays as it is: an elector that forgets a promise can split the fleet. So does every file that is there.
+
+    Raises:
+        AdapterError: there are files of others, the invitation does not bring what lacks, or a file cannot be written.
+        ConfigError: the document, or the certificate, cannot be used here.
+    """
+    _check_file(places.config, invitation.fleet)
+    fleet, content = _fleet_here(invitation, places)
+    folder = None if fleet.security is None else Path(fleet.security.folder)
+    lacking = () if folder is None else tuple(name for name in _WHAT if not os.path.exists(folder / name))  # noqa: PTH110 - never raises
+    written = () if content is None else _listed_file(places, content.text.encode())
+    if folder is not None and lacking:
+        usable(invitation, places)
+        _check_brought(fleet, folder, lacking, invitation, places)
+        written += tuple(Written(path=folder / name, what=_WHAT[name]) for name in lacking)
+    if is_plan:
+        return fleet, written
+    if folder is not None and lacking and invitation.papers is not None:
+        _put_papers(folder, invitation.papers, lacking)
+    if content is not None:
+        _put_file(places, content.text.encode())
+        _put(places.state / COPY_NAME, f"{fleet_hash(fleet)}\n".encode(), PRIVATE_MODE)
+    if written:
+        with contextlib.suppress(OSError):  # the node is wanted again
+            (places.state / OUT_NAME).unlink(missing_ok=True)
+    return fleet, written
+
+
+def _fleet_here(invitation: Invitation, places: Places) -> tuple[Fleet, Document | None]:
+    """(the fleet that the daemon starts by, the document to write as the fleet file).
+
+    ``None``: it starts by the file that is there. Else it is the newest document that is known here.
+    """
+    there = None
+    with contextlib.suppress(FileNotFoundError):
+        there = check_bytes(read_regular(places.config, MAX_FILE_BYTES), str(places.config)).fleet
+    if there is not None and _lets_in(there, invitation):
+        return there, None
+    content, kept = invitation.document, _agreed_here(invitation, places)
+    if kept is not None and kept[0] > invitation.value.revision:
+        content = kept[1]
+    fleet = _read(content.text, places.config)
+    if there is not None and not _lets_in(fleet, invitation):
+        return there, None  # that one would be no better
+    return fleet, content
+
+
+def _lets_in(fleet: Fleet, invitation: Invitation) -> bool:
+    """Whether a fleet names this machine's node, and lets it in by its certificate, or else by an invitation's."""
+    if all(node.name != invitation.node for node in fleet.nodes):
+        return False
+    if fleet.security is None:
+        return True
+    pem = b"" if invitation.papers is None else invitation.papers.certificate.encode()
+    with contextlib.suppress(OSError):
+        pem = read_regular(Path(fleet.security.folder) / CERTIFICATE, MAX_FILE_BYTES)
+    holder = parse_common_name(_named(pem) or "", fleet.name)
+    return holder is None or holder in accepted(invitation.node, Role.NODE, fleet.security.revoked)
+
+
+def take_later_key(
+    invitation: Invitation, places: Places, *, is_plan: bool
+) -> tuple[Fleet, tuple[Written, ...], tuple[Written, ...]]:
+    """Let this machine, which is an invitation's node already, have the later key that it brings; its daemon has ended.
+
+    The former key is renamed, and the stored document of before goes, which lets nobody in by the new one: the others
+    tell the newest. The state stays as it is, as in `mend`.
+
+    Returns:
+        (the fleet, what becomes of the former files, what is written).
+
+    Raises:
+        AdapterError: a daemon runs by them, or one cannot be renamed, deleted or written.
+        ConfigError: the document, or the certificate, cannot be used here.
+    """
+    fleet = usable(invitation, places)
+    _check_file(places.config, invitation.fleet)
+    assert fleet.security is not None
+    folder = Path(fleet.security.folder)
+    former = [one for name, what in _WHAT.items() for one in _there(folder / name, what, is_purged=False)]
+    moved = tuple(Written(path=one.path, what=_fate(one, is_purged=False)) for one in former)
+    brought = invitation.document
+    if is_plan:
+        written = _listed_file(places, brought.text.encode())
+        return fleet, moved, (*written, *(Written(path=folder / name, what=what) for name, what in _WHAT.items()))
+    with StateFile(places.state, fleet=invitation.fleet, node=invitation.node) as file:
+        file.check_owner()
+        for one in former:
+            _put_one_away(one.path, is_deleted=False)
+        _drop_document(invitation, places)
+        fleet, written = mend(invitation, places, is_plan=False)
+    return fleet, moved, written
+
+
+def _drop_document(invitation: Invitation, places: Places) -> None:
+    """Delete the document that the state names, if it lets nobody in by the invitation's key; others have it, too."""
+    papers, let_in = invitation.papers, _let_in(invitation, places)
+    holder = None if papers is None else parse_common_name(_named(papers.certificate.encode()) or "", invitation.fleet)
+    kept = _agreed_here(invitation, places)
+    if kept is None or not let_in or holder in let_in:
+        return
+    store = DocumentStore(places.state)
+    store.delete_others({path.name for path in store.folder.iterdir()} - {document_hash(kept[1])})
+
+
+def _check_brought(
+    fleet: Fleet, folder: Path, lacking: tuple[str, ...], invitation: Invitation, places: Places
+) -> None:
+    """Refuse where an invitation does not bring what lacks here, or what it brings does not go with what is here."""
+    from zsched.pki.certificates import is_key_of  # noqa: PLC0415 - imports cryptography
+    from zsched.pki.signatures import Trust  # noqa: PLC0415 - as above
+
+    path, papers = folder / lacking[0], invitation.papers
+    advice = f"have another invitation written where the fleet's authority is (`zsched invite {invitation.node}`)"
+    if papers is None:
+        raise AdapterError(f"{path} is not there, and the invitation brings no certificate; {advice}")
+    offered, let_in = _named(papers.certificate.encode()) or "", _let_in(invitation, places)
+    if let_in and parse_common_name(offered, fleet.name) not in let_in:
+        raise AdapterError(f"{path} is not there, and nobody lets in by the invitation's key ({offered}); {advice}")
+    _check_papers(fleet, invitation)
+    if CERTIFICATE in lacking:
+        return
+    try:
+        pem = read_regular(folder / CERTIFICATE, MAX_FILE_BYTES)
+        der = ders_of(pem)[0]
+        is_fitting = KEY not in lacking or is_key_of(papers.key.encode(), pem)
+        is_fitting &= (
+            TRUSTED not in lacking or Trust(papers.trusted.encode()).certified(der, parts_of(der).begins) is not None
+        )
+    except (OSError, ValueError) as error:
+        raise AdapterError(f"{folder / CERTIFICATE}: {error}; move it away, then join again") from error
+    if not is_fitting:
+        raise AdapterError(f"{path} is not there, and that of the invitation does not go with {CERTIFICATE}; {advice}")
 
 
 def _check_file(path: Path, fleet: str) -> None:
@@ -613,16 +786,30 @@ def _listed(
     fleet: Fleet, me: NodeId, content: Document, places: Places, *, listed: tuple[str, ...]
 ) -> tuple[Written, ...]:
     """What is written, in this order."""
-    written = [Written(path=places.config, what="the fleet file, as a copy of the agreed document")]
-    if _other_text(places.config, content.text.encode()) is not None:
-        kept = places.config.with_name(f"{places.config.name}{BEFORE}")
-        written.append(Written(path=kept, what="the fleet file that was there"))
+    written = list(_listed_file(places, content.text.encode()))
     folder = None if fleet.security is None else Path(fleet.security.folder)
     if folder is not None:
         written += [Written(path=folder / name, what=_WHAT[name]) for name in listed]
     written.append(Written(path=places.state / FOLDER_NAME, what="the agreed document"))
     written.append(Written(path=places.state / STATE_NAME, what=f"the state of {me}: it has never voted"))
     return tuple(written)
+
+
+def _listed_file(places: Places, text: bytes) -> tuple[Written, ...]:
+    """What `_put_file` writes."""
+    written = (Written(path=places.config, what="the fleet file, as a copy of the agreed document"),)
+    if _other_text(places.config, text) is None:
+        return written
+    kept = places.config.with_name(f"{places.config.name}{BEFORE}")
+    return (*written, Written(path=kept, what="the fleet file that was there"))
+
+
+def _put_file(places: Places, text: bytes) -> None:
+    """Write the fleet file; another one that is there is kept beside it."""
+    old, former = _other_text(places.config, text), _former(places.config)
+    if old is not None:
+        _put(places.config.with_name(f"{places.config.name}{BEFORE}"), old, PUBLIC_MODE, former)
+    _put(places.config, text, PUBLIC_MODE, former)
 
 
 def _put_all(
@@ -638,13 +825,9 @@ def _put_all(
     papers: Papers | None,
 ) -> None:
     """Write all of it, the state last."""
-    text = content.text.encode()
     plain = blank_state(fleet, me, generation, None, incarnation=wall_tenths(), hardware=hardware_id(), disk=disk)
     state = replace(plain, registers=(), fleet_register=RegisterState(task=fleet.name, learnt=value))
-    old, former = _other_text(places.config, text), _former(places.config)
-    if old is not None:
-        _put(places.config.with_name(f"{places.config.name}{BEFORE}"), old, PUBLIC_MODE, former)
-    _put(places.config, text, PUBLIC_MODE, former)
+    _put_file(places, content.text.encode())
     if papers is not None and fleet.security is not None:
         _put_papers(Path(fleet.security.folder), papers)
     DocumentStore(places.state).save(content)
@@ -714,10 +897,10 @@ def _make_folder(path: Path) -> None:
         one.chmod(FOLDER_MODE)
 
 
-def _put_papers(folder: Path, papers: Papers) -> None:
+def _put_papers(folder: Path, papers: Papers, names: Collection[str] = tuple(_WHAT)) -> None:
     """Whole, never readable by others in between, and each the property of the folder's owner."""
+    brought = ((KEY, papers.key, PRIVATE), (TRUSTED, papers.trusted, PUBLIC), (CERTIFICATE, papers.certificate, PUBLIC))
     _make_folder(folder)
-    if papers.key:  # first: a certificate without its key would look complete
-        write_whole(folder / KEY, papers.key.encode(), PRIVATE)
-    write_whole(folder / TRUSTED, papers.trusted.encode(), PUBLIC)
-    write_whole(folder / CERTIFICATE, papers.certificate.encode(), PUBLIC)
+    for name, pem, mode in brought:  # the key first: a certificate without its key would look complete
+        if pem and name in names:
+            write_whole(folder / name, pem.encode(), mode)

@@ -13,6 +13,7 @@ import stat
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from ipaddress import ip_address
 from pathlib import Path
@@ -39,8 +40,13 @@ from zsched.core.values.struct import replace
 from zsched.errors import ConfigError
 from zsched.exits import EXIT_WOULD_CHANGE
 from zsched.pki.authority import create, opened
+from zsched.pki.certificates import is_key_of
+from zsched.runtime import membership as membership_files
+from zsched.runtime.library import Library
 from zsched.runtime.membership import Places
+from zsched.runtime.restoring import read_stored
 from zsched.runtime.secured import require_own
+from zsched.sessions.certificate import common_names
 from zsched.wire.codec import as_plain, document_hash, from_plain
 from zsched.wire.invitation import decode_invitation, encode_invitation
 
@@ -740,6 +746,162 @@ def test_a_later_invitation_that_cannot_be_used_leaves_the_machine_the_node_that
         refused = run("join", second, *more, *here(folder))
         assert (refused.exit_code, "and this machine's clock says" in refused.stderr) == (78, True)
         assert sorted(str(path) for path in folder.rglob("*")) == before
+
+
+def lets_in(folder: Path) -> None:
+    """The daemon of robot2 would start by the fleet file, and then by the agreed document, if that is here."""
+    fleet = load_fleet(folder / "fleet.yaml")
+    assert fleet.security is not None
+    require_own(fleet, fleet.security, "robot2")
+    state = StateFile(folder / "state", fleet="hall", node="robot2").load().state
+    assert state is not None
+    library = Library(
+        fleet="hall", node="robot2", config=folder / "fleet.yaml", state_dir=folder / "state", post=lambda _event: None
+    )
+    agreed = read_stored(library, state).fleet
+    if agreed is not None:
+        assert agreed.security is not None
+        require_own(agreed, agreed.security, "robot2")
+
+
+def test_a_machine_whose_fleet_file_is_gone_gets_it_back_and_keeps_its_state(node: Node, tmp_path: Path) -> None:
+    file, folder = tmp_path / "robot2.invite", tmp_path / "robot2"
+    file.write_text(run("invite", "robot2", "--address", "192.0.2.12", "--yes").stdout)
+    assert run("join", file, *here(folder)).exit_code == 0
+    state = (folder / "state" / "state").read_bytes()
+    (folder / "fleet.yaml").unlink()
+    planned = run("join", file, "--plan", "--json", *here(folder))
+    assert (planned.exit_code, (folder / "fleet.yaml").exists()) == (10, False)
+    done = run("join", file, "--json", *here(folder))
+    assert (done.exit_code, json.loads(done.stdout)["outcome"]) == (0, "joined"), done.stderr
+    assert [faults(json.loads(one.stdout)) for one in (planned, done)] == [[], []]
+    assert json.loads(planned.stdout)["files"] == json.loads(done.stdout)["files"]
+    assert (folder / "fleet.yaml").read_text() == node.text
+    assert (folder / "state" / "state").read_bytes() == state
+    assert "nothing to do" in run("join", file, *here(folder)).stdout
+    (folder / "fleet.yaml").write_text(node.text.replace("fleet: hall", "fleet: yard"))
+    refused = run("join", file, *here(folder))
+    assert (refused.exit_code, "is the file of fleet yard" in refused.stderr) == (1, True)
+
+
+@pytest.mark.parametrize("gone", [("fleet.yaml", "pki"), ("pki",), ("pki/key.pem",), ("pki/ca.pem", "fleet.yaml")])
+def test_a_machine_whose_system_was_installed_anew_gets_its_certificate_back_and_keeps_its_state(
+    node: Node, tmp_path: Path, gone: tuple[str, ...]
+) -> None:
+    """Its daemon tells it to join. Of an elector's state nothing may be forgotten."""
+    secured(tmp_path, node)
+    file, folder = tmp_path / "robot2.invite", tmp_path / "robot2"
+    assert run("invite", "robot2", "--address", "192.0.2.12", "--yes", "-o", file).exit_code == 0
+    assert run("join", file, *here(folder)).exit_code == 0
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    for name in gone:
+        path = folder / name
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    done = run("join", file, *here(folder))
+    assert done.exit_code == 0, done.stderr
+    assert "its state is here, and stays" in done.stdout
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+    assert stat.S_IMODE((folder / "pki" / "key.pem").stat().st_mode) == 0o600
+    assert "nothing to do" in run("join", file, *here(folder)).stdout
+
+
+def test_what_an_invitation_does_not_bring_is_named(node: Node, tmp_path: Path) -> None:
+    first, second, folder = invited_twice(tmp_path, node)
+    bare = decode_invitation(first.read_bytes())
+    (tmp_path / "bare.invite").write_text(encode_invitation(replace(bare, papers=None)))
+    assert run("join", second, *here(folder)).exit_code == 0
+    state, key = (folder / "state" / "state").read_bytes(), (folder / "pki" / "key.pem")
+    for file, why in (
+        (tmp_path / "bare.invite", "the invitation brings no certificate; have another invitation written"),
+        (first, "is the certificate of 'robot2.k2.hall.zsched.internal', and is left as it is"),
+    ):
+        key.unlink(missing_ok=True)
+        refused = run("join", file, *here(folder))
+        assert (refused.exit_code, why in " ".join(refused.stderr.split())) == (1, True), refused.stderr
+        assert not key.exists()
+    assert run("join", second, *here(folder)).exit_code == 0
+    assert (key.exists(), (folder / "state" / "state").read_bytes()) == (True, state)
+
+
+def test_an_invitation_whose_key_the_agreed_document_has_revoked_is_refused(node: Node, tmp_path: Path) -> None:
+    first, second, folder = invited_twice(tmp_path, node)
+    other = tmp_path / "other"
+    assert run("join", second, *here(other)).exit_code == 0
+    shutil.rmtree(other / "pki")
+    (other / "fleet.yaml").unlink()
+    refused = run("join", first, *here(other))
+    assert refused.exit_code == 1
+    assert "nobody lets in by the invitation's key (robot2.hall.zsched.internal)" in refused.stderr
+    assert "zsched invite robot2" in refused.stderr
+    assert not (other / "pki").exists()
+    assert "nothing to do" in run("join", first, *here(folder)).stdout
+
+
+@pytest.mark.parametrize("is_new", [False, True], ids=["it has the earlier key", "its system was installed anew"])
+@pytest.mark.parametrize("step", range(10))
+def test_a_later_key_is_taken_though_the_power_goes_at_any_step_and_the_state_stays(
+    node: Node, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: int, *, is_new: bool
+) -> None:
+    class PowerCut(BaseException):
+        pass
+
+    _, second, folder = invited_twice(tmp_path, node)
+    state = (folder / "state" / "state").read_bytes()
+    if is_new:
+        shutil.rmtree(folder / "pki")
+        (folder / "fleet.yaml").unlink()
+    left = step
+
+    def cut_after(name: str) -> Callable[..., Any]:
+        call = getattr(membership_files, name)
+
+        def done(*words: Any, **more: Any) -> Any:
+            nonlocal left
+            result = call(*words, **more)
+            if (left := left - 1) < 0:
+                raise PowerCut
+            return result
+
+        return done
+
+    with monkeypatch.context() as patch:
+        for name in ("_put_one_away", "_drop_document", "write_whole", "_put"):
+            patch.setattr(membership_files, name, cut_after(name))
+        with suppress(PowerCut):
+            run("join", second, *here(folder))
+    done = run("join", second, *here(folder))
+    assert done.exit_code == 0, done.stderr
+    certificate = (folder / "pki" / "certificate.pem").read_bytes()
+    assert common_names(certificate) == ("robot2.k2.hall.zsched.internal",)
+    assert is_key_of((folder / "pki" / "key.pem").read_bytes(), certificate)
+    lets_in(folder)
+    assert (folder / "state" / "state").read_bytes() == state
+    assert "nothing to do" in run("join", second, *here(folder)).stdout
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP, signal.SIGTERM])
+def test_a_signal_while_a_later_key_is_taken_leaves_no_half_of_it(
+    node: Node,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    request: pytest.FixtureRequest,
+    number: signal.Signals,
+) -> None:
+    def ended(*_: Any) -> None:
+        pytest.fail("the signal ends the verb")
+
+    _, second, folder = invited_twice(tmp_path, node)
+    put = membership_files._put_one_away
+
+    def interrupted(*words: Any, **more: Any) -> None:
+        put(*words, **more)
+        signal.raise_signal(number)
+
+    monkeypatch.setattr(membership_files, "_put_one_away", interrupted)
+    before = signal.signal(number, ended)
+    request.addfinalizer(lambda: signal.signal(number, before))
+    assert run("join", second, *here(folder)).exit_code == 0
+    lets_in(folder)
 
 
 def test_a_request_for_the_same_key_is_answered_again(node: Node, tmp_path: Path) -> None:
