@@ -32,6 +32,7 @@ from zsched.commands.papers import (
     papers_for,
     refuse_open_network,
 )
+from zsched.commands.pki import check_held
 from zsched.config.editing import add_entries, add_names, is_list
 from zsched.config.load import check_bytes
 from zsched.config.schema import is_loopback
@@ -325,6 +326,7 @@ def invite(door: Door, view: ApplyView, guest: Guest, file: Path | None) -> int:
         _close_to_others()  # before there is anything to read: who opens it now may read on when it is private
     held = in_force(door)
     fleet = fleet_of(document_text(held))
+    check_held(fleet_of(document_text(held), _own_file(door)), guest.authority)
     check_request(fleet, guest.request, guest.authority)
     secret = b"" if view.is_plan else key_to_papers(fleet, guest.authority)
     if fleet.security is None and guest.address is not None:
@@ -358,13 +360,19 @@ def _check_invited_again(door: Door, guest: Guest, kind: NodeKind) -> None:
         raise CliError(EXIT_FAILED, f"{guest.name} is in the document already, as {told}; {advice}")
 
 
-def fleet_of(text: str) -> Fleet:
-    """The fleet of a document in force.
+def _own_file(door: Door) -> str:
+    """The fleet file of this machine: that of the daemon here, beside which its certificates are."""
+    told = "" if door.endpoint else status_of(door).get("fleet_file")
+    return told or str(places.config_path(None, os.environ))
+
+
+def fleet_of(text: str, file: str = DOCUMENT) -> Fleet:
+    """The fleet of a document in force; ``file``: beside which certificates are looked for.
 
     Raises:
         CliError: it has faults for this version.
     """
-    fleet = check_bytes(text.encode(), DOCUMENT).fleet
+    fleet = check_bytes(text.encode(), file).fleet
     if fleet is None:
         advice = "update zsched here; `zsched fleet export` shows the document"
         raise CliError(EXIT_FAILED, f"the document in force has faults for this version of zsched; {advice}")

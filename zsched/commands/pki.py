@@ -29,7 +29,7 @@ from zsched.errors import AdapterError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE
 from zsched.files import read_regular
 from zsched.runtime.secured import CERTIFICATE, CREDENTIALS, KEY, TRUSTED
-from zsched.sessions.certificate import common_names
+from zsched.sessions.certificate import common_names, ders_of
 
 if TYPE_CHECKING:
     from zsched.pki.authority import Authority, Entry, Issued  # imports cryptography
@@ -41,6 +41,9 @@ HANDED: Final = "passphrase"
 MAX_BYTES: Final = 1 << 20
 SENT, HAD = "ok", "unchanged"
 """How a node answers to its certificate."""
+SECOND: Final = "second-authority"
+"""The danger: nobody lets in by the certificates of an authority that the nodes do not know."""
+DANGERS: Final = (SECOND,)
 DUE, REVOKED, ENDED, VALID = "due", "revoked", "ended", "valid"
 
 
@@ -58,15 +61,23 @@ class _Office(Struct, frozen=True, kw_only=True):
     folder: Path
 
 
-def init(where: Where, *, asks_passphrase: bool) -> int:
-    """Make the authority of the fleet in the fleet file.
+def init(where: Where, *, asks_passphrase: bool, accepted: Sequence[str] = ()) -> int:
+    """Make the authority of the fleet in the fleet file; ``accepted``: names of dangers.
 
     Raises:
+        CliError: this machine trusts another one, and the danger is not accepted.
         AdapterError: there is an authority already, or the folder cannot be written.
     """
     from zsched.pki.authority import create  # noqa: PLC0415 - imports cryptography
 
+    for name in accepted:
+        if name not in DANGERS:
+            raise CliError(EXIT_USAGE, f"--accept: there is no danger {name!r}{nearest(name, DANGERS)}")
     office = _office(where)
+    if (trusted := _trusted_here(office.fleet)) and SECOND not in accepted and not _has_record(office.folder):
+        advice = f"if that is lost for good (docs/guide/secure.md): --accept {SECOND}"
+        said = f"a second authority makes certificates by which nobody is let in; {advice}"
+        raise CliError(EXIT_FAILED, f"{_elsewhere(office.fleet, trusted)}; {said}")
     secret = _new_passphrase() if asks_passphrase else os.environ.get(PASSPHRASE, "").encode()
     authority = create(office.folder, office.fleet.name, secret, _now())
     lock = "locked with the passphrase" if secret else "not locked: --passphrase does that"
@@ -87,10 +98,11 @@ def issue(where: Where, name: str, role: Role, request: Path | None, out: Path |
     """Make the first certificate of a node, an operator or a guest.
 
     Raises:
-        CliError: the fleet file knows no such node, or a node of that name.
+        CliError: the fleet file knows no such node, or a node of that name; or this machine trusts another authority.
         AdapterError: the holder has a certificate already, or a file is not usable.
     """
     with _opened(where) as (office, authority):
+        check_trusted(office.fleet, authority)
         hosts = _check_name(office.fleet, name, role)
         asked, now = _request(request), _now()
         holder = authority.next_holder(name, role, asked, now)
@@ -456,8 +468,64 @@ def _opened(where: Where) -> Iterator[tuple[_Office, Authority]]:
     from zsched.pki.authority import opened  # noqa: PLC0415 - imports cryptography
 
     office = _office(where)
+    if (trusted := _trusted_here(office.fleet)) and not _has_record(office.folder):
+        raise AdapterError(f"there is no authority in {office.folder}; {_elsewhere(office.fleet, trusted)}")
     with opened(office.folder, office.fleet.name) as authority:
         yield office, authority
+
+
+def _has_record(folder: Path) -> bool:
+    """Whether an authority lies there."""
+    return (folder / places.AUTHORITY_RECORD).exists()
+
+
+def _trusted_here(fleet: Fleet) -> Path | None:
+    """The file of authorities that this machine trusts; ``None``: it trusts none, or the fleet has no certificates."""
+    path = None if fleet.security is None else Path(fleet.security.folder) / TRUSTED
+    return path if path is not None and path.exists() else None
+
+
+def _elsewhere(fleet: Fleet, trusted: Path) -> str:
+    """That a fleet has an authority, which is not here, and how to get at it."""
+    how = "give the command there, bring its folder here, or name it with --authority DIR"
+    return f"fleet {fleet.name} has an authority already ({trusted} names it), on another machine or a stick: {how}"
+
+
+def check_trusted(fleet: Fleet, authority: Authority) -> None:
+    """Refuse an authority that this machine does not trust: nobody would let in by its certificates.
+
+    Raises:
+        CliError: no certificate of it is among those that are trusted here.
+        AdapterError: those cannot be read.
+    """
+    path = _trusted_here(fleet)
+    if path is None:
+        return
+    try:
+        known = set(ders_of(read_regular(path, MAX_BYTES)))
+    except (OSError, ValueError) as error:
+        raise AdapterError(f"{path}: {error}; bring it back from another node") from error
+    if known.isdisjoint(ders_of(authority.trusted)):
+        how = "name the fleet's own with --authority DIR"
+        after = f"if this one is new (a rotation, or the former one is lost), put {authority.folder / TRUSTED} there"
+        told = f"{authority.folder} holds an authority that {path} does not know"
+        raise CliError(EXIT_FAILED, f"{told}, so nobody lets in by its certificates: {how}; {after}")
+
+
+def check_held(fleet: Fleet, given: Path | None) -> None:
+    """As `check_trusted`, of the authority on this machine, if there is one.
+
+    Raises:
+        CliError: it is not trusted here.
+        AdapterError: it cannot be used.
+    """
+    folder = holds_authority(fleet.name, given)
+    if folder is None or fleet.security is None:
+        return
+    from zsched.pki.authority import opened  # noqa: PLC0415 - imports cryptography
+
+    with opened(folder, fleet.name) as authority:
+        check_trusted(fleet, authority)
 
 
 def _check_name(fleet: Fleet, name: str, role: Role) -> tuple[str, ...]:

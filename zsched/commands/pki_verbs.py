@@ -41,11 +41,19 @@ def init(
     passphrase: Annotated[
         bool, typer.Option("--passphrase", help="Lock its key. [ZSCHED_AUTHORITY_PASSPHRASE, else it asks]")
     ] = False,
+    accept: Annotated[
+        list[str] | None,
+        typer.Option("--accept", metavar="DANGER", help="second-authority: the fleet's own is lost for good."),
+    ] = None,
 ) -> None:
-    """Make the fleet's authority: a key that signs certificates, on this machine only."""
+    """Make the fleet's authority: a key that signs certificates, on this machine only.
+
+    Refused where this machine trusts an authority already: that one is on another machine, and signs for the fleet.
+    """
     from zsched.commands import pki  # noqa: PLC0415 - each verb imports what it needs
 
-    raise typer.Exit(pki.init(pki.Where(config=config, authority=authority), asks_passphrase=passphrase))
+    where = pki.Where(config=config, authority=authority)
+    raise typer.Exit(pki.init(where, asks_passphrase=passphrase, accepted=accept or ()))
 
 
 @pki_app.command(cls=Verb)

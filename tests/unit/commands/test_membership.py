@@ -71,6 +71,7 @@ class Node:
         self.states = {"robot1": "alive", "edge1": "alive", "robot3": "gone"}
         self.changes: list[Json] = []
         self.is_old = False
+        self.fleet_file = ""
         self.rollouts: list[Json] = []
         self.look: Callable[[], object] = object
         """Called at each question."""
@@ -80,7 +81,13 @@ class Node:
         if request["verb"] == "status":
             nodes = [{"name": name, "state": state} for name, state in self.states.items()]
             tasks = [{"name": "merge", "owner": "robot1"}]
-            told = {"fleet": "hall", "nodes": nodes, "tasks": tasks, "fleet_file": "", "schema": "zsched.status/1"}
+            told = {
+                "fleet": "hall",
+                "nodes": nodes,
+                "tasks": tasks,
+                "fleet_file": self.fleet_file,
+                "schema": "zsched.status/1",
+            }
             return {**told, "quorum": {"generation": 0}}
         if request["verb"] == "change":
             self.changes.append(request)
@@ -650,6 +657,24 @@ def test_who_would_print_an_invitation_is_told_the_same_command_into_a_file(
         app(words)
     assert ended.value.code == 2
     assert f"the invitation is a file: {shlex.join(['zsched', *words])} > robot2.invite\n" in capsys.readouterr().err
+
+
+def test_an_authority_that_this_machine_does_not_trust_invites_nobody(
+    node: Node, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Beside the file by which the daemon runs lies the certificate of the fleet's own, which is elsewhere."""
+    secured(tmp_path, node)
+    (tmp_path / "etc" / "pki").mkdir(parents=True)
+    node.fleet_file = str(tmp_path / "etc" / "fleet.yaml")
+    stick = create(tmp_path / "stick", "hall", b"", datetime.now(UTC))
+    (tmp_path / "etc" / "pki" / "ca.pem").write_bytes(stick.trusted)
+    for more in ((), ("--plan",)):
+        refused = run("invite", "robot2", "--yes", *more)
+        assert refused.exit_code == 1
+        assert f"{tmp_path}/authority holds an authority that {tmp_path}/etc/pki/ca.pem does not know" in refused.stderr
+        assert (refused.stdout, node.changes) == ("", [])
+    monkeypatch.setenv("ZSCHED_AUTHORITY", str(tmp_path / "stick"))
+    assert run("invite", "robot2", "--yes").exit_code == 0
 
 
 def test_who_had_the_invitations_file_open_before_reads_no_key(node: Node, tmp_path: Path) -> None:

@@ -51,6 +51,49 @@ def test_init_says_where_the_key_lies_and_how_to_take_it_offline(here: Path) -> 
     assert "holds an authority" in pki("init", code=1).stderr
 
 
+def of_another_authority(here: Path) -> None:
+    """This machine trusts the fleet's authority, which lies elsewhere."""
+    pki("init", "--authority", str(here / "stick"))
+    (here / "pki").mkdir()
+    (here / "pki" / "ca.pem").write_bytes((here / "stick" / "ca.pem").read_bytes())
+
+
+def test_where_the_fleet_s_authority_is_elsewhere_no_second_one_is_made_without_its_danger(here: Path) -> None:
+    of_another_authority(here)
+    for words in (("show",), ("issue", "robot1"), ("renew",)):
+        told = " ".join(pki(*words, code=1).stderr.split())
+        assert f"there is no authority in {here}/authority; fleet yard has an authority already" in told
+        assert f"({here}/pki/ca.pem names it), on another machine or a stick" in told
+        assert "name it with --authority DIR" in told
+        assert "pki init" not in told
+    refused = " ".join(pki("init", code=1).stderr.split())
+    assert "fleet yard has an authority already" in refused
+    assert "--accept second-authority" in refused
+    assert not (here / "authority").exists()
+    assert (
+        "there is no danger 'second'; did you mean second-authority?"
+        in pki("init", "--accept", "second", code=2).stderr
+    )
+    pki("init", "--accept", "second-authority")
+    assert (here / "authority" / "ca-1.key").exists()
+
+
+def test_an_authority_that_this_machine_does_not_trust_issues_nothing(here: Path) -> None:
+    of_another_authority(here)
+    pki("init", "--accept", "second-authority")
+    refused = " ".join(pki("issue", "robot1", code=1).stderr.split())
+    assert f"{here}/authority holds an authority that {here}/pki/ca.pem does not know" in refused
+    assert "name the fleet's own with --authority DIR" in refused
+    assert not (here / "robot1").exists()
+    assert json.loads(pki("show", "--json").stdout)["certificates"] == [], "nothing was issued"
+    pki("rotate", "--authority", str(here / "stick"))
+    pki("issue", "robot1", "--authority", str(here / "stick"))
+    (here / "pki" / "ca.pem").write_text("torn")
+    assert "pki/ca.pem" in pki("issue", "robot2", "--authority", str(here / "stick"), code=1).stderr
+    (here / "pki" / "ca.pem").write_bytes((here / "authority" / "ca.pem").read_bytes())
+    pki("issue", "robot2", "--out", "second")
+
+
 def test_issue_writes_three_files_of_which_only_the_key_is_secret(here: Path) -> None:
     pki("init")
     said = pki("issue", "robot1").stdout
