@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import shutil
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from support.sessions import matches
 from support.waiting import until
 from zsched.exits import EXIT_LEFT
 from zsched.sessions.config import client_config
+from zsched.wire.codec import decode_state
 from zsched_lab.fleet.hall import Hall, block_of_ports
 
 pytestmark = pytest.mark.long
@@ -134,3 +136,32 @@ def test_the_machine_that_founded_a_fleet_leaves_it_to_the_other_one(tmp_path: P
         quorum = hall.status("robot2")["quorum"]
         assert (quorum["names"], quorum["ok"]) == (["robot2"], True)
         hall.zsched("robot2", "fleet", "show")
+
+
+def test_an_elector_whose_system_was_installed_anew_goes_on_with_its_promises_and_another_key(tmp_path: Path) -> None:
+    """/etc is new, /var is kept: its fleet file, its certificate and its key are gone, and its state is not."""
+    port = block_of_ports(30)
+    with Hall(tmp_path) as hall:
+        hall.zsched("robot1", "fleet", "create", "hall", "--address", f"127.0.0.1:{port}")
+        hall.start("robot1")
+        until(lambda: hall.alive("robot1") == {"robot1"}, "the first daemon")
+        for count, name in enumerate(("robot2", "robot3"), 1):
+            bring(hall, name, port + 10 * count)
+        until(lambda: elects(hall, "robot1", "robot2", "robot3"), "one elector has become three")
+        hall.stop("robot2")
+        disk = decode_state((tmp_path / "robot2" / "state" / "state").read_bytes()).disk
+        shutil.rmtree(tmp_path / "robot2" / "etc")
+        until(lambda: "robot2" not in hall.alive("robot1"), "robot2 is missed")
+        invitation = tmp_path / "again.invite"
+        invitation.write_text(hall.zsched("robot1", "invite", "robot2", "--yes"))
+        hall.zsched("robot2", "join", str(invitation))
+        hall.start("robot2")
+        for name in ("robot3", "robot1"):  # by themselves they would wait for 2 min, for an elector is away
+            hall.stop(name)
+            hall.start(name)
+        until(lambda: "robot2" in hall.alive("robot1"), "robot2 is let in by its other key")
+        until(lambda: elects(hall, "robot1", "robot2", "robot3"), "it is an elector")
+        until(lambda: hall.status("robot2")["quorum"]["alive"] == len(("robot1", "robot2", "robot3")), "it answers")
+        assert decode_state((tmp_path / "robot2" / "state" / "state").read_bytes()).disk == disk
+        exported = {name: hall.zsched(name, "fleet", "export") for name in ("robot1", "robot2")}
+        assert exported["robot1"] == exported["robot2"]
