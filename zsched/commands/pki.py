@@ -270,11 +270,17 @@ def deliver(where: Where, door: Door, label: str | None) -> int:
     A node that was away gets it the next time. What the fleet has no node for is named, and not renewed.
 
     Raises:
-        CliError: there is no such node's key, the fleet has no such node (any more), or nobody answers here.
+        CliError: there is no such node's key, the fleet has no such node (any more), nobody answers here, or who does
+            is of another fleet.
         AdapterError: a file is not usable.
     """
-    members = {str(one["name"]) for one in ask_door(door, {"verb": "status"})["nodes"]}
+    if door.cell is not None:
+        advice = f"give the command where the authority of {door.cell.name} is, on a machine with a daemon of it"
+        raise CliError(EXIT_USAGE, f"--node: {door.cell.name} is another fleet of the site; {advice}")
+    status = ask_door(door, {"verb": "status"})
+    members = {str(one["name"]) for one in status["nodes"]}
     with _opened(where) as (_, authority):
+        _check_fleet(status, authority)
         _see_anew(door, authority, members)
         now, number = int(_now().timestamp()), authority.record.number
         live = [one for one in authority.record.entries if one.revoked is None and one.holder.role is Role.NODE]
@@ -297,6 +303,20 @@ def deliver(where: Where, door: Door, label: str | None) -> int:
         newest = [entry for one in named if (entry := authority.record.entry(one.label)) is not None]
     results = [_send(door, entry) for entry in newest if entry.holder.name in members]
     return EXIT_OK if all(one in (SENT, HAD) for one in results) else EXIT_FAILED
+
+
+def _check_fleet(status: Json, authority: Authority) -> None:
+    """Refuse to go by the nodes of another fleet: this one's keys would look as if nobody had them.
+
+    Raises:
+        CliError: the daemon that answers is of another fleet.
+    """
+    told, own = str(status.get("fleet", "")), authority.record.fleet
+    if told != own:
+        advice = "say with --node or ZSCHED_NODE which daemon is meant, or which fleet by --config"
+        raise CliError(
+            EXIT_USAGE, f"{authority.folder} is the authority of fleet {own}, and who answers is of {told}; {advice}"
+        )
 
 
 def _see_anew(door: Door, authority: Authority, members: set[str]) -> None:

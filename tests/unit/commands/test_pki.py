@@ -274,6 +274,36 @@ def test_what_is_due_is_sent_to_the_nodes_and_so_is_what_a_node_has_missed(
         assert "go without --deliver" in pki(*words, "robot2", "--out", "x", code=2).stderr
 
 
+def test_nothing_is_sent_by_the_nodes_of_another_fleet_nor_is_a_key_called_a_stray(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The keys of all nodes would be due and of no node, with the advice to revoke them."""
+    asked = list[str]()
+
+    def answer(request: Json) -> Json:
+        asked.append(request["verb"])
+        return {"fleet": "hall", "nodes": [{"name": "crane1"}]}
+
+    pki("init")
+    pki("issue", "robot1")
+    pki("rotate")
+    before = json.loads(pki("show", "--json").stdout)
+    (here / "fleet.yaml").write_text(f"{FLEET}site: {{hall: {{gateways: [tls/192.0.2.9:7457], file: hall.yaml}}}}\n")
+    with closing(OperatorSocket(here / "crane1.sock", answer)) as door:
+        door.open()
+        monkeypatch.setenv("ZSCHED_NODE", "crane1")
+        words = ("renew", "--deliver", "--runtime-dir", str(here))
+        for more in ((), ("robot1",)):
+            refused = pki(*words, *more, code=2)
+            assert "is the authority of fleet yard, and who answers is of hall" in " ".join(refused.stderr.split())
+            assert "revoke" not in refused.output
+        assert set(asked) == {"status"}
+        monkeypatch.setenv("ZSCHED_RUNTIME_DIR", str(here))
+        refused = pki(*words, "--node", "hall/crane1", code=2)
+        assert "--node: hall is another fleet of the site" in " ".join(refused.stderr.split())
+    assert json.loads(pki("show", "--json").stdout) == before
+
+
 def test_no_certificate_of_a_new_authority_is_sent_while_a_node_would_not_know_it(
     here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
