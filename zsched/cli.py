@@ -112,8 +112,30 @@ def _leave_out_others(word: str) -> None:
         app.registered_commands, app.registered_groups = commands, groups
 
 
+STANDARD = ("stdin", "stdout", "stderr")
+"""By their descriptors' numbers."""
+
+
+def open_missing() -> None:
+    """Open /dev/null for each standard stream that the caller has closed (``<&-``, some supervisors).
+
+    Else Python has none there, and the next file or socket that is opened gets its number.
+    """
+    for number, name in enumerate(STANDARD):
+        if getattr(sys, name) is not None:
+            continue
+        null = os.open(os.devnull, os.O_RDWR)
+        if null != number:
+            os.dup2(null, number)
+            os.close(null)
+        os.set_inheritable(number, True)  # `up` becomes the daemon, and others are started from here
+        mode = "r" if name == "stdin" else "w"
+        setattr(sys, name, open(number, mode, encoding="utf-8", closefd=False))  # noqa: SIM115 - until the end
+
+
 def main() -> None:
     """The console entry point."""
+    open_missing()
     _leave_out_others("".join(sys.argv[1:2]))
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # bars in a terminal without UTF-8

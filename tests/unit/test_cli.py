@@ -13,6 +13,43 @@ from support.clinic import FLEET
 from support.recorded_daemon import Daemon
 from zsched.cli import app
 
+# --- streams that are closed -----------------------------------------------------------------------------------------
+
+
+def with_closed(redirection: str, *words: str) -> subprocess.CompletedProcess[str]:
+    """The program in a shell that has closed some of its streams."""
+    command = ["sh", "-c", f'"$0" -m zsched "$@" {redirection}', sys.executable, *words]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+
+
+@pytest.mark.parametrize("redirection", ["<&-", ">&-", "<&- >&-"])
+def test_a_verb_without_a_stdin_is_off_a_terminal(daemon: Daemon, folder: Path, redirection: str) -> None:
+    words = ("restart", "echo", "--runtime-dir", str(folder))
+    done = with_closed(redirection, *words)
+    assert (done.returncode, "Traceback" in done.stderr) == (2, False), done.stderr
+    assert f"to do it:\nzsched {' '.join(words)} --yes" in done.stderr
+    assert {one["verb"] for one in daemon.asked} == {"status"}
+
+
+@pytest.mark.parametrize("redirection", [">&-", "2>&-", "<&- >&- 2>&-"])
+def test_a_verb_without_a_stdout_or_stderr_ends_as_ever(daemon: Daemon, folder: Path, redirection: str) -> None:
+    done = with_closed(redirection, "status", "--runtime-dir", str(folder))
+    assert (done.returncode, done.stderr) == (0, "")
+    assert bool(done.stdout) == (">&-" not in redirection.split())
+    assert daemon.asked
+    wrong = with_closed(redirection, "status", "--runtime-dir", str(folder / "none"))
+    assert (wrong.returncode, "Traceback" in wrong.stderr) == (3, False), wrong.stderr
+
+
+def test_a_program_that_is_started_from_a_verb_has_all_three_streams() -> None:
+    text = (
+        "import os; from zsched.cli import open_missing; open_missing(); print(list(map(os.get_inheritable, range(3))))"
+    )
+    command = ["sh", "-c", '"$0" -c "$1" <&- 2>&-', sys.executable, text]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout) == (0, "[True, True, True]\n")
+
+
 # --- words that are wrong --------------------------------------------------------------------------------------------
 
 
