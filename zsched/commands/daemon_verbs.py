@@ -60,6 +60,10 @@ def init(
     settle: Annotated[
         bool, typer.Option("--settle", help="The other machine of this name is gone: be an elector again.")
     ] = False,
+    accept: Annotated[
+        list[str] | None,
+        typer.Option("--accept", metavar="DANGER", help="lost-state: its state is lost, and no other node is left."),
+    ] = None,
 ) -> None:
     """Create this node's blank state: "this name has never voted here".
 
@@ -67,10 +71,13 @@ def init(
     If too many states are lost to agree, stop every daemon, and run it on every node with the --generation that
     `zsched status` names. That is refused while the fleet agrees, and where a good state would be lost.
 
+    A machine that has lost its state gets the fleet's document first: what `zsched fleet export` writes on a living
+    node, as its fleet file.
+
     With --example it writes no state but a small task: a fleet file, a worker, an application (see `zsched dev`).
     """
     if example is not None:
-        if config or node or state_dir or generation or force or settle:
+        if config or node or state_dir or generation or force or settle or accept:
             raise CliError(EXIT_USAGE, "--example goes with a folder only")
         give_example(example, folder or Path())
         return
@@ -78,7 +85,7 @@ def init(
         raise CliError(EXIT_USAGE, f"{folder}: a folder goes with --example; name the state folder with --state-dir")
     from zsched.commands.init import create_state  # noqa: PLC0415 - each verb imports what it needs
 
-    create_state(config, node, state_dir, generation, is_forced=force, is_settling=settle)
+    create_state(config, node, state_dir, generation, is_forced=force, is_settling=settle, accepted=accept or ())
 
 
 def recover(

@@ -1,22 +1,27 @@
 """`zsched init`: creates a node's blank state, or settles a dispute about its name.
 
-Knows: whom the others' answers let begin, in words. Does not know: states and sessions (`zsched.runtime.init`).
+Knows: whom the others' answers let begin, in words. Does not know: states and sessions (`zsched.runtime.init`), what
+an authority's folder holds (`zsched.commands.pki`).
 """
 
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
 from zsched import paths as places
+from zsched.adapters.host.state_file import STATE_NAME
 from zsched.adapters.machine import core_speed
-from zsched.commands.common import CliError, counted, say, warn
+from zsched.commands.common import CliError, counted, nearest, say, warn
 from zsched.commands.here import own_name
+from zsched.commands.pki import known_here
 from zsched.config.load import load_fleet, require_node
+from zsched.core.values.fleet import Fleet
 from zsched.core.vote.belief import MAX_GENERATION
 from zsched.errors import ConfigError
-from zsched.exits import EXIT_USAGE
+from zsched.exits import EXIT_FAILED, EXIT_USAGE
 from zsched.runtime.init import Heard, begin_anew, check_blank, init_state, settle_dispute, standing_state
 
 _LOST: Final = (
@@ -25,6 +30,9 @@ _LOST: Final = (
     "`zsched init` again"
 )
 """Of a secured fleet, whose files `fleet create` and `join` wrote, together with a state."""
+LOST_STATE: Final = "lost-state"
+"""The danger: the fleet lives on elsewhere, and this machine becomes a fleet of one of the same name."""
+DANGERS: Final = (LOST_STATE,)
 
 
 def create_state(
@@ -35,6 +43,7 @@ def create_state(
     *,
     is_forced: bool,
     is_settling: bool,
+    accepted: Sequence[str] = (),
 ) -> None:
     """Write the blank state of this machine's node, where nothing speaks against it.
 
@@ -45,12 +54,16 @@ def create_state(
         generation: above 0 the fleet starts anew with it.
         is_forced: although nobody says that it is needed.
         is_settling: write none, but make the node an elector again whose name another machine had.
+        accepted: names of dangers.
 
     Raises:
-        CliError: the words do not go together, or name no node.
+        CliError: the words do not go together, or name no node; or the state seems to be lost.
         ConfigError: the fleet file cannot be used.
         AdapterError: something speaks against it, or the folder cannot be written.
     """
+    for danger in accepted:
+        if danger not in DANGERS:
+            raise CliError(EXIT_USAGE, f"--accept: there is no danger {danger!r}{nearest(danger, DANGERS)}")
     if generation > MAX_GENERATION:
         raise CliError(EXIT_USAGE, f"--generation {generation}: at most {MAX_GENERATION}")
     file = places.config_path(config, os.environ)
@@ -74,6 +87,8 @@ def create_state(
         text = f"{name} has its state in fleet {fleet.name}, generation {standing.generation}: nothing to do"
         say(f"{state}: {text}")
         return
+    if not is_forced and LOST_STATE not in accepted:
+        _check_not_lost(fleet, name, file, state)
     heard = check_blank(fleet, name, state, generation, standing, is_forced=is_forced)
     side = heard.side
     path = init_state(fleet, name, state, generation) if side is None else begin_anew(fleet, name, state, side)
@@ -86,6 +101,27 @@ def create_state(
         say(f"{path}: blank state of {name} in fleet {fleet.name}; {text} it is added as one")
         return
     say(f"{path}: blank state of {name} in fleet {fleet.name}, generation {generation}")
+
+
+def _check_not_lost(fleet: Fleet, name: str, file: Path, state: Path) -> None:
+    """Refuse where nobody else is named who could be asked, and the authority here tells that there was a state.
+
+    Raises:
+        CliError: it was made together with one, or it has certified other nodes.
+    """
+    if any(node.name != name for node in fleet.nodes) or (state / STATE_NAME).exists():
+        return
+    known = known_here(fleet)
+    if known is None:
+        return
+    others = f" and has certified {', '.join(known.others)}" if known.others else ""
+    raise CliError(
+        EXIT_FAILED,
+        f"nothing was written: {file} names nobody but {name}, and {known.folder} is the authority of a fleet that had "
+        f"its state{others}. If {name} has lost it, the file may be of the first day, and this would make a fleet of "
+        f"one: bring what `zsched fleet export` writes on a living node as {file}, then `zsched init` again. Only if "
+        f"no other node is left: --accept {LOST_STATE}",
+    )
 
 
 def _heard(heard: Heard, name: str, generation: int, *, is_elector: bool) -> str:

@@ -146,6 +146,32 @@ def holds_authority(fleet: str, given: Path | None) -> Path | None:
     return folder if (folder / places.AUTHORITY_RECORD).exists() else None
 
 
+class Known(Struct, frozen=True, kw_only=True):
+    """What the authority on this machine tells of its fleet."""
+
+    folder: Path
+    others: tuple[str, ...]
+    """Nodes that have a certificate, and are not in the fleet file here."""
+
+
+def known_here(fleet: Fleet) -> Known | None:
+    """What the authority here tells of a fleet that had a state; ``None``: there is none, or it tells of none.
+
+    `zsched fleet create` makes it together with a state, and by hand it is made before any state.
+    """
+    folder = None if fleet.security is None else holds_authority(fleet.name, None)
+    if folder is None:
+        return None
+    from zsched.pki.authority import opened  # noqa: PLC0415 - imports cryptography
+
+    with contextlib.suppress(AdapterError, OSError), opened(folder, fleet.name) as authority:
+        record, named = authority.record, {node.name for node in fleet.nodes}
+        live = {one.holder.name for one in record.entries if one.revoked is None and one.holder.role is Role.NODE}
+        others = tuple(sorted(live - named))
+        return Known(folder=folder, others=others) if record.creation or others else None
+    return None
+
+
 def is_left_of(creation: str, fleet: str, node: str, given: Path | None, *, is_destroyed: bool = False) -> bool:
     """Whether the authority here was made by this creation of a fleet, and nobody but its first node has got anything.
 

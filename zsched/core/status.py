@@ -126,6 +126,8 @@ def _problems(node: Stages, quorum: QuorumStatus, now: float) -> tuple[str, ...]
         names = ", ".join(quorum.stateless)
         first = (
             f"{NEVER_INITIALISED}: no elector heard has a state ({names}), and nobody knows of one. "
+            "If this node has lost its state and the fleet lives on elsewhere, first bring here, as the fleet file, "
+            "what `zsched fleet export` writes on a living node, then `zsched init` here alone. If the fleet is new: "
             "Stop every daemon, run `zsched init` on every node, and start them again"
         )
         return (first, *(f"{source}: {text}" for source, text in sorted(others.items())))

@@ -402,6 +402,37 @@ def test_ctrl_c_at_the_question_for_the_passphrase_founds_nothing(
     assert not authority.exists()
 
 
+@pytest.mark.parametrize("is_by_hand", [False, True], ids=["fleet create", "its authority knows another node"])
+def test_a_founder_that_lost_its_state_is_not_made_a_fleet_of_one(
+    tmp_path: Path, authority: Path, *, is_by_hand: bool
+) -> None:
+    """Its fleet file is of the first day, so there is nobody to ask; the fleet lives on without it."""
+    words = ("--node", "robot1", *here(tmp_path))
+    assert run("fleet", "create", "hall", "--address", "127.0.0.1", *words).exit_code == 0
+    shutil.rmtree(tmp_path / "state")
+    if is_by_hand:
+        shutil.rmtree(authority)
+        held = create(authority, "hall", b"", datetime.now(UTC))
+        assert run("init", *words).exit_code == 0, "a fleet of one that is secured by hand"
+        shutil.rmtree(tmp_path / "state")
+        held.issue("robot2", Role.NODE, (), b"", b"", datetime.now(UTC))
+    for more in ((), ("--generation", "1")):
+        refused = run("init", *words, *more)
+        assert (refused.exit_code, refused.stdout) == (1, "")
+        told = " ".join(refused.stderr.split())
+        assert f"nothing was written: {tmp_path}/fleet.yaml names nobody but robot1" in told
+        assert f"bring what `zsched fleet export` writes on a living node as {tmp_path}/fleet.yaml" in told
+        assert ("has certified robot2" in told) == is_by_hand
+    assert not (tmp_path / "state").exists()
+    assert "did you mean lost-state?" in run("init", *words, "--accept", "lost-stat").stderr
+    if is_by_hand:
+        assert run("init", *words, "--accept", "lost-state").exit_code == 0
+        return
+    text = (tmp_path / "fleet.yaml").read_text()
+    (tmp_path / "fleet.yaml").write_text(text.replace("nodes:\n", "nodes:\n  robot2: {kind: robot}\n"))
+    assert run("init", *words).exit_code == 0, "the exported document"
+
+
 def test_without_certificates_a_fleet_says_so_and_stays_where_strangers_are_not(
     tmp_path: Path, authority: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

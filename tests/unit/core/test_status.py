@@ -221,6 +221,14 @@ def test_a_fleet_that_was_never_initialised_is_told_one_order_and_told_it_first(
     assert "lost state" not in shown
 
 
+def test_a_node_that_seems_never_initialised_may_have_lost_its_state_and_hears_how_it_comes_back_first() -> None:
+    """A founder's fleet file of the first day names nobody else: `zsched init` would make it a fleet of one."""
+    (told,) = build_snapshot(forgotten(), 100.0).problems
+    first, _, then = told.partition("If the fleet is new: ")
+    assert "what `zsched fleet export` writes on a living node, then `zsched init` here alone" in first
+    assert then.startswith("Stop every daemon")
+
+
 def test_a_fleet_of_which_somebody_remembers_a_state_was_initialised() -> None:
     """A blank state in place of a lost one may vote twice: only a new generation helps."""
     learnt = forgotten()

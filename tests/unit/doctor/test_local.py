@@ -211,6 +211,7 @@ def test_an_elector_without_a_state_is_found(tmp_path: Path) -> None:
     assert run("state.valid", scene).verdict is PASS
     (scene.state_folder / "state").unlink()
     assert_finds(run("state.valid", scene), FAIL, "does not exist", "cannot vote")
+    assert "what `zsched fleet export` writes on a living node" in run("state.valid", scene).fix
     edge = replace(scene, node="edge1")
     assert_finds(run("state.valid", edge), WARN, "works without")
 
