@@ -338,7 +338,7 @@ def mend(invitation: Invitation, places: Places, *, is_plan: bool) -> tuple[Flee
     _check_file(places.config, invitation.fleet)
     fleet, content = _fleet_here(invitation, places)
     folder = None if fleet.security is None else Path(fleet.security.folder)
-    lacking = () if folder is None else tuple(name for name in _WHAT if not os.path.exists(folder / name))  # noqa: PTH110 - never raises
+    lacking = () if folder is None else tuple(name for name in _WHAT if not os.access(folder / name, os.F_OK))
     written = () if content is None else _listed_file(places, content.text.encode())
     if folder is not None and lacking:
         usable(invitation, places)
@@ -348,9 +348,9 @@ def mend(invitation: Invitation, places: Places, *, is_plan: bool) -> tuple[Flee
         return fleet, written
     if folder is not None and lacking and invitation.papers is not None:
         _put_papers(folder, invitation.papers, lacking)
-    if content is not None:
-        _put_file(places, content.text.encode())
+    if content is not None:  # the file last: by it is seen that nothing is missing
         _put(places.state / COPY_NAME, f"{fleet_hash(fleet)}\n".encode(), PRIVATE_MODE)
+        _put_file(places, content.text.encode())
     if written:
         with contextlib.suppress(OSError):  # the node is wanted again
             (places.state / OUT_NAME).unlink(missing_ok=True)
@@ -444,7 +444,8 @@ def _check_brought(
     path, papers = folder / lacking[0], invitation.papers
     advice = f"have another invitation written where the fleet's authority is (`zsched invite {invitation.node}`)"
     if papers is None:
-        raise AdapterError(f"{path} is not there, and the invitation brings no certificate; {advice}")
+        by_hand = f"`zsched pki issue {invitation.node}` there, and bring its files"
+        raise AdapterError(f"{path} is not there, and the invitation brings no certificate; {advice}, or {by_hand}")
     offered, let_in = _named(papers.certificate.encode()) or "", _let_in(invitation, places)
     if let_in and parse_common_name(offered, fleet.name) not in let_in:
         raise AdapterError(f"{path} is not there, and nobody lets in by the invitation's key ({offered}); {advice}")

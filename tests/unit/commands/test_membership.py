@@ -36,6 +36,7 @@ from zsched.commands.renewing import UNIT_FOLDER, renew_advice
 from zsched.config.load import check_bytes, load_fleet
 from zsched.core.values.certificates import Role
 from zsched.core.values.document import Document, Rollout, Text
+from zsched.core.values.fleet import fleet_hash
 from zsched.core.values.struct import replace
 from zsched.errors import ConfigError
 from zsched.exits import EXIT_WOULD_CHANGE
@@ -931,6 +932,7 @@ def test_a_later_key_is_taken_though_the_power_goes_at_any_step_and_the_state_st
     assert common_names(certificate) == ("robot2.k2.hall.zsched.internal",)
     assert is_key_of((folder / "pki" / "key.pem").read_bytes(), certificate)
     lets_in(folder)
+    assert membership_files.copied_file(folder / "state") == fleet_hash(load_fleet(folder / "fleet.yaml"))
     assert (folder / "state" / "state").read_bytes() == state
     assert "nothing to do" in run("join", second, *here(folder)).stdout
 
