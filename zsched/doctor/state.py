@@ -33,8 +33,8 @@ def valid(scene: Scene) -> Result:
     if found.state is not None:
         return passed(f"{folder}: generation {found.state.generation}, start {found.state.incarnation}")
     told, role = found.problem or "no state", "an elector" if scene.node in scene.fleet.electors else "no elector"
-    was_lost = f"if the state was lost, first what `zsched fleet export` writes on a living node, as {scene.file}; then"
-    fix = f"{was_lost} sudo zsched init --config {scene.file} --node {scene.node}, with the daemon stopped"
+    first = "before it, if the state was lost, bring what `zsched fleet export` writes on a living node as that file"
+    fix = f"sudo zsched init --config {scene.file} --node {scene.node}, with the daemon stopped; {first}"
     if not found.is_missing:
         fix = "zsched init --help says how a node becomes an elector again; do not copy a state from elsewhere"
     if found.is_others:
