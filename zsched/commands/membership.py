@@ -362,7 +362,7 @@ def _check_invited_again(door: Door, guest: Guest, kind: NodeKind) -> None:
 
 def _own_file(door: Door) -> str:
     """The fleet file of this machine: that of the daemon here, beside which its certificates are."""
-    told = "" if door.endpoint else status_of(door).get("fleet_file")
+    told = "" if door.endpoint else status_of(Door(socket=door.socket)).get("fleet_file")  # not of the node behind it
     return told or str(places.config_path(None, os.environ))
 
 
