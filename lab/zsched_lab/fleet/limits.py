@@ -35,13 +35,19 @@ class NodeLimits:
         says: str,
         *,
         groups: Mapping[NodeId, LimitedGroup] | None = None,
+        work: Mapping[NodeId, LimitedGroup] | None = None,
         cpus: Mapping[NodeId, int] | None = None,
+        outer: tuple[LimitedGroup, ...] = (),
     ) -> None:
+        """``outer``: groups that only hold the others, and go last."""
         self.kind = kind
         self.says = says
         """One sentence for the operator."""
         self._groups = dict(groups or {})
+        self._work = dict(work or {})
+        """Where a node's tasks have a smaller quota than the node: their groups, within its own."""
         self._cpus = dict(cpus or {})
+        self._outer = outer
 
     def put(self, node: NodeId, pid: int) -> None:
         """Put a process that has just started into its node's share; robots have none.
@@ -60,17 +66,30 @@ class NodeLimits:
         except OSError as error:
             raise AdapterError(f"cannot bind process {pid} to CPU {cpu}: {error}") from error
 
+    def put_work(self, node: NodeId, pid: int) -> None:
+        """The same of a process that is the node's work, and no part of zsched.
+
+        Raises:
+            AdapterError: it may not be moved, or is gone.
+        """
+        if (group := self._work.get(node)) is not None:
+            group.add(pid)
+        else:
+            self.put(node, pid)
+
     def pids(self, node: NodeId) -> tuple[int, ...]:
         """Every process in the node's group; none where it has no group."""
-        group = self._groups.get(node)
-        return () if group is None else group.pids()
+        groups = (self._groups.get(node), self._work.get(node))
+        return tuple(sorted({pid for group in groups if group is not None for pid in group.pids()}))
 
     def remove(self) -> None:
         """Remove the groups; what is still inside one stays (in the lab the janitor comes after us)."""
-        for group in self._groups.values():
+        for group in (*self._work.values(), *self._groups.values(), *self._outer):
             with contextlib.suppress(AdapterError):
                 group.remove()
+        self._work.clear()
         self._groups.clear()
+        self._outer = ()
 
 
 def make_limits(prefix: str, cores: Mapping[NodeId, float], memory_mb: float) -> NodeLimits:

@@ -18,7 +18,9 @@ class Arrival:
     latency_s: float
     size: int
     known: float
-    """Share of the truth's known cells that it knows."""
+    """Share of the truth's known cells that it knows, right or wrong."""
+    walls: float = 0.0
+    """Share of the truth's walls that it has where they are."""
 
 
 @dataclass(slots=True)

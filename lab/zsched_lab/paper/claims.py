@@ -153,13 +153,14 @@ LESS_IS_BETTER = frozenset(
 )
 SIX = ("cpu_peak", "memory_mean", "throughput_mb_s", "map_hz", "task_latency_s", "ssim_rebased")
 """The paper's six metrics, fleet-wide."""
-LED = ("coverage_mean", "stopped_ratio")
+LED = ("coverage_mean", "walls_mean", "stopped_ratio")
 """And of robots that SLAM on the edges leads: there a bad place costs coverage, and a robot stands."""
 POINTS = frozenset({"stopped_ratio"})
 """Shares of the time that may be 0, compared by their difference (`points`)."""
 
 GAINS = (
     "coverage_mean",
+    "walls_mean",
     "throughput_mb_s",
     "received_mb_s",
     "map_hz",
@@ -312,19 +313,20 @@ def compared(runs: Sequence[Json]) -> tuple[str, ...]:
     return (*SIX, *LED) if led(runs) else SIX
 
 
-def declared(runs: Sequence[Json]) -> list[tuple[str, Difference]]:
+def declared(runs: Sequence[Json], metric: str = "coverage_mean") -> list[tuple[str, Difference]]:
     """(against whom, difference) of zsched's coverage on the way, of led robots: as declared before their runs.
 
     Against the mean of the fixed schemes, the best of them as known afterwards, and every other scheme that was run.
+    ``metric``: another figure to compare them by.
     """
     own = led(runs)
-    best = best_fixed(own, "coverage_mean")
+    best = best_fixed(own, metric)
     others = [name for name in SCHEMES if name not in (*FIXED_SCHEMES, "zsched")]
     against: dict[str, tuple[str, ...]] = {"the mean of the fixed schemes": FIXED_SCHEMES}
     against |= {} if best is None else {f"the best fixed one, {best}": (best,)}
     against |= {name: (name,) for name in others}
-    mine = table_of(own, "coverage_mean", ("zsched",))
-    found = [(name, difference(mine, table_of(own, "coverage_mean", schemes))) for name, schemes in against.items()]
+    mine = table_of(own, metric, ("zsched",))
+    found = [(name, difference(mine, table_of(own, metric, schemes))) for name, schemes in against.items()]
     return [(name, one) for name, one in found if one is not None]
 
 

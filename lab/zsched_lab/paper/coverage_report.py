@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 
 from zsched_lab.demo.plots import COLOURS, DPI
 from zsched_lab.paper.claims import T_975
+from zsched_lab.paper.led_metrics import mean_stood
 from zsched_lab.paper.roles import ROLES, mean_shares
 from zsched_lab.paper.schemes import SCHEMES
 
@@ -24,6 +25,12 @@ OURS = {"zsched": "#111111", "zsched_slam": "#8a1c1c"}
 """Colours that stand out among the others' lines and bands."""
 Curve = tuple[list[float], list[float], list[float | None]]
 """(t_s, mean share, half of its 95 % interval or ``None`` of one run)."""
+COVERAGE_SAYS = (
+    "Share of the truth that the newest merged map knows, right or wrong, mean over the robots; 95 % interval over the "
+    "runs. *Walls*: the mean share of the truth's walls that it has where they are.\n"
+)
+STANDS_AT_MOST = 0.05
+"""Of the time robots may stand whose SLAM's edge has a model and no merger; with the merger they stand for longer."""
 MARKS = 5
 """This many instants of the run stand in the table."""
 STATES = (
@@ -41,11 +48,13 @@ def coverage_parts(runs: Sequence[Json]) -> list[str]:
         return []
     return [
         "### Coverage over time\n",
-        "Share of the truth that the newest merged map knows, mean over the robots; 95 % interval over the runs.\n",
+        COVERAGE_SAYS,
         coverage_table(led),
         "### Whose CPU an edge's was\n",
-        "Shares of an edge's CPU, the mean over edges and runs by time. zsched's own has a quota of its own on top.\n",
+        "Shares of an edge's CPU, the mean over edges and runs by time. All but zsched's own have a quota in common.\n",
         roles_table(led),
+        "### When robots stood\n",
+        stood_text(led),
     ]
 
 
@@ -83,7 +92,7 @@ def coverage_table(runs: Sequence[Json]) -> str:
     by_scheme = {name: own for name in SCHEMES if (own := [f for f in runs if f["scheme"] == name])}
     instants = mean_curve(runs)[0]
     chosen = [instants[round(number * (len(instants) - 1) / MARKS)] for number in range(1, MARKS + 1)]
-    heads = ["scheme", "runs", *(f"{t_s:g} s" for t_s in chosen), "mean over the run", "m² at the end"]
+    heads = ["scheme", "runs", *(f"{t_s:g} s" for t_s in chosen), "mean over the run", "walls", "m² at the end"]
     heads += ["stood", "corrections/s", "oldest s", "pose error m", "merge CPU s"]
     lines = [f"| {' | '.join(heads)} |", "| --- " * len(heads) + "|"]
     for name, own in by_scheme.items():
@@ -91,7 +100,8 @@ def coverage_table(runs: Sequence[Json]) -> str:
         at = dict(zip(times, zip(means, halves, strict=True), strict=True))
         over = [float(figures["coverage_mean"]) for figures in own]
         cells = [with_interval(*at[t_s], len(own)) for t_s in chosen]
-        cells += [with_interval(statistics.fmean(over), interval(over), len(own)), mean_of(own, "explored_m2", 0)]
+        cells += [with_interval(statistics.fmean(over), interval(over), len(own))]
+        cells += [mean_of(own, "walls_mean", 3), mean_of(own, "explored_m2", 0)]
         cells += [mean_of(own, "stopped_ratio", 3), mean_of(own, "corrections_hz", 2)]
         cells += [
             mean_of(own, "correction_age_max_s", 2),
@@ -120,6 +130,25 @@ def roles_table(runs: Sequence[Json]) -> str:
             row = f"| {says} | {' | '.join(cells)} | {total:.1%} | {shares.get('zsched', 0.0):.1%} |"
             lines.append(row.replace("%", " %"))
     return "\n".join(lines) + "\n"
+
+
+def stood_text(runs: Sequence[Json]) -> str:
+    """How long robots stood by what was on the edge of their SLAM, and whether the block is what it is to be."""
+    measured = [figures["stood_by_state"] for figures in runs if figures.get("stood_by_state")]
+    told = {state: row for state, _ in STATES if (row := mean_stood(measured, state)) is not None}
+    if not told:
+        return "Not measured by state.\n"
+    lines = ["| on the edge of its SLAM | robots' minutes | stood |", "| --- | --- | --- |"]
+    for state, says in STATES:
+        if state in told:
+            lines.append(f"| {says} | {told[state][0] / 60.0:.1f} | {100.0 * told[state][1]:.1f} % |")
+    model, both = told.get("model"), told.get("both")
+    if model is None or both is None:
+        return "\n".join(lines) + "\n"
+    is_faithful = model[1] < STANDS_AT_MOST < both[1]
+    verdict = "as it must be" if is_faithful else "**not what the block is to show**"
+    lines += ["", f"Less than {STANDS_AT_MOST:.0%} beside the model alone, and more with the merger: {verdict}."]
+    return "\n".join(lines).replace("5%", "5 %") + "\n"
 
 
 def save_coverage(path: Path, runs: Sequence[Json], title: str) -> str | None:

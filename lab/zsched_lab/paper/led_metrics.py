@@ -9,13 +9,15 @@ import bisect
 import itertools
 import math
 import statistics
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from zsched.core.values.model import NodeId
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched_lab.fleet.recorder import read_records
 from zsched_lab.paper.arrivals import Arrival, Streams
+from zsched_lab.paper.roles import state_of
 
 CURVE_S = 5.0
 """Coverage over time is recorded this often."""
@@ -26,17 +28,19 @@ def coverage_figures(streams: Streams, duration_s: float, area_m2: float) -> Jso
     """Coverage over time: the share of the truth's known cells that the robots' newest merged map knows, their mean.
 
     ``coverage_curve`` is [[t_s, share], ...] every `CURVE_S` from 0 and at the end; ``coverage_mean`` its mean over the
-    run's time (each value holds until the next), ``explored_m2`` the known area at the end. A robot without a map
-    knows nothing.
+    run's time (each value holds until the next), ``explored_m2`` the known area at the end. ``walls_mean`` is the same
+    mean of the truth's walls that the map has where they are: coverage counts what is known, right or wrong. A robot
+    without a map knows nothing.
     """
     by_robot = [([arrival.t_s for arrival in maps], maps) for maps in streams.maps.values()]
     instants = [CURVE_S * number for number in range(int(duration_s / CURVE_S) + 1)]
     instants += [duration_s] if instants[-1] < duration_s else []
     curve = [[t_s, statistics.fmean(known_at(times, maps, t_s) for times, maps in by_robot)] for t_s in instants]
-    mean = statistics.fmean(held_mean(times, maps, duration_s) for times, maps in by_robot)
+    timed = [(times, [one.known for one in maps], [one.walls for one in maps]) for times, maps in by_robot]
     return {
         "coverage_curve": [[t_s, round(share, 4)] for t_s, share in curve],
-        "coverage_mean": mean,
+        "coverage_mean": statistics.fmean(held_mean(times, known, duration_s) for times, known, _ in timed),
+        "walls_mean": statistics.fmean(held_mean(times, walls, duration_s) for times, _, walls in timed),
         "explored_m2": curve[-1][1] * area_m2,
     }
 
@@ -47,10 +51,15 @@ def known_at(times: Sequence[float], maps: Sequence[Arrival], t_s: float) -> flo
     return maps[index - 1].known if index else 0.0
 
 
-def held_mean(times: Sequence[float], maps: Sequence[Arrival], duration_s: float) -> float:
-    """The mean over [0, ``duration_s``] of what the newest map knows."""
+def held_mean(times: Sequence[float], shares: Sequence[float], duration_s: float) -> float:
+    """The mean over [0, ``duration_s``] of the newest map's share; ``shares`` are those of the maps of ``times``."""
+
+    def at(t_s: float) -> float:
+        index = bisect.bisect_right(times, t_s)
+        return shares[index - 1] if index else 0.0
+
     steps = [0.0, *(t_s for t_s in times if 0.0 < t_s < duration_s), duration_s]
-    return sum((b - a) * known_at(times, maps, a) for a, b in itertools.pairwise(steps)) / duration_s
+    return sum((b - a) * at(a) for a, b in itertools.pairwise(steps)) / duration_s
 
 
 def led_figures(folder: Path, run: Mapping[str, Any]) -> Json:
@@ -78,18 +87,57 @@ def led_of(records: Sequence[Json], run: Mapping[str, Any]) -> dict[str, float] 
         "stopped_ratio": (float(last["stopped_s"]) - float(first["stopped_s"])) / seconds,
         "corrections_hz": (int(last["corrections"]) - int(first["corrections"])) / seconds,
         "correction_age_max_s": max(float(record["correction_age_s"]) for record in progress),
-        "pose_error_m": statistics.median(pose_errors(records)),
+        "pose_error_m": statistics.median(pose_errors(records, zero_s, duration_s)),
     }
 
 
-def pose_errors(records: Iterable[Json]) -> list[float]:
-    """How far (m) a robot's belief was from the truth at each record of its path; [0] without any."""
+def stood_figures(
+    folder: Path, run: Mapping[str, Any], slam_on: Mapping[str, NodeId], owners: Callable[[float], NodeId | None]
+) -> Json:
+    """{state of its SLAM's edge: {"s": robots' seconds, "stood": share of them}}, over the drive.
+
+    The states are those of `zsched_lab.paper.roles.state_of`; ``owners`` tells who owned the task when. A moment counts
+    by both its ends, so one in which a load or the task came or went counts for no state. Empty: nobody led a robot.
+    """
+    found: dict[str, list[float]] = {}
+    zero_s, duration_s = float(run["zero_s"]), float(run["duration_s"])
+    loads = [(load["node"], float(load["start_s"]), float(load["end_s"])) for load in run["loads"]]
+    for robot in sorted(slam_on):
+        records = read_records(folder / "records" / f"{robot}.ndjson")
+        told = [record for record in records if record["kind"] == "progress" and record.get("corrections")]
+        node = slam_on[robot]
+
+        def state(t_s: float, node: NodeId = node) -> str:
+            return state_of(any(n == node and a <= t_s < b for n, a, b in loads), owners(t_s) == node)
+
+        for before, after in itertools.pairwise(told):
+            begin, end = float(before["t_s"]) - zero_s, float(after["t_s"]) - zero_s
+            if begin >= 0.0 and end <= duration_s and state(begin) == state(end):
+                row = found.setdefault(state(begin), [0.0, 0.0])
+                row[0] += end - begin
+                row[1] += float(after["stopped_s"]) - float(before["stopped_s"])
+    return {
+        name: {"s": round(seconds, 1), "stood": round(stood_s / seconds, 4)}
+        for name, (seconds, stood_s) in sorted(found.items())
+        if seconds > 0.0
+    }
+
+
+def mean_stood(figures: Iterable[Json], state: str) -> tuple[float, float] | None:
+    """(robots' seconds, share of them that they stood) in one state of their edge, over runs; ``None``: never there."""
+    rows = [one[state] for one in figures if state in one]
+    seconds = sum(float(row["s"]) for row in rows)
+    return (seconds, sum(row["s"] * row["stood"] for row in rows) / seconds) if seconds > 0.0 else None
+
+
+def pose_errors(records: Iterable[Json], zero_s: float, duration_s: float) -> list[float]:
+    """How far (m) a robot's belief was from the truth at each record of its path over the drive; [0] without any."""
     start = Pose2()
     errors = []
     for record in records:
         if record["kind"] == "start":
             start = Pose2(x=record["x"], y=record["y"], yaw=record["yaw"])
-        elif record["kind"] == "path":
+        elif record["kind"] == "path" and zero_s <= float(record["t_s"]) <= zero_s + duration_s:
             believed = start.compose(Pose2(x=record["belief_x"], y=record["belief_y"]))
             errors.append(math.dist((believed.x, believed.y), (record["x"], record["y"])))
     return errors or [0.0]

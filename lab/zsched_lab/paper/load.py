@@ -101,7 +101,7 @@ class Loads:
         if share.ballast_mb <= 0.0:
             return
         command = [sys.executable, "-m", "zsched_lab.paper.load", f"{share.ballast_mb:g}"]
-        self._limits.put(node, self._children.start(f"ballast-{node}", command).process.pid)
+        self._limits.put_work(node, self._children.start(f"ballast-{node}", command).process.pid)
 
     def tick(self, t_s: float) -> None:
         """Do what is due at ``t_s``."""
@@ -124,7 +124,7 @@ class Loads:
         command = [sys.executable, "-m", "zsched_lab.paper.cameras", "--streams", str(level.streams)]
         command += ["--cores", f"{level.share * self._full_cores:g}", "--side", str(level.side)]
         child = self._children.start(name, command, output=self._records / f"{name}.ndjson")
-        self._limits.put(window.node, child.process.pid)
+        self._limits.put_work(window.node, child.process.pid)
         self._running[window.node] = (window, child, t_s)
         self._tell(t_s, f"load on {window.node} until {window.end_s:.1f} s")
 

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 from mcap.reader import make_reader
+from numpy.typing import NDArray
 
 from zsched.core.values.model import NodeId
 from zsched.tasks.map_merge.cdr import CdrError, decode_grid
@@ -29,7 +30,7 @@ from zsched_lab.fleet.recorder import read_records
 from zsched_lab.fleet.view import Load
 from zsched_lab.maps.metrics import score_map
 from zsched_lab.paper.arrivals import Arrival, Streams
-from zsched_lab.paper.led_metrics import coverage_figures, led_figures, merge_cpu_s
+from zsched_lab.paper.led_metrics import coverage_figures, led_figures, merge_cpu_s, stood_figures
 from zsched_lab.paper.load import Window, loaded_at
 from zsched_lab.paper.oracle import changes, utilities
 from zsched_lab.paper.roles import role_figures
@@ -39,6 +40,8 @@ WASTED_S = 30.0
 """A move back to the node that was left within this time was for nothing."""
 HELD_EVERY_S = 5.0
 Json = dict[str, Any]
+WALL_M = 0.1
+"""So far may a wall be off: two cells of `nano`'s maps, twice the error of a robot's pose."""
 
 
 class Truth:
@@ -49,6 +52,9 @@ class Truth:
         rows, columns = np.nonzero(grid.known)
         self._x = grid.origin.x + (columns + 0.5) * grid.resolution
         self._y = grid.origin.y + (rows + 0.5) * grid.resolution
+        rows, columns = np.nonzero(grid.occupied)
+        self._wall_x = grid.origin.x + (columns + 0.5) * grid.resolution
+        self._wall_y = grid.origin.y + (rows + 0.5) * grid.resolution
         self.area_m2 = self._x.size * grid.resolution**2
         """What can be known."""
 
@@ -60,10 +66,38 @@ class Truth:
         grid = grid_of(payload)
         if grid is None or not self._x.size:
             return 0.0
-        columns = np.floor((self._x - grid.origin.x) / grid.resolution).astype(np.int64)
-        rows = np.floor((self._y - grid.origin.y) / grid.resolution).astype(np.int64)
-        inside = (columns >= 0) & (columns < grid.width) & (rows >= 0) & (rows < grid.height)
-        return float(grid.known[rows[inside], columns[inside]].sum()) / self._x.size
+        return _share(grid, grid.known, self._x, self._y)
+
+    def walls(self, payload: bytes) -> float:
+        """Share of the truth's walls that the map has within `WALL_M` of where they are; 0 for what is no map.
+
+        A map whose parts lie in the wrong places knows as much as a right one, and has hardly a wall in its place.
+        """
+        grid = grid_of(payload)
+        if grid is None or not self._wall_x.size:
+            return 0.0
+        return _share(grid, _near(grid.occupied, round(WALL_M / grid.resolution)), self._wall_x, self._wall_y)
+
+
+def _share(grid: Grid, cells: NDArray[np.bool_], x: NDArray[Any], y: NDArray[Any]) -> float:
+    """The share of these points (m) whose cell of ``grid`` is one of ``cells``."""
+    columns = np.floor((x - grid.origin.x) / grid.resolution).astype(np.int64)
+    rows = np.floor((y - grid.origin.y) / grid.resolution).astype(np.int64)
+    inside = (columns >= 0) & (columns < grid.width) & (rows >= 0) & (rows < grid.height)
+    return float(cells[rows[inside], columns[inside]].sum()) / x.size
+
+
+def _near(cells: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
+    """These cells, and all within ``reach`` rows and columns of one."""
+    found = cells.copy()
+    for axis in (0, 1):
+        line = found.copy()
+        for step in range(1, reach + 1):
+            ahead, behind = [slice(None)] * 2, [slice(None)] * 2
+            ahead[axis], behind[axis] = slice(step, None), slice(None, -step)
+            found[tuple(ahead)] |= line[tuple(behind)]
+            found[tuple(behind)] |= line[tuple(ahead)]
+    return found
 
 
 def measure(folder: Path, scenario: Scenario, truth: Truth) -> Json:
@@ -101,6 +135,7 @@ def measure(folder: Path, scenario: Scenario, truth: Truth) -> Json:
         **map_figures(streams, truth, len(run["robots"])),
         **coverage_figures(streams, duration_s, truth.area_m2),
         **led_figures(folder, run),
+        "stood_by_state": stood_figures(folder, run, scenario.explore.slam_on, partial(owner_at, owners)),
         "merge_cpu_s": merge_cpu_s(nodes, len(streams.stamps)),
         "roles": role_figures(nodes, run["shares"], partial(owner_at, owners)),
         "other_moves": sum(
@@ -129,7 +164,7 @@ def read_streams(folder: Path, run: Mapping[str, Any], truth: Truth) -> Streams:
     """The maps of a run, out of its MCAP files; only those whose payload is needed later are kept."""
     offset_ns = int(run["zero_wall_ns"])
     found = Streams(maps={robot: [] for robot in run["robots"]}, sent={robot: [] for robot in run["robots"]})
-    known: dict[int, float] = {}
+    known: dict[int, tuple[float, float]] = {}
     newest: dict[NodeId, int] = {}
     instants = held_instants(float(run["duration_s"]))
     for topic, log_ns, sent_ns, data in messages(sorted(folder.glob("streams*.mcap"))):
@@ -143,12 +178,12 @@ def read_streams(folder: Path, run: Mapping[str, Any], truth: Truth) -> Streams:
             keep(found, newest, instants.pop(0))
         key = hash(data)
         if key not in known:
-            known[key] = truth.coverage(data)
+            known[key] = truth.coverage(data), truth.walls(data)
         newest[robot] = key
         if 0.0 <= t_s <= float(run["duration_s"]):
             found.stamps.add(key)
         found.payloads[key] = data
-        found.maps[robot].append(Arrival(t_s, (log_ns - sent_ns) / 1e9, len(data), known[key]))
+        found.maps[robot].append(Arrival(t_s, (log_ns - sent_ns) / 1e9, len(data), *known[key]))
         drop_unheld(found, newest)
     for instant in instants:
         keep(found, newest, instant)

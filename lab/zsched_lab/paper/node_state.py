@@ -14,6 +14,7 @@ from zsched_lab.fleet.limits import LimitKind, NodeLimits
 from zsched_lab.fleet.runner import LabFleet
 from zsched_lab.fleet.view import Status, find_task
 from zsched_lab.paper.scenario import Scenario
+from zsched_lab.paper.work_group import OWN, WORK
 
 CALM_RATIO = 0.3
 
@@ -21,25 +22,39 @@ CALM_RATIO = 0.3
 def node_limits(prefix: str, scenario: Scenario, fleet: LabFleet) -> NodeLimits:
     """A control group with quota and memory limit for each node that has a share in the scenario.
 
+    Where a share names what zsched takes on top, tasks have a group within it, with a quota of their own: else they
+    would have what zsched leaves, which is another part on every machine. Workers go there by
+    `zsched_lab.paper.work_group`.
+
     Raises:
         AdapterError: this user may not make them; without them the nodes would not differ, and nothing be shown.
     """
     groups: dict[NodeId, LimitedGroup] = {}
+    work: dict[NodeId, LimitedGroup] = {}
+    outer: list[LimitedGroup] = []
     says = []
     try:
         for node, share in scenario.nodes.items():
             if node not in fleet.kinds:
                 continue
             name = f"{prefix}-{node}"
-            groups[node] = LimitedGroup.create(name, cpu_cores=share.quota_cores, memory_mb=share.memory_mb)
-            says.append(f"{node} {share.quota_cores:g} cores, {share.memory_mb:.0f} MiB")
+            group = LimitedGroup.create(name, cpu_cores=share.quota_cores, memory_mb=share.memory_mb)
+            if not share.overhead_cores:
+                groups[node] = group
+                says.append(f"{node} {share.quota_cores:g} cores, {share.memory_mb:.0f} MiB")
+                continue
+            outer.append(group)
+            groups[node] = group.inner(OWN)
+            work[node] = group.inner(WORK, cpu_cores=share.cpu_cores)
+            says.append(f"{node} {share.quota_cores:g} cores, {share.cpu_cores:g} for tasks, {share.memory_mb:.0f} MiB")
     except AdapterError:
-        for group in groups.values():
+        for group in (*work.values(), *groups.values(), *outer):
             group.remove()
         raise
     if not groups:
         return NodeLimits(LimitKind.NONE, "no node has a share of its own")
-    return NodeLimits(LimitKind.CGROUP, "control groups: " + "; ".join(says), groups=groups)
+    said = "control groups: " + "; ".join(says)
+    return NodeLimits(LimitKind.CGROUP, said, groups=groups, work=work, outer=tuple(outer))
 
 
 def ready_workers(status: Status, task: str) -> set[NodeId]:

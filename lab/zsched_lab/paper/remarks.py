@@ -19,10 +19,24 @@ DROPS_SAY = (
     "taken by a relay, and thrown away for a reason; `cut` are the old owner's answers behind a move, in whose place "
     "the new owner's come. Schemes without any are left out."
 )
-DECLARED_SAY = (
-    "Share of the truth that the newest merged map knows, mean over robots and time. Better, or worse, is what has an "
-    "interval clear of 0; the best fixed scheme is known only afterwards.\n"
+JUDGED_SAY = "Better, or worse, is what has an interval clear of 0; the best fixed scheme is known only afterwards.\n"
+WALLS_SAY = (
+    "Share of the truth's walls that the newest merged map has where they are, mean over robots and time: a map whose "
+    "parts lie in the wrong places knows as much as a right one."
 )
+DECLARED = (
+    (
+        "coverage_mean",
+        "## Coverage on the way, as declared\n",
+        f"Share of the truth that the newest merged map knows, mean over robots and time. {JUDGED_SAY}",
+    ),
+    (
+        "walls_mean",
+        "## Walls on the way\n",
+        f"{WALLS_SAY} {JUDGED_SAY}",
+    ),
+)
+"""(figure, heading, what it says) of the comparisons that were declared before their runs."""
 
 
 def ended_text(runs: Sequence[Json], scenario: Json) -> str:
@@ -54,19 +68,24 @@ def declared_parts(groups: Mapping[str, Sequence[Json]], scenario: Json) -> list
 
     There is no verdict before every declared run of a block is done.
     """
+    parts = []
+    for metric, heading, says in DECLARED:
+        if table := _declared_table(groups, scenario, metric):
+            parts += [heading, says, table]
+    return parts
+
+
+def _declared_table(groups: Mapping[str, Sequence[Json]], scenario: Json, metric: str) -> str:
     lines = []
     for title, runs in groups.items():
-        found = declared(runs)
         block = scenario.get("blocks", {}).get(str(runs[0].get("block", MATRIX)) if runs else MATRIX, {})
         wanted = max(int(block.get("runs") or 0), LEAST_RUNS)
-        for against, one in found:
+        for against, one in declared(runs, metric):
             cells = (title, against, f"{one.runs} of {wanted}", f"{one.mine:.3f}", f"{one.theirs:.3f}", one.text())
             lines.append(f"| {' | '.join(cells)} | {declared_verdict(one, wanted)} |")
-    if not lines:
-        return []
     titles = ("where", "zsched against", "runs", "zsched's", "theirs", "difference")
     head = [f"| {' | '.join(titles)} | zsched is |", "| --- " * (len(titles) + 1) + "|"]
-    return ["## Coverage on the way, as declared\n", DECLARED_SAY, "\n".join([*head, *lines]) + "\n"]
+    return "\n".join([*head, *lines]) + "\n" if lines else ""
 
 
 def declared_verdict(one: Difference, wanted: int) -> str:

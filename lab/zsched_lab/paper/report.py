@@ -52,7 +52,7 @@ GAINS_SAY = (
     "Eq. 1 and 2 at every moment.\n"
 )
 BEST_SAY = "zsched against the best fixed scheme of each figure, which is known only afterwards:\n"
-COUNTED = {6: "six", 8: "eight"}
+COUNTED = {6: "six", 9: "nine"}
 RANKED = ("zsched", "dyna_both", "oracle")
 """The schemes in the table of gains."""
 EXHAUSTED = 0.95

@@ -215,7 +215,7 @@ class CellRun:
         with parts.observer:
             parts.runner.wait_up(parts.observer.statuses, lambda: time.sleep(TICK_S))
             for number, (node, command) in enumerate(self._inputs.robots.helpers(parts.fleet.data_endpoints), start=1):
-                parts.limits.put(node, children.start(f"helper-{number}-{node}", command).process.pid)
+                parts.limits.put_work(node, children.start(f"helper-{number}-{node}", command).process.pid)
             self._wait_owned(children, parts)
             self._record_streams(children, parts)
             self._start(children, parts)

@@ -28,6 +28,7 @@ COLUMNS = (
     ("memory_mean", "mem mean", 2),
     ("ssim_rebased", "SSIM", 3),
     ("held_ssim_rebased", "SSIM held", 3),
+    ("walls_mean", "walls on the way", 3),
     ("coverage_mean", "covered on the way", 3),
     ("stopped_ratio", "stood", 2),
     ("moves", "moves", 1),

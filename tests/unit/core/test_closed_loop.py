@@ -105,7 +105,7 @@ class Machine:
         room = max(self.cores - rest, 0.5)
         takes = min(needs, room, self.most_cores)
         is_short = takes < needs
-        wanted = math.ceil(needs) if is_short else None
+        wanted = float(math.ceil(needs)) if is_short else None
         runnable = math.ceil(needs) if is_short else takes
         if self.takes_turns and needs > 0.0:
             takes, runnable = self._in_turns(needs, self.cores - rest)

@@ -216,6 +216,28 @@ class LimitedGroup:
             ) from error
         return group
 
+    def inner(self, name: str, *, cpu_cores: float | None = None) -> LimitedGroup:
+        """Make a group inside this one, which holds no process of its own (version 2 asks for that).
+
+        Raises:
+            AdapterError: the user may not; nothing is left behind.
+        """
+        made: list[Path] = []
+        try:
+            for parent in self.folders:
+                if (parent / "cgroup.subtree_control").exists() and cpu_cores is not None:
+                    _delegate(parent, "cpu")
+                (parent / name).mkdir()
+                made.append(parent / name)
+                for file, value in [] if cpu_cores is None else _cpu_settings(parent / name, cpu_cores):
+                    (parent / name / file).write_text(value, encoding="ascii")
+        except (OSError, AdapterError) as error:
+            for folder in made:
+                with contextlib.suppress(OSError):
+                    folder.rmdir()
+            raise AdapterError(f"cannot make the control group {name!r} in {self.folders[0]}: {error}") from error
+        return LimitedGroup(tuple(made))
+
     @classmethod
     def why_not(cls, *, cpu: bool = True, memory: bool = True) -> str | None:
         """Why this user cannot limit processes here; ``None`` when they can (found out by making a group)."""
@@ -265,16 +287,28 @@ def _settings(
     """``{controller: ((file, value), ...)}`` that the wanted limits need."""
     values: dict[str, tuple[tuple[str, str], ...]] = {}
     if cpu_cores is not None:
-        quota_us = max(MIN_QUOTA_US, round(cpu_cores * PERIOD_US))
-        if tree.is_v2("cpu"):
-            values["cpu"] = (("cpu.max", f"{quota_us} {PERIOD_US}"),)
-        else:
-            values["cpu"] = (("cpu.cfs_period_us", str(PERIOD_US)), ("cpu.cfs_quota_us", str(quota_us)))
+        values["cpu"] = _quota_files(cpu_cores, is_v2=tree.is_v2("cpu"))
+        if not tree.is_v2("cpu"):
             values["cpuacct"] = ()
     if memory_mb is not None:
         file = "memory.max" if tree.is_v2("memory") else "memory.limit_in_bytes"
         values["memory"] = ((file, str(int(memory_mb * MIB))),)
     return values
+
+
+def _quota_files(cpu_cores: float, *, is_v2: bool) -> tuple[tuple[str, str], ...]:
+    """((file, value), ...) of a quota, in the order in which they are written."""
+    quota_us = max(MIN_QUOTA_US, round(cpu_cores * PERIOD_US))
+    if is_v2:
+        return (("cpu.max", f"{quota_us} {PERIOD_US}"),)
+    return (("cpu.cfs_period_us", str(PERIOD_US)), ("cpu.cfs_quota_us", str(quota_us)))
+
+
+def _cpu_settings(folder: Path, cpu_cores: float) -> tuple[tuple[str, str], ...]:
+    """The same for a group that is there; none for one of another controller."""
+    if (folder / "cpu.max").exists():
+        return _quota_files(cpu_cores, is_v2=True)
+    return _quota_files(cpu_cores, is_v2=False) if (folder / "cpu.cfs_quota_us").exists() else ()
 
 
 def _parent(tree: CgroupTree, controller: str, wanted: tuple[str, ...]) -> Path:

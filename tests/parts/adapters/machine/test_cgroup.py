@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import pytest
 from support.waiting import until
 from zsched.adapters.machine.cgroup import CgroupTree, LimitedGroup, parse_flat, parse_membership, parse_mounts
 from zsched.errors import AdapterError
+from zsched_lab.paper.work_group import OWN, WORK
 
 V2 = "30 25 0:26 / /sys/fs/cgroup rw,nosuid shared:9 - cgroup2 cgroup2 rw,nsdelegate\n"
 V1 = (
@@ -184,6 +186,46 @@ def test_real_group_is_made_limits_a_process_and_is_removed() -> None:
     finally:
         group.remove()
     assert not any(folder.exists() for folder in group.folders)
+
+
+def test_a_group_within_another_has_a_quota_of_its_own_and_its_node_is_the_outer_one() -> None:
+    """As a node of the lab whose tasks are not to have what zsched leaves; a worker goes there by itself."""
+    if (reason := LimitedGroup.why_not(memory=False)) is not None:
+        pytest.skip(reason)
+    outer = LimitedGroup.create(f"zsched-test-outer-{os.getpid()}", cpu_cores=0.5)
+    own, work = outer.inner(OWN), outer.inner(WORK, cpu_cores=0.2)
+    try:
+        with pytest.raises(AdapterError, match=WORK):
+            outer.inner(WORK, cpu_cores=0.2)
+        with subprocess.Popen(["sleep", "60"]) as child:
+            try:
+                own.add(child.pid)
+                quota = CgroupTree(pid=str(child.pid)).cpu_quota()
+                assert quota is not None
+                assert (quota.cores, quota.folder.name) == (0.5, outer.folders[0].name)
+            finally:
+                child.kill()
+        script = f"read _; exec {sys.executable} -m zsched_lab.paper.work_group timeit -n 1 -r 1 'while True: pass'"
+        with subprocess.Popen(["sh", "-c", script], stdin=subprocess.PIPE) as busy:
+            try:
+                own.add(busy.pid)
+                assert busy.stdin is not None
+                busy.stdin.write(b"go\n")
+                busy.stdin.flush()
+                until(lambda: work.pids() == (busy.pid,), "it is in the tasks' group")
+                quota = CgroupTree(pid=str(busy.pid)).cpu_quota()
+                assert quota is not None
+                assert quota.cores == 0.2
+                begin_s, begin = time.monotonic(), quota.used_s()
+                assert begin is not None
+                end = until(lambda: (used := quota.used_s() or 0.0) > begin + 0.2 and used, "it works")
+                assert (end - begin) / (time.monotonic() - begin_s) < 0.3
+            finally:
+                busy.kill()
+    finally:
+        for group in (work, own, outer):
+            group.remove()
+    assert not any(folder.exists() for folder in (*outer.folders, *work.folders))
 
 
 def test_group_that_exists_is_refused_and_left_alone() -> None:

@@ -506,8 +506,8 @@ def test_the_threads_of_a_worker_are_smoothed_in_step_with_those_of_its_machine(
         if mine is not None and mine.runnable is not None:
             assert told.runnable - mine.runnable == pytest.approx(4.0)
     profiler.absorb(replace(device(), workers=(load_of(runnable=2.0),)), (), now=9.0)
-    load = taken(profiler, 9.0).worker("merge")
-    assert load is None or load.runnable is None, "nobody counts the machine's"
+    mine = taken(profiler, 9.0).worker("merge")
+    assert mine is None or mine.runnable is None, "nobody counts the machine's"
 
 
 def test_who_wants_to_run_is_smoothed_and_unknown_at_once_where_nobody_counts() -> None:

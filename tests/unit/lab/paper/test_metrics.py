@@ -18,6 +18,7 @@ from zsched_lab.fleet.recorder import Recorder
 from zsched_lab.paper.drive_clock import begun_before, smoothed
 from zsched_lab.paper.load import Window
 from zsched_lab.paper.metrics import (
+    WALL_M,
     Truth,
     brief,
     held_instants,
@@ -55,6 +56,28 @@ def test_coverage_does_not_depend_on_the_merged_map_s_resolution(factor: int) ->
     fine = np.kron(data, np.ones((factor, factor), dtype=np.int8))
     merged = Grid(data=fine, resolution=SIDE / factor, origin=room.origin)
     assert Truth(room).coverage(encode_grid(merged)) == pytest.approx(0.25)
+
+
+def test_walls_are_found_where_they_are_and_not_by_a_map_that_lies_elsewhere() -> None:
+    """Turned by half a turn a room with a wall inside knows as much of the truth, and has its walls elsewhere."""
+    room = a_room()
+    data = room.data.copy()
+    data[4:9, 4] = OCCUPIED
+    with_wall = Grid(data=data, resolution=room.resolution, origin=room.origin)
+    truth, cells = Truth(with_wall), int(with_wall.occupied.sum())
+    assert truth.walls(encode_grid(with_wall)) == 1.0
+    assert truth.walls(b"no map") == 0.0
+    inner = Grid(data=np.where(room.data == OCCUPIED, room.data, data), resolution=room.resolution, origin=room.origin)
+    turned = Grid(data=inner.data[::-1, ::-1].copy(), resolution=room.resolution, origin=room.origin)
+    assert truth.coverage(encode_grid(turned)) == truth.coverage(encode_grid(with_wall))
+    assert truth.walls(encode_grid(turned)) == pytest.approx((cells - 5) / cells)
+    reach = round(WALL_M / room.resolution)
+    for cells_off, is_found in ((reach, True), (reach + 1, False)):
+        off = Pose2(x=room.origin.x + cells_off * room.resolution, y=room.origin.y)
+        line = np.full(room.data.shape, UNKNOWN, dtype=room.data.dtype)
+        line[4:9, 4] = OCCUPIED
+        own = Truth(Grid(data=line, resolution=room.resolution, origin=room.origin))
+        assert (own.walls(encode_grid(Grid(data=line, resolution=room.resolution, origin=off))) == 1.0) is is_found
 
 
 def part_of_room(share: float, stamp_ns: int = 0, margin: int = 0) -> bytes:
