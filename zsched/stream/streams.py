@@ -172,7 +172,7 @@ class Streams:
         self._path, self._link = path, link
         self._config = link.session
         try:
-            self._session = opened(link.session)
+            self._session = opened(link.session, is_guest=True)
         except (zenoh.ZError, ValueError) as error:
             link.hang_up()
             raise AdapterError(f"the streams' session {why_not_open(link.session, error)}") from error

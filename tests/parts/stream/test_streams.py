@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -154,6 +155,16 @@ def test_what_is_put_is_processed_answered_and_counted_and_the_streams_outlive_t
     assert unaccounted(bench.count()) == 0
     assert bench.count().at_most_lost == 0
     assert bench.taken == [str(number).encode() for number in range(201)]
+
+
+def test_the_applications_own_servers_may_speak_first(bench: Bench) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server, bench.join():
+        assert not server.getsockopt(socket.IPPROTO_TCP, socket.TCP_DEFER_ACCEPT)
+        with socket.create_connection(server.getsockname()) as client:
+            server.settimeout(5.0)
+            with server.accept()[0] as taken:
+                taken.sendall(b"$GPGGA")
+                assert client.recv(6) == b"$GPGGA"
 
 
 @pytest.mark.parametrize(
