@@ -37,7 +37,7 @@ from zsched.core.values.messages import (
     Votes,
 )
 from zsched.core.values.model import MAX_COUNTER, NodeId, Proposal, TaskId, check_counter, check_name
-from zsched.core.values.plan import StreamCount
+from zsched.core.values.plan import DrainingSlot, StreamCount
 from zsched.core.values.profile import DeviceSample, LinkSample, Profile, WorkerState
 from zsched.core.values.rehearsal import KeepRehearsal, ReadRehearsals, Strike
 from zsched.core.values.struct import Struct
@@ -324,6 +324,8 @@ class SlotFlipped(Struct, frozen=True, kw_only=True):
     task: TaskId
     epoch: int
     replayed: int = 0
+    draining: tuple[DrainingSlot, ...] = ()
+    """What it has left, the oldest first: another daemon may have opened that."""
 
 
 class SlotDrained(Struct, frozen=True, kw_only=True):

@@ -22,6 +22,7 @@ from zsched.core.relay_protocol import RelayReport, SlotLost
 from zsched.core.values.model import TaskId
 from zsched.core.values.plan import (
     Direction,
+    DrainingSlot,
     OnCrash,
     ReadyWhen,
     Route,
@@ -72,6 +73,8 @@ class _OpenSlot(Struct, eq=False):
     lack: SlotReady | None = None
     """What it lacks, as it was told last."""
     is_flipped: bool = False
+    left_since: float | None = None
+    """Since when a newer slot carries."""
     is_drained: bool = False
     gone_at: float | None = None
     ended_at: float | None = None
@@ -393,7 +396,7 @@ class TaskRelay:
         if current is not None:
             current.lack = None  # the same
         if current is not None and plan.phase is RoutePhase.FLIP and current.is_flipped:
-            self._report(SlotFlipped(task=self._task, epoch=current.slot.epoch, replayed=0))  # for another daemon
+            self._report_flip(current.slot.epoch, 0)  # for another daemon
         for sink in self._streams.outputs.values():
             sink.resume(0 if plan.current is None else plan.current.epoch)
         self._forget_streams()
@@ -625,15 +628,26 @@ class TaskRelay:
         )
         self._services.flip(epoch)
         state.is_flipped = True
+        for old in olds:
+            old.left_since = old.left_since or monotonic_s()
         if not is_reported:
             return
-        self._report(SlotFlipped(task=self._task, epoch=epoch, replayed=replayed))
+        self._report_flip(epoch, replayed)
         if olds:  # a stalled old owner may hold these up for a lease: not in this thread
             epochs = [old.slot.epoch for old in olds]
             try:
                 guarded(self._send_ends, epochs, name="ends", is_lasting=False).start()
             except RuntimeError:  # no thread is to be had: without their ends nobody would know when they are done
                 self._send_ends(epochs)
+
+    def _report_flip(self, epoch: int, replayed: int) -> None:
+        now = monotonic_s()
+        draining = tuple(
+            DrainingSlot(epoch=old.slot.epoch, owner=old.slot.owner, since_s=now - (old.left_since or now))
+            for old in self._before(epoch)
+            if old.is_flipped and not old.is_drained
+        )
+        self._report(SlotFlipped(task=self._task, epoch=epoch, replayed=replayed, draining=draining))
 
     def _has_answer(self, stamp: Timestamp) -> bool:
         """Whether the one input with this timestamp has an answer that has passed, on every output that counts.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator
 from functools import partial
 from types import SimpleNamespace
@@ -12,12 +13,20 @@ from typing import Any, cast
 import pytest
 import zenoh
 
+from support.allocations import allocation_of
+from support.fleets import task_of
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import until
 from zsched.clock import monotonic_s
-from zsched.core.relay_protocol import StreamAck, StreamAcks, TaskEnded, WorkerWatch
+from zsched.core.events import SlotDrained, SlotFlipped, SlotReady
+from zsched.core.executor.handover import Executor, Phase
+from zsched.core.instructions import ApplyRoutes
+from zsched.core.relay_protocol import RelayReport, StreamAck, StreamAcks, TaskEnded, WorkerWatch
+from zsched.core.todo import ToDo
+from zsched.core.values.fleet import StreamRule, WorkerSpec
 from zsched.core.values.plan import (
     Direction,
+    HandoverRule,
     ReadyWhen,
     Route,
     RoutePhase,
@@ -61,7 +70,8 @@ class Scene:
         acks = Acks(relay, KEYS, "robot1", self.tokens.has_worker)
         self.streams = OpenStreams(relay, frozenset({str(relay.zid())}))
         graph = GraphMirror(relay, None, "robot1")
-        self.task = TaskRelay(relay, "t", self.tokens, acks, lambda _word: None, graph, self.streams)
+        self.words: deque[RelayReport] = deque(maxlen=1000)
+        self.task = TaskRelay(relay, "t", self.tokens, acks, self.words.append, graph, self.streams)
 
     def _wake(self) -> None:
         self.task.wake()
@@ -244,6 +254,92 @@ def test_who_waits_for_an_answer_when_the_relay_ends_is_told_so(scene: Scene, *,
         undeclare(owner)
     for query in held:
         query.drop()
+
+
+ECHO = task_of(
+    "t",
+    candidates=("edge1", "edge2"),
+    drain_s=1.0,
+    worker=WorkerSpec(ready_when=ReadyWhen.MATCHING),
+    rules=(
+        StreamRule(
+            direction=Direction.INPUT,
+            from_template="{robot}/in",
+            to_template="{target}/t/{robot}/in",
+            settings=replace(BEST, handover=HandoverRule.ALL),
+        ),
+        StreamRule(
+            direction=Direction.OUTPUT,
+            from_template="{target}/t/{epoch}/{robot}/out",
+            to_template="{robot}/out",
+            settings=replace(BEST, handover=HandoverRule.ALL),
+        ),
+    ),
+)
+
+
+class Daemon:
+    """A robot's part of a daemon: its executor, the real one, tells the relay its plans, and hears what that says."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene, self.executor = scene, Executor(spec=ECHO, me="robot1", has_streams=True)
+
+    def carry_out(self, todo: ToDo) -> None:
+        for one in todo.apply:
+            if isinstance(one, ApplyRoutes):
+                self.scene.task.apply(one.plan)
+
+    def hear(self) -> None:
+        todo = ToDo()
+        while self.scene.words:
+            word = self.scene.words.popleft()
+            if isinstance(word, SlotReady) and word.is_ready:
+                self.executor.on_ready(word.epoch, todo)
+            elif isinstance(word, SlotFlipped):
+                self.executor.on_flipped(word.epoch, word.replayed, todo, monotonic_s(), word.draining)
+            elif isinstance(word, SlotDrained):
+                self.executor.on_drained(word.epoch, todo)
+        self.executor.tick(todo, monotonic_s())
+        self.carry_out(todo)
+
+    def learn(self, epoch: int, owner: str) -> None:
+        todo = ToDo()
+        self.executor.execute(allocation_of(epoch, owner, task=ECHO.name), todo, monotonic_s())
+        self.carry_out(todo)
+
+    def until(self, *phases: Phase) -> None:
+        def is_there() -> bool:
+            self.hear()
+            return self.executor.phase in phases
+
+        until(is_there, f"one of {phases}")
+
+
+@pytest.mark.parametrize("has_flipped", [True, False])
+def test_an_old_owner_drains_on_while_the_daemon_restarts(scene: Scene, *, has_flipped: bool) -> None:
+    """The next daemon knows the new owner only, and closed the old one's slot at the flip."""
+    answers, other = list[bytes](), scene.other
+    kept = [other.declare_subscriber(f"{edge}/t/robot1/in", lambda _sample: None) for edge in ("edge1", "edge2")]
+    kept.append(other.declare_subscriber("robot1/out", partial(_take, answers)))
+    first = Daemon(scene)
+    first.learn(1, "edge1")
+    first.until(Phase.SETTLED)
+    if has_flipped:
+        first.learn(2, "edge2")
+        first.until(Phase.DRAINING)
+    scene.task.lose_daemon()
+    scene.words.clear()
+    began_at, second = monotonic_s(), Daemon(scene)
+    second.learn(2, "edge2")
+    second.until(Phase.DRAINING, Phase.SETTLED)
+    time.sleep(0.2)
+    other.put("edge1/t/1/robot1/out", b"in hand")
+    until(lambda: answers == [b"in hand"], "the old owner's answer", 5.0)
+    second.until(Phase.SETTLED)
+    assert monotonic_s() - began_at < ECHO.drain_s + 1.0
+    until(lambda: set(scene.task._slots) == {2}, "the old slot is closed")
+    for one in kept:
+        undeclare(one)
 
 
 def test_an_input_whose_rule_has_gone_is_taken_no_more_though_nobody_owns_the_task(scene: Scene) -> None:

@@ -9,7 +9,7 @@ import pytest
 from zsched.core.values.plan import WorkerRole
 from zsched.ipc import words
 
-TODAY = "0e2d4a8d086ffa5c"
+TODAY = "fc96379498019052"
 """Another digest means: relays of the version before say other words. Where they were only added, with a default, those
 relays go on until somebody uses what is new (`zsched.ipc.vocabulary`); where the daemon waits for a new report, raise
 `PROTOCOL`. All else replaces every relay at an upgrade, and its robot's applications are cut off for a second: say so

@@ -13,6 +13,8 @@ any          a newer epoch is learnt                  plan PREPARE: the new slot
 PREPARING    the new owner's worker is ready          plan FLIP: kept values, switch, end markers   FLIPPING
 FLIPPING     the relay flipped, an old slot is left   (the old slots drain)                         DRAINING
 FLIPPING     the relay flipped, none is left          plan CLOSE                                    SETTLED
+FLIPPING     the first flip since this daemon began:  (that slot drains)                            DRAINING
+             the relay still has a slot of before
 DRAINING     the last old slot drained, or its drain  plan CLOSE: every old slot is dropped         SETTLED
              time is over
 any          an old slot drained                      (the next plan does not name it)              as before
@@ -41,7 +43,7 @@ from zsched.core.route.route import plan_for, slot_for
 from zsched.core.todo import ToDo
 from zsched.core.values.fleet import OnIsolation, Standby, TaskSpec, runs_worker
 from zsched.core.values.model import Allocation, NodeId, NodeKind
-from zsched.core.values.plan import Role, Route, RoutePhase, RoutePlan, Slot, WorkerRole
+from zsched.core.values.plan import DrainingSlot, Role, Route, RoutePhase, RoutePlan, Slot, WorkerRole
 from zsched.core.values.struct import Struct, replace
 
 ROLE_DRAIN_MARGIN_S = 1.0
@@ -113,6 +115,8 @@ class Executor:
     _current: Slot | None = None
     _old: tuple[_Old, ...] = ()
     """The predecessors, the oldest first."""
+    _may_inherit: bool = True
+    """Until the first flip: the relay may carry what a former life of this daemon has opened, and this one not seen."""
     _role_deadline: float = math.inf
     started_at: float = 0.0
     """When the newest slot began to be prepared: a move's, this robot's own when it works alone, or the one back."""
@@ -447,10 +451,13 @@ class Executor:
         if epoch == self.epoch and self.phase is Phase.PREPARING:
             self._go(Phase.FLIPPING, RoutePhase.FLIP, f"flips to {self.served_by}", todo)
 
-    def on_flipped(self, epoch: int, replayed: int, todo: ToDo, now: float) -> None:
-        """The relay switched every stream to the slot of ``epoch``."""
+    def on_flipped(
+        self, epoch: int, replayed: int, todo: ToDo, now: float, draining: tuple[DrainingSlot, ...] = ()
+    ) -> None:
+        """The relay switched every stream to the slot of ``epoch``, and has those that are ``draining`` still."""
         if epoch != self.epoch or self.phase is not Phase.FLIPPING:
             return
+        self._inherit(draining, now)
         lasted_s = now - self.started_at
         took_s = lasted_s if self._is_move else None
         if self._is_move:
@@ -462,6 +469,25 @@ class Executor:
         drained_by = now + self.spec.drain_s
         self._old = tuple(old if old.is_left else replace(old, until=drained_by) for old in self._old)
         self._go(Phase.DRAINING, None, f"{done}; {', '.join(self.predecessors)} drains", todo, took_s)
+
+    def _inherit(self, draining: tuple[DrainingSlot, ...], now: float) -> None:
+        """Take over the slots that a former life of this daemon has left, or was about to leave; they drain as ever.
+
+        Only at the first flip: later this daemon has opened each slot itself, and dropped some.
+        """
+        may_inherit, self._may_inherit = self._may_inherit, False
+        if not may_inherit or self.is_local:
+            return
+        known = {old.slot.epoch for old in self._old}
+        before = (one for one in draining if one.epoch < self.epoch and one.epoch not in known)
+        inherited = tuple(
+            _Old(
+                slot_for(self.spec, self.me, one.owner, one.epoch),
+                until=now + max(0.0, self.spec.drain_s - one.since_s),
+            )
+            for one in before
+        )
+        self._old = tuple(sorted((*inherited, *self._old), key=lambda old: old.slot.epoch))[-MAX_OLD:]
 
     def on_drained(self, epoch: int, todo: ToDo) -> None:
         """The old slot of ``epoch`` has given back everything."""

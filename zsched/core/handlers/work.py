@@ -212,7 +212,7 @@ def _on_slot_ready(node: Stages, event: ev.SlotReady, todo: ToDo, now: float) ->
 
 def _on_slot_flipped(node: Stages, event: ev.SlotFlipped, todo: ToDo, now: float) -> None:
     if event.task in node.executors:
-        node.executors[event.task].on_flipped(event.epoch, event.replayed, todo, now)
+        node.executors[event.task].on_flipped(event.epoch, event.replayed, todo, now, event.draining)
 
 
 def _on_slot_drained(node: Stages, event: ev.SlotDrained, todo: ToDo, _now: float) -> None:

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from zsched.core.values.limits import Range, check_ranges, key
-from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.model import MAX_COUNTER, NodeId, TaskId, check_counter, check_name
 from zsched.core.values.struct import Struct
-from zsched.core.values.words import missed
+from zsched.core.values.words import check_range, missed
 
 
 class Direction(StrEnum):
@@ -130,6 +130,19 @@ class Slot(Struct, frozen=True, kw_only=True):
     owner: NodeId
     routes: tuple[Route, ...]
     ready_when: ReadyWhen
+
+
+class DrainingSlot(Struct, frozen=True, kw_only=True):
+    """A slot that the relay has left ``since_s`` ago, and that has not drained."""
+
+    epoch: int
+    owner: NodeId
+    since_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_counter("draining.epoch", self.epoch)
+        check_name("draining.owner", self.owner)
+        check_range("draining.since_s", self.since_s, 0.0, MAX_COUNTER)
 
 
 class RoutePhase(StrEnum):

@@ -17,7 +17,7 @@ from zsched.core.instructions import ApplyRoutes, Instruction, RecordStory, SetR
 from zsched.core.todo import ToDo
 from zsched.core.values.fleet import OnIsolation, Standby, StreamRule, TaskSpec, WorkerSpec
 from zsched.core.values.model import Allocation
-from zsched.core.values.plan import Direction, RoutePlan, WorkerRole
+from zsched.core.values.plan import Direction, DrainingSlot, RoutePlan, WorkerRole
 
 T = TypeVar("T")
 SPEC = task_of(
@@ -101,6 +101,42 @@ def test_move_goes_through_every_phase_and_keeps_the_old_slot_until_it_is_draine
     assert (one.phase, one.predecessors) == (Phase.DRAINING, ("edge1",))
     assert plan(done(one.on_drained, 1)) == ("close", 2, None)
     assert (one.phase, one.predecessors) == (Phase.SETTLED, ())
+
+
+def began_again(left: DrainingSlot) -> tuple[Executor, tuple[Instruction, ...]]:
+    """A daemon that restarted during the move to edge2, whose relay still has ``left``; and what it does at 10 s."""
+    one = robot()
+    assert plan(done(one.execute, allocation_of(2, "edge2"), 9.0)) == ("prepare", 2, None)
+    assert plan(done(one.on_ready, 2)) == ("flip", 2, None)
+    return one, flipped(one, left)
+
+
+def flipped(one: Executor, left: DrainingSlot) -> tuple[Instruction, ...]:
+    todo = ToDo()
+    one.on_flipped(2, 0, todo, 10.0, (left,))
+    return tuple(todo.apply)
+
+
+def test_a_slot_that_drains_goes_on_to_when_the_daemon_restarts() -> None:
+    one, out = began_again(DrainingSlot(epoch=1, owner="edge1", since_s=0.5))
+    assert plan(out) is None
+    assert (one.phase, one.predecessors, one.next_deadline()) == (Phase.DRAINING, ("edge1",), 11.5)
+    assert plan(done(one.on_drained, 1)) == ("close", 2, None)
+    late, _ = began_again(DrainingSlot(epoch=1, owner="edge1", since_s=0.5))
+    assert plan(done(late.tick, 11.4)) is None
+    assert plan(done(late.tick, 11.5)) == ("close", 2, None), "its drain time began before the restart"
+
+
+def test_it_is_named_when_the_task_moves_again() -> None:
+    one, _ = began_again(DrainingSlot(epoch=1, owner="edge1"))
+    assert plan(done(one.execute, allocation_of(3, "edge3"), 10.5)) == ("prepare", 3, 1, 2)
+
+
+def test_what_this_daemon_has_dropped_does_not_come_back() -> None:
+    one = at(Phase.FLIPPING)
+    assert plan(done(one.on_gone, "edge1")) == ("flip", 2, None)
+    left = DrainingSlot(epoch=1, owner="edge1")
+    assert plan(flipped(one, left)) == ("close", 2, None)
 
 
 def test_drain_time_closes_the_old_slot() -> None:
