@@ -9,13 +9,18 @@ from contextlib import contextmanager
 import pytest
 
 
-def _refuse(_self: threading.Thread) -> None:
-    raise RuntimeError("can't start new thread")
-
-
 @contextmanager
-def no_threads() -> Iterator[None]:
-    """No thread starts."""
+def no_threads(count: int = 1_000_000) -> Iterator[None]:
+    """None of the next ``count`` threads starts."""
+    start, left = threading.Thread.start, [count]
+
+    def refuse(self: threading.Thread) -> None:
+        left[0] -= 1
+        if left[0] < 0:
+            start(self)
+            return
+        raise RuntimeError("can't start new thread")
+
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(threading.Thread, "start", _refuse)
+        patch.setattr(threading.Thread, "start", refuse)
         yield

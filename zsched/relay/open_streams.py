@@ -49,6 +49,8 @@ class OpenStreams:
         """What streams have counted that were closed, and may come again by the same name..."""
         self._left: dict[str, KeptValues] = {}
         """{key expression: what inputs kept that were closed since `keep`}: rules may change places, and settings."""
+        self._late: set[str] = set()
+        """Those of them whose next input could not be opened for a moment: it is tried again."""
         self._changing = threading.Lock()
         """...which a reader of counters sees in one of both places."""
 
@@ -61,6 +63,7 @@ class OpenStreams:
 
         Raises:
             ValueError, zenoh.ZError: it cannot be opened.
+            RuntimeError: no thread is to be had.
         """
         return self._of(self.inputs, route, self._take_input)
 
@@ -69,6 +72,7 @@ class OpenStreams:
 
         Raises:
             ValueError, zenoh.ZError: it cannot be opened.
+            RuntimeError: no thread is to be had.
         """
         return self._of(self.outputs, route, self._take_output)
 
@@ -78,7 +82,7 @@ class OpenStreams:
             for stream in tuple(streams):
                 if stream not in names:
                     self._end(streams, stream)
-        self._left.clear()
+        self._left = {expr: kept for expr, kept in self._left.items() if expr in self._late}
 
     def keep_inputs(self, names: Collection[str]) -> None:
         """Close all other inputs."""
@@ -95,7 +99,7 @@ class OpenStreams:
         for stream in self.all():
             try:
                 stream.rejoin(session, own_ids)
-            except (ValueError, zenoh.ZError) as error:
+            except (ValueError, zenoh.ZError, RuntimeError) as error:  # RuntimeError: no thread is to be had
                 yield f"{stream.route.stream}: {error}"
 
     def counts(self) -> tuple[StreamCount, ...]:
@@ -124,7 +128,13 @@ class OpenStreams:
             before = self._closed.get(route.stream)
             cell[0] = 0 if before is None else before.messages
         kept = self._kept(route)
-        return InputStream(self._session, route, self._own_ids, self._local, self._times, cell=cell, kept=kept)
+        self._late.discard(route.from_expr)
+        try:
+            return InputStream(self._session, route, self._own_ids, self._local, self._times, cell=cell, kept=kept)
+        except RuntimeError:
+            self._late.add(route.from_expr)
+            self._left[route.from_expr] = kept
+            raise
 
     def _kept(self, route: Route) -> KeptValues:
         """What a stream of the same keys has kept, beside which this one comes, or in its place."""

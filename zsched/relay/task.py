@@ -59,9 +59,18 @@ MAX_UNTAKEN: Final = 4
 """More keys than that are not told of."""
 LACK_S: Final = 1.0
 """What a worker lacks that has just come is on its way; after this time it is reported."""
+AGAIN_S: Final = 0.5
+"""A route for which no thread was to be had is tried again after this time."""
 BUSY_S, CARE_S, IDLE_S = 0.01, 0.2, 0.5
 
 _log = logging.getLogger("zsched.relay")
+
+
+class _Late(Struct, frozen=True):
+    """How a route is opened that could not be for a moment."""
+
+    is_from_start: bool
+    is_as_opened: bool
 
 
 class _OpenSlot(Struct, eq=False):
@@ -128,6 +137,11 @@ class TaskRelay:
         """What we carry is the work of a daemon that is gone; the next one may not know of an older slot."""
         self._broken: set[tuple[int, str]] = set()
         """(epoch, stream) of what could not be opened."""
+        self._late: dict[tuple[int, str], _Late] = {}
+        """Those of them that are tried again: for a moment no thread was to be had..."""
+        self._unheard: tuple[Route, ...] = ()
+        """...and inputs of a task without an owner."""
+        self._try_at = 0.0
         self._has_problem = False
         """One was told, and not that it is over."""
         guarded(self._run, name=f"task {task}").start()
@@ -234,6 +248,8 @@ class TaskRelay:
     def _step(self) -> None:
         if self._is_away:
             return
+        if (self._late or self._unheard) and monotonic_s() >= self._try_at:
+            self._try_again()
         for state in tuple(self._slots.values()):
             self._refresh(state)
             self._tell_left(state)
@@ -261,7 +277,7 @@ class TaskRelay:
     def _end_problem(self) -> None:
         """A plan was taken to its end: what was told is over, unless a stream of one of its slots is not open."""
         self._broken &= self._all_routes()
-        if self._has_problem and not self._broken:
+        if self._has_problem and not self._broken and not self._unheard:
             self._has_problem = False
             self._report(ProblemReported(source=f"relay/{self._task}", problem=None))
 
@@ -353,15 +369,21 @@ class TaskRelay:
             finish.is_done.set()
 
     def _listen(self, routes: tuple[Route, ...]) -> None:
+        self._unheard = ()
         for route in routes:
             if self._slots and route.stream in self._streams.inputs:
                 continue  # the plans say what it takes
-            try:
-                self._streams.input_of(route)
-            except (ValueError, zenoh.ZError) as error:
-                self._problem(f"{route.stream}: {route.from_expr}: {error}")
+            self._listen_to(route)
         if not self._slots:  # else the plans say that, too
             self._streams.keep_inputs({route.stream for route in routes})
+
+    def _listen_to(self, route: Route) -> None:
+        try:
+            self._streams.input_of(route)
+        except (ValueError, zenoh.ZError, RuntimeError) as error:
+            self._problem(f"{route.stream}: {route.from_expr}: {error}")
+            if isinstance(error, RuntimeError):  # no thread is to be had: that may be over in a moment
+                self._unheard, self._try_at = (*self._unheard, route), monotonic_s() + AGAIN_S
 
     def _take(self, plan: RoutePlan) -> None:
         self._plan = plan
@@ -476,12 +498,34 @@ class TaskRelay:
 
     def _try_route(self, slot: Slot, route: Route, *, is_from_start: bool, is_as_opened: bool = False) -> None:
         """``is_as_opened``: in the stream of its name that there is, though that goes by another file now."""
-        self._broken.discard((slot.epoch, route.stream))
+        place = slot.epoch, route.stream
+        self._broken.discard(place)
+        self._late.pop(place, None)
         try:
             self._open_route(slot, route, is_from_start=is_from_start, is_as_opened=is_as_opened)
-        except (ValueError, zenoh.ZError) as error:
-            self._broken.add((slot.epoch, route.stream))
+        except (ValueError, zenoh.ZError, RuntimeError) as error:
+            self._broken.add(place)
             self._problem(f"{route.stream}: {route.from_expr} -> {route.to_expr}: {error}")
+            if isinstance(error, RuntimeError):  # no thread is to be had: that may be over in a moment
+                self._late[place] = _Late(is_from_start=is_from_start, is_as_opened=is_as_opened)
+                self._try_at = monotonic_s() + AGAIN_S
+
+    def _try_again(self) -> None:
+        """Open what could not be for want of a thread, as it was to be opened."""
+        unheard, self._unheard = self._unheard, ()
+        for route in unheard if not self._slots else ():
+            self._listen_to(route)
+        late, self._late = self._late, {}
+        for state in self._slots.values():
+            for route in state.slot.routes:
+                how = late.get((state.slot.epoch, route.stream))
+                if how is None or (how.is_as_opened and self._has(state.slot.epoch, route)):
+                    continue
+                self._try_route(state.slot, route, is_from_start=how.is_from_start, is_as_opened=how.is_as_opened)
+        carrier = self._carrier()
+        if late and carrier is not None:
+            self._flip_anew(carrier.slot.epoch)
+        self._end_problem()
 
     def _open_route(self, slot: Slot, route: Route, *, is_from_start: bool, is_as_opened: bool) -> None:
         epoch = slot.epoch

@@ -16,9 +16,10 @@ import zenoh
 from support.allocations import allocation_of
 from support.fleets import task_of
 from support.sessions import hub_and_neighbour, matches
+from support.threads import no_threads
 from support.waiting import until
 from zsched.clock import monotonic_s
-from zsched.core.events import SlotDrained, SlotFlipped, SlotReady
+from zsched.core.events import ProblemReported, SlotDrained, SlotFlipped, SlotReady
 from zsched.core.executor.handover import Executor, Phase
 from zsched.core.instructions import ApplyRoutes
 from zsched.core.relay_protocol import RelayReport, StreamAck, StreamAcks, TaskEnded, WorkerWatch
@@ -254,6 +255,62 @@ def test_who_waits_for_an_answer_when_the_relay_ends_is_told_so(scene: Scene, *,
         undeclare(owner)
     for query in held:
         query.drop()
+
+
+@pytest.mark.parametrize("stream_class", [StreamClass.BEST_EFFORT, StreamClass.RELIABLE])
+@pytest.mark.parametrize("refused", [1, 1000], ids=["the first one", "all"])
+def test_what_no_thread_was_to_be_had_for_is_opened_later(
+    scene: Scene, stream_class: StreamClass, refused: int
+) -> None:
+    """A limit of the machine's, for a moment: the routes behind the first one stayed closed for the whole epoch."""
+    slot, other = whole(3, "edge1", replace(BEST, stream_class=stream_class), BRIEF), scene.other
+    got, answers, kept = list[bytes](), list[bytes](), list[Any]()
+    kept.append(other.declare_subscriber("edge1/t/robot1/in", partial(_take, got)))
+    kept.append(other.declare_subscriber("robot1/out", partial(_take, answers)))
+    kept.append(
+        other.declare_queryable("edge1/t/ask", lambda query: query.reply(query.key_expr, b"told"), complete=True)
+    )
+    with no_threads(refused):
+        scene.task.apply(RoutePlan(task="t", phase=RoutePhase.CLOSE, current=slot))
+        until(lambda: any(isinstance(word, ProblemReported) for word in scene.words), "the problem")
+    names = {"t/in/0", "t/out/0", "t/srv/0"}
+    until(lambda: {one.stream for one in scene.task.counts()} == names, "the streams", 5.0)
+    until(lambda: scene.streams.inputs[IN.stream].has_way, "the way", 5.0)
+    other.put("robot1/in", b"x")
+    other.put("edge1/t/3/robot1/out", b"y")
+    until(lambda: got == [b"x"], "the input", 5.0)
+    until(lambda: answers == [b"y"], "the answer", 5.0)
+    said = [reply.ok.payload.to_bytes() for reply in other.get("robot1/ask") if reply.ok is not None]
+    assert said == [b"told"]
+    problems = [word.problem for word in scene.words if isinstance(word, ProblemReported)]
+    assert problems[-1] is None, "it is over"
+    for one in kept:
+        undeclare(one)
+
+
+def test_what_an_input_kept_is_there_when_its_next_one_opens_later(scene: Scene) -> None:
+    """The file has changed: the input is closed and opened, and the map's publisher puts it once."""
+    got: list[bytes] = []
+    worker = scene.other.declare_subscriber(LATCHED.to_expr, partial(_take, got))
+    scene.settle(LATCHED, ReadyWhen.MATCHING)
+    scene.put(1)
+    until(partial(_counts, got, 1), "the map")
+    changed = replace(LATCHED, settings=replace(LATCHED.settings, depth=2000))
+    with no_threads():
+        scene.words.clear()
+        slot = Slot(epoch=4, owner="edge1", routes=(changed,), ready_when=ReadyWhen.MATCHING)
+        scene.task.apply(RoutePlan(task="t", phase=RoutePhase.CLOSE, current=slot))
+        until(lambda: any(isinstance(word, ProblemReported) for word in scene.words), "the problem")
+    until(partial(_counts, got, 2), "the map once more", 5.0)
+    undeclare(worker)
+
+
+def test_an_input_of_a_task_without_an_owner_is_taken_later(scene: Scene) -> None:
+    with no_threads():
+        scene.task.listen((replace(IN, settings=BEST),))
+        until(lambda: any(isinstance(word, ProblemReported) for word in scene.words), "the problem")
+    until(lambda: IN.stream in scene.streams.inputs, "the input", 5.0)
+    scene.put(3)
 
 
 ECHO = task_of(

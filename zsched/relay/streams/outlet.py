@@ -99,6 +99,7 @@ class Outlet:
         Raises:
             ValueError: ``to_expr`` cannot be filled from ``from_expr``.
             zenoh.ZError: an expression is none.
+            RuntimeError: no thread is to be had; nothing is declared.
         """
         self._session = session
         self._settings = settings
@@ -136,7 +137,11 @@ class Outlet:
             seen = zenoh.handlers.Callback(tolerant(self._matched, "matching"), indirect=False)
             self._watch = self._probe.declare_matching_listener(seen)
         self._main = None if self._rewriting.is_wild else self._declare(to_expr, Priority.DATA, is_express=False)
-        self._queue = self._make_queue()
+        try:
+            self._queue = self._make_queue()
+        except RuntimeError:
+            self._undeclare()
+            raise
         self._crowd = self._make_crowd() if has_crowd else None
         self._makes_up = False
         """What the crowd is owed goes out behind what waits in the queue."""

@@ -134,6 +134,7 @@ class OutputStream:
 
         Raises:
             zenoh.ZError: ``from`` is no key expression.
+            RuntimeError: no thread is to be had; the slot is not open.
         """
         self._end_late(route.from_expr)
         has_epoch = str(epoch) in route.from_expr.split("/")
@@ -153,7 +154,11 @@ class OutputStream:
             if any(other.expr == slot.expr for other in self._slots.values() if other is not slot):
                 return  # the same owner once more, without {epoch}: what comes cannot belong to both
         feed = slot.feed = Feed(slot=slot)
-        self._subscribe(feed, epoch, has_history=has_epoch)
+        try:
+            self._subscribe(feed, epoch, has_history=has_epoch)
+        except RuntimeError:
+            self.close_slot(epoch)
+            raise
 
     def _subscribe(self, feed: Feed, epoch: int, *, has_history: bool) -> None:
         route_from, settings = feed.slot.expr, self.route.settings

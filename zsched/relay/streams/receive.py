@@ -71,6 +71,7 @@ class Receiver:
 
         Raises:
             zenoh.ZError: ``expr`` is no key expression.
+            RuntimeError: no thread is to be had; nothing is subscribed to.
         """
         is_latest = settings.stream_class is StreamClass.LATEST
         self._history: HeldValues | None = None
@@ -87,7 +88,11 @@ class Receiver:
             take = zenoh.handlers.Callback(tolerant(self._carry, "from"), self._ended.set)
             self._subscriber = session.declare_subscriber(expr, take, allowed_origin=origin)
         if self._history is not None:
-            self._history.start()
+            try:
+                self._history.start()
+            except RuntimeError:
+                self.close()
+                raise
 
     def close(self) -> None:
         """Unsubscribe; the thread ends behind what it has in hand."""
@@ -101,7 +106,11 @@ class Receiver:
         self._subscriber = subscriber
         self._handler = subscriber.handler  # the thread's own: undeclare() refuses while recv() borrows
         carry = self._carry_newest if settings.stream_class is StreamClass.BEST_EFFORT else self._carry_all
-        guarded(carry, name=f"from {expr}", kind="from").start()
+        try:
+            guarded(carry, name=f"from {expr}", kind="from").start()
+        except RuntimeError:
+            undeclare(subscriber)
+            raise
 
     def _carry_all(self) -> None:
         for sample in self._handler:
