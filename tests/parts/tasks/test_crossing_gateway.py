@@ -7,11 +7,13 @@ from collections.abc import Iterator
 import pytest
 import zenoh
 
+from zsched.clock import monotonic_s
 from zsched.core.values.struct import replace
 from zsched.sessions.config import client_config
 from zsched.tasks.crossing import gateway as module
 from zsched.tasks.crossing.gateway import NOBODY, Gateway
-from zsched.tasks.crossing.parcels import NOT_OWNER, TAKEN, Parcel, given_key
+from zsched.tasks.crossing.parcels import LASTING, NOT_OWNER, TAKEN, Parcel, given_key
+from zsched.tasks.crossing.ways import Ways
 from zsched_lab.fleet.loopback import free_endpoint
 
 PARCEL = Parcel(name="robot1/map", life="a1", number=1, payload=b"x", attachment=b"a", encoding="text/plain")
@@ -134,3 +136,14 @@ def test_after_the_end_nothing_is_asked(there: There, way: Gateway) -> None:
     way.end()
     assert way.give(PARCEL) == "the session has ended"
     assert there.asked == []
+
+
+def test_an_owner_that_refuses_for_good_is_asked_once_whatever_standbys_say(there: There, way: Gateway) -> None:
+    refused = f"failed: AdapterError: {LASTING}hall-a/robot1/map: 4096 keys have come already"
+    there.takes("edge1", NOT_OWNER, is_error=True)
+    there.takes("edge2", refused, is_error=True)
+    there.takes("edge3", NOT_OWNER, is_error=True)
+    began_at = monotonic_s()
+    assert Ways([way]).give(PARCEL, 10.0, lambda _pause_s: True) == f"at {there.endpoint} {refused}"
+    assert monotonic_s() - began_at < 5.0
+    assert sorted(node for node, _ in there.asked) == ["edge1", "edge2", "edge3"]

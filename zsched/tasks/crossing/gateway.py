@@ -13,7 +13,7 @@ import zenoh
 from zsched.guard import ends_within
 from zsched.sessions.closing import CLOSE_S
 from zsched.sessions.problems import why_not_open
-from zsched.tasks.crossing.parcels import ANY_TAKER, TAKEN, Parcel, given_key, parts_of
+from zsched.tasks.crossing.parcels import ANY_TAKER, TAKEN, Parcel, given_key, is_lasting, parts_of
 
 ANSWER_S: Final = 2.0
 """A gateway that is silent for so long is frozen, cut off or too slow: the next one is asked."""
@@ -96,6 +96,8 @@ class Gateway:
             if parcel is None or text == TAKEN:
                 return ""
             why = text[:MAX_WHY]
+            if is_lasting(why):
+                return why  # the owner's word; standbys say only that they are none
         return why
 
 

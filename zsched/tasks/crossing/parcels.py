@@ -14,6 +14,8 @@ from zsched.wire.keyspace import GIVEN_CHUNK, counter
 TAKEN: Final = "taken"
 """The answer to a sample that was put, or that had been before."""
 NOT_OWNER: Final = "not owner: nothing was done"
+LASTING: Final = "never taken: "
+"""In an answer to a sample that this taker's worker will not take later either. Takers of before do not say it."""
 ANY_TAKER: Final = "*/*"
 MAX_LIVES: Final = 64
 """Givers' lives whose numbers a taker remembers, the newest."""
@@ -63,6 +65,11 @@ def has_been_in(name: str, cell: str) -> bool:
     (True, False)
     """
     return cell in name.split("/")
+
+
+def is_lasting(why: str) -> bool:
+    """Whether it says that nothing is gained by asking again."""
+    return LASTING in why
 
 
 class Had:

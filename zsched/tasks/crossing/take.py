@@ -11,7 +11,7 @@ from typing import Final
 from zsched.core.route.keyexpr import is_wild
 from zsched.core.values.plan import WorkerRole
 from zsched.errors import AdapterError
-from zsched.tasks.crossing.parcels import NOT_OWNER, TAKEN, Had, given_key, parts_of
+from zsched.tasks.crossing.parcels import LASTING, NOT_OWNER, TAKEN, Had, given_key, parts_of
 from zsched.worker import Output, Request, Worker
 
 LOOK_S: Final = 0.05
@@ -51,7 +51,7 @@ class Taker:
         Only on a lease: an owner that was left and does not know it yet would put what the robots do not admit.
 
         Raises:
-            AdapterError: the task has no lease, or there are too many keys.
+            AdapterError: the task has no lease; or for good (`LASTING`): there are too many keys, or the key is none.
         """
         key = parts_of(request.key)[1]
         with self._lock:
@@ -71,9 +71,12 @@ class Taker:
 
     def _declare(self, key: str) -> Output:
         if len(self._outputs) >= MAX_KEYS:
-            raise AdapterError(f"{key} is not taken: {MAX_KEYS} keys have come already")
-        output = self._worker.publisher(
-            f"{{prefix}}/{{epoch}}/{key}", latest=self._is_latest, reliable=not self._is_latest
-        )
+            raise AdapterError(f"{LASTING}{key}: {MAX_KEYS} keys have come already")
+        try:
+            output = self._worker.publisher(
+                f"{{prefix}}/{{epoch}}/{key}", latest=self._is_latest, reliable=not self._is_latest
+            )
+        except ValueError as error:  # a brace in a key is none of the library's placeholders
+            raise AdapterError(f"{LASTING}{key}: {error}") from error
         self._outputs[key] = output
         return output

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 from typing import Final, Protocol
 
 from zsched.clock import monotonic_s
-from zsched.tasks.crossing.parcels import Parcel
+from zsched.tasks.crossing.parcels import Parcel, is_lasting
 
 PAUSE_S: Final = 0.1
 """Between two rounds of all gateways."""
@@ -38,11 +38,12 @@ class Ways:
     def give(self, parcel: Parcel, patience_s: float, goes_on: Callable[[float], bool]) -> str:
         """Try for at most ``patience_s``, a round at least; empty: it was taken; else why not, by gateway.
 
+        What is refused for good is not tried again: the samples behind it would wait.
         ``goes_on(pause_s)`` waits so long between two rounds, and says whether there is another one.
         """
         end = self._clock() + patience_s
         while why := self._round(lambda way: way.give(parcel)):
-            if self._clock() >= end or not goes_on(PAUSE_S):
+            if is_lasting(why) or self._clock() >= end or not goes_on(PAUSE_S):
                 return why
         return ""
 
@@ -57,5 +58,7 @@ class Ways:
             if not why:
                 return ""
             whys.append(f"at {self._ways[0].endpoint} {why}")
+            if is_lasting(why):
+                break
             self._ways.rotate(-1)
         return "; ".join(whys)

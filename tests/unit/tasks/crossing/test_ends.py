@@ -11,10 +11,11 @@ import zenoh
 from zsched.core.values.plan import Role, WorkerRole
 from zsched.errors import AdapterError
 from zsched.tasks.crossing.give import Giver
-from zsched.tasks.crossing.parcels import NOT_OWNER, TAKEN, Parcel, given_key
+from zsched.tasks.crossing.parcels import NOT_OWNER, TAKEN, Parcel, given_key, is_lasting
 from zsched.tasks.crossing.take import MAX_KEYS, Taker
 from zsched.tasks.crossing.ways import Ways
 from zsched.worker import Received, Request
+from zsched.worker.keys import output_key
 
 
 class Played:
@@ -38,6 +39,7 @@ class Played:
 
     def publisher(self, template: str, **_options: bool) -> Any:
         played = self
+        output_key(template, self.prefix)
 
         class _Output:
             def put(self, payload: Any, *, attachment: Any = None, encoding: Any = None) -> bool:
@@ -178,3 +180,19 @@ def test_keys_are_bounded() -> None:
         taker.on_request(request(f"robot1/{number}", number + 1))
     with pytest.raises(AdapterError, match="4096 keys have come already"):
         taker.on_request(request("robot1/more", MAX_KEYS + 1))
+
+
+def test_a_key_with_a_brace_is_refused_for_good() -> None:
+    """Each of its samples held up all others for 10 s."""
+    with pytest.raises(AdapterError, match=r"^never taken: hall-a/robot1/\{x\}: .*no placeholder \{x\}") as refused:
+        Taker(Played(), is_latest=False).on_request(request("robot1/{x}"))  # type: ignore[arg-type] # played
+    assert is_lasting(str(refused.value))
+
+
+def test_one_key_too_many_is_refused_for_good() -> None:
+    taker = Taker(Played(), is_latest=False)  # type: ignore[arg-type] # played
+    for number in range(MAX_KEYS):
+        taker.on_request(request(f"robot1/{number}", number + 1))
+    with pytest.raises(AdapterError, match=r"^never taken: "):
+        taker.on_request(request("robot1/more", MAX_KEYS + 1))
+    assert taker.on_request(request("robot1/0", MAX_KEYS + 2)) == TAKEN.encode()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from zsched.tasks.crossing.parcels import Parcel
+from zsched.tasks.crossing.parcels import LASTING, Parcel
 from zsched.tasks.crossing.ways import Ways
 
 PARCEL = Parcel(name="robot1/map", life="a1", number=1)
@@ -12,11 +12,11 @@ class Gate:
     """Takes while it is open."""
 
     def __init__(self, endpoint: str, *, is_open: bool) -> None:
-        self.endpoint, self.is_open, self.asked = endpoint, is_open, 0
+        self.endpoint, self.is_open, self.asked, self.why = endpoint, is_open, 0, "is shut"
 
     def give(self, _parcel: Parcel) -> str:
         self.asked += 1
-        return "" if self.is_open else "is shut"
+        return "" if self.is_open else self.why
 
     def reach(self) -> str:
         return self.give(PARCEL)
@@ -73,3 +73,12 @@ def test_nothing_is_tried_again_once_it_is_over() -> None:
     assert Ways([gate], time).give(PARCEL, 10.0, time.goes_on) == "at tcp/1 is shut"
     assert gate.asked == 1
     assert Ways([gate], time).reach() == "at tcp/1 is shut"
+
+
+def test_what_is_refused_for_good_costs_no_patience() -> None:
+    first, second, third = (Gate(f"tcp/{number}", is_open=False) for number in (1, 2, 3))
+    second.why = f"failed: AdapterError: {LASTING}robot1/map: 4096 keys have come already"
+    ways, time = Ways([first, second, third], Time()), Time()
+    for _ in range(2):
+        assert ways.give(PARCEL, 10.0, time.goes_on).endswith(f"at tcp/2 {second.why}")
+    assert (time.now, first.asked, second.asked, third.asked) == (0.0, 1, 2, 0), "the one that has the owner first"
