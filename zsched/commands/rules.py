@@ -54,9 +54,11 @@ def _worth(spec: TaskSpec) -> Iterator[str]:
     if is_service:
         less = f"counts up to {100 * NEARLY_FULL:g} % less"
         yield f"a machine that it leaves less than {floor} of the memory free {less} (memory_floor_ratio)"
+        of_cpu = f"{100 * spec.cpu_floor_ratio:g} %"
         if spec.cpu_floor_ratio > 0.0:
-            of_cpu = f"{100 * spec.cpu_floor_ratio:g} %"
             yield f"so does one that it leaves less than {of_cpu} of the CPU free (cpu_floor_ratio)"
+        else:
+            yield "what programs that are no tasks would still get there does not count (cpu_floor_ratio: 0)"
     else:
         yield f"an owner with less than {floor} of its memory free is left at once (memory_floor_ratio)"
     for name, limit in spec.gauge_limits:
