@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,10 +11,15 @@ import zenoh
 
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import until
+from zsched.core.hop.books import unaccounted
 from zsched.core.values.plan import Direction, Route, StreamClass, StreamCount, StreamSettings
 from zsched.core.values.struct import replace
 from zsched.relay.books import Books
 from zsched.relay.open_streams import OpenStreams
+from zsched.relay.streams.acks import Acks
+from zsched.relay.streams.outlet import QUEUE_DEPTH
+from zsched.sessions import send_queue
+from zsched.wire.keyspace import Keyspace
 
 IN = Route(
     stream="t/in/0",
@@ -134,3 +140,32 @@ def test_kept_values_outlive_a_change_of_their_rule(
     until(lambda: got == ["1", "2", "3"], "what comes behind them")
     streams.close()
     kept.undeclare()
+
+
+@pytest.mark.parametrize("depth", [100, 300], ids=["by zenoh's thread", "by ours"])
+def test_what_waits_for_a_slow_worker_is_counted_when_its_rule_changes(
+    sessions: tuple[zenoh.Session, zenoh.Session], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, depth: int
+) -> None:
+    """The relay has taken it off the network, and its thread waited for room in the owner's queue."""
+    monkeypatch.setattr(send_queue, "NO_ROOM_S", 30.0)  # as for a worker that takes one now and then
+    relay, outside = sessions
+    settings = StreamSettings(stream_class=StreamClass.RELIABLE, depth=depth)
+    route, streams = replace(IN, settings=settings), Life(*sessions, tmp_path / "books").streams
+    acks = Acks(relay, Keyspace("test"), "robot1", lambda *_: True)
+    source = streams.input_of(route)
+    source.open(1, route, acks.of("edge1", "t"))  # whose worker is not there yet: nothing goes out
+    source.flip(1)
+    publisher = outside.declare_publisher(IN.from_expr, congestion_control=zenoh.CongestionControl.BLOCK)
+    until(lambda: matches(publisher), "the relay subscribes")
+    room = max(depth, QUEUE_DEPTH)
+    for _ in range(room + 150):
+        publisher.put(b"x")
+    until(lambda: source.count().messages >= room, "the queue is full")
+    time.sleep(0.1)
+    assert source.count().messages < room + 150, "some are in hand"
+    streams.input_of(replace(route, settings=replace(settings, depth=depth + 1)))
+    told = streams.counts()[0]
+    assert told.messages == room + 150
+    assert unaccounted(told) == 0
+    assert dict(told.drops) == {"closed": room + 150}
+    streams.close()

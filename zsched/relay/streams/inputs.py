@@ -144,6 +144,8 @@ class InputStream:
         self._has_end = self._is_late = False
         """The end marker is on its way, or we are closed; what is given comes behind that (guarded likewise)."""
         self._receiver: Receiver | None = None if is_ours else self._subscribe(side)
+        self._ending: Receiver | None = None
+        """It has unsubscribed, and may still have samples in hand: a full queue holds them up."""
 
     def _subscribe(self, side: Session) -> Receiver:
         return Receiver(
@@ -332,12 +334,13 @@ class InputStream:
         """Unsubscribe; what a rate has held back goes out now, for nobody looks after it any more."""
         receiver, self._receiver = self._receiver, None
         if receiver is not None:
+            self._ending = receiver
             receiver.close()
         with self._lock:
             self._send_passed_over(math.inf)
 
     def close(self) -> None:
-        """Unsubscribe and close every slot."""
+        """Unsubscribe and close every slot; what has come by then is counted when this returns."""
         self.stop()
         with self._lock:
             self._has_end = True
@@ -345,6 +348,9 @@ class InputStream:
             self._paused.clear()
         for epoch in tuple(self._slots):
             self.close_slot(epoch)
+        ending, self._ending = self._ending, None
+        if ending is not None:  # it waits at no slow worker any more
+            ending.wait()
 
     # --- another data session ----------------------------------------------------------------------------------------
 
@@ -563,7 +569,7 @@ class InputStream:
         elif self._replays:
             self._owe([LeftOpen(sample, stamp)])
         elif not self._keep_last:
-            self._counter.dropped("no_route")
+            self._counter.dropped("closed" if self._has_end else "no_route")
         else:
             self._counter.unsent += 1
 

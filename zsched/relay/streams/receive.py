@@ -28,6 +28,8 @@ from zsched.guard import guarded, tolerant
 from zsched.relay.streams.history import HeldValues
 
 JOIN_S: Final = 0.3
+REST_S: Final = 2.0
+"""What a thread has in its queue is counted within this time, once nothing holds it up."""
 QUEUE_DEPTH: Final = 256
 """Samples that zenoh's thread can leave for ours without waiting, at least; also as many as we take in one go."""
 BEHIND_S: Final = 0.01
@@ -100,6 +102,10 @@ class Receiver:
         if self._history is not None:
             self._history.close()
         self._ended.wait(JOIN_S)
+
+    def wait(self) -> None:
+        """Behind `close`, when nothing holds up ``carry`` any more: wait until the last sample has been given to it."""
+        self._ended.wait(REST_S)
 
     def _drain(self, subscriber: _Subscriber, expr: str, settings: StreamSettings) -> None:
         """Start a thread of our own for what zenoh's queue holds."""
