@@ -276,15 +276,19 @@ def test_what_no_thread_was_to_be_had_for_is_opened_later(
     names = {"t/in/0", "t/out/0", "t/srv/0"}
     until(lambda: {one.stream for one in scene.task.counts()} == names, "the streams", 5.0)
     until(lambda: scene.streams.inputs[IN.stream].has_way, "the way", 5.0)
-    other.put("robot1/in", b"x")
-    other.put("edge1/t/3/robot1/out", b"y")
+    source, owner = other.declare_publisher("robot1/in"), other.declare_publisher("edge1/t/3/robot1/out")
+    asker = other.declare_querier("robot1/ask")
+    for end in (source, owner, asker):
+        until(partial(matches, end), "the relay is seen there", 5.0)
+    source.put(b"x")
+    owner.put(b"y")
     until(lambda: got == [b"x"], "the input", 5.0)
     until(lambda: answers == [b"y"], "the answer", 5.0)
-    said = [reply.ok.payload.to_bytes() for reply in other.get("robot1/ask") if reply.ok is not None]
+    said = [reply.ok.payload.to_bytes() for reply in asker.get() if reply.ok is not None]
     assert said == [b"told"]
     problems = [word.problem for word in scene.words if isinstance(word, ProblemReported)]
     assert problems[-1] is None, "it is over"
-    for one in kept:
+    for one in (source, owner, asker, *kept):
         undeclare(one)
 
 
@@ -310,7 +314,10 @@ def test_an_input_of_a_task_without_an_owner_is_taken_later(scene: Scene) -> Non
         scene.task.listen((replace(IN, settings=BEST),))
         until(lambda: any(isinstance(word, ProblemReported) for word in scene.words), "the problem")
     until(lambda: IN.stream in scene.streams.inputs, "the input", 5.0)
+    publisher = scene.other.declare_publisher("robot1/in")
+    until(partial(matches, publisher), "the relay subscribes", 5.0)
     scene.put(3)
+    undeclare(publisher)
 
 
 ECHO = task_of(
@@ -390,7 +397,7 @@ def test_an_old_owner_drains_on_while_the_daemon_restarts(scene: Scene, *, has_f
     second.learn(2, "edge2")
     second.until(Phase.DRAINING, Phase.SETTLED)
     time.sleep(0.2)
-    other.put("edge1/t/1/robot1/out", b"in hand")
+    other.put("edge1/t/1/robot1/out", b"in hand", congestion_control=zenoh.CongestionControl.BLOCK)
     until(lambda: answers == [b"in hand"], "the old owner's answer", 5.0)
     second.until(Phase.SETTLED)
     assert monotonic_s() - began_at < ECHO.drain_s + 1.0
