@@ -965,6 +965,13 @@ VOTE_BUGS = (
         ("tests/unit/core/gateway/test_task_speed.py",),
     ),
     _bug(
+        "a task that has just come uses no GPU yet",
+        SCORING,
+        'readings["gpu"] + coming_gpu, own',
+        'readings["gpu"], own',
+        ("tests/unit/core/scheduler/test_turns.py",),
+    ),
+    _bug(
         "what a task's processes do not show of its memory counts twice",
         SCORING,
         "(memory is None or allocation.tuning.score is ScoreForm.SERVICE)",

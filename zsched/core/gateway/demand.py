@@ -292,6 +292,11 @@ class Demands:
         """One job's need; ``None``: its worker has never reported any."""
         return self._known.get(task, _Known()).job
 
+    def has_been(self, task: TaskId, node: NodeId, for_s: float, now: float) -> bool:
+        """Whether the task has been seen on the node, with its worker ready, for so long."""
+        known = self._known.get(task, _Known())
+        return known.owner == node and now - known.since >= for_s
+
     def experience(self, task: TaskId, profile: Profile) -> tuple[float, float]:
         """(part of the forecast work that the task got there, at most 1; how many times as long its jobs took).
 

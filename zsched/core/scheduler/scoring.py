@@ -141,7 +141,7 @@ def score(
         is_measured = is_owner and load is not None and is_short(load)
         demand, unseen = gateway.demand(spec, profile), _unseen(spec, profile, bookings, gateway)
         use = _predicted(spec, allocation, profile, demand, unseen)
-        gauges = _readings(spec, allocation, profile, gateway)
+        gauges = _readings(spec, allocation, profile, gateway, _coming_gpu(spec, profile, bookings, gateway, now))
         reason = _refusal(spec, allocation, profile, demand, use, gauges)
         if reason:
             refused.append((candidate, reason))
@@ -340,14 +340,36 @@ def _beyond_limits(spec: TaskSpec, profile: Profile, gauges: Mapping[GaugeName, 
     return next((fault for fault in faults if fault), "")
 
 
-def _readings(spec: TaskSpec, allocation: Allocation, profile: Profile, gateway: Gateway) -> Mapping[GaugeName, float]:
+GPU_SHOWS_S = 6.0
+"""So long after a task has come, its use of the GPU shows: three time constants of the gauges' means."""
+
+
+def _coming_gpu(spec: TaskSpec, profile: Profile, bookings: Bookings | None, gateway: Gateway, now: float) -> float:
+    """What other tasks will use of a node's GPU, beyond what shows: all that they ask for, until it must show.
+
+    Else two of them that leave one GPU at the same moment find the other one idle, and go together, again and again.
+    """
+    others = () if bookings is None else bookings.get(profile.node, ())
+    return sum(
+        (
+            other.demand.gpu
+            for other in others
+            if other.name != spec.name and not gateway.demands.has_been(other.name, profile.node, GPU_SHOWS_S, now)
+        ),
+        0.0,
+    )
+
+
+def _readings(
+    spec: TaskSpec, allocation: Allocation, profile: Profile, gateway: Gateway, coming_gpu: float
+) -> Mapping[GaugeName, float]:
     """The node's gauges, predicted as if it had the task; none where the task goes by none."""
     if not (spec.gauge_limits or allocation.tuning.weights.gauges):
         return {}
     readings, need = dict(gateway.readings(profile)), spec.demand.gpu
     if need and "gpu" in readings:  # by the fleet file: no driver tells which process uses how much
         own = need if profile.node == allocation.owner else 0.0
-        readings["gpu"] = predicted_use(readings["gpu"], own, need)
+        readings["gpu"] = predicted_use(readings["gpu"] + coming_gpu, own, need)
     return readings
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pytest
 
@@ -11,12 +11,13 @@ from support.allocations import allocation_of
 from support.fleets import fleet_of, task_of, tuning_of
 from support.profiles import load_of, profile_of
 from zsched.core.gateway.gateway import Gateway
+from zsched.core.profile.profile import Profiler
 from zsched.core.scheduler.scoring import book, score
 from zsched.core.scheduler.turns import in_turn, who_moves_first
 from zsched.core.scheduler.utility import service_utility
 from zsched.core.values.fleet import Demand, WorkerSpec
-from zsched.core.values.model import Allocation, PeerState, ScoreForm, UtilityVector
-from zsched.core.values.profile import WorkerLoad
+from zsched.core.values.model import Allocation, PeerState, ScoreForm, Tuning, UtilityVector, Weights
+from zsched.core.values.profile import DeviceSample, WorkerLoad, WorkerState
 from zsched.core.vote.voting import Voting
 
 
@@ -170,3 +171,38 @@ def test_a_task_that_has_just_come_to_a_full_machine_counts_until_it_shows_that_
 
 def test_a_single_task_has_no_bookings() -> None:
     assert book((A,), values("edge1")) == {}
+
+
+# --- GPUs ------------------------------------------------------------------------------------------------------------
+
+ON_GPU = Tuning(weights=Weights.of({"cpu": 0.5, "gpu": 0.5}), score=ScoreForm.SERVICE, bonus=0.05, cool_down_s=2.0)
+TWO = tuple(task_of(name, demand=Demand(gpu=0.4), tuning=ON_GPU, patience=0.3) for name in ("a", "b"))
+
+
+def test_two_tasks_that_leave_one_gpu_at_the_same_moment_do_not_go_together() -> None:
+    """Each moves by its own figures; the second one comes a round later, before the first one's use shows."""
+    fleet = fleet_of(*TWO, of=("edge1", "edge2"), electors=("robot1",))
+    gateway, owners = Gateway(fleet), {"a": "edge1", "b": "edge1"}
+    profilers = {name: Profiler(name, 1, fleet.timing) for name in ("edge1", "edge2")}
+    moves = 0
+    for step in range(300):
+        now = 0.2 * step
+        for name, profiler in profilers.items():
+            used = 0.4 * sum(owner == name for owner in owners.values())
+            loads = tuple(load_of(task, cpu_cores=0.1, memory_mb=100.0) for task in owners)
+            sample = DeviceSample(cpu_cores=4.0, cpu_used_cores=0.5, memory_mb=4000.0, memory_used_mb=1000.0)
+            profiler.absorb(replace(sample, workers=loads, gauges=(("gpu", used),)), (), now)
+            ready = dict.fromkeys(owners, WorkerState.READY)
+            profile = profiler.publishable(ready, is_draining=False, now=now)
+            if profile is not None:
+                assert gateway.absorb(profile, now) is None
+        agreed = {name: allocation_of(owner=owner, task=name, tuning=ON_GPU) for name, owner in owners.items()}
+        turn = TWO[step % 2]  # a vote a round
+        for name, owner in owners.items():
+            gateway.learn_demand(name, owner, now)
+        vector = score(turn, agreed[turn.name], "robot1", gateway, ALIVE, now, book(TWO, agreed))
+        told = {one.candidate: one.value for one in vector.utilities}
+        best = max(told, key=lambda name: told[name])
+        if now >= 10.0 and told[best] > told[owners[turn.name]] + ON_GPU.bonus:
+            owners[turn.name], moves = best, moves + 1
+    assert (sorted(owners.values()), moves) == (["edge1", "edge2"], 1)
