@@ -965,6 +965,13 @@ VOTE_BUGS = (
         ("tests/unit/core/gateway/test_task_speed.py",),
     ),
     _bug(
+        "a candidate gains by a far robot that leaves it out",
+        SCORING,
+        "return whole if len(whole) >= majority(len(vectors)) else vectors",
+        "return vectors",
+        ("tests/unit/core/scheduler/test_compare.py",),
+    ),
+    _bug(
         "a task that has just come uses no GPU yet",
         SCORING,
         'readings["gpu"] + coming_gpu, own',

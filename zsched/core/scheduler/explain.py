@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from zsched.core.scheduler.damping import WINDOW_S, Damping
 from zsched.core.scheduler.decision import Decided, decide_again, verdict_of
 from zsched.core.scheduler.judge import Outcome
-from zsched.core.scheduler.scoring import Standing, joined, pick, rounded
+from zsched.core.scheduler.scoring import Standing, counted, joined, pick, rounded
 from zsched.core.scheduler.utility import total_utility
 from zsched.core.values.decision import Decision, Figures, Verdict
 from zsched.core.values.model import Aggregate, NodeId, PeerState, Tuning, Utility, UtilityVector
@@ -337,7 +337,8 @@ def owner_cpu_below(figures: Figures, standing: Standing, owner: CandidateSum, r
     ``None``: at no level, or no robot measured that term.
     """
     tuning = figures.allocation.tuning
-    column = [one for vector in standing.vectors for one in vector.utilities if one.candidate == owner.node]
+    vectors = counted(standing.aggregates, standing.vectors)
+    column = [one for vector in vectors for one in vector.utilities if one.candidate == owner.node]
     terms = [one.cpu for one in column if one.cpu is not None]
     if tuning.weights.cpu <= 0.0 or not terms:
         return None

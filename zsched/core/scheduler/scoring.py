@@ -9,7 +9,7 @@ vectors of all fresh voters into a `Standing` (Compare_Utility), and `pick` name
 from __future__ import annotations
 
 import statistics
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from collections.abc import Set as AbstractSet
 
 from zsched.core.gateway.company import is_full
@@ -472,8 +472,8 @@ def compare(spec: TaskSpec, allocation: Allocation, vectors: Mapping[NodeId, Uti
             columns.setdefault(candidate, []).append(utility)  # once per voter, however often its vector names it
         reasons.update(vector.refused)
     mean = statistics.fmean if allocation.tuning.aggregate is Aggregate.MEAN else statistics.median
-    aggregates: dict[NodeId, float] = {}
     vetoed: dict[NodeId, str] = {}
+    kept: list[NodeId] = []
     for candidate in spec.candidates:
         column = columns[candidate]
         reaching = sum(utility.reachable for utility in column)
@@ -484,14 +484,32 @@ def compare(spec: TaskSpec, allocation: Allocation, vectors: Mapping[NodeId, Uti
         elif reaching < needed:
             vetoed[candidate] = f"reached by {reaching} of {len(fresh)} robots"
         else:
-            aggregates[candidate] = mean([utility.value for utility in column])
+            kept.append(candidate)
     return Standing(
-        aggregates=aggregates,
+        aggregates=_aggregates(kept, fresh, mean),
         vetoed=vetoed,
         vectors=fresh,
         voters_heard=len(fresh),
         penalties=joined(dict(vector.penalties) for vector in fresh),
     )
+
+
+def counted(candidates: Iterable[NodeId], vectors: tuple[UtilityVector, ...]) -> tuple[UtilityVector, ...]:
+    """The vectors that these candidates are compared by: of the robots that score all of them, if they are a majority.
+
+    A robot that is far away gives low values. If it leaves out one candidate, for a doubt of its own, that one would
+    gain by it, and the task move there and back with every doubt. Else all count, each for what it scores.
+    """
+    wanted = set(candidates)
+    whole = tuple(one for one in vectors if wanted <= {utility.candidate for utility in one.utilities})
+    return whole if len(whole) >= majority(len(vectors)) else vectors
+
+
+def _aggregates(
+    candidates: list[NodeId], vectors: tuple[UtilityVector, ...], mean: Callable[[list[float]], float]
+) -> dict[NodeId, float]:
+    told = [{one.candidate: one.value for one in vector.utilities} for vector in counted(candidates, vectors)]
+    return {name: mean([values[name] for values in told if name in values]) for name in candidates}
 
 
 def joined(penalties: Iterable[Mapping[NodeId, float]]) -> dict[NodeId, float]:

@@ -147,3 +147,23 @@ def test_pick_takes_the_highest_to_one_in_256_then_the_owner_then_the_name(
 def test_sums_that_differ_by_their_order_only_are_one_number() -> None:
     assert rounded(0.1 + 0.2 + 0.3) == rounded(0.3 + 0.2 + 0.1)
     assert [majority(count) for count in range(1, 8)] == [1, 2, 2, 3, 3, 4, 4]
+
+
+@pytest.mark.parametrize("aggregate", list(Aggregate))
+def test_a_candidate_gains_nothing_by_a_far_robot_that_leaves_it_out(aggregate: Aggregate) -> None:
+    """Both are alike to each robot; the far one doubts edge2 for a moment."""
+    near = [vote(name, edge1=0.9, edge2=0.9) for name in ("r1", "r2")]
+    far, doubts = vote("r3", edge1=0.1, edge2=0.1), vote("r3", edge1=0.1, refused={"edge2": "was gone"})
+
+    both = joined(*near, far, aggregate=aggregate).aggregates
+    assert both["edge1"] == both["edge2"]
+    assert joined(*near, doubts, aggregate=aggregate).aggregates == {
+        "edge1": pytest.approx(0.9),
+        "edge2": pytest.approx(0.9),
+    }
+    first = [vote(name, edge1=0.9, refused={"edge2": "was gone"}) for name in ("r1", "r2")]
+    last = [vote(name, edge2=0.5, refused={"edge1": "was gone"}) for name in ("r4", "r5")]
+    found = joined(*first, vote("r3", edge1=0.3, edge2=0.2, edge3=0.2), *last)
+    if aggregate is Aggregate.MEAN:
+        assert found.aggregates == {"edge1": pytest.approx(0.7), "edge2": pytest.approx(0.4)}, "one robot scores both"
+    assert found.vetoed == {"edge3": "not scored by enough robots"}
