@@ -443,12 +443,18 @@ def test_how_long_robots_stood_is_told_by_what_was_on_the_edge_of_their_slam(tmp
 
 
 def test_a_block_whose_robots_stand_beside_the_model_alone_is_not_what_it_is_to_be() -> None:
+    """Under schemes that move a robot may stand there for what the merger has left behind: that tells nothing."""
+
     def stood(model: float, both: float) -> str:
         states = {"model": {"s": 60.0, "stood": model}, "both": {"s": 120.0, "stood": both}}
-        return stood_text([a_run("zsched", 0, 0.5, stood_by_state=states)])
+        moving = {"model": {"s": 600.0, "stood": 0.5}}
+        return stood_text(
+            [a_run("fixed_e1", 0, 0.5, stood_by_state=states), a_run("zsched", 0, 0.5, stood_by_state=moving)]
+        )
 
     assert "as it must be" in stood(0.01, 0.2)
-    assert "| and both: the tipping point | 2.0 | 20.0 % |" in stood(0.01, 0.2)
+    assert "| and both: the tipping point | 2.0 | 20.0 % | - | - |" in stood(0.01, 0.2)
+    assert "| and the model | 1.0 | 1.0 % | 10.0 | 50.0 % |" in stood(0.01, 0.2)
     for model, both in ((0.06, 0.2), (0.0, 0.04)):
         assert "**not what the block is to show**" in stood(model, both)
     assert "Not measured" in stood_text([a_run("zsched", 0, 0.5)])
