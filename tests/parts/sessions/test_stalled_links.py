@@ -171,7 +171,7 @@ def test_a_relay_ends_the_link_of_a_frozen_worker_behind_its_put(tmp_path: Path)
             lane = outlet._main
             assert lane is not None
             taken = relay.declare_subscriber("robot1/in", samples.append)
-            relay.put("robot1/in", bytes(200_000))  # what the sockets may hold is several MB
+            relay.put("robot1/in", bytes(800_000))  # 70 of them are more than any sockets hold: 32 + 4 MB (tcp(7))
             until(lambda: samples, "a sample")
             outlet.send(samples[0])
 
