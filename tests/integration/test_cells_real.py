@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 
 from support.authorities import install, make_authority
+from support.waiting import until
 from zsched.core.values.certificates import Role
 from zsched.core.values.fleet import dial_endpoint
 from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
@@ -148,7 +149,8 @@ def test_a_secured_cell_is_asked_with_a_certificate_of_its_own_authority(tmp_pat
         assert (done.returncode, TASK in done.stdout) == (0, True), done.stderr
         done = here.zsched("pause", TASK, "--node", f"{B}/edge1", "--yes")
         assert done.returncode == 0, done.stderr
-        assert bed.task("robot1")["pause"]["by"] == "ana.operator"
+        paused = until(lambda: bed.task("robot1")["pause"], "robot1 has learnt the pause")
+        assert paused["by"] == "ana.operator"
         passed_on = here.zsched("resume", TASK, "--node", f"{B}/robot1", "--yes")
         assert passed_on.returncode == 1  # nodes of a secured fleet pass on no commands
         assert "robot1 is none of the gateways of hall-b that answer (edge1, edge2)" in passed_on.stderr

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import fcntl
 import json
@@ -45,6 +46,8 @@ class Terminal:
             stderr=subprocess.PIPE,
         )
         self.seen = ""
+        self._decoder = codecs.getincrementaldecoder("utf-8")()
+        """What was read may end within a character."""
 
     def resize(self, columns: int, lines: int) -> None:
         fcntl.ioctl(self._terminal, termios.TIOCSWINSZ, struct.pack("HHHH", lines, columns, 0, 0))
@@ -54,7 +57,7 @@ class Terminal:
 
     def read(self) -> str:
         while select.select([self.controller], [], [], 0.0)[0]:
-            self.seen += os.read(self.controller, 65536).decode()
+            self.seen += self._decoder.decode(os.read(self.controller, 65536))
         return self.seen
 
     def wait_for(self, text: str) -> None:
