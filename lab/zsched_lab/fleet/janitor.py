@@ -5,8 +5,9 @@ why the lab ended: the end of its standard input is the sign, whether by exit, b
 
 Started as ``python -m zsched_lab.fleet.janitor TOKEN`` in a session of its own, it reads one JSON object per line:
 ``{"remove": PATH}`` (a folder of ours). At the end of the input it waits `GRACE_S` for the run's processes to go by
-themselves, kills the rest, removes the folders, every control group with the token in its name and zenoh's orphaned
-shared memory, and prints one JSON object: ``{"killed": [pid], "left": [path or pid]}``. Standard library only.
+themselves, kills the rest, removes the folders, every control group with the token in its name and those within, and
+zenoh's orphaned shared memory, and prints one JSON object: ``{"killed": [pid], "left": [path or pid]}``.
+Standard library only.
 """
 
 from __future__ import annotations
@@ -68,9 +69,9 @@ def end_processes(token: str) -> tuple[list[int], list[int]]:
 
 
 def groups_of(token: str) -> list[Path]:
-    """The control groups of the run, in every hierarchy: those with the token in their name, deepest first."""
-    found = [Path(folder, name) for folder, names, _ in os.walk(CONTROL_GROUPS) for name in names if token in name]
-    return sorted(found, reverse=True)
+    """The run's control groups in every hierarchy: those with the token in their name and all within, deepest first."""
+    found = (Path(folder, name) for folder, names, _ in os.walk(CONTROL_GROUPS) for name in names)
+    return sorted((path for path in found if any(token in part for part in path.parts)), reverse=True)
 
 
 def remove_group(path: Path) -> bool:

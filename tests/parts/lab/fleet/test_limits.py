@@ -12,7 +12,7 @@ import pytest
 from support.waiting import until
 from zsched.adapters.machine.cgroup import LimitedGroup
 from zsched.errors import AdapterError
-from zsched_lab.fleet.janitor import groups_of
+from zsched_lab.fleet.janitor import clean, groups_of
 from zsched_lab.fleet.limits import LimitKind, NodeLimits, by_affinity, make_limits
 
 BUSY = [sys.executable, "-c", "while True: pass"]
@@ -41,6 +41,17 @@ def test_a_nodes_share_is_its_own_and_is_removed() -> None:
         busy.wait()
         limits.remove()
     assert took_s >= 0.6  # a fifth of a CPU: 1 s, less a period of what was saved up; more on a busy machine
+    assert groups_of(token) == []
+
+
+@pytest.mark.skipif(WHY_NOT is not None, reason=f"no control groups here: {WHY_NOT}")
+def test_groups_within_a_nodes_are_cleaned_away_with_it() -> None:
+    """Only the node's own has the run's token in its name."""
+    token = secrets.token_hex(8)
+    outer = LimitedGroup.create(f"zsched-{token}-edge1", cpu_cores=0.5)
+    inner = outer.inner("work", cpu_cores=0.2)
+    assert set(groups_of(token)) == {*outer.folders, *inner.folders}
+    assert clean(token, [], time.time()) == {"killed": [], "left": []}
     assert groups_of(token) == []
 
 
