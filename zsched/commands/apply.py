@@ -15,7 +15,7 @@ from typing import TextIO
 
 from zsched import paths as places
 from zsched.commands.ask import Door
-from zsched.commands.common import CliError, Json, check_reason, nearest, print_json, say, says_yes, warn
+from zsched.commands.common import CliError, Json, check_dangers, check_reason, print_json, say, says_yes, warn
 from zsched.commands.document import (
     QUESTION,
     InForce,
@@ -364,9 +364,7 @@ def _body(plan: Plan, outcome: str, revision: int) -> Json:
 
 
 def _check_accepted(view: ApplyView) -> None:
-    for name in view.accepted:
-        if name not in DANGERS:
-            raise CliError(EXIT_USAGE, f"--accept: there is no danger {name!r}{nearest(name, DANGERS)}")
+    check_dangers(view.accepted, DANGERS)
 
 
 def _confirm(view: ApplyView, plan: Plan) -> None:

@@ -18,7 +18,7 @@ from zsched import paths
 from zsched.clock import monotonic_s
 from zsched.commands.apply import OPEN_NETWORK
 from zsched.commands.ask import Door, ask_door, door_of, find_door, fleet_here
-from zsched.commands.common import CliError, Json, check_reason, nearest, warn
+from zsched.commands.common import CliError, Json, check_dangers, check_reason, nearest, warn
 from zsched.commands.document import (
     ConflictError,
     InForce,
@@ -107,10 +107,7 @@ def change_cells(order: LeaveOrder, word: str) -> int:
         ConfigError: a document would have faults, or cannot be used here.
         AdapterError: this machine is in no fleet, or a file cannot be read or written.
     """
-    dangers = (*DANGERS, OPEN_NETWORK)
-    for name in order.accepted:
-        if name not in dangers:
-            raise CliError(EXIT_USAGE, f"--accept: there is no danger {name!r}{nearest(name, dangers)}")
+    check_dangers(order.accepted, (*DANGERS, OPEN_NETWORK))
     check_reason(order.reason)
     going = next_cell.under_way(order.places.state)
     if going is not None and not _runs_in(order, going.former):

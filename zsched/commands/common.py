@@ -12,7 +12,7 @@ import re
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any, Final, TextIO
@@ -293,6 +293,17 @@ def nearest(name: str, known: Sequence[str]) -> str:
 
     close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
     return f"; did you mean {close[0]}?" if close else f"; there are {', '.join(known) or 'none'}"
+
+
+def check_dangers(accepted: Iterable[str], known: Sequence[str]) -> None:
+    """Refuse an ``--accept`` that names none of the dangers which a verb knows.
+
+    Raises:
+        CliError: one is unknown.
+    """
+    for name in accepted:
+        if name not in known:
+            raise CliError(EXIT_USAGE, f"--accept: there is no danger {name!r}{nearest(name, known)}")
 
 
 def told_task(status: Json, task: str) -> Json:

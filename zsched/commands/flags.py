@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door
-from zsched.commands.common import CliError, Json, nearest, print_json, say, told_task
+from zsched.commands.common import CliError, Json, check_dangers, nearest, print_json, say, told_task
 from zsched.commands.document import InForce, change_over, document_text, in_force, ordered
 from zsched.commands.entries import DOCUMENT
 from zsched.commands.orders import (
@@ -354,9 +354,7 @@ def _check_dangers(
     Raises:
         CliError: it is there, and is not accepted by name.
     """
-    for name in accepted:
-        if name != NO_OTHER:
-            raise CliError(EXIT_USAGE, f"--accept: there is no danger {name!r}{nearest(name, (NO_OTHER,))}")
+    check_dangers(accepted, (NO_OTHER,))
     was, closed = ({flag["subject"] for flag in flags} for flags in (before, after))
     told = [
         str(task["name"])

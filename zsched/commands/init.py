@@ -14,7 +14,7 @@ from typing import Final
 from zsched import paths as places
 from zsched.adapters.host.state_file import STATE_NAME
 from zsched.adapters.machine import core_speed
-from zsched.commands.common import CliError, counted, nearest, say, warn
+from zsched.commands.common import CliError, check_dangers, counted, say, warn
 from zsched.commands.here import own_name
 from zsched.commands.pki import known_here
 from zsched.config.load import load_fleet, require_node
@@ -61,9 +61,7 @@ def create_state(
         ConfigError: the fleet file cannot be used.
         AdapterError: something speaks against it, or the folder cannot be written.
     """
-    for danger in accepted:
-        if danger not in DANGERS:
-            raise CliError(EXIT_USAGE, f"--accept: there is no danger {danger!r}{nearest(danger, DANGERS)}")
+    check_dangers(accepted, DANGERS)
     if generation > MAX_GENERATION:
         raise CliError(EXIT_USAGE, f"--generation {generation}: at most {MAX_GENERATION}")
     file = places.config_path(config, os.environ)

@@ -19,7 +19,7 @@ from typing import Final
 from zsched import paths
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door, find_door
-from zsched.commands.common import CliError, Json, check_reason, nearest, say, warn
+from zsched.commands.common import CliError, Json, check_dangers, check_reason, say, warn
 from zsched.commands.document import (
     QUESTION,
     UNKNOWING,
@@ -141,9 +141,7 @@ def leave(order: LeaveOrder) -> int:
         ConfigError: without this node the document would have faults.
         AdapterError: this machine is in no fleet, or its files cannot be put away.
     """
-    for name in order.accepted:
-        if name not in DANGERS:
-            raise CliError(EXIT_USAGE, f"--accept: there is no danger {name!r}{nearest(name, DANGERS)}")
+    check_dangers(order.accepted, DANGERS)
     check_reason(order.reason)
     fleet, me = whose(order.places.state)
     files = belongings(order.places, is_purged=order.is_purged)

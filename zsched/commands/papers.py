@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 
 from zsched import paths as places
 from zsched.commands.apply import DANGERS, OPEN_NETWORK
-from zsched.commands.common import CliError, check_name, nearest, warn
+from zsched.commands.common import CliError, check_dangers, check_name, warn
 from zsched.commands.pki import (
     begin_for,
     former_keys,
@@ -211,9 +211,7 @@ def refuse_open_network(hosts: Iterable[str], accepted: Collection[str]) -> None
     Raises:
         CliError: an address is outside loopback and private ranges, or a name leads to none that can be looked at.
     """
-    for name in accepted:
-        if name not in DANGERS:
-            raise CliError(EXIT_USAGE, f"--accept: there is no danger {name!r}{nearest(name, DANGERS)}")
+    check_dangers(accepted, DANGERS)
     if OPEN_NETWORK in accepted:
         return
     for host in hosts:

@@ -20,7 +20,17 @@ import typer
 from zsched import paths as places
 from zsched.clock import wall_ns
 from zsched.commands.ask import Door, ask_door, find_door, fleet_here
-from zsched.commands.common import CliError, Json, check_name, interruptible, nearest, print_json, say, warn
+from zsched.commands.common import (
+    CliError,
+    Json,
+    check_dangers,
+    check_name,
+    interruptible,
+    nearest,
+    print_json,
+    say,
+    warn,
+)
 from zsched.config.load import load_fleet
 from zsched.core.values.certificates import Holder, Role, parse_common_name, parse_label
 from zsched.core.values.fleet import Fleet
@@ -70,9 +80,7 @@ def init(where: Where, *, asks_passphrase: bool, accepted: Sequence[str] = ()) -
     """
     from zsched.pki.authority import create  # noqa: PLC0415 - imports cryptography
 
-    for name in accepted:
-        if name not in DANGERS:
-            raise CliError(EXIT_USAGE, f"--accept: there is no danger {name!r}{nearest(name, DANGERS)}")
+    check_dangers(accepted, DANGERS)
     office = _office(where)
     if (trusted := _trusted_here(office.fleet)) and SECOND not in accepted and not _has_record(office.folder):
         advice = f"if that is lost for good (docs/guide/secure.md): --accept {SECOND}"
@@ -143,7 +151,7 @@ def begin_for(fleet: Fleet, node: str, given: Path | None, *, asks_passphrase: b
 def holds_authority(fleet: str, given: Path | None) -> Path | None:
     """The folder of a fleet's authority on this machine; ``None``: there is none."""
     folder = places.authority_folder(given, os.environ, fleet)
-    return folder if (folder / places.AUTHORITY_RECORD).exists() else None
+    return folder if _has_record(folder) else None
 
 
 class Known(Struct, frozen=True, kw_only=True):

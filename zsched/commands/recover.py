@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from zsched import paths as places
-from zsched.commands.common import CliError, nearest, say, says_yes, warn
+from zsched.commands.common import CliError, check_dangers, say, says_yes, warn
 from zsched.commands.here import own_name
 from zsched.commands.orders import user_name
 from zsched.config.load import load_fleet, require_node
@@ -76,9 +76,7 @@ def recover(place: Place, manner: Manner, brought: Sequence[Path]) -> int:
         CliError: something speaks against it, a danger is not accepted, or the operator says no.
         AdapterError: a daemon runs here, or a state cannot be read or written.
     """
-    for name in manner.accepted:
-        if name not in DANGERS:
-            raise CliError(EXIT_USAGE, f"--accept: there is no danger {name!r}{nearest(name, DANGERS)}")
+    check_dangers(manner.accepted, DANGERS)
     plan = consider(runtime.look(place.fleet, place.node, place.config, place.folder, brought))
     if isinstance(plan, str):
         raise CliError(EXIT_FAILED, f"nothing was changed: {plan}")

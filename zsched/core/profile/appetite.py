@@ -48,8 +48,9 @@ class Appetite:
             known = self._shares.get(thread)
             ran, wanted = shares[thread] = known or (_from_nothing(self._at), _from_nothing(self._at))
             ran.update(max(run_s - run_before_s, 0.0) / elapsed_s, now)
-            wanted.update(max(run_s + wait_s - run_before_s - wait_before_s, 0.0) / elapsed_s, now)
-            spent_s += max(run_s + wait_s - run_before_s - wait_before_s, 0.0)
+            both_s = max(run_s + wait_s - run_before_s - wait_before_s, 0.0)
+            wanted.update(both_s / elapsed_s, now)
+            spent_s += both_s
         self.runnable = spent_s / elapsed_s if shares else None
         self._at, self._times, self._shares = now, times, shares
 
