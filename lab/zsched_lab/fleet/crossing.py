@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from typing import Any, Final
 
 import zenoh
 
-from zsched.guard import guarded
+from zsched_lab.fleet.pace import at_pace
 from zsched_lab.fleet.testbed import SCHEDULING, Json, Testbed, echo_fleet
 
 GIVING, TAKING = "hall-a", "hall-b"
@@ -87,22 +86,9 @@ class Ends:
                 self.sent += 1
             time.sleep(pause_s)
 
-    @contextmanager
-    def sending(self) -> Iterator[None]:
+    def sending(self) -> AbstractContextManager[None]:
         """50 numbers a second meanwhile."""
-        end = threading.Event()
-
-        def run() -> None:
-            while not end.wait(0.02):
-                self.send()
-
-        thread = guarded(run, name="sending", is_lasting=False)
-        thread.start()
-        try:
-            yield
-        finally:
-            end.set()
-            thread.join()
+        return at_pace(50.0, self.send)
 
     def flows(self, timeout_s: float = 60.0) -> None:
         """Wait until a number comes that is put from now on."""

@@ -219,13 +219,24 @@ def points(mine: Mapping[int, float], theirs: Mapping[int, float]) -> Difference
     if not common:
         return None
     apart = [mine[run] - theirs[run] for run in common]
-    value, half = statistics.fmean(apart), math.inf
-    if len(apart) > 1:
-        half = T_975[min(len(apart) - 1, len(T_975)) - 1] * statistics.stdev(apart) / math.sqrt(len(apart))
+    value, half = statistics.fmean(apart), interval(apart)
+    half = math.inf if half is None else half
     ours, others = (statistics.fmean(table[run] for run in common) for table in (mine, theirs))
     return Difference(
         value=value, low=value - half, high=value + half, runs=len(common), mine=ours, theirs=others, is_points=True
     )
+
+
+def interval(values: Sequence[float]) -> float | None:
+    """Half of the 95 % interval of a mean (Student's t); ``None`` of one value.
+
+    >>> interval([1.0]), round(interval([1.0, 2.0, 3.0]), 3)
+    (None, 2.484)
+    """
+    if len(values) < 2:
+        return None
+    t = T_975[min(len(values) - 1, len(T_975)) - 1]
+    return t * statistics.stdev(values) / math.sqrt(len(values))
 
 
 def half_width(mine: Sequence[float], theirs: Sequence[float]) -> float:

@@ -5,7 +5,6 @@ Knows: Markdown, the curves, intervals over seeds. Does not know: how a run was 
 
 from __future__ import annotations
 
-import math
 import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,7 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from zsched_lab.demo.plots import COLOURS, DPI
-from zsched_lab.paper.claims import T_975
+from zsched_lab.paper.claims import interval, led
 from zsched_lab.paper.led_metrics import mean_stood
 from zsched_lab.paper.roles import ROLES, mean_shares
 from zsched_lab.paper.schemes import FIXED_SCHEMES, SCHEMES
@@ -43,31 +42,19 @@ STATES = (
 
 def coverage_parts(runs: Sequence[Json]) -> list[str]:
     """Both tables under their headings; nothing of runs whose robots nobody leads."""
-    led = [figures for figures in runs if figures.get("stopped_ratio") is not None]
-    if not led:
+    own = led(runs)
+    if not own:
         return []
     return [
         "### Coverage over time\n",
         COVERAGE_SAYS,
-        coverage_table(led),
+        coverage_table(own),
         "### Whose CPU an edge's was\n",
         "Shares of an edge's CPU, the mean over edges and runs by time. All but zsched's own have a quota in common.\n",
-        roles_table(led),
+        roles_table(own),
         "### When robots stood\n",
-        stood_text(led),
+        stood_text(own),
     ]
-
-
-def interval(values: Sequence[float]) -> float | None:
-    """Half of the 95 % interval of a mean (Student's t); ``None`` of one value.
-
-    >>> interval([1.0]), round(interval([1.0, 2.0, 3.0]), 3)
-    (None, 2.484)
-    """
-    if len(values) < 2:
-        return None
-    t = T_975[min(len(values) - 1, len(T_975)) - 1]
-    return t * statistics.stdev(values) / math.sqrt(len(values))
 
 
 def mean_curve(runs: Sequence[Json]) -> Curve:
@@ -169,7 +156,7 @@ def _stood_cells(row: tuple[float, float] | None) -> tuple[str, str]:
 
 def save_coverage(path: Path, runs: Sequence[Json], title: str) -> str | None:
     """Coverage over time, a line per scheme with its interval; ``None``, and no picture, without any curve."""
-    known = [figures for figures in runs if figures.get("stopped_ratio") is not None and figures.get("coverage_curve")]
+    known = [figures for figures in led(runs) if figures.get("coverage_curve")]
     schemes = [name for name in SCHEMES if any(figures["scheme"] == name for figures in known)]
     if not schemes:
         return None

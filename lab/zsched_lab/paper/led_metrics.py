@@ -16,7 +16,8 @@ from typing import Any
 from zsched.core.values.model import NodeId
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched_lab.fleet.recorder import read_records
-from zsched_lab.paper.arrivals import Arrival, Streams
+from zsched_lab.paper.arrivals import Streams
+from zsched_lab.paper.load import Window, loaded_at
 from zsched_lab.paper.roles import state_of
 
 CURVE_S = 5.0
@@ -32,34 +33,31 @@ def coverage_figures(streams: Streams, duration_s: float, area_m2: float) -> Jso
     mean of the truth's walls that the map has where they are: coverage counts what is known, right or wrong. A robot
     without a map knows nothing.
     """
-    by_robot = [([arrival.t_s for arrival in maps], maps) for maps in streams.maps.values()]
+    by_robot = [
+        ([one.t_s for one in maps], [one.known for one in maps], [one.walls for one in maps])
+        for maps in streams.maps.values()
+    ]
     instants = [CURVE_S * number for number in range(int(duration_s / CURVE_S) + 1)]
     instants += [duration_s] if instants[-1] < duration_s else []
-    curve = [[t_s, statistics.fmean(known_at(times, maps, t_s) for times, maps in by_robot)] for t_s in instants]
-    timed = [(times, [one.known for one in maps], [one.walls for one in maps]) for times, maps in by_robot]
+    curve = [[t_s, statistics.fmean(held_at(times, known, t_s) for times, known, _ in by_robot)] for t_s in instants]
     return {
         "coverage_curve": [[t_s, round(share, 4)] for t_s, share in curve],
-        "coverage_mean": statistics.fmean(held_mean(times, known, duration_s) for times, known, _ in timed),
-        "walls_mean": statistics.fmean(held_mean(times, walls, duration_s) for times, _, walls in timed),
+        "coverage_mean": statistics.fmean(held_mean(times, known, duration_s) for times, known, _ in by_robot),
+        "walls_mean": statistics.fmean(held_mean(times, walls, duration_s) for times, _, walls in by_robot),
         "explored_m2": curve[-1][1] * area_m2,
     }
 
 
-def known_at(times: Sequence[float], maps: Sequence[Arrival], t_s: float) -> float:
-    """What the newest map at ``t_s`` knows; ``times`` are those of ``maps``."""
+def held_at(times: Sequence[float], shares: Sequence[float], t_s: float) -> float:
+    """The newest map's share at ``t_s``; ``shares`` are those of the maps of ``times``, 0 before the first."""
     index = bisect.bisect_right(times, t_s)
-    return maps[index - 1].known if index else 0.0
+    return shares[index - 1] if index else 0.0
 
 
 def held_mean(times: Sequence[float], shares: Sequence[float], duration_s: float) -> float:
-    """The mean over [0, ``duration_s``] of the newest map's share; ``shares`` are those of the maps of ``times``."""
-
-    def at(t_s: float) -> float:
-        index = bisect.bisect_right(times, t_s)
-        return shares[index - 1] if index else 0.0
-
+    """The mean of that over [0, ``duration_s``]."""
     steps = [0.0, *(t_s for t_s in times if 0.0 < t_s < duration_s), duration_s]
-    return sum((b - a) * at(a) for a, b in itertools.pairwise(steps)) / duration_s
+    return sum((b - a) * held_at(times, shares, a) for a, b in itertools.pairwise(steps)) / duration_s
 
 
 def led_figures(folder: Path, run: Mapping[str, Any]) -> Json:
@@ -101,14 +99,16 @@ def stood_figures(
     """
     found: dict[str, list[float]] = {}
     zero_s, duration_s = float(run["zero_s"]), float(run["duration_s"])
-    loads = [(load["node"], float(load["start_s"]), float(load["end_s"])) for load in run["loads"]]
+    loads = [
+        Window(node=load["node"], start_s=float(load["start_s"]), end_s=float(load["end_s"])) for load in run["loads"]
+    ]
     for robot in sorted(slam_on):
         records = read_records(folder / "records" / f"{robot}.ndjson")
         told = [record for record in records if record["kind"] == "progress" and record.get("corrections")]
         node = slam_on[robot]
 
         def state(t_s: float, node: NodeId = node) -> str:
-            return state_of(any(n == node and a <= t_s < b for n, a, b in loads), owners(t_s) == node)
+            return state_of(node in loaded_at(loads, t_s), owners(t_s) == node)
 
         for before, after in itertools.pairwise(told):
             begin, end = float(before["t_s"]) - zero_s, float(after["t_s"]) - zero_s

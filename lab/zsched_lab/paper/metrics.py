@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from zsched.core.values.model import NodeId
 from zsched.tasks.map_merge.cdr import CdrError, decode_grid
 from zsched.tasks.map_merge.grid import Grid
+from zsched_lab.demo.plots import wider
 from zsched_lab.fleet.recorder import read_records
 from zsched_lab.fleet.view import Load
 from zsched_lab.maps.metrics import score_map
@@ -76,7 +77,7 @@ class Truth:
         grid = grid_of(payload)
         if grid is None or not self._wall_x.size:
             return 0.0
-        return _share(grid, _near(grid.occupied, round(WALL_M / grid.resolution)), self._wall_x, self._wall_y)
+        return _share(grid, wider(grid.occupied, round(WALL_M / grid.resolution)), self._wall_x, self._wall_y)
 
 
 def _share(grid: Grid, cells: NDArray[np.bool_], x: NDArray[Any], y: NDArray[Any]) -> float:
@@ -85,19 +86,6 @@ def _share(grid: Grid, cells: NDArray[np.bool_], x: NDArray[Any], y: NDArray[Any
     rows = np.floor((y - grid.origin.y) / grid.resolution).astype(np.int64)
     inside = (columns >= 0) & (columns < grid.width) & (rows >= 0) & (rows < grid.height)
     return float(cells[rows[inside], columns[inside]].sum()) / x.size
-
-
-def _near(cells: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
-    """These cells, and all within ``reach`` rows and columns of one."""
-    found = cells.copy()
-    for axis in (0, 1):
-        line = found.copy()
-        for step in range(1, reach + 1):
-            ahead, behind = [slice(None)] * 2, [slice(None)] * 2
-            ahead[axis], behind[axis] = slice(step, None), slice(None, -step)
-            found[tuple(ahead)] |= line[tuple(behind)]
-            found[tuple(behind)] |= line[tuple(ahead)]
-    return found
 
 
 def measure(folder: Path, scenario: Scenario, truth: Truth) -> Json:
