@@ -1014,6 +1014,27 @@ VOTE_BUGS = (
         ("tests/unit/core/gateway/test_sharing.py", "tests/unit/core/test_closed_loop.py"),
     ),
     _bug(
+        "a machine's queue is the owner's wherever the task was",
+        "zsched.core.gateway.demand",
+        "return known.job if known.job is None or known.owner == node else",
+        "return known.job if node else",
+        ("tests/unit/core/gateway/test_demand.py", "tests/unit/core/test_closed_loop.py"),
+    ),
+    _bug(
+        "a queue that a load made is remembered of the machine",
+        "zsched.core.gateway.demand",
+        "if is_calm(load.jobs) if load.jobs is not None else found.seen_s - found.full_at > CALM_S:",
+        "if found.seen_s >= 0.0:",
+        ("tests/unit/core/gateway/test_demand.py",),
+    ),
+    _bug(
+        "a queue of many jobs is remembered when few come",
+        "zsched.core.gateway.queueing",
+        "return max(one_hz, other_hz) <= SAME_RATE_RATIO * min(one_hz, other_hz)",
+        "return one_hz > 0.0",
+        ("tests/unit/core/gateway/test_queueing.py", "tests/unit/core/test_closed_loop.py"),
+    ),
+    _bug(
         "answers are compared with what was spent since they were counted",
         "zsched.core.gateway.spending",
         "if not risen or not (self._clock is None or self._clock in risen or is_silent):",

@@ -80,6 +80,8 @@ class Machine:
     """Of such an answer, for other things than a CPU."""
     in_bursts: bool = False
     """It works on one whole job after the other, on one core, and rests in between."""
+    queueing: float = 0.0
+    """Its jobs come irregularly: they wait so many times u / (1 - u) of their time for each other, u being busy."""
     rub: float = 1.0
     """A job takes so many times the CPU time when the machine is full."""
     most_cores: float = math.inf
@@ -90,6 +92,8 @@ class Machine:
     """Its one thread waits for its turn among them: a job takes longer there, and wants to run all that time."""
     frees_at: float = math.inf
     """From then on nobody else is there."""
+    fewer_from: float = math.inf
+    """From then on its jobs come a fifth as often."""
     works_until: float = math.inf
     """From then on its worker has nothing to do."""
 
@@ -102,6 +106,7 @@ class Machine:
         rest = max(cpu, 0.0) * self.cores
         # A full machine gives the task what is left, half a core at least.
         needs = self.task_cores / self._speed if is_owner and now < self.works_until else 0.0
+        needs = needs / 5.0 if now >= self.fewer_from else needs
         room = max(self.cores - rest, 0.5)
         takes = min(needs, room, self.most_cores)
         is_short = takes < needs
@@ -188,7 +193,9 @@ class Machine:
         jobs, time_s = int(self._done) - before, max(1.0 / done_hz, cpu_s) if takes < needs else cpu_s
         if self.takes_turns:
             time_s = runnable / done_hz
-        self.answers = (self.waits_s + time_s, done_hz)
+        busy = min(needs, 0.9)
+        queue_s = time_s * self.queueing * busy / (1.0 - busy)
+        self.answers = (self.waits_s + time_s + queue_s, done_hz)
         if self.is_foreign:
             self.told = None
             return
@@ -200,7 +207,7 @@ class Machine:
             time_s=word.time_s + jobs * (time_s + (self.waits_s if self.takes_turns else 0.0)),
             cpu_s=word.cpu_s + jobs * cpu_s,
             wait_s=(word.wait_s or 0.0) + jobs * (time_s - cpu_s),
-            age_s=(word.age_s or 0.0) + jobs * (time_s + (self.waits_s if self.takes_turns else 0.0)),
+            age_s=(word.age_s or 0.0) + jobs * (time_s + queue_s + (self.waits_s if self.takes_turns else 0.0)),
         )
 
 
@@ -877,6 +884,47 @@ def test_jobs_that_a_load_held_up_are_no_reason_to_leave_when_it_has_ended(
     by_latency = replace(BY_SERVICE, deadline_ms=deadline_ms)
     loop = Loop((machine, replace(machine, name="edge2")), weights=CPU_ONLY, tuning=by_latency, learns=True)
     assert loop.run(60.0) == []
+
+
+QUEUES = Machine(name="edge1", base=0.1, signal_dbm=-45.0, task_cores=0.5, job_s=0.06, queueing=1.0)
+
+
+@settings(derandomize=True, database=None, deadline=None, max_examples=8)
+@example(far_dbm=-55.0, speed=2.0, queueing=1.0, deadline_ms=150.0, is_foreign=False)
+@example(far_dbm=-60.0, speed=2.0, queueing=2.0, deadline_ms=150.0, is_foreign=False)
+@example(far_dbm=-60.0, speed=2.0, queueing=1.0, deadline_ms=100.0, is_foreign=True)
+@given(
+    far_dbm=st.floats(-70.0, -45.0),
+    speed=st.floats(1.0, 4.0),
+    queueing=st.floats(0.2, 3.0),
+    deadline_ms=st.floats(60.0, 300.0),
+    is_foreign=st.booleans(),
+)
+def test_a_task_whose_jobs_wait_for_each_other_comes_to_rest(
+    far_dbm: float, speed: float, queueing: float, deadline_ms: float, is_foreign: bool
+) -> None:
+    """A quick machine far away keeps the deadline, and by its short queue the slow one nearby would keep it as well.
+
+    By the owner's queue alone the examples are limit cycles of 19 to 38 moves (docs/decisions/0123).
+    """
+    near = replace(QUEUES, queueing=queueing, is_foreign=is_foreign)
+    far = replace(near, name="edge2", speed=speed, signal_dbm=far_dbm)
+    tuning = replace(BY_SERVICE, deadline_ms=deadline_ms)
+    moves = Loop((near, far), weights=WITH_NETWORK, tuning=tuning, learns=True).run(400.0)
+    assert len(moves) <= 4
+    assert [at for at, _ in moves if at > 200.0] == []
+
+
+@pytest.mark.parametrize("is_foreign", [False, True])
+def test_a_machine_that_was_too_slow_for_its_queue_has_the_task_again_when_jobs_come_less_often(
+    is_foreign: bool,
+) -> None:
+    near = replace(QUEUES, is_foreign=is_foreign, fewer_from=60.0)
+    far = replace(near, name="edge2", speed=2.0, signal_dbm=-60.0)
+    loop = Loop((near, far), weights=WITH_NETWORK, tuning=replace(BY_SERVICE, deadline_ms=100.0), learns=True)
+    moves = loop.run(400.0)
+    assert [where for _, where in moves] == ["edge2", "edge1"]
+    assert moves[0][0] < 60.0 < moves[1][0]
 
 
 @pytest.mark.parametrize("base", [0.7, 1.0])

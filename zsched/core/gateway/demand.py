@@ -14,7 +14,8 @@ from __future__ import annotations
 import math
 
 from zsched.core.gateway.company import Company, is_full
-from zsched.core.gateway.job_need import CALM_S, Heard, JobNeed, other_s, told_job
+from zsched.core.gateway.job_need import CALM_S, Heard, JobNeed, is_calm, other_s, told_job
+from zsched.core.gateway.queueing import Queues
 from zsched.core.gateway.spending import Spending
 from zsched.core.gateway.task_speed import MOST_RATIO, TaskSpeeds, speed_of
 from zsched.core.values.fleet import Demand, TaskSpec
@@ -99,6 +100,7 @@ class Demands:
         self._shortfalls: dict[tuple[TaskId, NodeId], _Shortfall] = {}
         self._foretold: dict[TaskId, _Foretold] = {}
         self._speeds = TaskSpeeds()
+        self._queues = Queues()
         self._spending: dict[TaskId, Spending] = {}
         """What the task's worker has spent on answers where the task is."""
 
@@ -136,7 +138,7 @@ class Demands:
         if load is None or load.state is not WorkerState.READY or profile.cpu_used_cores is None:
             return False
         if known.owner != profile.node:
-            known = _came(known, profile.node, now)
+            known = _came(known, self.job_on(task, profile.node), profile.node, now)
             self._spending.pop(task, None)
         found = replace(known, seen_s=now)
         if is_full(profile):
@@ -171,6 +173,7 @@ class Demands:
             found = _with_heard(found, load, heard, job_cpu_s, speed, now)
         else:
             found = _with_job(found, load, speed, is_new=is_new)
+        self._note_waits(task, profile.node, load, found, now - max(known.seen_s, known.since))
         self._known[task] = found
         is_seen = not is_new and self._note_shortfall(task, profile, load, found, fair_cores, heard, now)
         return is_seen or (found.work, found.memory_mb, found.job) != (known.work, known.memory_mb, known.job)
@@ -181,6 +184,7 @@ class Demands:
         self._spending.pop(task, None)
         self._foretold.pop(task, None)
         self._speeds.forget(task)
+        self._queues.forget(task)
         self._shortfalls = {key: seen for key, seen in self._shortfalls.items() if key[0] != task}
 
     def expect_another(self, task: TaskId) -> None:
@@ -247,6 +251,16 @@ class Demands:
         self._speeds.note(task, profile, speed)
         return as_before
 
+    def _note_waits(self, task: TaskId, node: NodeId, load: WorkerLoad, found: _Known, elapsed_s: float) -> None:
+        """Remember how often jobs come, and how they wait on a machine that has CPU to spare."""
+        spending = self._spending.get(task)
+        hz = load.jobs.wanted_hz if load.jobs is not None else None if spending is None else spending.answers_hz
+        if found.job is None or not hz:
+            return
+        self._queues.count(task, hz, elapsed_s)
+        if is_calm(load.jobs) if load.jobs is not None else found.seen_s - found.full_at > CALM_S:
+            self._queues.note(task, node, found.job, elapsed_s)
+
     def _note_shortfall(
         self,
         task: TaskId,
@@ -292,6 +306,11 @@ class Demands:
         """One job's need; ``None``: its worker has never reported any."""
         return self._known.get(task, _Known()).job
 
+    def job_on(self, task: TaskId, node: NodeId) -> JobNeed | None:
+        """One job's need on a node: it waits there as was seen there; ``None``: its worker has never reported any."""
+        known = self._known.get(task, _Known())
+        return known.job if known.job is None or known.owner == node else self._queues.on(task, node, known.job)
+
     def has_been(self, task: TaskId, node: NodeId, for_s: float, now: float) -> bool:
         """Whether the task has been seen on the node, with its worker ready, for so long."""
         known = self._known.get(task, _Known())
@@ -320,12 +339,12 @@ class Demands:
         )
 
 
-def _came(known: _Known, node: NodeId, now: float) -> _Known:
+def _came(known: _Known, job: JobNeed | None, node: NodeId, now: float) -> _Known:
     """It begins to be seen on a node: another one than before, or the same one, where its worker has started again."""
     before = None
     if known.seen_at not in (None, node) and now - known.seen_s <= RECENT_S:
         before = _Before(known.work if known.is_sure else None, known.job_work_s)
-    return replace(known, owner=node, since=now, before=before, seen_at=node, full_at=-math.inf)
+    return replace(known, owner=node, since=now, before=before, seen_at=node, full_at=-math.inf, job=job)
 
 
 def is_short(load: WorkerLoad) -> bool:

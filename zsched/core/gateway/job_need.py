@@ -4,9 +4,10 @@ Knows: work and waits of a job, what of a time was which. Does not know: what a 
 (`zsched.core.gateway.demand`), how answers are measured (`zsched.core.profile.answers`).
 
 A foreign worker tells nothing. Its processes are measured, so CPU time per answer is known. The rest of an answer's
-time is a wait for other things, the same on every machine, if the owner has had CPU to spare for some seconds. On a
-full machine, and soon after, the rest is also a wait for a CPU. There the wait for other things counts as it was seen
-before, and what an answer takes longer than foreseen is remembered of that machine.
+time is a wait for other things, if the owner has had CPU to spare for some seconds. On a full machine, and soon after,
+the rest is also a wait for a CPU. There the wait for other things counts as it was seen before, and what an answer
+takes longer than foreseen is remembered of that machine. Elsewhere it is what was seen there
+(`zsched.core.gateway.queueing`), and the owner's until then.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ class JobNeed(Struct, frozen=True):
     work_s: float
     """CPU time at speed 1."""
     other_s: float
-    """Its wait for things other than a CPU, the same on every machine."""
+    """Its wait for things other than a CPU; of heard answers also for each other."""
     queue_ratio: float
     """Time from arrival to end over its own time where nothing is short; at least 1."""
     is_serial: bool
@@ -52,8 +53,13 @@ class JobNeed(Struct, frozen=True):
 
 
 def other_s(jobs: Jobs) -> float:
-    """A job's wait for things other than a CPU, the same on every machine; 0 where the kernel does not report it."""
+    """A job's wait for things other than a CPU; 0 where the kernel does not report it."""
     return 0.0 if jobs.wait_s is None else max(jobs.time_s - jobs.wait_s - jobs.cpu_s, 0.0)
+
+
+def is_calm(jobs: Jobs) -> bool:
+    """Whether they show their usual wait in the queue: next to no wait for a CPU."""
+    return jobs.wait_s is not None and jobs.wait_s <= CALM_WAIT_RATIO * jobs.time_s
 
 
 def told_job(jobs: Jobs, speed: float, known: JobNeed | None) -> JobNeed:
@@ -61,8 +67,7 @@ def told_job(jobs: Jobs, speed: float, known: JobNeed | None) -> JobNeed:
     is_serial, queue_ratio = jobs.wait_s is not None, QUEUE_RATIO if known is None else known.queue_ratio
     if jobs.age_s is not None and jobs.time_s > 0.0:
         seen = max(jobs.age_s / jobs.time_s, 1.0)
-        is_calm = jobs.wait_s is not None and jobs.wait_s <= CALM_WAIT_RATIO * jobs.time_s
-        queue_ratio = seen if is_calm else min(seen, queue_ratio)
+        queue_ratio = seen if is_calm(jobs) else min(seen, queue_ratio)
     work_s = jobs.cpu_s if is_serial else min(jobs.cpu_s, jobs.time_s)
     return JobNeed(work_s=work_s * speed, other_s=other_s(jobs), queue_ratio=queue_ratio, is_serial=is_serial)
 

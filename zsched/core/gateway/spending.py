@@ -36,7 +36,7 @@ class Spending:
         self._spent_s: float | None = None
         self._counts: dict[NodeId, float] | None = None
         """Both by the last look that counted; ``None``: none has."""
-        self._cpu_s = self._answers = 0.0
+        self._cpu_s = self._answers = self._for_s = 0.0
         self._clock: NodeId | None = None
         """The robot whose rises are waited for."""
         self._at = self._gap_s = 0.0
@@ -65,6 +65,7 @@ class Spending:
             self._cpu_s = kept * self._cpu_s + _risen(self._spent_s, spent_s)
             answers = sum(_risen(self._counts.get(robot), count) for robot, count in counts)
             self._answers = kept * self._answers + answers
+            self._for_s = kept * self._for_s + self._gap_s
         self._spent_s = spent_s
         self._counts |= dict(counts)
 
@@ -72,6 +73,11 @@ class Spending:
     def per_answer_s(self) -> float | None:
         """CPU seconds per answer, of all threads; ``None``: there were too few answers."""
         return self._cpu_s / self._answers if self._answers >= LEAST_ANSWERS else None
+
+    @property
+    def answers_hz(self) -> float | None:
+        """How often answers came, on the mean; ``None``: there were too few."""
+        return self._answers / self._for_s if self._answers >= LEAST_ANSWERS else None
 
 
 def _risen(before: float | None, now: float) -> float:

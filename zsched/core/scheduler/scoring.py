@@ -419,7 +419,7 @@ def _cpu(
         return None
     if tuning.score is ScoreForm.PAPER:
         return cpu_utility(profile.cpu_cores, used)
-    free, job = profile.cpu_cores - used + demand.cpu_cores, demands.job(spec.name)
+    free, job = profile.cpu_cores - used + demand.cpu_cores, demands.job_on(spec.name, profile.node)
     share, stretch = demands.experience(spec.name, profile)
     share *= spare_factor(profile.cpu_cores - used, profile.cpu_cores, spec.cpu_floor_ratio)
     if job is None:
