@@ -1035,6 +1035,20 @@ VOTE_BUGS = (
         ("tests/unit/core/gateway/test_queueing.py", "tests/unit/core/test_closed_loop.py"),
     ),
     _bug(
+        "others that waited only beside a task are forgotten when it leaves",
+        "zsched.core.gateway.sharing",
+        "more = 0.0 if seen is None or seen.left_at is None else seen.more",
+        "more = 0.0",
+        ("tests/unit/core/gateway/test_sharing.py", "tests/unit/core/test_closed_loop_tasks.py"),
+    ),
+    _bug(
+        "what comes is taken off the share of an owner that is short",
+        "zsched.core.scheduler.scoring",
+        "least = min(fair, own.cpu_cores) if is_measured else fair",
+        "least = 0.0 if is_measured else fair",
+        ("tests/unit/core/scheduler/test_bookings.py", "tests/unit/core/test_closed_loop_tasks.py"),
+    ),
+    _bug(
         "answers are compared with what was spent since they were counted",
         "zsched.core.gateway.spending",
         "if not risen or not (self._clock is None or self._clock in risen or is_silent):",

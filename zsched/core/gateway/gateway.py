@@ -108,6 +108,9 @@ class Gateway:
         if self.demands.is_replaced(task, profile):
             self.forget(task)
         has_share = self._shares.learn(task, profile)
+        for name in self._shares.left_by(task, owner):
+            left = self.fresh(name, now)
+            has_share |= left is not None and self._shares.look_back(task, left, now)
         # What a job takes there is compared with what `score` foretells, so by the same share.
         fair = 0.0 if spec is None else self.share(spec, profile, self.demand(spec, profile).cpu_cores, 0.0)
         heard = None if spec is None or tells_jobs(spec.worker) else self._heard(task, owner, now)

@@ -136,11 +136,9 @@ def score(
             refused.append((candidate, "no fresh profile"))
             continue
         load = profile.worker(spec.name)
-        # what an owner that is short gets is measured
-        is_owner = candidate == allocation.owner
-        is_measured = is_owner and load is not None and is_short(load)
         demand, unseen = gateway.demand(spec, profile), _unseen(spec, profile, bookings, gateway)
-        use = _predicted(spec, allocation, profile, demand, unseen)
+        own = _own(spec, allocation, profile, demand)
+        use = _predicted(profile, own, demand, unseen)
         gauges = _readings(spec, allocation, profile, gateway, _coming_gpu(spec, profile, bookings, gateway, now))
         reason = _refusal(spec, allocation, profile, demand, use, gauges)
         if reason:
@@ -151,7 +149,9 @@ def score(
             unreachable.append(candidate)
             continue
         fair = gateway.share(spec, profile, demand.cpu_cores, unseen.cpu_cores)
-        least = 0.0 if is_measured else fair
+        # what an owner that is short gets is measured
+        is_measured = candidate == allocation.owner and load is not None and is_short(load)
+        least = min(fair, own.cpu_cores) if is_measured else fair
         network_s = away_s.get(candidate, 0.0)
         cpu = _cpu(spec, profile, demand, use, allocation.tuning, gateway.demands, network_s, least, fair)
         memory = _memory(spec, profile, demand, use, form)
@@ -239,9 +239,8 @@ class _Use(Struct, frozen=True):
     memory_mb: float | None
 
 
-def _predicted(spec: TaskSpec, allocation: Allocation, profile: Profile, demand: Demand, unseen: Demand) -> _Use:
+def _predicted(profile: Profile, own: Demand, demand: Demand, unseen: Demand) -> _Use:
     cpu, memory = profile.cpu_used_cores, profile.memory_used_mb
-    own = _own(spec, allocation, profile, demand)
     return _Use(
         cpu_cores=None if cpu is None else predicted_use(cpu + unseen.cpu_cores, own.cpu_cores, demand.cpu_cores),
         memory_mb=None if memory is None else predicted_use(memory + unseen.memory_mb, own.memory_mb, demand.memory_mb),

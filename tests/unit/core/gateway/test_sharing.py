@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from support.profiles import load_of, profile_of
-from zsched.core.gateway.sharing import Shares, fair_share
+from zsched.core.gateway.sharing import LEFT_S, Shares, fair_share
 from zsched.core.values.profile import Jobs, Profile, WorkerLoad, WorkerState
 
 
@@ -77,6 +77,51 @@ def test_what_it_got_counts_as_a_part_of_what_as_many_threads_would_get_by_fairn
     assert shares.at("merge", idle(), 0.25) == pytest.approx(4.0 / 9 / 2), "beside seven others half a core is fair"
     shares.learn("merge", profile(runnable=2.0, got=2.0, wanted=4.0))
     assert shares.at("merge", idle(runnable=0.0), 0.25) == pytest.approx(2.0), "the machine is the task's alone"
+
+
+def crowded(shares: Shares, beside: float = 5.0) -> None:
+    """The task had four threads on edge1, and a fair share beside so many others."""
+    got = fair_share(4.0, 4.0, beside)
+    assert shares.learn("merge", profile(runnable=4.0 + beside, got=got, wanted=4.0))
+
+
+def test_others_that_waited_only_beside_the_task_wait_again_when_it_comes_back() -> None:
+    shares, now = Shares(), 100.0
+    crowded(shares)
+    assert shares.left_by("merge", "edge2") == ("edge1",)
+    assert shares.left_by("merge", "edge1") == shares.left_by("slam", "edge2") == ()
+    for runnable in (8.5, 4.0, 3.0):  # its worker ends, and the means follow
+        ending = replace(idle(runnable=runnable), workers=(load_of(cpu_cores=0.0, runnable=max(runnable - 5.0, 0.0)),))
+        shares.look_back("merge", ending, now)
+        assert shares.at("merge", ending, 4.0) == pytest.approx(fair_share(4.0, 4.0, 5.0))
+        now += 1.0
+    assert not shares.look_back("merge", ending, now), "the same again is no news"
+    assert shares.at("merge", idle("edge2", runnable=3.0), 4.0) == pytest.approx(fair_share(4.0, 4.0, 3.0))
+    now += LEFT_S
+    assert not shares.look_back("merge", idle(runnable=0.0), now), "what changes later is the others' doing"
+    assert shares.at("merge", idle(runnable=0.0), 4.0) == pytest.approx(fair_share(4.0, 4.0, 2.0))
+
+
+def test_where_the_task_is_again_others_are_those_that_are_seen() -> None:
+    shares = Shares()
+    crowded(shares)
+    assert shares.look_back("merge", idle(runnable=3.0), 100.0)
+    there = profile(runnable=5.0, got=2.0)  # it lacks nothing now: nothing is learnt
+    assert not shares.learn("merge", there)
+    assert shares.at("merge", there, 2.0) == pytest.approx(fair_share(4.0, 4.0, 3.0))
+    assert shares.look_back("merge", idle(runnable=1.0), 900.0), "it has left once more"
+    assert shares.at("merge", idle(runnable=1.0), 4.0) == pytest.approx(fair_share(4.0, 4.0, 5.0))
+
+
+def test_fewer_others_beside_the_task_than_without_it_are_not_believed_and_nobody_counted_is_nothing() -> None:
+    shares = Shares()
+    crowded(shares)
+    assert not shares.look_back("merge", profile(runnable=None, got=0.0), 99.0)
+    shares.look_back("merge", idle(runnable=9.0), 100.0)
+    assert shares.at("merge", idle(runnable=9.0), 4.0) == pytest.approx(fair_share(4.0, 4.0, 9.0))
+    shares.forget("merge")
+    assert shares.left_by("merge", "edge2") == ()
+    assert not shares.look_back("merge", idle(), 100.0)
 
 
 def test_nothing_is_learnt_of_a_worker_whose_use_nobody_measured() -> None:

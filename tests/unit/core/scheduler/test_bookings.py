@@ -11,8 +11,9 @@ from support.fleets import fleet_of, task_of
 from support.profiles import load_of, profile_of
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.scoring import score
+from zsched.core.scheduler.utility import service_utility
 from zsched.core.values.fleet import Demand, TaskSpec, WorkerSpec
-from zsched.core.values.model import PeerState, Utility
+from zsched.core.values.model import PeerState, ScoreForm, Tuning, Utility, Weights
 from zsched.core.values.profile import WorkerLoad, WorkerState
 
 TASKS = tuple(
@@ -23,6 +24,7 @@ MAP, PLAN, WATCH = TASKS
 FLEET = fleet_of(*TASKS, of=("edge1", "robot1"), electors=("robot1",))
 NOBODY = allocation_of(owner=None, task="map")
 READY = WorkerState.READY
+CPU = Weights(cpu=1.0, memory=0.0, network=0.0)
 
 
 def load(task: str, cpu: float | None = None, memory: float | None = None) -> WorkerLoad:
@@ -69,6 +71,28 @@ def test_what_another_task_will_use_counts_as_far_as_its_worker_does_not_show_it
     utility = seen(shown, booked=(PLAN,))
     same = seen(shown, cpu=1.0 + cpu, memory=1000.0 + memory)
     assert (utility.cpu, utility.memory) == pytest.approx((same.cpu, same.memory))
+
+
+@pytest.mark.parametrize("coming_cores", [0.0, 0.5, 6.0])
+def test_an_owner_that_is_short_keeps_its_share_beside_what_comes_and_gets_no_more_than_now(
+    coming_cores: float,
+) -> None:
+    """A candidate would share with what comes: taken off what the owner gets, the task would go there and back."""
+    spec = replace(MAP, candidates=("edge1", "edge2"), demand=Demand(cpu_cores=3.0))
+    plan = replace(PLAN, demand=Demand(cpu_cores=0.5 + coming_cores))
+    fleet = fleet_of(spec, plan, of=("edge1", "edge2", "robot1"), electors=("robot1",))
+    gateway = Gateway(fleet)
+    here = (load_of("map", READY, cpu_cores=1.5, wanted_cores=3.0, runnable=3.0), load("plan", 0.5))
+    there = (load_of("map", READY, cpu_cores=0.0, runnable=0.0), load("plan", 0.5))
+    assert gateway.absorb(profile_of("edge1", cpu_used_cores=4.0, workers=here, runnable=8.0), 10.0) is None
+    assert gateway.absorb(profile_of("edge2", cpu_used_cores=4.0, workers=there, runnable=5.0), 10.0) is None
+    agreed = allocation_of(task="map", tuning=Tuning(weights=CPU, score=ScoreForm.SERVICE))
+    gateway.learn_demand("map", "edge1", 10.0)
+    states = dict.fromkeys(("edge1", "edge2", "robot1"), PeerState.ALIVE)
+    booked = {"edge1": (plan,), "edge2": (plan,)}
+    terms = {one.candidate: one.cpu for one in score(spec, agreed, "robot1", gateway, states, 10.0, booked).utilities}
+    assert terms["edge1"] == pytest.approx(terms["edge2"])
+    assert terms["edge1"] == pytest.approx(service_utility(4.0 * 3.0 / (8.0 + coming_cores), 3.0, 4.0))
 
 
 def test_several_tasks_add_up_and_our_own_and_a_stranger_s_do_not_count() -> None:
