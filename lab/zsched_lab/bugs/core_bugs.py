@@ -987,7 +987,7 @@ VOTE_BUGS = (
     ),
     _bug(
         "jobs that a load held up are a machine's fault when it has ended",
-        "zsched.core.gateway.demand",
+        "zsched.core.gateway.shortfall",
         "return max(age_s, mean_s)",
         "return age_s",
         ("tests/unit/core/gateway/test_demand.py", "tests/unit/core/test_closed_loop.py"),

@@ -13,9 +13,10 @@ from __future__ import annotations
 
 import math
 
-from zsched.core.gateway.company import Company, is_full
-from zsched.core.gateway.job_need import CALM_S, Heard, JobNeed, is_calm, other_s, told_job
+from zsched.core.gateway.company import is_full
+from zsched.core.gateway.job_need import CALM_S, Heard, JobNeed, age_of, is_calm, other_s, told_job
 from zsched.core.gateway.queueing import Queues
+from zsched.core.gateway.shortfall import Shortfalls, shows_lack
 from zsched.core.gateway.spending import Spending
 from zsched.core.gateway.task_speed import MOST_RATIO, TaskSpeeds, speed_of
 from zsched.core.values.fleet import Demand, TaskSpec
@@ -33,28 +34,6 @@ RECENT_S = 60.0
 """Older figures say nothing of the machine to which a task has come: the task may have changed since."""
 SAME_JOB_RATIO = 0.8
 """CPU times per answer count as the same up to this quotient: both are means of some answers."""
-LAGS_S = 4.0
-"""Time constant of the age that is foretold: jobs' ages are means that follow later than the machine's figures."""
-SHORT_RATIO = 0.9
-"""A task that gets a smaller part of its forecast has a shortfall on that machine."""
-
-
-class _Foretold(Struct, frozen=True):
-    """How long a task's jobs were to take on a machine, on the mean of the last seconds."""
-
-    node: NodeId
-    age_s: float
-    at: float
-
-
-class _Shortfall(Struct, frozen=True):
-    """What a task got on a machine, compared with the forecast for that machine."""
-
-    share: float
-    """The part of the forecast work that it got, at most 1."""
-    stretch: float
-    """How many times as long its jobs took, at least 1."""
-    company: Company
 
 
 class _Before(Struct, frozen=True):
@@ -97,8 +76,8 @@ class Demands:
 
     def __init__(self) -> None:
         self._known: dict[TaskId, _Known] = {}
-        self._shortfalls: dict[tuple[TaskId, NodeId], _Shortfall] = {}
-        self._foretold: dict[TaskId, _Foretold] = {}
+        self.shortfalls = Shortfalls()
+        """What machines did not keep."""
         self._speeds = TaskSpeeds()
         self._queues = Queues()
         self._spending: dict[TaskId, Spending] = {}
@@ -152,19 +131,8 @@ class Demands:
             found = replace(found, memory_mb=max(load.memory_mb, (known.memory_mb or 0.0) if is_new else 0.0))
         if load.cpu_cores is not None:
             speed = self._speeds.of(task, profile, is_there=True)
-            use, most = load.cpu_cores * speed, (load.wanted_cores or 0.0) * speed
-            told = _told(load, speed, max(fastest or speed, speed))
-            least = max(use, known.work or 0.0)
-            is_held = known.is_sure and known.work == least
-            is_starved = is_full(profile)
-            if told is not None and not known.is_sure and (most > use or is_new or is_starved):
-                found = replace(found, work=max(told, known.work or 0.0) if is_new else told)
-            elif most > use and not (is_held and least <= most):
-                found = replace(found, work=min(UNSURE * use, most), is_sure=False)
-            elif most > use or is_new or is_starved:
-                found = replace(found, work=least, is_sure=is_held)
-            else:
-                found = replace(found, work=use, is_sure=True)
+            fastest = max(fastest or speed, speed)
+            found = _with_use(found, load, load.cpu_cores, speed, fastest, is_new=is_new, is_starved=is_full(profile))
             if before is not None:
                 has_jobs = job_cpu_s is not None
                 found = self._compared(task, profile, found, before, is_new=is_new, has_jobs=has_jobs)
@@ -175,17 +143,27 @@ class Demands:
             found = _with_job(found, load, speed, is_new=is_new)
         self._note_waits(task, profile.node, load, found, now - max(known.seen_s, known.since))
         self._known[task] = found
-        is_seen = not is_new and self._note_shortfall(task, profile, load, found, fair_cores, heard, now)
+        age_s, is_seen = age_of(load.jobs, heard), False
+        if not is_new and age_s is not None and found.job is not None and found.work:
+            is_seen = self.shortfalls.note(
+                task,
+                profile,
+                found.job,
+                age_s,
+                need_cores=found.work / speed,
+                speed=speed,
+                fair_cores=fair_cores,
+                now=now,
+            )
         return is_seen or (found.work, found.memory_mb, found.job) != (known.work, known.memory_mb, known.job)
 
     def forget(self, task: TaskId) -> None:
         """Know nothing of a task that is no more: one of the same name that comes later is another one (0043)."""
         self._known.pop(task, None)
         self._spending.pop(task, None)
-        self._foretold.pop(task, None)
         self._speeds.forget(task)
         self._queues.forget(task)
-        self._shortfalls = {key: seen for key, seen in self._shortfalls.items() if key[0] != task}
+        self.shortfalls.forget(task)
 
     def expect_another(self, task: TaskId) -> None:
         """Know nothing of a task whose program the file has changed; what its owner's one still shows counts for now.
@@ -261,47 +239,6 @@ class Demands:
         if is_calm(load.jobs) if load.jobs is not None else found.seen_s - found.full_at > CALM_S:
             self._queues.note(task, node, found.job, elapsed_s)
 
-    def _note_shortfall(
-        self,
-        task: TaskId,
-        profile: Profile,
-        load: WorkerLoad,
-        found: _Known,
-        fair_cores: float,
-        heard: Heard | None,
-        now: float,
-    ) -> bool:
-        """Remember that the task gets less on a machine than forecast, or no longer does; whether that has changed."""
-        job, company = found.job, Company.of(task, profile)
-        age_s = _age_s(load, heard)
-        if age_s is None or job is None or company is None or load.cpu_cores is None or not found.work:
-            return False
-        speed = self._speeds.of(task, profile, is_there=True)
-        need, free = found.work / speed, profile.cpu_cores - company.others_cores
-        most = job.most_cores(speed)
-        foreseen = min(free / need, 1.0 if most is None else most / need, 1.0)
-        is_lacking = foreseen > 0.0 and _is_told(load) and is_short(load)
-        share = min(load.cpu_cores / need / foreseen, 1.0) if is_lacking else 1.0
-        foretold_s = self._foretell(task, profile.node, job.age_s(speed, max(free, fair_cores)), now)
-        stretch = max(age_s / max(foretold_s, 1e-9), 1.0)
-        before = self._shortfalls.pop((task, profile.node), None)
-        if share >= SHORT_RATIO and stretch <= 1.0 / SHORT_RATIO:
-            return before is not None
-        self._shortfalls[task, profile.node] = _Shortfall(share, stretch, company)
-        return before != self._shortfalls[task, profile.node]
-
-    def _foretell(self, task: TaskId, node: NodeId, age_s: float, now: float) -> float:
-        """The age that jobs' mean age is compared with: this one, or what was foretold of those that ended before.
-
-        When a load ends the jobs that it held up count in their mean for some seconds.
-        """
-        known = self._foretold.get(task)
-        if known is None or known.node != node:
-            known = _Foretold(node, age_s, now)
-        mean_s = age_s + (known.age_s - age_s) * math.exp(-max(now - known.at, 0.0) / LAGS_S)
-        self._foretold[task] = _Foretold(node, mean_s, now)
-        return max(age_s, mean_s)
-
     def job(self, task: TaskId) -> JobNeed | None:
         """One job's need; ``None``: its worker has never reported any."""
         return self._known.get(task, _Known()).job
@@ -315,15 +252,6 @@ class Demands:
         """Whether the task has been seen on the node, with its worker ready, for so long."""
         known = self._known.get(task, _Known())
         return known.owner == node and now - known.since >= for_s
-
-    def experience(self, task: TaskId, profile: Profile) -> tuple[float, float]:
-        """(part of the forecast work that the task got there, at most 1; how many times as long its jobs took).
-
-        This counts while others use about as much there, whoever owns the task now. The owner's term is measured, so a
-        machine must not look better as soon as the task has left.
-        """
-        seen = self._shortfalls.get((task, profile.node))
-        return (seen.share, seen.stretch) if seen and seen.company.is_still(task, profile) else (1.0, 1.0)
 
     def speed(self, task: TaskId, profile: Profile) -> float:
         """The task's speed on a node, > 0: the benchmark's, or what was seen when the task came there."""
@@ -347,28 +275,20 @@ def _came(known: _Known, job: JobNeed | None, node: NodeId, now: float) -> _Know
     return replace(known, owner=node, since=now, before=before, seen_at=node, full_at=-math.inf, job=job)
 
 
-def is_short(load: WorkerLoad) -> bool:
-    """Whether the worker visibly wants more than it gets; an idle worker lacks nothing.
-
-    Either its threads always want to run and run for less, or it leaves work undone.
-    """
-    jobs, use = load.jobs, load.cpu_cores or 0.0
-    is_hungry = load.wanted_cores is not None and use < SHORT_RATIO * load.wanted_cores
-    return is_hungry or (jobs is not None and jobs.done_hz < SHORT_RATIO * jobs.wanted_hz)
-
-
-def _age_s(load: WorkerLoad, heard: Heard | None) -> float | None:
-    """From a job's arrival to its end: by the worker's report, else by its answers; ``None``: nobody knows."""
-    jobs = load.jobs
-    if jobs is None:
-        return None if heard is None else heard.age_s
-    return jobs.time_s if jobs.age_s is None else jobs.age_s
-
-
-def _is_told(load: WorkerLoad) -> bool:
-    """Whether the worker's report shows its lack of CPU, and not only its undone work."""
-    jobs = load.jobs
-    return jobs is not None and (jobs.wait_s is not None or load.wanted_cores is not None)
+def _with_use(
+    known: _Known, load: WorkerLoad, cores: float, speed: float, fastest: float, *, is_new: bool, is_starved: bool
+) -> _Known:
+    """With the work that its use of ``cores`` shows (`Demands.learn`)."""
+    use, most = cores * speed, (load.wanted_cores or 0.0) * speed
+    told, least = _told(load, speed, fastest), max(use, known.work or 0.0)
+    is_held = known.is_sure and known.work == least
+    if told is not None and not known.is_sure and (most > use or is_new or is_starved):
+        return replace(known, work=max(told, known.work or 0.0) if is_new else told)
+    if most > use and not (is_held and least <= most):
+        return replace(known, work=min(UNSURE * use, most), is_sure=False)
+    if most > use or is_new or is_starved:
+        return replace(known, work=least, is_sure=is_held)
+    return replace(known, work=use, is_sure=True)
 
 
 def _told(load: WorkerLoad, speed: float, fastest: float) -> float | None:
@@ -379,7 +299,7 @@ def _told(load: WorkerLoad, speed: float, fastest: float) -> float | None:
     waited for a CPU, that bound is known. Elsewhere only threads that always want to run show a lack.
     """
     jobs, use = load.jobs, load.cpu_cores
-    if jobs is None or use is None or not _is_told(load):
+    if jobs is None or use is None or not shows_lack(load):
         return None
     undone_hz = jobs.wanted_hz - jobs.done_hz
     if jobs.wait_s is None:

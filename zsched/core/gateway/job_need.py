@@ -92,6 +92,13 @@ class Heard(Struct, frozen=True):
         return JobNeed(work_s=cpu_s * speed, other_s=waits_s, queue_ratio=1.0, is_serial=False)
 
 
+def age_of(jobs: Jobs | None, heard: Heard | None) -> float | None:
+    """From a job's arrival to its end: by the worker's report, else by its answers; ``None``: nobody knows."""
+    if jobs is None:
+        return None if heard is None else heard.age_s
+    return jobs.time_s if jobs.age_s is None else jobs.age_s
+
+
 def heard_of(task: TaskId, owner: NodeId, profiles: Iterable[Profile]) -> Heard | None:
     """What these profiles tell of the answers of the task's owner; ``None``: nothing."""
     told: dict[NodeId, AnswerTime] = {}

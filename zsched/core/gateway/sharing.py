@@ -16,8 +16,8 @@ from __future__ import annotations
 from typing import Final
 
 from zsched.core.gateway.company import is_full
-from zsched.core.gateway.demand import is_short
 from zsched.core.gateway.job_need import CALM_WAIT_RATIO
+from zsched.core.gateway.shortfall import is_short
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.profile import Profile, WorkerLoad, WorkerState
 from zsched.core.values.struct import Struct, replace

@@ -13,9 +13,10 @@ from collections.abc import Callable, Iterable, Mapping
 from collections.abc import Set as AbstractSet
 
 from zsched.core.gateway.company import is_full
-from zsched.core.gateway.demand import Demands, is_short
+from zsched.core.gateway.demand import Demands
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.gateway.sharing import fair_share
+from zsched.core.gateway.shortfall import is_short
 from zsched.core.scheduler.links import pair_link, ways
 from zsched.core.scheduler.utility import (
     cpu_utility,
@@ -419,7 +420,7 @@ def _cpu(
     if tuning.score is ScoreForm.PAPER:
         return cpu_utility(profile.cpu_cores, used)
     free, job = profile.cpu_cores - used + demand.cpu_cores, demands.job_on(spec.name, profile.node)
-    share, stretch = demands.experience(spec.name, profile)
+    share, stretch = demands.shortfalls.of(spec.name, profile)
     share *= spare_factor(profile.cpu_cores - used, profile.cpu_cores, spec.cpu_floor_ratio)
     if job is None:
         return service_utility(free, demand.cpu_cores, profile.cpu_cores, least=least_cores, share=share)

@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from support.fleets import fleet_of, task_of
 from support.profiles import load_of, profile_of
 from zsched.core.gateway.company import STARVED_CPU_RATIO
-from zsched.core.gateway.demand import SETTLE_S, SHORT_RATIO, UNSURE, Demands, is_short
+from zsched.core.gateway.demand import SETTLE_S, UNSURE, Demands
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.gateway.job_need import CALM_S, QUEUE_RATIO, Heard
 from zsched.core.values.fleet import Demand
-from zsched.core.values.profile import Jobs, Profile, Renewal, WorkerLoad, WorkerState
+from zsched.core.values.profile import Jobs, Profile, Renewal, WorkerState
 
 TASK = task_of(demand=Demand(cpu_cores=0.4, memory_mb=250.0))
 EVERY_S = 2 * SETTLE_S
@@ -60,7 +60,9 @@ def test_waits_for_a_cpu_are_no_other_waits_where_a_machine_is_hardly_ever_calm(
         job = demands.job("merge")
         assert job is not None
         assert job.other_s == pytest.approx(0.0)
-        assert demands.experience("merge", profile_of(cpu_used_cores=3.9, workers=(load_of(cpu_cores=0.4),)))[1] > 5.0
+        assert (
+            demands.shortfalls.of("merge", profile_of(cpu_used_cores=3.9, workers=(load_of(cpu_cores=0.4),)))[1] > 5.0
+        )
     stay(1.0, 0.9, at, 2 * CALM_S)
     job = demands.job("merge")
     assert job is not None
@@ -304,26 +306,26 @@ def test_a_task_that_gets_less_than_its_machine_s_figures_say_is_remembered_ther
     """Half of its jobs are left undone beside two idle cores (it is pinned, or has a quota of its own)."""
     demands, pinned = Demands(), told(9.0, got=0.5, used=2.0)
     demands.learn("merge", pinned, 0.0)
-    assert demands.experience("merge", pinned) == (1.0, 1.0), "it has just come"
+    assert demands.shortfalls.of("merge", pinned) == (1.0, 1.0), "it has just come"
     assert demands.learn("merge", pinned, EVERY_S), "its need is the same, and it is scored anew all the same"
     assert not demands.learn("merge", pinned, EVERY_S)
-    share, stretch = demands.experience("merge", pinned)
+    share, stretch = demands.shortfalls.of("merge", pinned)
     assert share == pytest.approx(5 / 9)
     assert stretch == pytest.approx(2.0)
     left = profile(0.0, cpu=1.5)
-    assert demands.experience("merge", left) == (share, stretch), "it does not look better once the task has left"
-    assert demands.experience("merge", profile(0.0, cpu=1.0)) == (1.0, 1.0), "another load may be another story"
-    assert demands.experience("merge", profile(0.0, cpu=1.5, node="edge2")) == (1.0, 1.0)
-    assert demands.experience("merge", profile(0.0, cpu=None)) == (1.0, 1.0), "nobody knows what others use"
+    assert demands.shortfalls.of("merge", left) == (share, stretch), "it does not look better once the task has left"
+    assert demands.shortfalls.of("merge", profile(0.0, cpu=1.0)) == (1.0, 1.0), "another load may be another story"
+    assert demands.shortfalls.of("merge", profile(0.0, cpu=1.5, node="edge2")) == (1.0, 1.0)
+    assert demands.shortfalls.of("merge", profile(0.0, cpu=None)) == (1.0, 1.0), "nobody knows what others use"
     demands.learn("merge", told(9.0, used=2.0), 2 * EVERY_S)
-    assert demands.experience("merge", pinned) == (1.0, 1.0), "it gets all again"
+    assert demands.shortfalls.of("merge", pinned) == (1.0, 1.0), "it gets all again"
 
 
 def test_a_loss_that_the_machine_s_figures_explain_is_not_counted_twice() -> None:
     demands, starved = Demands(), told(9.0, got=0.5, used=4.0)
     for now in (0.0, EVERY_S):
         demands.learn("merge", starved, now)
-    share, _ = demands.experience("merge", starved)
+    share, _ = demands.shortfalls.of("merge", starved)
     assert share == pytest.approx(1.0)
 
 
@@ -335,31 +337,14 @@ def test_the_same_word_again_is_no_news() -> None:
     assert demands.learn("merge", told(9.0, cpu_s=0.3), 30.0)
 
 
-def test_who_gets_less_than_its_threads_want_is_short() -> None:
-    def load(cores: float | None, wanted: float | None) -> WorkerLoad:
-        return load_of(cpu_cores=cores, wanted_cores=wanted)
-
-    assert is_short(load(1.0, 4.0))
-    assert is_short(load(0.8 * SHORT_RATIO, 0.9)), "whatever it wants"
-    assert not is_short(load(3.99, 4.0))
-    assert not is_short(load(1.0, None))
-    assert is_short(load(None, 1.0))
-
-
-@pytest.mark.parametrize(("done_hz", "expected"), [(8.9, True), (10 * SHORT_RATIO, False), (10.0, False)])
-def test_who_leaves_a_tenth_of_its_jobs_undone_is_short(done_hz: float, expected: bool) -> None:
-    jobs = Jobs(time_s=0.1, cpu_s=0.1, done_hz=done_hz, wanted_hz=10.0)
-    assert is_short(load_of(cpu_cores=0.9, jobs=jobs)) is expected
-
-
 def test_a_worker_that_tells_its_jobs_no_more_is_known_by_what_it_told() -> None:
     """A restart with an older kit, for one."""
     demands, pinned = Demands(), told(9.0, got=0.5, used=2.0)
     for number in range(2):
         demands.learn("merge", pinned, number * EVERY_S)
-    seen, job = demands.experience("merge", pinned), demands.job("merge")
+    seen, job = demands.shortfalls.of("merge", pinned), demands.job("merge")
     demands.learn("merge", profile(0.5, cpu=2.0), 2 * EVERY_S)
-    assert demands.experience("merge", pinned) == seen != (1.0, 1.0)
+    assert demands.shortfalls.of("merge", pinned) == seen != (1.0, 1.0)
     assert demands.job("merge") == job is not None
 
 
@@ -410,8 +395,8 @@ def test_a_changed_program_is_not_held_to_what_the_one_before_needed_and_lacked(
             if number == 0 and is_changed:
                 gateway.expect_another("merge")
             if number == 3:
-                found.append((gateway.demand(TASK, before).cpu_cores, gateway.demands.experience("merge", before)))
-        found.append((gateway.demand(TASK, before).cpu_cores, gateway.demands.experience("merge", before)))
+                found.append((gateway.demand(TASK, before).cpu_cores, gateway.demands.shortfalls.of("merge", before)))
+        found.append((gateway.demand(TASK, before).cpu_cores, gateway.demands.shortfalls.of("merge", before)))
     needs, lacks = [need for need, _ in found], [lack for _, lack in found]
     assert needs[:2] == [2.0, UNSURE * 0.5 if is_changed else 2.0]
     assert lacks[2] != (1.0, 1.0), "what runs until then is the one before"
@@ -442,7 +427,7 @@ def test_a_worker_that_does_not_tell_its_jobs_ages_is_judged_by_how_long_they_ta
         demands.learn("merge", told(9.0), 0.0)
         demands.learn("merge", word, EVERY_S)
         demands.learn("merge", word, 2 * EVERY_S)
-        assert demands.experience("merge", pinned)[1] == pytest.approx(stretch)
+        assert demands.shortfalls.of("merge", pinned)[1] == pytest.approx(stretch)
 
 
 def test_a_job_is_at_least_as_old_as_it_takes() -> None:
@@ -467,7 +452,7 @@ def test_jobs_that_take_longer_than_foreseen_are_remembered_though_all_of_them_a
     demands, slow = Demands(), told(2.0, got=2 / 3, used=1.0)
     for now in (0.0, EVERY_S):
         demands.learn("merge", slow, now)
-    assert demands.experience("merge", slow) == pytest.approx((1.0, 1.5))
+    assert demands.shortfalls.of("merge", slow) == pytest.approx((1.0, 1.5))
 
 
 def test_jobs_that_a_load_held_up_tell_nothing_of_the_machine_when_it_has_ended() -> None:
@@ -480,11 +465,11 @@ def test_jobs_that_a_load_held_up_tell_nothing_of_the_machine_when_it_has_ended(
         jobs = Jobs(time_s=age_s, cpu_s=0.1, wait_s=age_s - 0.1, age_s=age_s, done_hz=2.0, wanted_hz=2.0)
         one = profile(0.2, cpu=0.3 if is_over else 4.0, jobs=jobs)
         demands.learn("merge", one, now, fair_cores=4.0 if is_over else 0.25)
-        assert demands.experience("merge", one) == (1.0, 1.0)
+        assert demands.shortfalls.of("merge", one) == (1.0, 1.0)
     jobs = Jobs(time_s=0.3, cpu_s=0.1, wait_s=0.2, age_s=0.3, done_hz=2.0, wanted_hz=2.0)
     slow = profile(0.2, cpu=0.3, jobs=jobs)
     demands.learn("merge", slow, 30.0, fair_cores=4.0)
-    assert demands.experience("merge", slow)[1] == pytest.approx(3.0, rel=0.1), "which nothing explains"
+    assert demands.shortfalls.of("merge", slow)[1] == pytest.approx(3.0, rel=0.1), "which nothing explains"
 
 
 @pytest.mark.parametrize(
@@ -500,7 +485,7 @@ def test_who_needed_more_before_and_does_not_say_that_it_lacks_a_cpu_gets_its_sh
     for number, word in enumerate((before, before, now_on_full, now_on_full)):
         demands.learn("merge", word, number * EVERY_S)
     assert demands.at(TASK, now_on_full).cpu_cores == 0.6
-    assert demands.experience("merge", now_on_full)[0] == 1.0
+    assert demands.shortfalls.of("merge", now_on_full)[0] == 1.0
 
 
 def queued(node: str, queue_ratio: float, *, wait_s: float = 0.0, speed: float = 1.0) -> Profile:

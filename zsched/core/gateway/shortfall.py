@@ -1,0 +1,127 @@
+"""GATEWAY: what a task got less of on a machine than was foretold, and whether its worker lacks anything.
+
+Knows: forecasts of work and of jobs' ages, what came of them. Does not know: needs, speeds, fair shares.
+
+The owner's service is measured, the candidates' foretold. So what a machine did not keep is remembered of it for as
+long as others use about as much there. Otherwise it would look better as soon as the task has left, and the task go
+there and back for ever (docs/decisions/0032).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from zsched.core.gateway.company import Company
+from zsched.core.gateway.job_need import JobNeed
+from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.profile import Profile, WorkerLoad
+from zsched.core.values.struct import Struct
+
+SHORT_RATIO: Final = 0.9
+"""A task that gets a smaller part of its forecast has a shortfall on that machine."""
+LAGS_S: Final = 4.0
+"""Time constant of the age that is foretold: jobs' ages are means that follow later than the machine's figures."""
+
+
+class _Foretold(Struct, frozen=True):
+    """How long a task's jobs were to take on a machine, on the mean of the last seconds."""
+
+    node: NodeId
+    age_s: float
+    at: float
+
+
+class _Shortfall(Struct, frozen=True):
+    """What a task got on a machine, compared with the forecast for that machine."""
+
+    share: float
+    """The part of the forecast work that it got, at most 1."""
+    stretch: float
+    """How many times as long its jobs took, at least 1."""
+    company: Company
+
+
+class Shortfalls:
+    """One node's experience of what machines did not keep."""
+
+    def __init__(self) -> None:
+        self._seen: dict[tuple[TaskId, NodeId], _Shortfall] = {}
+        self._foretold: dict[TaskId, _Foretold] = {}
+
+    def note(
+        self,
+        task: TaskId,
+        profile: Profile,
+        job: JobNeed,
+        age_s: float,
+        *,
+        need_cores: float,
+        speed: float,
+        fair_cores: float,
+        now: float,
+    ) -> bool:
+        """Remember that the task gets less on its owner than forecast, or no longer does; whether that has changed.
+
+        Args:
+            task: which one.
+            profile: its owner's.
+            job: one job's need.
+            age_s: how long its jobs take, from arrival to end.
+            need_cores: what it needs there, > 0.
+            speed: of the task there.
+            fair_cores: what a job gets there at least while it runs.
+            now: monotonic seconds.
+        """
+        load, company = profile.worker(task), Company.of(task, profile)
+        if load is None or load.cpu_cores is None or company is None:
+            return False
+        free, most = profile.cpu_cores - company.others_cores, job.most_cores(speed)
+        foreseen = min(free / need_cores, 1.0 if most is None else most / need_cores, 1.0)
+        is_lacking = foreseen > 0.0 and shows_lack(load) and is_short(load)
+        share = min(load.cpu_cores / need_cores / foreseen, 1.0) if is_lacking else 1.0
+        foretold_s = self._foretell(task, profile.node, job.age_s(speed, max(free, fair_cores)), now)
+        stretch = max(age_s / max(foretold_s, 1e-9), 1.0)
+        before = self._seen.pop((task, profile.node), None)
+        if share >= SHORT_RATIO and stretch <= 1.0 / SHORT_RATIO:
+            return before is not None
+        self._seen[task, profile.node] = _Shortfall(share, stretch, company)
+        return before != self._seen[task, profile.node]
+
+    def _foretell(self, task: TaskId, node: NodeId, age_s: float, now: float) -> float:
+        """The age that jobs' mean age is compared with: this one, or what was foretold of those that ended before.
+
+        When a load ends the jobs that it held up count in their mean for some seconds.
+        """
+        known = self._foretold.get(task)
+        if known is None or known.node != node:
+            known = _Foretold(node, age_s, now)
+        mean_s = age_s + (known.age_s - age_s) * math.exp(-max(now - known.at, 0.0) / LAGS_S)
+        self._foretold[task] = _Foretold(node, mean_s, now)
+        return max(age_s, mean_s)
+
+    def of(self, task: TaskId, profile: Profile) -> tuple[float, float]:
+        """(part of the forecast work that the task got there, at most 1; how many times as long its jobs took)."""
+        seen = self._seen.get((task, profile.node))
+        return (seen.share, seen.stretch) if seen and seen.company.is_still(task, profile) else (1.0, 1.0)
+
+    def forget(self, task: TaskId) -> None:
+        """Know nothing of a task that is no more."""
+        self._foretold.pop(task, None)
+        self._seen = {key: seen for key, seen in self._seen.items() if key[0] != task}
+
+
+def is_short(load: WorkerLoad) -> bool:
+    """Whether the worker visibly wants more than it gets; an idle worker lacks nothing.
+
+    Either its threads always want to run and run for less, or it leaves work undone.
+    """
+    jobs, use = load.jobs, load.cpu_cores or 0.0
+    is_hungry = load.wanted_cores is not None and use < SHORT_RATIO * load.wanted_cores
+    return is_hungry or (jobs is not None and jobs.done_hz < SHORT_RATIO * jobs.wanted_hz)
+
+
+def shows_lack(load: WorkerLoad) -> bool:
+    """Whether the worker's report shows its lack of CPU, and not only its undone work."""
+    jobs = load.jobs
+    return jobs is not None and (jobs.wait_s is not None or load.wanted_cores is not None)
