@@ -17,7 +17,8 @@ from dataclasses import dataclass, replace
 from benchmarks.common import machine, percentile
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.judge import Judge
-from zsched.core.scheduler.scoring import compare, score
+from zsched.core.scheduler.scoring import score
+from zsched.core.scheduler.standing import compare
 from zsched.core.values.fleet import Demand, Fleet, NodeSpec, TaskSpec, Timing
 from zsched.core.values.messages import Utilities
 from zsched.core.values.model import Allocation, NodeKind, PeerState, Tuning, UtilityVector, Weights

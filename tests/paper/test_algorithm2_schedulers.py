@@ -15,7 +15,8 @@ from support.robots import Decider
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.instructions import AskUtilities, Instruction, PublishProposal
 from zsched.core.scheduler.judge import Judge, Outcome
-from zsched.core.scheduler.scoring import compare, pick, score
+from zsched.core.scheduler.scoring import score
+from zsched.core.scheduler.standing import compare, pick
 from zsched.core.values.fleet import Timing, WorkerSpec
 from zsched.core.values.messages import Utilities
 from zsched.core.values.model import Allocation, PeerState, Proposal, Tuning, UtilityVector, Weights

@@ -10,7 +10,7 @@ import pytest
 from support.allocations import allocation_of
 from support.fleets import task_of, tuning_of
 from support.proposals import vector_of
-from zsched.core.scheduler.scoring import Standing, compare, pick
+from zsched.core.scheduler.standing import Standing, compare, pick
 from zsched.core.scheduler.utility import cpu_utility, memory_utility, network_utility, predicted_use, total_utility
 from zsched.core.values.fleet import LinkLimits
 from zsched.core.values.model import Aggregate, Reach, Tuning, Weights

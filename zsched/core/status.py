@@ -10,9 +10,10 @@ from collections.abc import Iterable, Iterator
 
 from zsched.core.executor.handover import Executor, Phase
 from zsched.core.executor.rollouts import waiting
+from zsched.core.scheduler.eligibility import may_get
 from zsched.core.scheduler.judge import by
 from zsched.core.scheduler.rounds import TaskRound
-from zsched.core.scheduler.scoring import joined, may_get
+from zsched.core.scheduler.standing import joined
 from zsched.core.stages import Stages, Unready
 from zsched.core.values.deadline import tells_jobs
 from zsched.core.values.decision import Explanation

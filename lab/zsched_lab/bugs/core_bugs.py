@@ -51,9 +51,11 @@ VOTE, VOTING = "zsched.core.vote.tally", "zsched.core.vote.voting"
 DECISION, ROUNDS = "zsched.core.scheduler.decision", "zsched.core.scheduler.rounds"
 ORDERS, EXPIRY = "zsched.core.handlers.orders", "zsched.core.vote.expiry"
 DAMPING = "zsched.core.scheduler.damping"
-SCHEDULER, SCORING, EXECUTOR = (
+SCHEDULER, SCORING, USAGE, STANDING, EXECUTOR = (
     "zsched.core.scheduler.judge",
     "zsched.core.scheduler.scoring",
+    "zsched.core.scheduler.usage",
+    "zsched.core.scheduler.standing",
     "zsched.core.executor.handover",
 )
 
@@ -966,21 +968,21 @@ VOTE_BUGS = (
     ),
     _bug(
         "a candidate gains by a far robot that leaves it out",
-        SCORING,
+        STANDING,
         "return whole if len(whole) >= majority(len(vectors)) else vectors",
         "return vectors",
         ("tests/unit/core/scheduler/test_compare.py",),
     ),
     _bug(
         "a task that has just come uses no GPU yet",
-        SCORING,
+        USAGE,
         'readings["gpu"] + coming_gpu, own',
         'readings["gpu"], own',
         ("tests/unit/core/scheduler/test_turns.py",),
     ),
     _bug(
         "what a task's processes do not show of its memory counts twice",
-        SCORING,
+        USAGE,
         "(memory is None or allocation.tuning.score is ScoreForm.SERVICE)",
         "memory is None",
         ("tests/unit/core/scheduler/test_scoring.py", "tests/unit/core/test_closed_loop.py"),
@@ -1009,8 +1011,8 @@ VOTE_BUGS = (
     _bug(
         "a task's own thread takes from its share where it runs",
         "zsched.core.gateway.sharing",
-        "max(profile.runnable - own, 0.0) + coming_cores",
-        "profile.runnable + coming_cores",
+        "max(profile.runnable - own, 0.0) + more + coming_cores",
+        "profile.runnable + more + coming_cores",
         ("tests/unit/core/gateway/test_sharing.py", "tests/unit/core/test_closed_loop.py"),
     ),
     _bug(
@@ -1043,7 +1045,7 @@ VOTE_BUGS = (
     ),
     _bug(
         "what comes is taken off the share of an owner that is short",
-        "zsched.core.scheduler.scoring",
+        SCORING,
         "least = min(fair, own.cpu_cores) if is_measured else fair",
         "least = 0.0 if is_measured else fair",
         ("tests/unit/core/scheduler/test_bookings.py", "tests/unit/core/test_closed_loop_tasks.py"),
@@ -1078,7 +1080,7 @@ VOTE_BUGS = (
     ),
     _bug(
         "median and mean swapped",
-        SCORING,
+        STANDING,
         "if allocation.tuning.aggregate is Aggregate.MEAN",
         "if allocation.tuning.aggregate is not Aggregate.MEAN",
         _SCHEDULER,

@@ -19,7 +19,7 @@ from typing import Any, Protocol
 from zsched.core.scheduler.damping import Damping
 from zsched.core.scheduler.decision import decide_by, rules_of
 from zsched.core.scheduler.judge import Judge, Judgement, Outcome
-from zsched.core.scheduler.scoring import Standing, pick
+from zsched.core.scheduler.standing import Standing, pick
 from zsched.core.values.decision import Figures, Rules
 from zsched.core.values.fleet import PAPER_PATIENCE, TaskSpec
 from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, Tuning

@@ -16,7 +16,8 @@ from typing import Final, Protocol
 from zsched.config.timing import WIFI
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.profile.profile import Profiler
-from zsched.core.scheduler.scoring import Standing, compare, score
+from zsched.core.scheduler.scoring import score
+from zsched.core.scheduler.standing import Standing, compare
 from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.model import Allocation, NodeId, PeerState, UtilityVector
 from zsched.core.values.profile import DeviceSample, LinkSample, LinkSource

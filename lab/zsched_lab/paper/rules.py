@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from zsched.core.scheduler.judge import Judge, Judgement
-from zsched.core.scheduler.scoring import Standing
+from zsched.core.scheduler.standing import Standing
 from zsched.core.values.model import Allocation, NodeId
 
 PENALTY = 0.05

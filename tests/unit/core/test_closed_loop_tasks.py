@@ -21,7 +21,8 @@ from zsched.core.profile.profile import Profiler
 from zsched.core.scheduler.damping import Damping
 from zsched.core.scheduler.decision import decide, rules_of
 from zsched.core.scheduler.judge import Judge, Judgement, Outcome
-from zsched.core.scheduler.scoring import book, score
+from zsched.core.scheduler.scoring import score
+from zsched.core.scheduler.usage import book
 from zsched.core.values.decision import Figures
 from zsched.core.values.fleet import DEFAULT_BONUS, DEFAULT_COOL_DOWN_S, PAPER_PATIENCE, Demand, Timing
 from zsched.core.values.model import PeerState, ScoreForm, Tuning, Weights

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Container, Iterable, Mapping
 from enum import StrEnum
 
-from zsched.core.scheduler.scoring import may_get
+from zsched.core.scheduler.eligibility import may_get
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.model import Allocation, NodeId, TaskId
 from zsched.core.values.profile import Profile, WorkerState

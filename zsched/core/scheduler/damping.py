@@ -8,7 +8,7 @@ again; nor does a node pay that was told to stop. Points decay with a half-life,
 ``STEP * (2**points - 1)``, at most `MAX_PENALTY`. A penalised node stays eligible: when it is the only one, it serves.
 Every robot learns the same allocations, so all come to the same penalties; but one that was cut off has missed some,
 and one that was restarted has forgotten them. So robots tell each other (`UtilityVector.penalties`), and what any of
-them remembers counts (`zsched.core.scheduler.scoring.joined`).
+them remembers counts (`zsched.core.scheduler.standing.joined`).
 """
 
 from __future__ import annotations

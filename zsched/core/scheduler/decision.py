@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from zsched.core.scheduler.damping import Damping
 from zsched.core.scheduler.judge import Judge, Judgement, Outcome, escape_ahead, escape_reason, short_of_memory
-from zsched.core.scheduler.scoring import Standing, compare
+from zsched.core.scheduler.standing import Standing, compare
 from zsched.core.values.decision import Figures, Rules, Verdict
 from zsched.core.values.fleet import TaskSpec, WorkerSpec
 from zsched.core.values.model import Allocation, PeerState

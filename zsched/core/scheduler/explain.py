@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from zsched.core.scheduler.damping import WINDOW_S, Damping
 from zsched.core.scheduler.decision import Decided, decide_again, verdict_of
 from zsched.core.scheduler.judge import Outcome
-from zsched.core.scheduler.scoring import Standing, counted, joined, pick, rounded
+from zsched.core.scheduler.standing import Standing, counted, joined, pick, rounded
 from zsched.core.scheduler.utility import total_utility
 from zsched.core.values.decision import Decision, Figures, Verdict
 from zsched.core.values.model import Aggregate, NodeId, PeerState, Tuning, Utility, UtilityVector

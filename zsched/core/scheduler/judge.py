@@ -16,7 +16,7 @@ from enum import StrEnum
 
 from zsched.core.scheduler.damping import ESCAPES_PER_MINUTE, WINDOW_S, Damping
 from zsched.core.scheduler.patience import LONGEST_GAP_S, LearntPatience, spend
-from zsched.core.scheduler.scoring import Standing, joined, pick
+from zsched.core.scheduler.standing import Standing, joined, pick
 from zsched.core.values.decision import JudgeMemory
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.model import Allocation, NodeId, Pause, PeerState, Pin, ScoreForm, told_by

@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from zsched.core.scheduler.scoring import pick
+from zsched.core.scheduler.standing import pick
 from zsched.core.values.decision import PlayerMemory
 from zsched.core.values.model import NodeId
 from zsched.core.values.struct import Struct

@@ -22,11 +22,14 @@ from zsched.core.gateway.round_trips import RoundTrips
 from zsched.core.instructions import AskUtilities, RecordStory
 from zsched.core.scheduler.damping import Damping
 from zsched.core.scheduler.decision import decide, rules_of, verdict_of
+from zsched.core.scheduler.eligibility import is_out
 from zsched.core.scheduler.flags import NodeFlags
 from zsched.core.scheduler.judge import Judge, Judgement, Outcome
 from zsched.core.scheduler.rest import Answers, is_like
-from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts, Standing, book, is_out, score
+from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts, score
+from zsched.core.scheduler.standing import Standing
 from zsched.core.scheduler.turns import Turn, in_turn, who_moves_first
+from zsched.core.scheduler.usage import book
 from zsched.core.todo import ToDo
 from zsched.core.values.decision import Decision, Figures, Need, Rules
 from zsched.core.values.fleet import Fleet, TaskSpec

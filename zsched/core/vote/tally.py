@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Mapping
 from enum import StrEnum
 
-from zsched.core.scheduler.scoring import rounded
+from zsched.core.scheduler.standing import rounded
 from zsched.core.values.model import NodeId, Proposal
 from zsched.core.values.quorum import majority
 from zsched.core.values.struct import Struct

@@ -16,7 +16,9 @@ from typing import Any, Final
 from zsched.core.events import WorkerJobs
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.profile.profile import Profiler
-from zsched.core.scheduler.scoring import Standing, book, compare, score
+from zsched.core.scheduler.scoring import score
+from zsched.core.scheduler.standing import Standing, compare
+from zsched.core.scheduler.usage import book
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.model import Allocation, NodeId, PeerState, TaskId, Tuning
 from zsched.core.values.profile import DeviceSample, LinkSample, LinkSource, WorkerLoad, WorkerState

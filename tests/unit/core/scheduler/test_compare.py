@@ -8,7 +8,7 @@ import pytest
 from support.allocations import allocation_of
 from support.fleets import task_of, tuning_of
 from support.proposals import vector_of
-from zsched.core.scheduler.scoring import Standing, compare, pick, rounded
+from zsched.core.scheduler.standing import Standing, compare, pick, rounded
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.model import Aggregate, Reach, Utility, UtilityVector
 from zsched.core.values.quorum import majority

@@ -11,7 +11,7 @@ from support.allocations import allocation_of
 from support.fleets import task_of, tuning_of
 from zsched.core.scheduler.damping import EARLY_FAILURE_S, MAX_PENALTY, STEP, WINDOW_S, Damping
 from zsched.core.scheduler.judge import Judge, Outcome
-from zsched.core.scheduler.scoring import Standing
+from zsched.core.scheduler.standing import Standing
 
 SPEC = task_of(tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0), patience=0.0, max_moves_per_minute=2)
 OWNED = allocation_of(tuning=SPEC.tuning)

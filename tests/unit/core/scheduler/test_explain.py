@@ -24,7 +24,7 @@ from zsched.core.scheduler.explain import (
     utility_of,
     without,
 )
-from zsched.core.scheduler.scoring import pick
+from zsched.core.scheduler.standing import pick
 from zsched.core.values.decision import DampingMemory, Decision, JudgeMemory, Need
 from zsched.core.values.model import (
     Aggregate,

@@ -21,7 +21,7 @@ from zsched.core.scheduler.judge import (
     escape_reason,
 )
 from zsched.core.scheduler.patience import FIRST_PATIENCE, FORGIVEN_IN_S
-from zsched.core.scheduler.scoring import Standing, compare
+from zsched.core.scheduler.standing import Standing, compare
 from zsched.core.values.fleet import TaskSpec, WorkerSpec
 from zsched.core.values.model import Allocation, Asked, Pause, PeerState, Pin
 from zsched.core.values.profile import Profile, WorkerState

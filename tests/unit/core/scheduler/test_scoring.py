@@ -12,7 +12,8 @@ from support.allocations import allocation_of
 from support.fleets import fleet_of, task_of
 from support.profiles import load_of, profile_of
 from zsched.core.gateway.gateway import Gateway
-from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts, compare, pick, score
+from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts, score
+from zsched.core.scheduler.standing import compare, pick
 from zsched.core.scheduler.utility import NEARLY_FULL, service_utility
 from zsched.core.values.fleet import DEFAULT_BONUS, Demand, LinkLimits, Standby, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.model import (

@@ -12,8 +12,9 @@ from support.fleets import fleet_of, task_of, tuning_of
 from support.profiles import load_of, profile_of
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.profile.profile import Profiler
-from zsched.core.scheduler.scoring import book, score
+from zsched.core.scheduler.scoring import score
 from zsched.core.scheduler.turns import in_turn, who_moves_first
+from zsched.core.scheduler.usage import book
 from zsched.core.scheduler.utility import service_utility
 from zsched.core.values.fleet import Demand, WorkerSpec
 from zsched.core.values.model import Allocation, PeerState, ScoreForm, Tuning, UtilityVector, Weights

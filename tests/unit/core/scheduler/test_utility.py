@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from zsched.core.scheduler import scoring, utility
-from zsched.core.scheduler.scoring import rounded
+from zsched.core.scheduler import standing, utility
+from zsched.core.scheduler.standing import rounded
 from zsched.core.scheduler.utility import (
     clamp,
     cpu_utility,
@@ -34,7 +34,7 @@ def weights(draw: st.DrawFn) -> Weights:
     return Weights(cpu=low, memory=high - low, network=1.0 - high)
 
 
-@pytest.mark.parametrize("module", [utility, scoring, fleet])
+@pytest.mark.parametrize("module", [utility, standing, fleet])
 def test_the_worked_examples_in_the_docstrings_hold(module: object) -> None:
     result = doctest.testmod(module)  # type: ignore[arg-type]  # parametrisation loses the module's type
 

@@ -7,7 +7,7 @@ import pytest
 from support.allocations import allocation_of
 from support.fleets import fleet_of, task_of, tuning_of
 from zsched.core.scheduler.judge import INITIAL_SETTLE_S, Judge, Outcome
-from zsched.core.scheduler.scoring import Standing
+from zsched.core.scheduler.standing import Standing
 from zsched.core.values.fleet import WorkerSpec
 from zsched_lab.sim.simulator import Simulator
 

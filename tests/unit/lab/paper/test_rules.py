@@ -10,7 +10,7 @@ from support.fleets import task_of, tuning_of
 from zsched.core.scheduler import rounds
 from zsched.core.scheduler.damping import Damping
 from zsched.core.scheduler.judge import Judge, Judgement, Outcome
-from zsched.core.scheduler.scoring import Standing
+from zsched.core.scheduler.standing import Standing
 from zsched_lab.paper.ruled_daemon import install
 from zsched_lab.paper.rules import EVERY_S, RANDOM_PERIOD_S, JudgeMaker, Rule, RuleName, RulePlan, read_plan
 

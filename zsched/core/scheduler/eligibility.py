@@ -1,0 +1,79 @@
+"""SCHEDULER: whether a node may have a task at all, and why not.
+
+Knows: workers' states, memory that is not there, gauges' limits. Does not know: what the node is worth
+(`zsched.core.scheduler.scoring`), who reaches it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from zsched.core.scheduler.usage import Use
+from zsched.core.values.fleet import Demand, Standby, TaskSpec
+from zsched.core.values.gauges import BY_NAME, possible
+from zsched.core.values.model import Allocation
+from zsched.core.values.profile import Profile, WorkerState
+from zsched.core.values.words import GaugeName
+
+
+def is_out(spec: TaskSpec, profile: Profile) -> bool:
+    """Whether a node cannot have the task until an operator or a restart changes something there."""
+    load = profile.worker(spec.name)
+    return profile.draining or (load is not None and load.state is WorkerState.FAILED)
+
+
+def may_get(spec: TaskSpec, state: WorkerState | None) -> bool:
+    """Whether a node that is not the owner may get the task by its worker there; ``None``: no worker is known.
+
+    What somebody else starts is there or is not, cold or warm.
+    """
+    if state is None:
+        return not spec.worker.command
+    starts_then = bool(spec.worker.command) and spec.worker.standby is Standby.COLD
+    return state is WorkerState.READY or (starts_then and state is not WorkerState.FAILED)
+
+
+def refusal(
+    spec: TaskSpec,
+    allocation: Allocation,
+    profile: Profile,
+    demand: Demand,
+    use: Use,
+    gauges: Mapping[GaugeName, float],
+) -> str:
+    """Why the node may not have the task; empty when it may."""
+    if profile.draining:
+        return "draining"
+    load = profile.worker(spec.name)
+    state = None if load is None else load.state
+    if spec.worker.command and state is None:
+        return "runs no worker for it"
+    why = "" if load is None or not load.reason else f": {load.reason}"
+    if state is WorkerState.FAILED:
+        return f"worker failed{why}"
+    is_owner = profile.node == allocation.owner
+    if not is_owner and not may_get(spec, state):
+        return f"worker {state}{why}"
+    used = use.memory_mb
+    if used is not None and used > profile.memory_mb:
+        return f"needs {demand.memory_mb:.0f} MiB, has {max(profile.memory_mb - used + demand.memory_mb, 0.0):.0f} free"
+    return _beyond_limits(spec, profile, gauges, is_owner=is_owner)
+
+
+def _beyond_limits(spec: TaskSpec, profile: Profile, gauges: Mapping[GaugeName, float], *, is_owner: bool) -> str:
+    """Why the machine's gauges forbid the task; empty: they do not.
+
+    An owner whose GPU may be busy with the task alone, for all that is known, is not left for that.
+    """
+    told = dict(possible(profile.gauges)) if spec.gauge_limits else {}
+    added = {"gpu"} if spec.demand.gpu and not is_owner else set[str]()
+    limits = dict(spec.gauge_limits)
+    if is_owner and "gpu" in limits and not spec.demand.gpu:
+        limits["gpu"] = BY_NAME["gpu"].high
+    faults = (
+        BY_NAME[name].fault(
+            gauges.get(name), limit, is_owner=is_owner, is_reckoned=name in added, is_old=name not in told
+        )
+        for name, limit in limits.items()
+    )
+    return next((fault for fault in faults if fault), "")

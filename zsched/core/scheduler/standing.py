@@ -1,0 +1,107 @@
+"""SCHEDULER: joins all robots' scores of a task's candidates (Alg. 2, Compare_Utility).
+
+Knows: Eq. 5-6, vetoes, penalties. Does not know: how a score is made (`zsched.core.scheduler.scoring`), stickiness
+(`zsched.core.scheduler.judge`), how scores travel.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Iterable, Mapping
+
+from zsched.core.values.fleet import TaskSpec
+from zsched.core.values.model import Aggregate, Allocation, NodeId, Reach, Utility, UtilityVector
+from zsched.core.values.quorum import majority
+from zsched.core.values.struct import Struct, field
+
+
+def rounded(aggregate: float) -> float:
+    """An aggregate to 1/256: sums of floats differ by their order, and a difference that small decides nothing."""
+    return round(aggregate * 256) / 256
+
+
+class Standing(Struct, frozen=True, kw_only=True):
+    """The joint view of one gather: ``aggregates`` without bonus, ``vetoed`` with reasons, and who was heard."""
+
+    aggregates: Mapping[NodeId, float]
+    vetoed: Mapping[NodeId, str]
+    vectors: tuple[UtilityVector, ...]
+    voters_heard: int
+    penalties: Mapping[NodeId, float] = field(default_factory=dict)
+    """{node: what is held against it}, by the robot that remembers most."""
+
+
+def compare(spec: TaskSpec, allocation: Allocation, vectors: Mapping[NodeId, UtilityVector]) -> Standing:
+    """Join the fresh voters' vectors column by column (Eq. 5-6: argmax over candidates of the aggregate over robots).
+
+    Args:
+        spec: the task.
+        allocation: the current one; vectors under another revision are not counted.
+        vectors: {voter: its vector}, the fresh ones only.
+    """
+    fresh = tuple(vectors[voter] for voter in sorted(vectors) if vectors[voter].revision == allocation.revision)
+    columns: dict[NodeId, list[Utility]] = {candidate: [] for candidate in spec.candidates}
+    reasons: dict[NodeId, str] = {}
+    for vector in fresh:
+        for candidate, utility in {utility.candidate: utility for utility in vector.utilities}.items():
+            columns.setdefault(candidate, []).append(utility)  # once per voter, however often its vector names it
+        reasons.update(vector.refused)
+    mean = statistics.fmean if allocation.tuning.aggregate is Aggregate.MEAN else statistics.median
+    vetoed: dict[NodeId, str] = {}
+    kept: list[NodeId] = []
+    for candidate in spec.candidates:
+        column = columns[candidate]
+        reaching = sum(utility.reachable for utility in column)
+        needed = len(fresh) if spec.reach is Reach.ALL else majority(len(fresh))
+        if len(column) < majority(len(fresh)) or len(column) == reaching < needed:
+            # Not scored is not "not reached": only the latter is a reason to flee from an owner.
+            vetoed[candidate] = reasons.get(candidate, "not scored by enough robots")
+        elif reaching < needed:
+            vetoed[candidate] = f"reached by {reaching} of {len(fresh)} robots"
+        else:
+            kept.append(candidate)
+    return Standing(
+        aggregates=_aggregates(kept, fresh, mean),
+        vetoed=vetoed,
+        vectors=fresh,
+        voters_heard=len(fresh),
+        penalties=joined(dict(vector.penalties) for vector in fresh),
+    )
+
+
+def counted(candidates: Iterable[NodeId], vectors: tuple[UtilityVector, ...]) -> tuple[UtilityVector, ...]:
+    """The vectors that these candidates are compared by: of the robots that score all of them, if they are a majority.
+
+    A robot that is far away gives low values. If it leaves out one candidate, for a doubt of its own, that one would
+    gain by it, and the task move there and back with every doubt. Else all count, each for what it scores.
+    """
+    wanted = set(candidates)
+    whole = tuple(one for one in vectors if wanted <= {utility.candidate for utility in one.utilities})
+    return whole if len(whole) >= majority(len(vectors)) else vectors
+
+
+def _aggregates(
+    candidates: list[NodeId], vectors: tuple[UtilityVector, ...], mean: Callable[[list[float]], float]
+) -> dict[NodeId, float]:
+    told = [{one.candidate: one.value for one in vector.utilities} for vector in counted(candidates, vectors)]
+    return {name: mean([values[name] for values in told if name in values]) for name in candidates}
+
+
+def joined(penalties: Iterable[Mapping[NodeId, float]]) -> dict[NodeId, float]:
+    """What any of them holds against a node, the most of it: forgetting (a restart) and not knowing say nothing.
+
+    >>> joined([{"edge1": 0.09}, {}, {"edge1": 0.03, "edge2": 0.03}])
+    {'edge1': 0.09, 'edge2': 0.03}
+    """
+    most: dict[NodeId, float] = {}
+    for held in penalties:
+        for name, penalty in held.items():
+            most[name] = max(penalty, most.get(name, 0.0))
+    return dict(sorted(most.items()))
+
+
+def pick(aggregates: Mapping[NodeId, float], owner: NodeId | None) -> NodeId | None:
+    """The candidate with the highest aggregate; ties (to 1/256) go to the owner, then to the lowest name."""
+    if not aggregates:
+        return None
+    return min(aggregates, key=lambda name: (-rounded(aggregates[name]), name != owner, name))

@@ -1,0 +1,132 @@
+"""SCHEDULER: what would be in use on a candidate that had the task: CPU, memory, gauges.
+
+Knows: which use is the task's own, what other tasks will use there and do not show yet. Does not know: what that is
+worth, who may have the task (`zsched.core.scheduler.eligibility`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from zsched.core.gateway.company import is_full
+from zsched.core.gateway.gateway import Gateway
+from zsched.core.gateway.sharing import fair_share
+from zsched.core.gateway.shortfall import is_short
+from zsched.core.scheduler.utility import predicted_use
+from zsched.core.values.fleet import Demand, TaskSpec
+from zsched.core.values.model import Allocation, NodeId, ScoreForm, TaskId
+from zsched.core.values.profile import Profile, WorkerLoad, WorkerState
+from zsched.core.values.struct import Struct
+from zsched.core.values.words import GaugeName
+
+Bookings = Mapping[NodeId, tuple[TaskSpec, ...]]
+"""{owner: its tasks}: of a task that has just come, profiles show nothing yet."""
+
+GPU_SHOWS_S = 6.0
+"""So long after a task has come, its use of the GPU shows: three time constants of the gauges' means."""
+_NOTHING = Demand()
+
+
+def book(specs: Iterable[TaskSpec], values: Mapping[TaskId, Allocation]) -> Bookings:
+    """{owner: its tasks}; empty with a single task."""
+    booked: dict[NodeId, tuple[TaskSpec, ...]] = {}
+    specs = tuple(specs)
+    for spec in specs if len(specs) > 1 else ():
+        owner = values[spec.name].owner
+        if owner is not None:
+            booked[owner] = (*booked.get(owner, ()), spec)
+    return booked
+
+
+def coming_use(spec: TaskSpec, profile: Profile, bookings: Bookings | None, gateway: Gateway) -> Demand:
+    """What other tasks will use on a node beyond what its profile shows of their workers.
+
+    A worker that somebody else started never shows what it uses, so it is in the profile already, or nowhere. What a
+    worker visibly lacks on a full machine is no coming use: it will not get it there while that lasts.
+    """
+    others = () if bookings is None else bookings.get(profile.node, ())
+    if not others:
+        return _NOTHING
+    cpu = memory = 0.0
+    for other in others:
+        load = profile.worker(other.name)
+        if other.name != spec.name and load is not None:
+            demand = gateway.demand(other, profile)
+            if not (is_full(profile) and is_short(load)):
+                cpu += max(demand.cpu_cores - (load.cpu_cores or 0.0), 0.0)
+            memory += max(demand.memory_mb - (load.memory_mb or 0.0), 0.0)
+    return Demand(cpu_cores=cpu, memory_mb=memory)
+
+
+class Use(Struct, frozen=True):
+    """What would be in use on a node if it had the task; ``None`` where the node does not measure it."""
+
+    cpu_cores: float | None
+    memory_mb: float | None
+
+
+def predicted(profile: Profile, own: Demand, demand: Demand, coming: Demand) -> Use:
+    """What would be in use on the node with the task, of which ``own`` is in use now, and with what is ``coming``."""
+    cpu, memory = profile.cpu_used_cores, profile.memory_used_mb
+    return Use(
+        cpu_cores=None if cpu is None else predicted_use(cpu + coming.cpu_cores, own.cpu_cores, demand.cpu_cores),
+        memory_mb=None if memory is None else predicted_use(memory + coming.memory_mb, own.memory_mb, demand.memory_mb),
+    )
+
+
+def own_use(spec: TaskSpec, allocation: Allocation, profile: Profile, demand: Demand) -> Demand:
+    """What of a node's use is the task's own.
+
+    Nobody measures a worker that somebody else started. At the owner its demand is taken for its use, or the owner
+    would look worse by the task's own work. So is a demand of memory, whatever is measured: not all of it shows in the
+    worker's processes (a GPU's, where that is the machine's, or files that it maps), and no machine could keep a task
+    whose memory counts twice there. Eq. 2 goes by what shows.
+    """
+    load = profile.worker(spec.name)
+    cpu, memory = (None, None) if load is None else (load.cpu_cores, load.memory_mb)
+    is_at_work = profile.node == allocation.owner and (load is None or load.state is WorkerState.READY)
+    if cpu is None:
+        cpu = _likely_cores(profile, load, demand) if is_at_work else 0.0
+    if is_at_work and (memory is None or allocation.tuning.score is ScoreForm.SERVICE):
+        memory = max(memory or 0.0, min(profile.memory_used_mb or 0.0, demand.memory_mb))
+    return Demand(cpu_cores=cpu, memory_mb=memory or 0.0)
+
+
+def _likely_cores(profile: Profile, load: WorkerLoad | None, demand: Demand) -> float:
+    """What a worker without a figure uses at the owner: its demand, as far as the machine gives it that."""
+    use = profile.cpu_used_cores or 0.0
+    if load is not None and load.jobs is not None and is_short(load):
+        return min(load.jobs.done_hz * load.jobs.cpu_s, use)
+    if profile.runnable is None:
+        return min(demand.cpu_cores, use)
+    others = max(profile.runnable - demand.cpu_cores, 0.0)
+    return min(demand.cpu_cores, use, fair_share(profile.cpu_cores, max(demand.cpu_cores, 1.0), others))
+
+
+def coming_gpu(spec: TaskSpec, profile: Profile, bookings: Bookings | None, gateway: Gateway, now: float) -> float:
+    """What other tasks will use of a node's GPU, beyond what shows: all that they ask for, until it must show.
+
+    Else two of them that leave one GPU at the same moment find the other one idle, and go together, again and again.
+    """
+    others = () if bookings is None else bookings.get(profile.node, ())
+    return sum(
+        (
+            other.demand.gpu
+            for other in others
+            if other.name != spec.name and not gateway.demands.has_been(other.name, profile.node, GPU_SHOWS_S, now)
+        ),
+        0.0,
+    )
+
+
+def readings(
+    spec: TaskSpec, allocation: Allocation, profile: Profile, gateway: Gateway, coming_gpu: float
+) -> Mapping[GaugeName, float]:
+    """The node's gauges, predicted as if it had the task; none where the task goes by none."""
+    if not (spec.gauge_limits or allocation.tuning.weights.gauges):
+        return {}
+    readings, need = dict(gateway.readings(profile)), spec.demand.gpu
+    if need and "gpu" in readings:  # by the fleet file: no driver tells which process uses how much
+        own = need if profile.node == allocation.owner else 0.0
+        readings["gpu"] = predicted_use(readings["gpu"] + coming_gpu, own, need)
+    return readings
