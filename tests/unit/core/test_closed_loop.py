@@ -788,11 +788,17 @@ LARGE = tuple(
     )
     for name, cores, memory, speed, own in (("edge1", 11.07, 0.9, 0.58, 1.1), ("edge2", 1.67, 0.21, 1.34, 0.77))
 )
+FEW_THREADS = (
+    Machine(name="edge1", base=0.09, speed=0.49, threads=18.0, task_cores=6.18, task_mb=100.0),
+    Machine(name="edge2", cores=2.0, base=0.81, speed=2.33, threads=18.0, task_cores=6.18, task_mb=800.0),
+)
+"""13 of the task's threads want to run on the slow machine, and 3 on the other one."""
 ONE, THREE = ("robot1",), ("robot1", "robot2", "robot3")
 
 
 @settings(derandomize=True, database=None, deadline=None, max_examples=12)
 @example(machines=QUICK_AND_FULL, weights=CPU_ONLY, job_s=0.136, waits_s=0.0, deadline_ms=150.0, whole=True, robots=ONE)
+@example(machines=FEW_THREADS, weights=CPU_ONLY, job_s=0.37, waits_s=0.0, deadline_ms=1000.0, whole=False, robots=ONE)
 @example(machines=LARGE, weights=BOTH, job_s=0.27, waits_s=0.0, deadline_ms=1000.0, whole=False, robots=THREE)
 @given(
     machines=st.one_of(tempting_machines(), constant_machines()),

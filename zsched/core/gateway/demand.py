@@ -12,10 +12,10 @@ has no limit cycle (docs/decisions/0118).
 from __future__ import annotations
 
 import math
+from collections.abc import Container
 
 from zsched.core.gateway.company import is_full
-from zsched.core.gateway.job_need import CALM_S, Heard, JobNeed, age_of, is_calm, other_s, told_job
-from zsched.core.gateway.queueing import Queues
+from zsched.core.gateway.job_need import CALM_S, Heard, JobNeed, age_of, other_s, told_job
 from zsched.core.gateway.shortfall import Shortfalls, shows_lack
 from zsched.core.gateway.spending import Spending
 from zsched.core.gateway.task_speed import MOST_RATIO, TaskSpeeds, speed_of
@@ -79,7 +79,6 @@ class Demands:
         self.shortfalls = Shortfalls()
         """What machines did not keep."""
         self._speeds = TaskSpeeds()
-        self._queues = Queues()
         self._spending: dict[TaskId, Spending] = {}
         """What the task's worker has spent on answers where the task is."""
 
@@ -117,7 +116,7 @@ class Demands:
         if load is None or load.state is not WorkerState.READY or profile.cpu_used_cores is None:
             return False
         if known.owner != profile.node:
-            known = _came(known, self.job_on(task, profile.node), profile.node, now)
+            known = _came(known, profile.node, now)
             self._spending.pop(task, None)
         found = replace(known, seen_s=now)
         if is_full(profile):
@@ -138,10 +137,10 @@ class Demands:
                 found = self._compared(task, profile, found, before, is_new=is_new, has_jobs=has_jobs)
         speed = self._speeds.of(task, profile, is_there=True)
         if heard is not None and load.jobs is None and not is_new:
-            found = _with_heard(found, load, heard, job_cpu_s, speed, now)
+            hz = self._spending[task].answers_hz if task in self._spending else None
+            found = _with_heard(found, load, heard, job_cpu_s, hz, speed, now)
         else:
             found = _with_job(found, load, speed, is_new=is_new)
-        self._note_waits(task, profile.node, load, found, now - max(known.seen_s, known.since))
         self._known[task] = found
         age_s, is_seen = age_of(load.jobs, heard), False
         if not is_new and age_s is not None and found.job is not None and found.work:
@@ -162,8 +161,12 @@ class Demands:
         self._known.pop(task, None)
         self._spending.pop(task, None)
         self._speeds.forget(task)
-        self._queues.forget(task)
         self.shortfalls.forget(task)
+
+    def keep(self, nodes: Container[NodeId]) -> None:
+        """Know nothing of other nodes: one of the same name that comes later is another one."""
+        self._speeds.keep(nodes)
+        self.shortfalls.keep(nodes)
 
     def expect_another(self, task: TaskId) -> None:
         """Know nothing of a task whose program the file has changed; what its owner's one still shows counts for now.
@@ -229,24 +232,9 @@ class Demands:
         self._speeds.note(task, profile, speed)
         return as_before
 
-    def _note_waits(self, task: TaskId, node: NodeId, load: WorkerLoad, found: _Known, elapsed_s: float) -> None:
-        """Remember how often jobs come, and how they wait on a machine that has CPU to spare."""
-        spending = self._spending.get(task)
-        hz = load.jobs.wanted_hz if load.jobs is not None else None if spending is None else spending.answers_hz
-        if found.job is None or not hz:
-            return
-        self._queues.count(task, hz, elapsed_s)
-        if is_calm(load.jobs) if load.jobs is not None else found.seen_s - found.full_at > CALM_S:
-            self._queues.note(task, node, found.job, elapsed_s)
-
     def job(self, task: TaskId) -> JobNeed | None:
         """One job's need; ``None``: its worker has never reported any."""
         return self._known.get(task, _Known()).job
-
-    def job_on(self, task: TaskId, node: NodeId) -> JobNeed | None:
-        """One job's need on a node: it waits there as was seen there; ``None``: its worker has never reported any."""
-        known = self._known.get(task, _Known())
-        return known.job if known.job is None or known.owner == node else self._queues.on(task, node, known.job)
 
     def has_been(self, task: TaskId, node: NodeId, for_s: float, now: float) -> bool:
         """Whether the task has been seen on the node, with its worker ready, for so long."""
@@ -267,12 +255,12 @@ class Demands:
         )
 
 
-def _came(known: _Known, job: JobNeed | None, node: NodeId, now: float) -> _Known:
+def _came(known: _Known, node: NodeId, now: float) -> _Known:
     """It begins to be seen on a node: another one than before, or the same one, where its worker has started again."""
     before = None
     if known.seen_at not in (None, node) and now - known.seen_s <= RECENT_S:
         before = _Before(known.work if known.is_sure else None, known.job_work_s)
-    return replace(known, owner=node, since=now, before=before, seen_at=node, full_at=-math.inf, job=job)
+    return replace(known, owner=node, since=now, before=before, seen_at=node, full_at=-math.inf)
 
 
 def _with_use(
@@ -310,12 +298,14 @@ def _told(load: WorkerLoad, speed: float, fastest: float) -> float | None:
     return max(use + undone_hz * jobs.cpu_s, 0.0) * speed
 
 
-def _with_heard(known: _Known, load: WorkerLoad, heard: Heard, cpu_s: float | None, speed: float, now: float) -> _Known:
+def _with_heard(
+    known: _Known, load: WorkerLoad, heard: Heard, cpu_s: float | None, hz: float | None, speed: float, now: float
+) -> _Known:
     """With the job of the owner's worker as robots see it; where too little is known yet it stays what it was."""
     is_old = load.renewal is not Renewal.NONE
-    if cpu_s is None:
+    if cpu_s is None or hz is None:
         return replace(known, is_job_old=known.is_job_old or is_old)
-    job = heard.job(cpu_s, speed, known.job, is_calm=now - known.full_at > CALM_S)
+    job = heard.job(cpu_s, hz, speed, known.job, is_calm=now - known.full_at > CALM_S)
     return replace(known, job=job, job_work_s=cpu_s * speed, is_job_old=is_old)
 
 

@@ -52,6 +52,8 @@ class Gateway:
         for known in (self._profiles, self._tracks, self._readings):
             for name in [name for name in known if name not in self._names]:
                 del known[name]
+        self.demands.keep(self._names)
+        self._shares.keep(self._names)
         self.version += 1
 
     def absorb(self, profile: Profile, now: float, life: int | None = None) -> str | None:
@@ -107,7 +109,7 @@ class Gateway:
         fastest = max((self.demands.speed(task, one) for one in known), default=None)
         if self.demands.is_replaced(task, profile):
             self.forget(task)
-        has_share = self._shares.learn(task, profile)
+        has_share = self._shares.learn(task, profile, now)
         for name in self._shares.left_by(task, owner):
             left = self.fresh(name, now)
             has_share |= left is not None and self._shares.look_back(task, left, now)

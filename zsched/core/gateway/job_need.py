@@ -3,11 +3,15 @@
 Knows: work and waits of a job, what of a time was which. Does not know: what a task needs on the mean
 (`zsched.core.gateway.demand`), how answers are measured (`zsched.core.profile.answers`).
 
+Jobs that come irregularly wait for each other, and the more of its time a worker is busy the longer, by more than the
+time of a job: ``u / (1 - u)`` times it, and some factor for how irregular they are (Kingman 1961, "The single server
+queue in heavy traffic"). That factor is the task's, and what it is seen to be on its owner counts on every machine. A
+queue that was taken along as it is would make a slow machine look as quick as its owner (docs/decisions/0123).
+
 A foreign worker tells nothing. Its processes are measured, so CPU time per answer is known. The rest of an answer's
-time is a wait for other things, if the owner has had CPU to spare for some seconds. On a full machine, and soon after,
-the rest is also a wait for a CPU. There the wait for other things counts as it was seen before, and what an answer
-takes longer than foreseen is remembered of that machine. Elsewhere it is what was seen there
-(`zsched.core.gateway.queueing`), and the owner's until then.
+time is a wait, if the owner has had CPU to spare for some seconds: for other answers, as far as that is likely, and for
+other things, the same on every machine. On a full machine, and soon after, the rest is also a wait for a CPU. There
+other waits count as they were seen before, and what an answer takes longer than foreseen is remembered of that machine.
 """
 
 from __future__ import annotations
@@ -27,6 +31,12 @@ LEAST_FREE_CORES = 0.05
 """A job on a full machine gets at least this much, so that its time is finite."""
 CALM_S = 6.0
 """For so long the machine must have had CPU to spare: answers' time is a mean that follows later than the machine's."""
+BUSY_FROM, BUSY_TO = 0.01, 0.9
+"""The part of its time that a worker is busy: beyond these nobody knows how long its queue is."""
+LIKELY_QUEUEING = 3.0
+"""Answers wait for each other by at most this factor (1: they come at random); longer waits are for other things."""
+MOST_QUEUE_RATIO = 20.0
+"""No queue makes a job's age more than this many times its own time: whatever was told, it is much too late then."""
 
 
 class JobNeed(Struct, frozen=True):
@@ -35,9 +45,11 @@ class JobNeed(Struct, frozen=True):
     work_s: float
     """CPU time at speed 1."""
     other_s: float
-    """Its wait for things other than a CPU; of heard answers also for each other."""
-    queue_ratio: float
-    """Time from arrival to end over its own time where nothing is short; at least 1."""
+    """Its wait for things other than a CPU and its turn, the same on every machine."""
+    queueing: float
+    """How irregularly jobs come: their wait for each other is so many times `crowd` of their time, >= 0."""
+    hz: float
+    """How often they come, > 0."""
     is_serial: bool
     """One thread does it, so it uses at most one core at a time."""
 
@@ -47,9 +59,25 @@ class JobNeed(Struct, frozen=True):
         return cpu_s / (cpu_s + self.other_s) if self.is_serial and cpu_s > 0.0 else None
 
     def age_s(self, speed: float, free_cores: float) -> float:
-        """Expected seconds from arrival to end where a job gets this many cores while it runs, at most one."""
+        """Expected seconds from arrival to end where a job gets this many cores while it runs, at most one.
+
+        A thread that does one job after the other is busy while its job waits for other things, too.
+        """
         stretch = 1.0 / min(max(free_cores, LEAST_FREE_CORES), 1.0)
-        return self.queue_ratio * (self.other_s + stretch * self.work_s / speed)
+        held_s, beside_s = (self.other_s, 0.0) if self.is_serial else (0.0, self.other_s)
+        cpu_s = self.work_s / speed
+        queue_ratio = min(1.0 + self.queueing * crowd(self.hz * (held_s + cpu_s)), MOST_QUEUE_RATIO)
+        return beside_s + queue_ratio * (held_s + stretch * cpu_s)
+
+
+def crowd(busy: float) -> float:
+    """How many jobs wait, on the mean, for a worker that is ``busy`` for this part of its time, if they come at random.
+
+    >>> round(crowd(0.5), 3), round(crowd(7.0), 3)
+    (1.0, 9.0)
+    """
+    busy = min(max(busy, BUSY_FROM), BUSY_TO)
+    return busy / (1.0 - busy)
 
 
 def other_s(jobs: Jobs) -> float:
@@ -57,19 +85,23 @@ def other_s(jobs: Jobs) -> float:
     return 0.0 if jobs.wait_s is None else max(jobs.time_s - jobs.wait_s - jobs.cpu_s, 0.0)
 
 
-def is_calm(jobs: Jobs) -> bool:
-    """Whether they show their usual wait in the queue: next to no wait for a CPU."""
-    return jobs.wait_s is not None and jobs.wait_s <= CALM_WAIT_RATIO * jobs.time_s
-
-
 def told_job(jobs: Jobs, speed: float, known: JobNeed | None) -> JobNeed:
     """A job by its worker's report, on a machine of ``speed``; ``known``: what was known before."""
-    is_serial, queue_ratio = jobs.wait_s is not None, QUEUE_RATIO if known is None else known.queue_ratio
+    is_serial, waits_s = jobs.wait_s is not None, other_s(jobs)
+    cpu_s = jobs.cpu_s if is_serial else min(jobs.cpu_s, jobs.time_s)
+    crowded = crowd(jobs.wanted_hz * (waits_s + cpu_s))
+    queueing = (QUEUE_RATIO - 1.0) / crowded if known is None else known.queueing
     if jobs.age_s is not None and jobs.time_s > 0.0:
-        seen = max(jobs.age_s / jobs.time_s, 1.0)
-        queue_ratio = seen if is_calm(jobs) else min(seen, queue_ratio)
-    work_s = jobs.cpu_s if is_serial else min(jobs.cpu_s, jobs.time_s)
-    return JobNeed(work_s=work_s * speed, other_s=other_s(jobs), queue_ratio=queue_ratio, is_serial=is_serial)
+        seen = (min(max(jobs.age_s / jobs.time_s, 1.0), MOST_QUEUE_RATIO) - 1.0) / crowded
+        is_calm = jobs.wait_s is not None and jobs.wait_s <= CALM_WAIT_RATIO * jobs.time_s
+        queueing = seen if is_calm else min(seen, queueing)
+    return JobNeed(
+        work_s=cpu_s * speed,
+        other_s=waits_s,
+        queueing=queueing,
+        hz=max(jobs.wanted_hz, jobs.done_hz),
+        is_serial=is_serial,
+    )
 
 
 class Heard(Struct, frozen=True):
@@ -80,16 +112,21 @@ class Heard(Struct, frozen=True):
     counts: tuple[tuple[NodeId, float], ...]
     """(robot, how many answers to its own inputs it has counted)."""
 
-    def job(self, cpu_s: float, speed: float, known: JobNeed | None, *, is_calm: bool) -> JobNeed:
-        """A job by its answers, which take ``cpu_s`` each on a machine of ``speed``.
+    def job(self, cpu_s: float, hz: float, speed: float, known: JobNeed | None, *, is_calm: bool) -> JobNeed:
+        """A job by its answers, which come ``hz`` times a second and take ``cpu_s`` each on a machine of ``speed``.
 
         ``known``: what was known before. ``is_calm``: the machine has had CPU to spare for `CALM_S`.
         """
         cpu_s = min(cpu_s, self.age_s)  # several threads at once work for no longer
-        waits_s = self.age_s - cpu_s
-        if not is_calm:
-            waits_s = min(waits_s, 0.0 if known is None else known.other_s)
-        return JobNeed(work_s=cpu_s * speed, other_s=waits_s, queue_ratio=1.0, is_serial=False)
+        waits_s, crowded_s = self.age_s - cpu_s, crowd(hz * cpu_s) * cpu_s
+        if is_calm:
+            queue_s = min(waits_s, LIKELY_QUEUEING * crowded_s)
+            other_s = waits_s - queue_s
+        else:
+            other_s = 0.0 if known is None else min(waits_s, known.other_s)
+            queue_s = 0.0 if known is None else min(waits_s - other_s, known.queueing * crowded_s)
+        queueing = queue_s / crowded_s if crowded_s > 0.0 else 0.0
+        return JobNeed(work_s=cpu_s * speed, other_s=other_s, queueing=queueing, hz=hz, is_serial=False)
 
 
 def age_of(jobs: Jobs | None, heard: Heard | None) -> float | None:

@@ -1,21 +1,23 @@
 """GATEWAY: what a task would get on a full machine: the fair share of its threads, corrected by experience.
 
-Knows: run queues, what a task got beside how many others. Does not know: the task's need, which node is better.
+Knows: run queues, what a task got beside how many others. Does not know: how a need is learnt, which node is better.
 
 A fair scheduler (CFS, EEVDF) gives the same to every thread that wants to run. Groups with weights of their own
 (services, sessions) share differently, and nobody can see that from outside. So a share is believed until the task has
-been there. From then on the ratio of what it got to its fair share counts for that machine. Otherwise two machines that
-both promise more than they give would pass the task back and forth for ever.
+been there. From then on the ratio of what it got to its fair share counts for that machine, and how many of its threads
+wanted to run there: on a quick machine fewer do. Otherwise two machines that both promise more than they give would
+pass the task back and forth for ever.
 
 Others' threads that rest now and then wait longer beside the task. Without it a machine shows fewer that want to run
-than the task would find there, so how many more they were is remembered, too.
+than the task would find there, so how many more they were is remembered, too (docs/decisions/0124).
 """
 
 from __future__ import annotations
 
+from collections.abc import Container
 from typing import Final
 
-from zsched.core.gateway.company import is_full
+from zsched.core.gateway.company import SAME_RATIO, is_full, others_cores
 from zsched.core.gateway.job_need import CALM_WAIT_RATIO
 from zsched.core.gateway.shortfall import is_short
 from zsched.core.values.model import NodeId, TaskId
@@ -23,7 +25,7 @@ from zsched.core.values.profile import Profile, WorkerLoad, WorkerState
 from zsched.core.values.struct import Struct, replace
 
 LEFT_S: Final = 4.0
-"""So long after the task has left, what others do without it shows: their means have settled, its worker has ended."""
+"""So long after the task's worker has stopped working there, what others do without it shows."""
 
 
 def fair_share(capacity: float, threads: float, others: float) -> float:
@@ -40,14 +42,31 @@ def fair_share(capacity: float, threads: float, others: float) -> float:
     return min(capacity * threads / max(threads + others, capacity), capacity)
 
 
+class _Got(Struct, frozen=True):
+    """What a task got on a machine where it lacked CPU; the newest figures."""
+
+    threads: float
+    """Of the task, that wanted to run there."""
+    kept: float
+    """The part of their fair share that it got, at most 1."""
+
+
 class _Others(Struct, frozen=True):
     """Others' threads on a machine that wanted to run beside a task that lacked CPU there."""
 
     beside: float
+    cores: float
+    """What others used then."""
+    seen_at: float
+    """When the task was last seen at work there."""
     left_at: float | None = None
-    """When the task was first seen to be elsewhere; ``None``: it is there."""
+    """When it was first seen not to be; ``None``: it has not been."""
     more: float = 0.0
     """So many more they were than without it."""
+
+    def expected(self, seen: float) -> float:
+        """How many would want to run beside the task, where so many do now: no more than were found, or are there."""
+        return seen if self.left_at is None else max(seen, min(seen + self.more, self.beside))
 
 
 class Shares:
@@ -56,50 +75,71 @@ class Shares:
     def __init__(self) -> None:
         self._others: dict[tuple[TaskId, NodeId], _Others] = {}
         self._threads: dict[TaskId, float] = {}
-        self._kept: dict[tuple[TaskId, NodeId], float] = {}
-        """What a task got on a machine as a part of its fair share there, at most 1; the newest figure."""
+        """How many of a task's threads wanted to run where it lacked CPU last."""
+        self._got: dict[tuple[TaskId, NodeId], _Got] = {}
 
-    def learn(self, task: TaskId, profile: Profile) -> bool:
+    def learn(self, task: TaskId, profile: Profile, now: float) -> bool:
         """Note how many threads of the task want to run on its owner, and what they get; whether that has changed.
 
         A worker that starts does other work, by other threads: that tells nothing of the task.
         """
         load, key = profile.worker(task), (task, profile.node)
-        if key in self._others:
-            self._others[key] = replace(self._others[key], left_at=None)
-        if load is None or load.state is not WorkerState.READY:
+        used, known = others_cores(task, profile), self._others.get(key)
+        if load is None or load.state is not WorkerState.READY or profile.runnable is None or used is None:
             return False
-        if load.cpu_cores is None or profile.runnable is None or not (_is_hungry(load) or _is_held_up(profile, load)):
+        if load.cpu_cores is None or not (_is_hungry(load) or _is_held_up(profile, load)):
+            if known is not None:  # others that are fewer by now would be fewer beside it, too
+                beside = min(known.beside, max(profile.runnable - threads_of(load), 0.0))
+                self._others[key] = replace(
+                    known, beside=beside, cores=min(known.cores, used), seen_at=now, left_at=None
+                )
             return False
         threads = max(threads_of(load) if load.wanted_cores is None else load.wanted_cores, 1.0)
         own = threads if load.runnable is None else threads_of(load)
         others = max(profile.runnable - own, 0.0)
         kept = min(load.cpu_cores / fair_share(profile.cpu_cores, threads, others), 1.0)
-        before = self._threads.get(task), self._kept.get(key)
-        self._threads[task], self._kept[key], self._others[key] = threads, kept, _Others(others)
-        return before != (threads, kept)
+        before, got = self._got.get(key), _Got(threads, kept)
+        self._threads[task], self._got[key], self._others[key] = threads, got, _Others(others, used, now)
+        return before != got
 
     def left_by(self, task: TaskId, owner: NodeId) -> tuple[NodeId, ...]:
         """The nodes on which the task lacked CPU, but for its ``owner``."""
         return tuple(node for name, node in self._others if name == task and node != owner)
 
     def look_back(self, task: TaskId, profile: Profile, now: float) -> bool:
-        """Note how many others want to run where the task was and is no more; whether that has changed anything."""
-        known = self._others.get((task, profile.node))
-        if known is None or profile.runnable is None:
+        """Note how many others want to run where the task was and is no more; whether that has changed anything.
+
+        Its worker may go on for long: until the next owner's is ready, and to drain. Threads that only rest use as much
+        without the task as beside it, or more. Others that use less have ended, and nobody knows who was who.
+        """
+        key, load, used = (task, profile.node), profile.worker(task), others_cores(task, profile)
+        known = self._others.get(key)
+        if known is None or profile.runnable is None or used is None:
+            return False
+        own = 0.0 if load is None else threads_of(load)
+        if known.left_at is None and own > self._threads[task] / 2:
+            self._others[key] = replace(known, seen_at=now)
             return False
         left_at = now if known.left_at is None else known.left_at
         if now - left_at > LEFT_S:
             return False
-        load = profile.worker(task)
-        more = max(known.beside - profile.runnable + (0.0 if load is None else threads_of(load)), 0.0)
-        self._others[task, profile.node] = replace(known, left_at=left_at, more=more)
+        has_been_away = known.left_at is None and now - known.seen_at > LEFT_S
+        if has_been_away or used < known.cores - SAME_RATIO * profile.cpu_cores:
+            del self._others[key]
+            return True
+        more = max(known.beside - max(profile.runnable - own, 0.0), 0.0)
+        self._others[key] = replace(known, left_at=left_at, more=more)
         return (left_at, more) != (known.left_at, known.more)
+
+    def keep(self, nodes: Container[NodeId]) -> None:
+        """Know nothing of other nodes: one of the same name that comes later is another one."""
+        self._got = {key: got for key, got in self._got.items() if key[1] in nodes}
+        self._others = {key: others for key, others in self._others.items() if key[1] in nodes}
 
     def forget(self, task: TaskId) -> None:
         """Know nothing of a task that is no more."""
         self._threads.pop(task, None)
-        self._kept = {key: kept for key, kept in self._kept.items() if key[0] != task}
+        self._got = {key: got for key, got in self._got.items() if key[0] != task}
         self._others = {key: others for key, others in self._others.items() if key[0] != task}
 
     def at(self, task: TaskId, profile: Profile, need_cores: float, coming_cores: float = 0.0) -> float:
@@ -113,13 +153,12 @@ class Shares:
         """
         if profile.runnable is None:
             return 0.0
-        threads = self._threads.get(task, max(need_cores, 1.0))
+        got = self._got.get((task, profile.node), _Got(self._threads.get(task, max(need_cores, 1.0)), 1.0))
         load = profile.worker(task)
         own = 0.0 if load is None else threads_of(load)
-        seen = self._others.get((task, profile.node))
-        more = 0.0 if seen is None or seen.left_at is None else seen.more
-        fair = fair_share(profile.cpu_cores, threads, max(profile.runnable - own, 0.0) + more + coming_cores)
-        return self._kept.get((task, profile.node), 1.0) * fair
+        known, others = self._others.get((task, profile.node)), max(profile.runnable - own, 0.0)
+        others = others if known is None else known.expected(others)
+        return got.kept * fair_share(profile.cpu_cores, got.threads, others + coming_cores)
 
 
 def _is_hungry(load: WorkerLoad) -> bool:

@@ -1,6 +1,6 @@
 """GATEWAY: what a task got less of on a machine than was foretold, and whether its worker lacks anything.
 
-Knows: forecasts of work and of jobs' ages, what came of them. Does not know: needs, speeds, fair shares.
+Knows: forecasts of work and of jobs' ages, what came of them. Does not know: how needs, speeds and shares are learnt.
 
 The owner's service is measured, the candidates' foretold. So what a machine did not keep is remembered of it for as
 long as others use about as much there. Otherwise it would look better as soon as the task has left, and the task go
@@ -10,6 +10,7 @@ there and back for ever (docs/decisions/0032).
 from __future__ import annotations
 
 import math
+from collections.abc import Container
 from typing import Final
 
 from zsched.core.gateway.company import Company
@@ -104,6 +105,10 @@ class Shortfalls:
         """(part of the forecast work that the task got there, at most 1; how many times as long its jobs took)."""
         seen = self._seen.get((task, profile.node))
         return (seen.share, seen.stretch) if seen and seen.company.is_still(task, profile) else (1.0, 1.0)
+
+    def keep(self, nodes: Container[NodeId]) -> None:
+        """Know nothing of other nodes."""
+        self._seen = {key: seen for key, seen in self._seen.items() if key[1] in nodes}
 
     def forget(self, task: TaskId) -> None:
         """Know nothing of a task that is no more."""

@@ -54,7 +54,8 @@ class Spending:
             self._counts, self._at = dict(counts), now
             return
         risen = [robot for robot, count in counts if count != self._counts.setdefault(robot, count)]
-        is_silent = now - self._at > max(SILENT_S, min(SILENT_GAPS * self._gap_s, MEAN_S))
+        longest_s = max(SILENT_S, min(SILENT_GAPS * self._gap_s, MEAN_S))
+        is_silent = now - self._at > longest_s
         if not risen or not (self._clock is None or self._clock in risen or is_silent):
             return
         if self._clock not in risen:
@@ -65,7 +66,7 @@ class Spending:
             self._cpu_s = kept * self._cpu_s + _risen(self._spent_s, spent_s)
             answers = sum(_risen(self._counts.get(robot), count) for robot, count in counts)
             self._answers = kept * self._answers + answers
-            self._for_s = kept * self._for_s + self._gap_s
+            self._for_s = kept * self._for_s + min(self._gap_s, longest_s)  # a pause is no rate
         self._spent_s = spent_s
         self._counts |= dict(counts)
 

@@ -9,6 +9,7 @@ one the other one looks better (docs/decisions/0118).
 
 from __future__ import annotations
 
+from collections.abc import Container
 from typing import Final
 
 from zsched.core.gateway.company import Company
@@ -56,6 +57,10 @@ class TaskSpeeds:
             ratio = min(max(speed / benchmark, 1.0 / MOST_RATIO), MOST_RATIO)
             is_own = company.is_next_to_nobody(profile)
             self._seen[task, profile.node] = _Seen(ratio, benchmark, None if is_own else company)
+
+    def keep(self, nodes: Container[NodeId]) -> None:
+        """Know nothing of other nodes."""
+        self._seen = {key: seen for key, seen in self._seen.items() if key[1] in nodes}
 
     def forget(self, task: TaskId) -> None:
         """Know nothing of a task that is no more."""

@@ -1,7 +1,7 @@
-"""SCHEDULER: whether a node may have a task at all, and why not.
+"""SCHEDULER: whether a node may have a task, by its own profile, and why not.
 
 Knows: workers' states, memory that is not there, gauges' limits. Does not know: what the node is worth
-(`zsched.core.scheduler.scoring`), who reaches it.
+(`zsched.core.scheduler.scoring`), who reaches it, doubts.
 """
 
 from __future__ import annotations

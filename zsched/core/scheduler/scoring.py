@@ -14,7 +14,7 @@ from zsched.core.gateway.gateway import Gateway
 from zsched.core.gateway.shortfall import is_short
 from zsched.core.scheduler.eligibility import refusal
 from zsched.core.scheduler.links import pair_link, ways
-from zsched.core.scheduler.usage import Bookings, Use, coming_gpu, coming_use, own_use, predicted, readings
+from zsched.core.scheduler.usage import Bookings, Use, coming_gpu, coming_use, own_use, predicted, predicted_gauges
 from zsched.core.scheduler.utility import (
     cpu_utility,
     memory_service,
@@ -121,7 +121,8 @@ def score(
         demand, coming = gateway.demand(spec, profile), coming_use(spec, profile, bookings, gateway)
         own = own_use(spec, allocation, profile, demand)
         use = predicted(profile, own, demand, coming)
-        gauges = readings(spec, allocation, profile, gateway, coming_gpu(spec, profile, bookings, gateway, now))
+        gpu = coming_gpu(spec, profile, bookings, gateway, now)
+        gauges = predicted_gauges(spec, allocation, profile, gateway, gpu)
         reason = refusal(spec, allocation, profile, demand, use, gauges)
         if reason:
             refused.append((candidate, reason))
@@ -226,7 +227,7 @@ def _cpu(
         return None
     if tuning.score is ScoreForm.PAPER:
         return cpu_utility(profile.cpu_cores, used)
-    free, job = profile.cpu_cores - used + demand.cpu_cores, demands.job_on(spec.name, profile.node)
+    free, job = profile.cpu_cores - used + demand.cpu_cores, demands.job(spec.name)
     share, stretch = demands.shortfalls.of(spec.name, profile)
     share *= spare_factor(profile.cpu_cores - used, profile.cpu_cores, spec.cpu_floor_ratio)
     if job is None:

@@ -119,14 +119,17 @@ def coming_gpu(spec: TaskSpec, profile: Profile, bookings: Bookings | None, gate
     )
 
 
-def readings(
-    spec: TaskSpec, allocation: Allocation, profile: Profile, gateway: Gateway, coming_gpu: float
+def predicted_gauges(
+    spec: TaskSpec, allocation: Allocation, profile: Profile, gateway: Gateway, coming: float
 ) -> Mapping[GaugeName, float]:
-    """The node's gauges, predicted as if it had the task; none where the task goes by none."""
+    """The node's gauges as if it had the task, with what is ``coming`` of other tasks' use of its GPU.
+
+    None where the task goes by none.
+    """
     if not (spec.gauge_limits or allocation.tuning.weights.gauges):
         return {}
     readings, need = dict(gateway.readings(profile)), spec.demand.gpu
     if need and "gpu" in readings:  # by the fleet file: no driver tells which process uses how much
         own = need if profile.node == allocation.owner else 0.0
-        readings["gpu"] = predicted_use(readings["gpu"] + coming_gpu, own, need)
+        readings["gpu"] = predicted_use(readings["gpu"] + coming, own, need)
     return readings

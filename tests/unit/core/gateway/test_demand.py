@@ -14,7 +14,7 @@ from support.profiles import load_of, profile_of
 from zsched.core.gateway.company import STARVED_CPU_RATIO
 from zsched.core.gateway.demand import SETTLE_S, UNSURE, Demands
 from zsched.core.gateway.gateway import Gateway
-from zsched.core.gateway.job_need import CALM_S, QUEUE_RATIO, Heard
+from zsched.core.gateway.job_need import CALM_S, LIKELY_QUEUEING, QUEUE_RATIO, Heard, crowd
 from zsched.core.values.fleet import Demand
 from zsched.core.values.profile import Jobs, Profile, Renewal, WorkerState
 
@@ -66,7 +66,8 @@ def test_waits_for_a_cpu_are_no_other_waits_where_a_machine_is_hardly_ever_calm(
     stay(1.0, 0.9, at, 2 * CALM_S)
     job = demands.job("merge")
     assert job is not None
-    assert job.other_s == pytest.approx(0.8), "it waits for something else after all"
+    assert job.age_s(1.0, 4.0) == pytest.approx(0.9), "it waits for something else after all"
+    assert job.other_s == pytest.approx(0.8 - LIKELY_QUEUEING * 0.1 * crowd(0.4)), "all but what may be a queue"
 
 
 def test_a_program_of_few_answers_is_old_as_soon_as_it_is_told_so() -> None:
@@ -293,13 +294,18 @@ def test_the_wait_for_a_turn_is_what_it_is_where_nothing_is_short() -> None:
         return profile(0.3, cpu=2.0, jobs=jobs)
 
     demands = Demands()
+
+    def age_s() -> float:
+        job = demands.job("merge")
+        assert job is not None
+        return job.age_s(1.0, 4.0)
+
     demands.learn("merge", queued(2.0, 0.4), 0.0)
-    assert demands.job("merge") is not None
-    assert getattr(demands.job("merge"), "queue_ratio", 0.0) == QUEUE_RATIO
+    assert age_s() == pytest.approx(QUEUE_RATIO * 0.1)
     demands.learn("merge", queued(0.3, 0.0), EVERY_S)
-    assert getattr(demands.job("merge"), "queue_ratio", 0.0) == pytest.approx(3.0)
+    assert age_s() == pytest.approx(0.3)
     demands.learn("merge", queued(5.0, 0.4), 2 * EVERY_S)
-    assert getattr(demands.job("merge"), "queue_ratio", 0.0) == pytest.approx(3.0)
+    assert age_s() == pytest.approx(0.3)
 
 
 def test_a_task_that_gets_less_than_its_machine_s_figures_say_is_remembered_there() -> None:
@@ -435,7 +441,7 @@ def test_a_job_is_at_least_as_old_as_it_takes() -> None:
     demands = Demands()
     jobs = Jobs(time_s=0.1, cpu_s=0.1, wait_s=0.0, age_s=0.05, done_hz=3.0, wanted_hz=3.0)
     demands.learn("merge", profile(0.3, cpu=2.0, jobs=jobs), 0.0)
-    assert getattr(demands.job("merge"), "queue_ratio", 0.0) == 1.0
+    assert getattr(demands.job("merge"), "queueing", 1.0) == 0.0
 
 
 def test_a_job_of_several_threads_takes_elsewhere_what_it_takes_here() -> None:
@@ -486,74 +492,3 @@ def test_who_needed_more_before_and_does_not_say_that_it_lacks_a_cpu_gets_its_sh
         demands.learn("merge", word, number * EVERY_S)
     assert demands.at(TASK, now_on_full).cpu_cores == 0.6
     assert demands.shortfalls.of("merge", now_on_full)[0] == 1.0
-
-
-def queued(node: str, queue_ratio: float, *, wait_s: float = 0.0, speed: float = 1.0) -> Profile:
-    """Jobs of 0.1 s at speed 1, five a second, which wait for each other and ``wait_s`` for a CPU."""
-    time_s = 0.1 / speed + wait_s
-    jobs = Jobs(time_s=time_s, cpu_s=0.1 / speed, wait_s=wait_s, age_s=queue_ratio * time_s, done_hz=5.0, wanted_hz=5.0)
-    return profile(0.5 / speed, node=node, cpu=2.0, speed=speed, jobs=jobs)
-
-
-def age_on(demands: Demands, node: str, speed: float) -> float:
-    """How long a job would take there if no CPU were short."""
-    job = demands.job_on("merge", node)
-    assert job is not None
-    return job.age_s(speed, 4.0)
-
-
-def test_a_queue_is_the_machines_once_it_was_seen_there() -> None:
-    demands = Demands()
-    for at in range(10):
-        demands.learn("merge", queued("edge1", 2.0), float(at))
-    assert age_on(demands, "edge2", 2.0) == pytest.approx(0.1), "nothing else is known of it"
-    for at in range(10, 20):
-        demands.learn("merge", queued("edge2", 1.2, speed=2.0), float(at))
-    assert age_on(demands, "edge2", 2.0) == pytest.approx(0.06)
-    assert age_on(demands, "edge1", 1.0) == pytest.approx(0.2), "as it was seen there"
-    assert age_on(demands, "edge3", 1.0) == pytest.approx(0.12)
-
-
-@pytest.mark.parametrize("queue_ratio", [1.0, 4.0])
-def test_a_queue_that_a_load_made_is_not_the_machines(queue_ratio: float) -> None:
-    """Jobs that take long, and of which fewer come to their end, wait less for each other by comparison."""
-    demands = Demands()
-    for at in range(10):
-        demands.learn("merge", queued("edge1", 1.2), float(at))
-    for at in range(10, 30):
-        demands.learn("merge", queued("edge1", queue_ratio, wait_s=0.1), float(at))
-    for at in range(30, 40):
-        demands.learn("merge", queued("edge2", 1.1, speed=2.0), float(at))
-    assert age_on(demands, "edge1", 1.0) == pytest.approx(0.12)
-
-
-def test_waits_that_are_only_heard_are_the_machines_if_it_had_cpu_to_spare() -> None:
-    demands = Demands()
-
-    def stay(node: str, age_s: float, begin: float, used: float = 1.0) -> float:
-        at = begin
-        while at < begin + 3 * CALM_S:
-            load = load_of(cpu_cores=0.4, spent_s=0.4 * at)
-            one = profile_of(node, cpu_used_cores=used, workers=(load,))
-            demands.learn("merge", one, at, heard=Heard(age_s, (("robot1", 4.0 * at),)))
-            at += 0.5
-        return at
-
-    at = stay("edge1", 0.3, 0.0)
-    at = stay("edge1", 0.9, at, used=3.9)
-    stay("edge2", 0.15, at)
-    assert age_on(demands, "edge1", 1.0) == pytest.approx(0.3, rel=0.05)
-    assert age_on(demands, "edge2", 1.0) == pytest.approx(0.15, rel=0.05)
-    assert age_on(demands, "edge3", 1.0) == pytest.approx(0.15, rel=0.05)
-
-
-def test_how_jobs_waited_counts_from_the_first_look_after_a_move_and_not_for_the_time_before() -> None:
-    """Nobody had the task for an hour: one look after it weighs no more than another one."""
-    demands = Demands()
-    demands.learn("merge", queued("edge1", 1.0), 5000.0)
-    for at in (9000.0, 9001.0, 9002.0):
-        demands.learn("merge", queued("edge2", 4.0), at)
-    for at in (9003.0, 9004.0, 9005.0):
-        demands.learn("merge", queued("edge2", 1.0), at)
-    demands.learn("merge", queued("edge1", 1.0), 9006.0)
-    assert age_on(demands, "edge2", 1.0) == pytest.approx(0.22)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import doctest
+from dataclasses import replace
+
 import pytest
 
 from support.profiles import profile_of
-from zsched.core.gateway.job_need import Heard, JobNeed, heard_of
-from zsched.core.values.profile import AnswerTime
+from zsched.core.gateway import job_need
+from zsched.core.gateway.job_need import LIKELY_QUEUEING, MOST_QUEUE_RATIO, Heard, JobNeed, crowd, heard_of, told_job
+from zsched.core.values.profile import AnswerTime, Jobs
 
 
 def heard(age_s: float) -> Heard:
@@ -14,25 +18,84 @@ def heard(age_s: float) -> Heard:
 
 
 def test_time_that_is_no_cpu_time_is_a_wait_for_other_things_where_cpu_is_free() -> None:
-    job = heard(0.3).job(0.1, 2.0, None, is_calm=True)
-    assert (job.work_s, job.other_s) == pytest.approx((0.2, 0.2))
+    job = heard(0.3).job(0.1, 0.001, 2.0, None, is_calm=True)
+    assert (job.work_s, job.other_s) == pytest.approx((0.2, 0.2), rel=0.02), (
+        "answers as rare do not wait for each other"
+    )
     assert job.age_s(2.0, 4.0) == pytest.approx(0.3), "as it was seen there"
-    assert job.age_s(1.0, 4.0) == pytest.approx(0.4)
-    assert job.age_s(2.0, 0.5) == pytest.approx(0.4)
+    assert job.age_s(1.0, 4.0) == pytest.approx(0.4, rel=0.02)
+    assert job.age_s(2.0, 0.5) == pytest.approx(0.4, rel=0.02)
     assert job.most_cores(1.0) is None, "it may work on several at once"
 
 
 def test_on_a_full_machine_more_time_than_before_is_a_wait_for_a_cpu() -> None:
     late = heard(0.9)
-    before = JobNeed(work_s=0.1, other_s=0.2, queue_ratio=1.0, is_serial=False)
-    assert late.job(0.1, 1.0, before, is_calm=False) == before
-    assert late.job(0.1, 1.0, None, is_calm=False).other_s == 0.0
-    assert late.job(0.1, 1.0, before, is_calm=True).other_s == pytest.approx(0.8)
+    before = JobNeed(work_s=0.1, other_s=0.2, queueing=0.5, hz=1.0, is_serial=False)
+    assert late.job(0.1, 1.0, 1.0, before, is_calm=False) == before
+    unknown = late.job(0.1, 1.0, 1.0, None, is_calm=False)
+    assert (unknown.other_s, unknown.queueing) == (0.0, 0.0)
+    assert heard(0.15).job(0.1, 1.0, 1.0, before, is_calm=False).other_s == pytest.approx(0.05)
+    assert late.job(0.1, 0.001, 1.0, before, is_calm=True).other_s == pytest.approx(0.8, rel=0.01)
 
 
 def test_a_worker_that_uses_several_cores_at_once_works_all_the_time_of_an_answer() -> None:
-    job = heard(0.3).job(0.75, 1.0, None, is_calm=True)
-    assert (job.work_s, job.other_s) == pytest.approx((0.3, 0.0))
+    job = heard(0.3).job(0.75, 2.0, 1.0, None, is_calm=True)
+    assert (job.work_s, job.other_s, job.queueing) == pytest.approx((0.3, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("queueing", [0.3, 1.0, LIKELY_QUEUEING])
+@pytest.mark.parametrize("is_told", [True, False])
+def test_jobs_that_come_irregularly_wait_the_longer_the_slower_the_machine_is(queueing: float, is_told: bool) -> None:
+    """Whichever of both machines it is seen on: five a second, of 0.1 s on the slow one and 0.05 s on the other."""
+
+    def age_s(cpu_s: float) -> float:
+        return cpu_s * (1.0 + queueing * crowd(5.0 * cpu_s))
+
+    for speed in (1.0, 2.0):
+        cpu_s = 0.1 / speed
+        told = Jobs(time_s=cpu_s, cpu_s=cpu_s, wait_s=0.0, age_s=age_s(cpu_s), done_hz=5.0, wanted_hz=5.0)
+        answers = heard(age_s(cpu_s))
+        job = told_job(told, speed, None) if is_told else answers.job(cpu_s, 5.0, speed, None, is_calm=True)
+        assert job.age_s(1.0, 4.0) == pytest.approx(age_s(0.1))
+        assert job.age_s(2.0, 4.0) == pytest.approx(age_s(0.05))
+
+
+def test_a_wait_that_is_too_long_for_a_queue_is_for_other_things_and_the_same_everywhere() -> None:
+    """A GPU, of which the worker's processes show nothing."""
+    job = heard(0.155).job(0.005, 60.0, 1.0, None, is_calm=True)
+    assert job.age_s(1.0, 4.0) == pytest.approx(0.155)
+    assert job.age_s(4.0, 4.0) == pytest.approx(0.145, abs=0.005)
+
+
+def test_a_serial_worker_is_busy_while_its_job_waits_for_other_things_as_well() -> None:
+    told = Jobs(time_s=0.1, cpu_s=0.05, wait_s=0.0, age_s=0.2, done_hz=5.0, wanted_hz=5.0)
+    job = told_job(told, 1.0, None)
+    assert (job.other_s, job.queueing) == pytest.approx((0.05, 1.0))
+    assert job.age_s(2.0, 4.0) == pytest.approx(0.075 * (1.0 + crowd(0.375)))
+
+
+def test_a_queue_under_a_load_is_at_most_the_usual_one() -> None:
+    usual = JobNeed(work_s=0.1, other_s=0.0, queueing=1.0, hz=5.0, is_serial=True)
+
+    def seen(age_s: float) -> float:
+        jobs = Jobs(time_s=0.2, cpu_s=0.1, wait_s=0.1, age_s=age_s, done_hz=5.0, wanted_hz=5.0)
+        return told_job(jobs, 1.0, usual).queueing
+
+    assert seen(2.0) == 1.0
+    assert seen(0.3) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("time_s", [1e-9, 1e-3])
+def test_whatever_is_told_an_age_stays_within_bounds(time_s: float) -> None:
+    jobs = Jobs(time_s=time_s, cpu_s=time_s, wait_s=0.0, age_s=1e6, done_hz=1e6, wanted_hz=1e6)
+    job = told_job(jobs, 1.0, None)
+    assert job.age_s(1.0, 4.0) == pytest.approx(MOST_QUEUE_RATIO * time_s)
+    assert job.age_s(0.25, 4.0) <= 4.0 * MOST_QUEUE_RATIO * time_s * (1 + 1e-9)
+    assert told_job(replace(jobs, wanted_hz=0.0, done_hz=0.0), 1.0, None).age_s(0.1, 0.0) > 0.0
+
+
+def test_the_worked_example_holds() -> None:
+    assert doctest.testmod(job_need).failed == 0
 
 
 def answer(age_s: float, count: float, owner: str = "edge1", task: str = "merge") -> AnswerTime:

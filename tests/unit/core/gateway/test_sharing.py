@@ -30,8 +30,8 @@ def test_by_its_need_until_it_was_seen_to_lack_cpu_then_by_its_threads() -> None
     shares = Shares()
     assert shares.at("merge", idle("edge2"), 2.0) == pytest.approx(4.0 * 2 / 10)
     assert shares.at("merge", idle("edge2"), 0.3) == pytest.approx(4.0 / 9), "one thread at least"
-    assert not shares.learn("merge", profile(got=0.7)), "it has what it wants"
-    assert shares.learn("merge", profile(got=2.0, wanted=4.0))
+    assert not shares.learn("merge", profile(got=0.7), 0.0), "it has what it wants"
+    assert shares.learn("merge", profile(got=2.0, wanted=4.0), 0.0)
     assert shares.at("merge", idle("edge2"), 0.3) == pytest.approx(4.0 * 4 / 12)
 
 
@@ -39,50 +39,63 @@ def test_by_its_need_until_it_was_seen_to_lack_cpu_then_by_its_threads() -> None
 def test_a_worker_that_starts_again_tells_nothing_of_the_task_s_threads(state: WorkerState) -> None:
     """It loads a model by one thread for some seconds; its four threads are as many afterwards."""
     shares = Shares()
-    shares.learn("merge", profile(got=2.0, wanted=4.0))
+    shares.learn("merge", profile(got=2.0, wanted=4.0), 0.0)
     before = shares.at("merge", idle("edge2"), 4.0)
     starting = profile(got=0.1, wanted=1.0)
     load = replace(starting.workers[0], state=state)
-    assert not shares.learn("merge", replace(starting, workers=(load,)))
+    assert not shares.learn("merge", replace(starting, workers=(load,)), 0.0)
     assert before == shares.at("merge", idle("edge2"), 4.0)
 
 
 def test_what_comes_shares_as_well_and_nobody_counted_is_nothing() -> None:
     assert Shares().at("merge", idle("edge2"), 2.0, coming_cores=6.0) == pytest.approx(4.0 * 2 / 16)
     assert Shares().at("merge", profile(runnable=None), 2.0) == 0.0
-    assert not Shares().learn("merge", profile(runnable=None, wanted=3.0))
+    assert not Shares().learn("merge", profile(runnable=None, wanted=3.0), 0.0)
 
 
 def test_where_it_got_less_than_its_share_that_is_believed_of_this_machine_only() -> None:
     """Groups with weights of their own: 4 threads of 8 got a quarter of what is fair."""
     shares = Shares()
-    shares.learn("merge", profile(got=0.5, wanted=4.0))
+    shares.learn("merge", profile(got=0.5, wanted=4.0), 0.0)
     fair = 4.0 * 4 / 12
     assert shares.at("merge", idle(), 4.0) == pytest.approx(fair / 4)
     assert shares.at("merge", idle("edge2"), 4.0) == pytest.approx(fair)
-    shares.learn("merge", profile(got=9.0, wanted=4.0))
+    shares.learn("merge", profile(got=9.0, wanted=4.0), 0.0)
     assert shares.at("merge", idle(), 4.0) == pytest.approx(fair), "the newest counts, and no more than is fair"
 
 
 def test_the_same_again_is_no_news() -> None:
     shares = Shares()
-    assert shares.learn("merge", profile(got=0.5, wanted=4.0))
-    assert not shares.learn("merge", profile(got=0.5, wanted=4.0))
+    assert shares.learn("merge", profile(got=0.5, wanted=4.0), 0.0)
+    assert not shares.learn("merge", profile(got=0.5, wanted=4.0), 0.0)
 
 
 def test_what_it_got_counts_as_a_part_of_what_as_many_threads_would_get_by_fairness() -> None:
     shares = Shares()
-    shares.learn("merge", profile(got=0.25, wanted=0.95))
+    shares.learn("merge", profile(got=0.25, wanted=0.95), 0.0)
     assert shares.at("merge", idle("edge2"), 0.25) == pytest.approx(4.0 / 9), "one thread, never less"
     assert shares.at("merge", idle(), 0.25) == pytest.approx(4.0 / 9 / 2), "beside seven others half a core is fair"
-    shares.learn("merge", profile(runnable=2.0, got=2.0, wanted=4.0))
+    shares.learn("merge", profile(runnable=2.0, got=2.0, wanted=4.0), 0.0)
     assert shares.at("merge", idle(runnable=0.0), 0.25) == pytest.approx(2.0), "the machine is the task's alone"
 
 
-def crowded(shares: Shares, beside: float = 5.0) -> None:
+def test_as_many_of_its_threads_count_as_wanted_to_run_there() -> None:
+    """On a quick machine fewer do; where it has not been, as many as where it lacked CPU last."""
+    shares = Shares()
+    shares.learn("merge", profile(got=1.0, wanted=3.0), 0.0)
+    shares.learn("merge", profile(runnable=20.0, got=2.4, wanted=12.0, node="edge2"), 1.0)
+    assert shares.at("merge", idle(runnable=9.0), 5.0) == pytest.approx(1.0 / fair_share(4.0, 3.0, 5.0))
+    assert shares.at("merge", idle("edge3"), 5.0) == pytest.approx(fair_share(4.0, 12.0, 8.0))
+
+
+def crowded(shares: Shares, beside: float = 5.0, now: float = 99.0) -> None:
     """The task had four threads on edge1, and a fair share beside so many others."""
     got = fair_share(4.0, 4.0, beside)
-    assert shares.learn("merge", profile(runnable=4.0 + beside, got=got, wanted=4.0))
+    assert shares.learn("merge", profile(runnable=4.0 + beside, got=got, wanted=4.0), now)
+
+
+def share_of(shares: Shares, runnable: float, node: str = "edge1") -> float:
+    return shares.at("merge", idle(node, runnable=runnable), 4.0)
 
 
 def test_others_that_waited_only_beside_the_task_wait_again_when_it_comes_back() -> None:
@@ -90,16 +103,34 @@ def test_others_that_waited_only_beside_the_task_wait_again_when_it_comes_back()
     crowded(shares)
     assert shares.left_by("merge", "edge2") == ("edge1",)
     assert shares.left_by("merge", "edge1") == shares.left_by("slam", "edge2") == ()
-    for runnable in (8.5, 4.0, 3.0):  # its worker ends, and the means follow
-        ending = replace(idle(runnable=runnable), workers=(load_of(cpu_cores=0.0, runnable=max(runnable - 5.0, 0.0)),))
-        shares.look_back("merge", ending, now)
-        assert shares.at("merge", ending, 4.0) == pytest.approx(fair_share(4.0, 4.0, 5.0))
+    for runnable in (4.0, 3.0):  # the means follow
+        shares.look_back("merge", idle(runnable=runnable), now)
+        assert share_of(shares, runnable) == pytest.approx(fair_share(4.0, 4.0, 5.0))
         now += 1.0
-    assert not shares.look_back("merge", ending, now), "the same again is no news"
-    assert shares.at("merge", idle("edge2", runnable=3.0), 4.0) == pytest.approx(fair_share(4.0, 4.0, 3.0))
+    assert not shares.look_back("merge", idle(runnable=3.0), now), "the same again is no news"
+    assert share_of(shares, 3.0, "edge2") == pytest.approx(fair_share(4.0, 4.0, 3.0))
     now += LEFT_S
     assert not shares.look_back("merge", idle(runnable=0.0), now), "what changes later is the others' doing"
-    assert shares.at("merge", idle(runnable=0.0), 4.0) == pytest.approx(fair_share(4.0, 4.0, 2.0))
+    assert share_of(shares, 0.0) == pytest.approx(fair_share(4.0, 4.0, 2.0))
+
+
+@pytest.mark.parametrize("runnable", [4.0, 9.0])
+def test_no_more_others_are_expected_than_were_found_or_are_there(runnable: float) -> None:
+    """Somebody else makes those threads wait by now."""
+    shares = Shares()
+    crowded(shares)
+    shares.look_back("merge", idle(runnable=1.0), 100.0)
+    assert share_of(shares, runnable) == pytest.approx(fair_share(4.0, 4.0, max(runnable, 5.0)))
+
+
+def test_a_worker_that_goes_on_for_long_has_not_left() -> None:
+    """Until the next owner's is ready, for one."""
+    shares, at_work = Shares(), load_of(cpu_cores=1.6, runnable=4.0)
+    crowded(shares)
+    for now in range(100, 160):
+        assert not shares.look_back("merge", of(at_work, 9.0), float(now))
+    shares.look_back("merge", idle(runnable=3.0), 160.0)
+    assert share_of(shares, 3.0) == pytest.approx(fair_share(4.0, 4.0, 5.0))
 
 
 def test_where_the_task_is_again_others_are_those_that_are_seen() -> None:
@@ -107,25 +138,52 @@ def test_where_the_task_is_again_others_are_those_that_are_seen() -> None:
     crowded(shares)
     assert shares.look_back("merge", idle(runnable=3.0), 100.0)
     there = profile(runnable=5.0, got=2.0)  # it lacks nothing now: nothing is learnt
-    assert not shares.learn("merge", there)
+    assert not shares.learn("merge", there, 200.0)
     assert shares.at("merge", there, 2.0) == pytest.approx(fair_share(4.0, 4.0, 3.0))
-    assert shares.look_back("merge", idle(runnable=1.0), 900.0), "it has left once more"
-    assert shares.at("merge", idle(runnable=1.0), 4.0) == pytest.approx(fair_share(4.0, 4.0, 5.0))
 
 
-def test_fewer_others_beside_the_task_than_without_it_are_not_believed_and_nobody_counted_is_nothing() -> None:
+def test_others_that_ended_while_the_task_stayed_are_expected_no_more() -> None:
     shares = Shares()
     crowded(shares)
-    assert not shares.look_back("merge", profile(runnable=None, got=0.0), 99.0)
-    shares.look_back("merge", idle(runnable=9.0), 100.0)
-    assert shares.at("merge", idle(runnable=9.0), 4.0) == pytest.approx(fair_share(4.0, 4.0, 9.0))
-    shares.forget("merge")
-    assert shares.left_by("merge", "edge2") == ()
-    assert not shares.look_back("merge", idle(), 100.0)
+    assert not shares.learn("merge", profile(runnable=2.5, got=2.0), 150.0)
+    shares.look_back("merge", idle(runnable=0.1), 151.0)
+    assert share_of(shares, 4.0) == pytest.approx(fair_share(4.0, 4.0, 4.0)), "half a thread was there at last"
+
+
+def test_a_load_that_ends_just_after_the_task_has_left_is_no_thread_that_rests() -> None:
+    """Threads that rest use as much without the task, or more."""
+    shares = Shares()
+    crowded(shares)
+    shares.look_back("merge", idle(runnable=5.0), 100.0)
+    ended = profile_of("edge1", cpu_used_cores=0.2, workers=(load_of(cpu_cores=0.0),), runnable=0.2)
+    assert shares.look_back("merge", ended, 102.0)
+    assert share_of(shares, 4.0) == pytest.approx(fair_share(4.0, 4.0, 4.0))
+
+
+def test_a_machine_that_was_away_tells_nothing_of_what_was_there_before() -> None:
+    shares = Shares()
+    crowded(shares)
+    assert shares.look_back("merge", idle(runnable=0.0), 100.0 + LEFT_S)
+    assert share_of(shares, 4.0) == pytest.approx(fair_share(4.0, 4.0, 4.0))
+
+
+def test_a_task_and_a_node_that_are_no_more_are_forgotten_and_nobody_counted_is_nothing() -> None:
+    for is_node in (True, False):
+        shares = Shares()
+        crowded(shares)
+        assert not shares.look_back("merge", profile(runnable=None, got=0.0), 99.0)
+        shares.keep({"edge1"})
+        assert shares.left_by("merge", "edge2") == ("edge1",)
+        if is_node:
+            shares.keep({"edge2"})
+        else:
+            shares.forget("merge")
+        assert shares.left_by("merge", "edge2") == ()
+        assert not shares.look_back("merge", idle(), 100.0)
 
 
 def test_nothing_is_learnt_of_a_worker_whose_use_nobody_measured() -> None:
-    assert not Shares().learn("merge", profile(got=None, wanted=3.0))
+    assert not Shares().learn("merge", profile(got=None, wanted=3.0), 0.0)
 
 
 @pytest.mark.parametrize("need_cores", [0.3, 2.0])
@@ -160,12 +218,12 @@ def test_what_a_task_gets_that_lacks_cpu_between_its_pauses_is_believed_of_this_
     jobs = Jobs(time_s=0.14, cpu_s=0.06, wait_s=0.06, done_hz=7.0, wanted_hz=10.0)
     held_up = of(load_of(cpu_cores=0.4, runnable=0.84, jobs=jobs), 8.84)
     shares = Shares()
-    assert shares.learn("merge", held_up)
+    assert shares.learn("merge", held_up, 0.0)
     assert shares.at("merge", held_up, 0.6) == pytest.approx(0.4)
     assert shares.at("merge", idle(), 0.6) == pytest.approx(0.4)
     for calm in (replace(jobs, wait_s=0.005), replace(jobs, wait_s=None), replace(jobs, wanted_hz=7.0)):
-        assert not Shares().learn("merge", of(load_of(cpu_cores=0.4, runnable=0.84, jobs=calm), 8.84))
-    assert not Shares().learn("merge", of(load_of(cpu_cores=0.4, runnable=0.84, jobs=jobs), 8.84, used=3.0)), (
+        assert not Shares().learn("merge", of(load_of(cpu_cores=0.4, runnable=0.84, jobs=calm), 8.84), 0.0)
+    assert not Shares().learn("merge", of(load_of(cpu_cores=0.4, runnable=0.84, jobs=jobs), 8.84, used=3.0), 0.0), (
         "others leave it a CPU"
     )
 
@@ -174,7 +232,7 @@ def test_what_a_task_gets_that_lacks_cpu_between_its_pauses_is_believed_of_this_
 def test_of_an_owner_that_is_short_the_share_is_what_it_gets(others: float, wanted: float, got: float) -> None:
     shares, threads = Shares(), max(wanted, 1.0)
     owner = profile(runnable=threads + others, got=min(got, fair_share(4.0, threads, others)), wanted=threads)
-    shares.learn("merge", owner)
+    shares.learn("merge", owner, 0.0)
     assert shares.at("merge", owner, 0.3) == pytest.approx(owner.cores_of("merge"))
 
 

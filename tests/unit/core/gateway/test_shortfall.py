@@ -35,7 +35,7 @@ def test_undone_jobs_alone_show_no_lack_of_cpu() -> None:
     assert not shows_lack(load_of(wanted_cores=1.0))
 
 
-JOB = JobNeed(work_s=0.1, other_s=0.0, queue_ratio=1.0, is_serial=True)
+JOB = JobNeed(work_s=0.1, other_s=0.0, queueing=0.0, hz=4.0, is_serial=True)
 HELD_UP = Jobs(time_s=0.2, cpu_s=0.1, wait_s=0.1, age_s=0.2, done_hz=4.0, wanted_hz=8.0)
 
 
