@@ -439,6 +439,7 @@ OWN: Json = {
     "patience": None,
     "max_moves_per_minute": 6,
     "memory_floor_ratio": 0.05,
+    "cpu_floor_ratio": 0.0,
     "reach": "majority",
     "nu_dbm": -80.0,
     "rho_dbm": -40.0,

@@ -107,6 +107,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "for_s": (1.0, model.MAX_FOR_S),
     "max_moves_per_minute": (1, model.MAX_MOVES_PER_MINUTE),
     "memory_floor_ratio": (0.0, model.MAX_FLOOR),
+    "cpu_floor_ratio": (0.0, model.MAX_FLOOR),
     "nu_dbm": (-120.0, 0.0),
     "rho_dbm": (-120.0, 0.0),
 }

@@ -218,7 +218,7 @@ class LinkLimits:
     )
 
 
-TUNED_RULES = ("patience", "max_moves_per_minute", "memory_floor_ratio", "reach")
+TUNED_RULES = ("patience", "max_moves_per_minute", "memory_floor_ratio", "cpu_floor_ratio", "reach")
 TUNED_LINKS = ("nu_dbm", "rho_dbm", "pair", "foresee_s")
 """Settings of a task's file that a `Tuning` may set anew: fields of `TaskSpec` and of `LinkLimits`."""
 

@@ -176,6 +176,7 @@ class Tuning(Struct, frozen=True, kw_only=True):
     rho_dbm: float | None = None
     pair: PairReading | None = None
     foresee_s: float | None = None
+    cpu_floor_ratio: float | None = None
 
     @property
     def objective(self) -> Objective:
@@ -189,6 +190,7 @@ class Tuning(Struct, frozen=True, kw_only=True):
         check_range("patience", self.patience, 0.0, MAX_PATIENCE)
         check_range("max_moves_per_minute", self.max_moves_per_minute, 1, MAX_MOVES_PER_MINUTE)
         check_range("memory_floor_ratio", self.memory_floor_ratio, 0.0, MAX_FLOOR)
+        check_range("cpu_floor_ratio", self.cpu_floor_ratio, 0.0, MAX_FLOOR)
         check_range("nu_dbm", self.nu_dbm, RSSI_MIN_DBM, RSSI_MAX_DBM)
         check_range("rho_dbm", self.rho_dbm, RSSI_MIN_DBM, RSSI_MAX_DBM)
         check_range("foresee_s", self.foresee_s, 0.0, MAX_FORESEE_S)

@@ -155,6 +155,7 @@ OWN: dict[str, Any] = {
     "patience": 0.7,
     "max_moves_per_minute": 2,
     "memory_floor_ratio": 0.3,
+    "cpu_floor_ratio": 0.2,
     "reach": Reach.ALL,
     "nu_dbm": -70.0,
     "rho_dbm": -30.0,
