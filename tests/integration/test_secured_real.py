@@ -55,12 +55,6 @@ def bed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Testbed]:
         yield testbed
 
 
-def application(bed: Testbed, node: str) -> zenoh.Session:
-    """An application of the node's host, by what its operator socket tells root."""
-    access = ask(bed.folder / f"{node}.sock", {"verb": "access", "node": node}, 5.0)
-    return zenoh.open(zenoh.Config.from_json5(access["sides"]["fleet"]))
-
-
 def zsched(bed: Testbed, node: str, *words: str) -> subprocess.CompletedProcess[str]:
     """A verb on the machine of a node, or (a folder of its own) of a person."""
     home = bed.folder / node
@@ -230,18 +224,18 @@ def promise_for(query: zenoh.Query) -> bytes:
 def test_streams_run_and_move_and_tools_find_their_certificates(bed: Testbed) -> None:
     first = bed.wait_whole()
     got: list[str] = []
-    with application(bed, "robot1") as session:
-        session.declare_subscriber("robot1/out", lambda sample: got.append(sample.payload.to_string()))
-        publisher = session.declare_publisher("robot1/in")
+    session = bed.app("robot1")
+    session.declare_subscriber("robot1/out", lambda sample: got.append(sample.payload.to_string()))
+    publisher = session.declare_publisher("robot1/in")
 
-        def echoed(text: str) -> bool:
-            publisher.put(text)
-            return any(one.endswith(text) for one in got)
+    def echoed(text: str) -> bool:
+        publisher.put(text)
+        return any(one.endswith(text) for one in got)
 
-        bed.wait(lambda: echoed("before"), 60, "the owner's answer")
-        bed.stop(first)
-        second = bed.wait_settled()
-        bed.wait(lambda: echoed("after"), 60, "the next owner's answer")
+    bed.wait(lambda: echoed("before"), 60, "the owner's answer")
+    bed.stop(first)
+    second = bed.wait_settled()
+    bed.wait(lambda: echoed("after"), 60, "the next owner's answer")
     assert second != first
     pinged = zsched(bed, "robot1", "ping", "robot2", "--count", "1")
     assert pinged.returncode == 0, pinged.stdout + pinged.stderr

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from support.authorities import secured
 from support.verbs import command, move
 from zsched import paths
 from zsched.adapters.host.operator_client import ask
@@ -51,7 +52,7 @@ with Worker.from_env() as worker:
 
 @contextmanager
 def counting(
-    folder: Path, *words: str, edges: int = 2, link: str = "peer"
+    folder: Path, *words: str, edges: int = 2, link: str = "peer", has_certificates: bool = False
 ) -> Iterator[tuple[Testbed, str, list[int], zenoh.Publisher]]:
     """A fleet whose task has counted to 50; its owner, every count that robot1 got, and what it counts by.
 
@@ -61,6 +62,8 @@ def counting(
     script.write_text(WORKER)
     worker = {"command": [sys.executable, str(script), *words], "link": link}
     tree = echo_fleet(robots=1, edges=edges, stream_class="reliable", task={"worker": worker})
+    if has_certificates:
+        secured(tree, folder)
     with Testbed(folder, tree) as bed:
         bed.init()
         bed.start()
@@ -75,14 +78,24 @@ def counting(
 
 
 @pytest.mark.parametrize(
-    ("link", "save_s", "stops"), [("peer", 0.0, False), ("client", 0.0, False), ("peer", 1.0, True)]
+    ("link", "save_s", "stops", "has_certificates"),
+    [
+        ("peer", 0.0, False, False),
+        ("client", 0.0, False, False),
+        ("peer", 1.0, True, False),
+        ("peer", 0.0, False, True),
+        ("client", 0.0, False, True),
+    ],
 )
-def test_the_state_moves_with_the_task(tmp_path: Path, link: str, save_s: float, stops: bool) -> None:
+def test_the_state_moves_with_the_task(
+    tmp_path: Path, link: str, save_s: float, stops: bool, has_certificates: bool
+) -> None:
     """Workers of different machines must reach each other, whatever their links; else every move is a cold start.
 
     An owner that is told to stop stays until its state has been taken, though that takes a second.
     """
-    with counting(tmp_path, str(save_s), str(TIMEOUT_S), link=link) as (bed, first, totals, publisher):
+    words = (str(save_s), str(TIMEOUT_S))
+    with counting(tmp_path, *words, link=link, has_certificates=has_certificates) as (bed, first, totals, publisher):
         second = next(name for name in ("edge1", "edge2") if name != first)
         if stops:
             assert bed.stop(first)[first][0] == 0

@@ -332,9 +332,15 @@ class Testbed:
         return self.wait_settled(timeout_s)
 
     def app(self, node: NodeId) -> zenoh.Session:
-        """A plain zenoh application on ``node``: a client of its data endpoint; closed with the testbed."""
-        endpoint = self.fleet.node(node).listen_data
-        config = zenoh_config.client_config(connect=(endpoint,), timing=self.fleet.timing)
+        """A plain zenoh application on ``node``: a client of its data endpoint; closed with the testbed.
+
+        In a secured fleet it joins by what the node's operator socket tells root.
+        """
+        if self.fleet.security is not None:
+            config = ask(places.socket_path(self.folder, node), {"verb": "access", "node": node}, 5.0)["sides"]["fleet"]
+        else:
+            endpoint = self.fleet.node(node).listen_data
+            config = zenoh_config.client_config(connect=(endpoint,), timing=self.fleet.timing)
         session = zenoh.open(zenoh.Config.from_json5(config))
         self._sessions.append(session)
         return session
