@@ -150,6 +150,8 @@ class LifecycleNode:
             state = self._state(session)
             if state is not None:
                 heard_s = awake_s()
+            elif heard_s is not None and not _has_link(session):
+                heard_s = awake_s()  # the relay is away, and nobody can be asked
             elif heard_s is not None and awake_s() - heard_s > SILENT_S:
                 self._fail(f"{self._node} has not told its state for {SILENT_S:g} s")
                 return
@@ -223,6 +225,11 @@ class LifecycleNode:
     def _fail(self, reason: str) -> None:
         """End this worker: the node is killed with this process, whatever state it is in."""
         self._tell_end(Ended(reason=reason))
+
+
+def _has_link(session: zenoh.Session) -> bool:
+    """Whether the relay is there: a client has no other link."""
+    return any((*session.info.routers_zid(), *session.info.peers_zid()))
 
 
 def name_here(node: str, target: str) -> str:

@@ -74,14 +74,18 @@ class StateLink:
         self._main, self._zenoh_config = main, zenoh_config
         self._lock = threading.Lock()
         self._own: zenoh.Session | None = None
+        self._has_told = False
 
     @property
     def session(self) -> zenoh.Session:
-        """The session; the worker's own one where that is a client already, or no relay is known."""
+        """The session; the worker's own one where that is a client already, or no relay is known.
+
+        Where the relay cannot be reached it is the worker's own one for now: a later call tries again.
+        """
         with self._lock:
             if self._own is None:
                 self._own = self._opened()
-            return self._own
+            return self._main if self._own is None else self._own
 
     def open(self) -> None:
         """Open it now, so that it need not be in a move."""
@@ -93,7 +97,7 @@ class StateLink:
         if own is not None and own is not self._main:
             own.close()
 
-    def _opened(self) -> zenoh.Session:
+    def _opened(self) -> zenoh.Session | None:
         try:
             config = zenoh.Config.from_json5(self._zenoh_config)
             endpoints = json.loads(config.get_json("connect/endpoints"))
@@ -108,8 +112,10 @@ class StateLink:
             config.insert_json5("access_control/enabled", "false")
             return zenoh.open(config)
         except (zenoh.ZError, ValueError) as error:
-            _log.warning("no session of its own for snapshots (%s): only direct neighbours are asked", error)
-            return self._main
+            if not self._has_told:
+                _log.warning("no session of its own for snapshots yet (%s): only direct neighbours are asked", error)
+                self._has_told = True
+            return None
 
 
 class Offer:
@@ -130,11 +136,27 @@ class Offer:
         self._book = book
         self._waiting = threading.Semaphore(MAX_WAITING)
         self._saving = threading.Lock()
-        self._queryable = session.declare_queryable(key, tolerant(self._hear, "snapshot"), complete=True)
+        self._moving = threading.Lock()
+        self._session, self._queryable = session, self._declared(session)
+
+    def offer_by(self, session: zenoh.Session) -> None:
+        """Offer it by this session from now on, if it was another one."""
+        with self._moving:
+            if session is self._session:
+                return
+            try:
+                before, self._queryable, self._session = self._queryable, self._declared(session), session
+                before.undeclare()
+            except zenoh.ZError as error:  # one of them is closed: the worker ends
+                _log.info("the snapshot is offered by the session of before (%s)", error)
 
     def undeclare(self) -> None:
         """Offer it no more."""
-        self._queryable.undeclare()
+        with self._moving:
+            self._queryable.undeclare()
+
+    def _declared(self, session: zenoh.Session) -> zenoh.Queryable[None]:
+        return session.declare_queryable(self._key, tolerant(self._hear, "snapshot"), complete=True)
 
     def _hear(self, query: zenoh.Query) -> None:
         epoch = _asked_for(query)

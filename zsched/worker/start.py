@@ -6,6 +6,8 @@ Knows: the variables that the daemon sets. Does not know: roles, inputs, outputs
 from __future__ import annotations
 
 import json
+import logging
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
@@ -21,6 +23,11 @@ _ASKED_NODE: Final = "ZSCHED_NODE"
 """Alone it is no sign of a daemon: a terminal may have it, to say which node the verbs of ``zsched`` ask."""
 
 DEADLINE: Final = "ZSCHED_DEADLINE_MS"
+
+AGAIN_S: Final = 0.2
+"""A client dials its relay again so long after a try has failed, which takes `zsched.sessions.config.RELAY_START_S`."""
+
+_log = logging.getLogger("zsched.worker")
 
 
 class Surroundings(Struct, frozen=True, kw_only=True):
@@ -73,13 +80,28 @@ def surroundings(env: Mapping[str, str], standalone: str) -> Surroundings:
 def open_session(zenoh_config: str) -> zenoh.Session:
     """The worker's session on the data network.
 
+    A client cannot be without its relay, which may listen later than the worker begins (a port that is taken). That is
+    no fault of this worker's: it goes on trying, for as long as its daemon lets it.
+
     Raises:
         ConfigError: zenoh refuses the configuration.
     """
-    try:
-        return zenoh.open(zenoh.Config.from_json5(zenoh_config))
-    except (zenoh.ZError, ValueError) as error:
-        raise ConfigError(f"the worker's zenoh session cannot be opened: {error}") from error
+    has_told = False
+    while True:
+        try:
+            config = zenoh.Config.from_json5(zenoh_config)
+            is_client = json.loads(config.get_json("mode")) == "client"
+        except (zenoh.ZError, ValueError) as error:
+            raise ConfigError(f"the worker's zenoh session cannot be opened: {error}") from error
+        try:
+            return zenoh.open(config)
+        except zenoh.ZError as error:
+            if not is_client:
+                raise ConfigError(f"the worker's zenoh session cannot be opened: {error}") from error
+            if not has_told:
+                _log.warning("the relay of this node cannot be reached yet, and is tried again: %s", error)
+                has_told = True
+            time.sleep(AGAIN_S)
 
 
 def relay_endpoint(zenoh_config: str) -> str:

@@ -564,8 +564,10 @@ class Worker:
     def _fetch_snapshot(
         self, predecessor: str, epoch: int, timeout_s: float, is_gone: Callable[[], bool]
     ) -> bytes | str:
-        key = self._keyspace.snapshot(predecessor, self._task)
-        return fetch(self._state_link.session, key, epoch, timeout_s, is_gone)
+        key, session = self._keyspace.snapshot(predecessor, self._task), self._state_link.session
+        for offer in [entity for entity in self._declared if isinstance(entity, Offer)]:
+            offer.offer_by(session)  # the relay may not have been there when it was declared
+        return fetch(session, key, epoch, timeout_s, is_gone)
 
     def _is_owner(self) -> bool:
         role = self.role

@@ -20,7 +20,7 @@ from support.waiting import free_endpoint, until
 from zsched.core.relay_protocol import SnapshotChunk
 from zsched.core.values.plan import Role, WorkerRole
 from zsched.ipc.pipe import encode_chunk
-from zsched.sessions.config import data_config, worker_config
+from zsched.sessions.config import client_config, data_config, worker_config
 from zsched.worker import snapshot as worker_snapshot
 from zsched.worker.snapshot import (
     CHUNK,
@@ -171,6 +171,29 @@ def test_a_worker_that_is_there_before_its_relay_waits_for_it() -> None:
         link.close()
     late.join()
     relays[0].close()
+
+
+def test_a_relay_that_comes_much_later_is_found_and_the_state_offered_through_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Its port was taken for a while. A neighbour that is a client of the relay hears of no offer beside it."""
+    monkeypatch.setattr(worker_snapshot, "RELAY_S", 0.2)
+    endpoint = free_endpoint()
+    text = worker_config(connect=(endpoint,), shared_memory=False)
+    with opened(text) as main:
+        link = StateLink(main, text)
+        assert link.session is main
+        offer = offered(link.session, KEY, lambda: b"state")
+        with opened(data_config(listen=(endpoint,), connect=(), shared_memory=False)):
+            own = link.session
+            assert own is not main
+            offer.offer_by(own)
+            offer.offer_by(own)
+            with opened(client_config(connect=(endpoint,), shared_memory=False)) as neighbour:
+                until_offered(neighbour)
+                assert asked(neighbour)[0] == b"state"
+            offer.undeclare()
+            link.close()
 
 
 def test_a_large_snapshot_arrives_whole(sessions: tuple[zenoh.Session, zenoh.Session]) -> None:

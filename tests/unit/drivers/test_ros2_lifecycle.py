@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -63,8 +65,9 @@ class Led(LifecycleNode):
         self.change_s, self.reasons = 0.0, list[str]()
         self._tell_end = lambda ended: self.reasons.append(ended.reason)
 
-    def lead(self) -> Led:
-        self._lead(cast("Any", None))  # nothing of it is used
+    def lead(self, relays: Sequence[object] = ("a relay",)) -> Led:
+        info = SimpleNamespace(routers_zid=lambda: [], peers_zid=lambda: list(relays))
+        self._lead(cast("Any", SimpleNamespace(info=info)))  # nothing else of it is used
         return self
 
     def _state(self, session: zenoh.Session) -> int | None:
@@ -91,6 +94,13 @@ def test_a_node_is_heard_by_the_answer_to_a_long_transition(monkeypatch: pytest.
     assert led.lead().reasons == []
     still = Led(Clocks(monkeypatch), (0.0, State.UNCONFIGURED), *(((2.0, None),) * 6))
     assert still.lead().reasons == ["/edge1/slam has not told its state for 10 s"]
+
+
+def test_a_node_is_not_silent_while_its_relay_is_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is asked through the relay: a port that is taken for a minute is no fault of the node's."""
+    script = ((0.0, State.INACTIVE), *(((2.0, None),) * 30), (0.0, State.INACTIVE), (0.0, State.FINALIZED))
+    assert Led(Clocks(monkeypatch), *script).lead(relays=()).reasons == []
+    assert len(Led(Clocks(monkeypatch), *script).lead().reasons) == 1
 
 
 def test_a_machine_that_sleeps_is_no_silence_of_a_node(monkeypatch: pytest.MonkeyPatch) -> None:
