@@ -66,7 +66,7 @@ class Led(LifecycleNode):
         self._tell_end = lambda ended: self.reasons.append(ended.reason)
 
     def lead(self, relays: Sequence[object] = ("a relay",)) -> Led:
-        info = SimpleNamespace(routers_zid=lambda: [], peers_zid=lambda: list(relays))
+        info = SimpleNamespace(routers_zid=list, peers_zid=lambda: list(relays))
         self._lead(cast("Any", SimpleNamespace(info=info)))  # nothing else of it is used
         return self
 

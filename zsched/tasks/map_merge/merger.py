@@ -17,7 +17,7 @@ from dataclasses import asdict
 from enum import StrEnum
 from typing import Any
 
-from zsched.core.values.struct import Struct, field
+from zsched.core.values.struct import Struct, field, replace
 from zsched.tasks.map_merge.align import Fit, prepare
 from zsched.tasks.map_merge.compose import Extent, compose, extent_of
 from zsched.tasks.map_merge.geometry import Pose2
@@ -114,6 +114,8 @@ class Merger:
         self._numbers: dict[str, int] = {}
         self._versions: dict[str, MapVersion] = {}
         self._areas: dict[str, float] = {}
+        self._refusals: dict[str, str] = {}
+        """{robot: why its newest map is not taken}; an older one may be in the merged map."""
         hints = dict(settings.poses) if settings.mode is Mode.TRACK else {}
         self._pairs = PairBook(
             rule=settings.rule,
@@ -143,7 +145,9 @@ class Merger:
             return f"more than {MAX_ROBOTS} robots"
         cropped = crop_known(grid)
         if cropped is not None and (refusal := self._too_large(cropped)):
+            self._refusals[robot] = refusal
             return refusal
+        self._refusals.pop(robot, None)
         area = 0.0 if cropped is None else cropped.known_area_m2
         if area < RESTART_RATIO * self._areas.get(robot, 0.0):
             self._pairs.forget(robot)
@@ -167,8 +171,8 @@ class Merger:
 
         Its alignments stay: others may be connected through it, and it may come back in the same frame.
         """
-        self._grids.pop(robot, None)
-        self._versions.pop(robot, None)
+        for known in (self._grids, self._versions, self._refusals):
+            known.pop(robot, None)
 
     def merge(self) -> MergeResult:
         """Bring the alignments up to date and lay the connected maps over each other."""
@@ -215,13 +219,15 @@ class Merger:
             "revision": self._revision,
             "extent": None if self._extent is None else asdict(self._extent),
             "edges": edges,
+            "areas": self._areas,
         }
         return json.dumps(state).encode()
 
     def restore(self, snapshot: bytes) -> str:
         """Take over a previous owner's transforms; returns why they are not taken (empty: taken).
 
-        An owner that comes back takes them over too: the robots have followed its predecessor's map meanwhile. The
+        An owner that comes back takes them over too: the robots have followed its predecessor's map meanwhile, and a
+        robot may have started again in another frame. So what it had accepted itself is over. The
         canvas then covers what either had, unless the world frame is another.
         """
         try:
@@ -234,12 +240,15 @@ class Merger:
             extent = None if state["extent"] is None else Extent(**{k: int(v) for k, v in state["extent"].items()})
             reference = None if state["reference"] is None else str(state["reference"])
             revision = int(state["revision"])
+            areas = {str(robot): float(area) for robot, area in state.get("areas", {}).items()}
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
             return f"malformed snapshot: {error!r}"
         if extent is not None and (extent.is_too_large or extent.width <= 0 or extent.height <= 0):
             return "malformed snapshot: extent"
-        for edge in edges:
-            self._pairs.adopt(edge)
+        if len(areas) > MAX_ROBOTS or not all(0.0 <= area < math.inf for area in areas.values()):
+            return "malformed snapshot: areas"
+        self._pairs.adopt(edges)
+        self._areas = areas
         if reference is None and extent is None:
             return ""  # the predecessor never had a map
         is_same_world = self._reference in {None, reference}
@@ -250,7 +259,7 @@ class Merger:
         return ""
 
     def _robots(self) -> set[str]:
-        return {*self._grids, *self._settings.poses}
+        return {*self._grids, *self._settings.poses, *self._refusals}
 
     def _align(self, grids: Mapping[str, Grid]) -> bool:
         """Bring all pairs up to date; returns whether a search is still due."""
@@ -309,6 +318,12 @@ class Merger:
         )
 
     def _status(self, robot: str, attached: Mapping[str, Pose2], oversize: frozenset[str]) -> RobotStatus:
+        status = self._status_of_taken(robot, attached, oversize)
+        if robot not in self._refusals:
+            return status
+        return replace(status, state=RobotState.REFUSED, reason=self._refusals[robot])
+
+    def _status_of_taken(self, robot: str, attached: Mapping[str, Pose2], oversize: frozenset[str]) -> RobotStatus:
         if self._grids.get(robot) is None:
             reason = "its map is empty" if robot in self._grids else "no map received yet"
             return RobotStatus(robot=robot, state=RobotState.WAITING, reason=reason)

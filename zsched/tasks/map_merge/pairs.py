@@ -85,6 +85,8 @@ class _PairState(Struct):
     searched_areas: tuple[float, float] | None = None
     job: int | None = None
     """Number of the search that runs."""
+    is_adopted: bool = False
+    """Accepted by a previous owner, and not held against a map of this one's yet."""
     has_few_walls: bool = False
     """The newest search had nothing to judge."""
     contradictions: int = 0
@@ -148,9 +150,16 @@ class PairBook:
             return "the maps have too few walls so far"
         return "its map waits for a search"
 
-    def adopt(self, alignment: Alignment) -> None:
-        """Take over an alignment that a previous owner had accepted."""
-        self._states[alignment.pair] = _PairState(alignment=alignment)
+    def adopt(self, alignments: Iterable[Alignment]) -> None:
+        """Take over the alignments that the previous owner had accepted; others of before count no more.
+
+        They are searched again as its own would be: once a map has grown from what it is at the next `refresh`.
+        """
+        for state in self._states.values():
+            if state.accepted is not None:
+                state.alignment = None
+        for one in alignments:
+            self._states[one.pair] = _PairState(alignment=one, is_adopted=self._hint(one.pair) is None)
 
     def forget(self, robot: str) -> None:
         """Drop everything about a robot whose map frame is a new one."""
@@ -171,6 +180,8 @@ class PairBook:
             if state.versions == versions:
                 continue
             state.versions = versions
+            if state.is_adopted:
+                state.searched_areas, state.is_adopted = (maps[pair[0]].area_m2, maps[pair[1]].area_m2), False
             a, b = maps[pair[0]].walls, maps[pair[1]].walls
             if state.accepted is not None:
                 self._track(state, state.accepted, a, b)

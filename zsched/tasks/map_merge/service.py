@@ -83,7 +83,11 @@ class _Input(Struct):
     maps: int = 0
     bad: int = 0
     last_error: str | None = None
+    """Why the newest of its messages, or its map, was not taken."""
     received_s: float | None = None
+    """When the newest map came."""
+    taken_s: float | None = None
+    """When the map came that is merged."""
 
 
 class MapMergeService:
@@ -252,8 +256,10 @@ class MapMergeService:
         for robot, grid in pending.items():
             if grid is None:
                 self._merger.remove(robot)
-            elif refusal := self._merger.update(robot, grid):
-                self._inputs[robot].last_error = refusal
+            else:
+                book = self._inputs[robot]
+                book.last_error = self._merger.update(robot, grid) or None
+                book.taken_s = book.taken_s if book.last_error else book.received_s
         return self._merger.merge()
 
     def _leave_out(self, pending: Mapping[str, Grid | None]) -> None:
@@ -349,7 +355,7 @@ def _robot_fields(status: RobotStatus | None, book: _Input, result: MergeResult 
         "overlap": None if status is None else _rounded(status.overlap),
         "margin": None if status is None else _rounded(status.margin),
         "pose": None if pose is None else _pose_fields(pose),
-        "map_age_s": None if book.received_s is None else round(now - book.received_s, 3),
+        "map_age_s": None if book.taken_s is None else round(now - book.taken_s, 3),
         "maps": book.maps,
         "bad": book.bad,
         "last_error": book.last_error,

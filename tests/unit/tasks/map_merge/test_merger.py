@@ -266,6 +266,73 @@ def test_reference_survives_in_the_snapshot_though_a_lower_name_comes(view: View
     assert _fed(second, view, ("robot1", "robot2")).merge().reference == "robot2"
 
 
+def test_an_owner_that_comes_back_forgets_an_alignment_that_its_successor_no_longer_has(view: View) -> None:
+    """robot2 has started again meanwhile, in another frame; its new map is over half as large as the old one."""
+    first = _fed(_merger(Mode.ESTIMATE), view, ("robot1", "robot2"))
+    _settled(first)
+    second = _fed(_merger(Mode.ESTIMATE), view, ("robot1",))
+    assert second.restore(first.snapshot()) == ""
+    frame = Pose2(x=30.0, y=-20.0, yaw=2.0)
+    for width in (0.5, 8.0):
+        assert second.update("robot2", view((6.0, 0.0, 6.0 + width, 16.0), frame)) == ""
+        second.merge()
+    assert first.restore(second.snapshot()) == ""
+    assert first.update("robot2", view((6.0, 0.0, 14.0, 16.0), frame)) == ""
+    result = _settled(first)
+    if "robot2" in result.transforms:
+        found = result.transforms["robot1"].inverse().compose(result.transforms["robot2"])
+        assert difference(found, _FRAMES["robot1"].inverse().compose(frame), (10.0, 8.0))[0] < 0.5
+
+
+def test_an_owner_that_comes_back_keeps_what_its_successor_has_aligned_with_smaller_maps(view: View) -> None:
+    first = _fed(_merger(Mode.ESTIMATE), view, ("robot1", "robot2"))
+    _settled(first)
+    frame, part = Pose2(x=30.0, y=-20.0, yaw=2.0), (6.0, 0.0, 11.0, 16.0)
+    second = _merger(Mode.ESTIMATE)
+    assert second.update("robot1", view(_VIEWS["robot1"], _FRAMES["robot1"])) == ""
+    assert second.update("robot2", view(part, frame)) == ""
+    assert set(_settled(second).transforms) == {"robot1", "robot2"}
+    assert first.restore(second.snapshot()) == ""
+    assert first.update("robot1", view(_VIEWS["robot1"], _FRAMES["robot1"])) == ""
+    assert first.update("robot2", view(part, frame)) == ""
+    searches, result = first.searches, first.merge()
+    assert set(result.transforms) == {"robot1", "robot2"}
+    assert first.searches == searches
+    found = result.transforms["robot1"].inverse().compose(result.transforms["robot2"])
+    assert difference(found, _FRAMES["robot1"].inverse().compose(frame), (10.0, 8.0))[0] < 0.5
+
+
+def test_an_alignment_that_was_handed_over_is_searched_again_when_a_map_has_grown(view: View) -> None:
+    """As one's own: the first one may be a little wrong, or plausible and wrong."""
+    first = _fed(_merger(Mode.ESTIMATE), view, ("robot1", "robot2"))
+    _settled(first)
+    second = _merger(Mode.ESTIMATE)
+    assert second.restore(first.snapshot()) == ""
+    _settled(_fed(second, view, ("robot1", "robot2")))
+    assert second.searches == 0, "a move costs no search"
+    assert second.update("robot2", view((6.0, 0.0, 24.0, 16.0), _FRAMES["robot2"])) == ""
+    _settled(second)
+    assert second.searches == 1
+
+
+def test_a_map_that_has_become_too_large_shows_though_an_older_one_is_merged(
+    view: View, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    merger = _fed(_merger(Mode.ESTIMATE), view, ("robot1", "robot2"))
+    assert _states(_settled(merger))["robot2"] is RobotState.ATTACHED
+    with monkeypatch.context() as smaller:
+        smaller.setattr("zsched.tasks.map_merge.merger.MAX_ALIGNED_CELLS", 1000)
+        refusal = merger.update("robot2", view(_VIEWS["robot2"], _FRAMES["robot2"]))
+        assert merger.update("robot3", view(_VIEWS["robot3"], _FRAMES["robot3"])) != ""
+    result = merger.merge()
+    shown = _status(result, "robot2")
+    assert (shown.state, shown.reason) == (RobotState.REFUSED, refusal)
+    assert "robot2" in result.transforms, "an older one is in the map"
+    assert "too large" in _status(result, "robot3").reason
+    _fed(merger, view, ("robot2",))
+    assert _states(merger.merge())["robot2"] is RobotState.ATTACHED
+
+
 def test_snapshot_of_another_mode_or_shape_is_refused(view: View) -> None:
     good = _fed(_merger(Mode.KNOWN, _FRAMES), view)
     good.merge()
@@ -277,5 +344,9 @@ def test_snapshot_of_another_mode_or_shape_is_refused(view: View) -> None:
     state["extent"]["high_x"] = 10**9
     assert _merger(Mode.KNOWN).restore(json.dumps(state).encode())
     state = json.loads(raw)
+    for areas in ({"a": -1.0}, {"a": math.nan}, [1.0], dict.fromkeys(map(str, range(MAX_ROBOTS + 1)), 1.0)):
+        assert _merger(Mode.KNOWN).restore(json.dumps(state | {"areas": areas}).encode())
+    older = {key: value for key, value in state.items() if key != "areas"}
+    assert _merger(Mode.KNOWN).restore(json.dumps(older).encode()) == "", "an older version's has none"
     state["edges"] = [{"pair": ["a", "b"], "margin": None, "fit": {"a_t_b": {"x": math.nan, "y": 0, "yaw": 0}}}]
     assert _merger(Mode.KNOWN).restore(json.dumps(state).encode())
