@@ -17,7 +17,7 @@ from zsched.config.reader import MAX_FILE_BYTES, Collector, Fault, Place, neares
 from zsched.config.schema import FLEET
 from zsched.config.security import read_security
 from zsched.config.site import read_site
-from zsched.config.tasks import read_tasks
+from zsched.config.tasks import check_secured, read_tasks
 from zsched.config.timing import WIFI, timing_faults
 from zsched.core.membership.beat_room import MAX_BEAT_BYTES, most_bytes
 from zsched.core.values.document import MAX_DOCUMENT_BYTES
@@ -139,6 +139,8 @@ def _fleet(section: Section, folder: Path, size: int, out: Collector) -> Fleet |
     tasks = read_tasks(section, cast, out)
     zenoh_config = _zenoh_config(section, folder, out)
     security = read_security(section, cast, folder, out)
+    if security is not None:
+        check_secured(section, out)
     cells = read_site(section, folder, out)
     if out.count:
         return None

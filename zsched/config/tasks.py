@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from typing import Any, Final
 
 from zsched.config.blocks import Located, Section
-from zsched.config.drivers import command_of
+from zsched.config.drivers import Driver, command_of
 from zsched.config.nodes import Cast, select
 from zsched.config.reader import Collector, Place, nearest
 from zsched.config.ros2 import ros2_rules
@@ -112,6 +112,16 @@ def _task(
     by_rule = {id(stream.value): stream.place for stream in streams}
     places.update({stream: by_rule.get(id(rule), entry.place) for stream, rule in named_rules(task)})
     return task
+
+
+def check_secured(section: Section, out: Collector) -> None:
+    """What no task of a secured fleet can have: services of a ROS node are under no rule that lets them through."""
+    entries: dict[str, Located[Section | None]] = section.get("tasks", {})
+    for entry in entries.values():
+        worker: Section | None = None if entry.value is None else entry.value.get("worker")
+        if worker is not None and worker.get("driver") is Driver.ROS2_LIFECYCLE:
+            message = "a secured fleet lets nobody lead a managed node: its services are no streams of the fleet"
+            out.error(worker.where("driver"), message, "start the node by `command:` alone, and leave `driver:` out")
 
 
 def _of(section: Section, *names: str) -> dict[str, Any]:

@@ -214,8 +214,9 @@ class Worker:
 
         ``on_sample`` runs in the dispatch thread. When it falls behind, samples wait: of an input of class ``reliable``
         all, of any other the newest per key. ``keep_last`` says otherwise: this many of the newest per key, ``None``:
-        all. Of all, at most ``depth`` per key wait, then the oldest go. What goes of a ``reliable`` input is counted
-        `lost` in `zsched status`; of others, what gives way to something newer counts as processed.
+        all. Of all, at most ``depth`` per key wait, then the oldest go. What goes of a ``reliable`` input, or of one
+        with ``keep_last=None``, is counted `lost` in `zsched status`; of others, what gives way to something newer
+        counts as processed.
 
         Raises:
             ValueError: ``keep_last`` or ``depth`` is below 1, the key has another placeholder, or another input of this

@@ -96,3 +96,14 @@ def test_a_fault_stands_at_its_key(worker: str, said: str, column: int) -> None:
 def test_an_engine_in_place_of_a_driver_is_one_fault_with_the_word_to_write(engine: str) -> None:
     faults = check(f"{{driver: {engine}, image: a}}").faults
     assert [fault.hint for fault in faults] == ["did you mean 'container'?"]
+
+
+def test_a_managed_node_in_a_secured_fleet_is_refused_where_it_is_named() -> None:
+    worker = "{driver: ros2_lifecycle, node: '/{target}/slam', command: [slam], ready: matching}"
+    assert worker_of(worker).command[:3] == ("python", "-m", "zsched.drivers.ros2_lifecycle")
+    secured = FILE.replace("WORKER", worker).replace("tcp/", "tls/") + "security: {}\n"
+    (fault,) = check_bytes(secured.encode()).faults
+    assert "managed node" in fault.message
+    assert "driver: ros2_lifecycle" in fault.source_line
+    other = secured.replace(worker, "{driver: systemd, unit: shout@.service}")
+    assert check_bytes(other.encode()).faults == ()
