@@ -19,7 +19,9 @@ Bytecode is kept, whatever the environment says: else each process that a test s
 
 from __future__ import annotations
 
+import contextlib
 import gc
+import importlib
 import os
 import signal
 import sys
@@ -46,8 +48,21 @@ HANDLED = pytest.StashKey[tuple[dict[signal.Signals, Any], set[signal.Signals]]]
 STALLS = pytest.StashKey[Stalls]()
 
 
+def _draw_the_same_everywhere() -> None:
+    """Let no module that happens to be loaded change what Hypothesis draws.
+
+    It draws constants out of all of them, so a test would meet other examples alone, beside others, or in another
+    worker: red there, and green for whoever looks.
+    """
+    with contextlib.suppress(ImportError):
+        providers = importlib.import_module("hypothesis.internal.conjecture.providers")
+        if hasattr(providers, "is_local_module_file"):
+            setattr(providers, "is_local_module_file", lambda _path: False)  # noqa: B010 - mypy knows no such attribute
+
+
 def pytest_configure() -> None:
     """In each process that runs tests, before any does."""
+    _draw_the_same_everywhere()
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     typer.testing._get_command = cache(typer.testing._get_command)
     sys.dont_write_bytecode = False
