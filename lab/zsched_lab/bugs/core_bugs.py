@@ -1046,7 +1046,7 @@ VOTE_BUGS = (
     _bug(
         "a worker that goes on has left",
         "zsched.core.gateway.sharing",
-        "if known.left_at is None and own > self._threads[task] / 2:",
+        "if known.left_at is None and own > known.own / 2:",
         "if own < 0.0:",
         ("tests/unit/core/gateway/test_sharing.py",),
     ),

@@ -278,8 +278,22 @@ BOOKED_TWICE = (
 """The file says that two tasks take twice what they do."""
 
 
+TAKES_THE_REST = (
+    (Machine(cores=2.0, speed=2.05, steady=0.59, memory=0.6),) * 3,
+    (
+        Work(cores=0.33, job_s=0.24, deadline_ms=360.0),
+        Work(cores=2.955, threads=5, memory_mb=300.0, demand_cores=2.955),
+        Work(cores=1.1, threads=4, memory_mb=300.0),
+        Work(cores=0.08, threads=3),
+    ),
+    (1, 3, 1, 2),
+)
+"""The second one lacks nothing, and leaves somebody else's thread a little too little."""
+
+
 @settings(derandomize=True, database=None, deadline=None, max_examples=12)
 @example(fleet=WAITING_FOR_IT, weights=BOTH)
+@example(fleet=TAKES_THE_REST, weights=BOTH)
 @example(fleet=BOOKED_TWICE, weights=BOTH)
 @given(fleet=fleets(), weights=st.sampled_from((CPU_ONLY, BOTH)))
 def test_where_nothing_changes_several_tasks_come_to_rest(
@@ -287,7 +301,7 @@ def test_where_nothing_changes_several_tasks_come_to_rest(
 ) -> None:
     """Each may go once to each machine, to learn what it gets there.
 
-    The examples were limit cycles of 47 and 60 moves (docs/decisions/0124).
+    The examples were limit cycles of 47, 4 and 60 moves in 300 s (docs/decisions/0124).
     """
     machines, works, owners = fleet
     moves = Tasks(machines, works, owners, weights).run(300.0)

@@ -52,11 +52,13 @@ class _Got(Struct, frozen=True):
 
 
 class _Others(Struct, frozen=True):
-    """Others' threads on a machine that wanted to run beside a task that lacked CPU there."""
+    """Others' threads on a machine that wanted to run beside a task."""
 
     beside: float
     cores: float
     """What others used then."""
+    own: float
+    """The task's threads that ran or waited then."""
     seen_at: float
     """When the task was last seen at work there."""
     left_at: float | None = None
@@ -83,27 +85,23 @@ class Shares:
 
         A worker that starts does other work, by other threads: that tells nothing of the task.
         """
-        load, key = profile.worker(task), (task, profile.node)
-        used, known = others_cores(task, profile), self._others.get(key)
+        load, key, used = profile.worker(task), (task, profile.node), others_cores(task, profile)
         if load is None or load.state is not WorkerState.READY or profile.runnable is None or used is None:
             return False
-        if load.cpu_cores is None or not (_is_hungry(load) or _is_held_up(profile, load)):
-            if known is not None:  # others that are fewer by now would be fewer beside it, too
-                beside = min(known.beside, max(profile.runnable - threads_of(load), 0.0))
-                self._others[key] = replace(
-                    known, beside=beside, cores=min(known.cores, used), seen_at=now, left_at=None
-                )
-            return False
+        is_lacking = _is_hungry(load) or _is_held_up(profile, load)
         threads = max(threads_of(load) if load.wanted_cores is None else load.wanted_cores, 1.0)
-        own = threads if load.runnable is None else threads_of(load)
+        own = threads if is_lacking and load.runnable is None else threads_of(load)
         others = max(profile.runnable - own, 0.0)
+        self._others[key] = _Others(others, used, own, now)
+        if load.cpu_cores is None or not is_lacking:
+            return False
         kept = min(load.cpu_cores / fair_share(profile.cpu_cores, threads, others), 1.0)
         before, got = self._got.get(key), _Got(threads, kept)
-        self._threads[task], self._got[key], self._others[key] = threads, got, _Others(others, used, now)
+        self._threads[task], self._got[key] = threads, got
         return before != got
 
     def left_by(self, task: TaskId, owner: NodeId) -> tuple[NodeId, ...]:
-        """The nodes on which the task lacked CPU, but for its ``owner``."""
+        """The nodes on which the task was, but for its ``owner``."""
         return tuple(node for name, node in self._others if name == task and node != owner)
 
     def look_back(self, task: TaskId, profile: Profile, now: float) -> bool:
@@ -117,7 +115,7 @@ class Shares:
         if known is None or profile.runnable is None or used is None:
             return False
         own = 0.0 if load is None else threads_of(load)
-        if known.left_at is None and own > self._threads[task] / 2:
+        if known.left_at is None and own > known.own / 2:
             self._others[key] = replace(known, seen_at=now)
             return False
         left_at = now if known.left_at is None else known.left_at

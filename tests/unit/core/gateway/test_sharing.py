@@ -123,6 +123,14 @@ def test_no_more_others_are_expected_than_were_found_or_are_there(runnable: floa
     assert share_of(shares, runnable) == pytest.approx(fair_share(4.0, 4.0, max(runnable, 5.0)))
 
 
+def test_so_do_others_that_waited_beside_a_task_that_lacked_nothing() -> None:
+    """It took all that was left, and they a little less than they want."""
+    shares = Shares()
+    assert not shares.learn("merge", profile(runnable=3.0, got=2.0), 99.0)
+    shares.look_back("merge", idle(runnable=0.6), 100.0)
+    assert share_of(shares, 0.6) == pytest.approx(fair_share(4.0, 4.0, 1.0))
+
+
 def test_a_worker_that_goes_on_for_long_has_not_left() -> None:
     """Until the next owner's is ready, for one."""
     shares, at_work = Shares(), load_of(cpu_cores=1.6, runnable=4.0)
