@@ -25,8 +25,8 @@ from zsched.core.values.struct import Struct
 
 CALM_WAIT_RATIO = 0.1
 """Jobs that wait for a CPU for a smaller part of their time show their usual wait in the queue."""
-QUEUE_RATIO = 2.0
-"""Until that was seen, a job's age counts as at most this many times its own time."""
+RANDOM_QUEUEING = 1.0
+"""Until it was seen, jobs count as coming at random."""
 LEAST_FREE_CORES = 0.05
 """A job on a full machine gets at least this much, so that its time is finite."""
 CALM_S = 6.0
@@ -90,7 +90,7 @@ def told_job(jobs: Jobs, speed: float, known: JobNeed | None) -> JobNeed:
     is_serial, waits_s = jobs.wait_s is not None, other_s(jobs)
     cpu_s = jobs.cpu_s if is_serial else min(jobs.cpu_s, jobs.time_s)
     crowded = crowd(jobs.wanted_hz * (waits_s + cpu_s))
-    queueing = (QUEUE_RATIO - 1.0) / crowded if known is None else known.queueing
+    queueing = RANDOM_QUEUEING if known is None else known.queueing
     if jobs.age_s is not None and jobs.time_s > 0.0:
         seen = (min(max(jobs.age_s / jobs.time_s, 1.0), MOST_QUEUE_RATIO) - 1.0) / crowded
         is_calm = jobs.wait_s is not None and jobs.wait_s <= CALM_WAIT_RATIO * jobs.time_s

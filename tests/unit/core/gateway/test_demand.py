@@ -14,7 +14,7 @@ from support.profiles import load_of, profile_of
 from zsched.core.gateway.company import STARVED_CPU_RATIO
 from zsched.core.gateway.demand import SETTLE_S, UNSURE, Demands
 from zsched.core.gateway.gateway import Gateway
-from zsched.core.gateway.job_need import CALM_S, LIKELY_QUEUEING, QUEUE_RATIO, Heard, crowd
+from zsched.core.gateway.job_need import CALM_S, LIKELY_QUEUEING, Heard, crowd
 from zsched.core.values.fleet import Demand
 from zsched.core.values.profile import Jobs, Profile, Renewal, WorkerState
 
@@ -301,7 +301,7 @@ def test_the_wait_for_a_turn_is_what_it_is_where_nothing_is_short() -> None:
         return job.age_s(1.0, 4.0)
 
     demands.learn("merge", queued(2.0, 0.4), 0.0)
-    assert age_s() == pytest.approx(QUEUE_RATIO * 0.1)
+    assert age_s() == pytest.approx(0.1 * (1.0 + crowd(0.3)))
     demands.learn("merge", queued(0.3, 0.0), EVERY_S)
     assert age_s() == pytest.approx(0.3)
     demands.learn("merge", queued(5.0, 0.4), 2 * EVERY_S)
