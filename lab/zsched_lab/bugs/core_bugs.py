@@ -1004,8 +1004,8 @@ VOTE_BUGS = (
     _bug(
         "what a task gets between its pauses is forgotten",
         "zsched.core.gateway.sharing",
-        "not (_is_hungry(load) or _is_held_up(profile, load))",
-        "not _is_hungry(load)",
+        "is_lacking = _is_hungry(load) or _is_held_up(profile, load)",
+        "is_lacking = _is_hungry(load)",
         ("tests/unit/core/gateway/test_sharing.py", "tests/unit/core/test_closed_loop.py"),
     ),
     _bug(
