@@ -52,7 +52,7 @@ _ANY_TUNING: Final = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
 _ANY_CANDIDATES: Final = (NOBODY,)
 """The same for candidates: of a task without any the file has a fault."""
 _OF_THE_TASK: Final = ("reach", "memory_floor_ratio", "cpu_floor_ratio", "max_moves_per_minute")
-"""Keys of `scheduling:` that the task keeps; at run time a tuning may set them anew, as `patience`."""
+"""Keys of `scheduling:` that are fields of the task; a tuning may set them anew at run time, as it may `patience`."""
 _Places = dict[str, Place]
 """Where each rule stands, by stream name."""
 

@@ -25,7 +25,7 @@ _ASKED_NODE: Final = "ZSCHED_NODE"
 DEADLINE: Final = "ZSCHED_DEADLINE_MS"
 
 AGAIN_S: Final = 0.2
-"""A client dials its relay again so long after a try has failed, which takes `zsched.sessions.config.RELAY_START_S`."""
+"""A client's pause between two tries to reach its relay; a try takes up to `zsched.sessions.config.RELAY_START_S`."""
 
 _log = logging.getLogger("zsched.worker")
 
@@ -88,14 +88,12 @@ def open_session(zenoh_config: str) -> zenoh.Session:
     """
     has_told = False
     while True:
+        is_client = False
         try:
             config = zenoh.Config.from_json5(zenoh_config)
             is_client = json.loads(config.get_json("mode")) == "client"
-        except (zenoh.ZError, ValueError) as error:
-            raise ConfigError(f"the worker's zenoh session cannot be opened: {error}") from error
-        try:
             return zenoh.open(config)
-        except zenoh.ZError as error:
+        except (zenoh.ZError, ValueError) as error:
             if not is_client:
                 raise ConfigError(f"the worker's zenoh session cannot be opened: {error}") from error
             if not has_told:

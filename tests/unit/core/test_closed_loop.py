@@ -16,6 +16,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from support.allocations import allocation_of
+from support.decisions import figures_of
 from support.fleets import fleet_of, task_of
 from support.profiles import load_of
 from support.proposals import proposal_of
@@ -24,11 +25,10 @@ from zsched.core.gateway.gateway import Gateway
 from zsched.core.profile.answers import Answers
 from zsched.core.profile.profile import Profiler
 from zsched.core.scheduler.damping import Damping
-from zsched.core.scheduler.decision import decide, rules_of
+from zsched.core.scheduler.decision import decide
 from zsched.core.scheduler.judge import Judge, Judgement, Outcome
 from zsched.core.scheduler.patience import CHOICES
 from zsched.core.scheduler.scoring import score
-from zsched.core.values.decision import Figures
 from zsched.core.values.fleet import (
     DEFAULT_BONUS,
     DEFAULT_COOL_DOWN_S,
@@ -309,18 +309,13 @@ class Loop:
             robot: score(self.spec, self.allocation, robot, gateway, self.states, now)
             for robot, gateway in self.gateways.items()
         }
-        figures = Figures(
-            task=self.spec.name,
+        figures = figures_of(
+            self.spec,
+            *self.robots,
             now=now,
-            rules=rules_of(self.spec),
             allocation=self.allocation,
-            voters=self.robots,
-            present=self.robots,
             vectors=tuple(vectors.values()),
-            electors=self.robots,
-            electors_heard=self.robots,
             settled_for_s=now - self.settled_at,
-            owner_state=PeerState.ALIVE,
             owner_profile=self.gateways[self.robots[0]].fresh(owner, now),
             is_called=is_called,
         )

@@ -13,17 +13,17 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from support.allocations import allocation_of
+from support.decisions import figures_of
 from support.fleets import fleet_of, task_of
 from support.profiles import load_of
 from zsched.core.events import WorkerJobs
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.profile.profile import Profiler
 from zsched.core.scheduler.damping import Damping
-from zsched.core.scheduler.decision import decide, rules_of
+from zsched.core.scheduler.decision import decide
 from zsched.core.scheduler.judge import Judge, Judgement, Outcome
 from zsched.core.scheduler.scoring import score
 from zsched.core.scheduler.usage import book
-from zsched.core.values.decision import Figures
 from zsched.core.values.fleet import DEFAULT_BONUS, DEFAULT_COOL_DOWN_S, PAPER_PATIENCE, Demand, Timing
 from zsched.core.values.model import PeerState, ScoreForm, Tuning, Weights
 from zsched.core.values.profile import DeviceSample, WorkerState
@@ -216,18 +216,13 @@ class Tasks:
         self.gateway.learn_demand(name, allocation.owner, now)
         booked = book(self.specs.values(), self.values)
         vector = score(spec, allocation, ROBOT, self.gateway, self.states, now, bookings=booked)
-        figures = Figures(
-            task=name,
+        figures = figures_of(
+            spec,
+            ROBOT,
             now=now,
-            rules=rules_of(spec),
             allocation=allocation,
-            voters=(ROBOT,),
-            present=(ROBOT,),
             vectors=(vector,),
-            electors=(ROBOT,),
-            electors_heard=(ROBOT,),
             settled_for_s=now - self.settled_at[name],
-            owner_state=PeerState.ALIVE,
             owner_profile=self.gateway.fresh(allocation.owner, now),
             is_called=is_called,
         )

@@ -25,7 +25,7 @@ from zsched.core.values.profile import Profile, WorkerLoad, WorkerState
 from zsched.core.values.struct import Struct, replace
 
 LEFT_S: Final = 4.0
-"""So long after the task's worker has stopped working there, what others do without it shows."""
+"""Others show what they do without the task for this time after its worker has stopped working there."""
 
 
 def fair_share(capacity: float, threads: float, others: float) -> float:

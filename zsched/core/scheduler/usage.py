@@ -23,7 +23,7 @@ Bookings = Mapping[NodeId, tuple[TaskSpec, ...]]
 """{owner: its tasks}: of a task that has just come, profiles show nothing yet."""
 
 GPU_SHOWS_S = 6.0
-"""So long after a task has come, its use of the GPU shows: three time constants of the gauges' means."""
+"""A task's use of the GPU shows this time after it has come: three time constants of the gauges' means."""
 _NOTHING = Demand()
 
 
