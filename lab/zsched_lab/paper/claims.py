@@ -288,9 +288,9 @@ def judged(runs: Sequence[Json]) -> list[tuple[Claim, Difference | None, Verdict
     return found
 
 
-def over_fixed(runs: Sequence[Json], scheme: str, fixed: Sequence[str] = FIXED_SCHEMES) -> dict[str, Difference]:
-    """{metric: difference} of a scheme to the mean of the fixed ones, where all of them were run often enough."""
-    found = {metric: difference(table_of(runs, metric, (scheme,)), table_of(runs, metric, fixed)) for metric in GAINS}
+def over(runs: Sequence[Json], scheme: str, others: Sequence[str] = FIXED_SCHEMES) -> dict[str, Difference]:
+    """{metric: difference} of a scheme to the mean of the others (the fixed ones), where all were run often enough."""
+    found = {metric: difference(table_of(runs, metric, (scheme,)), table_of(runs, metric, others)) for metric in GAINS}
     return {metric: one for metric, one in found.items() if one is not None and one.runs >= LEAST_RUNS}
 
 

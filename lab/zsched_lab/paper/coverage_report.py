@@ -18,6 +18,7 @@ from zsched_lab.paper.claims import interval, led
 from zsched_lab.paper.led_metrics import mean_stood
 from zsched_lab.paper.roles import ROLES, mean_shares
 from zsched_lab.paper.schemes import FIXED_SCHEMES, SCHEMES
+from zsched_lab.paper.tables import known_columns, mean_text
 
 Json = Mapping[str, Any]
 OURS = {"zsched": "#111111", "zsched_slam": "#8a1c1c"}
@@ -26,10 +27,21 @@ Curve = tuple[list[float], list[float], list[float | None]]
 """(t_s, mean share, half of its 95 % interval or ``None`` of one run)."""
 COVERAGE_SAYS = (
     "Share of the truth that the newest merged map knows, right or wrong, mean over the robots; 95 % interval over the "
-    "runs. *Walls*: the mean share of the truth's walls that it has where they are.\n"
+    "runs. What a run knew when it was done holds from there on. *Walls*: the mean share of the truth's walls that it "
+    "has where they are.\n"
 )
 STANDS_AT_MOST = 0.05
 """Of the time robots may stand whose SLAM's edge has a model and no merger; with the merger they stand for longer."""
+LED_COLUMNS = (
+    ("walls_mean", "walls", 3),
+    ("explored_m2", "m² at the end", 0),
+    ("stopped_ratio", "stood", 3),
+    ("corrections_hz", "corrections/s", 2),
+    ("correction_age_max_s", "oldest s", 2),
+    ("pose_error_m", "pose error m", 3),
+    ("merge_cpu_s", "merge CPU s", 3),
+)
+"""(metric, title, digits) behind the coverage: how well the robots were led."""
 MARKS = 5
 """This many instants of the run stand in the table."""
 STATES = (
@@ -41,20 +53,24 @@ STATES = (
 
 
 def coverage_parts(runs: Sequence[Json]) -> list[str]:
-    """Both tables under their headings; nothing of runs whose robots nobody leads."""
-    own = led(runs)
+    """The tables under their headings; of runs whose robots nobody leads coverage alone, where it was measured."""
+    known, own = covered(runs), led(runs)
+    curves = ["### Coverage over time\n", COVERAGE_SAYS, coverage_table(known)] if known else []
     if not own:
-        return []
+        return curves
     return [
-        "### Coverage over time\n",
-        COVERAGE_SAYS,
-        coverage_table(own),
+        *curves,
         "### Whose CPU an edge's was\n",
         "Shares of an edge's CPU, the mean over edges and runs by time. All but zsched's own have a quota in common.\n",
         roles_table(own),
         "### When robots stood\n",
         stood_text(own),
     ]
+
+
+def covered(runs: Sequence[Json]) -> list[Json]:
+    """The runs of which coverage over time was measured."""
+    return [figures for figures in runs if figures.get("coverage_curve")]
 
 
 def mean_curve(runs: Sequence[Json]) -> Curve:
@@ -78,9 +94,11 @@ def coverage_table(runs: Sequence[Json]) -> str:
     """A row per scheme: coverage at some instants, its mean over the run, and how the robots were led."""
     by_scheme = {name: own for name in SCHEMES if (own := [f for f in runs if f["scheme"] == name])}
     instants = mean_curve(runs)[0]
-    chosen = [instants[round(number * (len(instants) - 1) / MARKS)] for number in range(1, MARKS + 1)]
-    heads = ["scheme", "runs", *(f"{t_s:g} s" for t_s in chosen), "mean over the run", "walls", "m² at the end"]
-    heads += ["stood", "corrections/s", "oldest s", "pose error m", "merge CPU s"]
+    marks = [round(number * (len(instants) - 1) / MARKS) for number in range(1, MARKS + 1)]
+    chosen = [instants[mark] for mark in dict.fromkeys(marks)]
+    columns = known_columns(runs, LED_COLUMNS)
+    heads = ["scheme", "runs", *(f"{t_s:g} s" for t_s in chosen), "mean over the run"]
+    heads += [title for _, title, _ in columns]
     lines = [f"| {' | '.join(heads)} |", "| --- " * len(heads) + "|"]
     for name, own in by_scheme.items():
         times, means, halves = mean_curve(own)
@@ -88,21 +106,9 @@ def coverage_table(runs: Sequence[Json]) -> str:
         over = [float(figures["coverage_mean"]) for figures in own]
         cells = [with_interval(*at[t_s], len(own)) for t_s in chosen]
         cells += [with_interval(statistics.fmean(over), interval(over), len(own))]
-        cells += [mean_of(own, "walls_mean", 3), mean_of(own, "explored_m2", 0)]
-        cells += [mean_of(own, "stopped_ratio", 3), mean_of(own, "corrections_hz", 2)]
-        cells += [
-            mean_of(own, "correction_age_max_s", 2),
-            mean_of(own, "pose_error_m", 3),
-            mean_of(own, "merge_cpu_s", 3),
-        ]
+        cells += [mean_text([figures.get(metric) for figures in own], digits) for metric, _, digits in columns]
         lines.append(f"| {name} | {len(own)} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
-
-
-def mean_of(runs: Sequence[Json], metric: str, digits: int) -> str:
-    """The mean of a figure; a dash where nothing was measured."""
-    known = [float(figures[metric]) for figures in runs if figures.get(metric) is not None]
-    return f"{statistics.fmean(known):.{digits}f}" if known else "-"
 
 
 def roles_table(runs: Sequence[Json]) -> str:
@@ -156,7 +162,7 @@ def _stood_cells(row: tuple[float, float] | None) -> tuple[str, str]:
 
 def save_coverage(path: Path, runs: Sequence[Json], title: str) -> str | None:
     """Coverage over time, a line per scheme with its interval; ``None``, and no picture, without any curve."""
-    known = [figures for figures in led(runs) if figures.get("coverage_curve")]
+    known = covered(runs)
     schemes = [name for name in SCHEMES if any(figures["scheme"] == name for figures in known)]
     if not schemes:
         return None

@@ -16,7 +16,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from zsched_lab.demo.plots import COLOURS, DPI
-from zsched_lab.paper.claims import over_fixed, shared
+from zsched_lab.paper.claims import over, shared
 from zsched_lab.paper.schemes import SCHEMES, Family
 
 Json = Mapping[str, Any]
@@ -89,9 +89,7 @@ def save_gains(path: Path, groups: Mapping[str, Sequence[Json]], title: str) -> 
 
     ``None``, and no picture, where no group has enough runs.
     """
-    found = {
-        (name, scheme): over_fixed(runs, scheme) for name, runs in groups.items() for scheme in ("oracle", "zsched")
-    }
+    found = {(name, scheme): over(runs, scheme) for name, runs in groups.items() for scheme in ("oracle", "zsched")}
     rows = [key for key, known in found.items() if known]
     if not rows:
         return None

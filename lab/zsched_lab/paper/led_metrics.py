@@ -25,25 +25,28 @@ CURVE_S = 5.0
 Json = dict[str, Any]
 
 
-def coverage_figures(streams: Streams, duration_s: float, area_m2: float) -> Json:
+def coverage_figures(streams: Streams, duration_s: float, most_s: float, area_m2: float) -> Json:
     """Coverage over time: the share of the truth's known cells that the robots' newest merged map knows, their mean.
 
-    ``coverage_curve`` is [[t_s, share], ...] every `CURVE_S` from 0 and at the end; ``coverage_mean`` its mean over the
-    run's time (each value holds until the next), ``explored_m2`` the known area at the end. ``walls_mean`` is the same
+    ``coverage_curve`` is [[t_s, share], ...] every `CURVE_S` from 0 and at the end; ``coverage_mean`` its mean over
+    that time (each value holds until the next), ``explored_m2`` the known area at the end. The end is ``most_s``, which
+    a run may take: what a run knew when it was done after ``duration_s`` holds from there on, or a run that is done
+    sooner would count for less. ``walls_mean`` is the same
     mean of the truth's walls that the map has where they are: coverage counts what is known, right or wrong. A robot
     without a map knows nothing.
     """
+    within = [[one for one in maps if one.t_s <= duration_s] for maps in streams.maps.values()]
     by_robot = [
-        ([one.t_s for one in maps], [one.known for one in maps], [one.walls for one in maps])
-        for maps in streams.maps.values()
+        ([one.t_s for one in maps], [one.known for one in maps], [one.walls for one in maps]) for maps in within
     ]
-    instants = [CURVE_S * number for number in range(int(duration_s / CURVE_S) + 1)]
-    instants += [duration_s] if instants[-1] < duration_s else []
+    end_s = max(duration_s, most_s)
+    instants = [CURVE_S * number for number in range(int(end_s / CURVE_S) + 1)]
+    instants += [end_s] if instants[-1] < end_s else []
     curve = [[t_s, statistics.fmean(held_at(times, known, t_s) for times, known, _ in by_robot)] for t_s in instants]
     return {
         "coverage_curve": [[t_s, round(share, 4)] for t_s, share in curve],
-        "coverage_mean": statistics.fmean(held_mean(times, known, duration_s) for times, known, _ in by_robot),
-        "walls_mean": statistics.fmean(held_mean(times, walls, duration_s) for times, _, walls in by_robot),
+        "coverage_mean": statistics.fmean(held_mean(times, known, end_s) for times, known, _ in by_robot),
+        "walls_mean": statistics.fmean(held_mean(times, walls, end_s) for times, _, walls in by_robot),
         "explored_m2": curve[-1][1] * area_m2,
     }
 

@@ -121,7 +121,7 @@ def measure(folder: Path, scenario: Scenario, truth: Truth) -> Json:
         "is_done": is_done,
         "duration_s": duration_s,
         **map_figures(streams, truth, len(run["robots"])),
-        **coverage_figures(streams, duration_s, truth.area_m2),
+        **coverage_figures(streams, duration_s, scenario.duration_s, truth.area_m2),
         **led_figures(folder, run),
         "stood_by_state": stood_figures(folder, run, scenario.explore.slam_on, partial(owner_at, owners)),
         "merge_cpu_s": merge_cpu_s(nodes, len(streams.stamps)),

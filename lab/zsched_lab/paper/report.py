@@ -16,8 +16,9 @@ from zsched_lab.paper.claims import (
     better_than_ours,
     compared,
     judged,
+    led,
+    over,
     over_best_fixed,
-    over_fixed,
     shared,
 )
 from zsched_lab.paper.coverage_report import coverage_parts
@@ -51,6 +52,7 @@ GAINS_SAY = (
     "Against the mean of the three fixed schemes. The oracle knows the load beforehand and is at the best node by "
     "Eq. 1 and 2 at every moment.\n"
 )
+MOVING_SAY = "zsched against schemes that move, too, in the runs that both have:\n"
 BEST_SAY = "zsched against the best fixed scheme of each figure, which is known only afterwards:\n"
 COUNTED = {6: "six", 9: "nine"}
 RANKED = ("zsched", "dyna_both", "oracle")
@@ -193,14 +195,17 @@ def floors_text(groups: Mapping[str, Sequence[Json]]) -> str:
 
 def gains_parts(results: Json, pictures: Sequence[str] = ()) -> list[str]:
     """What the `RANKED` schemes gain, under its heading; nothing without enough runs."""
+    groups = groups_of(results)
+    moving: Gains = {
+        (title, name): over(runs, "zsched", (name,)) for title, runs in groups.items() for name in RANKED[1:]
+    }
+    rivals = [MOVING_SAY, beside] if (beside := gains_table(("where", "against"), moving)) else []
     table = gains_text(results, RANKED)
     if not table:
-        return []
-    best = gains_table(
-        ("where",), {(title,): over_best_fixed(runs, "zsched") for title, runs in groups_of(results).items()}
-    )
+        return ["## Where placing pays\n", *rivals] if rivals else []
+    best = gains_table(("where",), {(title,): over_best_fixed(runs, "zsched") for title, runs in groups.items()})
     picture = [shown("gains.png")] if "gains.png" in pictures else []
-    return ["## Where placing pays\n", GAINS_SAY, table, *picture, BEST_SAY, best]
+    return ["## Where placing pays\n", GAINS_SAY, table, *picture, BEST_SAY, best, *rivals]
 
 
 def gains_text(results: Json, schemes: Sequence[str]) -> str:
@@ -210,7 +215,7 @@ def gains_text(results: Json, schemes: Sequence[str]) -> str:
     """
     rows: dict[tuple[str, ...], Mapping[str, Difference]] = {}
     for title, runs in groups_of(results).items():
-        found = {scheme: over_fixed(runs, scheme) for scheme in schemes}
+        found = {scheme: over(runs, scheme) for scheme in schemes}
         for scheme in sorted(found, key=lambda name: -found[name]["map_hz"].value if "map_hz" in found[name] else 0.0):
             rows[title, scheme] = found[scheme]
     return gains_table(("where", "scheme"), rows)
@@ -249,7 +254,7 @@ def uneven_text(runs: Sequence[Json]) -> str:
 
 def others_text(runs: Sequence[Json]) -> str:
     """How far the schemes that the table of gains leaves out are from the mean of the fixed ones; empty without any."""
-    rows: Gains = {(name,): over_fixed(runs, name) for name in SCHEMES if name not in (*FIXED_SCHEMES, *RANKED)}
+    rows: Gains = {(name,): over(runs, name) for name in SCHEMES if name not in (*FIXED_SCHEMES, *RANKED)}
     table = gains_table(("scheme",), rows)
     return f"The other schemes against the mean of the three fixed ones:\n\n{table}" if table else ""
 
@@ -321,7 +326,7 @@ def blocks_parts(results: Json, pictures: Sequence[str] = ()) -> list[str]:
         own = comparable(in_block(results["runs"], name))
         if why or not own:
             notes.append(f"* `{name}`: {says}. {f'Left out: {why}' if why else 'Not run'}.")
-        elif is_whole(own) or coverage_parts(own):
+        elif is_whole(own) or led(own):
             picture = [shown(f"{name}.png")] if f"{name}.png" in pictures else []
             alone += [f"## Block {name}\n", f"As the matrix, but for: {says}.\n"]
             alone += [ended_text(own, results["scenario"]), schemes_text(own), others_text(own)]

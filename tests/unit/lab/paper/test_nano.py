@@ -25,8 +25,8 @@ from zsched_lab.paper.claims import (
     better_than_ours,
     compared,
     declared,
+    over,
     over_best_fixed,
-    over_fixed,
 )
 from zsched_lab.paper.coverage_report import coverage_parts, coverage_table, roles_table, save_coverage, stood_text
 from zsched_lab.paper.latency_floor import ceiling_of, floor_of, tell_ceiling
@@ -377,7 +377,7 @@ def test_coverage_over_time_is_the_mean_of_what_the_robots_hold() -> None:
         "robot1": [Arrival(-3.0, 0.1, 1, 0.1), Arrival(6.0, 0.1, 1, 0.5)],
         "robot2": [Arrival(10.0, 0.1, 1, 0.4), Arrival(11.0, 0.1, 1, 0.9)],
     }
-    found = coverage_figures(Streams(maps=maps), 11.0, area_m2=200.0)
+    found = coverage_figures(Streams(maps=maps), 11.0, 11.0, area_m2=200.0)
 
     assert found["coverage_curve"] == [[0.0, 0.05], [5.0, 0.05], [10.0, 0.45], [11.0, 0.7]]
     first, second = (0.1 * 6 + 0.5 * 5) / 11, 0.4 * 1 / 11
@@ -385,7 +385,18 @@ def test_coverage_over_time_is_the_mean_of_what_the_robots_hold() -> None:
     assert found["explored_m2"] == pytest.approx(140.0)
     assert found["walls_mean"] == 0.0
     walls = {"robot1": [Arrival(-3.0, 0.1, 1, 0.1, 0.05), Arrival(6.0, 0.1, 1, 0.5, 0.2)]}
-    assert coverage_figures(Streams(maps=walls), 11.0, area_m2=200.0)["walls_mean"] == pytest.approx(1.3 / 11)
+    assert coverage_figures(Streams(maps=walls), 11.0, 11.0, area_m2=200.0)["walls_mean"] == pytest.approx(1.3 / 11)
+
+
+def test_a_run_that_is_done_sooner_covers_more_on_the_way() -> None:
+    """What it knew at its end holds for as long as a run may take; what came behind its end does not count."""
+    maps = {"robot1": [Arrival(-1.0, 0.1, 1, 0.2, 0.1), Arrival(6.0, 0.1, 1, 0.8, 0.6), Arrival(6.5, 0.1, 1, 0.9, 0.7)]}
+    found = coverage_figures(Streams(maps=maps), 6.2, 12.0, area_m2=100.0)
+
+    assert found["coverage_curve"] == [[0.0, 0.2], [5.0, 0.2], [10.0, 0.8], [12.0, 0.8]]
+    assert found["coverage_mean"] == pytest.approx((0.2 * 6 + 0.8 * 6) / 12)
+    assert found["walls_mean"] == pytest.approx((0.1 * 6 + 0.6 * 6) / 12)
+    assert found["explored_m2"] == pytest.approx(80.0)
 
 
 def test_how_a_robot_was_led_is_told_of_its_drive_only() -> None:
@@ -478,7 +489,7 @@ def the_runs(count: int = 3) -> list[dict[str, Any]]:
 
 def test_the_best_fixed_scheme_stands_beside_the_mean_of_all() -> None:
     runs = the_runs()
-    mean, best = over_fixed(runs, "zsched")["coverage_mean"], over_best_fixed(runs, "zsched")["coverage_mean"]
+    mean, best = over(runs, "zsched")["coverage_mean"], over_best_fixed(runs, "zsched")["coverage_mean"]
 
     assert best_fixed(runs, "coverage_mean") == "fixed_e2"
     assert mean.value == pytest.approx(0.66 / 0.51 - 1)
@@ -543,7 +554,12 @@ def test_coverage_is_told_with_intervals_and_without_one_of_one_run() -> None:
     one = coverage_table(the_runs(1))
     assert "(n = 1)" in one
     assert "inf" not in one + told
-    assert coverage_parts([{**figures, "stopped_ratio": None} for figures in the_runs()]) == []
+    nobody_led = [{**figures, "stopped_ratio": None} for figures in the_runs()]
+    assert [part for part in coverage_parts(nobody_led) if part.startswith("#")] == ["### Coverage over time\n"]
+    assert "stood" not in "".join(coverage_parts(nobody_led))
+    assert coverage_parts([{**figures, "coverage_curve": None} for figures in nobody_led]) == []
+    short = [{**figures, "coverage_curve": [[0.0, 0.1], [5.0, 0.2]]} for figures in the_runs()]
+    assert "| runs | 0 s | 5 s | mean over the run |" in coverage_table(short), "no instant stands twice"
     assert "| and both: the tipping point | 31.0 % | 0.0 % | 0.0 % | 58.0 % | 89.0 % | 9.0 % |" in roles_table(
         the_runs()
     )
@@ -552,7 +568,7 @@ def test_coverage_is_told_with_intervals_and_without_one_of_one_run() -> None:
 def test_the_curves_are_drawn_where_there_are_any(tmp_path: Path) -> None:
     assert save_coverage(tmp_path / "c.png", the_runs(), "title") == "c.png"
     assert (tmp_path / "c.png").stat().st_size > 5000
-    assert save_coverage(tmp_path / "d.png", [{**one, "stopped_ratio": None} for one in the_runs()], "x") is None
+    assert save_coverage(tmp_path / "d.png", [{**one, "coverage_curve": None} for one in the_runs()], "x") is None
 
 
 def results_of(runs: list[dict[str, Any]], main: str = "nano") -> dict[str, Any]:
@@ -584,6 +600,18 @@ def test_a_report_is_of_the_main_block() -> None:
     assert "![nano-coverage.png](nano-coverage.png)" in text
     assert blocks_parts(results) == []
     assert text.count("| zsched | 3 |") >= 2
+
+
+def test_zsched_stands_beside_schemes_that_move_also_where_no_fixed_one_was_run() -> None:
+    moving = [{**one, "scheme": "oracle" if one["scheme"] == "fixed_e3" else one["scheme"]} for one in the_runs()]
+    parts = gains_parts(results_of([one for one in moving if not one["scheme"].startswith("fixed")]))
+    rows = [line for line in parts[-1].splitlines() if line.startswith("| nano")]
+
+    assert [row.split(" | ")[1] for row in rows] == ["dyna_both", "oracle"]
+    assert rows[0].startswith("| nano | dyna_both | 3 | -7 % [")  # 0.66 of 0.71
+    assert rows[1].startswith("| nano | oracle | 3 | +61 % [")  # 0.66 of 0.41
+    assert "fixed" not in "".join(parts)
+    assert gains_parts(results_of([one for one in moving if one["scheme"] == "zsched"])) == []
 
 
 def test_schemes_stand_where_they_stand_behind_what_moves_cost() -> None:
