@@ -80,7 +80,7 @@ def options(tmp_path: Path, name: str, **given: Any) -> BenchOptions:
 
 
 def test_the_shipped_scenarios_are_found_by_name_and_nothing_else_is() -> None:
-    assert shipped_names() == ("heavy-again", "nano", "nano-moves", "paper")
+    assert shipped_names() == ("heavy-again", "heavy-oracle", "nano", "nano-moves", "paper")
     assert shipped_scenario("paper") == scenario_path()
     assert shipped_scenario("nono") is None
     assert shipped_scenario("../paper") is None
@@ -119,6 +119,7 @@ def test_each_declared_block_is_all_that_its_scenario_runs() -> None:
         "nano": (("fixed_e1", "fixed_e2", "fixed_e3", "dyna_cpu", "dyna_mem", "dyna_both", "zsched"), 5),
         "nano-moves": (("dyna_both", "dyna_both_slam", "zsched", "zsched_slam"), 5),
         "heavy-again": (("fixed_e1", "fixed_e2", "fixed_e3", "dyna_both", "zsched"), 8),
+        "heavy-oracle": (("dyna_both", "zsched", "oracle"), 8),
     }
     limits, seeds = set(), set(range(20260, 20260 + 100))
     for name, (schemes, runs) in wanted.items():
@@ -142,8 +143,9 @@ def test_every_second_run_takes_the_schemes_in_reverse() -> None:
     assert abs(order[0].index("zsched") - order[0].index("dyna_both")) == 1
 
 
-def test_heavy_again_is_heavy() -> None:
-    paper, again = load_scenario(scenario_path()), shipped("heavy-again")
+@pytest.mark.parametrize("name", ["heavy-again", "heavy-oracle"])
+def test_heavy_again_is_heavy(name: str) -> None:
+    paper, again = load_scenario(scenario_path()), shipped(name)
     heavy = paper.blocks["heavy"]
     assert again.merge == replace(paper.merge, **heavy.merge)
     assert again.explore == replace(paper.explore, world=heavy.world or "")
