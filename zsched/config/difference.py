@@ -22,6 +22,7 @@ from zsched.config.rows import rows
 from zsched.core.route.route import named_rules, outputs_of
 from zsched.core.values.certificates import Role, accepted
 from zsched.core.values.fleet import (
+    TASK_RULES,
     Cell,
     Fleet,
     NodeSpec,
@@ -498,7 +499,7 @@ def _tuning(old: TaskSpec, new: TaskSpec, path: str) -> Iterator[_Verdict]:
         if before != after:
             key = "weights" if one.name == "weights" else f"scheduling.{one.name}"
             yield _set(AT_ONCE, f"{path}.{key}", _plain(before), _plain(after))
-    for name in ("reach", "memory_floor_ratio", "cpu_floor_ratio", "max_moves_per_minute"):
+    for name in TASK_RULES:
         if getattr(old, name) != getattr(new, name):
             yield _set(AT_ONCE, f"{path}.scheduling.{name}", getattr(old, name), getattr(new, name))
     patience, other = ("learnt" if task.learns_patience else task.patience for task in (old, new))

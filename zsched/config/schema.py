@@ -38,6 +38,7 @@ from zsched.core.values.fleet import (
     DEFAULT_SCORE,
     PAPER_PATIENCE,
     RADIO_PATIENCE,
+    TASK_RULES,
     Demand,
     Fleet,
     LinkLimits,
@@ -293,7 +294,7 @@ SCHEDULING: Final = Record(
             "How the robots' utilities become one; `median` resists a liar.",
             default=f"`{Aggregate.MEAN}`",
         ),
-        **keys(TaskSpec, "reach", "memory_floor_ratio", "cpu_floor_ratio", "max_moves_per_minute"),
+        **keys(TaskSpec, *TASK_RULES),
         "patience": Field(
             Number(0, MAX_PATIENCE),
             "What staying may cost before the task moves. A second of staying costs what the best candidate's lead in "

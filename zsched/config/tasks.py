@@ -23,6 +23,7 @@ from zsched.core.values.fleet import (
     DEFAULT_COOL_DOWN_S,
     DEFAULT_FORESEE_S,
     DEFAULT_SCORE,
+    TASK_RULES,
     TUNED_RULES,
     Demand,
     LinkLimits,
@@ -51,8 +52,6 @@ _ANY_TUNING: Final = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
 """Stands in for a faulty one, so that the task's rules are checked in the same pass; such a file gives no fleet."""
 _ANY_CANDIDATES: Final = (NOBODY,)
 """The same for candidates: of a task without any the file has a fault."""
-_OF_THE_TASK: Final = ("reach", "memory_floor_ratio", "cpu_floor_ratio", "max_moves_per_minute")
-"""Keys of `scheduling:` that are fields of the task; a tuning may set them anew at run time, as it may `patience`."""
 _Places = dict[str, Place]
 """Where each rule stands, by stream name."""
 
@@ -91,7 +90,7 @@ def _task(
     _advise_ready(given, worker, streams, out)
     _check_mirrors(given, streams, out)
     scheduling: Section | None = given.get("scheduling")
-    more = {} if scheduling is None else _of(scheduling, *_OF_THE_TASK)
+    more = {} if scheduling is None else _of(scheduling, *TASK_RULES)
     patience = _patience(scheduling, (tuning or _ANY_TUNING).weights)
     demand: Section | None = given.get("demand")
     gauge_limits: Section | None = given.get("limits")

@@ -218,7 +218,9 @@ class LinkLimits:
     )
 
 
-TUNED_RULES = ("patience", "max_moves_per_minute", "memory_floor_ratio", "cpu_floor_ratio", "reach")
+TASK_RULES = ("reach", "memory_floor_ratio", "cpu_floor_ratio", "max_moves_per_minute")
+"""Keys of `scheduling` that are fields of `TaskSpec`, under the same name."""
+TUNED_RULES = ("patience", *TASK_RULES)
 TUNED_LINKS = ("nu_dbm", "rho_dbm", "pair", "foresee_s")
 """Settings of a task's file that a `Tuning` may set anew: fields of `TaskSpec` and of `LinkLimits`."""
 
