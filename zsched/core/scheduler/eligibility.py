@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from zsched.core.scheduler.usage import Use
-from zsched.core.values.fleet import Demand, Standby, TaskSpec
+from zsched.core.values.fleet import Standby, TaskSpec
 from zsched.core.values.gauges import BY_NAME, possible
-from zsched.core.values.model import Allocation
+from zsched.core.values.model import Allocation, PeerState
 from zsched.core.values.profile import Profile, WorkerState
 from zsched.core.values.words import GaugeName
 
@@ -20,6 +20,20 @@ def is_out(spec: TaskSpec, profile: Profile) -> bool:
     """Whether a node cannot have the task until an operator or a restart changes something there."""
     load = profile.worker(spec.name)
     return profile.draining or (load is not None and load.state is WorkerState.FAILED)
+
+
+def is_served(spec: TaskSpec, owner_state: PeerState, profile: Profile | None, *, is_spared: bool) -> bool:
+    """Whether a task has an owner that lives, and whose worker has not failed, for all that is known of it.
+
+    Args:
+        spec: the task.
+        owner_state: how the owner is seen; nobody's is unknown.
+        profile: the owner's newest fresh one.
+        is_spared: it counts as alive though it is silent.
+    """
+    load = None if profile is None else profile.worker(spec.name)
+    is_down = load is not None and load.state is WorkerState.FAILED
+    return (owner_state is PeerState.ALIVE or is_spared) and not is_down
 
 
 def may_get(spec: TaskSpec, state: WorkerState | None) -> bool:
@@ -37,11 +51,14 @@ def refusal(
     spec: TaskSpec,
     allocation: Allocation,
     profile: Profile,
-    demand: Demand,
+    needed_mb: float,
     use: Use,
     gauges: Mapping[GaugeName, float],
 ) -> str:
-    """Why the node may not have the task; empty when it may."""
+    """Why the node may not have the task; empty when it may.
+
+    ``needed_mb``: memory without which the task is not placed, as it is part of ``use``.
+    """
     if profile.draining:
         return "draining"
     load = profile.worker(spec.name)
@@ -56,7 +73,7 @@ def refusal(
         return f"worker {state}{why}"
     used = use.memory_mb
     if used is not None and used > profile.memory_mb:
-        return f"needs {demand.memory_mb:.0f} MiB, has {max(profile.memory_mb - used + demand.memory_mb, 0.0):.0f} free"
+        return f"needs {needed_mb:.0f} MiB, has {max(profile.memory_mb - used + needed_mb, 0.0):.0f} free"
     return _beyond_limits(spec, profile, gauges, is_owner=is_owner)
 
 

@@ -12,7 +12,7 @@ from collections.abc import Set as AbstractSet
 from zsched.core.gateway.demand import Demands
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.gateway.shortfall import is_short
-from zsched.core.scheduler.eligibility import refusal
+from zsched.core.scheduler.eligibility import is_served, refusal
 from zsched.core.scheduler.links import pair_link, ways
 from zsched.core.scheduler.usage import Bookings, Use, coming_gpu, coming_use, own_use, predicted, predicted_gauges
 from zsched.core.scheduler.utility import (
@@ -90,11 +90,21 @@ def score(
     what it has and gets nothing new. What the other tasks of ``bookings`` will use there, and do not show yet, counts
     as in use. ``penalties`` are what this robot remembers; they go along, and `compare` joins them. ``round_trips`` are
     seconds to each candidate and back, where measured (`zsched.core.gateway.round_trips`).
+
+    Memory that a worker has come to use forbids a candidate that lacks it, while the task runs elsewhere. Without an
+    owner the file's figure alone does: a worker that starts anew may need far less, and any place is better than none.
     """
     form = allocation.tuning.score
     away_s = NOTHING_HELD
     if allocation.tuning.deadline_ms is not None:
         away_s = ways(voter, spec.candidates, round_trips, gateway, now)
+    owner = allocation.owner
+    has_owner = owner is not None and is_served(
+        spec,
+        states.get(owner, PeerState.UNKNOWN),
+        gateway.fresh(owner, now),
+        is_spared=owner in doubts.in_grace,
+    )
     terms: dict[NodeId, _Terms] = {}
     unreachable: list[NodeId] = []
     refused: list[tuple[NodeId, str]] = []
@@ -103,14 +113,14 @@ def score(
         if state is PeerState.UNKNOWN:
             refused.append((candidate, "not heard yet"))  # we may have just started: that says nothing about it
             continue
-        is_spared = candidate == allocation.owner and candidate in doubts.in_grace
+        is_spared = candidate == owner and candidate in doubts.in_grace
         if (state is not PeerState.ALIVE and not is_spared) or candidate in doubts.unseen:
             unreachable.append(candidate)
             continue
         if candidate in doubts.unfit:
             refused.append((candidate, doubts.unfit[candidate]))
             continue
-        if candidate in doubts.unproven and candidate != allocation.owner:
+        if candidate in doubts.unproven and candidate != owner:
             refused.append((candidate, doubts.unproven[candidate]))
             continue
         profile = gateway.fresh(candidate, now)
@@ -118,12 +128,13 @@ def score(
             refused.append((candidate, "no fresh profile"))
             continue
         load = profile.worker(spec.name)
-        demand, coming = gateway.demand(spec, profile), coming_use(spec, profile, bookings, gateway)
+        demand, coming = gateway.demand(spec, profile), coming_use(spec, profile, bookings, gateway, now)
         own = own_use(spec, allocation, profile, demand)
         use = predicted(profile, own, demand, coming)
         gpu = coming_gpu(spec, profile, bookings, gateway, now)
         gauges = predicted_gauges(spec, allocation, profile, gateway, gpu)
-        reason = refusal(spec, allocation, profile, demand, use, gauges)
+        needed = demand if has_owner and candidate != owner else spec.demand
+        reason = refusal(spec, allocation, profile, needed.memory_mb, predicted(profile, own, needed, coming), gauges)
         if reason:
             refused.append((candidate, reason))
             continue
@@ -133,7 +144,7 @@ def score(
             continue
         fair = gateway.share(spec, profile, demand.cpu_cores, coming.cpu_cores)
         # what an owner that is short gets is measured
-        is_measured = candidate == allocation.owner and load is not None and is_short(load)
+        is_measured = candidate == owner and load is not None and is_short(load)
         least = min(fair, own.cpu_cores) if is_measured else fair
         network_s = away_s.get(candidate, 0.0)
         cpu = _cpu(spec, profile, demand, use, allocation.tuning, gateway.demands, network_s, least, fair)

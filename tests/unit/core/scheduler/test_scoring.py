@@ -306,6 +306,54 @@ def test_memory_that_the_task_would_not_get_is_a_hard_constraint() -> None:
     assert vector.refused[0] == ("edge2", "needs 500 MiB, has 400 free")
 
 
+@pytest.mark.parametrize(
+    ("state", "worker", "wanted_mb", "is_refused"),
+    [
+        (PeerState.ALIVE, WorkerState.READY, 0.0, True),
+        (PeerState.ALIVE, WorkerState.STARTING, 0.0, True),
+        (PeerState.ALIVE, WorkerState.FAILED, 0.0, False),
+        (PeerState.SUSPECT, WorkerState.READY, 0.0, False),
+        (PeerState.GONE, WorkerState.READY, 0.0, False),
+        (PeerState.GONE, WorkerState.READY, 1500.0, True),
+    ],
+)
+def test_what_a_worker_has_come_to_hold_forbids_a_machine_only_while_the_task_has_an_owner(
+    state: PeerState, worker: WorkerState, wanted_mb: float, is_refused: bool
+) -> None:
+    """A worker that leaked, or that sized its heap by its machine: without its owner nobody would have room for it."""
+    spec = replace(SPEC, demand=Demand(memory_mb=wanted_mb))
+    gateway = Gateway(fleet_of(spec, of=(*spec.candidates, "robot1")))
+    for one in (profile("edge1", memory=3500.0, own=(0.5, 3000.0)), profile("edge2", memory=3000.0), ROBOT):
+        assert gateway.absorb(one, 0.0) is None
+    gateway.learn_demand("merge", "edge1", 0.0)
+    ended = profile_of("edge1", sequence=1, workers=(load_of(state=worker),), memory_used_mb=500.0, links=WIRED)
+    assert gateway.absorb(ended, 0.1) is None
+    states = dict.fromkeys((*spec.candidates, "robot1"), PeerState.ALIVE) | {"edge1": state}
+
+    vector = score(spec, allocation(), "robot1", gateway, states, 0.1)
+
+    assert ("edge2" in dict(vector.refused)) == is_refused
+    if is_refused:
+        assert (
+            dict(vector.refused)["edge2"]
+            == f"needs {max(wanted_mb, 3000.0 * (state is PeerState.ALIVE)):.0f} MiB, has 1000 free"
+        )
+
+
+def test_a_machine_that_took_the_task_without_room_for_all_that_it_held_keeps_it() -> None:
+    spec = replace(SPEC, tuning=Tuning(weights=CPU))
+    gateway = Gateway(fleet_of(spec, of=(*spec.candidates, "robot1")))
+    for one in (profile("edge1", memory=3500.0, own=(0.5, 3000.0)), profile("edge2", memory=3000.0), ROBOT):
+        assert gateway.absorb(one, 0.0) is None
+    gateway.learn_demand("merge", "edge1", 0.0)
+    gateway.learn_demand("merge", "edge2", 0.2)
+    states = dict.fromkeys((*spec.candidates, "robot1"), PeerState.ALIVE) | {"edge1": PeerState.GONE}
+
+    vector = score(spec, allocation(owner="edge2"), "robot1", gateway, states, 0.2)
+
+    assert "edge2" in values(vector)
+
+
 def test_memory_that_is_not_measured_refuses_nobody() -> None:
     spec = replace(SPEC, demand=Demand(memory_mb=500.0))
     assert "edge1" not in dict(scored(ROBOT, profile("edge1", memory=None), spec=spec).refused)
