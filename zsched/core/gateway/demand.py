@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Container
+from typing import Final
 
 from zsched.core.gateway.company import is_full
 from zsched.core.gateway.job_need import CALM_S, Heard, JobNeed, age_of, other_s, told_job
@@ -28,6 +29,8 @@ UNSURE = 1.5
 """Need of a worker that always wants to run and never had enough: this many times its use."""
 SETTLE_S = 4.0
 """After a move, or a worker's start, the smoothed use rises for so long: it is only a lower bound of the need."""
+SHOWS_S: Final = 0.5
+"""By this time constant a machine's figures show a task that has come: that of their means, and their way here."""
 COMPARED_S = 12.0
 """What differs so soon after a move is the machine's doing; what changes later is the task's."""
 RECENT_S = 60.0
@@ -240,6 +243,16 @@ class Demands:
         """Whether the task has been seen on the node, with its worker ready, for so long."""
         known = self._known.get(task, _Known())
         return known.owner == node and now - known.since >= for_s
+
+    def unshown_ratio(self, task: TaskId, node: NodeId, now: float) -> float:
+        """The part of a task's use that a node's figures, which are means, do not show yet, in [0, 1].
+
+        All of it until the task is seen there, if it was seen on another node before; then less with every second.
+        """
+        known = self._known.get(task, _Known())
+        if known.owner != node:
+            return 1.0 if known.seen_at not in (None, node) else 0.0
+        return 0.0 if known.before is None else math.exp((known.since - now) / SHOWS_S)
 
     def speed(self, task: TaskId, profile: Profile) -> float:
         """The task's speed on a node, > 0: the benchmark's, or what was seen when the task came there."""

@@ -38,11 +38,12 @@ def book(specs: Iterable[TaskSpec], values: Mapping[TaskId, Allocation]) -> Book
     return booked
 
 
-def coming_use(spec: TaskSpec, profile: Profile, bookings: Bookings | None, gateway: Gateway) -> Demand:
+def coming_use(spec: TaskSpec, profile: Profile, bookings: Bookings | None, gateway: Gateway, now: float) -> Demand:
     """What other tasks will use on a node beyond what its profile shows of their workers.
 
-    A worker that somebody else started never shows what it uses, so it is in the profile already, or nowhere. What a
-    worker visibly lacks on a full machine is no coming use: it will not get it there while that lasts.
+    Of a worker that somebody else started no profile says what it uses. What it brings from another node is coming as
+    far as the machine's means do not show it yet. What a worker visibly lacks on a full machine is no coming use: it
+    will not get it there while that lasts.
     """
     others = () if bookings is None else bookings.get(profile.node, ())
     if not others:
@@ -52,9 +53,10 @@ def coming_use(spec: TaskSpec, profile: Profile, bookings: Bookings | None, gate
         load = profile.worker(other.name)
         if other.name != spec.name and load is not None:
             demand = gateway.demand(other, profile)
+            unshown = 1.0 if other.worker.command else gateway.demands.unshown_ratio(other.name, profile.node, now)
             if not (is_full(profile) and is_short(load)):
-                cpu += max(demand.cpu_cores - (load.cpu_cores or 0.0), 0.0)
-            memory += max(demand.memory_mb - (load.memory_mb or 0.0), 0.0)
+                cpu += unshown * max(demand.cpu_cores - (load.cpu_cores or 0.0), 0.0)
+            memory += unshown * max(demand.memory_mb - (load.memory_mb or 0.0), 0.0)
     return Demand(cpu_cores=cpu, memory_mb=memory)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from dataclasses import replace
 
 import pytest
@@ -102,6 +104,37 @@ def test_several_tasks_add_up_and_our_own_and_a_stranger_s_do_not_count() -> Non
     plain = seen(load("plan"))
     assert seen(load("plan"), booked=(MAP,)) == plain
     assert seen(load("plan"), booked=(WATCH,)) == plain, "it runs no worker that zsched would see"
+
+
+def test_what_somebody_else_starts_is_coming_only_until_the_machine_s_figures_show_it() -> None:
+    """No profile says what such a worker uses, so it would count twice for as long as it is there."""
+    plan = replace(PLAN, worker=WorkerSpec(), candidates=("edge0", "edge1"))
+    fleet = fleet_of(MAP, plan, of=("edge0", "edge1", "robot1"), electors=("robot1",))
+    states = dict.fromkeys(("edge0", "edge1", "robot1"), PeerState.ALIVE)
+    gateway = Gateway(fleet)
+
+    def coming_cores(now: float, owner: str) -> float:
+        """What robot1 takes for coming on edge1, by its worth for the task ``map``; the profiles say nothing of it."""
+        for node in ("edge0", "edge1"):
+            assert (
+                gateway.absorb(profile_of(node, sequence=next(turn), workers=(load("map"), load("plan"))), now) is None
+            )
+        gateway.learn_demand("plan", owner, now)
+        utilities = score(MAP, NOBODY, "robot1", gateway, states, now, {"edge1": (plan,)}).utilities
+        (utility,) = (one for one in utilities if one.candidate == "edge1")
+        idle = 1.0 if utility.cpu is None else utility.cpu
+        return (free_of_nothing - idle) * 4.0
+
+    turn = itertools.count()
+    gateway.absorb(profile_of("edge1", sequence=next(turn), workers=(load("map"), load("plan"))), 0.0)
+    (alone,) = score(MAP, NOBODY, "robot1", gateway, states, 0.0).utilities
+    free_of_nothing = alone.cpu or 0.0
+
+    assert coming_cores(1.0, "edge1") == 0.0, "it has been there for as long as this robot knows"
+    assert coming_cores(2.0, "edge0") == pytest.approx(PLAN.demand.cpu_cores), "it is to come from edge0"
+    assert coming_cores(3.0, "edge1") == pytest.approx(PLAN.demand.cpu_cores), "it has just come"
+    assert coming_cores(3.5, "edge1") == pytest.approx(PLAN.demand.cpu_cores / math.e)
+    assert coming_cores(9.0, "edge1") < 0.001
 
 
 def test_where_somebody_else_starts_the_worker_its_whole_demand_is_added() -> None:
