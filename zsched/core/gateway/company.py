@@ -1,6 +1,6 @@
 """GATEWAY: beside whom a task runs on a machine, and whether that is still so.
 
-Knows: what others use of a machine. Does not know: needs, speeds, time.
+Knows: what others use of a machine, how large it is. Does not know: needs, speeds, time.
 """
 
 from __future__ import annotations
@@ -23,21 +23,25 @@ class Company(Struct, frozen=True):
     others_cores: float
     taken_cores: float
     """What the task may have taken from them: its use of a full machine, else 0. They may use that, too, without it."""
+    machine_cores: float
 
     @classmethod
     def of(cls, task: TaskId, profile: Profile) -> Self | None:
         """The task's company on the node of ``profile``; ``None``: nobody has measured it."""
         others = others_cores(task, profile)
-        return None if others is None else cls(others, profile.cores_of(task) if is_full(profile) else 0.0)
+        taken = profile.cores_of(task) if is_full(profile) else 0.0
+        return None if others is None else cls(others, taken, profile.cpu_cores)
 
     def is_next_to_nobody(self, profile: Profile) -> bool:
         """Whether others use so little there that they slow nothing down."""
         return self.others_cores + self.taken_cores <= SAME_RATIO * profile.cpu_cores
 
     def is_still(self, task: TaskId, profile: Profile) -> bool:
-        """Whether others use about as much as then."""
+        """Whether others use about as much as then, of as large a machine."""
         others, slack = others_cores(task, profile), SAME_RATIO * profile.cpu_cores
-        return others is not None and -slack <= others - self.others_cores <= slack + self.taken_cores
+        if others is None or self.machine_cores != profile.cpu_cores:
+            return False
+        return -slack <= others - self.others_cores <= slack + self.taken_cores
 
 
 def others_cores(task: TaskId, profile: Profile) -> float | None:

@@ -17,13 +17,15 @@ from __future__ import annotations
 from collections.abc import Container
 from typing import Final
 
-from zsched.core.gateway.company import SAME_RATIO, is_full, others_cores
+from zsched.core.gateway.company import SAME_RATIO, STARVED_CPU_RATIO, is_full, others_cores
 from zsched.core.gateway.job_need import CALM_WAIT_RATIO
 from zsched.core.gateway.shortfall import is_short
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.profile import Profile, WorkerLoad, WorkerState
 from zsched.core.values.struct import Struct, replace
 
+ENDED_S: Final = 10.0
+"""Others that do not fill a machine any more for this time have ended."""
 LEFT_S: Final = 4.0
 """Others show what they do without the task for this time after its worker has stopped working there."""
 
@@ -49,6 +51,11 @@ class _Got(Struct, frozen=True):
     """Of the task, that wanted to run there."""
     kept: float
     """The part of their fair share that it got, at most 1."""
+    machine_cores: float
+    is_crowded: bool = False
+    """Others alone were seen to fill the machine since the task has left."""
+    calm_at: float | None = None
+    """Since when they do not any more; ``None``: they do, or never did."""
 
 
 class _Others(Struct, frozen=True):
@@ -59,6 +66,7 @@ class _Others(Struct, frozen=True):
     """What others used then."""
     own: float
     """The task's threads that ran or waited then."""
+    machine_cores: float
     seen_at: float
     """When the task was last seen at work there."""
     left_at: float | None = None
@@ -92,20 +100,42 @@ class Shares:
         threads = max(threads_of(load) if load.wanted_cores is None else load.wanted_cores, 1.0)
         own = threads if is_lacking and load.runnable is None else threads_of(load)
         others = max(profile.runnable - own, 0.0)
-        self._others[key] = _Others(others, used, own, now)
+        self._others[key] = _Others(others, used, own, profile.cpu_cores, now)
         if load.cpu_cores is None or not is_lacking:
             return False
         kept = min(load.cpu_cores / fair_share(profile.cpu_cores, threads, others), 1.0)
-        before, got = self._got.get(key), _Got(threads, kept)
+        before, got = self._got.get(key), _Got(threads, kept, profile.cpu_cores)
         self._threads[task], self._got[key] = threads, got
         return before != got
 
     def left_by(self, task: TaskId, owner: NodeId) -> tuple[NodeId, ...]:
         """The nodes on which the task was, but for its ``owner``."""
-        return tuple(node for name, node in self._others if name == task and node != owner)
+        nodes = dict.fromkeys(node for known in (self._others, self._got) for name, node in known if name == task)
+        return tuple(node for node in nodes if node != owner)
 
     def look_back(self, task: TaskId, profile: Profile, now: float) -> bool:
-        """Note how many others want to run where the task was and is no more; whether that has changed anything.
+        """Note what others do where the task was and is no more; whether that has changed anything."""
+        has_ended = self._watch_crowd((task, profile.node), profile, now)
+        return self._watch_others(task, profile, now) or has_ended
+
+    def _watch_crowd(self, key: tuple[TaskId, NodeId], profile: Profile, now: float) -> bool:
+        """Forget what the task got beside others that filled the machine, when they have ended: the next share anew.
+
+        A machine that only the task fills is not judged: nobody sees from outside whether it would keep its promise.
+        """
+        got, others = self._got.get(key), others_cores(key[0], profile)
+        if got is None or others is None:
+            return False
+        is_crowded = others >= STARVED_CPU_RATIO * profile.cpu_cores
+        calm_at = None if is_crowded or not got.is_crowded else now if got.calm_at is None else got.calm_at
+        if calm_at is not None and now - calm_at > ENDED_S:
+            del self._got[key]
+            return True
+        self._got[key] = replace(got, is_crowded=is_crowded or got.is_crowded, calm_at=calm_at)
+        return False
+
+    def _watch_others(self, task: TaskId, profile: Profile, now: float) -> bool:
+        """Note how many others want to run there; whether that has changed anything.
 
         Its worker may go on for long: until the next owner's is ready, and to drain. Threads that only rest use as much
         without the task as beside it, or more. Others that use less have ended, and nobody knows who was who.
@@ -151,12 +181,15 @@ class Shares:
         """
         if profile.runnable is None:
             return 0.0
-        got = self._got.get((task, profile.node), _Got(self._threads.get(task, max(need_cores, 1.0)), 1.0))
+        cores = profile.cpu_cores
+        got = self._got.get((task, profile.node))
+        if got is None or got.machine_cores != cores:
+            got = _Got(self._threads.get(task, max(need_cores, 1.0)), 1.0, cores)
         load = profile.worker(task)
         own = 0.0 if load is None else threads_of(load)
         known, others = self._others.get((task, profile.node)), max(profile.runnable - own, 0.0)
-        others = others if known is None else known.expected(others)
-        return got.kept * fair_share(profile.cpu_cores, got.threads, others + coming_cores)
+        others = others if known is None or known.machine_cores != cores else known.expected(others)
+        return got.kept * fair_share(cores, got.threads, others + coming_cores)
 
 
 def _is_hungry(load: WorkerLoad) -> bool:
@@ -179,7 +212,6 @@ def threads_of(load: WorkerLoad) -> float:
     """
     if load.runnable is not None:
         return max(load.runnable, load.cpu_cores or 0.0)  # threads that live for a moment are missed
-    if load.cpu_cores is not None:
-        return load.cpu_cores if load.wanted_cores is None else load.wanted_cores
     jobs = load.jobs
-    return 0.0 if jobs is None else jobs.done_hz * (jobs.cpu_s + (jobs.wait_s or 0.0))
+    told = 0.0 if jobs is None else jobs.done_hz * (jobs.cpu_s + (jobs.wait_s or 0.0))
+    return max(told, (load.cpu_cores or 0.0) if load.wanted_cores is None else load.wanted_cores)

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from support.profiles import load_of, profile_of
-from zsched.core.gateway.sharing import LEFT_S, Shares, fair_share
+from zsched.core.gateway.sharing import ENDED_S, LEFT_S, Shares, fair_share
 from zsched.core.values.profile import Jobs, Profile, WorkerLoad, WorkerState
 
 
@@ -173,6 +173,42 @@ def test_a_machine_that_was_away_tells_nothing_of_what_was_there_before() -> Non
     crowded(shares)
     assert shares.look_back("merge", idle(runnable=0.0), 100.0 + LEFT_S)
     assert share_of(shares, 4.0) == pytest.approx(fair_share(4.0, 4.0, 4.0))
+
+
+def weighed_down(shares: Shares) -> None:
+    """A group with a weight of its own left the task's four threads a tenth of their fair share of edge1."""
+    assert shares.learn("merge", profile(runnable=8.0, got=fair_share(4.0, 4.0, 4.0) / 10, wanted=4.0), 99.0)
+
+
+def used(cores: float, runnable: float = 4.0) -> Profile:
+    """Of edge1, where the task's worker is ready and does nothing."""
+    return replace(idle(runnable=runnable), cpu_used_cores=cores)
+
+
+def test_what_a_task_got_beside_a_crowd_that_has_ended_says_nothing_of_the_next_one() -> None:
+    shares, fair = Shares(), fair_share(4.0, 4.0, 4.0)
+    weighed_down(shares)
+    for now in range(100, 160):
+        assert not shares.look_back("merge", used(4.0), float(now)) or now == 100
+        assert share_of(shares, 4.0) == pytest.approx(fair / 10), "as long as the machine is full"
+    for start, cores in ((160.0, 2.0), (160.0 + ENDED_S, 2.0), (161.0 + ENDED_S, 4.0), (162.0 + ENDED_S, 2.0)):
+        shares.look_back("merge", used(cores), start)
+        assert share_of(shares, 4.0) == pytest.approx(fair / 10), "a pause is no end"
+    assert not shares.look_back("merge", used(2.0), 162.0 + 2 * ENDED_S)
+    assert shares.look_back("merge", used(2.0), 162.1 + 2 * ENDED_S)
+    assert share_of(shares, 4.0) == pytest.approx(fair)
+    assert "edge1" in shares.left_by("merge", "edge2"), "its others are still known"
+
+
+def test_a_machine_of_another_size_is_another_one() -> None:
+    shares = Shares()
+    weighed_down(shares)
+    larger = replace(idle(runnable=4.0), cpu_cores=8.0, cpu_used_cores=8.0)
+    assert shares.at("merge", larger, 4.0) == pytest.approx(fair_share(8.0, 4.0, 4.0))
+    crowded(shares)
+    shares.look_back("merge", idle(runnable=3.0), 100.0)
+    assert shares.at("merge", replace(larger, runnable=8.0), 4.0) == pytest.approx(fair_share(8.0, 4.0, 8.0))
+    assert shares.at("merge", replace(larger, runnable=3.0), 4.0) == pytest.approx(fair_share(8.0, 4.0, 3.0))
 
 
 def test_a_task_and_a_node_that_are_no_more_are_forgotten_and_nobody_counted_is_nothing() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from support.profiles import load_of, profile_of
@@ -57,6 +59,7 @@ def test_half_of_the_work_and_twice_the_time_is_remembered_while_others_use_as_m
     assert shortfalls.of("merge", there(cores=0.0)) == pytest.approx((0.5, 2.0))
     assert shortfalls.of("merge", there(cores=0.0, others=2.0)) == without
     assert shortfalls.of("merge", profile_of("edge2", cpu_used_cores=1.0)) == without
+    assert shortfalls.of("merge", replace(there(cores=0.0), cpu_cores=8.0)) == without, "a larger machine"
     assert shortfalls.of("slam", there()) == without
     shortfalls.forget("merge")
     assert shortfalls.of("merge", there()) == without
