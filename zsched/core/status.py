@@ -479,9 +479,10 @@ def _task_problems(node: Stages, task: TaskSpec, value: Allocation, now: float) 
             yield f"the worker on {name}{why}"
         elif name == owner and load.unended_s is not None and _hangs(load):
             more = f", and {load.jobs.backlog} wait" if load.jobs is not None and load.jobs.backlog else ""
+            anew = f"see `zsched logs {task.name}`, `zsched restart {task.name}` starts it anew"
             yield (
                 f"the worker on {name} has had work for {load.unended_s:.0f} s and finished no job{more}: it "
-                f"may hang in a callback; see `zsched logs {task.name}`, `zsched restart {task.name}` starts it anew"
+                f"may hang in a callback; {anew if task.worker.command else 'start it again there'}"
             )
     if owner is not None and owner == server and is_server_ready and node.membership.state(owner) is PeerState.ALIVE:
         yield from _no_spare(node, task, owner, now)

@@ -768,6 +768,10 @@ def test_an_owner_that_has_work_and_ends_no_job_is_a_problem(
     problems = [one for one in build_snapshot(node, 101.0).tasks[0].problems if "finished no job" in one]
     assert len(problems) == (told is not None)
     assert all(f"has had work for {told}" in one for one in problems)
+    assert all(one.endswith("`zsched restart merge` starts it anew") for one in problems)
+    node.fleet = replace(FLEET, tasks=tuple(replace(task, worker=WorkerSpec()) for task in FLEET.tasks))
+    problems = [one for one in build_snapshot(node, 101.0).tasks[0].problems if "finished no job" in one]
+    assert all(one.endswith("in a callback; start it again there") for one in problems), "it is somebody else's"
 
 
 def test_a_slot_that_is_not_taken_is_told_of_only_once_the_owner_s_own_worker_is_ready() -> None:

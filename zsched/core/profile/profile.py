@@ -217,16 +217,27 @@ class Profiler:
     def _worker(self, load: WorkerLoad) -> WorkerLoad:
         cpu, memory = self._worker_cpu.get(load.task), self._worker_memory.get(load.task)
         runnable = self._worker_runnable.get(load.task)
-        meter = self._jobs.get(load.task)
-        return WorkerLoad(
-            task=load.task,
-            state=load.state,
-            cpu_cores=None if cpu is None else cpu.value,
+        told = self._told(load.task, load.state)
+        return replace(
+            told,
+            cpu_cores=told.cpu_cores if cpu is None else cpu.value,
             memory_mb=None if memory is None else memory.value,
             wanted_cores=_possible(load.wanted_cores, MAX_CPU_CORES),
             runnable=None if runnable is None else runnable.value,
-            jobs=None if meter is None else meter.value,
-            unended_s=None if meter is None else meter.unended_s(self._sampled_at),
+        )
+
+    def _told(self, task: TaskId, state: WorkerState) -> WorkerLoad:
+        """What a worker says of its jobs: all that is known of one that somebody else started.
+
+        Its use is that of its jobs then.
+        """
+        meter = self._jobs.get(task)
+        if meter is None:
+            return WorkerLoad(task=task, state=state)
+        jobs = meter.value
+        cores = None if jobs is None else min(jobs.done_hz * jobs.cpu_s, MAX_CPU_CORES)
+        return WorkerLoad(
+            task=task, state=state, cpu_cores=cores, jobs=jobs, unended_s=meter.unended_s(self._sampled_at)
         )
 
     def owe(self, now: float) -> None:
@@ -295,20 +306,14 @@ class Profiler:
         is_measured = now - self._sampled_at <= STALE_S
         loads = {load.task: load for load in self._workers} if is_measured else {}
         workers = tuple(
-            WorkerLoad(
-                task=task,
-                state=states[task],
-                cpu_cores=loads[task].cpu_cores if task in loads else None,
-                memory_mb=loads[task].memory_mb if task in loads else None,
-                wanted_cores=loads[task].wanted_cores if task in loads else None,
-                runnable=loads[task].runnable if task in loads else None,
+            replace(
+                loads.get(task) or (self._told(task, state) if is_measured else WorkerLoad(task=task, state=state)),
+                state=state,
                 reason=reasons.get(task, ""),
-                jobs=loads[task].jobs if task in loads else None,
                 renewal=renewals.get(task, Renewal.NONE),
-                unended_s=loads[task].unended_s if task in loads else None,
                 spent_s=self._spent(loads.get(task)),
             )
-            for task in sorted(states)
+            for task, state in sorted(states.items())
         )
         return Profile(
             node=self._node,

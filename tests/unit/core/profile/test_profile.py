@@ -620,6 +620,23 @@ def test_what_a_worker_tells_of_its_jobs_stands_with_another_time_constant() -> 
     assert worker.jobs.time_s == pytest.approx(0.05)
 
 
+def test_of_somebody_else_s_worker_its_jobs_are_told_and_their_use() -> None:
+    """The machine's samples have workers of ours only, and no figures before the second one."""
+    profiler = make_profiler()
+    for step in range(60):
+        word = WorkerJobs(
+            task="merge", incarnation="1", at_s=0.2 * step, done=step, time_s=0.05 * step, cpu_s=0.04 * step
+        )
+        assert profiler.note_jobs(word, 0.2 * step)
+        profiler.absorb(device(1.0, 1000.0), (), 0.2 * step)
+    (worker,) = taken(profiler, 12.0).workers
+    assert worker.jobs is not None
+    assert worker.jobs.done_hz == pytest.approx(5.0, rel=0.01)
+    assert worker.cpu_cores == pytest.approx(0.2, rel=0.01)
+    assert (worker.memory_mb, worker.spent_s, worker.runnable) == (None, None, None)
+    assert taken(profiler, 100.0).workers == (WorkerLoad(task="merge", state=WorkerState.READY),), "nobody measures"
+
+
 @pytest.mark.parametrize("tau_s", [0.5, 4.0])
 def test_a_signal_goes_on_by_another_time_constant_and_its_trend_begins_anew(tau_s: float) -> None:
     signal = SignalFilter(1.0)

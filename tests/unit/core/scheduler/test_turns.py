@@ -78,7 +78,7 @@ def test_a_move_keeps_its_turn_for_a_second_try_and_loses_it_then_or_when_it_has
 # --- bookings --------------------------------------------------------------------------------------------------------
 
 DEMAND = Demand(cpu_cores=1.0, memory_mb=800.0)
-A, B = (task_of(name, demand=DEMAND) for name in ("a", "b"))
+A, B = (task_of(name, demand=DEMAND, worker=WorkerSpec(command=("work",))) for name in ("a", "b"))
 FLEET = fleet_of(A, B, of=("edge1", "edge2"), electors=("robot1",))
 ALIVE = dict.fromkeys(("edge1", "edge2"), PeerState.ALIVE)
 
@@ -93,8 +93,9 @@ def scored_b(gateway: Gateway, agreed: dict[str, Allocation]) -> UtilityVector:
 
 
 def gateway_with(*workers_on_edge1: WorkerLoad, memory_mb: float = 1000.0) -> Gateway:
-    gateway = Gateway(FLEET)
-    for node, workers in (("edge1", workers_on_edge1), ("edge2", ())):
+    gateway, idle = Gateway(FLEET), load_of("b", cpu_cores=0.0, memory_mb=0.0)
+    for node, shown in (("edge1", workers_on_edge1), ("edge2", ())):
+        workers = shown if any(load.task == "b" for load in shown) else (*shown, idle)
         seen_cores = sum(load.cpu_cores or 0.0 for load in workers)
         seen_mb = sum(load.memory_mb or 0.0 for load in workers)
         profile = profile_of(node, cpu_used_cores=1.0 + seen_cores, memory_used_mb=memory_mb + seen_mb, workers=workers)
@@ -119,7 +120,7 @@ def test_a_task_that_has_just_come_counts_before_its_load_shows_and_not_twice_af
     assert value(vector, "edge2") == pytest.approx(0.5 * 0.5 + 0.5 * 2200 / 4000)
 
 
-def test_nothing_is_booked_for_a_task_elsewhere_for_oneself_and_for_a_foreign_worker() -> None:
+def test_nothing_is_booked_for_a_task_elsewhere_for_oneself_and_where_no_worker_is() -> None:
     for agreed, workers in ((values("edge2"), (of_a(0.0, 0.0),)), (values("edge1"), ())):
         vector = scored_b(gateway_with(*workers), agreed)
         assert value(vector, "edge1") == pytest.approx(0.5 * 0.5 + 0.5 * 2200 / 4000)
