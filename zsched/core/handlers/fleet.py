@@ -22,7 +22,7 @@ from zsched.core.stages import HISTORY, Handler, Stages
 from zsched.core.todo import ToDo
 from zsched.core.values.adoption import in_force, obstacle
 from zsched.core.values.electorate import CREATION_STEP
-from zsched.core.values.fleet import Fleet, WorkerSpec, file_hash, fleet_hash
+from zsched.core.values.fleet import Fleet, TaskSpec, file_hash, fleet_hash
 from zsched.core.values.model import Allocation, NodeKind
 
 SOURCE: Final = "fleet"
@@ -114,7 +114,7 @@ def _adopt_work(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
             come.append(executor)
         else:
             del kept[spec.name]
-            if _runs_another_program(executor.spec.worker, spec.worker):
+            if _runs_another_program(executor.spec, spec):
                 _learn_anew(node, values[spec.name], now)
             executor.adopt(spec, todo, now, is_agreed_leased=values[spec.name].leased)
         node.executors[spec.name] = executor
@@ -146,8 +146,10 @@ def _is_of_before(executor: Executor, value: Allocation) -> bool:
     return 0 < executor.epoch < value.epoch // CREATION_STEP * CREATION_STEP
 
 
-def _runs_another_program(before: WorkerSpec, after: WorkerSpec) -> bool:
-    return (before.command, before.env) != (after.command, after.env)
+def _runs_another_program(before: TaskSpec, after: TaskSpec) -> bool:
+    """Whether any candidate does: the first nodes of a rollout when it begins, all others when it ends."""
+    workers = ((before.worker_on(node), after.worker_on(node)) for node in after.candidates)
+    return any((old.command, old.env) != (new.command, new.env) for old, new in workers)
 
 
 def _learn_anew(node: Stages, value: Allocation, now: float) -> None:
