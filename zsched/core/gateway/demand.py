@@ -17,7 +17,7 @@ from typing import Final
 
 from zsched.core.gateway.company import is_full
 from zsched.core.gateway.job_need import CALM_S, Heard, JobNeed, age_of, other_s, told_job
-from zsched.core.gateway.shortfall import Shortfalls, shows_lack
+from zsched.core.gateway.shortfall import SHORT_RATIO, Shortfalls, is_short, shows_lack
 from zsched.core.gateway.spending import Spending
 from zsched.core.gateway.task_speed import MOST_RATIO, TaskSpeeds, speed_of
 from zsched.core.values.fleet import Demand, TaskSpec
@@ -134,7 +134,8 @@ class Demands:
         if load.cpu_cores is not None:
             speed = self._speeds.of(task, profile, is_there=True)
             fastest = max(fastest or speed, speed)
-            found = _with_use(found, load, load.cpu_cores, speed, fastest, is_new=is_new, is_starved=is_full(profile))
+            is_starved = is_full(profile) and not _gets_all(load, load.cpu_cores)
+            found = _with_use(found, load, load.cpu_cores, speed, fastest, is_new=is_new, is_starved=is_starved)
             if before is not None:
                 has_jobs = job_cpu_s is not None
                 found = self._compared(task, profile, found, before, is_new=is_new, has_jobs=has_jobs)
@@ -274,6 +275,16 @@ def _came(known: _Known, node: NodeId, now: float) -> _Known:
     if known.seen_at not in (None, node) and now - known.seen_s <= RECENT_S:
         before = _Before(known.work if known.is_sure else None, known.job_work_s)
     return replace(known, owner=node, since=now, before=before, seen_at=node, full_at=-math.inf)
+
+
+def _gets_all(load: WorkerLoad, cores: float) -> bool:
+    """Whether its threads are seen to wait for no CPU: then its use is its need on a full machine, too.
+
+    Where fewer threads run or wait than run, some live for a moment only, and nobody has counted them.
+    """
+    if load.runnable is None or is_short(load):
+        return False
+    return abs(load.runnable - cores) <= (1.0 - SHORT_RATIO) * cores
 
 
 def _with_use(

@@ -16,7 +16,7 @@ from zsched.core.gateway.demand import SETTLE_S, UNSURE, Demands
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.gateway.job_need import CALM_S, LIKELY_QUEUEING, Heard, crowd
 from zsched.core.values.fleet import Demand
-from zsched.core.values.profile import Jobs, Profile, Renewal, WorkerState
+from zsched.core.values.profile import Jobs, Profile, Renewal, WorkerLoad, WorkerState
 
 TASK = task_of(demand=Demand(cpu_cores=0.4, memory_mb=250.0))
 EVERY_S = 2 * SETTLE_S
@@ -222,6 +222,28 @@ def test_a_starved_worker_s_need_is_what_it_is_without_the_load(got: float, want
 def test_cpu_time_that_rises_by_a_tenth_under_contention_raises_the_need_by_no_more() -> None:
     calm, beside = learnt(told(8.0)).cpu_cores, learnt(told(8.0, cpu_s=0.11, got=0.5)).cpu_cores
     assert calm < beside <= 1.11 * calm
+
+
+@pytest.mark.parametrize(
+    ("load", "need"),
+    [
+        (load_of(cpu_cores=0.5, runnable=0.5), 0.5),
+        (load_of(cpu_cores=0.5, runnable=0.54), 0.5),
+        (load_of(cpu_cores=0.5, runnable=0.8), 2.0),  # it waits
+        (load_of(cpu_cores=0.5, runnable=0.3), 2.0),  # threads that nobody has counted
+        (load_of(cpu_cores=0.5), 2.0),
+        (load_of(cpu_cores=0.5, runnable=0.5, jobs=Jobs(time_s=0.1, cpu_s=0.1, done_hz=5.0, wanted_hz=9.0)), 2.0),
+    ],
+)
+def test_a_need_falls_on_a_full_machine_only_where_the_worker_is_seen_to_wait_for_nothing(
+    load: WorkerLoad, need: float
+) -> None:
+    demands = Demands()
+    for second in range(10):
+        demands.learn("merge", profile(2.0, cpu=2.5), float(second))
+    for second in range(10, 20):
+        demands.learn("merge", profile_of(cpu_used_cores=4.0, workers=(load,)), float(second))
+    assert demands.at(TASK, profile(node="edge2")).cpu_cores == need
 
 
 def test_a_need_that_was_told_falls_again_on_a_full_machine() -> None:
