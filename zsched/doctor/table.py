@@ -164,7 +164,7 @@ def run_all(scene: Scene) -> list[tuple[Check, Result]]:
 
 
 def _run(check: Check, scene: Scene) -> Result:
-    why = _missing(check.needs, scene)
+    why = _missing(check, scene)
     if why:
         return skipped(why)
     try:
@@ -174,8 +174,9 @@ def _run(check: Check, scene: Scene) -> Result:
         return failed(told, fix=f"report it, with zsched bugreport: {check.name}")
 
 
-def _missing(needs: Needs, scene: Scene) -> str:
-    """What a check lacks; empty: nothing."""
+def _missing(check: Check, scene: Scene) -> str:
+    """What a check lacks; empty: nothing. That nobody answers is a finding of the check that asks for it."""
+    needs = check.needs
     if needs is Needs.NOTHING:
         return ""
     if scene.known is None:
@@ -184,7 +185,7 @@ def _missing(needs: Needs, scene: Scene) -> str:
         return "it needs this machine's name in the fleet file"
     if needs is Needs.STATUS and scene.own is None:
         return "it needs the daemon's answer"
-    if needs is Needs.FLEET and not scene.statuses:
+    if needs is Needs.FLEET and not scene.statuses and (check.run is not fleet.answer or not scene.is_fleet):
         return "no node answers" if scene.is_fleet else "it needs --fleet"
     return ""
 

@@ -50,6 +50,14 @@ def test_nodes_that_do_not_answer_are_named(tmp_path: Path) -> None:
     assert_finds(run("fleet.electors", lonely), FAIL, "3 of 3 electors")
 
 
+def test_a_fleet_of_which_nobody_answers_is_no_healthy_one(tmp_path: Path) -> None:
+    """Else the doctor would end with 0 where a port is closed, and all else is left out."""
+    scene = replace(fleet_scene(tmp_path), statuses={})
+    assert_finds(run("fleet.answers", scene), FAIL, "4 of 4", "robot2")
+    of_fleet = [result for check, result in run_all(scene) if check.needs is Needs.FLEET]
+    assert [result.verdict for result in of_fleet] == [FAIL] + [SKIP] * (len(of_fleet) - 1)
+
+
 def test_an_address_that_nobody_can_reach_is_found(tmp_path: Path) -> None:
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
