@@ -162,7 +162,7 @@ LATENCY = (
     "objective latency: of the work that it gets done there the share counts that is expected within {deadline} ms "
     "(deadline_ms), by its worker's word of its jobs (CPU per job over the machine's speed and what is free there, or "
     "its fair share if that is more; its usual queue, and what a job waits for otherwise; what it got there before) "
-    "and the measured way there and back"
+    "and the measured way there and back; late work counts a tenth"
 )
 _REACH = {"majority": "most robots reach", "all": "all robots reach"}
 _PAIR = {PairReading.CANDIDATE: "the candidate's way alone", PairReading.WEAKER: "the weaker of the two ways"}

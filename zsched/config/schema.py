@@ -280,7 +280,7 @@ SCHEDULING: Final = Record(
         "objective": Field(
             Choice.of(Objective),
             "What the task wants: `service`, as many of its jobs done as possible; `latency`, as many as possible "
-            "done within `deadline_ms`. With `score: service` only.",
+            "done within `deadline_ms` (a late one counts a tenth). With `score: service` only.",
             default=f"`{Objective.SERVICE}`",
         ),
         "deadline_ms": Field(

@@ -22,6 +22,7 @@ from zsched.core.scheduler.utility import (
     on_time,
     service_utility,
     spare_factor,
+    timely_worth,
     total_utility,
 )
 from zsched.core.values.fleet import Demand, TaskSpec
@@ -245,7 +246,8 @@ def _cpu(
         return service_utility(free, demand.cpu_cores, profile.cpu_cores, least=least_cores, share=share)
     speed = demands.speed(spec.name, profile)
     if tuning.deadline_ms is not None:
-        share *= on_time(stretch * job.age_s(speed, max(free, fair_cores)) + network_s, tuning.deadline_ms / 1e3)
+        job_s = stretch * job.age_s(speed, max(free, fair_cores)) + network_s
+        share *= timely_worth(on_time(job_s, tuning.deadline_ms / 1e3))
     most = job.most_cores(speed)
     return service_utility(free, demand.cpu_cores, profile.cpu_cores, least=least_cores, most=most, share=share)
 

@@ -127,6 +127,22 @@ def on_time(job_s: float, deadline_s: float) -> float:
     return 1.0 / (1.0 + math.pow(ratio, STEEPNESS))
 
 
+LATE_WORTH = 0.1
+"""A job that comes too late is worth this part of one in time."""
+
+
+def timely_worth(on_time_ratio: float) -> float:
+    """What a task's jobs are worth of which this share comes in time, in [`LATE_WORTH`, 1].
+
+    A late job keeps a little worth. Else machines would be alike where none can keep the deadline, and a task stay on
+    one that does a tenth of its jobs.
+
+    >>> [round(timely_worth(ratio), 2) for ratio in (0.0, 0.5, 1.0)]
+    [0.1, 0.55, 1.0]
+    """
+    return LATE_WORTH + (1.0 - LATE_WORTH) * on_time_ratio
+
+
 NEARLY_FULL = 0.15
 """This part of a term goes where nothing is left beside the task: enough to leave for, in some seconds."""
 

@@ -14,8 +14,8 @@ from support.fleets import fleet_of, task_of, tuning_of
 from support.profiles import load_of, profile_of
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.scoring import NOTHING_HELD, score
-from zsched.core.scheduler.utility import on_time, service_utility
-from zsched.core.values.fleet import Demand, WorkerSpec
+from zsched.core.scheduler.utility import LATE_WORTH, on_time, service_utility, timely_worth
+from zsched.core.values.fleet import DEFAULT_BONUS, Demand, WorkerSpec
 from zsched.core.values.model import PeerState, ScoreForm, Tuning
 from zsched.core.values.profile import Jobs
 
@@ -71,13 +71,13 @@ def test_by_service_both_machines_that_do_all_jobs_are_worth_the_same_but_for_wh
 
 def test_with_a_deadline_the_machine_is_worth_more_whose_jobs_are_in_time() -> None:
     owner, other = worth(speeds=(1.0, 4.0))
-    assert owner == pytest.approx(service_utility(3.16, 0.16, 4.0, share=on_time(0.08, 0.1)), abs=0.01)
+    assert owner == pytest.approx(service_utility(3.16, 0.16, 4.0, share=timely_worth(on_time(0.08, 0.1))), abs=0.01)
     assert other > owner + 0.2
 
 
 def test_the_way_counts_as_a_job_s_own_time_does() -> None:
     near, far = worth(away_s=(0.0, 0.3))
-    assert far < 0.1 < near
+    assert far < LATE_WORTH + 0.05 < 0.4 < near
     assert worth(away_s=(0.05, 0.05))[0] < near
 
 
@@ -105,7 +105,16 @@ def test_a_robot_that_is_a_candidate_is_no_way_from_itself() -> None:
 
 def test_a_candidate_with_nothing_free_stretches_the_job() -> None:
     owner, full = worth(used=(1.0, 3.8))
-    assert full < 0.1 < owner
+    assert full < LATE_WORTH + 0.01 < 0.4 < owner
+
+
+@pytest.mark.parametrize("deadline_ms", [1.0, 10.0, 25.0])
+def test_where_no_machine_keeps_the_deadline_the_one_that_does_more_of_the_jobs_leads_beyond_the_bonus(
+    deadline_ms: float,
+) -> None:
+    held_up = replace(JOBS, time_s=0.5, wait_s=0.42, age_s=0.5, done_hz=0.2, wanted_hz=2.0)
+    owner, other = worth(replace(TUNING, deadline_ms=deadline_ms), jobs=held_up, used=(4.0, 0.1))
+    assert other > owner + DEFAULT_BONUS
 
 
 SHORT_JOBS = Jobs(time_s=0.025, cpu_s=0.02, wait_s=0.005, age_s=0.025, done_hz=5.0, wanted_hz=5.0)
