@@ -24,7 +24,7 @@ from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.profile import Profile, WorkerLoad, WorkerState
 from zsched.core.values.struct import Struct, replace
 
-ENDED_S: Final = 10.0
+ENDED_S: Final = 60.0
 """Others that do not fill a machine any more for this time have ended."""
 LEFT_S: Final = 4.0
 """Others show what they do without the task for this time after its worker has stopped working there."""
