@@ -20,7 +20,9 @@ NameOption = Annotated[
 ]
 StateOption = Annotated[
     Path | None,
-    typer.Option("--state-dir", metavar="DIR", help="Durable state. [ZSCHED_STATE_DIR, else /var/lib/zsched]"),
+    typer.Option(
+        "--state-dir", metavar="DIR", help="Durable state. [ZSCHED_STATE_DIR, else /var/lib/zsched; yours if not root]"
+    ),
 ]
 RuntimeOption = Annotated[
     Path | None,
