@@ -22,7 +22,7 @@ def is_out(spec: TaskSpec, profile: Profile) -> bool:
     return profile.draining or (load is not None and load.state is WorkerState.FAILED)
 
 
-def is_served(spec: TaskSpec, owner_state: PeerState, profile: Profile | None, *, is_spared: bool) -> bool:
+def has_living_owner(spec: TaskSpec, owner_state: PeerState, profile: Profile | None, *, is_spared: bool) -> bool:
     """Whether a task has an owner that lives, and whose worker has not failed, for all that is known of it.
 
     Args:

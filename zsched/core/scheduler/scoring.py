@@ -12,7 +12,7 @@ from collections.abc import Set as AbstractSet
 from zsched.core.gateway.demand import Demands
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.gateway.shortfall import is_short
-from zsched.core.scheduler.eligibility import is_served, refusal
+from zsched.core.scheduler.eligibility import has_living_owner, refusal
 from zsched.core.scheduler.links import pair_link, ways
 from zsched.core.scheduler.usage import Bookings, Use, coming_gpu, coming_use, own_use, predicted, predicted_gauges
 from zsched.core.scheduler.utility import (
@@ -100,7 +100,7 @@ def score(
     if allocation.tuning.deadline_ms is not None:
         away_s = ways(voter, spec.candidates, round_trips, gateway, now)
     owner = allocation.owner
-    has_owner = owner is not None and is_served(
+    has_owner = owner is not None and has_living_owner(
         spec,
         states.get(owner, PeerState.UNKNOWN),
         gateway.fresh(owner, now),
