@@ -40,7 +40,7 @@ SAME_JOB_RATIO = 0.8
 
 
 class _Before(Struct, frozen=True):
-    """What another machine had shown of a task when it came; ``None``: nothing sure."""
+    """What another machine had shown of a task when it came, if any had; ``None``: nothing sure."""
 
     work: float | None = None
     job_work_s: float | None = None
@@ -55,7 +55,7 @@ class _Known(Struct, frozen=True):
     job_work_s: float | None = None
     """CPU time of a job at speed 1, of all its threads; ``None``: its worker is silent."""
     before: _Before | None = None
-    """``None``: it has not come from another machine."""
+    """``None``: it has not come from elsewhere."""
     seen_at: NodeId | None = None
     """Where these figures were seen last..."""
     seen_s: float = 0.0
@@ -67,6 +67,8 @@ class _Known(Struct, frozen=True):
     """The job is a worker's that is to start again, by a changed recipe."""
     is_changed: bool = False
     """The file has named another program since then; the owner may still run the one before."""
+    is_unplaced: bool = False
+    """Nobody has had it when it was looked at last."""
     owner: NodeId | None = None
     since: float = 0.0
     """When it was first looked at there, with its worker ready."""
@@ -160,6 +162,11 @@ class Demands:
             )
         return is_seen or (found.work, found.memory_mb, found.job) != (known.work, known.memory_mb, known.job)
 
+    def note_unplaced(self, task: TaskId) -> None:
+        """Nobody has the task: who gets it next will not show it at once."""
+        known = self._known.get(task, _Known())
+        self._known[task] = replace(known, owner=None, is_unplaced=True)
+
     def forget(self, task: TaskId) -> None:
         """Know nothing of a task that is no more: one of the same name that comes later is another one (0043)."""
         self._known.pop(task, None)
@@ -248,11 +255,11 @@ class Demands:
     def unshown_ratio(self, task: TaskId, node: NodeId, now: float) -> float:
         """The part of a task's use that a node's figures, which are means, do not show yet, in [0, 1].
 
-        All of it until the task is seen there, if it was seen on another node before; then less with every second.
+        All of it until the task is seen there, if it was seen elsewhere before; then less with every second.
         """
         known = self._known.get(task, _Known())
         if known.owner != node:
-            return 1.0 if known.seen_at not in (None, node) else 0.0
+            return 1.0 if known.is_unplaced or known.seen_at not in (None, node) else 0.0
         return 0.0 if known.before is None else math.exp((known.since - now) / SHOWS_S)
 
     def speed(self, task: TaskId, profile: Profile) -> float:
@@ -271,10 +278,10 @@ class Demands:
 
 def _came(known: _Known, node: NodeId, now: float) -> _Known:
     """It begins to be seen on a node: another one than before, or the same one, where its worker has started again."""
-    before = None
+    before = _Before() if known.is_unplaced else None
     if known.seen_at not in (None, node) and now - known.seen_s <= RECENT_S:
         before = _Before(known.work if known.is_sure else None, known.job_work_s)
-    return replace(known, owner=node, since=now, before=before, seen_at=node, full_at=-math.inf)
+    return replace(known, owner=node, since=now, before=before, seen_at=node, full_at=-math.inf, is_unplaced=False)
 
 
 def _gets_all(load: WorkerLoad, cores: float) -> bool:

@@ -98,8 +98,11 @@ class Gateway:
         ends = (at + self._ttl_s for _, at in self._profiles.values() if now - at <= self._ttl_s)
         return min(ends, default=math.inf)
 
-    def learn_demand(self, task: TaskId, owner: NodeId, now: float) -> None:
+    def learn_demand(self, task: TaskId, owner: NodeId | None, now: float) -> None:
         """Learn the task's need and share from its owner's profile (`zsched.core.gateway.demand` and `sharing`)."""
+        if owner is None:
+            self.demands.note_unplaced(task)
+            return
         profile = self.fresh(owner, now)
         if profile is None:
             return

@@ -159,8 +159,7 @@ def _learn_anew(node: Stages, value: Allocation, now: float) -> None:
     the owner runs the changed one, its need is learnt from nothing.
     """
     node.gateway.expect_another(value.task)
-    if value.owner is not None:
-        node.gateway.learn_demand(value.task, value.owner, now)
+    node.gateway.learn_demand(value.task, value.owner, now)
 
 
 def compare_file(node: Stages) -> None:

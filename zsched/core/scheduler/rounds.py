@@ -352,8 +352,7 @@ class Rounds:
         """Everything that the judgement goes by, read once."""
         name, owner, is_called, gone = task.spec.name, allocation.owner, task.is_called, PeerState.GONE
         profile = None if owner is None else self._gateway.fresh(owner, now)
-        if owner is not None:
-            self._gateway.learn_demand(name, owner, now)
+        self._gateway.learn_demand(name, owner, now)
         return Figures(
             task=name,
             now=now,

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from zsched.core.values.fleet import Demand, Fleet, TaskSpec, Timing
+from zsched.core.values.fleet import Demand, Fleet, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.model import Tuning
 from zsched_lab.decisions.loads import LONG, Array, Scatter, Spikes, correlated
 from zsched_lab.decisions.service.machines import Machine, Shared, Work, alone_s, share
@@ -264,6 +264,7 @@ def _fleet(machines: tuple[Machine, ...], works: tuple[Work, ...]) -> Fleet:
             candidates=fleet.tasks[0].candidates,
             tuning=Tuning(weights=EVEN),
             demand=Demand(cpu_cores=work.demand(fastest), memory_mb=work.memory_mb),
+            worker=WorkerSpec(command=("work",)),  # its use is measured
         )
         for work in works
     )

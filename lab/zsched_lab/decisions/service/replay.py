@@ -150,8 +150,7 @@ class Scene:
     def learn(self, now: float) -> None:
         """The robots note what the tasks use where they run."""
         for name, value in self.values.items():
-            if value.owner is not None:
-                self.gateway.learn_demand(name, value.owner, now)
+            self.gateway.learn_demand(name, value.owner, now)
 
     def place(self, task: TaskId, owner: NodeId) -> None:
         """``task`` is at ``owner`` from the next step on."""

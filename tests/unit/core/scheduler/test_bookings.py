@@ -113,7 +113,7 @@ def test_what_somebody_else_starts_is_coming_only_until_the_machine_s_figures_sh
     states = dict.fromkeys(("edge0", "edge1", "robot1"), PeerState.ALIVE)
     gateway = Gateway(fleet)
 
-    def coming_cores(now: float, owner: str) -> float:
+    def coming_cores(now: float, owner: str | None) -> float:
         """What robot1 takes for coming on edge1, by its worth for the task ``map``; the profiles say nothing of it."""
         for node in ("edge0", "edge1"):
             assert (
@@ -135,6 +135,9 @@ def test_what_somebody_else_starts_is_coming_only_until_the_machine_s_figures_sh
     assert coming_cores(3.0, "edge1") == pytest.approx(PLAN.demand.cpu_cores), "it has just come"
     assert coming_cores(3.5, "edge1") == pytest.approx(PLAN.demand.cpu_cores / math.e)
     assert coming_cores(9.0, "edge1") < 0.001
+    assert coming_cores(9.5, None) == pytest.approx(PLAN.demand.cpu_cores), "it is to be placed"
+    assert coming_cores(10.0, "edge1") == pytest.approx(PLAN.demand.cpu_cores), "its first owner has just got it"
+    assert coming_cores(19.0, "edge1") < 0.001
 
 
 def test_where_somebody_else_starts_the_worker_its_whole_demand_is_added() -> None:
