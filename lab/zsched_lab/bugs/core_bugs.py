@@ -1114,6 +1114,13 @@ VOTE_BUGS = (
         ("tests/unit/core/scheduler/test_latency.py",),
     ),
     _bug(
+        "a load that begins makes a task patient",
+        "zsched.core.scheduler.patience",
+        "if all(player.owner is not None and best - aggregates[player.owner] <= bonus for player in self._players):",
+        "if best >= 0.0:",
+        ("tests/unit/core/scheduler/test_patience.py",),
+    ),
+    _bug(
         "answers are compared with what was spent since they were counted",
         "zsched.core.gateway.spending",
         "if not risen or not (self._clock is None or self._clock in risen or is_silent):",

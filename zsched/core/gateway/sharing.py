@@ -155,7 +155,7 @@ class Shares:
         if has_been_away or used < known.cores - SAME_RATIO * profile.cpu_cores:
             del self._others[key]
             return True
-        more = max(known.beside - max(profile.runnable - own, 0.0), 0.0)
+        more = max(known.beside - max(profile.runnable - own, 0.0), known.more)  # who comes meanwhile hides it
         self._others[key] = replace(known, left_at=left_at, more=more)
         return (left_at, more) != (known.left_at, known.more)
 

@@ -96,6 +96,7 @@ class Judge:
             fit_since=self.fit_since,
             players=players,
             watched_at=watched_at,
+            patience=self.learnt.value if self.spec.learns_patience else None,
         )
 
     def recall(self, memory: JudgeMemory) -> None:
@@ -104,7 +105,7 @@ class Judge:
         self.spent, self.spent_at, self.seen_first_at = memory.spent, memory.spent_at, memory.seen_first_at
         self.fit_since = memory.fit_since
         self.learnt = LearntPatience()
-        self.learnt.recall(memory.players, memory.watched_at)
+        self.learnt.recall(memory.players, memory.watched_at, memory.patience)
 
     def judge(
         self,

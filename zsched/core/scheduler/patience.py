@@ -9,8 +9,12 @@ have led to, and goes by the one that has paid least: follow the leader with ful
 J. Comput. Syst. Sci. 71, 2005; here without perturbation, for nobody plays against it), old times fading.
 
 Where nothing comes and goes but noise, each move of an impatient one is a loss, and the task grows patient; where loads
-are real, whoever waits loses, and it grows quick. Robots may come to different values: the quickest calls the vote, and
-each answers with its own winner.
+are real, whoever waits loses, and it grows quick.
+
+Only accounts that are closed tell: whoever has just moved has paid for it, and what that is worth comes later. Were
+open ones compared, the task would grow patient in the very moment in which a load begins.
+
+Robots may come to different values: the quickest calls the vote, and each answers with its own winner.
 """
 
 from __future__ import annotations
@@ -90,28 +94,31 @@ class LearntPatience:
     def __init__(self) -> None:
         self._players = tuple(_Player(patience) for patience in CHOICES)
         self._at: float | None = None
-
-    @property
-    def value(self) -> float:
-        """The patience that has paid least, to a thousandth of a second; of several the nearest to the first."""
-        return min(self._players, key=_rank).patience
+        self.value = FIRST_PATIENCE
+        """That which had paid least when no account was open, to a thousandth; of several the nearest to the first."""
 
     def watch(self, aggregates: Mapping[NodeId, float], bonus: float, cool_down_s: float, now: float) -> None:
         """Play all choices on: the joint utilities have been ``aggregates`` since the last look (2 s at most)."""
         gap_s = 0.0 if self._at is None else min(max(now - self._at, 0.0), LONGEST_GAP_S)
         self._at = now
-        for player in self._players if aggregates else ():
+        if not aggregates:
+            return
+        for player in self._players:
             player.play(aggregates, bonus, cool_down_s, now, gap_s)
+        best = max(aggregates.values())
+        if all(player.owner is not None and best - aggregates[player.owner] <= bonus for player in self._players):
+            self.value = min(self._players, key=_rank).patience
 
     def memory(self) -> tuple[tuple[PlayerMemory, ...], float | None]:
         """(the choices as they stand, when they were last played)."""
         return tuple([player.memory() for player in self._players]), self._at
 
-    def recall(self, players: tuple[PlayerMemory, ...], at: float | None) -> None:
-        """Go on from there."""
+    def recall(self, players: tuple[PlayerMemory, ...], at: float | None, value: float | None) -> None:
+        """Go on from there; ``value``: the patience in force, ``None`` in a memory of before it was kept."""
         self._at = at
         for player, memory in zip(self._players, players, strict=False):
             player.recall(memory)
+        self.value = min(self._players, key=_rank).patience if value is None else value
 
 
 def _rank(player: _Player) -> tuple[float, float]:

@@ -48,6 +48,8 @@ class JudgeMemory(Struct, frozen=True, kw_only=True):
     fit_since: float | None = None
     players: tuple[PlayerMemory, ...] = ()
     watched_at: float | None = None
+    patience: float | None = None
+    """The learnt one in force; ``None``: not learnt, or from before it was kept."""
 
 
 class DampingMemory(Struct, frozen=True, kw_only=True):

@@ -114,6 +114,14 @@ def test_others_that_waited_only_beside_the_task_wait_again_when_it_comes_back()
     assert share_of(shares, 0.0) == pytest.approx(fair_share(4.0, 4.0, 2.0))
 
 
+def test_another_task_that_comes_just_after_it_has_left_hides_nothing() -> None:
+    shares = Shares()
+    crowded(shares)
+    shares.look_back("merge", idle(runnable=3.0), 100.0)
+    assert not shares.look_back("merge", idle(runnable=7.0), 102.0)
+    assert share_of(shares, 3.0) == pytest.approx(fair_share(4.0, 4.0, 5.0))
+
+
 @pytest.mark.parametrize("runnable", [4.0, 9.0])
 def test_no_more_others_are_expected_than_were_found_or_are_there(runnable: float) -> None:
     """Somebody else makes those threads wait by now."""

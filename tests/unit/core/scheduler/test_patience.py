@@ -77,6 +77,35 @@ def test_the_price_of_one_move_by_hand() -> None:
     assert paid(learnt)[3] == pytest.approx(stays * fade + stays)
 
 
+def test_a_load_that_begins_changes_nothing_before_every_choice_has_settled_with_it() -> None:
+    """Whoever has just moved has paid for it, and the others have not: that is no sign that they are right."""
+    learnt, told = LearntPatience(), []
+    for look in range(60):
+        lead = 0.45 if look >= 20 else 0.0
+        learnt.watch({"edge1": 1.0 - lead, "edge2": 1.0}, BONUS, COOL_DOWN_S, look * EVERY_S)
+        told.append((learnt.value, len({player.owner for player in learnt._players})))
+    assert {owners for _, owners in told} == {1, 2}, "the quick ones have moved before the patient ones"
+    assert {value for value, _ in told} == {FIRST_PATIENCE}
+
+
+def test_a_load_that_was_over_before_it_paid_to_move_makes_it_patient_when_it_is_over() -> None:
+    learnt, seen = LearntPatience(), lambda at_s: {"edge1": 0.55 if 10.0 <= at_s < 11.0 else 1.0, "edge2": 1.0}
+    watched(seen, 11.0, learnt)
+    assert learnt.value == FIRST_PATIENCE
+    watched(seen, 12.0, learnt, 11.0)
+    assert learnt.value == 0.5, "it has paid as little as the most patient one, and is nearer to the first"
+
+
+def test_what_is_recalled_goes_on_from_the_patience_in_force() -> None:
+    """A memory of before it was kept has none: then the accounts tell."""
+    learnt = watched(lambda at_s: {"edge1": 0.55 if at_s >= 10.0 else 1.0, "edge2": 1.0}, 11.0)
+    players, at = learnt.memory()
+    for kept, value in ((FIRST_PATIENCE, FIRST_PATIENCE), (None, 0.5)):
+        again = LearntPatience()
+        again.recall(players, at, kept)
+        assert again.value == value
+
+
 def test_long_loads_make_it_quick() -> None:
     assert watched(loads(0.2, 30.0, 15.0), 300.0).value == min(CHOICES)
 
