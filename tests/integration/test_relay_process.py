@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -202,3 +203,28 @@ def test_a_role_whose_token_goes_is_told_again_by_the_relay(tmp_path: Path) -> N
         until(lambda: told, "the role again")
         assert told == [Role(task=TASK, role=WorkerRole.ACTIVE, epoch=2)]
         watch.undeclare()
+
+
+def test_a_relay_whose_daemon_died_before_it_looked_waits_for_no_successor_in_that_process(tmp_path: Path) -> None:
+    """Who its parent is by then says nothing; it waited a minute for the dead one to become its own successor."""
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    assert dead.wait(30.0) == 0
+    with socket.socket(socket.AF_UNIX) as door:
+        door.bind(str(tmp_path / "door"))
+        door.listen()
+        command = [sys.executable, "-m", "zsched.relay", "--fleet", "test", "--node", "robot1", "--orphan", "0.2"]
+        command += ["--door", str(door.fileno()), "--parent", str(dead.pid)]
+        child = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, pass_fds=(door.fileno(),), start_new_session=True
+        )
+        try:
+            _, reports = begin(child)
+            next_report(reports)
+            assert child.stdin is not None
+            child.stdin.close()
+            assert child.wait(30.0) == 0
+        finally:
+            child.kill()
+            child.wait(30.0)
+            if child.stdout is not None:
+                child.stdout.close()

@@ -64,6 +64,7 @@ def main() -> None:
             has_local_side=arguments.local,
             door=arguments.door,
             orphan_s=arguments.orphan,
+            parent=arguments.parent,
             streams=Path(arguments.streams) if arguments.streams else None,
             streams_listen=arguments.streams_listen,
             books=Path(arguments.books) if arguments.books else None,
@@ -83,7 +84,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--node", required=True)
     threads = "threads that transmit, receive, and close links, each"
     parser.add_argument("--threads", type=int, default=DEFAULT_THREADS, help=threads)
-    parser.add_argument("--parent", type=int, default=0, help="process id that must be our parent")
+    parser.add_argument("--parent", type=int, default=0, help="process id of the daemon, which must be our parent")
     parser.add_argument("--local", action="store_true", help="a second frame holds the session of the host's own side")
     parser.add_argument("--door", type=int, help="listening socket (inherited) for the daemon's successors")
     parser.add_argument("--orphan", type=float, default=0.0, help="seconds to go on without a daemon (with --door)")

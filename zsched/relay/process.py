@@ -472,6 +472,7 @@ def run(
     has_local_side: bool = False,
     door: int | None = None,
     orphan_s: float = 0.0,
+    parent: int = 0,
     streams: Path | None = None,
     streams_listen: str = "",
     books: Path | None = None,
@@ -481,6 +482,7 @@ def run(
     ``books`` is where the counters of this node's relays stand.
     ``streams`` is the socket for an application that has its streams itself, which listens at ``streams_listen``.
     ``door`` is a listening socket: through it the daemon's successor comes, within ``orphan_s`` of the daemon's end.
+    ``parent`` is that daemon's process; 0: our parent's. It may be gone before we can ask who our parent is.
     """
     reporter = Reporter(reports)
     on_failure(lambda kind, text: reporter.report(ProblemReported(source=f"{SOURCE}/thread/{kind}", problem=text)))
@@ -512,7 +514,7 @@ def run(
     application.open(config)
     give_back()
     successors = None if door is None else Successors(socket.socket(fileno=door), me, reopens=has_local_side)
-    wakeups, parent = _signals_wake(), os.getppid()
+    wakeups, parent = _signals_wake(), parent or os.getppid()
     try:
         while not relay.obey(commands, wakeups) and successors is not None:
             successor = _bridge(relay, successors, orphan_s, parent)
