@@ -135,7 +135,8 @@ def score(
         gpu = coming_gpu(spec, profile, bookings, gateway, now)
         gauges = predicted_gauges(spec, allocation, profile, gateway, gpu)
         needed = demand if has_owner and candidate != owner else spec.demand
-        reason = refusal(spec, allocation, profile, needed.memory_mb, predicted(profile, own, needed, coming), gauges)
+        least_use = use if needed is demand else predicted(profile, own, needed, coming)
+        reason = refusal(spec, allocation, profile, needed.memory_mb, least_use, gauges)
         if reason:
             refused.append((candidate, reason))
             continue
