@@ -31,9 +31,8 @@ def coverage_figures(streams: Streams, duration_s: float, most_s: float, area_m2
     ``coverage_curve`` is [[t_s, share], ...] every `CURVE_S` from 0 and at the end; ``coverage_mean`` its mean over
     that time (each value holds until the next), ``explored_m2`` the known area at the end. The end is ``most_s``, which
     a run may take: what a run knew when it was done after ``duration_s`` holds from there on, or a run that is done
-    sooner would count for less. ``walls_mean`` is the same
-    mean of the truth's walls that the map has where they are: coverage counts what is known, right or wrong. A robot
-    without a map knows nothing.
+    sooner would count for less. ``walls_mean`` is the same mean of the truth's walls that the map has where they are:
+    coverage counts what is known, right or wrong. A robot without a map knows nothing.
     """
     within = [[one for one in maps if one.t_s <= duration_s] for maps in streams.maps.values()]
     by_robot = [

@@ -199,13 +199,14 @@ def gains_parts(results: Json, pictures: Sequence[str] = ()) -> list[str]:
     moving: Gains = {
         (title, name): over(runs, "zsched", (name,)) for title, runs in groups.items() for name in RANKED[1:]
     }
-    rivals = [MOVING_SAY, beside] if (beside := gains_table(("where", "against"), moving)) else []
-    table = gains_text(results, RANKED)
-    if not table:
-        return ["## Where placing pays\n", *rivals] if rivals else []
-    best = gains_table(("where",), {(title,): over_best_fixed(runs, "zsched") for title, runs in groups.items()})
-    picture = [shown("gains.png")] if "gains.png" in pictures else []
-    return ["## Where placing pays\n", GAINS_SAY, table, *picture, BEST_SAY, best, *rivals]
+    parts: list[str] = []
+    if table := gains_text(results, RANKED):
+        best = gains_table(("where",), {(title,): over_best_fixed(runs, "zsched") for title, runs in groups.items()})
+        picture = [shown("gains.png")] if "gains.png" in pictures else []
+        parts += [GAINS_SAY, table, *picture, BEST_SAY, best]
+    if beside := gains_table(("where", "against"), moving):
+        parts += [MOVING_SAY, beside]
+    return ["## Where placing pays\n", *parts] if parts else []
 
 
 def gains_text(results: Json, schemes: Sequence[str]) -> str:
