@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import socket
 import subprocess
@@ -46,10 +47,11 @@ END_S = 5.0
 """A relay ends itself within a second; a busy machine may need longer to let it."""
 
 
-@pytest.fixture
-def process() -> Iterator[subprocess.Popen[bytes]]:
-    command = [sys.executable, "-m", "zsched.relay", "--fleet", "test", "--node", "robot1"]
-    child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0)
+@contextlib.contextmanager
+def relay(*options: str, pass_fds: tuple[int, ...] = ()) -> Iterator[subprocess.Popen[bytes]]:
+    """A relay's process, which has not been told its session yet; at the end it is gone."""
+    command = [sys.executable, "-m", "zsched.relay", "--fleet", "test", "--node", "robot1", *options]
+    child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0, pass_fds=pass_fds)
     try:
         yield child
     finally:
@@ -58,6 +60,12 @@ def process() -> Iterator[subprocess.Popen[bytes]]:
         for pipe in (child.stdin, child.stdout):
             if pipe is not None:
                 pipe.close()
+
+
+@pytest.fixture
+def process() -> Iterator[subprocess.Popen[bytes]]:
+    with relay() as child:
+        yield child
 
 
 def begin(child: subprocess.Popen[bytes], config: str = CONFIG) -> tuple[int, int]:
@@ -212,19 +220,10 @@ def test_a_relay_whose_daemon_died_before_it_looked_waits_for_no_successor_in_th
     with socket.socket(socket.AF_UNIX) as door:
         door.bind(str(tmp_path / "door"))
         door.listen()
-        command = [sys.executable, "-m", "zsched.relay", "--fleet", "test", "--node", "robot1", "--orphan", "0.2"]
-        command += ["--door", str(door.fileno()), "--parent", str(dead.pid)]
-        child = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, pass_fds=(door.fileno(),), start_new_session=True
-        )
-        try:
+        options = ["--orphan", "0.2", "--door", str(door.fileno()), "--parent", str(dead.pid)]
+        with relay(*options, pass_fds=(door.fileno(),)) as child:
             _, reports = begin(child)
             next_report(reports)
             assert child.stdin is not None
             child.stdin.close()
             assert child.wait(30.0) == 0
-        finally:
-            child.kill()
-            child.wait(30.0)
-            if child.stdout is not None:
-                child.stdout.close()
