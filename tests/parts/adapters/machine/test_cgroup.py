@@ -11,7 +11,14 @@ from pathlib import Path
 import pytest
 
 from support.waiting import until
-from zsched.adapters.machine.cgroup import CgroupTree, LimitedGroup, parse_flat, parse_membership, parse_mounts
+from zsched.adapters.machine.cgroup import (
+    CgroupTree,
+    CpuQuota,
+    LimitedGroup,
+    parse_flat,
+    parse_membership,
+    parse_mounts,
+)
 from zsched.errors import AdapterError
 from zsched_lab.paper.work_group import OWN, WORK
 
@@ -213,7 +220,13 @@ def test_a_group_within_another_has_a_quota_of_its_own_and_its_node_is_the_outer
                 busy.stdin.write(b"go\n")
                 busy.stdin.flush()
                 until(lambda: work.pids() == (busy.pid,), "it is in the tasks' group")
-                quota = CgroupTree(pid=str(busy.pid)).cpu_quota()
+
+                def counted() -> CpuQuota | None:
+                    """Its quota, once it is in the group that counts, too: it joins one hierarchy after the other."""
+                    found = CgroupTree(pid=str(busy.pid)).cpu_quota()
+                    return found if found is not None and found.used_s() is not None else None
+
+                quota = until(counted, "its use is counted")
                 assert quota is not None
                 assert quota.cores == 0.2
                 begin_s, begin = time.monotonic(), quota.used_s()
