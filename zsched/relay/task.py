@@ -62,6 +62,9 @@ LACK_S: Final = 1.0
 AGAIN_S: Final = 0.5
 """A route for which no thread was to be had is tried again after this time."""
 BUSY_S, CARE_S, IDLE_S = 0.01, 0.2, 0.5
+LATE_S, FRESH_S = 0.1, 1.0
+"""What a worker lacks may stay away for good, such as a robot that it does not serve: it is looked for this often when
+nothing has been heard of the task (a plan, a token, an end marker) for so long."""
 
 _log = logging.getLogger("zsched.relay")
 
@@ -142,6 +145,8 @@ class TaskRelay:
         self._unheard: tuple[Route, ...] = ()
         """...and inputs of a task without an owner."""
         self._try_at = 0.0
+        self._heard_at = 0.0
+        """When a plan came last, or something woke us."""
         self._has_problem = False
         """One was told, and not that it is over."""
         guarded(self._run, name=f"task {task}").start()
@@ -209,6 +214,7 @@ class TaskRelay:
         while True:
             try:
                 plan = self._queue.get(timeout=self._wait_s())
+                self._heard_at = monotonic_s()
             except queue.Empty:
                 plan = None
             try:
@@ -240,9 +246,10 @@ class TaskRelay:
             return BUSY_S
         if current is None or self._is_away:
             return IDLE_S
-        is_moving = not current.is_ready or self._flip_by is not None or self._draining() is not None
-        if is_moving:
+        if self._flip_by is not None or self._draining() is not None:
             return BUSY_S
+        if not current.is_ready:
+            return BUSY_S if monotonic_s() - self._heard_at < FRESH_S else LATE_S
         return CARE_S if self._streams.is_counted else IDLE_S
 
     def _step(self) -> None:

@@ -147,6 +147,33 @@ def test_nor_is_one_after_another_data_session_that_has_not_seen_the_worker(
     undeclare(recorder)
 
 
+def test_a_worker_that_takes_nothing_of_this_robot_is_looked_for_ten_times_a_second(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A hundred times took 4 % of a core for each such task, for good."""
+    monkeypatch.setattr(task_module, "FRESH_S", 0.2)
+    steps: deque[float] = deque(maxlen=1000)
+    step = scene.task._step
+
+    def noted() -> None:
+        steps.append(monotonic_s())
+        step()
+
+    monkeypatch.setattr(scene.task, "_step", noted)
+    token = scene.other.liveliness().declare_token(KEYS.worker("edge1", "t", "7"))
+    until(scene.tokens.seen, "the worker")
+    scene.settle()
+    lack = SlotReady(task="t", epoch=3, is_ready=False, has_token=True, untaken=(IN.to_expr,))
+    until(lambda: lack in scene.words, "what the worker lacks is told")
+    began = monotonic_s()
+    until(lambda: monotonic_s() - began >= 1.0, "a second")
+    assert 2 <= sum(at >= began for at in steps) <= 20
+    data = scene.other.declare_subscriber(IN.to_expr, lambda _sample: None)
+    until(lambda: SlotReady(task="t", epoch=3) in scene.words, "the worker is ready")
+    for one in (token, data):
+        undeclare(one)
+
+
 LATCHED = replace(IN, settings=StreamSettings(stream_class=StreamClass.LATEST, keep_last=1))
 
 
