@@ -2,7 +2,7 @@
 
 Knows: the worker library, the task's keys. Does not know: how scans are matched, where it runs.
 
-    in   {prefix}/<robot>/scan           scans with the robot's raw odometry (`zsched_lab.explore.messages`)
+    in   {prefix}/*/scan                 scans with the robot's raw odometry (`zsched_lab.explore.messages`)
     out  {prefix}/{epoch}/<robot>/pose   where the robot was at each scan
          {prefix}/{epoch}/<robot>/map    nav_msgs/msg/OccupancyGrid, CDR
 
@@ -35,6 +35,8 @@ def run(settings: SlamSettings) -> None:
         maps = worker.publisher(f"{{prefix}}/{{epoch}}/{robot}/map", latest=True, keep_last=1)
 
         def on_scan(received: Received) -> None:
+            if received.key.split("/")[-2] != robot:
+                return
             try:
                 scan, odometry = decode_scan(received.payload.to_bytes())
             except WireError as error:
@@ -55,7 +57,8 @@ def run(settings: SlamSettings) -> None:
                 slam.restore(state)
 
         worker.on_snapshot(restore)
-        worker.subscribe(f"{{prefix}}/{robot}/scan", on_scan, keep_last=QUEUE)
+        # a worker is ready for a robot that takes what it may send: the other robots' relays have this task, too
+        worker.subscribe("{prefix}/*/scan", on_scan, keep_last=QUEUE)
         worker.offer_snapshot(snapshot)
         worker.ready()
         while worker.wait(1.0):
