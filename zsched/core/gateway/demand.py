@@ -22,7 +22,7 @@ from zsched.core.gateway.spending import Spending
 from zsched.core.gateway.task_speed import MOST_RATIO, TaskSpeeds, speed_of
 from zsched.core.values.fleet import Demand, TaskSpec
 from zsched.core.values.model import NodeId, TaskId
-from zsched.core.values.profile import Profile, Renewal, WorkerLoad, WorkerState
+from zsched.core.values.profile import MAX_CPU_CORES, Profile, Renewal, WorkerLoad, WorkerState
 from zsched.core.values.struct import Struct, replace
 
 UNSURE = 1.5
@@ -146,7 +146,8 @@ class Demands:
             hz = self._spending[task].answers_hz if task in self._spending else None
             found = _with_heard(found, load, heard, job_cpu_s, hz, speed, now)
         else:
-            found = _with_job(found, load, speed, is_new=is_new)
+            is_calm = now - found.full_at > CALM_S
+            found = _with_job(found, load, speed, is_new=is_new, is_calm=is_calm)
         self._known[task] = found
         age_s, is_seen = age_of(load.jobs, heard), False
         if not is_new and age_s is not None and found.job is not None and found.work:
@@ -247,20 +248,15 @@ class Demands:
         """One job's need; ``None``: its worker has never reported any."""
         return self._known.get(task, _Known()).job
 
-    def has_been(self, task: TaskId, node: NodeId, for_s: float, now: float) -> bool:
-        """Whether the task has been seen on the node, with its worker ready, for so long."""
-        known = self._known.get(task, _Known())
-        return known.owner == node and now - known.since >= for_s
-
-    def unshown_ratio(self, task: TaskId, node: NodeId, now: float) -> float:
-        """The part of a task's use that a node's figures, which are means, do not show yet, in [0, 1].
+    def unshown_ratio(self, task: TaskId, node: NodeId, now: float, shows_s: float = SHOWS_S) -> float:
+        """The part of a task's use that a node's figures, means over about ``shows_s``, do not show yet, in [0, 1].
 
         All of it until the task is seen there, if it was seen elsewhere before; then less with every second.
         """
         known = self._known.get(task, _Known())
         if known.owner != node:
             return 1.0 if known.is_unplaced or known.seen_at not in (None, node) else 0.0
-        return 0.0 if known.before is None else math.exp((known.since - now) / SHOWS_S)
+        return 0.0 if known.before is None else math.exp((known.since - now) / shows_s)
 
     def speed(self, task: TaskId, profile: Profile) -> float:
         """The task's speed on a node, > 0: the benchmark's, or what was seen when the task came there."""
@@ -270,8 +266,9 @@ class Demands:
     def at(self, spec: TaskSpec, profile: Profile) -> Demand:
         """The task's demand on a node: the larger of the fleet file's figure and the learnt one."""
         known = self._known.get(spec.name, _Known())
+        cores = min((known.work or 0.0) / self.speed(spec.name, profile), MAX_CPU_CORES)
         return Demand(
-            cpu_cores=max(spec.demand.cpu_cores, (known.work or 0.0) / self.speed(spec.name, profile)),
+            cpu_cores=max(spec.demand.cpu_cores, cores),
             memory_mb=max(spec.demand.memory_mb, known.memory_mb or 0.0),
         )
 
@@ -340,14 +337,14 @@ def _with_heard(
     return replace(known, job=job, job_work_s=cpu_s * speed, is_job_old=is_old)
 
 
-def _with_job(known: _Known, load: WorkerLoad, speed: float, *, is_new: bool) -> _Known:
+def _with_job(known: _Known, load: WorkerLoad, speed: float, *, is_new: bool, is_calm: bool) -> _Known:
     """With the job of the owner's worker: the one that it reports, or reported before it became silent.
 
     The job of a program that has been replaced says nothing of the one that runs now and reports none.
     """
     is_old = load.renewal is not Renewal.NONE
     if load.jobs is not None:
-        job = told_job(load.jobs, speed, known.job)
+        job = told_job(load.jobs, speed, known.job, is_calm=is_calm)
         # a worker that has just come may begin with nothing, and its first jobs be small by that
         job_work_s = known.job_work_s if is_new and known.before is not None else load.jobs.cpu_s * speed
         return replace(known, job=job, job_work_s=job_work_s, is_job_old=is_old)

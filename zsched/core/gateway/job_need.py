@@ -53,10 +53,15 @@ class JobNeed(Struct, frozen=True):
     is_serial: bool
     """One thread does it, so it uses at most one core at a time."""
 
-    def most_cores(self, speed: float) -> float | None:
-        """What the worker can use at a time on a machine of ``speed``; ``None``: any amount."""
+    def most_cores(self, speed: float, need_cores: float) -> float | None:
+        """What the worker can use at a time on a machine of ``speed``; ``None``: any amount.
+
+        What of its ``need_cores`` is not the jobs' is that of other threads, which run beside.
+        """
         cpu_s = self.work_s / speed
-        return cpu_s / (cpu_s + self.other_s) if self.is_serial and cpu_s > 0.0 else None
+        if not self.is_serial or cpu_s <= 0.0:
+            return None
+        return cpu_s / (cpu_s + self.other_s) + max(need_cores - self.hz * cpu_s, 0.0)
 
     def age_s(self, speed: float, free_cores: float) -> float:
         """Expected seconds from arrival to end where a job gets this many cores while it runs, at most one.
@@ -85,16 +90,20 @@ def other_s(jobs: Jobs) -> float:
     return 0.0 if jobs.wait_s is None else max(jobs.time_s - jobs.wait_s - jobs.cpu_s, 0.0)
 
 
-def told_job(jobs: Jobs, speed: float, known: JobNeed | None) -> JobNeed:
-    """A job by its worker's report, on a machine of ``speed``; ``known``: what was known before."""
+def told_job(jobs: Jobs, speed: float, known: JobNeed | None, *, is_calm: bool) -> JobNeed:
+    """A job by its worker's report, on a machine of ``speed``.
+
+    ``known``: what was known before. ``is_calm``: the machine has had CPU to spare for `CALM_S`. A job of several
+    threads does not tell how long it waits for a CPU, and on a full machine its whole time is no work.
+    """
     is_serial, waits_s = jobs.wait_s is not None, other_s(jobs)
-    cpu_s = jobs.cpu_s if is_serial else min(jobs.cpu_s, jobs.time_s)
+    cpu_s = jobs.cpu_s if is_serial else _at_once(jobs.cpu_s, jobs.time_s, speed, known, is_calm=is_calm)
     crowded = crowd(jobs.wanted_hz * (waits_s + cpu_s))
     queueing = RANDOM_QUEUEING if known is None else known.queueing
     if jobs.age_s is not None and jobs.time_s > 0.0:
         seen = (min(max(jobs.age_s / jobs.time_s, 1.0), MOST_QUEUE_RATIO) - 1.0) / crowded
-        is_calm = jobs.wait_s is not None and jobs.wait_s <= CALM_WAIT_RATIO * jobs.time_s
-        queueing = seen if is_calm else min(seen, queueing)
+        waits_little = is_calm if jobs.wait_s is None else jobs.wait_s <= CALM_WAIT_RATIO * jobs.time_s
+        queueing = seen if waits_little else min(seen, queueing)
     return JobNeed(
         work_s=cpu_s * speed,
         other_s=waits_s,
@@ -102,6 +111,15 @@ def told_job(jobs: Jobs, speed: float, known: JobNeed | None) -> JobNeed:
         hz=max(jobs.wanted_hz, jobs.done_hz),
         is_serial=is_serial,
     )
+
+
+def _at_once(cpu_s: float, time_s: float, speed: float, known: JobNeed | None, *, is_calm: bool) -> float:
+    """For how long a job works whose threads spend ``cpu_s`` in all: several at once work for no longer than it takes.
+
+    On a full machine it takes longer by waits for a CPU, so what was known counts as the most.
+    """
+    cpu_s = min(cpu_s, time_s)
+    return cpu_s if is_calm or known is None else min(cpu_s, known.work_s / speed)
 
 
 class Heard(Struct, frozen=True):
@@ -117,7 +135,8 @@ class Heard(Struct, frozen=True):
 
         ``known``: what was known before. ``is_calm``: the machine has had CPU to spare for `CALM_S`.
         """
-        cpu_s = min(cpu_s, self.age_s)  # several threads at once work for no longer
+        if cpu_s > self.age_s:  # of several threads; of one all CPU time is work, whatever it waits for
+            cpu_s = _at_once(cpu_s, self.age_s, speed, known, is_calm=is_calm)
         waits_s, crowded_s = self.age_s - cpu_s, crowd(hz * cpu_s) * cpu_s
         if is_calm:
             queue_s = min(waits_s, LIKELY_QUEUEING * crowded_s)

@@ -77,7 +77,7 @@ class Shortfalls:
         load, company = profile.worker(task), Company.of(task, profile)
         if load is None or load.cpu_cores is None or company is None:
             return False
-        free, most = profile.cpu_cores - company.others_cores, job.most_cores(speed)
+        free, most = profile.cpu_cores - company.others_cores, job.most_cores(speed, need_cores)
         foreseen = min(free / need_cores, 1.0 if most is None else most / need_cores, 1.0)
         is_lacking = foreseen > 0.0 and shows_lack(load) and is_short(load)
         share = min(load.cpu_cores / need_cores / foreseen, 1.0) if is_lacking else 1.0

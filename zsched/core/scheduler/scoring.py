@@ -132,7 +132,7 @@ def score(
         demand, coming = gateway.demand(spec, profile), coming_use(spec, profile, bookings, gateway, now)
         own = own_use(spec, allocation, profile, demand)
         use = predicted(profile, own, demand, coming)
-        gpu = coming_gpu(spec, profile, bookings, gateway, now)
+        gpu = 0.0 if candidate == owner else coming_gpu(spec, profile, bookings, gateway, now)
         gauges = predicted_gauges(spec, allocation, profile, gateway, gpu)
         needed = demand if has_owner and candidate != owner else spec.demand
         least_use = use if needed is demand else predicted(profile, own, needed, coming)
@@ -249,7 +249,7 @@ def _cpu(
     if tuning.deadline_ms is not None:
         job_s = stretch * job.age_s(speed, max(free, fair_cores)) + network_s
         share *= timely_worth(on_time(job_s, tuning.deadline_ms / 1e3))
-    most = job.most_cores(speed)
+    most = job.most_cores(speed, demand.cpu_cores)
     return service_utility(free, demand.cpu_cores, profile.cpu_cores, least=least_cores, most=most, share=share)
 
 

@@ -15,15 +15,15 @@ from zsched.core.gateway.shortfall import is_short
 from zsched.core.scheduler.utility import predicted_use
 from zsched.core.values.fleet import Demand, TaskSpec
 from zsched.core.values.model import Allocation, NodeId, ScoreForm, TaskId
-from zsched.core.values.profile import Profile, WorkerLoad, WorkerState
+from zsched.core.values.profile import MAX_CPU_CORES, MAX_MEMORY_MB, Profile, WorkerLoad, WorkerState
 from zsched.core.values.struct import Struct
 from zsched.core.values.words import GaugeName
 
 Bookings = Mapping[NodeId, tuple[TaskSpec, ...]]
 """{owner: its tasks}: of a task that has just come, profiles show nothing yet."""
 
-GPU_SHOWS_S = 6.0
-"""A task's use of the GPU shows this time after it has come: three time constants of the gauges' means."""
+GPU_SHOWS_S = 3.0
+"""Time constant with which a task's use of the GPU shows: that of the gauges' means, and they are read every 2 s."""
 _NOTHING = Demand()
 
 
@@ -52,12 +52,13 @@ def coming_use(spec: TaskSpec, profile: Profile, bookings: Bookings | None, gate
     for other in others:
         load = profile.worker(other.name)
         if other.name != spec.name and load is not None:
-            demand = gateway.demand(other, profile)
+            # what it had come to use ended with it; what the file asks for stays reserved
+            demand = other.demand if _has_failed(other, profile) else gateway.demand(other, profile)
             unshown = 1.0 if other.worker.command else gateway.demands.unshown_ratio(other.name, profile.node, now)
             if not (is_full(profile) and is_short(load)):
                 cpu += unshown * max(demand.cpu_cores - (load.cpu_cores or 0.0), 0.0)
             memory += unshown * max(demand.memory_mb - (load.memory_mb or 0.0), 0.0)
-    return Demand(cpu_cores=cpu, memory_mb=memory)
+    return Demand(cpu_cores=min(cpu, MAX_CPU_CORES), memory_mb=min(memory, MAX_MEMORY_MB))
 
 
 class Use(Struct, frozen=True):
@@ -106,19 +107,24 @@ def _likely_cores(profile: Profile, load: WorkerLoad | None, demand: Demand) -> 
 
 
 def coming_gpu(spec: TaskSpec, profile: Profile, bookings: Bookings | None, gateway: Gateway, now: float) -> float:
-    """What other tasks will use of a node's GPU, beyond what shows: all that they ask for, until it must show.
+    """What other tasks will use of a node's GPU, beyond what shows: what they ask for, as far as it cannot show yet.
 
     Else two of them that leave one GPU at the same moment find the other one idle, and go together, again and again.
+    An owner keeps what it has: there what shows counts.
     """
     others = () if bookings is None else bookings.get(profile.node, ())
-    return sum(
-        (
-            other.demand.gpu
-            for other in others
-            if other.name != spec.name and not gateway.demands.has_been(other.name, profile.node, GPU_SHOWS_S, now)
-        ),
-        0.0,
+    demands = gateway.demands
+    coming = (
+        other.demand.gpu * demands.unshown_ratio(other.name, profile.node, now, GPU_SHOWS_S)
+        for other in others
+        if other.name != spec.name and not _has_failed(other, profile)
     )
+    return sum(coming, 0.0)
+
+
+def _has_failed(spec: TaskSpec, profile: Profile) -> bool:
+    load = profile.worker(spec.name)
+    return load is not None and load.state is WorkerState.FAILED
 
 
 def predicted_gauges(

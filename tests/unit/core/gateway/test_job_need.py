@@ -25,7 +25,7 @@ def test_time_that_is_no_cpu_time_is_a_wait_for_other_things_where_cpu_is_free()
     assert job.age_s(2.0, 4.0) == pytest.approx(0.3), "as it was seen there"
     assert job.age_s(1.0, 4.0) == pytest.approx(0.4, rel=0.02)
     assert job.age_s(2.0, 0.5) == pytest.approx(0.4, rel=0.02)
-    assert job.most_cores(1.0) is None, "it may work on several at once"
+    assert job.most_cores(1.0, 0.1) is None, "it may work on several at once"
 
 
 def test_on_a_full_machine_more_time_than_before_is_a_wait_for_a_cpu() -> None:
@@ -55,7 +55,9 @@ def test_jobs_that_come_irregularly_wait_the_longer_the_slower_the_machine_is(qu
         cpu_s = 0.1 / speed
         told = Jobs(time_s=cpu_s, cpu_s=cpu_s, wait_s=0.0, age_s=age_s(cpu_s), done_hz=5.0, wanted_hz=5.0)
         answers = heard(age_s(cpu_s))
-        job = told_job(told, speed, None) if is_told else answers.job(cpu_s, 5.0, speed, None, is_calm=True)
+        job = (
+            told_job(told, speed, None, is_calm=True) if is_told else answers.job(cpu_s, 5.0, speed, None, is_calm=True)
+        )
         assert job.age_s(1.0, 4.0) == pytest.approx(age_s(0.1))
         assert job.age_s(2.0, 4.0) == pytest.approx(age_s(0.05))
 
@@ -69,7 +71,7 @@ def test_a_wait_that_is_too_long_for_a_queue_is_for_other_things_and_the_same_ev
 
 def test_a_serial_worker_is_busy_while_its_job_waits_for_other_things_as_well() -> None:
     told = Jobs(time_s=0.1, cpu_s=0.05, wait_s=0.0, age_s=0.2, done_hz=5.0, wanted_hz=5.0)
-    job = told_job(told, 1.0, None)
+    job = told_job(told, 1.0, None, is_calm=True)
     assert (job.other_s, job.queueing) == pytest.approx((0.05, 1.0))
     assert job.age_s(2.0, 4.0) == pytest.approx(0.075 * (1.0 + crowd(0.375)))
 
@@ -79,19 +81,59 @@ def test_a_queue_under_a_load_is_at_most_the_usual_one() -> None:
 
     def seen(age_s: float) -> float:
         jobs = Jobs(time_s=0.2, cpu_s=0.1, wait_s=0.1, age_s=age_s, done_hz=5.0, wanted_hz=5.0)
-        return told_job(jobs, 1.0, usual).queueing
+        return told_job(jobs, 1.0, usual, is_calm=False).queueing
 
     assert seen(2.0) == 1.0
     assert seen(0.3) == pytest.approx(0.5)
 
 
+@pytest.mark.parametrize("is_told", [True, False])
+def test_what_several_threads_wait_on_a_full_machine_is_no_work_elsewhere(is_told: bool) -> None:
+    """Jobs of four threads, 0.1 s each: their own word has no waits, so a full owner's crowd was taken along."""
+
+    def seen(time_s: float, before: JobNeed | None, *, is_calm: bool) -> JobNeed:
+        jobs = Jobs(time_s=time_s, cpu_s=0.4, age_s=time_s, done_hz=4.0, wanted_hz=4.0)
+        if is_told:
+            return told_job(jobs, 2.0, before, is_calm=is_calm)
+        return heard(time_s).job(0.4, 4.0, 2.0, before, is_calm=is_calm)
+
+    alone = seen(0.1, None, is_calm=True)
+    crowded = seen(0.25, alone, is_calm=False)
+    assert (alone.work_s, crowded.work_s) == pytest.approx((0.2, 0.2))
+    assert seen(0.25, None, is_calm=False).work_s == pytest.approx(0.5), "where nothing else is known"
+    assert seen(0.25, crowded, is_calm=True).work_s == pytest.approx(0.5), "its jobs have become larger"
+
+
+def test_how_irregularly_jobs_of_several_threads_come_is_seen_anew_on_every_calm_machine() -> None:
+    """It only sank, so that inputs which came in a burst later were taken for a machine that is slow, for good."""
+
+    def seen(age_s: float, before: JobNeed | None, *, is_calm: bool) -> JobNeed:
+        jobs = Jobs(time_s=0.05, cpu_s=0.1, age_s=age_s, done_hz=4.0, wanted_hz=4.0)
+        return told_job(jobs, 1.0, before, is_calm=is_calm)
+
+    quiet = seen(0.05, None, is_calm=True)
+    burst = seen(0.15, quiet, is_calm=True)
+    assert quiet.queueing == 0.0
+    assert burst.age_s(1.0, 4.0) == pytest.approx(0.15)
+    assert seen(0.15, quiet, is_calm=False).queueing == 0.0, "on a full machine that may be a wait for a CPU"
+
+
+def test_what_runs_beside_the_jobs_is_no_part_of_their_one_thread() -> None:
+    """0.8 cores of jobs and 0.45 beside them lack nothing on a machine that has 1.25."""
+    jobs = Jobs(time_s=0.05, cpu_s=0.05, wait_s=0.0, age_s=0.05, done_hz=16.0, wanted_hz=16.0)
+    job = told_job(jobs, 1.0, None, is_calm=True)
+    assert job.most_cores(1.0, 1.25) == pytest.approx(1.45)
+    assert job.most_cores(1.0, 0.8) == pytest.approx(1.0)
+    assert job.most_cores(0.5, 1.6) == pytest.approx(1.0), "more of them than one thread can do is left undone"
+
+
 @pytest.mark.parametrize("time_s", [1e-9, 1e-3])
 def test_whatever_is_told_an_age_stays_within_bounds(time_s: float) -> None:
     jobs = Jobs(time_s=time_s, cpu_s=time_s, wait_s=0.0, age_s=1e6, done_hz=1e6, wanted_hz=1e6)
-    job = told_job(jobs, 1.0, None)
+    job = told_job(jobs, 1.0, None, is_calm=False)
     assert job.age_s(1.0, 4.0) == pytest.approx(MOST_QUEUE_RATIO * time_s)
     assert job.age_s(0.25, 4.0) <= 4.0 * MOST_QUEUE_RATIO * time_s * (1 + 1e-9)
-    assert told_job(replace(jobs, wanted_hz=0.0, done_hz=0.0), 1.0, None).age_s(0.1, 0.0) > 0.0
+    assert told_job(replace(jobs, wanted_hz=0.0, done_hz=0.0), 1.0, None, is_calm=False).age_s(0.1, 0.0) > 0.0
 
 
 def test_the_worked_example_holds() -> None:

@@ -140,6 +140,83 @@ def test_what_somebody_else_starts_is_coming_only_until_the_machine_s_figures_sh
     assert coming_cores(19.0, "edge1") < 0.001
 
 
+def test_what_a_failed_worker_had_come_to_use_is_not_kept_for_it() -> None:
+    """An idle machine was refused for good, for the memory of a worker that is no more; the file's figure stays."""
+    other = replace(PLAN, candidates=("edge1",))
+    fleet = fleet_of(MAP, other, of=("edge1", "robot1"), electors=("robot1",))
+    gateway, states = Gateway(fleet), {"edge1": PeerState.ALIVE, "robot1": PeerState.ALIVE}
+
+    def seen_free(number: int, plan: WorkerLoad, used: float) -> Utility:
+        told = profile_of(sequence=number, cpu_used_cores=used, workers=(load("map", 0.0, 0.0), plan))
+        assert gateway.absorb(told, float(number)) is None
+        gateway.learn_demand("plan", "edge1", float(number))
+        vector = score(MAP, NOBODY, "robot1", gateway, states, float(number), {"edge1": (other,)})
+        assert vector.refused == ()
+        return vector.utilities[0]
+
+    for number in range(1, 20):
+        seen_free(number, load("plan", cpu=2.0, memory=2500.0), 3.0)
+    failed = load_of("plan", WorkerState.FAILED, cpu_cores=0.0, memory_mb=0.0)
+    by_file = seen_free(20, failed, 1.0)
+    gateway.forget("plan")
+    assert seen_free(21, failed, 1.0) == by_file
+    assert seen_free(22, load("plan", 0.0, 0.0), 1.0) == by_file
+
+
+def with_gpu(owner: str | None, seen_at: str | None, reading: float, now: float) -> tuple[tuple[str, str], ...]:
+    """Why ``map``, which needs 35 % of a GPU and is at ``owner``, is refused, where ``plan`` needs as much.
+
+    ``plan`` has been seen at ``seen_at``, is on edge1 now, and shows there since the time 0.
+    """
+    nodes = ("edge1", "edge2")
+    mine, other = (
+        replace(one, candidates=nodes, demand=Demand(gpu=0.35), gauge_limits=(("gpu", 0.9),)) for one in (MAP, PLAN)
+    )
+    gateway = Gateway(fleet_of(mine, other, of=(*nodes, "robot1"), electors=("robot1",)))
+    times = [(-9.0, seen_at)] if seen_at else []
+    for sequence, (at, plan_owner) in enumerate([*times, (0.0, "edge1"), (now, "edge1")]):
+        for node in nodes:
+            workers, gauges = (load("map", 0.1), load("plan", 0.1)), (("gpu", reading if node == "edge1" else 0.0),)
+            told = profile_of(node, sequence=sequence, workers=workers, gauges=gauges)
+            assert gateway.absorb(told, at) is None
+        gateway.learn_demand("plan", plan_owner, at)
+    agreed = replace(NOBODY, owner=owner)
+    states = dict.fromkeys((*nodes, "robot1"), PeerState.ALIVE)
+    return score(mine, agreed, "robot1", gateway, states, now, {"edge1": (other,)}).refused
+
+
+def test_a_task_that_has_come_to_a_gpu_drives_nobody_out_whom_it_leaves_room_for() -> None:
+    """It was added for 6 s to what showed it already: four tasks on three machines moved in a ring, every 6 s."""
+    for now in (0.2, 1.0, 3.0, 6.0):
+        assert with_gpu("edge1", "edge2", 0.7, now) == ()
+
+
+def test_whoever_would_come_beside_it_finds_the_gpu_as_full_as_it_is_about_to_be() -> None:
+    told = dict(with_gpu("edge2", "edge2", 0.3, 0.2))
+    assert list(told) == ["edge1"]
+    assert with_gpu("edge2", "edge2", 0.3, 9.0) == (), "what shows by then is all"
+    assert with_gpu("edge2", None, 0.4, 0.2) == (), "nobody has just come for a robot that has just started"
+
+
+def test_whatever_a_profile_tells_a_robot_can_score() -> None:
+    """One frame with figures at the ends of what a profile may hold ended every robot's daemon."""
+    tasks = tuple(replace(one, candidates=("edge1", "edge2")) for one in TASKS)
+    gateway = Gateway(fleet_of(*tasks, of=("edge1", "edge2", "robot1"), electors=("robot1",)))
+    huge = tuple(load(one.name, cpu=4000.0, memory=1e8) for one in tasks)
+    states = dict.fromkeys(("edge1", "edge2", "robot1"), PeerState.ALIVE)
+    for sequence, used in enumerate((3000.0, 4096.0)):
+        told = profile_of("edge1", sequence=sequence, cpu_cores=4096.0, cpu_used_cores=used, speed=2.0, workers=huge)
+        idle = profile_of("edge2", sequence=sequence, speed=0.001, workers=tuple(load(one.name) for one in tasks))
+        for one in (told, idle):
+            assert gateway.absorb(one, float(sequence)) is None
+        for task in tasks:
+            gateway.learn_demand(task.name, "edge1", float(sequence))
+    for task in tasks:
+        agreed = allocation_of(owner="edge1", task=task.name)
+        vector = score(task, agreed, "robot1", gateway, states, 1.5, {"edge1": tasks, "edge2": tasks})
+        assert {one.candidate for one in vector.utilities} | {name for name, _ in vector.refused} == {"edge1", "edge2"}
+
+
 def test_where_somebody_else_starts_the_worker_its_whole_demand_is_added() -> None:
     """No load of the task is in the profile: nothing of what is used is its own."""
     unseen, seen_idle = (profile_of(workers=workers) for workers in ((), (load("map", 0.0, 0.0),)))
