@@ -62,9 +62,10 @@ LACK_S: Final = 1.0
 AGAIN_S: Final = 0.5
 """A route for which no thread was to be had is tried again after this time."""
 BUSY_S, CARE_S, IDLE_S = 0.01, 0.2, 0.5
-LATE_S, FRESH_S = 0.1, 1.0
-"""What a worker lacks may stay away for good, such as a robot that it does not serve: it is looked for this often when
-nothing has been heard of the task (a plan, a token, an end marker) for so long."""
+LATE_S: Final = 0.1
+"""A worker that is not ready is looked at this often, for it may lack something for good..."""
+FRESH_S: Final = 1.0
+"""...but every `BUSY_S` for so long after the last plan, token or end marker."""
 
 _log = logging.getLogger("zsched.relay")
 

@@ -141,12 +141,11 @@ class Demands:
             if before is not None:
                 has_jobs = job_cpu_s is not None
                 found = self._compared(task, profile, found, before, is_new=is_new, has_jobs=has_jobs)
-        speed = self._speeds.of(task, profile, is_there=True)
+        speed, is_calm = self._speeds.of(task, profile, is_there=True), now - found.full_at > CALM_S
         if heard is not None and load.jobs is None and not is_new:
             hz = self._spending[task].answers_hz if task in self._spending else None
-            found = _with_heard(found, load, heard, job_cpu_s, hz, speed, now)
+            found = _with_heard(found, load, heard, job_cpu_s, hz, speed, is_calm=is_calm)
         else:
-            is_calm = now - found.full_at > CALM_S
             found = _with_job(found, load, speed, is_new=is_new, is_calm=is_calm)
         self._known[task] = found
         age_s, is_seen = age_of(load.jobs, heard), False
@@ -327,13 +326,20 @@ def _told(load: WorkerLoad, speed: float, fastest: float) -> float | None:
 
 
 def _with_heard(
-    known: _Known, load: WorkerLoad, heard: Heard, cpu_s: float | None, hz: float | None, speed: float, now: float
+    known: _Known,
+    load: WorkerLoad,
+    heard: Heard,
+    cpu_s: float | None,
+    hz: float | None,
+    speed: float,
+    *,
+    is_calm: bool,
 ) -> _Known:
     """With the job of the owner's worker as robots see it; where too little is known yet it stays what it was."""
     is_old = load.renewal is not Renewal.NONE
     if cpu_s is None or hz is None:
         return replace(known, is_job_old=known.is_job_old or is_old)
-    job = heard.job(cpu_s, hz, speed, known.job, is_calm=now - known.full_at > CALM_S)
+    job = heard.job(cpu_s, hz, speed, known.job, is_calm=is_calm)
     return replace(known, job=job, job_work_s=cpu_s * speed, is_job_old=is_old)
 
 

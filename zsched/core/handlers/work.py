@@ -11,7 +11,6 @@ from typing import Any, Final
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.executor.workers import failed_workers
 from zsched.core.register.register import FROM_A_PEER
 from zsched.core.stages import Handler, PastValue, Stages, Unready
 from zsched.core.todo import ToDo
@@ -142,7 +141,7 @@ def _has_failed(node: Stages, value: Allocation, left: NodeId | None, now: float
     if state is PeerState.GONE or (state is PeerState.SUSPECT and is_escape):
         return True
     profile = node.gateway.fresh(left, now)
-    return profile is not None and value.task in failed_workers(profile)
+    return profile is not None and profile.has_failed(value.task)
 
 
 def _told(weights: Weights) -> str:

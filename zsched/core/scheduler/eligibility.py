@@ -18,8 +18,7 @@ from zsched.core.values.words import GaugeName
 
 def is_out(spec: TaskSpec, profile: Profile) -> bool:
     """Whether a node cannot have the task until an operator or a restart changes something there."""
-    load = profile.worker(spec.name)
-    return profile.draining or (load is not None and load.state is WorkerState.FAILED)
+    return profile.draining or profile.has_failed(spec.name)
 
 
 def has_living_owner(spec: TaskSpec, owner_state: PeerState, profile: Profile | None, *, is_spared: bool) -> bool:
@@ -31,8 +30,7 @@ def has_living_owner(spec: TaskSpec, owner_state: PeerState, profile: Profile | 
         profile: the owner's newest fresh one.
         is_spared: it counts as alive though it is silent.
     """
-    load = None if profile is None else profile.worker(spec.name)
-    is_down = load is not None and load.state is WorkerState.FAILED
+    is_down = profile is not None and profile.has_failed(spec.name)
     return (owner_state is PeerState.ALIVE or is_spared) and not is_down
 
 

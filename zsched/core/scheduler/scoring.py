@@ -14,7 +14,7 @@ from zsched.core.gateway.gateway import Gateway
 from zsched.core.gateway.shortfall import is_short
 from zsched.core.scheduler.eligibility import has_living_owner, refusal
 from zsched.core.scheduler.links import pair_link, ways
-from zsched.core.scheduler.usage import Bookings, Use, coming_gpu, coming_use, own_use, predicted, predicted_gauges
+from zsched.core.scheduler.usage import Bookings, Use, coming_use, own_use, predicted, predicted_gauges
 from zsched.core.scheduler.utility import (
     cpu_utility,
     memory_service,
@@ -132,8 +132,7 @@ def score(
         demand, coming = gateway.demand(spec, profile), coming_use(spec, profile, bookings, gateway, now)
         own = own_use(spec, allocation, profile, demand)
         use = predicted(profile, own, demand, coming)
-        gpu = 0.0 if candidate == owner else coming_gpu(spec, profile, bookings, gateway, now)
-        gauges = predicted_gauges(spec, allocation, profile, gateway, gpu)
+        gauges = predicted_gauges(spec, allocation, profile, bookings, gateway, now)
         needed = demand if has_owner and candidate != owner else spec.demand
         least_use = use if needed is demand else predicted(profile, own, needed, coming)
         reason = refusal(spec, allocation, profile, needed.memory_mb, least_use, gauges)

@@ -53,7 +53,7 @@ def coming_use(spec: TaskSpec, profile: Profile, bookings: Bookings | None, gate
         load = profile.worker(other.name)
         if other.name != spec.name and load is not None:
             # what it had come to use ended with it; what the file asks for stays reserved
-            demand = other.demand if _has_failed(other, profile) else gateway.demand(other, profile)
+            demand = other.demand if load.state is WorkerState.FAILED else gateway.demand(other, profile)
             unshown = 1.0 if other.worker.command else gateway.demands.unshown_ratio(other.name, profile.node, now)
             if not (is_full(profile) and is_short(load)):
                 cpu += unshown * max(demand.cpu_cores - (load.cpu_cores or 0.0), 0.0)
@@ -106,38 +106,38 @@ def _likely_cores(profile: Profile, load: WorkerLoad | None, demand: Demand) -> 
     return min(demand.cpu_cores, use, fair_share(profile.cpu_cores, max(demand.cpu_cores, 1.0), others))
 
 
-def coming_gpu(spec: TaskSpec, profile: Profile, bookings: Bookings | None, gateway: Gateway, now: float) -> float:
+def _coming_gpu(spec: TaskSpec, profile: Profile, bookings: Bookings | None, gateway: Gateway, now: float) -> float:
     """What other tasks will use of a node's GPU, beyond what shows: what they ask for, as far as it cannot show yet.
 
     Else two of them that leave one GPU at the same moment find the other one idle, and go together, again and again.
-    An owner keeps what it has: there what shows counts.
     """
     others = () if bookings is None else bookings.get(profile.node, ())
     demands = gateway.demands
     coming = (
         other.demand.gpu * demands.unshown_ratio(other.name, profile.node, now, GPU_SHOWS_S)
         for other in others
-        if other.name != spec.name and not _has_failed(other, profile)
+        if other.name != spec.name and not profile.has_failed(other.name)
     )
     return sum(coming, 0.0)
 
 
-def _has_failed(spec: TaskSpec, profile: Profile) -> bool:
-    load = profile.worker(spec.name)
-    return load is not None and load.state is WorkerState.FAILED
-
-
 def predicted_gauges(
-    spec: TaskSpec, allocation: Allocation, profile: Profile, gateway: Gateway, coming: float
+    spec: TaskSpec,
+    allocation: Allocation,
+    profile: Profile,
+    bookings: Bookings | None,
+    gateway: Gateway,
+    now: float,
 ) -> Mapping[GaugeName, float]:
-    """The node's gauges as if it had the task, with what is ``coming`` of other tasks' use of its GPU.
+    """The node's gauges as if it had the task, with what is coming of other tasks' use of its GPU.
 
-    None where the task goes by none.
+    None where the task goes by none. An owner keeps what it has: there what shows counts.
     """
     if not (spec.gauge_limits or allocation.tuning.weights.gauges):
         return {}
     readings, need = dict(gateway.readings(profile)), spec.demand.gpu
     if need and "gpu" in readings:  # by the fleet file: no driver tells which process uses how much
-        own = need if profile.node == allocation.owner else 0.0
+        is_owner = profile.node == allocation.owner
+        own, coming = (need, 0.0) if is_owner else (0.0, _coming_gpu(spec, profile, bookings, gateway, now))
         readings["gpu"] = predicted_use(readings["gpu"] + coming, own, need)
     return readings

@@ -286,6 +286,11 @@ class Profile(Struct, frozen=True, kw_only=True):
                 return load
         return None
 
+    def has_failed(self, task: TaskId) -> bool:
+        """Whether ``task``'s worker on this node has failed for good."""
+        load = self.worker(task)
+        return load is not None and load.state is WorkerState.FAILED
+
     def cores_of(self, task: TaskId) -> float:
         """Cores that ``task``'s worker uses on this node; 0 without a worker or a measurement."""
         load = self.worker(task)
