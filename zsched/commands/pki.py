@@ -436,7 +436,8 @@ def rotate(where: Where, *, is_end: bool) -> int:
 
     Raises:
         AdapterError: a rotation is under way, or there is none.
-        CliError: certificates of the former authority are left, or nodes do not have theirs of the new one.
+        CliError: certificates of the former authority are left, nodes do not have theirs of the new one, or the daemon
+            here does not answer.
     """
     with _opened(where) as (_, authority):
         if not is_end:
@@ -466,12 +467,29 @@ def rotate(where: Where, *, is_end: bool) -> int:
 
 
 def _lives(fleet: str) -> dict[str, int]:
-    """{node: its incarnation}, of those that the fleet's daemon here hears; empty: there is none."""
-    told: Json = {}
-    with contextlib.suppress(CliError):
-        told = ask_door(find_door(None, None), {"verb": "status"})
-    nodes = told["nodes"] if told.get("fleet") == fleet else ()
+    """{node: its incarnation}, of those that the fleet's daemon here hears; empty: there is none.
+
+    Raises:
+        CliError: as `_told_here`.
+    """
+    _, told = _told_here(fleet)
+    nodes = told["nodes"] if told is not None else ()
     return {str(one["name"]): one["incarnation"] for one in nodes if one.get("incarnation") is not None}
+
+
+def _told_here(fleet: str) -> tuple[Door | None, Json | None]:
+    """The door of the daemon here and its status; ``None``: no daemon runs here, or only one of another fleet.
+
+    One that runs and does not answer is not "none": a rotation that goes on without it would cut nodes off unseen.
+
+    Raises:
+        CliError: it does not answer, refuses, is not the one that is meant, or there are several and none is meant.
+    """
+    if not places.local_sockets(places.asked_folder(None, os.environ)):
+        return None, None
+    door = find_door(None, None)
+    told = ask_door(door, {"verb": "status"})
+    return door, told if told.get("fleet") == fleet else None
 
 
 def _see_delivered(authority: Authority) -> None:
@@ -480,11 +498,8 @@ def _see_delivered(authority: Authority) -> None:
     Raises:
         CliError: some have not, or do not answer.
     """
-    told: Json = {}
-    with contextlib.suppress(CliError):
-        door = find_door(None, None)
-        told = ask_door(door, {"verb": "status"})
-    if told.get("fleet") != authority.record.fleet:
+    door, told = _told_here(authority.record.fleet)
+    if door is None or told is None:
         _say("no daemon of the fleet answers here: nobody has seen whether every node has its new certificate")
         return
     members = {str(one["name"]) for one in told["nodes"]}

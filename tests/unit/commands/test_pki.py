@@ -438,3 +438,27 @@ def test_a_daemon_of_another_fleet_is_not_asked_at_the_end_of_a_rotation(
     with closing(OperatorSocket(here / "robot1.sock", answer)) as door:
         door.open()
         assert "no daemon of the fleet answers here" in pki("rotate", "--finish").stdout
+
+
+def test_a_daemon_that_does_not_answer_is_not_taken_for_none_in_a_rotation(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its fleet's nodes may lack their new certificates: the former key would be gone, and they would be cut off."""
+
+    def refuse(_request: Json) -> Json:
+        return {"error": "the document is not read yet"}
+
+    pki("init")
+    monkeypatch.setenv("ZSCHED_RUNTIME_DIR", str(here))
+    with closing(OperatorSocket(here / "robot1.sock", refuse)) as door:
+        door.open()
+        assert "not read yet" in pki("rotate", code=1).stderr
+        assert not (here / "authority" / "ca-2.key").exists(), "nobody has seen who has to begin anew"
+    pki("rotate")
+    with closing(OperatorSocket(here / "robot1.sock", refuse)) as door:
+        door.open()
+        assert "not read yet" in pki("rotate", "--finish", code=1).stderr
+        monkeypatch.setenv("ZSCHED_NODE", "robot9")
+        assert "robot9" in pki("rotate", "--finish", code=3).stderr
+    assert (here / "authority" / "ca-1.key").exists()
+    assert (here / "authority" / "ca.pem").read_text().count("BEGIN CERTIFICATE") == 2
