@@ -30,6 +30,7 @@ LAUNCHER = str(Path(__file__).with_name("launch.py"))
 MAX_LINE_BYTES = 2048
 LINES_PER_S = 50.0
 LINES_BURST = 400.0
+PAST_ROUNDING_S = 0.001
 READ_BYTES = 65536
 INTAKE_BYTES = 262_144
 """Read from one worker per `INTAKE_WINDOW_S`; what it prints faster waits in its pipe."""
@@ -76,6 +77,15 @@ class LineLog:
                 return
             self._write(line)
 
+    def tells_s(self) -> float | None:
+        """When `feed` is due even if nothing comes (monotonic seconds): lines were left out, and nobody knows so far.
+
+        A worker that floods and then hangs prints nothing more; ``None``: all is told.
+        """
+        if not self._is_muted or self._refilled_s is None:
+            return None
+        return self._refilled_s + max(0.0, LINES_PER_S - self._tokens) / LINES_PER_S + PAST_ROUNDING_S
+
     def close(self) -> None:
         """Write the unfinished line and the count of those left out."""
         if self._partial:
@@ -114,7 +124,8 @@ class LineLog:
     def _report_suppressed(self) -> None:
         if self._suppressed:
             self._logger.warning("suppressed lines=%d limit_per_s=%g", self._suppressed, LINES_PER_S)
-            self._keep(f"... {self._suppressed} lines left out: more than {LINES_PER_S:g} a second")
+            told = f"... {self._suppressed} lines left out: more than {LINES_PER_S:g} a second"
+            self._keep(f"{told}; the newest: {self.last_line}")
             self._suppressed = 0
 
 
@@ -164,6 +175,14 @@ class WorkerProcess:
         self._window_bytes += len(chunk)
         self._lines.feed(chunk, now)
         return bool(chunk)
+
+    def tells_s(self) -> float | None:
+        """When `tell` is due (monotonic seconds); ``None``: all output is told."""
+        return self._lines.tells_s()
+
+    def tell(self, now: float) -> None:
+        """Say how many lines were left out."""
+        self._lines.feed(b"", now)
 
     def resume_reading_s(self) -> float | None:
         """When reading may go on (monotonic seconds); ``None``: at once."""
@@ -267,6 +286,7 @@ class ProcessWatch:
         self._selector = selectors.DefaultSelector()
         self._wake_fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._selector.register(self._wake_fd, selectors.EVENT_READ, partial(os.eventfd_read, self._wake_fd))
+        self._watched: dict[WorkerProcess, None] = {}
         self._paused: dict[WorkerProcess, float] = {}
         self._polled: set[WorkerProcess] = set()
         self._lock = threading.Lock()
@@ -281,7 +301,8 @@ class ProcessWatch:
     def wait(self, deadline_s: float | None) -> None:
         """Return at ``deadline_s`` (monotonic seconds; ``None``: never), or when woken or something happened."""
         now = awake_s()
-        times = [*self._paused.values(), *([deadline_s] if deadline_s is not None else [])]
+        untold = {process: at for process in self._watched if (at := process.tells_s()) is not None}
+        times = [*self._paused.values(), *untold.values(), *([deadline_s] if deadline_s is not None else [])]
         if self._polled:
             times.append(now + POLL_S)
         for key, _ in self._selector.select(max(0.0, min(times) - now) if times else None):
@@ -289,9 +310,13 @@ class ProcessWatch:
         for process in [process for process, resume_s in self._paused.items() if awake_s() >= resume_s]:
             del self._paused[process]
             self._register_output(process)
+        for process, at in untold.items():
+            if process in self._watched and awake_s() >= at:
+                process.tell(awake_s())
 
     def add(self, process: WorkerProcess) -> None:
         """Watch ``process``."""
+        self._watched[process] = None
         self._register_output(process)
         if process.pid_fd is None:
             self._polled.add(process)
@@ -300,6 +325,7 @@ class ProcessWatch:
 
     def discard(self, process: WorkerProcess) -> None:
         """Stop watching ``process``; to be called before its files are closed."""
+        self._watched.pop(process, None)
         self._paused.pop(process, None)
         self._polled.discard(process)
         for fd in (process.output_fd, process.pid_fd):

@@ -12,7 +12,16 @@ import psutil
 import pytest
 
 from support.waiting import until
-from zsched.adapters.workers.process import LAUNCHER, LINES_BURST, LineLog, WorkerGuard
+from zsched.adapters.workers.kept_lines import KeptLines
+from zsched.adapters.workers.process import (
+    LAUNCHER,
+    LINES_BURST,
+    LineLog,
+    ProcessWatch,
+    WorkerGuard,
+    WorkerProcess,
+)
+from zsched.clock import awake_s
 from zsched.log_limit import LogLimit
 
 
@@ -37,6 +46,44 @@ def test_line_log_cuts_long_lines_and_counts_suppressed_ones(caplog: pytest.LogC
     lines.feed(b"still muted\n", 0.9)
     lines.feed(b"", 1.1)
     assert caplog.messages[-1] == f"suppressed lines={2002 - int(LINES_BURST) + 4} limit_per_s=50"
+
+
+def test_lines_that_were_left_out_are_told_although_the_worker_prints_nothing_more(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """What it said before it hung was known to nobody."""
+    caplog.set_level(logging.INFO, "flood")
+    kept = KeptLines()
+    lines = LineLog(logging.getLogger("flood"), kept)
+    assert lines.tells_s() is None
+    lines.feed(b"y\n" * 1000 + b"no route to the camera\n", 3.0)
+    due_s = lines.tells_s()
+    assert due_s is not None
+    assert due_s == pytest.approx(4.0, abs=0.05)
+    lines.feed(b"", due_s)
+    left_out = 1001 - int(LINES_BURST)
+    assert (caplog.messages[-1], lines.tells_s()) == (f"suppressed lines={left_out} limit_per_s=50", None)
+    told = f"... {left_out} lines left out: more than 50 a second; the newest: no route to the camera"
+    assert [line.text for line in kept.behind(int(LINES_BURST))[0]] == [told]
+
+
+def test_a_worker_that_floods_and_hangs_is_told_of_by_the_watch(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "flood")
+    watch = ProcessWatch()
+    script = "print('y\\n' * 1000, flush=True); import time; time.sleep(600)"
+    process = WorkerProcess((sys.executable, "-c", script), dict(os.environ), logging.getLogger("flood"))
+    watch.add(process)
+
+    def is_told() -> bool:
+        watch.wait(awake_s() + 1.0)
+        return any("suppressed" in text for text in caplog.messages)
+
+    try:
+        until(is_told, "the count of the lines that were left out")
+    finally:
+        watch.discard(process)
+        process.finish(awake_s())
+        watch.close()
 
 
 def test_line_log_disarms_control_characters(caplog: pytest.LogCaptureFixture) -> None:
