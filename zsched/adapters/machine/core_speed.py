@@ -20,7 +20,7 @@ from time import thread_time
 from typing import Final
 
 from zsched.core.values.profile import MAX_SPEED, MIN_SPEED
-from zsched.files import read_regular
+from zsched.files import put_whole, read_regular
 
 NAME: Final = "speed.json"
 SCHEMA: Final = "zsched.speed/1"
@@ -28,6 +28,8 @@ TRIES: Final = 5
 REFERENCE_S: Final = {"hash": 0.00076, "sort": 0.00063, "pack": 0.00134}
 """CPU seconds of each kernel on a core of speed 1: one of an AMD EPYC server, in a virtual machine."""
 MAX_BYTES: Final = 4096
+READABLE: Final = 0o644
+"""Root writes it, the service reads it."""
 PROCESSOR_FIELDS: Final = ("model name", "Model", "Hardware", "CPU part")
 """Of /proc/cpuinfo, on x86 and ARM."""
 
@@ -62,9 +64,8 @@ def keep(folder: Path) -> float:
     """Measure, and write the figure into ``folder``. Raises `OSError`."""
     speed = round(measure(), 3)
     text = json.dumps({"schema": SCHEMA, "speed": speed, "processor": processor()})
-    new = folder / f"{NAME}.new"
-    new.write_text(text + "\n", encoding="utf-8")
-    new.replace(folder / NAME)
+    # root writes into the service's folder: under a name that nobody can have laid a link at before
+    put_whole(folder / NAME, f"{text}\n".encode(), READABLE, lambda _descriptor: None)
     return speed
 
 

@@ -66,6 +66,19 @@ def test_a_file_of_another_machine_or_kind_is_measured_anew(
     assert json.loads((tmp_path / core_speed.NAME).read_text())["processor"] == "P"
 
 
+def test_a_link_in_the_folder_does_not_choose_what_root_writes(tmp_path: Path) -> None:
+    """The folder is the service's, and `init` writes there as root."""
+    folder, other = tmp_path / "state", tmp_path / "passwd"
+    folder.mkdir()
+    other.write_text("root")
+    for name in (core_speed.NAME, f"{core_speed.NAME}.new"):
+        (folder / name).symlink_to(other)
+    speed = core_speed.keep(folder)
+    assert other.read_text() == "root"
+    assert (core_speed.kept(folder), (folder / core_speed.NAME).is_symlink()) == (speed, False)
+    assert (folder / core_speed.NAME).stat().st_mode & 0o777 == 0o644
+
+
 def test_a_folder_that_cannot_be_written_still_gives_a_speed(tmp_path: Path) -> None:
     assert core_speed.kept_or_new(tmp_path / "nowhere") > 0.0
     (tmp_path / core_speed.NAME).mkdir()
