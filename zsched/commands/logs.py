@@ -5,14 +5,16 @@ Knows: which node is meant, how lines are followed. Does not know: how they are 
 
 from __future__ import annotations
 
+import contextlib
 import re
 import sys
 import time
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from zsched.clock import wall_ns
+from zsched.clock import monotonic_s, wall_ns
 from zsched.commands.ask import Door, ask_door, find_door
 from zsched.commands.common import Away, CliError, Json, nearest, print_json, warn
 from zsched.commands.page import clock_time
@@ -22,6 +24,10 @@ from zsched.screen import harmless
 
 SCHEMA: Final = "zsched.logs/1"
 PAUSE_S: Final = 0.5
+OWNER_S: Final = 2.0
+"""How often is looked whether the followed task has another owner."""
+LAG_S: Final = 1.0
+"""A move is known here a little later than at the new owner, which has printed something by then."""
 LEVELS: Final = ("debug", "info", "warning", "error", "critical")
 _SAME: Final = {"warn": "warning", "fatal": "critical"}
 _LOOKED_AT: Final = 200
@@ -78,6 +84,16 @@ class LogsView(Struct, frozen=True, kw_only=True):
     """Only lines of at least this level."""
 
 
+@dataclass(slots=True)
+class _Reading:
+    """How far a follower has come."""
+
+    node: str
+    after: int
+    is_owner: bool
+    """The owner is followed, not a node that was named."""
+
+
 def show_logs(view: LogsView, task: str, whose: str | None) -> int:
     """Print the newest lines, and with ``is_followed`` those that come, until Ctrl-C; returns the exit code.
 
@@ -99,20 +115,46 @@ def show_logs(view: LogsView, task: str, whose: str | None) -> int:
         if kept and kept[0]["number"] > 1:
             since = f"in the {len(kept)} lines that its daemon keeps; older ones are in the journal there"
         warn(f"the worker of {task} on {node} has printed nothing{least} {since}")
-    away = Away("logs", "until Ctrl-C")
-    try:
-        while view.is_followed:
-            time.sleep(PAUSE_S)
-            try:
-                lines, after = _all_lines(asked, task, after)
-            except CliError as error:
-                away.tell(str(error))
-                continue
-            away.tell("")
-            _print(view, node, task, sieve.of(lines))
-    except KeyboardInterrupt:
-        pass
+    if view.is_followed:
+        with contextlib.suppress(KeyboardInterrupt):
+            _follow(view, door, task, _Reading(node=node, after=after, is_owner=whose is None), sieve)
     return EXIT_OK
+
+
+def _follow(view: LogsView, door: Door, task: str, reading: _Reading, sieve: Sieve) -> None:
+    """Print what comes; with `_Reading.is_owner` of the task's owner, whichever node that is by then."""
+    away, looked_s = Away("logs", "until Ctrl-C"), monotonic_s()
+    while True:
+        time.sleep(PAUSE_S)
+        now = monotonic_s()
+        try:
+            if reading.is_owner and now - looked_s >= OWNER_S:
+                since_s, looked_s = looked_s, now
+                _change_over(view, door, task, reading, sieve, now - since_s + LAG_S)
+            lines, reading.after = _all_lines(door.to(reading.node), task, reading.after)
+        except CliError as error:
+            away.tell(str(error))
+            continue
+        away.tell("")
+        _print(view, reading.node, task, sieve.of(lines))
+
+
+def _change_over(view: LogsView, door: Door, task: str, reading: _Reading, sieve: Sieve, age_s: float) -> None:
+    """Go on at the owner, if that is another node by now, with its lines that are no older than ``age_s``.
+
+    Raises:
+        CliError: who is asked does not answer, or the task has left the fleet.
+    """
+    tasks = {str(known["name"]): known for known in ask_door(door, {"verb": "status"})["tasks"]}
+    owner = tasks[task]["owner"] if task in tasks else None
+    if owner is None or owner == reading.node:
+        return
+    with contextlib.suppress(CliError):  # it may be gone
+        _print(view, reading.node, task, sieve.of(_all_lines(door.to(reading.node), task, reading.after)[0]))
+    warn(f"{task} is on {owner} now; `zsched logs {task} {reading.node}` has what {reading.node} printed")
+    reading.node, reading.after = str(owner), 0
+    lines, reading.after = _all_lines(door.to(reading.node), task, 0)
+    _print(view, reading.node, task, sieve.of([line for line in lines if line["age_s"] <= age_s]))
 
 
 def worker_node(status: Json, task: str, whose: str | None) -> str:

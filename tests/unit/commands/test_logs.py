@@ -93,6 +93,45 @@ def test_logs_followed_prints_what_comes_and_starts_anew_with_another_daemon(fol
     assert (process.returncode, error) == (0, "")
 
 
+def test_logs_followed_go_along_with_the_task_to_its_next_owner(
+    daemon: Daemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who follows a task wants its work, not the silence of the machine that it has left."""
+    printed_by = {
+        "edge1": [{"number": 1, "age_s": 9.0, "text": "one"}],
+        "edge2": [{"number": 7, "age_s": 60.0, "text": "long ago"}, {"number": 8, "age_s": 0.1, "text": "go"}],
+    }
+
+    def answer(request: Json) -> Json:
+        if request["verb"] != "lines":
+            return daemon.status
+        lines = [one for one in printed_by[request["node"]] if one["number"] > request["after"]]
+        newest = printed_by[request["node"]][-1]["number"]
+        return {"node": request["node"], "task": "echo", "lines": lines, "newest": newest, "is_here": True}
+
+    def sleep(_s: float) -> None:
+        step = next(steps)
+        if step == "end":
+            raise KeyboardInterrupt
+        if step == "move":
+            printed_by["edge1"].append({"number": 2, "age_s": 0.2, "text": "last words"})
+            daemon.status["tasks"][0]["owner"] = "edge2"
+        if step == "print":
+            printed_by["edge2"].append({"number": 9, "age_s": 0.0, "text": "on"})
+
+    monkeypatch.setattr(daemon._socket, "_answer", answer)
+    monkeypatch.setattr("zsched.commands.logs.OWNER_S", 0.0)
+    monkeypatch.setattr("zsched.commands.logs.time", SimpleNamespace(sleep=sleep))
+    for named, expected in (((), ["one", "last words", "go", "on"]), (("edge1",), ["one", "last words"])):
+        daemon.status["tasks"][0]["owner"] = "edge1"
+        printed_by["edge1"], printed_by["edge2"] = printed_by["edge1"][:1], printed_by["edge2"][:2]
+        steps = iter(["wait", "move", "print", "end"])
+        result = run("logs", "echo", *named, "-f")
+        assert [line.split(" ", 1)[1] for line in result.stdout.splitlines()] == expected
+        told = "echo is on edge2 now; `zsched logs echo edge1` has what edge1 printed\n"
+        assert (result.exit_code, result.stderr) == (0, "" if named else told)
+
+
 def test_logs_followed_says_once_that_nobody_answers(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
     """Who follows over night finds what was printed, and not two lines a second of who was away."""
     daemon.lines = printed("one")
