@@ -21,7 +21,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from zsched.core.values.words import A_NAME, MAX_ASKED, NAME
-from zsched.errors import AdapterError, ConfigError, ZschedError
+from zsched.errors import AdapterError, ConfigError, WireError, ZschedError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE
 from zsched.latch import Latch
 from zsched.screen import fitted
@@ -205,6 +205,9 @@ class Verbs(TyperGroup):
             code, text = EXIT_CONFIG, str(error)
         except AdapterError as error:
             code, text = EXIT_FAILED, str(error)
+        except WireError as error:
+            advice = "update the older of the two, zsched here or the daemon"
+            code, text = EXIT_FAILED, f"a daemon's answer cannot be read ({error}); {advice}"
         # a fleet file's faults start with its name, like a compiler's: nothing goes in front of them
         prefix = "" if code == EXIT_CONFIG else f"{ctx.command_path} {ctx.invoked_subcommand}: "
         warn(f"{prefix}{text}")

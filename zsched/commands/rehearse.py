@@ -204,7 +204,7 @@ def _play(view: OrderView, order: RehearseOrder, stage: Stage) -> int:
     else:
         sys.stdout.write(table(body, screen_width()))
     if over.is_kept:
-        return EXIT_OK
+        return EXIT_FAILED if still_drained or stage.is_elsewhere else EXIT_OK
     is_told = programme.is_all_left_out or any(result.broken for result in programme.results)
     return EXIT_FAILED if is_told and not interrupted else EXIT_TIMED_OUT
 
@@ -307,6 +307,8 @@ class Stage:
             view, revision=None, reason=str(self.asked["reason"]), for_s=order.limit_s + DRAIN_MORE_S
         )
         self._has_drained = self._is_unsure = False
+        self.is_elsewhere = False
+        """The task could not be brought back to where it was."""
         self._since = 0
         self.refused: Mapping[Step, str] = {}
         """{step that was shown as left out: why}: nobody has agreed to it, so it stays out when it becomes possible."""
@@ -526,6 +528,7 @@ class Stage:
             except KeyboardInterrupt:
                 why = "interrupted"
                 break
+        self.is_elsewhere = True
         return f"{self._order.task} is not back on {owner}: {why or 'it takes too long'}; `zsched move` brings it there"
 
     def _moved_back(self, owner: str) -> tuple[bool, str]:

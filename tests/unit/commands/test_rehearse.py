@@ -27,7 +27,8 @@ from zsched.commands.rehearse_report import table
 from zsched.core.rehearsal.programme import MIN_CALM_S, Do, Over, Programme
 from zsched.core.values.rehearsal import Step
 from zsched.core.values.struct import replace
-from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_TIMED_OUT
+from zsched.errors import WireError
+from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT
 
 PROMISED = {
     "move": {"step": "move", "gap_s": 0.3, "decide_s": 1.0, "whole": ["echo/in/0"]},
@@ -207,7 +208,7 @@ def test_only_steps_that_were_shown_as_possible_are_played(refusing: Daemon, mon
     monkeypatch.setattr(rehearse, "_run", play)
     monkeypatch.setattr(Stage, "go_back", lambda _self: "")
     result = run("echo", "--steps", "daemon,worker", "--yes")
-    assert result.exit_code == 0, result.output
+    assert result.exit_code == EXIT_OK, result.output
     assert played == [(Step.DAEMON, "this rehearsal looks at the fleet through robot1"), (Step.WORKER, "")]
     assert [one["step"] for one in refusing.done if one["verb"] == "strike"] == ["worker"]
 
@@ -229,6 +230,27 @@ def test_a_rehearsal_of_which_every_step_was_left_out_does_not_end_as_a_kept_one
     monkeypatch.setattr(rehearse, "_run", play)
     order = RehearseOrder(task="echo", steps=(Step.DRAIN,), pause_s=MIN_CALM_S)
     assert rehearse._play(stage._view, order, stage) == EXIT_FAILED
+
+
+@pytest.mark.parametrize("left", ["a drain", "the task", "nothing"])
+def test_a_rehearsal_that_leaves_something_behind_does_not_end_as_a_kept_one(
+    left: str, stage: Stage, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Every promise was kept, and the fleet is not what it was before: a script must hear of it."""
+    over = Over(is_kept=True, why="every step is done")
+    monkeypatch.setattr(rehearse, "_run", lambda _programme, _stage: over)
+    monkeypatch.setattr(stage, "lift", lambda: "a node may still be drained" if left == "a drain" else "")
+    stage._base.moved = True
+    monkeypatch.setattr(stage, "_moved_back", lambda _owner: (left != "the task", "edge1 is gone"))
+    monkeypatch.setattr(rehearse, "BACK_S", 0.01)
+    order = RehearseOrder(task="echo", steps=(Step.DRAIN,), pause_s=MIN_CALM_S)
+    assert rehearse._play(stage._view, order, stage) == (EXIT_OK if left == "nothing" else EXIT_FAILED)
+    told = {
+        "a drain": "may still be drained",
+        "the task": "echo is not back on edge1: edge1 is gone",
+        "nothing": "again",
+    }
+    assert told[left] in capsys.readouterr().out
 
 
 # --- the drain -------------------------------------------------------------------------------------------------------
@@ -359,6 +381,19 @@ def test_a_second_ctrl_c_while_nobody_answers_tells_what_is_left(
     monkeypatch.setattr(stage, "look", refuse)
     seconds = iter([0.0])
     assert "echo is not back on edge1: interrupted; `zsched move` brings it there" in stage.go_back()
+
+
+def test_a_daemon_of_another_version_is_one_message_and_no_traceback(
+    refusing: Daemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def read(_told: Json, _kind: object) -> object:
+        raise WireError("unknown", "a field that a later version has")
+
+    assert refusing.done == []
+    monkeypatch.setattr(rehearse, "from_plain", read)
+    result = run("echo", "--steps", "worker", "--yes")
+    assert (result.exit_code, type(result.exception)) == (EXIT_FAILED, SystemExit)
+    assert "a daemon's answer cannot be read (unknown: a field that a later version has); update" in result.stderr
 
 
 # --- kept ones -------------------------------------------------------------------------------------------------------
