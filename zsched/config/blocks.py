@@ -183,12 +183,17 @@ class Text(Struct, frozen=True):
         return self.what
 
 
+_NO_NAME_S: Final = re.compile(r"[^a-z0-9_-]+")
+
+
 def _name_fault(text: str) -> str | None:
     if NAME.fullmatch(text) is not None:
         return None
     if len(text) > 63:
         return f"it has {len(text)} characters, more than 63"
-    return "small letters, digits, '_' and '-', and a letter or digit first"
+    likely = _NO_NAME_S.sub("-", text.lower()).strip("-_")
+    example = f"; for example {likely}" if NAME.fullmatch(likely) is not None else ""
+    return f"small letters, digits, '_' and '-', and a letter or digit first{example}"
 
 
 NAME_BLOCK: Final = Text("a name", _name_fault)
@@ -244,17 +249,21 @@ class MapOf(Struct, Generic[T], frozen=True):
     item: Block[T]
 
     def read(self, node: Node, out: Collector) -> dict[str, Located[T | None]] | None:
-        """Value and place of each key; a value that could not be read is `None`, its key is still there."""
+        """Value and place of each key; a value that could not be read is `None`, its key is still there.
+
+        One of whose keys none can be read is `None`, and not empty.
+        """
         if not isinstance(node, Mapping):
             _refuse(node, out, self.says())
             return None
+        before = out.count
         held: dict[str, Located[T | None]] = {}
         for key, value in _distinct(node, out):
             name = self.key.read(key, out)
             item = self.item.read(value, out)
             if name is not None:
                 held[name] = Located(item, key.place)
-        return held
+        return held if held or out.count == before else None
 
     def says(self) -> str:
         """What keys and values are."""

@@ -128,6 +128,15 @@ def test_the_designs_file_loads_with_every_feature() -> None:
     assert task.rules[0].settings.stream_class is StreamClass.LATEST
 
 
+def test_a_bad_name_is_told_with_a_good_one_and_is_not_taken_for_no_node_at_all() -> None:
+    text = "fleet: hall\nnodes: {Edge One: {kind: edge}}\ntasks: {}\n"
+    (fault,) = check(text).faults
+    assert (fault.line, fault.col) == (2, 9)
+    assert fault.message.endswith("and a letter or digit first; for example edge-one")
+    (fault,) = check("fleet: hall\nnodes: {}\ntasks: {}\n").faults
+    assert fault.message == "the fleet has no nodes"
+
+
 def test_links_of_every_source() -> None:
     fleet = fleet_of(GOOD)
     assert fleet.node("robot1").links == (LinkSpec(source=LinkSource.NL80211, value="wlan0"),)
