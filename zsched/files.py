@@ -76,7 +76,8 @@ def write_regular(path: Path, content: bytes) -> None:
             while written < len(content):
                 written += file.write(content[written:])
         except OSError:
-            path.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # a folder that cannot be written must not hide the cause
+                path.unlink(missing_ok=True)
             raise
 
 

@@ -57,6 +57,26 @@ def test_what_is_written_is_whole_or_not_there(tmp_path: Path) -> None:
         write_regular(tmp_path, TEXT)
 
 
+def test_why_a_file_is_not_whole_is_told_although_what_is_left_cannot_be_deleted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The folder may be another user's: "permission denied" says nothing of a full disk."""
+
+    def refuse(_path: Path, *, missing_ok: bool = False) -> None:
+        raise PermissionError(errno.EACCES, f"no right, {missing_ok}")
+
+    monkeypatch.setattr(Path, "unlink", refuse)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            write_regular(tmp_path / "file", TEXT)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, ignored)
+
+
 @pytest.mark.parametrize(
     "packed", [gzip.compress(TEXT), gzip.compress(TEXT[:18]) + gzip.compress(TEXT[18:])], ids=["whole", "in parts"]
 )
