@@ -52,7 +52,7 @@ class LogLimit(logging.Filter):
 
 
 LIMIT: Final = LogLimit()
-LIBRARY: Final = ("zsched.guard", "zsched.introduction", "zsched.streams", "zsched.worker")
+LIBRARY: Final = ("zsched.guard", "zsched.introduction", "zsched.relay", "zsched.streams", "zsched.worker")
 """The loggers of the worker library, whose handlers are the program's own."""
 
 

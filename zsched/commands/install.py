@@ -149,14 +149,14 @@ def uninstall(root: Path, *, is_plan: bool) -> int:
     stays += [f"{path}: a drop-in that zsched has not made" for path in _other_drop_ins(root, pieces)]
     kept = [Path("/etc/zsched"), Path("/var/lib/zsched"), prefix]
     if is_plan:
-        _print(_still_a_node(root / "var/lib/zsched"))
+        _print(_still_a_node(root / "var/lib/zsched", is_gone=False))
         _print(f"would stop, disable and remove {piece.path}" for piece in ours if piece.path.suffix == ".service")
         _print(f"would remove {piece.path}" for piece in ours if piece.path.suffix != ".service")
         _print(f"would leave {one}" for one in stays)
         _print(left(kept, os.environ) if _is_this_machine(root) else [])
         return EXIT_WOULD_CHANGE if ours else EXIT_OK
     _need_rights(root)
-    _print(_still_a_node(root / "var/lib/zsched"))
+    _print(_still_a_node(root / "var/lib/zsched", is_gone=True))
     if _has_systemd(root):
         found = [piece.path.name for piece in ours if piece.path.name in UNITS]
         if found:
@@ -173,15 +173,16 @@ def uninstall(root: Path, *, is_plan: bool) -> int:
     return EXIT_OK
 
 
-def _still_a_node(state: Path) -> list[str]:
-    """That a fleet counts on this machine, by its state folder."""
+def _still_a_node(state: Path, *, is_gone: bool) -> list[str]:
+    """That a fleet counts on this machine, by its state folder; ``is_gone``: it cannot leave from here any more."""
     if not is_there(state / STATE_NAME):
         return []
     try:
         fleet, me = whose(state)
     except AdapterError as error:
         return [f"nobody knows whether this machine is still a node of a fleet: {error}"]
-    return [f"still {me} of fleet {fleet}: `sudo zsched leave` first, or elsewhere `zsched node forget {me}`"]
+    leaves = "" if is_gone else "`sudo zsched leave` first, or "
+    return [f"still {me} of fleet {fleet}, which counts on it: {leaves}elsewhere `zsched node forget {me}`"]
 
 
 def _other_drop_ins(root: Path, pieces: Iterable[Piece]) -> list[Path]:

@@ -250,7 +250,7 @@ def maint(
     runtime_dir: RuntimeOption = None,
     connect: ConnectOption = None,
 ) -> None:
-    """List every order in force: pauses and pins, with author and reason, and the nodes that stop."""
+    """List every order in force with its author and reason, of tasks and of nodes, and the nodes that stop."""
     from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
     from zsched.commands.maint import maint as show  # noqa: PLC0415 - as above
 

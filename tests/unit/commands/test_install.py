@@ -106,10 +106,11 @@ def test_uninstall_says_first_that_the_machine_is_still_a_node(prefix: Path, roo
     assert fleet is not None
     with StateFile(state, fleet="hall", node="robot2") as file:
         file.create(blank_state(fleet, "robot2", 0, None, incarnation=1, hardware="", disk="01"))
-    still = "still robot2 of fleet hall: `sudo zsched leave` first, or elsewhere `zsched node forget robot2`"
-    for options, code in ((("--plan",), 10), ((), 0)):
+    still = "still robot2 of fleet hall, which counts on it: "
+    forget = "elsewhere `zsched node forget robot2`"
+    for options, code, advice in ((("--plan",), 10, f"`sudo zsched leave` first, or {forget}"), ((), 0, forget)):
         result = run("uninstall", root, *options)
-        assert (result.exit_code, result.output.splitlines()[0]) == (code, still)
+        assert (result.exit_code, result.output.splitlines()[0]) == (code, f"{still}{advice}"), "what can be done then"
     (state / "state").write_text("what a power cut left")
     first = run("uninstall", root).output.splitlines()[0]
     assert first.startswith("nobody knows whether this machine is still a node of a fleet: ")
