@@ -69,10 +69,15 @@ def refusal(
     is_owner = profile.node == allocation.owner
     if not is_owner and not may_get(spec, state):
         return f"worker {state}{why}"
+    return lacks_memory(profile, needed_mb, use) or _beyond_limits(spec, profile, gauges, is_owner=is_owner)
+
+
+def lacks_memory(profile: Profile, needed_mb: float, use: Use) -> str:
+    """Why the machine's memory cannot hold ``use``, of which ``needed_mb`` is the task's; empty when it can."""
     used = use.memory_mb
-    if used is not None and used > profile.memory_mb:
-        return f"needs {needed_mb:.0f} MiB, has {max(profile.memory_mb - used + needed_mb, 0.0):.0f} free"
-    return _beyond_limits(spec, profile, gauges, is_owner=is_owner)
+    if used is None or used <= profile.memory_mb:
+        return ""
+    return f"needs {needed_mb:.0f} MiB, has {max(profile.memory_mb - used + needed_mb, 0.0):.0f} free"
 
 
 def _beyond_limits(spec: TaskSpec, profile: Profile, gauges: Mapping[GaugeName, float], *, is_owner: bool) -> str:

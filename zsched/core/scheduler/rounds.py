@@ -20,9 +20,10 @@ from random import Random
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.gateway.round_trips import RoundTrips
 from zsched.core.instructions import AskUtilities, RecordStory
+from zsched.core.scheduler.claims import claims_of_others, taken
 from zsched.core.scheduler.damping import Damping
 from zsched.core.scheduler.decision import decide, rules_of, verdict_of
-from zsched.core.scheduler.eligibility import is_out
+from zsched.core.scheduler.eligibility import has_living_owner, is_out
 from zsched.core.scheduler.flags import NodeFlags
 from zsched.core.scheduler.judge import Judge, Judgement, Outcome
 from zsched.core.scheduler.rest import Answers, is_like
@@ -284,7 +285,7 @@ class Rounds:
         if gathered.answered is None:
             whole = Answers(vectors=gathered.vectors, states=states, at=now)
             self._kept = None if gathered.expected else whole
-        for name in in_turn(self._turns):
+        for name in self._judging_order(values, states, now):
             task = self.tasks[name]
             vectors = {
                 voter: vector
@@ -293,9 +294,30 @@ class Rounds:
                 if vector.task == name and voter in self.voters
             }
             task.silent = tuple(voter for voter in self.voters if voter not in vectors)
-            proposal = self._judge(task, tuple(vectors.values()), values[name], states, todo, now)
+            proposal = self._judge(task, tuple(vectors.values()), values, states, todo, now)
             if proposal is not None:
                 yield proposal
+
+    def _judging_order(
+        self, values: Mapping[TaskId, Allocation], states: Mapping[NodeId, PeerState], now: float
+    ) -> list[TaskId]:
+        """Tasks that have lost their owner come first, in an order that all robots share (`claims`)."""
+        lost = {
+            name
+            for name, task in self.tasks.items()
+            if values[name].owner is not None and not self._has_owner(task.spec, values[name], states, now)
+        }
+        return [*sorted(lost), *(name for name in in_turn(self._turns) if name not in lost)]
+
+    def _has_owner(
+        self, spec: TaskSpec, allocation: Allocation, states: Mapping[NodeId, PeerState], now: float
+    ) -> bool:
+        owner = allocation.owner
+        if owner is None:
+            return False
+        state, profile = states.get(owner, PeerState.GONE), self._gateway.fresh(owner, now)
+        is_spared = state is PeerState.SUSPECT and owner in self._doubts(spec, now).in_grace
+        return has_living_owner(spec, state, profile, is_spared=is_spared)
 
     # --- SCHEDULER: the decision ---------------------------------------------------------------------------------
 
@@ -303,13 +325,14 @@ class Rounds:
         self,
         task: TaskRound,
         vectors: tuple[UtilityVector, ...],
-        allocation: Allocation,
+        values: Mapping[TaskId, Allocation],
         states: Mapping[NodeId, PeerState],
         todo: ToDo,
         now: float,
     ) -> Proposal | None:
+        allocation = values[task.spec.name]
         task.under(allocation.tuning)
-        figures = self._figures(task, vectors, allocation, states, now)
+        figures = self._figures(task, vectors, values, states, now)
         is_called, task.is_called, task.is_called_escape = task.is_called, False, False
         decided = decide(task.judge, task.damping, figures)
         judgement = decided.judgement
@@ -345,12 +368,14 @@ class Rounds:
         self,
         task: TaskRound,
         vectors: tuple[UtilityVector, ...],
-        allocation: Allocation,
+        values: Mapping[TaskId, Allocation],
         states: Mapping[NodeId, PeerState],
         now: float,
     ) -> Figures:
         """Everything that the judgement goes by, read once."""
-        name, owner, is_called, gone = task.spec.name, allocation.owner, task.is_called, PeerState.GONE
+        name, is_called, gone = task.spec.name, task.is_called, PeerState.GONE
+        allocation = values[name]
+        owner = allocation.owner
         profile = None if owner is None else self._gateway.fresh(owner, now)
         self._gateway.learn_demand(name, owner, now)
         return Figures(
@@ -370,11 +395,25 @@ class Rounds:
             is_called_escape=task.is_called_escape,
             out=self._out(task.spec, now) if owner is None else (),
             first=who_moves_first(self._turns, name, is_called=is_called, now=now),
-            closed=tuple(sorted(self._flags.closed.items())),
+            closed=tuple(sorted({**self._taken(task.spec, values, states, now), **self._flags.closed}.items())),
             drained="" if owner is None else self._flags.drained.get(owner, ""),
             judge=task.judge.memory(),
             damping=task.damping.memory(),
         )
+
+    def _taken(
+        self,
+        spec: TaskSpec,
+        values: Mapping[TaskId, Allocation],
+        states: Mapping[NodeId, PeerState],
+        now: float,
+    ) -> Mapping[NodeId, str]:
+        claims = claims_of_others(self._turns, spec.name, now)
+        if not claims:
+            return {}
+        specs = tuple(task.spec for task in self.tasks.values())
+        has_owner = self._has_owner(spec, values[spec.name], states, now)
+        return taken(spec, claims, specs, values, self._gateway, now, has_owner=has_owner)
 
     def decision(self, name: TaskId, now: float) -> Decision | None:
         """The last judgement with all its figures; ``None`` before the first."""

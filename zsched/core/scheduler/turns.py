@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Protocol
 
-from zsched.core.values.model import TaskId
+from zsched.core.values.model import NodeId, TaskId
 
 
 class Turn(Protocol):
@@ -36,6 +36,9 @@ class Turn(Protocol):
     @property
     def called_at(self) -> float:
         """When this robot last proposed a planned move of it, first tries in vain left out."""
+
+    def going_to(self, now: float) -> NodeId | None:
+        """The node that it is about to go to; ``None``: to none that this robot knows of."""
 
 
 def who_moves_first(tasks: Mapping[TaskId, Turn], mine: TaskId, *, is_called: bool, now: float) -> TaskId | None:

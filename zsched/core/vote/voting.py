@@ -79,6 +79,15 @@ class Voting:
         """These robots vote from now on."""
         self._voters = voters
 
+    def going_to(self, now: float) -> NodeId | None:
+        """Where the task is about to go: by a commit or a vote that was won, else by this robot's open proposal."""
+        if self.commit is not None:
+            return self.commit.owner
+        if now < self.awaited_until and self.tally is not None:
+            return self.tally.winner
+        mine = self.proposals.get(self._me)
+        return None if self.opened_at is None or mine is None else mine[0].candidate
+
     # --- proposals -----------------------------------------------------------------------------------------------
 
     def absorb(self, proposal: Proposal, allocation: Allocation, now: float) -> bool:

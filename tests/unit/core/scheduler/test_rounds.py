@@ -17,7 +17,7 @@ from zsched.core.gateway.gateway import Gateway
 from zsched.core.instructions import AskUtilities, Instruction, PublishProposal
 from zsched.core.scheduler.judge import Outcome
 from zsched.core.scheduler.rounds import TaskRound
-from zsched.core.values.fleet import Fleet, WorkerSpec
+from zsched.core.values.fleet import Demand, Fleet, WorkerSpec
 from zsched.core.values.messages import Utilities
 from zsched.core.values.model import Allocation, PeerState
 from zsched.core.values.profile import WorkerState
@@ -593,6 +593,61 @@ def test_no_other_task_moves_between_a_vote_that_others_won_and_its_value(ends: 
         robot.votes.on_commit_ended("plan")
         robot.rounds.hurry(robot.now)
     assert "merge" in {one.proposal.task for one in of(robot.gathered(), PublishProposal)}
+
+
+class RobotOfOrphans(RobotOfTwo):
+    """Both tasks need 1400 MiB and have lost edge1 with its machine; edge2 is best, and has ``free_mb`` left."""
+
+    def __init__(self, me: str, free_mb: float, **owners: str | None) -> None:
+        super().__init__(me)
+        (merge, _) = self.rounds.tasks.values()
+        need = replace(merge.file, candidates=("edge1", "edge2", "robot3"), demand=Demand(memory_mb=1400.0))
+        fleet = replace(FLEET, tasks=tuple(replace(need, name=name) for name in ("merge", "plan")))
+        self.gateway = Gateway(fleet)
+        self.decider = Decider(fleet, me, self.gateway, now=self.now)
+        self.rounds, self.votes = self.decider.rounds, self.decider.votes
+        self.value = replace(self.value, revision=5, owner=owners.get("merge", "edge1"))
+        self.plan = replace(self.plan, revision=5, owner=owners.get("plan", "edge1"))
+        self.states["edge1"] = PeerState.GONE
+        for name, free in (("edge2", free_mb), ("robot3", 8000.0)):
+            workers = tuple(load_of(task, cpu_cores=0.0, memory_mb=0.0) for task in ("merge", "plan"))
+            held = profile_of(name, memory_mb=16_000.0, memory_used_mb=16_000.0 - free, workers=workers)
+            assert self.gateway.absorb(held, self.now) is None
+
+    def hear_all(self, gather: int) -> list[bool]:
+        """The other robots' answers: edge2 is better."""
+        column = {"edge2": 0.9, "robot3": 0.7}
+        vectors = {one: tuple(vector_of(one, column, 5, task=name) for name in self.values()) for one in ROBOTS}
+        answers = [Utilities(voter=one, vectors=vectors[one]) for one in ROBOTS if one != self.me]
+        return [self.rounds.absorb_utilities(gather, answer) for answer in answers]
+
+    def fled(self) -> dict[str, str]:
+        """{task: where it would go}."""
+        return {one.proposal.task: one.proposal.candidate for one in of(self.gathered(), PublishProposal)}
+
+
+def test_tasks_that_lose_their_owner_together_do_not_all_go_where_one_of_them_fits() -> None:
+    """They were judged by the same figures: all went there, and some left it again for want of memory."""
+    assert RobotOfOrphans("robot1", 3000.0).fled() == {"merge": "edge2", "plan": "edge2"}, "both fit"
+    robot = RobotOfOrphans("robot1", 2000.0)
+    assert robot.fled() == {"merge": "edge2", "plan": "robot3"}
+    figures = robot.rounds.tasks["plan"].figures
+    assert figures is not None
+    assert figures.closed == (("edge2", "merge goes there now: needs 1400 MiB, has 600 free"),)
+
+
+def test_such_tasks_are_judged_in_one_order_by_all_robots_whoever_has_called_what_before() -> None:
+    robot = RobotOfOrphans("robot2", 2000.0)
+    robot.votes.tasks["merge"].called_at = 50.0
+    assert robot.fled() == {"merge": "edge2", "plan": "robot3"}
+
+
+def test_a_vote_that_others_have_won_takes_the_room_too() -> None:
+    robot = RobotOfOrphans("robot1", 2000.0)
+    for voter in ("robot2", "robot3"):
+        robot.paper(voter, "edge2", base=5, task="plan", is_escape=True)
+    assert robot.votes.tasks["plan"].commit is None, "the others commit it"
+    assert robot.fled()["merge"] == "robot3"
 
 
 # --- edges -----------------------------------------------------------------------------------------------------------

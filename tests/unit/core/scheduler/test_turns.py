@@ -12,6 +12,7 @@ from support.fleets import fleet_of, task_of, tuning_of
 from support.profiles import load_of, profile_of
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.profile.profile import Profiler
+from zsched.core.scheduler.claims import claims_of_others
 from zsched.core.scheduler.scoring import score
 from zsched.core.scheduler.turns import in_turn, who_moves_first
 from zsched.core.scheduler.usage import book
@@ -28,6 +29,11 @@ class Task:
     commit: object | None = None
     awaited_until: float = -math.inf
     called_at: float = -math.inf
+    bound_for: str | None = None
+
+    def going_to(self, now: float) -> str | None:
+        assert now >= 0.0
+        return self.bound_for
 
 
 def test_nobody_waits_while_nothing_moves() -> None:
@@ -52,6 +58,12 @@ def test_a_vote_that_was_won_goes_first_whoever_commits_it_but_not_for_ever() ->
     tasks = {"a": Task(), "b": Task(awaited_until=2.0)}
     assert who_moves_first(tasks, "a", is_called=True, now=1.9) == "b"
     assert who_moves_first(tasks, "a", is_called=True, now=2.0) is None
+
+
+def test_a_claim_is_every_other_task_s_that_is_about_to_go_somewhere() -> None:
+    tasks = {"a": Task(bound_for="edge1"), "b": Task(), "c": Task(bound_for="edge2")}
+    assert claims_of_others(tasks, "a", now=2.0) == {"c": "edge2"}
+    assert claims_of_others(tasks, "b", now=2.0) == {"a": "edge1", "c": "edge2"}
 
 
 def test_who_has_proposed_longest_ago_is_judged_first() -> None:
