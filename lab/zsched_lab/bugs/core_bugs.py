@@ -90,6 +90,9 @@ _ROUNDS = (
     "tests/unit/core/vote/test_tally.py",
 )
 _SCHEDULER = ("tests/unit/core/scheduler/test_judge.py", "tests/unit/core/scheduler/test_scoring.py", "tests/paper")
+_BOOKINGS = ("tests/unit/core/scheduler/test_bookings.py",)
+_JOB_NEED = ("tests/unit/core/gateway/test_job_need.py",)
+_ORPHANS = ("tests/unit/core/scheduler/test_rounds.py",)
 _EXECUTOR = ("tests/unit/core/executor/test_handover.py",)
 _ORDERS = ("tests/unit/core/handlers/test_orders.py",)
 _EXPIRY = ("tests/unit/core/vote/test_expiry.py",)
@@ -979,6 +982,62 @@ VOTE_BUGS = (
         'readings["gpu"] + coming, own',
         'readings["gpu"], own',
         ("tests/unit/core/scheduler/test_turns.py",),
+    ),
+    _bug(
+        "a task that has come to a GPU counts twice there",
+        USAGE,
+        "profile.node, now, GPU_SHOWS_S)",
+        "profile.node, now, 1e9)",
+        _BOOKINGS,
+    ),
+    _bug(
+        "a worker that has failed keeps what it had learnt booked",
+        USAGE,
+        "other.demand if load.state is WorkerState.FAILED else gateway.demand(other, profile)",
+        "gateway.demand(other, profile)",
+        _BOOKINGS,
+    ),
+    _bug(
+        "a full machine's crowd is work of a job of several threads",
+        "zsched.core.gateway.job_need",
+        "return cpu_s if is_calm or known is None else",
+        "return cpu_s if known is None or known is not None else",
+        _JOB_NEED,
+    ),
+    _bug(
+        "threads beside one-threaded jobs are capped with them",
+        "zsched.core.gateway.job_need",
+        " + max(need_cores - self.hz * cpu_s, 0.0)",
+        "",
+        _JOB_NEED,
+    ),
+    _bug(
+        "one extreme profile makes a need that no demand may be",
+        "zsched.core.gateway.demand",
+        "min((known.work or 0.0) / self.speed(spec.name, profile), MAX_CPU_CORES)",
+        "(known.work or 0.0) / self.speed(spec.name, profile)",
+        (*_BOOKINGS, *_JOB_NEED, "tests/unit/core/gateway/test_demand.py"),
+    ),
+    _bug(
+        "tasks that lose one owner together all go where one fits",
+        "zsched.core.scheduler.claims",
+        "if name != mine}",
+        "if name == mine}",
+        _ORPHANS,
+    ),
+    _bug(
+        "a vote that others have won takes no room",
+        VOTING,
+        "if now < self.awaited_until and self.tally is not None:",
+        "if now < self.awaited_until and self.tally is None:",
+        _ORPHANS,
+    ),
+    _bug(
+        "each robot judges orphans in an order of its own",
+        "zsched.core.scheduler.rounds",
+        "return [*sorted(lost), *(name for name in in_turn(self._turns) if name not in lost)]",
+        "return in_turn(self._turns) or sorted(lost)",
+        _ORPHANS,
     ),
     _bug(
         "what a task's processes do not show of its memory counts twice",

@@ -426,6 +426,13 @@ STREAM_BUGS = (
         (f"{_REPLAY}::test_a_timestamp_that_several_samples_have_proves_none_of_them_done",),
     ),
     _bug(
+        "a worker that takes nothing is looked for a hundred times a second",
+        TASK,
+        "return BUSY_S if monotonic_s() - self._heard_at < FRESH_S else LATE_S",
+        "return BUSY_S",
+        _TASK,
+    ),
+    _bug(
         "beats in turn wait for a loop that does not come",
         "zsched.adapters.network.control_bus",
         "zenoh.handlers.RingChannel(RING)",
