@@ -500,6 +500,7 @@ def test_a_revoked_key_does_not_take_its_revocation_back_before_sessions_are_ope
     security = replace(fleet.security, revoked=("robot2",))
     one.bus.take_orders_of(holders_of(fleet, security))
     assert order() == CommandResult(outcome=CommandOutcome.INVALID, detail="robot1 refused it: signer")
+    until(lambda: one.of(ev.FrameDropped), "that the frame is counted, behind the answer")
     assert one.of(ev.FrameDropped) == [ev.FrameDropped(kind="command", reason="signer")]
     assert not one.of(ev.FleetCommanded)
     assert not one.of(ev.Commanded)
