@@ -326,7 +326,7 @@ def invite(door: Door, view: ApplyView, guest: Guest, file: Path | None) -> int:
         _close_to_others()  # before there is anything to read: who opens it now may read on when it is private
     held = in_force(door)
     fleet = fleet_of(document_text(held))
-    check_held(fleet_of(document_text(held), _own_file(door)), guest.authority)
+    check_held(fleet_of(document_text(held), str(places.config_path(None, os.environ))), guest.authority)
     check_request(fleet, guest.request, guest.authority)
     secret = b"" if view.is_plan else key_to_papers(fleet, guest.authority)
     if fleet.security is None and guest.address is not None:
@@ -358,12 +358,6 @@ def _check_invited_again(door: Door, guest: Guest, kind: NodeKind) -> None:
         advice = "without options it gets its invitation once more; `zsched edit` changes what it is"
         told = "an edge" if kind is NodeKind.EDGE else "a robot"
         raise CliError(EXIT_FAILED, f"{guest.name} is in the document already, as {told}; {advice}")
-
-
-def _own_file(door: Door) -> str:
-    """The fleet file of this machine: that of the daemon here, beside which its certificates are."""
-    told = "" if door.endpoint else status_of(Door(socket=door.socket)).get("fleet_file")  # not of the node behind it
-    return told or str(places.config_path(None, os.environ))
 
 
 def fleet_of(text: str, file: str = DOCUMENT) -> Fleet:

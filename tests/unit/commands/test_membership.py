@@ -697,7 +697,8 @@ def test_an_authority_that_this_machine_does_not_trust_invites_nobody(
     """Beside the file by which the daemon runs lies the certificate of the fleet's own, which is elsewhere."""
     secured(tmp_path, node)
     (tmp_path / "etc" / "pki").mkdir(parents=True)
-    node.fleet_file = str(tmp_path / "etc" / "fleet.yaml")
+    monkeypatch.setenv("ZSCHED_CONFIG", str(tmp_path / "etc" / "fleet.yaml"))
+    monkeypatch.chdir(tmp_path / "etc" / "pki")  # where the command is given says nothing
     stick = create(tmp_path / "stick", "hall", b"", datetime.now(UTC))
     (tmp_path / "etc" / "pki" / "ca.pem").write_bytes(stick.trusted)
     for more in ((), ("--plan",)):
