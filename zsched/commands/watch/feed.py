@@ -29,6 +29,8 @@ class News(Struct, frozen=True, kw_only=True):
     """Why nobody answered."""
     code: int = EXIT_OK
     """The exit code that tells so."""
+    log_why: str = ""
+    """Why there are no entries, although somebody answered."""
     entries: tuple[Json, ...] = ()
     """Lines of the decision log since the question before, the newest last; ``at`` is the node's clock."""
 
@@ -62,7 +64,7 @@ class Feed:
                 return News(at=at, status=status, entries=self._entries(door))
             except CliError as error:  # a log that cannot be read hides no status
                 problems = [*status.get("problems", ()), f"no events are shown: {error}"]
-                return News(at=at, status={**status, "problems": problems})
+                return News(at=at, status={**status, "problems": problems}, log_why=str(error))
         except CliError as error:
             return News(at=at, status=None, why=str(error), code=error.code)
         except ConfigError as error:  # this machine's certificate is gone, or wrong; it may come back

@@ -85,7 +85,7 @@ def record(view: RecordView) -> int:
             if ended.is_set() or monotonic_s() >= end:
                 break
             news = feed.ask()
-            away.tell(news.why)
+            away.tell(news.why or news.log_why)
     told = f"{view.file}: {tape.messages} messages of {len(tape.topics)} topics, {size(view.file.stat().st_size)}"
     missed = f"; {tap.missed} samples came faster than they could be written" if tap is not None and tap.missed else ""
     warn(f"{told}{missed}")

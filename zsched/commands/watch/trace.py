@@ -60,13 +60,16 @@ def trace(view: TraceView) -> int:
     news = feed.ask()
     if news.status is None:
         raise CliError(news.code, news.why)
+    if news.log_why and view.is_once:
+        raise CliError(EXIT_FAILED, f"nothing was sent: {news.log_why}")
     sender, moves = Sender(view.url, news.status["fleet"], news.status["node"]), Moves()
     oldest, away = news.at - (view.since_s or 0.0), Away("trace")
+    away.tell(news.log_why)
     with stopped_by_signal() as ended:
         sender.send(span for span in moves.take(news.entries) if span.end >= oldest)
         while not view.is_once and not ended.wait(PERIOD_S):
             news = feed.ask()
-            away.tell(news.why)
+            away.tell(news.why or news.log_why)
             sender.send((*moves.take(news.entries), *moves.overdue(wall_s())))
     if view.is_once:
         sender.send(span for span in moves.rest() if span.end >= oldest)

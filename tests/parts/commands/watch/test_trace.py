@@ -170,6 +170,31 @@ def test_a_daemon_that_is_away_is_told_of_once(
     assert result.stderr.count("asking again") == 2
 
 
+def test_a_log_that_cannot_be_read_is_no_quiet_fleet(
+    tmp_path: Path, collector: Collector, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It said "0 spans sent, 0 refused", and ended with 0."""
+
+    def wait(_latch: Latch, _s: float | None = None) -> bool:
+        return next(steps)
+
+    def answer(asked: dict[str, Any]) -> dict[str, Any]:
+        return STATUS if asked["verb"] == "status" else {"error": "OSError: [Errno 5] Input/output error"}
+
+    monkeypatch.setenv("ZSCHED_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.delenv("ZSCHED_NODE", raising=False)
+    steps = iter([False, False, True])
+    monkeypatch.setattr(Latch, "wait", wait)
+    with contextlib.closing(OperatorSocket(tmp_path / "robot1.sock", answer)) as daemon:
+        daemon.open()
+        once = run(collector)
+        running = CliRunner().invoke(app, ["trace", "--otlp", collector.url])
+    assert once.exit_code == 1
+    assert "nothing was sent: " in once.stderr
+    assert "Input/output error" in once.stderr
+    assert (running.stderr.count("Input/output error"), collector.taken) == (1, []), "once, however often it is asked"
+
+
 @pytest.mark.parametrize("url", ["nonsense", "127.0.0.1:4318", "grpc://127.0.0.1:4317", "http://", "http://[::1:4318"])
 def test_what_is_no_address_of_a_collector_is_refused(folder: Path, url: str) -> None:
     assert folder.exists()
