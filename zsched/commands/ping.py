@@ -109,8 +109,11 @@ def _ways(fleet: Fleet, me: NodeId, question: Question) -> Iterator[Way]:
         )
         return Way(name=name, endpoint=endpoint, found=found)
 
-    with ThreadPoolExecutor(max_workers=2) as pool:
+    pool = ThreadPoolExecutor(max_workers=2)
+    try:
         yield from pool.map(measured, dialled)
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)  # Ctrl-C waits for no answer
 
 
 def _addresses(spec: NodeSpec) -> tuple[tuple[str, str], ...]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import signal
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -19,7 +21,7 @@ from zsched.adapters.network.node_ping import Pinged
 from zsched.cli import app
 from zsched.commands.brief import render_brief
 from zsched.commands.common import say
-from zsched.commands.ping import Way, _lines
+from zsched.commands.ping import Question, Way, _lines, _ways
 from zsched.commands.report import render_status
 from zsched.config.load import load_fleet
 from zsched.core.values.fleet import fleet_hash
@@ -437,3 +439,32 @@ def test_every_argument_of_every_verb_says_how_it_is_typed() -> None:
     arguments = [(verb.name, one) for verb in verbs for one in verb.params if one.param_type_name == "argument"]
     assert len(arguments) > 20
     assert [(verb, one.name) for verb, one in arguments if not one.metavar] == []
+
+
+def test_ctrl_c_ends_a_ping_that_waits_for_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It waited for every answer that was still to come: minutes, where nobody answers."""
+    end, under_way = threading.Event(), threading.Event()
+
+    def ask(*_given: object, **_more: object) -> Pinged:
+        under_way.set()
+        end.wait(60.0)
+        return Pinged()
+
+    def interrupt(_number: int, _frame: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("zsched.commands.ping.ping", ask)
+    (tmp_path / "fleet.yaml").write_text(FLEET)
+    fleet = load_fleet(tmp_path / "fleet.yaml")
+    before = signal.signal(signal.SIGALRM, interrupt)
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.2)
+        began = time.monotonic()
+        with pytest.raises(KeyboardInterrupt):
+            list(_ways(fleet, "robot2", Question(node="robot1", count=1000, timeout_s=1.0, interval_s=0.2)))
+        assert under_way.is_set()
+        assert time.monotonic() - began < 30.0
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+        end.set()
