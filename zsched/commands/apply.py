@@ -389,6 +389,9 @@ def _commit(door: Door, view: ApplyView, plan: Plan) -> int:
         try:
             _check_same(held, document)
             held = wait_until_settled(door, _agreed(door, step, held, view))
+        except KeyboardInterrupt:
+            warn(f"\n{number} of {len(steps)} changes are agreed, and the next one may be: give the command again")
+            raise
         except CliError as error:
             if number == 0 or error.code == EXIT_TIMED_OUT:
                 raise

@@ -114,7 +114,7 @@ def change_cells(order: LeaveOrder, word: str) -> int:
         return _resumed(order, going, word)
     fleet, me = whose(order.places.state)
     if word == fleet and going is not None:
-        return _taken_back(order, me)
+        return _taken_back(order, me, going.invitation.fleet)
     if word == fleet:
         said = f"{order.places.state}: this machine is {me} of fleet {fleet} already: nothing to do"
         Told(fleet=fleet, node=me, outcome="unchanged", said=said).tell(is_json=order.is_json)
@@ -154,13 +154,14 @@ def _runs_in(order: LeaveOrder, fleet: str) -> bool:
     return False
 
 
-def _taken_back(order: LeaveOrder, me: NodeId) -> int:
+def _taken_back(order: LeaveOrder, me: NodeId, fleet: str) -> int:
     """End a change that has not gone further than the former cell's flag."""
     door = own_door(order, me)
     view = OrderView(door=door, is_json=order.is_json, is_yes=order.is_yes, is_plan=order.is_plan, reason=order.reason)
     code = undrain(view, [me])
     if code == EXIT_OK and not order.is_plan:
         next_cell.end(order.places.state)
+        warn(f"{fleet} names {me} until somebody there says: zsched node forget {me}")
     return code
 
 
@@ -177,6 +178,13 @@ def _resumed(order: LeaveOrder, going: Change, word: str) -> int:
     is_back = word == going.former
     if not is_back and word != fleet and not Path(word).is_file():
         raise CliError(EXIT_USAGE, f"{me} is on its way from {going.former} to {fleet}: name one of them")
+    if not is_back and word != fleet:
+        given = read_invitation(word)
+        if (given.fleet, given.node) != (fleet, me):
+            what = f"{word} invites {given.node} into fleet {given.fleet}"
+            raise CliError(
+                EXIT_USAGE, f"{what}, and {me} is on its way from {going.former} to {fleet}: name one of them"
+            )
     if not is_back and next_cell.has_seat(order.places.state, going.former, me):
         start = "; ".join(how_to_start(me, order.places))
         told = f"{me} is an elector of {going.former} still, and its daemon does not run"
@@ -419,6 +427,17 @@ def _door_by(fleet: str, addresses: tuple[str, ...], file: Path) -> Door:
 
 
 def _arrive(way: Way, going: Change) -> int:
+    """As `_taken_over`; whoever interrupts it hears where the machine is."""
+    try:
+        return _taken_over(way, going)
+    except KeyboardInterrupt:
+        back = way.order.leaving_for(going.former)
+        told = f"{way.me} is between {going.former} and {going.invitation.fleet}, and may have no daemon"
+        warn(f"\n{told}: give `{way.order.verb}` again to go on, or `{back}` to go back")
+        raise
+
+
+def _taken_over(way: Way, going: Change) -> int:
     """Become the node of the next cell, wait until it is taken there, and have the former one forget it."""
     order, me, fleet = way.order, way.me, going.invitation.fleet
     if not _runs(way, fleet):
@@ -548,7 +567,8 @@ def _go_back(way: Way, going: Change, why: str) -> int:
         there = Way(order=order, view=OrderView(door=_own(way)), me=me, began=way.began, files=())
         stop_daemon(there, fleet, f"{me} goes back")
     next_cell.go_back(going, order.places)
-    _started(way)
+    if not _started(way):
+        warn(f"start its daemon now, this command waits for it: {'; '.join(how_to_start(me, order.places))}")
     lack = wait_for(lambda: _not_back(way, going.former), max(_left_s(way), TAKE_S))
     if lack:
         told = f"{me} has its files of {going.former} again: {lack}"

@@ -682,18 +682,44 @@ def bring_back(fleet: str, node: NodeId, places: Places, *, is_secured: bool) ->
         for one in reversed(tuple(_belongings(places, is_purged=False))):
             if one.path.name not in LOGS:  # the former one's take their places
                 _put_one_away(one.path, is_deleted=True)
-        names = [places.config, *(places.state / name for name in (*LOGS, COPY_NAME, FOLDER_NAME))]
-        folders = (places.config.parent / PKI_FOLDER, places.state / PKI_FOLDER)
-        own = [folder for folder in folders if is_secured and not _is_planted(folder, places)]
-        names += [folder / name for folder in own for name in _WHAT]
-        for path in (*names, places.state / STATE_NAME):
-            old = path.with_name(f"{path.name}{LEFT}")
-            try:
-                if os.path.lexists(old):
-                    old.rename(path)
-                    sync_folder(path.parent)
-            except OSError as error:
-                raise AdapterError(f"cannot rename {old}: {error.strerror}; {_advice(error, old)}") from error
+        for path in (*_come_back(places, is_secured=is_secured), places.state / STATE_NAME):
+            _name_again(path)
+
+
+def finish_back(fleet: str, node: NodeId, places: Places, *, is_secured: bool) -> None:
+    """Give the files their names again that `put_away` had renamed when it was broken off, before the state.
+
+    Raises:
+        AdapterError: a daemon runs by them, they are another node's, or one cannot be renamed.
+    """
+    gone = [path for path in _come_back(places, is_secured=is_secured) if not os.path.lexists(path)]
+    if any(os.path.lexists(_left_name(path)) for path in gone):
+        with StateFile(places.state, fleet=fleet, node=node) as file:
+            file.check_owner()
+            for path in gone:
+                _name_again(path)
+
+
+def _come_back(places: Places, *, is_secured: bool) -> list[Path]:
+    """What was renamed for a cell change, but the state."""
+    names = [places.config, *(places.state / name for name in (*LOGS, COPY_NAME, FOLDER_NAME))]
+    folders = (places.config.parent / PKI_FOLDER, places.state / PKI_FOLDER)
+    own = [folder for folder in folders if is_secured and not _is_planted(folder, places)]
+    return [*names, *(folder / name for folder in own for name in _WHAT)]
+
+
+def _left_name(path: Path) -> Path:
+    return path.with_name(f"{path.name}{LEFT}")
+
+
+def _name_again(path: Path) -> None:
+    old = _left_name(path)
+    try:
+        if os.path.lexists(old):
+            old.rename(path)
+            sync_folder(path.parent)
+    except OSError as error:
+        raise AdapterError(f"cannot rename {old}: {error.strerror}; {_advice(error, old)}") from error
 
 
 def _belongings(places: Places, *, is_purged: bool) -> Iterator[Written]:

@@ -29,7 +29,17 @@ from zsched.core.values.model import NodeId
 from zsched.core.values.struct import Struct
 from zsched.errors import AdapterError, WireError
 from zsched.files import read_regular
-from zsched.runtime.membership import NEXT_CELL, Places, Written, bring_back, is_joined, join, put_away, whose
+from zsched.runtime.membership import (
+    NEXT_CELL,
+    Places,
+    Written,
+    bring_back,
+    finish_back,
+    is_joined,
+    join,
+    put_away,
+    whose,
+)
 from zsched.runtime.secured import CERTIFICATE, KEY, TRUSTED, files_by
 from zsched.wire.codec import decode_state
 from zsched.wire.invitation import MAX_BYTES, Invitation, decode_invitation, encode_invitation
@@ -207,6 +217,8 @@ def go_back(change: Change, places: Places) -> None:
         AdapterError: a daemon runs by the files, or one cannot be renamed.
     """
     if (places.state / STATE_NAME).exists() and whose(places.state)[0] == change.former:
+        # its state is put away last: what was renamed before a power cut has no other way back
+        finish_back(change.former, change.invitation.node, places, is_secured=change.former_is_secured)
         return
     bring_back(change.invitation.fleet, change.invitation.node, places, is_secured=change.former_is_secured)
 

@@ -419,6 +419,31 @@ def test_files_that_were_changed_in_part_are_changed_to_the_end(
 
 
 @pytest.mark.parametrize("number", slices(9))
+def test_files_that_were_put_away_in_part_get_their_names_again_on_the_way_back(
+    site: Site, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    """The state is put away last, so it told that nothing was to be done: the daemon could not start any more."""
+    before = {name for name in kept(site.folder) if not name.endswith(".left")}
+    left, real = [number], membership._put_one_away
+
+    def broken(*given: Any, **more: Any) -> None:
+        left[0] -= 1
+        if left[0] == -1:
+            raise KeyboardInterrupt
+        real(*given, **more)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(membership, "_put_one_away", broken)
+        CliRunner().invoke(app, ["leave", "--to", "hall-b", "--yes"])
+    if left[0] >= 0 or whose(site.folder / "state")[0] != "hall-a":
+        return  # it takes fewer steps
+    back = run("--to", "hall-a", "--yes")
+    assert "works in hall-a as before" in back.stderr
+    assert before <= set(kept(site.folder))
+    assert (whose(site.folder / "state"), site.running) == (("hall-a", ME), "hall-a")
+
+
+@pytest.mark.parametrize("number", slices(9))
 def test_a_way_back_that_was_broken_off_goes_on_either_way(
     site: Site, monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
@@ -669,6 +694,38 @@ def broken_off(site: Site, monkeypatch: pytest.MonkeyPatch, step: str, *words: s
     assert (site.folder / "state" / "next-cell").exists()
 
 
+def test_who_interrupts_it_between_two_cells_hears_where_the_machine_is(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+
+        def broken(*_given: Any, **_more: Any) -> Any:
+            raise KeyboardInterrupt
+
+        patch.setattr(next_cell, "go_over", broken)
+        result = CliRunner().invoke(app, ["leave", "--to", "hall-b", "--yes"])
+    assert whose(site.folder / "state")[0] == "hall-a"
+    assert (
+        f"{ME} is between hall-a and hall-b, and may have no daemon: give `zsched leave --to hall-b`" in result.stderr
+    )
+    assert "or `zsched leave --to hall-a` to go back" in result.stderr
+
+
+def test_another_invitation_does_not_lead_into_the_cell_that_is_under_way(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Any file would do, and the machine became a node of the cell before."""
+    broken_off(site, monkeypatch, "go_over", "--to", "hall-b")
+    invitation = membership_invitation(site.folder)
+    given = decode_invitation(invitation.read_bytes())
+    invitation.write_text(encode_invitation(replace(given, node="robot1")))
+    refused = run("--to", str(invitation), "--yes")
+    assert (refused.exit_code, "invites robot1 into fleet hall-b" in refused.stderr) == (2, True), refused.stderr
+    assert whose(site.folder / "state")[0] == "hall-a"
+    assert run("--to", "hall-b", "--yes").exit_code == 0
+    check_arrived(site)
+
+
 def test_a_cell_that_has_forgotten_it_is_no_way_back(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     broken_off(site, monkeypatch, "end", "--to", "hall-b")
     site.cells["hall-b"].is_whole = False
@@ -685,7 +742,9 @@ def test_what_has_gone_no_further_than_the_flag_is_taken_back_by_its_own_cell_s_
     site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     broken_off(site, monkeypatch, "give_up_the_seat", "--to", "hall-b")
-    assert run("--to", "hall-a", "--yes").exit_code == 0
+    back = run("--to", "hall-a", "--yes")
+    assert back.exit_code == 0
+    assert f"hall-b names {ME} until somebody there says: zsched node forget {ME}" in back.stderr
     assert (site.cells["hall-a"].done, site.running) == (["leave", "undrain"], "hall-a")
     assert not (site.folder / "state" / "next-cell").exists()
 
