@@ -472,13 +472,13 @@ def _lives(fleet: str) -> dict[str, int]:
     Raises:
         CliError: as `_told_here`.
     """
-    _, told = _told_here(fleet)
-    nodes = told["nodes"] if told is not None else ()
+    here = _told_here(fleet)
+    nodes = here[1]["nodes"] if here is not None else ()
     return {str(one["name"]): one["incarnation"] for one in nodes if one.get("incarnation") is not None}
 
 
-def _told_here(fleet: str) -> tuple[Door | None, Json | None]:
-    """The door of the daemon here and its status; ``None``: no daemon runs here, or only one of another fleet.
+def _told_here(fleet: str) -> tuple[Door, Json] | None:
+    """The door of the fleet's daemon here and its status; ``None``: none runs here, or only one of another fleet.
 
     One that runs and does not answer is not "none": a rotation that goes on without it would cut nodes off unseen.
 
@@ -486,10 +486,10 @@ def _told_here(fleet: str) -> tuple[Door | None, Json | None]:
         CliError: it does not answer, refuses, is not the one that is meant, or there are several and none is meant.
     """
     if not places.local_sockets(places.asked_folder(None, os.environ)):
-        return None, None
+        return None
     door = find_door(None, None)
     told = ask_door(door, {"verb": "status"})
-    return door, told if told.get("fleet") == fleet else None
+    return (door, told) if told.get("fleet") == fleet else None
 
 
 def _see_delivered(authority: Authority) -> None:
@@ -498,10 +498,11 @@ def _see_delivered(authority: Authority) -> None:
     Raises:
         CliError: some have not, or do not answer.
     """
-    door, told = _told_here(authority.record.fleet)
-    if door is None or told is None:
+    here = _told_here(authority.record.fleet)
+    if here is None:
         _say("no daemon of the fleet answers here: nobody has seen whether every node has its new certificate")
         return
+    door, told = here
     members = {str(one["name"]) for one in told["nodes"]}
     _see_anew(door, authority, members)
     live = [one for one in authority.record.entries if one.revoked is None and one.holder.role is Role.NODE]
