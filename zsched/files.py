@@ -132,7 +132,8 @@ def put_whole(path: Path, content: bytes, mode: int, give: Callable[[int], None]
             os.fsync(file.fileno())
         part.replace(path)
     except BaseException:
-        part.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
         raise
 
 

@@ -2,19 +2,34 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import gzip
 import os
 import resource
 import signal
 import tracemalloc
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from zsched.files import owner_of, read_packed, read_regular, write_regular
+from zsched.files import owner_of, put_whole, read_packed, read_regular, write_regular
 
 TEXT = b"time_stamp,c_rssi\n" * 100
+
+
+@contextlib.contextmanager
+def full_disk() -> Iterator[None]:
+    """As a disk that is full in the middle of a file."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, ignored)
 
 
 def test_a_regular_file_is_read_up_to_its_bound(tmp_path: Path) -> None:
@@ -40,15 +55,8 @@ def test_what_is_written_is_whole_or_not_there(tmp_path: Path) -> None:
     for content in (TEXT, b"short"):
         write_regular(path, content)
         assert path.read_bytes() == content
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))  # as a disk that is full in the middle of it
-    try:
-        with pytest.raises(OSError, match="File too large"):
-            write_regular(path, TEXT)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-        signal.signal(signal.SIGXFSZ, ignored)
+    with full_disk(), pytest.raises(OSError, match="File too large"):
+        write_regular(path, TEXT)
     assert not path.exists()
     os.mkfifo(path)
     with pytest.raises(OSError, match="it is a pipe, not a regular file"):
@@ -66,15 +74,10 @@ def test_why_a_file_is_not_whole_is_told_although_what_is_left_cannot_be_deleted
         raise PermissionError(errno.EACCES, f"no right, {missing_ok}")
 
     monkeypatch.setattr(Path, "unlink", refuse)
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
-    try:
-        with pytest.raises(OSError, match="File too large"):
-            write_regular(tmp_path / "file", TEXT)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-        signal.signal(signal.SIGXFSZ, ignored)
+    with full_disk(), pytest.raises(OSError, match="File too large"):
+        write_regular(tmp_path / "file", TEXT)
+    with full_disk(), pytest.raises(OSError, match="File too large"):
+        put_whole(tmp_path / "other", TEXT, 0o600, lambda _descriptor: None)
 
 
 @pytest.mark.parametrize(
