@@ -176,15 +176,13 @@ def _resumed(order: LeaveOrder, going: Change, word: str) -> int:
         files=(),
     )
     is_back = word == going.former
-    if not is_back and word != fleet and not Path(word).is_file():
-        raise CliError(EXIT_USAGE, f"{me} is on its way from {going.former} to {fleet}: name one of them")
-    if not is_back and word != fleet:
+    if word not in (going.former, fleet):
+        under_way = f"{me} is on its way from {going.former} to {fleet}: name one of them"
+        if not Path(word).is_file():
+            raise CliError(EXIT_USAGE, under_way)
         given = read_invitation(word)
         if (given.fleet, given.node) != (fleet, me):
-            what = f"{word} invites {given.node} into fleet {given.fleet}"
-            raise CliError(
-                EXIT_USAGE, f"{what}, and {me} is on its way from {going.former} to {fleet}: name one of them"
-            )
+            raise CliError(EXIT_USAGE, f"{word} invites {given.node} into fleet {given.fleet}, and {under_way}")
     if not is_back and next_cell.has_seat(order.places.state, going.former, me):
         start = "; ".join(how_to_start(me, order.places))
         told = f"{me} is an elector of {going.former} still, and its daemon does not run"
@@ -495,9 +493,13 @@ def _started(way: Way) -> bool:
     if way.order.places.config == paths.SYSTEM_CONFIG and SYSTEMD.exists():
         done = subprocess.run(["systemctl", "start", "zsched"], check=False)
         return done.returncode == 0
+    _tell_how_to_start(way)
+    return True
+
+
+def _tell_how_to_start(way: Way) -> None:
     for line in how_to_start(way.me, way.order.places):
         warn(f"start its daemon now, this command waits for it: {line}")
-    return True
 
 
 def _not_taken(way: Way, fleet: str) -> str:
@@ -568,7 +570,7 @@ def _go_back(way: Way, going: Change, why: str) -> int:
         stop_daemon(there, fleet, f"{me} goes back")
     next_cell.go_back(going, order.places)
     if not _started(way):
-        warn(f"start its daemon now, this command waits for it: {'; '.join(how_to_start(me, order.places))}")
+        _tell_how_to_start(way)
     lack = wait_for(lambda: _not_back(way, going.former), max(_left_s(way), TAKE_S))
     if lack:
         told = f"{me} has its files of {going.former} again: {lack}"

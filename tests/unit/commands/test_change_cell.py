@@ -396,15 +396,16 @@ def test_nobody_starts_it_and_the_operator_takes_it_back(site: Site, monkeypatch
     assert site.cells["hall-a"].flags == []
 
 
-@pytest.mark.parametrize("number", slices(9))
-@pytest.mark.parametrize("call", ["_put_one_away", "_put"])
-def test_files_that_were_changed_in_part_are_changed_to_the_end(
-    site: Site, monkeypatch: pytest.MonkeyPatch, call: str, number: int
-) -> None:
+def always(*_given: Any, **_more: Any) -> bool:
+    return True
+
+
+def broken_at(monkeypatch: pytest.MonkeyPatch, call: str, number: int, counts: Callable[..., bool] = always) -> bool:
+    """Begin the change to hall-b, broken off at that call of those that count; false: it takes fewer of them."""
     left, real = [number], getattr(membership, call)
 
     def broken(*given: Any, **more: Any) -> None:
-        left[0] -= 1
+        left[0] -= counts(*given, **more)
         if left[0] == -1:
             raise KeyboardInterrupt
         real(*given, **more)
@@ -412,8 +413,16 @@ def test_files_that_were_changed_in_part_are_changed_to_the_end(
     with monkeypatch.context() as patch:
         patch.setattr(membership, call, broken)
         CliRunner().invoke(app, ["leave", "--to", "hall-b", "--yes"])
-    if left[0] >= 0:
-        return  # it takes fewer steps
+    return left[0] < 0
+
+
+@pytest.mark.parametrize("number", slices(9))
+@pytest.mark.parametrize("call", ["_put_one_away", "_put"])
+def test_files_that_were_changed_in_part_are_changed_to_the_end(
+    site: Site, monkeypatch: pytest.MonkeyPatch, call: str, number: int
+) -> None:
+    if not broken_at(monkeypatch, call, number):
+        return
     assert run("--to", "hall-b", "--yes").exit_code == 0
     check_arrived(site)
 
@@ -424,19 +433,8 @@ def test_files_that_were_put_away_in_part_get_their_names_again_on_the_way_back(
 ) -> None:
     """The state is put away last, so it told that nothing was to be done: the daemon could not start any more."""
     before = {name for name in kept(site.folder) if not name.endswith(".left")}
-    left, real = [number], membership._put_one_away
-
-    def broken(*given: Any, **more: Any) -> None:
-        left[0] -= 1
-        if left[0] == -1:
-            raise KeyboardInterrupt
-        real(*given, **more)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(membership, "_put_one_away", broken)
-        CliRunner().invoke(app, ["leave", "--to", "hall-b", "--yes"])
-    if left[0] >= 0 or whose(site.folder / "state")[0] != "hall-a":
-        return  # it takes fewer steps
+    if not broken_at(monkeypatch, "_put_one_away", number) or whose(site.folder / "state")[0] != "hall-a":
+        return
     back = run("--to", "hall-a", "--yes")
     assert "works in hall-a as before" in back.stderr
     assert before <= set(kept(site.folder))
@@ -448,20 +446,7 @@ def test_a_way_back_that_was_broken_off_goes_on_either_way(
     site: Site, monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
     site.is_taken = False
-    real = membership._put_one_away
-    left = [number]
-
-    def broken(path: Path, *, is_deleted: bool) -> None:
-        if is_deleted:
-            left[0] -= 1
-            if left[0] == -1:
-                raise KeyboardInterrupt
-        real(path, is_deleted=is_deleted)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(membership, "_put_one_away", broken)
-        CliRunner().invoke(app, ["leave", "--to", "hall-b", "--yes"])
-    if left[0] >= 0:
+    if not broken_at(monkeypatch, "_put_one_away", number, lambda _path, *, is_deleted: is_deleted):
         return
     site.is_taken = True
     assert run("--to", "hall-b", "--yes").exit_code == 0
@@ -681,7 +666,7 @@ def test_a_cell_that_forgot_it_between_two_tries_is_asked_again(site: Site, monk
     check_arrived(site)
 
 
-def broken_off(site: Site, monkeypatch: pytest.MonkeyPatch, step: str, *words: str) -> None:
+def broken_off(site: Site, monkeypatch: pytest.MonkeyPatch, step: str, *words: str) -> Result:
     """Give the command, and break it off where a step begins."""
 
     def broken(*_given: Any, **_more: Any) -> Any:
@@ -690,20 +675,16 @@ def broken_off(site: Site, monkeypatch: pytest.MonkeyPatch, step: str, *words: s
     owner = next_cell if step in FILES else change_cell
     with monkeypatch.context() as patch:
         patch.setattr(owner, step, broken)
-        assert CliRunner().invoke(app, ["leave", *words, "--yes"]).exit_code != 0
+        result = CliRunner().invoke(app, ["leave", *words, "--yes"])
+    assert result.exit_code != 0
     assert (site.folder / "state" / "next-cell").exists()
+    return result
 
 
 def test_who_interrupts_it_between_two_cells_hears_where_the_machine_is(
     site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with monkeypatch.context() as patch:
-
-        def broken(*_given: Any, **_more: Any) -> Any:
-            raise KeyboardInterrupt
-
-        patch.setattr(next_cell, "go_over", broken)
-        result = CliRunner().invoke(app, ["leave", "--to", "hall-b", "--yes"])
+    result = broken_off(site, monkeypatch, "go_over", "--to", "hall-b")
     assert whose(site.folder / "state")[0] == "hall-a"
     assert (
         f"{ME} is between hall-a and hall-b, and may have no daemon: give `zsched leave --to hall-b`" in result.stderr
