@@ -46,3 +46,21 @@ def test_three_tasks_of_a_dead_machine_share_the_room_of_the_others_at_once(seed
     assert sorted(owners, key=str) == ["edge2", "edge2", "robot3"]
     moved = [one for one in sim.owners if one not in before]
     assert len(moved) == len(TASKS), "each of them once"
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_task_with_one_place_left_gets_it_though_another_one_with_a_choice_is_before_it(seed: int) -> None:
+    """The other one had taken it, and had no reason to leave."""
+    first, *_ = fleet().tasks
+    tasks = (replace(first, name="a"), replace(first, name="b", candidates=("edge1", "edge2")))
+    loads = {**LOADS, "edge2": (1.0, 3000.0)}
+    sim = Simulator(
+        fleet=replace(FLEET, tasks=tasks), seed=seed, load=lambda node, _now: loads.get(node, (1.0, 1000.0))
+    )
+    sim.start()
+    assert sim.run_until(lambda: sim.agreed("a") == sim.agreed("b") == "edge1", 30)
+    sim.run(5.0)
+    sim.crash("edge1")
+    assert sim.run_until(lambda: sim.agreed("b") == "edge2" and sim.agreed("a") in ("edge2", "robot3"), 20)
+    sim.run(20.0)
+    assert sim.agreed("b") == "edge2"

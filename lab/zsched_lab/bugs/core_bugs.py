@@ -1026,6 +1026,13 @@ VOTE_BUGS = (
         _ORPHANS,
     ),
     _bug(
+        "a claim takes a task's only place",
+        "zsched.core.scheduler.decision",
+        "return rest if rest.aggregates.keys() - {figures.allocation.owner} else standing",
+        "return rest",
+        (*_ORPHANS, "tests/sim/test_orphans.py"),
+    ),
+    _bug(
         "a vote that others have won takes no room",
         VOTING,
         "if now < self.awaited_until and self.tally is not None:",

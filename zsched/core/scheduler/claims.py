@@ -1,12 +1,11 @@
 """SCHEDULER, several tasks: the room that another task is about to take.
 
 Knows: where tasks go whose votes are open or won at this robot, and what memory they will need there. Does not know:
-who is better.
+who is better, whether a task has another place (`zsched.core.scheduler.decision`).
 
 Tasks that lose their owner together are judged in one round, for no escape waits for another one. Each by itself they
-would all find the same machine free, go there together, and some would leave it again for want of memory. So a
-candidate that cannot hold this task beside those that are about to go there is out for this judgement. Every robot
-judges tasks without a living owner in the order of their names, and so comes to the same claims.
+would all find the same machine free, go there together, and some would leave it again for want of memory. Every robot
+judges them in the order of their names, and so comes to the same claims.
 """
 
 from __future__ import annotations
@@ -35,27 +34,21 @@ def taken(
     values: Mapping[TaskId, Allocation],
     gateway: Gateway,
     now: float,
-    *,
-    has_owner: bool,
 ) -> dict[NodeId, str]:
     """{candidate: why it has no room for the task beside those that are about to go there}.
 
-    ``has_owner``: the task has a living owner; without one the fleet file's figure of its memory alone counts, as in
-    `zsched.core.scheduler.scoring.score`.
+    The task has no living owner: the fleet file's figure of its memory counts, as in `zsched.core.scheduler.scoring`.
     """
-    nodes = frozenset(claims.values())
-    if not nodes.intersection(spec.candidates):
-        return {}
-    there = {**values, **{name: replace(values[name], owner=node) for name, node in claims.items()}}
-    bookings, found = book(specs, there), dict[NodeId, str]()
+    coming = {name: node for name, node in claims.items() if node != values[name].owner}
+    bookings = book(specs, {**values, **{name: replace(values[name], owner=node) for name, node in coming.items()}})
+    nodes, found = frozenset(coming.values()), dict[NodeId, str]()
     for candidate in [name for name in spec.candidates if name in nodes]:
         profile = gateway.fresh(candidate, now)
         if profile is None:
             continue
-        demand = gateway.demand(spec, profile) if has_owner else spec.demand
-        own = own_use(spec, values[spec.name], profile, demand)
-        use = predicted(profile, own, demand, coming_use(spec, profile, bookings, gateway, now))
-        if why := lacks_memory(profile, demand.memory_mb, use):
-            others = ", ".join(sorted(name for name, node in claims.items() if node == candidate))
+        own = own_use(spec, values[spec.name], profile, spec.demand)
+        use = predicted(profile, own, spec.demand, coming_use(spec, profile, bookings, gateway, now))
+        if why := lacks_memory(profile, spec.demand.memory_mb, use):
+            others = ", ".join(sorted(name for name, node in coming.items() if node == candidate))
             found[candidate] = f"{others} goes there now: {why}"
     return found

@@ -9,12 +9,14 @@ figures give the same judgement, bit for bit.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from zsched.core.scheduler.damping import Damping
 from zsched.core.scheduler.judge import Judge, Judgement, Outcome, escape_ahead, escape_reason, short_of_memory
 from zsched.core.scheduler.standing import Standing, compare
 from zsched.core.values.decision import Figures, Rules, Verdict
 from zsched.core.values.fleet import TaskSpec, WorkerSpec
-from zsched.core.values.model import Allocation, PeerState
+from zsched.core.values.model import Allocation, NodeId, PeerState
 from zsched.core.values.profile import WorkerState
 from zsched.core.values.quorum import majority
 from zsched.core.values.struct import Struct, replace
@@ -49,6 +51,7 @@ def decide_by(compared: Standing, judge: Judge, damping: Damping, figures: Figur
     allocation = figures.allocation
     standing = _keep_out(compared, figures)
     escape = _escape(judge, standing, figures)
+    standing = _leave_to_others(standing, figures)
     if escape is not None and escape == short_of_memory(judge.spec, allocation, figures.owner_profile):
         roomy = _with_room(standing, figures)
         # where all are short of memory, to flee would only be to come back
@@ -142,28 +145,39 @@ def verdict_of(judgement: Judgement) -> Verdict:
 
 def _keep_out(standing: Standing, figures: Figures) -> Standing:
     """The standing without the candidates that take nothing new; an owner among them keeps what it has."""
-    closed = {name: why for name, why in figures.closed if name != figures.allocation.owner}
-    if not closed:
-        return standing
-    return replace(
-        standing,
-        aggregates={name: value for name, value in standing.aggregates.items() if name not in closed},
-        vetoed={**standing.vetoed, **{name: why for name, why in closed.items() if name in figures.rules.candidates}},
-    )
+    candidates = figures.rules.candidates
+    return _without(standing, {name: why for name, why in figures.closed if name in candidates}, figures)
+
+
+def _leave_to_others(standing: Standing, figures: Figures) -> Standing:
+    """The standing without the candidates that other tasks are about to fill; all of them where it has no other place.
+
+    Who is first there by its name may have a choice, and leaves again; a task that waited would have no owner for good.
+    """
+    rest = _without(standing, dict(figures.claimed), figures)
+    return rest if rest.aggregates.keys() - {figures.allocation.owner} else standing
 
 
 def _with_room(standing: Standing, figures: Figures) -> Standing:
     """The standing without the candidates that would be left again at once, for the same want of memory."""
-    told = (one for vector in standing.vectors for one in vector.utilities if one.candidate != figures.allocation.owner)
     short = {
         one.candidate: f"would have {one.memory * 100:.0f} % of its memory free"
-        for one in told
+        for vector in standing.vectors
+        for one in vector.utilities
         if one.memory is not None and one.memory < figures.rules.memory_floor_ratio
     }
+    return _without(standing, {**short, **standing.vetoed}, figures)
+
+
+def _without(standing: Standing, shut: Mapping[NodeId, str], figures: Figures) -> Standing:
+    """The standing without the candidates of ``shut`` ({candidate: why}) but the owner."""
+    shut = {name: why for name, why in shut.items() if name != figures.allocation.owner}
+    if not shut:
+        return standing
     return replace(
         standing,
-        aggregates={name: value for name, value in standing.aggregates.items() if name not in short},
-        vetoed={**short, **standing.vetoed},
+        aggregates={name: value for name, value in standing.aggregates.items() if name not in shut},
+        vetoed={**standing.vetoed, **shut},
     )
 
 

@@ -302,22 +302,17 @@ class Rounds:
         self, values: Mapping[TaskId, Allocation], states: Mapping[NodeId, PeerState], now: float
     ) -> list[TaskId]:
         """Tasks that have lost their owner come first, in an order that all robots share (`claims`)."""
-        lost = {
-            name
-            for name, task in self.tasks.items()
-            if values[name].owner is not None and not self._has_owner(task.spec, values[name], states, now)
-        }
+        lost = {name for name, task in self.tasks.items() if self._is_lost(task.spec, values[name], states, now)}
         return [*sorted(lost), *(name for name in in_turn(self._turns) if name not in lost)]
 
-    def _has_owner(
-        self, spec: TaskSpec, allocation: Allocation, states: Mapping[NodeId, PeerState], now: float
-    ) -> bool:
+    def _is_lost(self, spec: TaskSpec, allocation: Allocation, states: Mapping[NodeId, PeerState], now: float) -> bool:
+        """Whether it had an owner, which does not live any more."""
         owner = allocation.owner
         if owner is None:
             return False
         state, profile = states.get(owner, PeerState.GONE), self._gateway.fresh(owner, now)
         is_spared = state is PeerState.SUSPECT and owner in self._doubts(spec, now).in_grace
-        return has_living_owner(spec, state, profile, is_spared=is_spared)
+        return not has_living_owner(spec, state, profile, is_spared=is_spared)
 
     # --- SCHEDULER: the decision ---------------------------------------------------------------------------------
 
@@ -395,25 +390,26 @@ class Rounds:
             is_called_escape=task.is_called_escape,
             out=self._out(task.spec, now) if owner is None else (),
             first=who_moves_first(self._turns, name, is_called=is_called, now=now),
-            closed=tuple(sorted({**self._taken(task.spec, values, states, now), **self._flags.closed}.items())),
+            closed=tuple(sorted(self._flags.closed.items())),
+            claimed=tuple(sorted(self._claimed(task.spec, values, states, now).items())),
             drained="" if owner is None else self._flags.drained.get(owner, ""),
             judge=task.judge.memory(),
             damping=task.damping.memory(),
         )
 
-    def _taken(
+    def _claimed(
         self,
         spec: TaskSpec,
         values: Mapping[TaskId, Allocation],
         states: Mapping[NodeId, PeerState],
         now: float,
     ) -> Mapping[NodeId, str]:
+        """Of a task that has lost its owner: the candidates that others are about to fill."""
         claims = claims_of_others(self._turns, spec.name, now)
-        if not claims:
+        if not claims or not self._is_lost(spec, values[spec.name], states, now):
             return {}
         specs = tuple(task.spec for task in self.tasks.values())
-        has_owner = self._has_owner(spec, values[spec.name], states, now)
-        return taken(spec, claims, specs, values, self._gateway, now, has_owner=has_owner)
+        return taken(spec, claims, specs, values, self._gateway, now)
 
     def decision(self, name: TaskId, now: float) -> Decision | None:
         """The last judgement with all its figures; ``None`` before the first."""

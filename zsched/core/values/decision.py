@@ -90,6 +90,9 @@ class Figures(Struct, frozen=True, kw_only=True):
     """The other task that moves first."""
     closed: tuple[tuple[NodeId, str], ...] = ()
     """(candidate, why it takes nothing new), by operators' flags; sorted."""
+    claimed: tuple[tuple[NodeId, str], ...] = ()
+    """(candidate, why it has no room for the task beside those that are about to go there); sorted. Only of a task that
+    has lost its owner, which leaves it to them while it has another place."""
     drained: str = ""
     """Why the owner hands the task over, by an operator's flag; empty: it need not."""
     judge: JudgeMemory = JudgeMemory()

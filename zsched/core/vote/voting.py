@@ -80,13 +80,17 @@ class Voting:
         self._voters = voters
 
     def going_to(self, now: float) -> NodeId | None:
-        """Where the task is about to go: by a commit or a vote that was won, else by this robot's open proposal."""
+        """Where the task is about to go: by a commit or a vote that was won, else by this robot's open proposal.
+
+        A proposal that is too old to count says nothing.
+        """
         if self.commit is not None:
             return self.commit.owner
         if now < self.awaited_until and self.tally is not None:
             return self.tally.winner
         mine = self.proposals.get(self._me)
-        return None if self.opened_at is None or mine is None else mine[0].candidate
+        is_open = self.opened_at is not None and mine is not None and now - mine[1] <= self._vote_s
+        return mine[0].candidate if mine is not None and is_open else None
 
     # --- proposals -----------------------------------------------------------------------------------------------
 

@@ -15,6 +15,7 @@ from support.proposals import proposal_of, vector_of
 from support.robots import Decider
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.instructions import AskUtilities, Instruction, PublishProposal
+from zsched.core.scheduler.claims import taken
 from zsched.core.scheduler.judge import Outcome
 from zsched.core.scheduler.rounds import TaskRound
 from zsched.core.values.fleet import Demand, Fleet, WorkerSpec
@@ -598,16 +599,15 @@ def test_no_other_task_moves_between_a_vote_that_others_won_and_its_value(ends: 
 class RobotOfOrphans(RobotOfTwo):
     """Both tasks need 1400 MiB and have lost edge1 with its machine; edge2 is best, and has ``free_mb`` left."""
 
-    def __init__(self, me: str, free_mb: float, **owners: str | None) -> None:
+    def __init__(self, me: str, free_mb: float, *, plan_on: tuple[str, ...] = ("edge1", "edge2", "robot3")) -> None:
         super().__init__(me)
         (merge, _) = self.rounds.tasks.values()
         need = replace(merge.file, candidates=("edge1", "edge2", "robot3"), demand=Demand(memory_mb=1400.0))
-        fleet = replace(FLEET, tasks=tuple(replace(need, name=name) for name in ("merge", "plan")))
+        fleet = replace(FLEET, tasks=(need, replace(need, name="plan", candidates=plan_on)))
         self.gateway = Gateway(fleet)
         self.decider = Decider(fleet, me, self.gateway, now=self.now)
         self.rounds, self.votes = self.decider.rounds, self.decider.votes
-        self.value = replace(self.value, revision=5, owner=owners.get("merge", "edge1"))
-        self.plan = replace(self.plan, revision=5, owner=owners.get("plan", "edge1"))
+        self.value, self.plan = (replace(one, revision=5, owner="edge1") for one in (self.value, self.plan))
         self.states["edge1"] = PeerState.GONE
         for name, free in (("edge2", free_mb), ("robot3", 8000.0)):
             workers = tuple(load_of(task, cpu_cores=0.0, memory_mb=0.0) for task in ("merge", "plan"))
@@ -633,7 +633,39 @@ def test_tasks_that_lose_their_owner_together_do_not_all_go_where_one_of_them_fi
     assert robot.fled() == {"merge": "edge2", "plan": "robot3"}
     figures = robot.rounds.tasks["plan"].figures
     assert figures is not None
-    assert figures.closed == (("edge2", "merge goes there now: needs 1400 MiB, has 600 free"),)
+    assert figures.claimed == (("edge2", "merge goes there now: needs 1400 MiB, has 600 free"),)
+
+
+def test_a_claim_takes_nobody_s_only_place() -> None:
+    """Who is first by its name has a choice, and would never have made room: the other one had no owner for good."""
+    robot = RobotOfOrphans("robot1", 2000.0, plan_on=("edge1", "edge2"))
+    assert robot.fled() == {"merge": "edge2", "plan": "edge2"}, "merge is refused there then, and goes on"
+
+
+def test_a_task_that_flees_from_nobody_leaves_no_room_to_others() -> None:
+    robot = RobotOfOrphans("robot1", 2000.0)
+    robot.states["edge1"] = PeerState.ALIVE
+    profile = profile_of("edge1", workers=tuple(load_of(task) for task in robot.values()))
+    assert robot.gateway.absorb(profile, robot.now) is None
+    robot.paper("robot2", "edge2", base=5)
+    robot.paper("robot3", "edge2", base=5)
+    robot.gathered()
+    figures = robot.rounds.tasks["plan"].figures
+    assert figures is not None
+    assert (figures.first, figures.claimed) == ("merge", ()), "its turn comes, and its patience goes on"
+
+
+def test_a_proposal_that_no_vote_counts_any_more_and_one_to_stay_are_no_claims() -> None:
+    robot = RobotOfOrphans("robot1", 2000.0)
+    robot.fled()
+    vote_s, voting = vote_time(FLEET.timing), robot.votes.tasks["merge"]
+    assert voting.going_to(robot.now) == "edge2"
+    voting.opened_at = robot.now + vote_s + 0.1
+    assert voting.going_to(robot.now + vote_s + 0.1) is None
+    specs = [task.spec for task in robot.rounds.tasks.values()]
+    stays = {**robot.values(), "merge": replace(robot.value, owner="edge2")}
+    for values, found in ((robot.values(), {"edge2"}), (stays, set())):
+        assert taken(specs[1], {"merge": "edge2"}, specs, values, robot.gateway, robot.now).keys() == found
 
 
 def test_such_tasks_are_judged_in_one_order_by_all_robots_whoever_has_called_what_before() -> None:
