@@ -30,7 +30,14 @@ def _bug(name: str, module: str, old: str, new: str, tests: tuple[str, ...], *, 
 
 
 FLAG_BUGS: tuple[Bug, ...] = (
-    _bug("a drained node gets tasks", DECISION, "    if not closed:\n", "    if True:\n", _FLAGS, has_schedules=True),
+    _bug(
+        "a drained node gets tasks",
+        DECISION,
+        "for name, why in figures.closed if name in candidates}",
+        "for name, why in figures.closed if name not in candidates}",
+        _FLAGS,
+        has_schedules=True,
+    ),
     _bug(
         "a drained owner that leads stays",
         JUDGE,
