@@ -51,8 +51,8 @@ class _Terms(Struct, frozen=True):
 
     def names(self) -> frozenset[str]:
         """The measured metrics."""
-        three = {"cpu": self.cpu, "memory": self.memory, "network": self.network}
-        return frozenset((*(name for name, term in three.items() if term is not None), *self.gauges))
+        three = (("cpu", self.cpu), ("memory", self.memory), ("network", self.network))
+        return frozenset([*[name for name, term in three if term is not None], *self.gauges])
 
 
 class Doubts(Struct, frozen=True, kw_only=True):
@@ -156,10 +156,11 @@ def score(
     if len(terms) > 1 and all(term.network is None for name, term in terms.items() if name != voter):
         # A robot always reaches itself: nobody measures that.
         terms = {name: replace(term, network=None) for name, term in terms.items()}
-    measured = frozenset[str]().union(*(term.names() for term in terms.values()))
+    named = {name: term.names() for name, term in terms.items()}
+    measured = frozenset[str]().union(*named.values())
     utilities = [Utility(candidate=name, value=0.0, reachable=False) for name in unreachable]
     for candidate, term in terms.items():
-        assumed = {name: 1.0 for name in sorted(measured - term.names()) if name in BY_NAME and _is_assumed(name)}
+        assumed = {name: 1.0 for name in sorted(measured - named[candidate]) if name in BY_NAME and _is_assumed(name)}
         by_gauge = {**term.gauges, **assumed}
         value = total_utility(
             allocation.tuning.weights,

@@ -51,4 +51,6 @@ def check_ranges(value: Any, prefix: str = "") -> None:
         held: list[tuple[str, Key | None]] = [(one.name, one.metadata.get("key")) for one in fields(value)]
         _RANGES[kind] = [(name, key.range) for name, key in held if key is not None and key.range is not None]
     for name, bounds in _RANGES[kind]:
-        check_range(f"{prefix}{name}", getattr(value, name), bounds.low, bounds.high)
+        given = getattr(value, name)
+        if given is not None and not bounds.low <= given <= bounds.high:  # names are put together for an error only
+            check_range(f"{prefix}{name}", given, bounds.low, bounds.high)
