@@ -39,6 +39,7 @@ def node_limits(prefix: str, scenario: Scenario, fleet: LabFleet) -> NodeLimits:
                 continue
             name = f"{prefix}-{node}"
             group = LimitedGroup.create(name, cpu_cores=share.quota_cores, memory_mb=share.memory_mb)
+            group.give_way()  # what has no quota stands for other machines
             if not share.overhead_cores:
                 groups[node] = group
                 says.append(f"{node} {share.quota_cores:g} cores, {share.memory_mb:.0f} MiB")

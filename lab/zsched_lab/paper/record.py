@@ -9,7 +9,8 @@ is its header's stamp, the log time that of its arrival.
 **Pressure.** /proc/pressure/cpu also counts processes that stand still because of their own quota: one loop under a
 quota of 0.2 cores shows 0.8 on an idle machine. So everything outside the nodes' quotas is put into a control group of
 the unified hierarchy, and that group's own pressure counts: the share of time in which some of it waited for a CPU.
-It stands for other machines, which no edge slows down: where the nodes want a CPU, too, it goes first (`PRECEDENCE`).
+It stands for other machines, which no edge slows down: where the nodes want a CPU, too, it goes first, at once by the
+nodes' class (`zsched.adapters.machine.cgroup.LimitedGroup.give_way`), and by weight where the kernel has none.
 """
 
 from __future__ import annotations

@@ -238,6 +238,17 @@ class LimitedGroup:
             raise AdapterError(f"cannot make the control group {name!r} in {self.folders[0]}: {error}") from error
         return LimitedGroup(tuple(made))
 
+    def give_way(self) -> None:
+        """Let processes of other groups run at once where they want to, instead of in their turn (Linux >= 5.15).
+
+        The group is of the class of idle ones (sched(7), SCHED_IDLE; its own quota holds all the same). On an older
+        kernel nothing is done: then it has its turns by its weight.
+        """
+        for folder in self.folders:
+            with contextlib.suppress(OSError):
+                if (folder / "cpu.idle").exists():
+                    (folder / "cpu.idle").write_text("1", encoding="ascii")
+
     @classmethod
     def why_not(cls, *, cpu: bool = True, memory: bool = True) -> str | None:
         """Why this user cannot limit processes here; ``None`` when they can (found out by making a group)."""

@@ -168,6 +168,32 @@ def test_v2_group_without_a_place_is_refused_with_advice(tmp_path: Path) -> None
         LimitedGroup.create("edge1", cpu_cores=0.5, tree=CgroupTree(tmp_path / "nowhere"))
 
 
+def test_a_group_that_gives_way_is_of_the_idle_class_and_keeps_its_quota() -> None:
+    reason = LimitedGroup.why_not()
+    if reason is not None:
+        pytest.skip(reason)
+    group = LimitedGroup.create(f"zsched-test-way-{os.getpid()}", cpu_cores=0.25, memory_mb=64)
+    try:
+        files = [folder / "cpu.idle" for folder in group.folders if (folder / "cpu.idle").exists()]
+        if not files:
+            pytest.skip("groups have no class here (Linux < 5.15)")
+        assert [file.read_text().strip() for file in files] == ["0"]
+        group.give_way()
+        assert [file.read_text().strip() for file in files] == ["1"]
+        inner = group.inner("work", cpu_cores=0.125)
+        inner.remove()
+        with subprocess.Popen(["sleep", "60"]) as idle:
+            try:
+                group.add(idle.pid)
+                quota = CgroupTree(pid=str(idle.pid)).cpu_quota()
+                assert quota is not None
+                assert quota.cores == 0.25
+            finally:
+                idle.kill()
+    finally:
+        group.remove()
+
+
 def test_real_group_is_made_limits_a_process_and_is_removed() -> None:
     reason = LimitedGroup.why_not()
     if reason is not None:
