@@ -110,6 +110,11 @@ def awake_s() -> float:
     return time.clock_gettime(time.CLOCK_MONOTONIC)
 
 
+def boot_s() -> float:
+    """Seconds of CLOCK_BOOTTIME, by which the kernel tells when a process began; `monotonic_s` parts from it."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
+
+
 def wall_time() -> str:
     """Now as an RFC 3339 string in UTC with milliseconds, for logs and people; never for decisions."""
     return datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -23,7 +23,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from zsched.adapters.machine.cgroup import CgroupTree, CpuQuota, MemoryQuota
-from zsched.clock import monotonic_s
+from zsched.clock import boot_s, monotonic_s
 from zsched.core.profile.appetite import Appetite, Thread
 from zsched.core.values.model import TaskId
 from zsched.core.values.profile import DeviceSample, WorkerLoad, WorkerState
@@ -270,7 +270,7 @@ class _ProcessTrees:
             return WorkerLoad(task=task, state=state)
         now, tree = seen
         before = self._seen.get(task)
-        cpu_cores = None if before is None else _cores(before[1], tree, now - before[0], now)
+        cpu_cores = None if before is None else _cores(before[1], tree, now - before[0], boot_s())
         appetite = self._appetites.setdefault(task, Appetite())
         is_looked_at = not self._is_at_rest(task, now)
         if is_looked_at:
@@ -336,7 +336,7 @@ class _ProcessTrees:
 
 
 def _cores(
-    before: Mapping[int, ProcessTimes], after: Mapping[int, ProcessTimes], elapsed_s: float, now: float
+    before: Mapping[int, ProcessTimes], after: Mapping[int, ProcessTimes], elapsed_s: float, since_boot_s: float
 ) -> float | None:
     """Cores a tree used in ``elapsed_s``, from its processes then and now; ``None``: not to be told.
 
@@ -349,13 +349,13 @@ def _cores(
     if not kept:
         return None
     total_s = sum(times.own_s + times.waited_s for pid, times in after.items() if pid in kept)
-    total_s += sum(_share(times, elapsed_s, now) for pid, times in after.items() if pid not in kept)
+    total_s += sum(_share(times, elapsed_s, since_boot_s) for pid, times in after.items() if pid not in kept)
     total_s -= sum(times.own_s + times.waited_s for times in before.values())
     survivors_s = sum(after[pid].own_s - before[pid].own_s for pid in kept)
     return max(total_s, survivors_s, 0.0) / elapsed_s
 
 
-def _share(times: ProcessTimes, elapsed_s: float, now: float) -> float:
+def _share(times: ProcessTimes, elapsed_s: float, since_boot_s: float) -> float:
     """What a newly seen process probably used in the last ``elapsed_s``: all if it is younger, else in proportion."""
-    age_s = max(now - times.start_s, elapsed_s)
+    age_s = max(since_boot_s - times.start_s, elapsed_s)
     return (times.own_s + times.waited_s) * elapsed_s / age_s

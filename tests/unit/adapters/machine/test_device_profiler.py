@@ -232,6 +232,22 @@ def test_adopted_old_process_does_not_make_a_spike(tmp_path: Path) -> None:
     assert load.cpu_cores < 1000.0 / time.clock_gettime(time.CLOCK_BOOTTIME) * 2.0
 
 
+@pytest.mark.parametrize("ahead_s", [-40.0, 0.0, 40.0])
+def test_a_young_child_counts_whole_however_far_the_clocks_have_parted(
+    tmp_path: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch, ahead_s: float
+) -> None:
+    """The kernel tells its start by a clock that time services slew, 30 ppm say: 26 s in ten days."""
+    monkeypatch.setattr(device_profiler, "boot_s", lambda: clock.now - ahead_s)
+    profiler = machine(tmp_path, **process(10, 1, own=100))
+    workers = {"merge": (WorkerState.READY, 10)}
+    profiler.sample(workers)
+    clock.now += 0.2
+    born = round((clock.now - ahead_s - 0.1) * 100)
+    write(tmp_path, process(11, 10, own=8, start=born))
+    (load,) = profiler.sample(workers).workers
+    assert load.cpu_cores == pytest.approx(0.08 / 0.2)
+
+
 def queued(pid: int, *threads: tuple[float, float]) -> dict[str, str]:
     """Threads of a process, and for how many seconds each has run and has waited to run."""
     return {
