@@ -147,10 +147,11 @@ def main() -> None:
             code = end.code
         sys.stdout.flush()
     except OSError as error:
-        if error.errno not in UNWRITABLE or error.filename is not None:
+        if error.errno not in (*UNWRITABLE, errno.EPIPE) or error.filename is not None:
             raise
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the interpreter will try once more
-        warn(f"zsched: the answer cannot be written: {error.strerror}; see where stdout goes")
+        if error.errno != errno.EPIPE:  # who read it has seen enough
+            warn(f"zsched: the answer cannot be written: {error.strerror}; see where stdout goes")
     _end(code)
 
 

@@ -318,6 +318,19 @@ def test_watch_into_a_closed_pipe_ends_quietly(folder: Path) -> None:
     assert "Traceback" not in error
 
 
+def test_a_reader_that_has_gone_changes_nothing_of_the_end(folder: Path) -> None:
+    """`zsched status | true` ended in a traceback, and its exit code was lost."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    with Daemon(folder), os.fdopen(writing, "wb") as gone:
+        command = [sys.executable, "-m", "zsched", "status", "--runtime-dir", str(folder)]
+        buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+        done = subprocess.run(
+            command, env=buffered, stdout=gone, stderr=subprocess.PIPE, text=True, timeout=60, check=False
+        )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_screen_that_is_too_low_keeps_the_problems(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LINES", "10")
     text = "\n".join([*(f"line {i}" for i in range(20)), "", "PROBLEMS no quorum"])
