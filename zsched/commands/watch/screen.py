@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import os
 import queue
+import re
 import select
 import shutil
 import signal
@@ -36,6 +37,8 @@ HOME, REST_OF_LINE, REST_OF_SCREEN = "\x1b[H", "\x1b[K", "\x1b[J"
 ENDS: Final = ("q", "Q", "\x03", "\x04")
 STEPS: Final = {"\x1b[A": -1, "\x1b[B": 1, "k": -1, "j": 1, "\x1b[5~": -10, "\x1b[6~": 10}
 """{key: by how many tasks it scrolls}."""
+KEYS: Final = re.compile(r"\x1b\[[0-9;]*[A-Za-z~]|.", re.DOTALL)
+"""One key of those that were read at once: held down, or typed before the screen was drawn."""
 
 
 class TopView(Struct, frozen=True, kw_only=True):
@@ -101,11 +104,12 @@ def _live(view: TopView, feed: Feed, past: Past) -> None:
                 while not told.empty():
                     past.take(told.get())
                 if sys.stdin.fileno() in ready:
-                    key = os.read(sys.stdin.fileno(), 32).decode(errors="replace")
-                    if key in ENDS or not key:
+                    keys = KEYS.findall(os.read(sys.stdin.fileno(), 32).decode(errors="replace"))
+                    if not keys or any(key in ENDS for key in keys):
                         return
                     tasks = 0 if past.status is None else len(past.status["tasks"])
-                    first_task = max(0, min(first_task + STEPS.get(key, 0), tasks - 1))
+                    for key in keys:
+                        first_task = max(0, min(first_task + STEPS.get(key, 0), tasks - 1))
         except KeyboardInterrupt:
             return
         finally:

@@ -389,6 +389,32 @@ def test_sigterm_gives_the_terminal_back_as_it_was(tmp_path: Path) -> None:
         os.close(terminal)
 
 
+def test_keys_that_come_at_once_count_each(tmp_path: Path) -> None:
+    """A held arrow over a slow line, or `q` twice; they were no key together."""
+    empty = {"node": "robot1", "now": NOON, "entries": [], "cursor": "", "more": False}
+    daemon = OperatorSocket(tmp_path / "robot1.sock", lambda one: recorded() if one["verb"] == "status" else empty)
+    controller, terminal = os.openpty()
+    daemon.open()
+    try:
+        command = [sys.executable, "-m", "zsched.cli", "top", "--runtime-dir", str(tmp_path)]
+        plain = {**os.environ, "NO_COLOR": "1"}
+        with subprocess.Popen(command, env=plain, stdin=terminal, stdout=terminal, stderr=terminal) as process:
+            shown = b""
+            while b"fleet testbed" not in shown:
+                assert select.select([controller], [], [], 60)[0], shown
+                shown += os.read(controller, 1 << 16)
+            os.write(controller, b"\x1b[Bjq")
+            while LEAVE.encode() not in shown and select.select([controller], [], [], 10)[0]:
+                shown += os.read(controller, 1 << 16)
+            if process.poll() is None and LEAVE.encode() not in shown:
+                process.kill()
+            assert process.wait(60) == 0
+    finally:
+        daemon.close()
+        os.close(controller)
+        os.close(terminal)
+
+
 def test_nobody_there_is_said_at_once(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["top", "--once", "--runtime-dir", str(tmp_path)])
     assert (result.exit_code, "no daemon in" in result.stderr) == (3, True)
