@@ -25,6 +25,8 @@ from zsched.procfs import parse_schedstat, read_file
 
 TELL_S: Final = 0.2
 """Shortest time between two reports to the node: it measures itself as often."""
+LAST_WORDS: Final = 2
+"""So often it tells that it is idle."""
 LONG_S: Final = 1e-3
 """Behind a job that took this long, the process's CPU clock is read as well: it costs more with more threads."""
 PARALLEL, ALONE = 1.5, 1.3
@@ -43,6 +45,8 @@ class JobTimer:
         "_cpu_s",
         "_deadline_s",
         "_is_long",
+        "_others",
+        "_others_s",
         "_process_s",
         "_thread_id",
         "_waited_s",
@@ -55,14 +59,22 @@ class JobTimer:
         "least",
         "long_process_s",
         "long_thread_s",
+        "queued",
         "skipped",
         "time_s",
         "waiting",
     )
 
-    def __init__(self, deadline_s: float | None = None) -> None:
-        """``deadline_s``: a job that takes longer from arrival to end is `late`."""
-        self._deadline_s = deadline_s
+    def __init__(
+        self, deadline_s: float | None = None, others: Callable[[], tuple[JobTimer, ...]] | None = None
+    ) -> None:
+        """``deadline_s``: a job that takes longer from arrival to end is `late`.
+
+        ``others`` gives every timer of the process; ``None``: there is no other.
+        """
+        self._deadline_s, self._others = deadline_s, others
+        self._others_s: dict[int, float] = {}
+        """{thread: what it had run} of those that were at long jobs of their own when the job began."""
         self._began_s = self._cpu_s = self._process_s = self._waited_s = 0.0
         self._base_s: float | None = 0.0
         """What its thread had waited when it began, less what earlier ones have; ``None``: the kernel does not tell."""
@@ -76,6 +88,8 @@ class JobTimer:
         self.done = self.late = self.skipped = 0
         self.waiting = self.least = 0
         """How many wait for their turn: now, and at least since the node was told."""
+        self.queued: Callable[[], int] | None = None
+        """Tells how many wait, where nobody counts them as they come."""
         self.time_s = self.cpu_s = self.age_s = 0.0
         self.long_thread_s = self.long_process_s = 0.0
 
@@ -88,6 +102,7 @@ class JobTimer:
             self._thread_id = thread_id
         self.is_in_hand = True
         if self._is_long:
+            self._others_s = self._run_by_others()
             self._process_s = process_time()
         self._began_s = monotonic()
         self._cpu_s = thread_time()
@@ -98,7 +113,7 @@ class JobTimer:
         now = monotonic()
         took_s = now - self._began_s
         if self._is_long:
-            process_s = process_time() - self._process_s
+            process_s = process_time() - self._process_s - self._others_risen_s()
             self.long_thread_s += cpu_s
             self.long_process_s += process_s
             if self.is_parallel:
@@ -112,6 +127,16 @@ class JobTimer:
             self.late += 1
         self.is_in_hand = False
         self.done += 1
+
+    def _run_by_others(self) -> dict[int, float]:
+        timers = () if self._others is None else self._others()
+        threads = {timer._thread_id for timer in timers if timer._is_long} - {self._thread_id}  # noqa: SLF001
+        return {thread: times[0] for thread in threads if (times := _times_s(thread)) is not None}
+
+    def _others_risen_s(self) -> float:
+        """What other threads have run since this job began, for jobs of their own."""
+        now = ((before_s, _times_s(thread)) for thread, before_s in self._others_s.items())
+        return sum(times[0] - before_s for before_s, times in now if times is not None)
 
     def look_for_helpers(self) -> None:
         """Judge by the long jobs since the last look whether other threads of the process work on them (any thread)."""
@@ -139,8 +164,13 @@ class JobTimer:
 
 def _waited_s(thread_id: int) -> float | None:
     """The run-queue delay of a thread of this process."""
-    times = parse_schedstat(read_file(f"/proc/self/task/{thread_id}/schedstat"))
+    times = _times_s(thread_id)
     return None if times is None else times[1]
+
+
+def _times_s(thread_id: int) -> tuple[float, float] | None:
+    """How long a thread of this process has run, and has waited to run; ``None``: not told, or it has ended."""
+    return parse_schedstat(read_file(f"/proc/self/task/{thread_id}/schedstat"))
 
 
 class Job:
@@ -181,7 +211,7 @@ class JobBook:
 
     def timer(self) -> JobTimer:
         """For a thread that is about to serve callbacks."""
-        timer = JobTimer(self._deadline_s)
+        timer = JobTimer(self._deadline_s, self._at_work)
         with self._lock:
             self._timers.append(timer)
         return timer
@@ -203,7 +233,7 @@ class JobBook:
                     self._before = _Sums()
                     for one in self._timers:
                         self._before.add(one)
-                timer = self._own[thread] = JobTimer(self._deadline_s)
+                timer = self._own[thread] = JobTimer(self._deadline_s, self._at_work)
         timer.skipped += count
         return Job(timer, self.wake, came_s)
 
@@ -229,10 +259,15 @@ class JobBook:
                 self._has_thread = False
 
     def _run(self) -> None:
-        """Tell, every `TELL_S` while there is work, and once behind it; then sleep until there is some."""
+        """Tell, every `TELL_S` while there is work, and twice behind it; then sleep until there is some.
+
+        Twice, for a word may be lost, and a worker whose last one is not idle is taken for one that hangs.
+        """
+        left = 0
         while not self._closed.wait(TELL_S):
             report, counts = self.report(), self._counts()
-            if self._is_busy() or counts != self._told:
+            left = LAST_WORDS if self._is_busy() or counts != self._told else left - 1
+            if left > 0:
                 self._told = counts
                 with contextlib.suppress(Exception):  # the session closes
                     self._tell(report)
@@ -262,6 +297,8 @@ class JobBook:
         for timer in self._at_work():
             timer.look_for_helpers()
             sums.add(timer)
+            if timer.queued is not None:
+                timer.waiting = timer.queued()
             waiting += timer.least
             timer.least = timer.waiting
         return WorkerJobs(

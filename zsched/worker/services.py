@@ -82,6 +82,7 @@ class Service:
         self._troubles = troubles
         self._jobs, self._timer = jobs, jobs.timer()
         self._requests: queue.Queue[tuple[zenoh.Query, float] | None] = queue.Queue(depth)
+        self._timer.queued = self._requests.qsize
         self._is_closed = False
         guarded(self._run, name=f"zsched serve {key_expr}", kind="zsched serve").start()
         self._queryable = session.declare_queryable(key_expr, tolerant(self._take, "request"), complete=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from threading import Event
 from typing import Any
 
 import pytest
@@ -52,6 +53,36 @@ def test_what_is_no_answer_is_the_handler_s_failure_and_the_next_request_is_answ
         (answered,) = session.get(KEY, timeout=20.0)
         assert answered.ok is not None
         assert answered.ok.payload.to_bytes() == b"done"
+        service.undeclare()
+    troubles.close()
+    jobs.close()
+
+
+def test_requests_behind_one_that_hangs_are_told_as_waiting() -> None:
+    troubles, jobs, go_on = Troubles(lambda _count, _text: None), JobBook("t", "1", lambda _jobs: None), Event()
+
+    def handle(_request: Request) -> bytes:
+        go_on.wait(60)
+        return b"done"
+
+    with zenoh.open(zenoh.Config.from_json5(data_config(listen=(), connect=()))) as session:
+        service = Service(
+            session,
+            KEY,
+            handle,
+            is_owner=lambda: True,
+            later=lambda call: call(),
+            troubles=troubles,
+            jobs=jobs,
+            depth=4,
+        )
+        answers = [session.get(KEY, timeout=20.0) for _ in range(3)]
+        try:
+            until(lambda: jobs.report().waiting == 2, "two wait behind the first")
+            assert jobs.report().waiting == 2, "however often it is told"
+        finally:
+            go_on.set()
+        assert [reply.ok is not None for answer in answers for reply in answer] == [True] * 3
         service.undeclare()
     troubles.close()
     jobs.close()
