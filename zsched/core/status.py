@@ -477,7 +477,7 @@ def _task_problems(node: Stages, task: TaskSpec, value: Allocation, now: float) 
             yield f"the worker on {name} {told_of_worker(load.state, load.reason)}"
         elif load.state is WorkerState.READY and load.reason:
             yield f"the worker on {name}{why}"
-        elif name == owner and load.unended_s is not None and _hangs(load):
+        if load.state is WorkerState.READY and name == owner and load.unended_s is not None and _hangs(load):
             more = f", and {load.jobs.backlog} wait" if load.jobs is not None and load.jobs.backlog else ""
             anew = f"see `zsched logs {task.name}`, `zsched restart {task.name}` starts it anew"
             yield (

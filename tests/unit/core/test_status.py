@@ -774,6 +774,17 @@ def test_an_owner_that_has_work_and_ends_no_job_is_a_problem(
     assert all(one.endswith("in a callback; start it again there") for one in problems), "it is somebody else's"
 
 
+def test_a_hang_is_told_beside_another_complaint_of_the_worker() -> None:
+    """Such a complaint stays for the worker's life, and hid it."""
+    node = make()
+    node.handle(ev.BeatReceived(beat=beat_of("edge1", incarnation=3)), 100.0)
+    learn(node, 1, "edge1")
+    told_by(node, "edge1", 1, WorkerState.READY, reason="puts on debug, which no output rule takes", unended_s=31.0)
+    told = "\n".join(build_snapshot(node, 101.0).tasks[0].problems)
+    assert "the worker on edge1: puts on debug, which no output rule takes" in told
+    assert "has had work for 31 s and finished no job" in told
+
+
 def test_a_slot_that_is_not_taken_is_told_of_only_once_the_owner_s_own_worker_is_ready() -> None:
     """Else the worker is what is told of; another node's worker excuses nothing."""
     node = make()

@@ -69,18 +69,18 @@ class JobMeter:
         has_ended = newest is None or not is_same_life or report.done > newest.done
         if report.is_idle:
             self._works_since = None
-        elif self._works_since is None or has_ended or now - self._heard_at > STALE_S:  # silent: it was idle
+        elif self._works_since is None or has_ended or now - self._heard_at > STALE_S:  # it may have been idle
             self._works_since = now
         self._newest, self._heard_at = report, now
         self._queue.append((now, report.waiting))
         return True
 
     def unended_s(self, now: float) -> float | None:
-        """For how many seconds the worker has had work, and has ended no job.
+        """For how many seconds the worker has had work, and has ended no job; ``None``: for less than `UNENDED_S`.
 
-        ``None``: for less than `UNENDED_S`, or it is silent.
+        One that falls silent with work in hand counts on: a callback that keeps Python's lock silences its reports.
         """
-        if self._works_since is None or now - self._heard_at > STALE_S:
+        if self._works_since is None:
             return None
         for_s = now - self._works_since
         return min(for_s, MAX_JOB_S) if for_s >= UNENDED_S else None

@@ -311,11 +311,26 @@ def test_a_worker_that_has_work_and_ends_no_job_is_told_of_after_a_while() -> No
         teller.works(1.0, done_hz=5.0)  # its word that it is idle is lost
 
 
-def test_one_that_says_nothing_or_lives_anew_is_not_said_to_end_no_job() -> None:
+def test_one_that_falls_silent_with_work_in_hand_is_said_to_end_no_job() -> None:
+    """A callback that keeps Python's lock silences the thread that reports."""
+    teller = told()
+    teller.works(2.0, done_hz=0.0)
+    assert teller.meter.unended_s(teller.now + STALE_S) is None
+    silent_s = UNENDED_S + STALE_S
+    assert teller.meter.unended_s(teller.now + silent_s) == pytest.approx(silent_s + 2.0, abs=2 * LOOK_S)
+    teller.now += silent_s
+    teller.works(LOOK_S, done_hz=0.0)
+    assert teller.meter.unended_s(teller.now) is None, "it speaks again, and may have been idle"
+
+
+def test_one_that_was_idle_when_it_fell_silent_or_lives_anew_is_not_said_to_end_no_job() -> None:
     teller = told()
     teller.works(UNENDED_S + 2.0, done_hz=0.0)
-    assert teller.meter.unended_s(teller.now + STALE_S) is not None
-    assert teller.meter.unended_s(teller.now + STALE_S + 1.0) is None
+    teller.works(LOOK_S, done_hz=0.0, is_idle=True)
+    assert teller.meter.unended_s(teller.now) is None
+    assert teller.meter.unended_s(teller.now + UNENDED_S + STALE_S) is None
+    teller.works(UNENDED_S + 2.0, done_hz=0.0)
+    assert teller.meter.unended_s(teller.now) is not None
     teller.word = replace(teller.word, incarnation="2", at_s=0.0)
     teller.works(LOOK_S, done_hz=0.0)
     assert teller.meter.unended_s(teller.now) is None
