@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
+from collections.abc import Set as AbstractSet
 from typing import Any, Final
 
 from zsched.core import events as ev
@@ -23,7 +24,7 @@ from zsched.core.todo import ToDo
 from zsched.core.values.adoption import in_force, obstacle
 from zsched.core.values.electorate import CREATION_STEP
 from zsched.core.values.fleet import Fleet, TaskSpec, file_hash, fleet_hash
-from zsched.core.values.model import Allocation, NodeKind
+from zsched.core.values.model import Allocation, NodeKind, TaskId
 
 SOURCE: Final = "fleet"
 """Of the problem that a file cannot be taken over."""
@@ -41,15 +42,17 @@ def adopt(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
         now: monotonic seconds.
     """
     before, values = node.fleet, node.values()
-    is_new = any(_is_of_before(executor, values[name]) for name, executor in node.executors.items() if name in values)
+    anew = frozenset(
+        name for name, one in node.executors.items() if name in values and _is_of_before(one, values[name])
+    )
     if _is_refused(node, fleet):
         return
-    if fleet == before and not is_new:
+    if fleet == before and not anew:
         node.fleet = fleet  # what it says beside its entries may differ (`Fleet.handed`)
         return
     node.fleet, node.fleet_file, node.text_hash = fleet, fleet_hash(fleet), file_hash(fleet)
     _adopt_nodes(node, fleet)
-    _adopt_choice(node, fleet, todo, now)
+    _adopt_choice(node, fleet, anew, todo, now)
     _adopt_work(node, fleet, todo, now)
     node.retuning.adopt(before, fleet, node.values(), now)
     text = f"goes by another fleet file: {node.fleet_file}"
@@ -93,13 +96,14 @@ def _adopt_nodes(node: Stages, fleet: Fleet) -> None:
     node.unseen.adopt({task.name for task in fleet.tasks})
 
 
-def _adopt_choice(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
-    """PROFILE, SCHEDULER and VOTE."""
+def _adopt_choice(node: Stages, fleet: Fleet, anew: AbstractSet[TaskId], todo: ToDo, now: float) -> None:
+    """PROFILE, SCHEDULER and VOTE; of the tasks ``anew`` (`_is_of_before`) nothing is remembered."""
     node.profiler.adopt(fleet.timing)
     node.votes.adopt(fleet)
-    node.rounds.adopt(fleet, now)
+    node.rounds.adopt(fleet, now, anew)
     node.agreement.adopt(fleet, todo, now)
-    node.history = {task.name: node.history.get(task.name) or deque(maxlen=HISTORY) for task in fleet.tasks}
+    past = {name: told for name, told in node.history.items() if name not in anew}
+    node.history = {task.name: past.get(task.name) or deque(maxlen=HISTORY) for task in fleet.tasks}
 
 
 def _adopt_work(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:

@@ -71,6 +71,7 @@ def decide_by(compared: Standing, judge: Judge, damping: Damping, figures: Figur
             is_called=figures.is_called,
             now=figures.now,
             damping=damping,
+            is_unheard=figures.owner_state is PeerState.UNKNOWN,
         )
     if escape is None:
         judgement = _look_ahead(judge, judgement, standing, figures)
@@ -153,7 +154,10 @@ def _leave_to_others(standing: Standing, figures: Figures) -> Standing:
     """The standing without the candidates that other tasks are about to fill; all of them where it has no other place.
 
     Who is first there by its name may have a choice, and leaves again; a task that waited would have no owner for good.
+    One that is pinned hard has one place.
     """
+    if figures.allocation.is_bound:
+        return standing
     rest = _without(standing, dict(figures.claimed), figures)
     return rest if rest.aggregates.keys() - {figures.allocation.owner} else standing
 

@@ -118,6 +118,7 @@ class Judge:
         now: float,
         damping: Damping | None = None,
         drained: str = "",
+        is_unheard: bool = False,
     ) -> Judgement:
         """Decide by one standing.
 
@@ -131,6 +132,7 @@ class Judge:
             damping: the task's record of moves, for the cap and the penalties (those that other robots remember, in
                 ``standing``, count as well); ``None``: neither.
             drained: why the owner hands the task over, by an operator's order; empty: it need not.
+            is_unheard: nobody here has ever heard the owner.
         """
         owner = allocation.owner
         if self.spec.learns_patience:
@@ -156,7 +158,8 @@ class Judge:
             return Judgement(outcome=Outcome.NONE, candidate=owner, aggregate=0.0, reason=reason)
         if not is_drain:
             self._spend(scored, owner, now)
-        outcome, reason = self._outcome(winner, scored, allocation, settled_for_s, leaving, is_called, now)
+        is_kept = allocation.home is not None and not (is_unheard and winner != allocation.home)
+        outcome, reason = self._outcome(winner, scored, allocation, settled_for_s, leaving, is_called, now, is_kept)
         cap = None
         if damping is not None and owner is not None and not is_drain:
             cap = self._cap(damping, is_escape=escape is not None, now=now)
@@ -205,7 +208,9 @@ class Judge:
         leaving: str | None,
         is_called: bool,
         now: float,
+        is_kept: bool,
     ) -> tuple[Outcome, str]:
+        """``is_kept``: by a pin, which holds no task on a machine that has never been heard."""
         owner, tuning = allocation.owner, allocation.tuning
         if allocation.paused:
             return Outcome.STAY, f"paused by {by(allocation.pause)}"
@@ -215,7 +220,7 @@ class Judge:
             return self._initial(winner, scored, is_called=is_called, now=now)
         if leaving is not None:
             return Outcome.PROPOSE, leaving
-        if allocation.home is not None:
+        if is_kept:
             return self._pinned(winner, allocation, settled_for_s, is_called, now)
         if winner == owner:
             return Outcome.STAY, "nobody better"

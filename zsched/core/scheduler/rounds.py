@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 from random import Random
 
@@ -38,6 +39,7 @@ from zsched.core.values.messages import Utilities
 from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, TaskId, Tuning, UtilityVector
 from zsched.core.values.struct import Struct
 
+HEARD = (PeerState.ALIVE, PeerState.SUSPECT)
 FRESH_MARGIN_S = 0.001
 """For the rounding of sums: a profile is surely fresh until this much before its end."""
 
@@ -126,12 +128,15 @@ class Rounds:
         self._number = 0
         self._round_at = now if self.is_voter else math.inf
 
-    def adopt(self, fleet: Fleet, now: float) -> None:
+    def adopt(self, fleet: Fleet, now: float, anew: AbstractSet[TaskId] = frozenset()) -> None:
         """Take tasks, robots and times from ``fleet``: what is remembered of a task that stays is kept.
 
+        ``anew``: tasks that are others than those of before, by the same name.
         A gather under way ends without a judgement, for it has asked the robots of before; another one follows at once.
         """
         was_gathering = self._gather is not None
+        for name in sorted(anew):
+            self.tasks.pop(name, None)
         self._adopt(fleet, now)
         if was_gathering:
             self.hurry(now)
@@ -382,7 +387,7 @@ class Rounds:
             present=tuple([voter for voter in self.voters if states[voter] is not gone]),
             vectors=vectors,
             electors=self.electors,
-            electors_heard=tuple([one for one in self.electors if states.get(one, gone) is not gone]),
+            electors_heard=tuple([one for one in self.electors if states.get(one, gone) in HEARD]),
             settled_for_s=now - task.settled_at,
             owner_state=gone if owner is None else states.get(owner, gone),
             owner_profile=profile,

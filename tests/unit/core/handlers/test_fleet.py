@@ -316,6 +316,24 @@ def test_what_a_task_needed_is_not_what_one_of_its_name_needs_that_comes_later(*
     assert node.gateway.demand(other, small).memory_mb == 20_000.0, "it has stayed"
 
 
+def test_what_was_remembered_of_a_task_is_not_remembered_of_one_of_its_name_that_comes_unheard() -> None:
+    """Its first placement waited for nobody, and its machine paid for what the former task had suffered there."""
+    merge, other = (task_of(name, candidates=("edge1",)) for name in ("merge", "other"))
+    fleet = fleet_of(merge, other)
+    node = node_of(fleet)
+    node.start(START)
+    placed = Learnt(node="robot2", values=(allocation_of(1, "edge1"),))
+    node.handle(ev.LearntReceived(learnt=placed, is_answer=True), START)
+    rounds = {name: node.rounds.tasks[name] for name in ("merge", "other")}
+    assert node.history["merge"]
+    later = allocation_of(CREATION_STEP + 1, None, tuning=merge.tuning)
+    node.registers["merge"].state = replace(node.registers["merge"].state, learnt=later)
+    adopt(node, fleet)
+    assert node.rounds.tasks["merge"] is not rounds["merge"]
+    assert node.rounds.tasks["other"] is rounds["other"]
+    assert not [one for one in node.history["merge"] if one.value.epoch == 1]
+
+
 @pytest.mark.parametrize("worker", [WorkerSpec(command=("small",)), WorkerSpec(command=("large",), env=(("S", "1"),))])
 @pytest.mark.parametrize("owner", ["edge1", None])
 def test_a_changed_worker_needs_what_its_owner_s_one_does_and_nothing_where_there_is_none(

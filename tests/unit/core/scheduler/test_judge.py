@@ -55,6 +55,7 @@ def judged(
     agreed: Allocation | None = None,
     drained: str = "",
     damping: Damping | None = None,
+    is_unheard: bool = False,
 ) -> Judgement:
     return judge.judge(
         standing(aggregates),
@@ -65,6 +66,7 @@ def judged(
         now=now,
         drained=drained,
         damping=damping,
+        is_unheard=is_unheard,
     )
 
 
@@ -315,6 +317,28 @@ def test_a_pinned_task_does_not_move_of_its_own_will_but_it_escapes(agreed: Allo
     assert stays[0].reason.startswith("pinned to edge1 by ")
     flees = judged(judge, BETTER, 60.0, escape="edge1 is gone", called=called, agreed=agreed)
     assert (flees.outcome, flees.candidate, flees.is_escape) == (Outcome.PROPOSE, "edge2", True)
+
+
+@pytest.mark.parametrize("agreed", [pinned_to("edge1"), pinned_to("edge3"), allocation(pinned=True)])
+def test_a_pin_holds_no_task_on_a_machine_that_has_never_been_heard(agreed: Allocation) -> None:
+    """The site comes back from a loss of power, and its owner does not: nobody ever took that one for gone."""
+    judge, others = Judge(spec=SPEC), {"edge2": 0.5}
+    found = [judged(judge, others, 0.1 * step, agreed=agreed, is_unheard=True) for step in range(int(UNSCORED_S * 10))]
+    assert {one.outcome for one in found} == {Outcome.WAIT}
+    leaves = judged(judge, others, UNSCORED_S, agreed=agreed, is_unheard=True)
+    assert (leaves.outcome, leaves.candidate) == (Outcome.PROPOSE, "edge2")
+    judge = Judge(spec=SPEC)
+    stays = {judged(judge, others, float(second), agreed=agreed).outcome for second in range(60)}
+    assert stays == {Outcome.STAY}, "it is heard, and has only no figures now"
+
+
+def test_a_task_that_is_pinned_hard_waits_for_a_machine_that_has_never_been_heard() -> None:
+    agreed = pinned_to("edge1", is_hard=True)
+    judge = Judge(spec=SPEC)
+    found = {
+        judged(judge, {"edge2": 0.5}, float(second), agreed=agreed, is_unheard=True).outcome for second in range(9)
+    }
+    assert found == {Outcome.NONE}
 
 
 def test_the_pinned_node_gets_the_task_back_once_it_is_fit_for_the_cool_down() -> None:

@@ -20,7 +20,7 @@ from zsched.core.scheduler.judge import Outcome
 from zsched.core.scheduler.rounds import TaskRound
 from zsched.core.values.fleet import Demand, Fleet, WorkerSpec
 from zsched.core.values.messages import Utilities
-from zsched.core.values.model import Allocation, PeerState
+from zsched.core.values.model import Allocation, Asked, PeerState, Pin
 from zsched.core.values.profile import WorkerState
 from zsched.core.vote.tally import VoteOutcome
 from zsched.core.vote.voting import Voting, vote_time
@@ -640,6 +640,32 @@ def test_a_claim_takes_nobody_s_only_place() -> None:
     """Who is first by its name has a choice, and would never have made room: the other one had no owner for good."""
     robot = RobotOfOrphans("robot1", 2000.0, plan_on=("edge1", "edge2"))
     assert robot.fled() == {"merge": "edge2", "plan": "edge2"}, "merge is refused there then, and goes on"
+
+
+def test_a_claim_leaves_a_task_that_is_pinned_hard_its_place() -> None:
+    """It has one, whatever other candidates there are."""
+    robot = RobotOfOrphans("robot1", 2000.0)
+    pin = Pin(node="edge2", asked=Asked(by="ada@robot1"), revision=5, is_hard=True)
+    robot.plan = replace(robot.plan, pinned=True, pin=pin)
+    assert robot.fled() == {"merge": "edge2", "plan": "edge2"}
+
+
+def test_an_elector_that_was_never_heard_is_not_counted_as_heard() -> None:
+    robot = Robot(owner="edge1")
+    robot.states.update(edge1=PeerState.GONE, robot3=PeerState.UNKNOWN)
+    robot.round(edge2=0.9)
+    figures = robot.rounds.tasks["merge"].figures
+    assert figures is not None
+    assert "robot3" in figures.electors
+    assert "robot3" not in figures.electors_heard
+
+
+def test_a_task_of_the_same_name_begins_without_the_memory_of_the_one_before() -> None:
+    robot = RobotOfTwo("robot1")
+    before = dict(robot.rounds.tasks)
+    robot.rounds.adopt(robot.rounds._fleet, robot.now, frozenset({"plan"}))
+    assert robot.rounds.tasks["merge"] is before["merge"]
+    assert robot.rounds.tasks["plan"] is not before["plan"]
 
 
 def test_a_task_that_flees_from_nobody_leaves_no_room_to_others() -> None:
