@@ -72,6 +72,7 @@ def read_tasks(section: Section, cast: Cast, out: Collector) -> tuple[TaskSpec, 
             _advise_network(task.tuning, entry.value, cast, out)
             _advise_deadline(task.tuning, task.worker, entry.value, out)
             _advise_gpu(task, entry.value, out)
+            _advise_gpu_limit(task, entry.value, out)
     split = frozenset(node.name for node in cast.nodes if node.local is not None)
     for conflict in rule_conflicts(tasks, cast.of_kind(NodeKind.ROBOT), split):
         _report(conflict, places, out)
@@ -294,6 +295,21 @@ def _advise_gpu(task: TaskSpec, given: Section, out: Collector) -> None:
     message += "no driver tells: the GPU counts where the task begins, and the task does not leave its owner for it"
     hint = "demand: {gpu: 0.3} (its share of one GPU; `zsched status` shows a machine's use with and without the task)"
     out.warn(section.where(gpu.name), message, hint)
+
+
+def _advise_gpu_limit(task: TaskSpec, given: Section, out: Collector) -> None:
+    """A limit that the task's own use breaks on an idle machine keeps it from all of them."""
+    gpu = BY_NAME["gpu"]
+    limit, most = dict(task.gauge_limits).get(gpu.name, gpu.high), gpu.high - gpu.margin
+    back = limit - gpu.margin
+    if limit < gpu.high and task.demand.gpu > max(back, gpu.low):
+        section: Section = given.get("limits")
+        message = (
+            f"no machine can get the task: its own demand of {task.demand.gpu:g} is above {max(back, gpu.low):g}, "
+            f"which is the limit less the margin of {gpu.margin:g}"
+        )
+        enough = task.demand.gpu + gpu.margin if task.demand.gpu <= most else gpu.high
+        out.warn(section.where(gpu.name), message, f"limits: {{gpu: {enough:g}}}, or more")
 
 
 def _advise_network(tuning: Tuning, given: Section, cast: Cast, out: Collector) -> None:

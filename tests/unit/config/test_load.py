@@ -854,6 +854,27 @@ def test_a_gpu_that_counts_without_the_task_s_use_of_it_is_a_warning(settings: s
         assert text.splitlines()[warning.line - 1][: warning.col - 1].endswith("gpu: ")
 
 
+@pytest.mark.parametrize(
+    ("settings", "above", "hint"),
+    [
+        ("limits: {gpu: 0.35}, demand: {gpu: 0.3}", "0.25", "{gpu: 0.4}, or more"),
+        ("limits: {gpu: 0.05}, demand: {gpu: 0.3}", "0", "{gpu: 0.4}, or more"),
+        ("limits: {gpu: 0.95}, demand: {gpu: 0.95}", "0.85", "{gpu: 1}, or more"),
+        ("limits: {gpu: 0.4}, demand: {gpu: 0.3}", "", ""),
+        ("limits: {gpu: 1}, demand: {gpu: 1}", "", ""),
+        ("limits: {gpu: 0.05}", "", ""),
+    ],
+)
+def test_a_limit_that_the_task_itself_breaks_everywhere_is_a_warning(settings: str, above: str, hint: str) -> None:
+    """It was never placed, and nobody said why."""
+    task = f"{{candidates: [r1], weights: {{cpu: 1}}, {settings}}}"
+    result = check(f"fleet: f\nnodes: {{r1: {{kind: robot}}}}\ntasks: {{t: {task}}}\n")
+    assert result.fleet is not None
+    found = [one for one in result.warnings if "no machine can get the task" in one.message]
+    assert [one.hint.endswith(hint) for one in found] == ([True] if above else [])
+    assert all(f"is above {above}, which" in one.message for one in found)
+
+
 # --- the price -------------------------------------------------------------------------------------------------------
 
 

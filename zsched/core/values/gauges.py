@@ -79,7 +79,7 @@ class Gauge(Struct, frozen=True, kw_only=True):
         at = f"{'would be' if is_reckoned else 'was last' if is_old else 'is'} at {self.shown(reading)}"
         if inside < 0.0:
             return f"{self.name} {at}, limit {self.shown(limit)}"
-        back = limit + sign * self.margin
+        back = min(max(limit + sign * self.margin, self.low), self.high)
         if is_owner or sign * (reading - back) >= 0.0:
             return ""
         return f"{self.name} {at}, limit {self.shown(limit)}, back from {self.shown(back)} on"

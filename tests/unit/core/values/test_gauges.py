@@ -128,3 +128,12 @@ def test_an_older_program_drops_weights_with_gauges_instead_of_agreeing_others()
 def test_hostile_readings_are_refused(bad: object) -> None:
     with pytest.raises(WireError):
         from_plain({**as_plain(profile_of()), "gauges": bad}, Profile)
+
+
+@pytest.mark.parametrize("name", [gauge.name for gauge in GAUGES])
+def test_no_limit_keeps_out_the_best_machine_there_can_be(name: str) -> None:
+    """A battery of 0.97 wanted 1.02 of others."""
+    gauge = BY_NAME[name]
+    steps = (gauge.low + (gauge.high - gauge.low) * step / 100 for step in range(101))
+    best = gauge.high if gauge.is_floor else gauge.low
+    assert {gauge.fault(best, limit, is_owner=False) for limit in steps} == {""}
