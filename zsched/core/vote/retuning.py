@@ -14,7 +14,6 @@ value is agreed.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
 from typing import Any
@@ -58,8 +57,10 @@ class Retuning(Struct):
             self._heard.add(peer)
             if revision > ours:
                 self._ahead[peer] = revision
-        elif self._ahead and ours >= self._ahead.get(peer, math.inf):
-            del self._ahead[peer]
+        elif peer in self._ahead:
+            self._ahead[peer] = min(revision, self._ahead[peer])  # revisions only rise: what falls was no true word
+            if ours >= self._ahead[peer]:
+                del self._ahead[peer]
 
     def on_gone(self, peer: NodeId) -> None:
         """A peer is gone: what it has when it is heard again may be old for all others."""
@@ -69,7 +70,10 @@ class Retuning(Struct):
     def adopt(self, old: Fleet, new: Fleet, values: Mapping[TaskId, Allocation], now: float) -> None:
         """Want what differs between two files; a task that was never agreed begins with the new file's tuning."""
         known = {task.name: task for task in old.tasks}
-        rank = [node.name for node in new.nodes].index(self.me)
+        names = [node.name for node in new.nodes]
+        rank = names.index(self.me)
+        self._heard.intersection_update(names)
+        self._ahead = {peer: revision for peer, revision in self._ahead.items() if peer in names}
         self._wishes = {task: wish for task, wish in self._wishes.items() if any(one.name == task for one in new.tasks)}
         for task in new.tasks:
             value = values[task.name]

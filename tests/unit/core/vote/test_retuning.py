@@ -145,3 +145,28 @@ def test_a_second_file_takes_back_what_the_first_one_wanted() -> None:
     assert list(retuning.due({"merge": late}, 0.2)) == [("merge", Retune(base_revision=6, tuning=FILE))]
     assert list(retuning.due({"merge": replace(value, revision=7)}, 0.3 + 2 * AGAIN_S)) == []
     assert retuning.is_idle
+
+
+def test_a_revision_that_no_later_beat_confirms_silences_nobody() -> None:
+    """A forged first beat told of a revision that never comes: nothing was proposed here for as long as it lived."""
+    retuning = Retuning("edge1")
+    old, new = fleet_of(task_of(tuning=FILE)), fleet_of(task_of(tuning=replace(FILE, bonus=0.2)))
+    values = {"merge": replace(allocation_of(5, "edge1"), tuning=FILE)}
+    retuning.hear("edge2", 1 << 53, 4)
+    retuning.adopt(old, new, values, 0.0)
+    assert retuning.is_idle, "it may know better"
+    retuning.hear("edge2", 5, 4)
+    retuning.adopt(old, new, values, 0.0)
+    assert retuning.is_idle, "it has one more"
+    retuning.hear("edge2", 5, 5)
+    retuning.adopt(old, new, values, 0.0)
+    assert not retuning.is_idle
+
+
+def test_who_has_left_the_fleet_is_not_waited_for() -> None:
+    retuning = Retuning("edge1")
+    old, new = fleet_of(task_of(tuning=FILE)), fleet_of(task_of(tuning=replace(FILE, bonus=0.2)))
+    values = {"merge": replace(allocation_of(5, "edge1"), tuning=FILE)}
+    retuning.hear("stranger", 9, 4)
+    retuning.adopt(old, new, values, 0.0)
+    assert not retuning.is_idle
