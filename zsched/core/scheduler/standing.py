@@ -9,6 +9,7 @@ from __future__ import annotations
 import statistics
 from collections.abc import Callable, Iterable, Mapping
 
+from zsched.core.scheduler.damping import MAX_PENALTY
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.model import Aggregate, Allocation, NodeId, Reach, Utility, UtilityVector
 from zsched.core.values.quorum import majority
@@ -90,13 +91,15 @@ def _aggregates(
 def joined(penalties: Iterable[Mapping[NodeId, float]]) -> dict[NodeId, float]:
     """What any of them holds against a node, the most of it: forgetting (a restart) and not knowing say nothing.
 
+    No robot's word costs a node more than `MAX_PENALTY`, whatever it says.
+
     >>> joined([{"edge1": 0.09}, {}, {"edge1": 0.03, "edge2": 0.03}])
     {'edge1': 0.09, 'edge2': 0.03}
     """
     most: dict[NodeId, float] = {}
     for held in penalties:
         for name, penalty in held.items():
-            most[name] = max(penalty, most.get(name, 0.0))
+            most[name] = max(min(penalty, MAX_PENALTY), most.get(name, 0.0))
     return dict(sorted(most.items()))
 
 
