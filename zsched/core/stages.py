@@ -328,7 +328,7 @@ class Stages:
         unfit = self.agreement.leases.unfit() if self.executors[spec.name].is_leased else {}
         loads = ((name, profile.worker(spec.name)) for name, profile in self._heard(spec, now))
         ready = (name for name, load in loads if load is not None and load.state is WorkerState.READY)
-        unseen = self.unseen.look(spec, ready, self.probation, now)
+        unseen = self.unseen.look(spec, ready, self.probation, now, self.fleet.timing.decide_s)
         if not in_grace and not unproven and not unfit and not unseen:
             return NO_DOUBTS
         return Doubts(in_grace=in_grace, unproven=unproven, unseen=unseen, unfit=unfit)

@@ -49,7 +49,9 @@ class Unseen(Struct):
             del self.found[task]
             self._since.pop(task, None)
 
-    def look(self, spec: TaskSpec, ready: Iterable[NodeId], tokens: Probation, now: float) -> frozenset[NodeId]:
+    def look(
+        self, spec: TaskSpec, ready: Iterable[NodeId], tokens: Probation, now: float, period_s: float = 0.0
+    ) -> frozenset[NodeId]:
         """The candidates that no stream reaches, as far as it can be told.
 
         Args:
@@ -57,8 +59,9 @@ class Unseen(Struct):
             ready: other nodes that are candidates, live, and whose fresh profile calls the worker ready.
             tokens: knows which workers our relay sees.
             now: monotonic seconds.
+            period_s: the longest time between two looks, while all is well.
         """
-        if now - self._looked_at > LONGEST_GAP_S:
+        if now - self._looked_at > max(LONGEST_GAP_S, 2.0 * period_s):
             self._since.clear()
         self._looked_at = now
         is_seen = {name: tokens.sees(name, spec.name) for name in ready} if shows_token(spec) else {}

@@ -24,7 +24,7 @@ class Robot:
     def __init__(self, *seen: str, spec: TaskSpec = TASK) -> None:
         self.spec, self.now = spec, 100.0
         self.tokens = Probation(fleet_of(TASK, OTHER, of=TASK.candidates, electors=("edge1",)))
-        self.unseen = Unseen()
+        self.unseen, self.period_s = Unseen(), STEP_S
         for name in seen:
             self.show(name)
 
@@ -32,7 +32,7 @@ class Robot:
         self.tokens.on_token(name, task, "1", is_present=is_present, now=self.now)
 
     def look(self, *ready: str) -> set[str]:
-        return set(self.unseen.look(self.spec, ready or EDGES, self.tokens, self.now))
+        return set(self.unseen.look(self.spec, ready or EDGES, self.tokens, self.now, self.period_s))
 
     def pass_time(self, seconds: float, *ready: str) -> set[str]:
         found, end = self.look(*ready), self.now + seconds
@@ -94,6 +94,19 @@ def test_a_robot_that_stood_still_begins_anew() -> None:
     robot.now += LONGEST_GAP_S + 0.01
     assert robot.look() == set()
     assert robot.pass_time(UNSEEN_S) == {"edge1"}
+
+
+def test_a_robot_that_looks_seldom_finds_it_all_the_same() -> None:
+    """Alone with `decide_s: 8` it forgot at every look what it had seen at the one before."""
+    robot = Robot("edge2")
+    robot.period_s = LONGEST_GAP_S + 3.0
+    found = [robot.look()]
+    for _ in range(2):
+        robot.now += robot.period_s
+        found.append(robot.look())
+    assert found == [set(), set(), {"edge1"}]
+    robot.now += 2.0 * robot.period_s + 0.01
+    assert robot.look() == set()
 
 
 @pytest.mark.parametrize(
