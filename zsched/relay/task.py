@@ -124,6 +124,8 @@ class TaskRelay:
         self._acks = acks
         self._report = report
         self._queue: queue.SimpleQueue[_Item] = queue.SimpleQueue()
+        self._is_woken = False
+        """A wake waits in the queue, which nobody has looked at yet."""
         self._plan: RoutePlan | None = None
         self._slots: dict[int, _OpenSlot] = {}
         self._streams = streams
@@ -165,7 +167,9 @@ class TaskRelay:
 
     def wake(self) -> None:
         """Something that readiness or draining hangs on has changed."""
-        self._queue.put(None)
+        if not self._is_woken:  # one look behind all of them is enough
+            self._is_woken = True
+            self._queue.put(None)
 
     def lose_daemon(self) -> None:
         """Nobody would tell us of another owner from now on, until the next plan."""
@@ -215,6 +219,8 @@ class TaskRelay:
         while True:
             try:
                 plan = self._queue.get(timeout=self._wait_s())
+                if plan is None:
+                    self._is_woken = False
                 self._heard_at = monotonic_s()
             except queue.Empty:
                 plan = None
@@ -366,7 +372,7 @@ class TaskRelay:
         try:
             self._services.stop()
             for source in self._streams.inputs.values():
-                source.stop()
+                source.finish()
             while (self._streams.under_way or self._services.is_asked) and monotonic_s() < finish.until:
                 for source in self._streams.inputs.values():
                     source.look_after()

@@ -92,6 +92,26 @@ class Scene:
         return next(iter(self.task.counts()), StreamCount(stream="t/in/0"))
 
 
+def test_however_often_it_is_woken_one_look_is_enough(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Somebody's end markers, faster than a look: the queue grew, and a plan waited behind all of them."""
+    is_in, go_on = threading.Event(), threading.Event()
+
+    def step() -> None:
+        is_in.set()
+        go_on.wait(60)
+
+    monkeypatch.setattr(scene.task, "_step", step)
+    scene.task.wake()
+    try:
+        assert is_in.wait(60)
+        for _ in range(1000):
+            scene.task.wake()
+        assert scene.task._queue.qsize() == 1
+    finally:
+        go_on.set()
+    until(lambda: not scene.task._queue.qsize(), "the look behind all of them")
+
+
 @pytest.fixture
 def scene(monkeypatch: pytest.MonkeyPatch) -> Iterator[Scene]:
     monkeypatch.setattr(greetings, "FOREIGN_S", 0.3)

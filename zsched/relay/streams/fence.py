@@ -42,6 +42,7 @@ class Fence:
         if is_older and monotonic_s() < self._until:
             return False
         self._newest[name] = stamp
+        self._newest.move_to_end(name)
         if len(self._newest) > MAX_STAMPS:
             self._newest.popitem(last=False)
         return True

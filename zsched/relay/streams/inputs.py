@@ -268,6 +268,7 @@ class InputStream:
         """
         ended = threading.Event()
         with self._lock:
+            self._end_hold()  # nobody sends what waits behind a flip once this has ended
             self._has_end, slot = True, self._active
             self._send_passed_over(math.inf)
         if slot is None:
@@ -329,6 +330,12 @@ class InputStream:
             said.in_flight = said.waiting = 0
             self._closed.add(said)
             return left
+
+    def finish(self) -> None:
+        """Unsubscribe; what waits behind a flip goes out now, and is waited for with the rest (`under_way`)."""
+        self.stop()
+        with self._lock:
+            self._end_hold()
 
     def stop(self) -> None:
         """Unsubscribe; what a rate has held back goes out now, for nobody looks after it any more."""
@@ -613,6 +620,8 @@ class InputStream:
             values = self._kept[key] = deque(maxlen=self._keep_last)
             if len(self._kept) > MAX_KEYS:
                 self._kept.popitem(last=False)
+        else:
+            self._kept.move_to_end(key)  # who gives way is who has rested longest
         values.append((self._number, sample, stamp))
         return stamp
 

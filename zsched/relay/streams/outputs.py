@@ -242,13 +242,14 @@ class OutputStream:
     def flip(self, epoch: int, *, drops_held: bool) -> None:
         """Let the slot's samples through, by the stream's handover rule.
 
-        ``drops_held``: what it made of warm-up values is older than what the carrier has let through meanwhile.
+        ``drops_held``: what it made of warm-up values is older than what the carrier has let through meanwhile. A
+        ``reliable`` output drops nothing: its answers may be to other robots' samples, and are acknowledged.
         """
         with self._lock:
             slot = self._slots.get(epoch)
             if slot is None or slot.is_flipped:
                 return
-            if drops_held:
+            if drops_held and self.route.settings.stream_class is not StreamClass.RELIABLE:
                 self._counter.dropped("superseded", len(slot.held))
                 slot.held.clear()
                 slot.held_bytes = 0

@@ -19,8 +19,10 @@ from zsched.core.hop.books import unaccounted
 from zsched.core.relay_protocol import EndMarker
 from zsched.core.values.plan import Direction, HandoverRule, Route, StreamClass, StreamSettings
 from zsched.ipc.pipe import decode_end, encode_end
-from zsched.relay.streams import outlet, outputs, receive, slots
+from zsched.relay.streams import fence as fences
+from zsched.relay.streams import inputs, outlet, outputs, receive, slots
 from zsched.relay.streams.acks import Acks
+from zsched.relay.streams.fence import Fence
 from zsched.relay.streams.inputs import InputStream
 from zsched.relay.streams.lanes import Lane
 from zsched.relay.streams.outputs import OutputStream
@@ -158,6 +160,48 @@ def test_kept_values_warm_up_a_slot_key_by_key(bench: Bench) -> None:
     until(lambda: got[-1] == ("edge1/t/a/map", "a3"), "only that one again")
     assert stream.count().replayed == 5
     kept.undeclare()
+
+
+def test_of_many_keys_those_give_way_that_have_rested_longest(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A new owner lacked the value of the key that was known longest, however often it came."""
+    monkeypatch.setattr(inputs, "MAX_KEYS", 2)
+    stream = bench.input(way_in(StreamClass.LATEST, "robot1/*/map", "edge1/t/*/map"))
+    a, b, c = (bench.publisher(f"robot1/{name}/map") for name in ("a", "b", "c"))
+    for number, publisher in enumerate((a, b, a, c), start=1):
+        publisher.put("value")
+        until(lambda number=number: stream.count().messages == number, "it comes")  # type: ignore[misc]
+    assert [str(sample.key_expr) for sample, _ in stream.kept()] == ["robot1/a/map", "robot1/c/map"]
+    fence = Fence()
+    stamps = [bench.relay.new_timestamp() for _ in range(2)]
+    monkeypatch.setattr(fences, "MAX_STAMPS", 2)
+    fence.begin(is_first=False)
+    assert [fence.passes(key, stamps[1]) for key in ("a", "b", "a", "c")] == [True] * 4
+    assert not fence.passes("a", stamps[0])
+
+
+def test_what_waits_behind_a_flip_goes_out_when_the_stream_ends(bench: Bench) -> None:
+    """Its application has closed: nobody sent it when the former owner had done its last."""
+    got: list[str] = []
+    kept = bench.outside.declare_subscriber("edge2/t/in", lambda sample: got.append(sample.payload.to_string()))
+    former = bench.outside.declare_subscriber("edge1/t/in", lambda _: None)
+    for end in ("end", "finish"):
+        route, stream = way_in(StreamClass.RELIABLE), bench.flowing(way_in(StreamClass.RELIABLE))
+        publisher = bench.publisher("robot1/in")
+        stream.open(2, replace(route, to_expr="edge2/t/in"))
+        until(lambda stream=stream: stream.is_matching(2), "the next owner subscribes")  # type: ignore[misc]
+        with stream._lock:
+            assert stream._active is not None
+            stream._hold(stream._active, stream._slots[2])
+        publisher.put(end)
+        until(lambda stream=stream: stream.count().messages == 1, "it comes")  # type: ignore[misc]
+        assert not got
+        getattr(stream, end)()
+        until(lambda end=end: got == [end], "it goes on")  # type: ignore[misc]
+        got.clear()
+        stream.close()
+        publisher.undeclare()
+    kept.undeclare()
+    former.undeclare()
 
 
 def test_the_end_marker_names_its_source_and_the_number_behind_it(bench: Bench) -> None:
@@ -409,15 +453,16 @@ def test_a_thinned_stream_ends_with_its_newest_value(bench: Bench) -> None:
 class Handover:
     """An output between the owner of epoch 1 (the carrier) and that of epoch 2 (prepared)."""
 
-    def __init__(self, bench: Bench, rule: HandoverRule) -> None:
+    def __init__(self, bench: Bench, rule: HandoverRule, stream_class: StreamClass = StreamClass.RELIABLE) -> None:
         self.got: list[str] = []
         self.wakes: list[int] = []
         self.bench = bench
         self.kept = bench.outside.declare_subscriber("robot1/out", lambda s: self.got.append(s.payload.to_string()))
-        self.stream = bench.output(way_out(1, rule), lambda: self.wakes.append(1))
-        for epoch in (1, 2):
-            self.stream.open(epoch, way_out(epoch, rule))
-        self.old, self.new = (bench.publisher(way_out(epoch, rule).from_expr) for epoch in (1, 2))
+        first, second = (way_out(epoch, rule, stream_class) for epoch in (1, 2))
+        self.stream = bench.output(first, lambda: self.wakes.append(1))
+        for epoch, route in ((1, first), (2, second)):
+            self.stream.open(epoch, route)
+        self.old, self.new = (bench.publisher(route.from_expr) for route in (first, second))
         self.stream.flip(1, drops_held=False)
         self.count = 0
 
@@ -585,8 +630,19 @@ def test_a_marker_of_another_epoch_ends_nothing(bench: Bench, monkeypatch: pytes
     assert move.stream.has_ended(1)
 
 
-def test_answers_to_warm_up_values_that_have_changed_are_dropped(bench: Bench) -> None:
+def test_reliable_answers_are_never_dropped_for_a_warm_up_value_that_has_changed(bench: Bench) -> None:
+    """They may be to what another robot has sent, which has flipped before, and their worker has let go of them."""
     move = Handover(bench, HandoverRule.ALL)
+    move.put(move.new, "to robot2")
+    move.stream.flip(2, drops_held=True)
+    move.put(move.new, "to us")
+    move.stream.close_slot(1)
+    assert move.is_through("to robot2", "to us")
+    assert drops(move.stream) == {}
+
+
+def test_answers_to_warm_up_values_that_have_changed_are_dropped(bench: Bench) -> None:
+    move = Handover(bench, HandoverRule.ALL, StreamClass.LATEST)
     move.put(move.new, "stale")
     move.stream.flip(2, drops_held=True)
     move.put(move.new, "fresh")
