@@ -187,8 +187,9 @@ class Answers:
         return sum(self._missing_of(one, passed.get(one, 0), ends.get(one, 0)) for one in self._names.get(key, ()))
 
     def _missing_of(self, name: SourceName, passed: int, end: int) -> int:
-        start = self._start_of(name)
-        return 0 if start is None else max(0, max(end, self._acks.arrived(name)) - max(start, passed))
+        start, early = self._start_of(name), self._early.get(name)
+        told = 0 if early is None else max(early.samples) + 1
+        return 0 if start is None else max(0, max(end, told, self._acks.arrived(name)) - max(start, passed))
 
     def first_of(self, name: SourceName) -> int | None:
         """The first number that counts as lost when it does not come; ``None``: the first one that comes."""

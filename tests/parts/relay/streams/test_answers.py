@@ -198,6 +198,16 @@ def test_a_tail_that_is_asked_for_in_vain_is_counted_when_the_slot_closes(
     assert stream.count().lost == lost
 
 
+def test_what_waits_for_a_missing_one_is_counted_with_it_when_the_slot_closes(bench: Bench) -> None:
+    """Its owner died before it could send that again, and left no end marker: five of six were in no counter."""
+    stream = bench.open()
+    bench.put(0, 2, 3, 4, 5)
+    bench.wait_ack(arrived=1, has_gap=True, until=2)
+    assert bench.is_through(0)
+    stream.close_slot(1)
+    assert stream.count().lost == 5
+
+
 def test_what_never_comes_is_given_up_also_when_nothing_else_comes(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
