@@ -91,6 +91,8 @@ class Tokens:
             return
         if (key in self._present) != is_present:
             self._of_node[node] += 1 if is_present else -1
+            if not self._of_node[node]:
+                del self._of_node[node]  # a stranger's tokens may have any name
         self._present = self._present | {key} if is_present else self._present - {key}
         if (worker := _worker(key, is_present=is_present)) is not None:
             self._on_worker(worker)
