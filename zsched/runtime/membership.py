@@ -687,12 +687,13 @@ def bring_back(fleet: str, node: NodeId, places: Places, *, is_secured: bool) ->
 
 
 def finish_back(fleet: str, node: NodeId, places: Places, *, is_secured: bool) -> None:
-    """Give the files their names again that `put_away` had renamed when it was broken off, before the state.
+    """Give the files their names again that are still put away: `put_away` or `bring_back` was broken off.
 
     Raises:
         AdapterError: a daemon runs by them, they are another node's, or one cannot be renamed.
     """
-    gone = [path for path in _come_back(places, is_secured=is_secured) if not os.path.lexists(path)]
+    all_of_it = (*_come_back(places, is_secured=is_secured), places.state / STATE_NAME)
+    gone = [path for path in all_of_it if not os.path.lexists(path)]
     if any(os.path.lexists(_left_name(path)) for path in gone):
         with StateFile(places.state, fleet=fleet, node=node) as file:
             file.check_owner()

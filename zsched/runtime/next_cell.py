@@ -186,8 +186,7 @@ def go_over(change: Change, places: Places) -> tuple[Written, ...]:
         AdapterError: a daemon runs by them, or a file cannot be renamed or written.
         ConfigError: the document cannot be used here.
     """
-    has_state = (places.state / STATE_NAME).exists()
-    if whose(places.state)[0] == change.former if has_state else _is_file_of(change.former, places.config):
+    if _is_the_former_here(change, places):
         put_away(change.former, change.invitation.node, places, is_purged=False, comes_back=True)
     if is_joined(change.invitation, places):
         return ()
@@ -216,11 +215,18 @@ def go_back(change: Change, places: Places) -> None:
     Raises:
         AdapterError: a daemon runs by the files, or one cannot be renamed.
     """
-    if (places.state / STATE_NAME).exists() and whose(places.state)[0] == change.former:
-        # its state is put away last: what was renamed before a power cut has no other way back
+    if _is_the_former_here(change, places):
+        # what was renamed before a power cut has no other way back, and what has come back must not be deleted
         finish_back(change.former, change.invitation.node, places, is_secured=change.former_is_secured)
         return
     bring_back(change.invitation.fleet, change.invitation.node, places, is_secured=change.former_is_secured)
+
+
+def _is_the_former_here(change: Change, places: Places) -> bool:
+    """Whether this machine's files are the former cell's, all or some: the state goes last, and comes back last."""
+    if (places.state / STATE_NAME).exists():
+        return whose(places.state)[0] == change.former
+    return _is_file_of(change.former, places.config)
 
 
 def _is_file_of(fleet: str, path: Path) -> bool:
@@ -240,7 +246,8 @@ def end(state: Path) -> None:
     """
     folder = state / NEXT_CELL
     try:
-        (folder / INVITATION).unlink(missing_ok=True)
+        with contextlib.suppress(FileNotFoundError), _opened(folder) as held:
+            (held / INVITATION).unlink(missing_ok=True)
         if folder.exists():
             shutil.rmtree(folder)
             sync_folder(state)

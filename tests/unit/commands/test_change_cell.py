@@ -441,22 +441,38 @@ def test_files_that_were_put_away_in_part_get_their_names_again_on_the_way_back(
     assert (whose(site.folder / "state"), site.running) == (("hall-a", ME), "hall-a")
 
 
+def check_goes_on(site: Site, word: str, before: set[str]) -> None:
+    """Whatever was broken off, the machine gets to that cell; ``before``: its files when it was hall-a's."""
+    site.is_taken = True
+    done = run("--to", word, "--yes")
+    if word == "hall-b":
+        assert done.exit_code == 0
+        check_arrived(site)
+    else:
+        assert "works in hall-a as before" in done.stderr
+        assert before <= set(kept(site.folder))
+        assert (whose(site.folder / "state"), site.running) == (("hall-a", ME), "hall-a")
+
+
+@pytest.mark.parametrize("word", ["hall-a", "hall-b"])
 @pytest.mark.parametrize("number", slices(9))
 def test_a_way_back_that_was_broken_off_goes_on_either_way(
-    site: Site, monkeypatch: pytest.MonkeyPatch, number: int
+    site: Site, monkeypatch: pytest.MonkeyPatch, number: int, word: str
 ) -> None:
+    before = {name for name in kept(site.folder) if not name.endswith(".left")}
     site.is_taken = False
     if not broken_at(monkeypatch, "_put_one_away", number, lambda _path, *, is_deleted: is_deleted):
         return
-    site.is_taken = True
-    assert run("--to", "hall-b", "--yes").exit_code == 0
-    check_arrived(site)
+    check_goes_on(site, word, before)
 
 
+@pytest.mark.parametrize("word", ["hall-a", "hall-b"])
 @pytest.mark.parametrize("number", slices(12))
 def test_a_way_back_that_was_broken_off_between_two_files_goes_on(
-    site: Site, monkeypatch: pytest.MonkeyPatch, number: int
+    site: Site, monkeypatch: pytest.MonkeyPatch, number: int, word: str
 ) -> None:
+    """Towards hall-a it deleted the files that it had given their names again."""
+    before = {name for name in kept(site.folder) if not name.endswith(".left")}
     site.is_taken = False
     real, left, is_back = sync_folder, [number], [False]
 
@@ -476,9 +492,7 @@ def test_a_way_back_that_was_broken_off_between_two_files_goes_on(
         CliRunner().invoke(app, ["leave", "--to", "hall-b", "--yes"])
     if left[0] >= 0:
         return  # it takes fewer steps
-    site.is_taken = True
-    assert run("--to", "hall-b", "--yes").exit_code == 0
-    check_arrived(site)
+    check_goes_on(site, word, before)
 
 
 @pytest.mark.parametrize(
