@@ -206,7 +206,9 @@ class Daemon:
         node.fleet_path = str(self._options.config.absolute())
         node.by_file = self._in_file
         node.copied_file = copied_file(self._options.state_dir)
-        if restored.problem is not None:
+        if restored.is_unsaved:
+            node.agreement.on_persist_failed(restored.problem or "")
+        elif restored.problem is not None:
             node.problems["state"] = restored.problem
         if self._memory_objection:
             log.warning("shared_memory off why=%s", self._memory_objection)

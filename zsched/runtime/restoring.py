@@ -29,9 +29,11 @@ class Restored(Struct, frozen=True, kw_only=True):
     incarnation: int
     """Of this start: above that of each start before that the folder tells of, also where there is no state."""
     state: DurableState | None = None
-    """With this life's incarnation, on the disk already; ``None``: this node is no elector."""
+    """With this life's incarnation; ``None``: this node is no elector."""
+    is_unsaved: bool = False
+    """The disk refuses this life: by the state it is known what was agreed, and this node is no elector."""
     problem: str | None = None
-    """Why there is no state."""
+    """Why there is no state, or why it is not saved."""
     is_foreign: bool = False
     """It was made with another electorate than the fleet file names."""
     is_others: bool = False
@@ -41,7 +43,7 @@ class Restored(Struct, frozen=True, kw_only=True):
 
 
 def restore(state_file: StateFile, fleet: Fleet, *, config: Path, node: NodeId, state_dir: Path) -> Restored:
-    """The durable state with this start's incarnation on disk, or why there is none; both are logged.
+    """The durable state with this start's incarnation on disk, or why it is not there; both are logged.
 
     ``config``, ``node`` and ``state_dir`` are named in the advice.
     """
@@ -67,7 +69,7 @@ def restore(state_file: StateFile, fleet: Fleet, *, config: Path, node: NodeId, 
     try:
         state_file.save(state)
     except AdapterError as error:
-        return Restored(incarnation=incarnation, problem=str(error))
+        return Restored(incarnation=incarnation, state=state, is_unsaved=True, problem=str(error))
     return Restored(incarnation=incarnation, state=state)
 
 

@@ -11,6 +11,7 @@ from support.fleets import fleet_of
 from support.states import state_of
 from zsched.adapters.host.state_file import LIFE_NAME, StateFile
 from zsched.core.values.fleet import electorate_hash
+from zsched.errors import AdapterError
 from zsched.runtime import restoring
 from zsched.runtime.restoring import Restored, restore
 
@@ -76,3 +77,23 @@ def test_a_life_that_cannot_be_noted_is_lived_all_the_same(
     (tmp_path / LIFE_NAME).mkdir()
     assert start(tmp_path, monkeypatch, 5000).incarnation == 5000
     assert "life not noted why=cannot write" in caplog.text
+
+
+def test_a_disk_that_refuses_this_life_keeps_nobody_from_knowing_what_was_agreed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It started by its fleet file: in a fleet that was created by a command it was a stranger to all others."""
+    save(tmp_path, 7000)
+    with monkeypatch.context() as patch:
+        patch.setattr(StateFile, "save", refuse)
+        found = start(tmp_path, patch, 40)
+    assert found.is_unsaved
+    assert found.problem == "cannot write state: No space left on device"
+    assert found.state == replace(STATE, incarnation=7001, disk=found.state.disk if found.state else "")
+    again = start(tmp_path, monkeypatch, 40)
+    assert (again.is_unsaved, again.problem) == (False, None)
+    assert again.incarnation > found.incarnation
+
+
+def refuse(*_given: object) -> None:
+    raise AdapterError("cannot write state: No space left on device")
