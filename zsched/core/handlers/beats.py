@@ -49,7 +49,7 @@ def send_beat(node: Stages, todo: ToDo, now: float) -> None:
         has_voted=node.agreement.has_voted,
         generation=node.agreement.generation or 0,
         lease_terms=node.agreement.leases.terms_told,
-        votes=node.agreement.witness.votes,
+        votes=node.agreement.votes_kept,
         number=node.agreement.number,
         fleet_revision=node.agreement.fleet_revision,
         has_lost_state=node.me in node.agreement.electors and not node.agreement.is_elector,

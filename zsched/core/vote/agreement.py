@@ -300,12 +300,17 @@ class Agreement:
             fleet=self._numbers.changed,
         )
 
+    @property
+    def votes_kept(self) -> int:
+        """How often this life has voted, as its disk knows: what the disk refused was never voted."""
+        return 0 if self._durable is None else self.witness.votes
+
     def answer(self) -> Learnt:
         """This node's answer to a peer: its learnt values, and its memory of electors and of itself."""
         return replace(
             self.learnt(),
             incarnation=0 if self._durable is None else self.witness.incarnation,
-            votes=0 if self._durable is None else self.witness.votes,  # what the disk refused was never voted
+            votes=self.votes_kept,
             seen=as_tuple(self.witness.seen),
             lease_terms=self.leases.terms,
         )
