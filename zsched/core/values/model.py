@@ -219,6 +219,7 @@ def told_by(asked: Asked) -> str:
 def _check_text(field: str, text: str, longest: int) -> None:
     if len(text) > longest:
         raise ValueError(f"{field}: {len(text)} characters, at most {longest}")
+    text.encode()  # half a character (a surrogate), which JSON may hold, goes into no frame: a `ValueError`, too
 
 
 class Pause(Struct, frozen=True, kw_only=True):
