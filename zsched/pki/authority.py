@@ -27,7 +27,7 @@ from zsched.core.values.struct import Struct, replace
 from zsched.errors import AdapterError
 from zsched.files import read_regular
 from zsched.pki import certificates as x509
-from zsched.pki.files import PRIVATE, PUBLIC, make_folder, write_whole
+from zsched.pki.files import PRIVATE, PUBLIC, make_folder, open_lock, write_whole
 from zsched.sessions.certificate import validities
 
 TRUSTED, RECORD, LOCK = "ca.pem", "authority.json", ".lock"
@@ -424,7 +424,7 @@ def opened(folder: Path, fleet: str) -> Iterator[Authority]:
     """
     try:
         record = _record(json.loads(read_regular(folder / RECORD, MAX_BYTES)))
-        descriptor = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, PRIVATE)
+        descriptor = open_lock(folder / LOCK)
     except FileNotFoundError as error:
         raise AdapterError(
             f"there is no authority in {folder}; `zsched pki init` makes one, --authority DIR says where it lies"

@@ -46,6 +46,21 @@ def write_whole(path: Path, content: bytes, mode: int, *, is_for_folder: bool = 
     _sync(path.parent)
 
 
+def open_lock(path: Path) -> int:
+    """A descriptor of a file that is only locked; one that is not there is made, for the folder's owner.
+
+    Raises:
+        OSError: it cannot be opened or made, or it is a link.
+    """
+    flags = os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW
+    try:
+        descriptor = os.open(path, flags | os.O_CREAT | os.O_EXCL, PRIVATE)
+    except FileExistsError:
+        return os.open(path, flags)
+    _give(descriptor, path.parent)
+    return descriptor
+
+
 def _give(descriptor: int, folder: Path) -> None:
     """Hand an open file over to its folder's owner (root only): its name there may lead elsewhere by now."""
     if os.geteuid() == 0:
