@@ -258,6 +258,8 @@ def test_node_whose_disk_refused_is_no_elector_and_says_so() -> None:
     assert snapshot.quorum.this_node == "lost_state"
     assert snapshot.quorum.alive == 2
     assert any("no space left" in text and "restarted" in text for text in snapshot.problems)
+    (told,) = of(node.handle(ev.DeadlineReached(), 102.0), do.PublishBeat)
+    assert told.beat.votes == node.agreement.answer().votes == 0, "more in the beat, and all would ask it for ever"
 
 
 def test_refused_disk_loses_no_route() -> None:

@@ -357,3 +357,16 @@ def test_a_key_of_another_authority_is_refused(authority: Authority, tmp_path: P
     authority.key_path.write_bytes(other.key_path.read_bytes())
     with pytest.raises(AdapterError, match="is not the key of"):
         issue(authority)
+
+
+def test_the_lock_is_made_through_no_link(authority: Authority, tmp_path: Path) -> None:
+    lock, elsewhere = authority.folder / module.LOCK, tmp_path / "elsewhere"
+    lock.unlink(missing_ok=True)
+    lock.symlink_to(elsewhere)
+    with pytest.raises(AdapterError, match="cannot be read"), opened(authority.folder, FLEET):
+        pass
+    assert not elsewhere.exists()
+    lock.unlink()
+    for _ in range(2):
+        with opened(authority.folder, FLEET):
+            assert stat.S_IMODE(lock.stat().st_mode) == 0o600

@@ -423,6 +423,13 @@ def test_a_rehearsal_keeps_within_its_bounds() -> None:
         replace(keep, body=Text("\ud800"))
 
 
+@pytest.mark.parametrize("field", ["by", "reason"])
+def test_half_a_character_is_no_word_of_an_order(field: str) -> None:
+    """JSON may hold one: its proposer kept it, and all others had another sign for the same revision."""
+    with pytest.raises(ValueError, match="surrogates not allowed"):
+        Asked(**{"by": "ada@robot1", field: "\ud800"})
+
+
 def test_a_state_follows_a_generation_by_its_id_only() -> None:
     assert state_of("robot1", joins="ab12").joins == "ab12"
     with pytest.raises(ValueError, match=r"state\.joins: 'generation 2' is not an id"):
