@@ -12,7 +12,7 @@ import zenoh
 
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import until
-from zsched.core.relay_protocol import REFUSED_ENCODING
+from zsched.core.relay_protocol import REFUSED_ENCODING, ServiceProblem
 from zsched.core.values.plan import Direction, Route, ServiceSettings, StreamSettings
 from zsched.core.values.struct import replace
 from zsched.relay.services import service
@@ -109,6 +109,26 @@ def asked(bench: Bench) -> tuple[threading.Thread, list[str]]:
     thread.start()
     until(lambda: sum(count.messages for count in bench.services.counts()) > before, "the relay has it")
     return thread, heard
+
+
+def test_an_asker_that_takes_no_refusal_holds_up_nobody_else(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It was refused in zenoh's thread: with its link full, all requests behind it waited."""
+    fail, go_on = service.ServiceStream._fail, threading.Event()
+
+    def refuse(stream: service.ServiceStream, query: zenoh.Query, problem: ServiceProblem, text: str) -> None:
+        if problem is ServiceProblem.BUSY:
+            go_on.wait(60)
+        fail(stream, query, problem, text)
+
+    monkeypatch.setattr(service.ServiceStream, "_fail", refuse)
+    bench.open(replace(SERVICE, service=ServiceSettings(hold_s=5.0, max_pending=1)))
+    try:
+        first, stalled, behind = (asked(bench) for _ in range(3))
+    finally:
+        go_on.set()
+    for thread, _ in (first, stalled, behind):
+        thread.join(30.0)
+    assert [heard[0].partition(":")[0] for _, heard in (first, stalled, behind)] == ["no owner", "busy", "busy"]
 
 
 def test_a_request_for_which_nobody_is_there_any_more_is_told_so_and_counted_with_its_service(bench: Bench) -> None:

@@ -19,13 +19,14 @@ zenoh ends a request when its owner's link ends, but not one that left within th
 queryables went with it: that would wait for its whole time. So `ServiceStream.look_after` ends what nobody can answer.
 
 A thread per request, at most ``max_pending`` of them: a plain callback would serialise all requests, and a stalled
-asker may block its own thread only.
+asker may block its own thread only. One more thread tells those that are turned away.
 """
 
 from __future__ import annotations
 
 import logging
 import threading
+from collections import deque
 from collections.abc import Iterable
 from enum import Enum
 from typing import Final
@@ -51,6 +52,8 @@ LOOK_AGAIN_S: Final = 0.02
 UNSERVED_GRACE_S: Final = 0.2
 """A request whose owner answers no more under its key gets this long: last answers may still be in our queues."""
 JOIN_S: Final = 0.3
+MAX_TURNED_AWAY: Final = 64
+"""So many wait to be told that all is busy; further ones are told nothing."""
 MAX_KEYS: Final = 256
 """Keys of a wildcard service that are looked after; of further ones it is only known when a request has no answer."""
 
@@ -122,6 +125,9 @@ class ServiceStream:
         self._slots: dict[int, _ServiceSlot] = {}
         self._active: _ServiceSlot | None = None
         self._running = 0
+        self._turned_away: deque[tuple[Query, str]] = deque()
+        self._has_teller = False
+        """A thread tells them."""
         self._is_closed = False
         self._ended = threading.Event()
         take = zenoh.handlers.Callback(tolerant(self._take, "asked"), self._ended.set)
@@ -251,8 +257,7 @@ class ServiceStream:
             is_full = self._running >= self.route.service.max_pending
             self._running += not is_full
         if is_full:
-            with query:
-                self._fail(query, ServiceProblem.BUSY, f"{self.route.service.max_pending} requests are being answered")
+            self._turn_away(query, f"{self.route.service.max_pending} requests are being answered")
             return
         try:
             guarded(self._serve, query, name=self.route.stream, kind="request", is_lasting=False).start()
@@ -262,6 +267,41 @@ class ServiceStream:
             note("request", error)
             with query:
                 self._fail(query, ServiceProblem.BUSY, f"{error}: it was not done")
+
+    def _turn_away(self, query: Query, text: str) -> None:
+        """Have an asker told that all is busy, for its link may be full: zenoh's thread waits for nobody."""
+        with self._lock:
+            has_room, needs_teller = len(self._turned_away) < MAX_TURNED_AWAY, not self._has_teller
+            if has_room:
+                self._turned_away.append((query, text))
+                self._has_teller = True
+            else:
+                self._counter.dropped("busy")
+        if not has_room:
+            query.drop()
+        elif needs_teller:
+            try:
+                guarded(self._tell_turned_away, name=self.route.stream, kind="turned away", is_lasting=False).start()
+            except RuntimeError as error:
+                note("turned away", error)
+                self._tell_turned_away()
+
+    def _tell_turned_away(self) -> None:
+        while True:
+            with self._lock:
+                if not self._turned_away:
+                    self._has_teller = False
+                    return
+                query, text = self._turned_away.popleft()
+            try:
+                with query:
+                    self._fail(query, ServiceProblem.BUSY, text)
+            except zenoh.ZError as error:
+                _log.info("%s: an answer could not be given (%s)", self.route.stream, error)
+            except BaseException:
+                with self._lock:
+                    self._has_teller = False  # the next one begins another thread
+                raise
 
     def _serve(self, query: Query) -> None:
         try:
