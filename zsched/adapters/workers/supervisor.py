@@ -161,6 +161,8 @@ class _Worker(Struct, kw_only=True):
     stop_grace_s: float = 0.0
     is_kept: bool = True
     """False: it left the fleet file, and is forgotten once it has stopped."""
+    is_there: bool = False
+    """One that somebody else has started is seen to be ready."""
     made_by: Recipe = Recipe()
     """The recipe of this process."""
     is_old: bool = False
@@ -349,8 +351,11 @@ class WorkerSupervisor:
                 has_changed or worker.made_by.is_old(self._recipe_of(worker))
             ):
                 self._on_reset(task)
+            if worker.spec.command and worker.process is None and worker.phase is _Phase.READY:
+                worker.phase = _Phase.IDLE  # somebody else's was ready, and ours is to be started from now on
             if not worker.spec.command:
                 self._on_stop(task)
+                self._go_by_sight(worker)
             elif task in self._early:
                 self._early.discard(task)
                 self._on_start(task)
@@ -399,7 +404,8 @@ class WorkerSupervisor:
         if worker is None:
             return
         if not worker.spec.command:
-            worker.phase = _Phase.READY
+            worker.is_there = True
+            self._go_by_sight(worker)
         elif worker.phase is _Phase.STARTING and incarnation == worker.incarnation:
             worker.phase, worker.deadline_s, worker.has_been_ready = _Phase.READY, None, True
             worker.why_again, worker.ready_at = "", awake_s()
@@ -408,10 +414,17 @@ class WorkerSupervisor:
         worker = self._workers.get(task)
         if worker is None:
             return
+        if not worker.spec.command or incarnation != worker.incarnation:
+            worker.is_there = False
         if not worker.spec.command:
-            worker.phase = _Phase.IDLE
+            self._go_by_sight(worker)
         elif worker.phase is _Phase.READY and incarnation == worker.incarnation:
             worker.phase, worker.deadline_s = _Phase.STARTING, awake_s() + worker.spec.start_deadline_s
+
+    def _go_by_sight(self, worker: _Worker) -> None:
+        """A worker that somebody else starts is ready while it is seen; ours, from before, has to be stopped first."""
+        if worker.process is None:
+            worker.phase = _Phase.READY if worker.is_there else _Phase.IDLE
 
     def _on_sight(self, within_s: float | None) -> None:
         self._is_blind = within_s is None
@@ -544,7 +557,7 @@ class WorkerSupervisor:
         worker.process, worker.deadline_s = None, None
         self._compare(worker)
         if worker.phase is _Phase.STOPPING and not worker.failure:
-            worker.phase = _Phase.IDLE
+            worker.phase = _Phase.IDLE if worker.spec.command or not worker.is_there else _Phase.READY
             reason = f"stopped by {STOP_SIGNALS[worker.stop_step].name}"
             self._tell(self._events.on_exited, worker.task, worker.incarnation, returncode, reason)
             return

@@ -374,6 +374,36 @@ def test_foreign_worker_is_never_started_but_may_be_ready() -> None:
         assert recorder.calls == []
 
 
+def test_a_worker_that_gets_its_command_is_started_though_somebody_else_s_was_ready() -> None:
+    """It counted as running for good: neither restart nor retry did anything."""
+    with supervised(WorkerSpec()) as (supervisor, recorder):
+        supervisor.start("merge")
+        supervisor.mark_ready("merge", 0)
+        wait_until(lambda: supervisor.states()["merge"] is WorkerState.READY)
+        supervisor.adopt({"merge": python(SLEEP)})
+        recorder.wait("started")
+        supervisor.mark_gone("merge", 0)
+        wait_until(lambda: supervisor.states()["merge"] is WorkerState.STARTING)
+
+
+def test_a_worker_that_loses_its_command_is_stopped_by_all_signals_and_another_one_s_is_seen_then() -> None:
+    """It closes its session and hangs: that its token goes is no end of its process."""
+    code = (
+        "import signal, time; [signal.signal(n, signal.SIG_IGN) for n in (2, 15)]; print('up')\nwhile 1: time.sleep(9)"
+    )
+    with supervised(python(code)) as (supervisor, recorder):
+        supervisor.start("merge")
+        output = supervisor.output("merge")
+        assert output is not None
+        wait_until(lambda: bool(output.behind(0)[0]))
+        supervisor.adopt({"merge": WorkerSpec(stop_grace_s=0.2)})
+        supervisor.mark_gone("merge", 0)
+        supervisor.mark_ready("merge", 0)
+        assert recorder.wait("exited")[-1] == "stopped by SIGKILL"
+        wait_until(lambda: supervisor.states()["merge"] is WorkerState.READY)
+        assert [call for call in recorder.calls if call[0] == "failed"] == []
+
+
 def test_close_ends_a_stubborn_worker_in_time() -> None:
     code = (
         "import signal, time; [signal.signal(n, signal.SIG_IGN) for n in (2, 15)]; print('up')\nwhile 1: time.sleep(9)"
