@@ -101,7 +101,13 @@ def ask(*command: str) -> subprocess.CompletedProcess[str]:
     """Run one of the engine's commands; a program that is missing or does not answer gives a status and a sentence."""
     try:
         return subprocess.run(
-            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=COMMAND_S, check=False
+            command,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            errors="replace",  # a worker's last line may be of any bytes
+            timeout=COMMAND_S,
+            check=False,
         )
     except FileNotFoundError:
         return subprocess.CompletedProcess(command, 127, "", f"there is no program {command[0]} on this machine")

@@ -6,6 +6,7 @@ Knows: the fleet file's workers, their session files in the runtime folder. Does
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -125,7 +126,8 @@ class Recipes:
         path = self._path(task)
         self._written.pop(task, None)
         for one in (path, beside_session(path, ENVIRONMENT_SUFFIX), beside_session(path, PID_SUFFIX)):
-            one.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # a folder that is read-only by now: nobody opens it any more
+                one.unlink(missing_ok=True)
 
     def _path(self, task: TaskId) -> Path:
         return self._folder / f"{self._me}-{task}{SESSION_SUFFIX}"

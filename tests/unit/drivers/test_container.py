@@ -11,7 +11,7 @@ import pytest
 
 from zsched.drivers import container
 from zsched.drivers.container import Container, files_named, look, why_it_ended
-from zsched.drivers.engine import Ended, Look
+from zsched.drivers.engine import Ended, Look, ask
 from zsched.drivers.place import Place
 
 IMAGE = "acme/merge:2"
@@ -139,3 +139,12 @@ def test_a_folder_to_be_mounted_must_be_there(tmp_path: Path, monkeypatch: pytes
     assert (
         look([f"--image={IMAGE}", f"--mount={gone}:/x"], "edge1", "merge").told == f"there is no {gone} to be mounted"
     )
+
+
+def test_words_of_an_engine_that_are_no_utf_8_are_taken_as_far_as_they_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A worker's last line is one of them: the driver ended by it, and a status of 78 counted as a crash."""
+    engine(tmp_path, monkeypatch, r"printf 'no camera: gr\374n'; exit 78")
+    done = ask("podman", "logs")
+    assert (done.returncode, done.stdout) == (78, "no camera: gr\ufffdn")

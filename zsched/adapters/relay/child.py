@@ -88,7 +88,8 @@ class RelayChild:
 
     def end(self, timeout_s: float) -> None:
         """SIGTERM, SIGKILL after half the time; returns when it is gone, or after ``timeout_s``."""
-        self._send(signal.SIGTERM)
+        if not self.has_ended():  # else its number may be another process's
+            self._send(signal.SIGTERM)
         if not self.wait(timeout_s / 2):
             self._send(signal.SIGKILL)
             self.wait(timeout_s / 2)

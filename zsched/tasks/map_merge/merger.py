@@ -241,7 +241,7 @@ class Merger:
             reference = None if state["reference"] is None else str(state["reference"])
             revision = int(state["revision"])
             areas = {str(robot): float(area) for robot, area in state.get("areas", {}).items()}
-        except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        except (ValueError, OverflowError, TypeError, KeyError, AttributeError, RecursionError) as error:
             return f"malformed snapshot: {error!r}"
         if extent is not None and (extent.is_too_large or extent.width <= 0 or extent.height <= 0):
             return "malformed snapshot: extent"

@@ -341,9 +341,11 @@ def test_snapshot_of_another_mode_or_shape_is_refused(view: View) -> None:
     for broken in (b"", b"[]", b"{", b"null", b'{"schema": 3}', raw.replace(b'"extent"', b'"extant"')):
         assert _merger(Mode.KNOWN).restore(broken)
     state = json.loads(raw)
-    state["extent"]["high_x"] = 10**9
-    assert _merger(Mode.KNOWN).restore(json.dumps(state).encode())
+    for name, end in (("high_x", 10**9), ("high_x", math.inf)):
+        state["extent"][name] = end
+        assert _merger(Mode.KNOWN).restore(json.dumps(state).encode())
     state = json.loads(raw)
+    assert _merger(Mode.KNOWN).restore(json.dumps(state | {"revision": math.inf}).encode()), "JSON may have 1e999"
     for areas in ({"a": -1.0}, {"a": math.nan}, [1.0], dict.fromkeys(map(str, range(MAX_ROBOTS + 1)), 1.0)):
         assert _merger(Mode.KNOWN).restore(json.dumps(state | {"areas": areas}).encode())
     older = {key: value for key, value in state.items() if key != "areas"}
