@@ -125,8 +125,8 @@ def put_whole(path: Path, content: bytes, mode: int, give: Callable[[int], None]
     descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
     try:
         with os.fdopen(descriptor, "wb") as file:
+            os.fchmod(file.fileno(), mode)  # first: root without CAP_FOWNER may not, once it is somebody else's
             give(file.fileno())
-            os.fchmod(file.fileno(), mode)
             file.write(content)
             file.flush()
             os.fsync(file.fileno())

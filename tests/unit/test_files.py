@@ -80,6 +80,13 @@ def test_why_a_file_is_not_whole_is_told_although_what_is_left_cannot_be_deleted
         put_whole(tmp_path / "other", TEXT, 0o600, lambda _descriptor: None)
 
 
+def test_a_file_has_its_mode_before_it_is_handed_over(tmp_path: Path) -> None:
+    """Root with a few capabilities only, as in the renewal's unit, may not change the mode of what is another's."""
+    modes = []
+    put_whole(tmp_path / "key", TEXT, 0o640, lambda descriptor: modes.append(os.fstat(descriptor).st_mode & 0o777))
+    assert modes == [0o640]
+
+
 @pytest.mark.parametrize(
     "packed", [gzip.compress(TEXT), gzip.compress(TEXT[:18]) + gzip.compress(TEXT[18:])], ids=["whole", "in parts"]
 )
