@@ -31,7 +31,7 @@ from zsched.commands.document import (
 from zsched.commands.orders import asker
 from zsched.commands.page import cut
 from zsched.commands.rollout import Wave, begun, kept_rollouts, told_in
-from zsched.config.difference import Change, Danger, difference, wanted_electors, warnings_in_force
+from zsched.config.difference import Change, Danger, Effect, difference, wanted_electors, warnings_in_force
 from zsched.config.handing import mark_of, marks_of
 from zsched.config.load import check_bytes
 from zsched.config.parts import Part
@@ -421,9 +421,13 @@ def _check_same(held: InForce, document: str) -> None:
 def _steps(door: Door, plan: Plan) -> Iterator[Json]:
     """The changes that make the plan true, in their order."""
     there = tuple(name for name, _ in plan.held.electors)
-    wanted = there if plan.is_first else wanted_electors(there, plan.fleet, plan.text)
+    is_asked = not plan.is_first and (
+        plan.text != plan.held.text or any(one.effect is Effect.ELECTORS for one in plan.changes)
+    )
+    wanted = wanted_electors(there, plan.fleet, plan.text) if is_asked else there
     come, go = [name for name in wanted if name not in there], [name for name in there if name not in wanted]
-    disks = _disks(door, come)
+    disks = _disks(door, come, _unseated(plan, there))
+    come = [name for name in come if name in disks]
     nodes = {node.name for node in plan.fleet.nodes}
     leave = [name for name in go if name not in nodes]
     yield from ({"remove_elector": name} for name in leave)
@@ -434,8 +438,17 @@ def _steps(door: Door, plan: Plan) -> Iterator[Json]:
     yield from ({"remove_elector": name} for name in go if name not in leave)
 
 
-def _disks(door: Door, names: list[str]) -> dict[str, str]:
+def _unseated(plan: Plan, there: tuple[str, ...]) -> tuple[str, ...]:
+    """The electors that the document of before names, too, and that have lost their seats."""
+    before = check_bytes(plan.held.text.encode(), "the document in force").fleet if plan.held.text else None
+    wanted = () if before is None else wanted_electors(there, before, plan.held.text)
+    return tuple(name for name in wanted if name not in there)
+
+
+def _disks(door: Door, names: list[str], unseated: tuple[str, ...]) -> dict[str, str]:
     """{node: id of the disk with which it becomes an elector}.
+
+    Of those that are ``unseated`` already one that does not answer is left out: it keeps nobody from forgetting others.
 
     Raises:
         CliError: one does not answer, or has no state.
@@ -443,6 +456,8 @@ def _disks(door: Door, names: list[str]) -> dict[str, str]:
     found = {}
     for name, answer in ask_all(door, names, QUESTION).items() if names else ():
         disk = "" if isinstance(answer, CliError) else str(answer["disk"])
+        if not disk and name in unseated:
+            continue
         if not disk:
             why = str(answer) if isinstance(answer, CliError) else "it has no state: zsched init there"
             raise CliError(EXIT_FAILED, f"nothing was changed: {name} cannot become an elector now: {why}")

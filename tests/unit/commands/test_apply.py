@@ -362,6 +362,20 @@ def test_a_change_that_stops_half_way_says_how_far_it_came(node: Node, tmp_path:
     assert run("apply", file, "--plan").exit_code == 0
 
 
+def test_an_elector_that_is_lost_keeps_nobody_from_changing_the_rest(node: Node, tmp_path: Path) -> None:
+    """The fleet was recovered: none of those that are lost could be forgotten, because of the other one."""
+    node.electors = ["robot1"]
+    node.states["robot2"] = node.states["edge1"] = "gone"
+    file = changed(tmp_path, "electorate: [robot1, robot2, edge1]", "electorate: [robot1, robot2]")
+    done = run("apply", file, "--yes", "--accept", "change-electors")
+    assert done.exit_code == 0, done.stderr
+    assert [(one.get("add_elector"), one.get("text")) for one in node.changes] == [(None, file.read_text())]
+    node.text = node.text.replace("electorate: [robot1, robot2]", "electorate: [robot1]")
+    refused = run("apply", file, "--yes", "--accept", "change-electors")
+    assert (refused.exit_code, len(node.changes)) == (1, 1)
+    assert "nothing was changed: robot2 cannot become an elector now" in refused.stderr, "it is named anew"
+
+
 def test_electors_change_one_after_another_and_only_when_accepted(node: Node, tmp_path: Path) -> None:
     """A removal counts before the document, for a node that leaves; an addition after it, for a node that comes."""
     node.electors = ["robot1", "robot2", "edge1"]
@@ -774,11 +788,13 @@ def test_promote_lets_the_changed_worker_go_on_and_without_a_task_shows_what_wai
     assert "tasks.merge.worker  on robot1 -> everywhere  workers of merge restart one after another" in shown.stdout
     assert run("task", "promote", "merge").exit_code == 2, "off a terminal it takes --yes"
     assert run("task", "promote", "mergo", "--yes").exit_code == 2
+    node.electors = ["edge1", "robot1"]
     planned = json.loads(run("task", "promote", "merge", "--plan", "--json").stdout)
     assert (faults(planned), planned["outcome"]) == ([], "planned")
     done = run("task", "promote", "merge", "--yes", "--revision", node.revision)
     assert done.exit_code == 0, done.stderr
     assert (node.changes[-1]["rollouts"], node.changes[-1]["text"], node.changes[-1]["flags"]) == ([], node.text, FLAGS)
+    assert not [one for one in node.changes if "add_elector" in one], "one that has no seat is not asked for here"
     again = run("task", "promote", "merge", "--yes")
     assert (again.exit_code, len(node.changes)) == (1, 2)
     assert "merge waits for nothing" in again.stderr
