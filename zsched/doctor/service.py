@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import os
+import pwd
 import shlex
 import stat
 from collections.abc import Iterator
@@ -15,6 +17,7 @@ from pathlib import Path
 from typing import Final
 
 from zsched.core.values.fleet import runs_worker
+from zsched.core.values.struct import Struct
 from zsched.doctor.model import Result, Scene, failed, joined, passed, skipped, warned
 from zsched.runtime.secured import CERTIFICATE, KEY, TRUSTED
 
@@ -65,11 +68,11 @@ def can_see_its_files(scene: Scene) -> Result:
     if not command:
         return failed(f"{unit} has no ExecStart", fix="install the unit that comes with zsched")
     hides_homes = _last(settings, "ProtectHome").lower() not in ("", "no", "false", "off", "0")
-    is_nameless = _last(settings, "DynamicUser").lower() in ("yes", "true", "on", "1")
+    reader = _reader(settings)
     found = [*_program(scene, Path(command[0]), hides_homes=hides_homes)]
     for path in _files(scene, command):
-        found += _file(scene, path, hides_homes=hides_homes, is_nameless=is_nameless)
-    found += _key(scene, settings, is_nameless=is_nameless)
+        found += _file(scene, path, hides_homes=hides_homes, reader=reader)
+    found += _key(scene, settings, reader)
     return joined(found, passed(f"{unit}: the service sees {command[0]} and all files that it needs"))
 
 
@@ -111,26 +114,58 @@ def _files(scene: Scene, command: list[str]) -> Iterator[Path]:
         yield from (Path(scene.fleet.security.folder, name) for name in (CERTIFICATE, TRUSTED))
 
 
-def _key(scene: Scene, settings: Settings, *, is_nameless: bool) -> Iterator[Result]:
-    """Of a secured fleet: the key, which a user without a name gets from systemd."""
+class _Reader(Struct, frozen=True):
+    """As whom the service reads."""
+
+    uid: int
+    """-1: nobody that this machine knows; 0: root, who reads all."""
+    groups: frozenset[int]
+
+    def reads(self, found: os.stat_result) -> bool:
+        """Whether it may read a file."""
+        if self.uid in (0, found.st_uid):
+            return self.uid == 0 or bool(found.st_mode & stat.S_IRUSR)
+        return bool(found.st_mode & (stat.S_IRGRP if found.st_gid in self.groups else stat.S_IROTH))
+
+
+def _reader(settings: Settings) -> _Reader:
+    """The unit's user: systemd makes one (`DynamicUser`), it has a name, or it is root."""
+    name = _last(settings, "User")
+    is_made = _last(settings, "DynamicUser").lower() in ("yes", "true", "on", "1")
+    if not is_made and name in ("", "root", "0"):
+        return _Reader(0, frozenset())
+    try:
+        user = pwd.getpwnam(name)
+    except KeyError:
+        return _Reader(-1, frozenset())
+    return _Reader(user.pw_uid, frozenset(os.getgrouplist(name, user.pw_gid)))
+
+
+def _key(scene: Scene, settings: Settings, reader: _Reader) -> Iterator[Result]:
+    """Of a secured fleet: the key, which a user that may not read it gets from systemd."""
     security = scene.fleet.security
     handed = [value for name, value in settings if name == "LoadCredential"]
-    if security is None or not is_nameless:
+    if security is None:
         return
     path = Path(security.folder, KEY)
-    if f"{KEY}:{path}" in handed:
+    here = _seen(scene, path)
+    if f"{KEY}:{path}" in handed or (here.exists() and reader.reads(here.stat())) or reader.uid == 0:
         return
     fix = f"systemctl edit zsched: [Service] LoadCredential={KEY}:{path} (docs/guide/secure.md)"
-    yield failed(f"{path} is not handed over to the service's user, which has no name", fix=fix)
+    yield failed(f"{path} is not handed over to the service's user, which may not read it", fix=fix)
 
 
-def _file(scene: Scene, path: Path, *, hides_homes: bool, is_nameless: bool) -> Iterator[Result]:
-    here = scene.at(path) if scene.root != Path("/") and not path.is_relative_to(scene.root) else path
+def _seen(scene: Scene, path: Path) -> Path:
+    return scene.at(path) if scene.root != Path("/") and not path.is_relative_to(scene.root) else path
+
+
+def _file(scene: Scene, path: Path, *, hides_homes: bool, reader: _Reader) -> Iterator[Result]:
+    here = _seen(scene, path)
     if not here.exists():
         yield failed(f"the unit reads {path}, which is not there", fix=f"sudo install -D -m 644 FILE {path}")
     elif hides_homes and (hidden := _home_of(path)):
         yield failed(f"{path} is below {hidden}, which the service cannot see (ProtectHome)", fix="move it to /etc")
-    elif is_nameless and not here.stat().st_mode & stat.S_IROTH:
+    elif not reader.reads(here.stat()):
         yield failed(f"{path} is not readable by the service's user", fix=f"sudo chmod o+r {path}")
 
 

@@ -87,6 +87,31 @@ def test_a_fleet_file_that_the_service_cannot_read_is_found(scene: Scene) -> Non
     assert_finds(run("unit.paths", scene), FAIL, "/etc/zsched/fleet.yaml, which is not there")
 
 
+def test_what_a_user_with_a_name_cannot_read_is_found(scene: Scene, tmp_path: Path) -> None:
+    """The unit of an installation has one (`10-user.conf`), and the daemon ended with 78 behind a PASS."""
+    drop_in = scene.root / "etc/systemd/system/zsched.service.d/10-user.conf"
+    drop_in.parent.mkdir()
+    file = scene.root / "etc/zsched/fleet.yaml"
+    for name in ("nobody", "who-is-not-here"):
+        drop_in.write_text(f"[Service]\nDynamicUser=no\nUser={name}\n")
+        file.chmod(0o600)
+        assert_finds(run("unit.paths", scene), FAIL, "not readable by the service's user")
+        file.chmod(0o644)
+        assert run("unit.paths", scene).verdict is PASS
+    drop_in.write_text("[Service]\nDynamicUser=no\nUser=root\n")
+    file.chmod(0o600)
+    assert run("unit.paths", scene).verdict is PASS
+    file.chmod(0o644)
+    authority = make_authority(tmp_path / "authority", "hall")
+    install(authority, scene.root / "etc/zsched/certificates", "robot1")
+    text = FLEET.replace("tcp/", "tls/")
+    text = text.replace("fleet: hall", "fleet: hall\nsecurity: {folder: /etc/zsched/certificates}")
+    secured = replace(scene_of(tmp_path, text), root=scene.root)
+    assert run("unit.paths", secured).verdict is PASS
+    drop_in.write_text("[Service]\nDynamicUser=no\nUser=nobody\n")
+    assert_finds(run("unit.paths", secured), FAIL, "key.pem is not handed over to the service's user, which may not")
+
+
 def test_a_key_that_systemd_does_not_hand_over_is_found(scene: Scene, tmp_path: Path) -> None:
     authority, text = make_authority(tmp_path / "authority", "hall"), FLEET.replace("tcp/", "tls/")
     for name, node in (("pki", "edge1"), ("certificates", "robot1")):
