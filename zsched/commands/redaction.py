@@ -44,8 +44,9 @@ def secrets_of(fleet: Fleet | None) -> tuple[str, ...]:
     for task in fleet.tasks if fleet is not None else ():
         found.update(value for name, value in task.worker.env if NAME.search(name))
         words = [word.removeprefix("--arg=").removeprefix("--option=") for word in task.worker.command]  # of drivers
-        found.update(after for word, after in itertools.pairwise(words) if _is_option(word) and "=" not in word)
-        found.update(word.partition("=")[2] for word in words if _is_option(word.partition("=")[0]))
+        for line in (words, *(word.split() for word in words)):  # a word may be a line for a shell
+            found.update(after for word, after in itertools.pairwise(line) if _is_option(word) and "=" not in word)
+            found.update(word.partition("=")[2] for word in line if _is_option(word.partition("=")[0]))
     plain = {line.strip() for value in found for line in value.splitlines()}
     lines = {form for line in plain for form in _forms(line)}
     return tuple(sorted((line for line in lines if len(line) >= LEAST), key=lambda line: (-len(line), line)))

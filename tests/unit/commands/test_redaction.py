@@ -56,6 +56,17 @@ def test_words_of_a_driver_s_program_are_looked_at_like_any_other_command_s() ->
     assert leaks(clean_yaml(text, secrets_of(fleet))) == []
 
 
+@pytest.mark.parametrize("option", ["--api-key abcd1234", "--api-key=abcd1234"])
+def test_words_of_a_line_for_a_shell_are_looked_at_too(option: str) -> None:
+    command = f'[bash, -c, "source /opt/ros/setup.bash && exec slam {option} --mode fast"]'
+    text = FLEET.replace("[python, -m, zsched.tasks.echo]", command)
+    fleet = check_bytes(text.encode()).fleet
+    assert fleet is not None
+    cleaned = clean_yaml(text, secrets_of(fleet))
+    assert leaks(cleaned) == []
+    assert "setup.bash && exec slam" in cleaned
+
+
 @pytest.mark.parametrize(
     "words",
     [
