@@ -926,9 +926,16 @@ def _make_folder(path: Path) -> None:
 
 
 def _put_papers(folder: Path, papers: Papers, names: Collection[str] = tuple(_WHAT)) -> None:
-    """Whole, never readable by others in between, and each the property of the folder's owner."""
+    """Whole, never readable by others in between, and each the property of the folder's owner.
+
+    Raises:
+        AdapterError: one cannot be written.
+    """
     brought = ((KEY, papers.key, PRIVATE), (TRUSTED, papers.trusted, PUBLIC), (CERTIFICATE, papers.certificate, PUBLIC))
-    _make_folder(folder)
-    for name, pem, mode in brought:  # the key first: a certificate without its key would look complete
-        if pem and name in names:
-            write_whole(folder / name, pem.encode(), mode)
+    try:
+        _make_folder(folder)
+        for name, pem, mode in brought:  # the key first: a certificate without its key would look complete
+            if pem and name in names:
+                write_whole(folder / name, pem.encode(), mode)
+    except OSError as error:
+        raise AdapterError(f"cannot write {folder}: {error.strerror}; {_advice(error, folder)}") from error
