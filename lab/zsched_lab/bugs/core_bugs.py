@@ -1033,6 +1033,27 @@ VOTE_BUGS = (
         (*_ORPHANS, "tests/sim/test_orphans.py"),
     ),
     _bug(
+        "a claim takes the place of a task that is pinned hard",
+        "zsched.core.scheduler.decision",
+        "if figures.allocation.is_bound:",
+        "if not figures.rules.candidates:",
+        _ORPHANS,
+    ),
+    _bug(
+        "a pin holds a task on a machine that was never heard",
+        "zsched.core.scheduler.judge",
+        " and not (is_unheard and winner != allocation.home)",
+        "",
+        _SCHEDULER,
+    ),
+    _bug(
+        "one robot's penalty shuts a machine out",
+        "zsched.core.scheduler.standing",
+        "max(min(penalty, MAX_PENALTY), most",
+        "max(penalty, most",
+        ("tests/unit/core/scheduler/test_compare.py",),
+    ),
+    _bug(
         "a vote that others have won takes no room",
         VOTING,
         "if now < self.awaited_until and self.tally is not None:",
