@@ -31,6 +31,8 @@ HOMES: Final = ("/home", "/root", "/run/user")
 LINE_BYTES: Final = 512
 
 Settings = list[tuple[str, str]]
+NOBODY: Final = 65534
+"""The ids of `nobody`, for a user that is not there yet."""
 
 
 def is_installed(scene: Scene) -> Result:
@@ -120,6 +122,8 @@ class _Reader(Struct, frozen=True):
     uid: int
     """-1: nobody that this machine knows; 0: root, who reads all."""
     groups: frozenset[int]
+    group: int = -1
+    """The first of them."""
 
     def reads(self, found: os.stat_result) -> bool:
         """Whether it may read a file."""
@@ -138,7 +142,19 @@ def _reader(settings: Settings) -> _Reader:
         user = pwd.getpwnam(name)
     except KeyError:
         return _Reader(-1, frozenset())
-    return _Reader(user.pw_uid, frozenset(os.getgrouplist(name, user.pw_gid)))
+    return _Reader(user.pw_uid, frozenset(os.getgrouplist(name, user.pw_gid)), user.pw_gid)
+
+
+def user_of_service(scene: Scene) -> tuple[int, int] | None:
+    """(user id, group id) as which the daemon starts workers; ``None``: there is no unit, or it is root.
+
+    A user that systemd makes is not there yet: then that of nobody.
+    """
+    unit = _unit(scene)
+    reader = _Reader(0, frozenset()) if unit is None else _reader(_settings(scene, unit))
+    if reader.uid == 0:
+        return None
+    return (reader.uid, reader.group) if reader.uid > 0 else (NOBODY, NOBODY)
 
 
 def _key(scene: Scene, settings: Settings, reader: _Reader) -> Iterator[Result]:

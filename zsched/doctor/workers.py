@@ -12,11 +12,12 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from zsched.core.values.fleet import TaskSpec, runs_worker
 from zsched.core.values.words import RESTARTING, WAS_READY, has_lost_its_worker, told_of_worker
 from zsched.doctor.model import Json, Result, Scene, failed, joined, passed, skipped, warned
+from zsched.doctor.service import user_of_service
 from zsched.drivers import container, ros2_lifecycle, systemd
 from zsched.drivers.engine import Look
 
@@ -63,11 +64,13 @@ def _command(task: TaskSpec) -> Result:
 
 def packages_are_there(scene: Scene) -> Result:
     """Whether each worker in Python finds the packages that it imports."""
-    found = [result for task in _mine(scene) if (result := _packages(task)) is not None]
+    user = user_of_service(scene) if os.geteuid() == 0 else None
+    found = [result for task in _mine(scene) if (result := _packages(task, user)) is not None]
     return joined(found, skipped("no worker in Python is started by the daemon here"))
 
 
-def _packages(task: TaskSpec) -> Result | None:
+def _packages(task: TaskSpec, user: tuple[int, int] | None) -> Result | None:
+    """``user``: as whom an operator's program may run here, where that is not who asks."""
     program, *words = task.worker.command
     if Path(program).name.rstrip("0123456789.") != "python":
         return None
@@ -76,9 +79,11 @@ def _packages(task: TaskSpec) -> Result | None:
     if module is None and (script is None or not Path(script).is_file()):
         return None
     kind, what = ("file", str(script)) if module is None else ("module", module)
+    own: dict[str, Any] = {} if user is None else {"user": user[0], "group": user[1], "extra_groups": [], "cwd": "/"}
     try:
         done = subprocess.run(
             [python, FINDER, kind, what],
+            **own,
             env={**os.environ, **dict(task.worker.env)},
             stdin=subprocess.DEVNULL,
             capture_output=True,

@@ -14,8 +14,9 @@ import pytest
 from support.authorities import install, make_authority
 from support.certificates import make_tls
 from support.clinic import FLEET, assert_finds, run, scene_of
-from zsched.doctor import security
+from zsched.doctor import security, workers
 from zsched.doctor.model import Scene, Verdict
+from zsched.doctor.service import NOBODY
 from zsched.pki.authority import opened
 from zsched.sessions.certificate import validities
 
@@ -110,6 +111,35 @@ def test_what_a_user_with_a_name_cannot_read_is_found(scene: Scene, tmp_path: Pa
     assert run("unit.paths", secured).verdict is PASS
     drop_in.write_text("[Service]\nDynamicUser=no\nUser=nobody\n")
     assert_finds(run("unit.paths", secured), FAIL, "key.pem is not handed over to the service's user, which may not")
+
+
+@pytest.mark.parametrize(
+    ("drop_in", "user"),
+    [
+        ("User=root\nDynamicUser=no", {}),
+        ("User=daemon\nDynamicUser=no", {"user": 1, "group": 1, "extra_groups": [], "cwd": "/"}),
+        ("", {"user": NOBODY, "group": NOBODY, "extra_groups": [], "cwd": "/"}),
+    ],
+)
+def test_an_operators_program_is_never_run_as_root(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch, drop_in: str, user: dict[str, object]
+) -> None:
+    """`sudo zsched doctor` imports what a task's command names, and operators may name anything."""
+    asked: list[dict[str, object]] = []
+
+    def run_it(_command: list[object], **words: object) -> subprocess.CompletedProcess[str]:
+        asked.append({name: words[name] for name in ("user", "group", "extra_groups", "cwd") if name in words})
+        return subprocess.CompletedProcess([], 0, "", "")
+
+    monkeypatch.setattr(workers.subprocess, "run", run_it)
+    file = scene.root / "etc/systemd/system/zsched.service.d/10-user.conf"
+    file.parent.mkdir()
+    file.write_text(f"[Service]\n{drop_in}\n")
+    for uid, expected in ((0, user), (1000, {})):
+        monkeypatch.setattr("os.geteuid", lambda uid=uid: uid)
+        assert run("worker.imports", scene).verdict is PASS
+        assert asked.pop() == expected
+        assert not asked
 
 
 def test_a_key_that_systemd_does_not_hand_over_is_found(scene: Scene, tmp_path: Path) -> None:
