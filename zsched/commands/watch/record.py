@@ -74,6 +74,7 @@ def record(view: RecordView) -> int:
         ended = stack.enter_context(stopped_by_signal())
         end = float("inf") if view.for_s is None else monotonic_s() + view.for_s
         news, away = replace(first, entries=()), Away("record")  # the log of before is no part of the recording
+        is_over = False
         while True:
             if news.status is not None:
                 for message in tracks.of_status(news.status, news.at):
@@ -81,9 +82,10 @@ def record(view: RecordView) -> int:
             for entry in news.entries:
                 for message in tracks.of_entry(entry):
                     tape.put(message)
-            _wait(min(monotonic_s() + view.interval_s, end), tap, tape, ended)
-            if ended.is_set() or monotonic_s() >= end:
+            if is_over:
                 break
+            _wait(min(monotonic_s() + view.interval_s, end), tap, tape, ended)
+            is_over = ended.is_set() or monotonic_s() >= end  # what has happened since the last look belongs to it
             news = feed.ask()
             away.tell(news.why or news.log_why)
     told = f"{view.file}: {tape.messages} messages of {len(tape.topics)} topics, {size(view.file.stat().st_size)}"

@@ -70,7 +70,8 @@ def trace(view: TraceView) -> int:
         while not view.is_once and not ended.wait(PERIOD_S):
             news = feed.ask()
             away.tell(news.why or news.log_why)
-            sender.send((*moves.take(news.entries), *moves.overdue(wall_s())))
+            spans = (*moves.take(news.entries), *moves.overdue(wall_s()))
+            sender.send(span for span in spans if span.end >= oldest)
     if view.is_once:
         sender.send(span for span in moves.rest() if span.end >= oldest)
     warn(f"{sender.sent} spans sent, {sender.refused} refused")

@@ -135,6 +135,26 @@ def test_older_moves_are_sent_when_they_are_asked_for(collector: Collector, fold
     assert len(collector.taken) == 2
 
 
+def test_a_move_of_long_ago_that_has_no_end_is_not_sent_unasked(
+    collector: Collector, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On an edge, which flips nothing, each start sent the newest move of every task once more."""
+    monkeypatch.setenv("ZSCHED_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.delenv("ZSCHED_NODE", raising=False)
+    steps = iter([False, False, True])
+    monkeypatch.setattr(Latch, "wait", lambda _latch, _s=None: next(steps))
+    page = {"node": "robot1", "now": wall_s(), "entries": move(wall_s() - 9000.0, 4, "edge1")[:2], "cursor": "1"}
+    first = iter([page["entries"]])
+
+    def answer(asked: dict[str, Any]) -> dict[str, Any]:
+        return STATUS if asked["verb"] == "status" else {**page, "entries": next(first, []), "more": False}
+
+    with contextlib.closing(OperatorSocket(tmp_path / "robot1.sock", answer)) as daemon:
+        daemon.open()
+        result = CliRunner().invoke(app, ["trace", "--otlp", collector.url])
+    assert (result.exit_code, result.stderr) == (0, "0 spans sent, 0 refused\n")
+
+
 def test_spans_that_nobody_takes_are_counted(collector: Collector, folder: Path) -> None:
     assert folder.exists()
     collector.code = 400

@@ -94,6 +94,14 @@ def test_the_file_holds_every_topic_and_the_moves_since_its_beginning(folder: Pa
     }
 
 
+def test_what_has_happened_since_the_last_look_is_in_the_file(folder: Path) -> None:
+    """With an interval as long as the recording there was no log, and no move at all."""
+    file = folder / "run.mcap"
+    done = run("-o", file, "--for", "0.3s", "--interval", "60")
+    assert done.exit_code == 0, done.stderr
+    assert {"/zsched/log", "/zsched/moves"} <= {topic for topic, _, _, _ in read_mcap(file)}
+
+
 def test_every_message_is_as_its_schema_says() -> None:
     checked = 0
     for message in (*of_status(recorded(), 5.0), *of_entry(entry("x")), *of_entry(entry("y", task="echo", move=MOVE))):
