@@ -4,7 +4,7 @@
 const KEPT_S = 900;
 const LONGEST_S = 3600;
 const MOST_EVENTS = 200;
-const state = { now: null, points: {}, moves: [], events: [], explained: {}, open: new Set(), token: "" };
+const state = { now: null, points: {}, moves: [], events: [], explained: {}, open: new Set(), token: "", isCut: false };
 const byId = (id) => document.getElementById(id);
 
 // --- elements --------------------------------------------------------------------------------------------------------
@@ -260,8 +260,10 @@ function draw() {
   byId("fleet").textContent = `fleet ${status.fleet}`;
   byId("who").textContent = `${status.node} (${status.kind}) · quorum ${status.quorum.alive} of ${status.quorum.electors}, needs ${status.quorum.needed} · up ${span(status.up_s)} · zsched ${status.version}`;
   const health = byId("health"), away = status.nodes.filter(isAway).length, troubles = state.now.problems.length;
-  health.textContent = state.now.degraded.length ? "DEGRADED" : troubles ? `${troubles} problem${troubles > 1 ? "s" : ""}` : away ? `ok, ${away} away` : "ok";
-  health.className = state.now.degraded.length ? "bad" : troubles || away ? "warn" : "good";
+  const isSilent = Boolean(state.now.why) || state.isCut;
+  if (isSilent) document.title = `! ${status.fleet} · zsched`;
+  health.textContent = isSilent ? "no answer" : state.now.degraded.length ? "DEGRADED" : troubles ? `${troubles} problem${troubles > 1 ? "s" : ""}` : away ? `ok, ${away} away` : "ok";
+  health.className = isSilent || state.now.degraded.length ? "bad" : troubles || away ? "warn" : "good";
   fill("problems", state.now.problems.map((text) => h("li", {}, text)));
   document.querySelector("main").hidden = false;
   fill("topology", topology(status));
@@ -283,13 +285,15 @@ const takers = {
   },
   now(body) {
     state.now = body;
+    state.isCut = false;
     for (const [task, point] of Object.entries(body.points)) {
       const kept = (state.points[task] = state.points[task] || []);
       if (kept.length && kept[kept.length - 1].at - point.at > 0.1) kept.length = 0; // the clock there was set back
       if (!kept.length || point.at > kept[kept.length - 1].at + 0.1) kept.push(point);
       while (kept.length > KEPT_S) kept.shift();
     }
-    tell(body.why ? `no answer since ${clock(body.answered_at)}: ${body.why}` : `live, ${clock(body.answered_at)}`, Boolean(body.why));
+    const since = body.answered_at ? `no answer since ${clock(body.answered_at)}` : "nothing heard yet";
+    tell(body.why ? `${since}: ${body.why}` : body.answered_at ? `live, ${clock(body.answered_at)}` : since, Boolean(body.why));
     for (const task of state.open) explain(task);
     draw();
   },
@@ -303,6 +307,13 @@ const takers = {
 function tell(text, isBad) {
   byId("link").textContent = text;
   byId("link").className = isBad ? "bad" : "";
+}
+
+// What is shown is old from now on, and its badge must not look fresh.
+function cut(text) {
+  tell(text, true);
+  state.isCut = true;
+  if (state.now) draw();
 }
 
 const bearer = () => (state.token ? { Authorization: `Bearer ${state.token}` } : {});
@@ -331,9 +342,9 @@ async function live() {
   for (;;) {
     try {
       await listen();
-      tell("the connection ended; connecting again", true);
+      cut("the connection ended; connecting again");
     } catch (error) {
-      tell(error.status === 401 ? "this server wants a token" : `no connection: ${error.message}; trying again`, true);
+      cut(error.status === 401 ? "this server wants a token" : `no connection: ${error.message}; trying again`);
       if (error.status === 401) return;
     }
     await new Promise((resolve) => setTimeout(resolve, 2000));
