@@ -69,6 +69,7 @@ def restore(state_file: StateFile, fleet: Fleet, *, config: Path, node: NodeId, 
     try:
         state_file.save(state)
     except AdapterError as error:
+        log.warning("state not saved why=%s; no elector", error)
         return Restored(incarnation=incarnation, state=state, is_unsaved=True, problem=str(error))
     return Restored(incarnation=incarnation, state=state)
 

@@ -243,6 +243,21 @@ def test_promise_is_persisted_in_front_of_its_answer() -> None:
     assert isinstance(answer.answer, Promise)
 
 
+def test_node_whose_disk_refuses_its_start_knows_what_was_agreed_and_is_no_elector() -> None:
+    """It dropped its whole state, and began by its fleet file."""
+    value = allocation_of(5, "edge1", tuning=FLEET.tasks[0].tuning)
+    node = make(learnt=value)
+    node.agreement.on_persist_failed("cannot write state: No space left on device")
+    batch = node.start(100.0)
+    assert node.values()["merge"] == value
+    batch += node.handle(prepare(6, "robot3"), 100.0)
+    assert not of(batch, do.PersistState)
+    assert [type(one.answer) for one in of(batch, do.AnswerElection)] == [Refused]
+    snapshot = build_snapshot(node, 100.0)
+    assert (snapshot.quorum.this_node, snapshot.tasks[0].owner) == ("lost_state", "edge1")
+    assert any("No space left" in text and "no elector until it is restarted" in text for text in snapshot.problems)
+
+
 def test_node_whose_disk_refused_is_no_elector_and_says_so() -> None:
     node = started()
     node.handle(prepare(5, "robot2"), 100.0)
