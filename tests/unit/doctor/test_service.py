@@ -14,7 +14,7 @@ import pytest
 from support.authorities import install, make_authority
 from support.certificates import make_tls
 from support.clinic import FLEET, assert_finds, run, scene_of
-from zsched.doctor import security, workers
+from zsched.doctor import security
 from zsched.doctor.model import Scene, Verdict
 from zsched.doctor.service import NOBODY
 from zsched.pki.authority import opened
@@ -131,7 +131,7 @@ def test_an_operators_program_is_never_run_as_root(
         asked.append({name: words[name] for name in ("user", "group", "extra_groups", "cwd") if name in words})
         return subprocess.CompletedProcess([], 0, "", "")
 
-    monkeypatch.setattr(workers.subprocess, "run", run_it)
+    monkeypatch.setattr("zsched.doctor.workers.subprocess.run", run_it)
     file = scene.root / "etc/systemd/system/zsched.service.d/10-user.conf"
     file.parent.mkdir()
     file.write_text(f"[Service]\n{drop_in}\n")
