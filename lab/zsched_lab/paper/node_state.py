@@ -46,8 +46,9 @@ def node_limits(prefix: str, scenario: Scenario, fleet: LabFleet) -> NodeLimits:
                 continue
             outer.append(group)
             groups[node] = group.inner(OWN)
-            work[node] = group.inner(WORK, cpu_cores=share.cpu_cores)
-            says.append(f"{node} {share.quota_cores:g} cores, {share.cpu_cores:g} for tasks, {share.memory_mb:.0f} MiB")
+            tasks_cores = share.cpu_cores + share.work_cores
+            work[node] = group.inner(WORK, cpu_cores=tasks_cores)
+            says.append(f"{node} {share.quota_cores:g} cores, {tasks_cores:g} for tasks, {share.memory_mb:.0f} MiB")
     except AdapterError:
         for group in (*work.values(), *groups.values(), *outer):
             group.remove()

@@ -32,24 +32,27 @@ class NodeShare:
     """What one node may use: ``cpu_cores`` (quota), ``memory_mb`` (limit); ``ballast_mb`` is taken from the start.
 
     ``overhead_cores`` come on top of the quota: what zsched's own processes take there while nothing happens, where
-    ``cpu_cores`` is to be there for the tasks alone.
+    ``cpu_cores`` is to be there for the tasks alone. ``work_cores`` come on top for the tasks: what their programs take
+    beyond the shares of ``cpu_cores`` that the scenario gives them, which is another part on every machine.
     """
 
     cpu_cores: float
     memory_mb: float
     ballast_mb: float = 0.0
     overhead_cores: float = 0.0
+    work_cores: float = 0.0
 
     def __post_init__(self) -> None:
         check_range("cpu_cores", self.cpu_cores, 0.05, MAX_CORES)
         check_range("memory_mb", self.memory_mb, 128.0, 1e6)
         check_range("ballast_mb", self.ballast_mb, 0.0, self.memory_mb)
         check_range("overhead_cores", self.overhead_cores, 0.0, MAX_CORES)
+        check_range("work_cores", self.work_cores, 0.0, MAX_CORES)
 
     @property
     def quota_cores(self) -> float:
         """What the node's group may use in all."""
-        return self.cpu_cores + self.overhead_cores
+        return self.cpu_cores + self.work_cores + self.overhead_cores
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -206,6 +206,7 @@ def test_a_machine_that_did_not_idle_could_not_keep_its_quotas() -> None:
 def test_zsched_s_own_cpu_comes_on_top_of_an_edge() -> None:
     share = NodeShare(cpu_cores=0.28, overhead_cores=0.035, memory_mb=1024)
     assert share.quota_cores == pytest.approx(0.315)
+    assert replace(share, work_cores=0.02).quota_cores == pytest.approx(0.335)
     assert shipped("nano").full_cores == 0.28, "shares are of the edge, not of its quota"
 
 
