@@ -284,7 +284,7 @@ def test_a_scheme_moves_slam_only_where_it_says_so(
     assert set(tasks["map_merge"].candidates) == {"edge1", "edge2", "edge3"}
     assert {name: tuple(sorted(tasks[name].candidates)) for name in wanted} == wanted
     command = list(tasks["slam_robot1"].worker.command)
-    assert command[command.index("--match") + 1] == f"{0.352 * 0.28:g}"
+    assert command[command.index("--match") + 1] == f"{0.352 * scenario.full_cores:g}"
     assert "0.5" in tasks["map_merge"].worker.command
     is_papers = scheme.startswith("dyna")
     assert (tasks["slam_robot1"].tuning.score.value == "paper") == is_papers
