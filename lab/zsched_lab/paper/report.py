@@ -370,8 +370,8 @@ def conditions_text(results: Json) -> str:
     """Shares, levels, limits, and what was invalid."""
     scenario = results["scenario"]
     shares = [
-        f"{node} {s['cpu_cores']:g} cores (and {s.get('overhead_cores', 0.0):g} for zsched, {s.get('work_cores', 0.0):g} "
-        f"for what programs take beyond their shares), {s['memory_mb']:g} MiB, "
+        f"{node} {s['cpu_cores']:g} cores (and {s.get('overhead_cores', 0.0):g} for zsched, "
+        f"{s.get('work_cores', 0.0):g} for what programs take beyond their shares), {s['memory_mb']:g} MiB, "
         f"ballast {s['ballast_mb']:g} MiB"
         for node, s in scenario["nodes"].items()
     ]
