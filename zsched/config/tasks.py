@@ -300,15 +300,15 @@ def _advise_gpu(task: TaskSpec, given: Section, out: Collector) -> None:
 def _advise_gpu_limit(task: TaskSpec, given: Section, out: Collector) -> None:
     """A limit that the task's own use breaks on an idle machine keeps it from all of them."""
     gpu = BY_NAME["gpu"]
-    limit, most = dict(task.gauge_limits).get(gpu.name, gpu.high), gpu.high - gpu.margin
-    back = limit - gpu.margin
-    if limit < gpu.high and task.demand.gpu > max(back, gpu.low):
+    limit = dict(task.gauge_limits).get(gpu.name, gpu.high)
+    back = gpu.back_from(limit)
+    if limit < gpu.high and task.demand.gpu > back:
         section: Section = given.get("limits")
         message = (
-            f"no machine can get the task: its own demand of {task.demand.gpu:g} is above {max(back, gpu.low):g}, "
+            f"no machine can get the task: its own demand of {task.demand.gpu:g} is above {back:g}, "
             f"which is the limit less the margin of {gpu.margin:g}"
         )
-        enough = task.demand.gpu + gpu.margin if task.demand.gpu <= most else gpu.high
+        enough = min(task.demand.gpu + gpu.margin, gpu.high)
         out.warn(section.where(gpu.name), message, f"limits: {{gpu: {enough:g}}}, or more")
 
 

@@ -52,6 +52,10 @@ class Gauge(Struct, frozen=True, kw_only=True):
         """
         return f"{reading * 100:.0f} %" if not self.unit else f"{reading:.0f} {self.unit}"
 
+    def back_from(self, limit: float) -> float:
+        """The reading from which on a machine beyond the limit may get the task (again), within what it can read."""
+        return min(max(limit + (self.margin if self.is_floor else -self.margin), self.low), self.high)
+
     def fault(
         self, reading: float | None, limit: float, *, is_owner: bool, is_reckoned: bool = False, is_old: bool = False
     ) -> str:
@@ -79,7 +83,7 @@ class Gauge(Struct, frozen=True, kw_only=True):
         at = f"{'would be' if is_reckoned else 'was last' if is_old else 'is'} at {self.shown(reading)}"
         if inside < 0.0:
             return f"{self.name} {at}, limit {self.shown(limit)}"
-        back = min(max(limit + sign * self.margin, self.low), self.high)
+        back = self.back_from(limit)
         if is_owner or sign * (reading - back) >= 0.0:
             return ""
         return f"{self.name} {at}, limit {self.shown(limit)}, back from {self.shown(back)} on"
