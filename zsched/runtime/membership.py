@@ -898,13 +898,20 @@ def _put(path: Path, content: bytes, mode: int, former: os.stat_result | None = 
     Raises:
         AdapterError: it cannot be written.
     """
-    try:
+    with _told_of(path):
         _make_folder(path.parent)
         if former is None:
             replace_synced(path, path.with_name(f"{path.name}.new"), content, mode)
         else:
             put_whole(path, content, stat.S_IMODE(former.st_mode), owner_like(former))
             sync_folder(path.parent)
+
+
+@contextlib.contextmanager
+def _told_of(path: Path) -> Iterator[None]:
+    """Raise `AdapterError` with advice where ``path`` cannot be written."""
+    try:
+        yield
     except OSError as error:
         raise AdapterError(f"cannot write {path}: {error.strerror}; {_advice(error, path)}") from error
 
@@ -932,10 +939,8 @@ def _put_papers(folder: Path, papers: Papers, names: Collection[str] = tuple(_WH
         AdapterError: one cannot be written.
     """
     brought = ((KEY, papers.key, PRIVATE), (TRUSTED, papers.trusted, PUBLIC), (CERTIFICATE, papers.certificate, PUBLIC))
-    try:
+    with _told_of(folder):
         _make_folder(folder)
         for name, pem, mode in brought:  # the key first: a certificate without its key would look complete
             if pem and name in names:
                 write_whole(folder / name, pem.encode(), mode)
-    except OSError as error:
-        raise AdapterError(f"cannot write {folder}: {error.strerror}; {_advice(error, folder)}") from error

@@ -557,7 +557,9 @@ class WorkerSupervisor:
         worker.process, worker.deadline_s = None, None
         self._compare(worker)
         if worker.phase is _Phase.STOPPING and not worker.failure:
-            worker.phase = _Phase.IDLE if worker.spec.command or not worker.is_there else _Phase.READY
+            worker.phase = _Phase.IDLE
+            if not worker.spec.command:
+                self._go_by_sight(worker)
             reason = f"stopped by {STOP_SIGNALS[worker.stop_step].name}"
             self._tell(self._events.on_exited, worker.task, worker.incarnation, returncode, reason)
             return

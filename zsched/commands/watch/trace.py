@@ -65,15 +65,18 @@ def trace(view: TraceView) -> int:
     sender, moves = Sender(view.url, news.status["fleet"], news.status["node"]), Moves()
     oldest, away = news.at - (view.since_s or 0.0), Away("trace")
     away.tell(news.log_why)
+
+    def send(spans: Iterable[Span]) -> None:
+        sender.send(span for span in spans if span.end >= oldest)
+
     with stopped_by_signal() as ended:
-        sender.send(span for span in moves.take(news.entries) if span.end >= oldest)
+        send(moves.take(news.entries))
         while not view.is_once and not ended.wait(PERIOD_S):
             news = feed.ask()
             away.tell(news.why or news.log_why)
-            spans = (*moves.take(news.entries), *moves.overdue(wall_s()))
-            sender.send(span for span in spans if span.end >= oldest)
+            send((*moves.take(news.entries), *moves.overdue(wall_s())))
     if view.is_once:
-        sender.send(span for span in moves.rest() if span.end >= oldest)
+        send(moves.rest())
     warn(f"{sender.sent} spans sent, {sender.refused} refused")
     return EXIT_FAILED if sender.refused else EXIT_OK
 

@@ -135,8 +135,7 @@ class Rounds:
         A gather under way ends without a judgement, for it has asked the robots of before; another one follows at once.
         """
         was_gathering = self._gather is not None
-        for name in sorted(anew):
-            self.tasks.pop(name, None)
+        self.tasks = {name: task for name, task in self.tasks.items() if name not in anew}
         self._adopt(fleet, now)
         if was_gathering:
             self.hurry(now)

@@ -256,12 +256,11 @@ function draw() {
   const status = state.now.status;
   if (!status) return;
   const view = window_();
-  document.title = `${state.now.degraded.length ? "! " : ""}${status.fleet} · zsched`;
+  const isSilent = Boolean(state.now.why) || state.isCut;
+  document.title = `${isSilent || state.now.degraded.length ? "! " : ""}${status.fleet} · zsched`;
   byId("fleet").textContent = `fleet ${status.fleet}`;
   byId("who").textContent = `${status.node} (${status.kind}) · quorum ${status.quorum.alive} of ${status.quorum.electors}, needs ${status.quorum.needed} · up ${span(status.up_s)} · zsched ${status.version}`;
   const health = byId("health"), away = status.nodes.filter(isAway).length, troubles = state.now.problems.length;
-  const isSilent = Boolean(state.now.why) || state.isCut;
-  if (isSilent) document.title = `! ${status.fleet} · zsched`;
   health.textContent = isSilent ? "no answer" : state.now.degraded.length ? "DEGRADED" : troubles ? `${troubles} problem${troubles > 1 ? "s" : ""}` : away ? `ok, ${away} away` : "ok";
   health.className = isSilent || state.now.degraded.length ? "bad" : troubles || away ? "warn" : "good";
   fill("problems", state.now.problems.map((text) => h("li", {}, text)));
