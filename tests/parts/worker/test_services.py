@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from threading import Event
 from typing import Any
 
@@ -16,6 +17,22 @@ from zsched.worker.services import Request, Service
 from zsched.worker.troubles import Troubles
 
 KEY = "edge1/t/robot1/job"
+
+
+def serve(
+    session: zenoh.Session, handle: Callable[[Request], Any], troubles: Troubles, jobs: JobBook, *, depth: int
+) -> Service:
+    """The owner's service under `KEY`."""
+    return Service(
+        session,
+        KEY,
+        handle,
+        is_owner=lambda: True,
+        later=lambda call: call(),
+        troubles=troubles,
+        jobs=jobs,
+        depth=depth,
+    )
 
 
 @pytest.mark.parametrize("first", [{}, SystemExit(3)])
@@ -33,16 +50,7 @@ def test_what_is_no_answer_is_the_handler_s_failure_and_the_next_request_is_answ
     troubles = Troubles(lambda count, text: told.append((count, text)))
     jobs = JobBook("t", "1", lambda _jobs: None, None)
     with zenoh.open(zenoh.Config.from_json5(data_config(listen=(), connect=()))) as session:
-        service = Service(
-            session,
-            KEY,
-            handle,
-            is_owner=lambda: True,
-            later=lambda call: call(),
-            troubles=troubles,
-            jobs=jobs,
-            depth=2,
-        )
+        service = serve(session, handle, troubles, jobs, depth=2)
         (failed,) = session.get(KEY, timeout=20.0)
         assert failed.err is not None
         kind = "SystemExit" if isinstance(first, SystemExit) else "TypeError"
@@ -66,16 +74,7 @@ def test_requests_behind_one_that_hangs_are_told_as_waiting() -> None:
         return b"done"
 
     with zenoh.open(zenoh.Config.from_json5(data_config(listen=(), connect=()))) as session:
-        service = Service(
-            session,
-            KEY,
-            handle,
-            is_owner=lambda: True,
-            later=lambda call: call(),
-            troubles=troubles,
-            jobs=jobs,
-            depth=4,
-        )
+        service = serve(session, handle, troubles, jobs, depth=4)
         answers = [session.get(KEY, timeout=20.0) for _ in range(3)]
         try:
             until(lambda: jobs.report().waiting == 2, "two wait behind the first")

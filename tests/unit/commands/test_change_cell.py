@@ -396,6 +396,11 @@ def test_nobody_starts_it_and_the_operator_takes_it_back(site: Site, monkeypatch
     assert site.cells["hall-a"].flags == []
 
 
+def here(site: Site) -> set[str]:
+    """This machine's files, without those that are put away."""
+    return {name for name in kept(site.folder) if not name.endswith(".left")}
+
+
 def always(*_given: Any, **_more: Any) -> bool:
     return True
 
@@ -432,7 +437,7 @@ def test_files_that_were_put_away_in_part_get_their_names_again_on_the_way_back(
     site: Site, monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
     """The state is put away last, so it told that nothing was to be done: the daemon could not start any more."""
-    before = {name for name in kept(site.folder) if not name.endswith(".left")}
+    before = here(site)
     if not broken_at(monkeypatch, "_put_one_away", number) or whose(site.folder / "state")[0] != "hall-a":
         return
     back = run("--to", "hall-a", "--yes")
@@ -459,7 +464,7 @@ def check_goes_on(site: Site, word: str, before: set[str]) -> None:
 def test_a_way_back_that_was_broken_off_goes_on_either_way(
     site: Site, monkeypatch: pytest.MonkeyPatch, number: int, word: str
 ) -> None:
-    before = {name for name in kept(site.folder) if not name.endswith(".left")}
+    before = here(site)
     site.is_taken = False
     if not broken_at(monkeypatch, "_put_one_away", number, lambda _path, *, is_deleted: is_deleted):
         return
@@ -472,7 +477,7 @@ def test_a_way_back_that_was_broken_off_between_two_files_goes_on(
     site: Site, monkeypatch: pytest.MonkeyPatch, number: int, word: str
 ) -> None:
     """Towards hall-a it deleted the files that it had given their names again."""
-    before = {name for name in kept(site.folder) if not name.endswith(".left")}
+    before = here(site)
     site.is_taken = False
     real, left, is_back = sync_folder, [number], [False]
 

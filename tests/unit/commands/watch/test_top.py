@@ -6,6 +6,7 @@ writes the screens anew (look at the difference before you commit it).
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import json
 import os
@@ -15,6 +16,7 @@ import subprocess
 import sys
 import termios
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -363,56 +365,56 @@ def test_once_prints_a_screen_and_exits_as_status_does(tmp_path: Path, monkeypat
     assert "needs a terminal" in refused.stderr
 
 
-def test_sigterm_gives_the_terminal_back_as_it_was(tmp_path: Path) -> None:
+@contextlib.contextmanager
+def live(folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], int, Callable[[], bool]]]:
+    """`zsched top` once it takes keys: (process, its terminal's other end, whether the terminal is as it was)."""
     empty = {"node": "robot1", "now": NOON, "entries": [], "cursor": "", "more": False}
-    daemon = OperatorSocket(tmp_path / "robot1.sock", lambda one: recorded() if one["verb"] == "status" else empty)
+    daemon = OperatorSocket(folder / "robot1.sock", lambda one: recorded() if one["verb"] == "status" else empty)
     controller, terminal = os.openpty()
     before = termios.tcgetattr(terminal)
     daemon.open()
     try:
-        command = [sys.executable, "-m", "zsched.cli", "top", "--runtime-dir", str(tmp_path)]
+        command = [sys.executable, "-m", "zsched.cli", "top", "--runtime-dir", str(folder)]
         plain = {**os.environ, "NO_COLOR": "1"}
         with subprocess.Popen(command, env=plain, stdin=terminal, stdout=terminal, stderr=terminal) as process:
             shown = b""
             while b"fleet testbed" not in shown:  # a screen: keys are taken
                 assert select.select([controller], [], [], 60)[0], shown
                 shown += os.read(controller, 1 << 16)
-            process.terminate()
-            while LEAVE.encode() not in shown and select.select([controller], [], [], 10)[0]:
-                shown += os.read(controller, 1 << 16)
-            assert process.wait(60) == 0
-        assert shown.endswith(LEAVE.encode()), "back to what stood there"
-        assert termios.tcgetattr(terminal) == before
+            try:
+                yield process, controller, lambda: termios.tcgetattr(terminal) == before
+            finally:
+                process.kill()  # nothing where it has ended
     finally:
         daemon.close()
         os.close(controller)
         os.close(terminal)
+
+
+def shown_to_the_end(controller: int) -> bytes:
+    """What comes until the terminal is given back."""
+    shown = b""
+    while LEAVE.encode() not in shown and select.select([controller], [], [], 10)[0]:
+        shown += os.read(controller, 1 << 16)
+    return shown
+
+
+def test_sigterm_gives_the_terminal_back_as_it_was(tmp_path: Path) -> None:
+    with live(tmp_path) as (process, controller, is_as_before):
+        assert not is_as_before()
+        process.terminate()
+        shown = shown_to_the_end(controller)
+        assert process.wait(60) == 0
+        assert shown.endswith(LEAVE.encode()), "back to what stood there"
+        assert is_as_before()
 
 
 def test_keys_that_come_at_once_count_each(tmp_path: Path) -> None:
     """A held arrow over a slow line, or `q` twice; they were no key together."""
-    empty = {"node": "robot1", "now": NOON, "entries": [], "cursor": "", "more": False}
-    daemon = OperatorSocket(tmp_path / "robot1.sock", lambda one: recorded() if one["verb"] == "status" else empty)
-    controller, terminal = os.openpty()
-    daemon.open()
-    try:
-        command = [sys.executable, "-m", "zsched.cli", "top", "--runtime-dir", str(tmp_path)]
-        plain = {**os.environ, "NO_COLOR": "1"}
-        with subprocess.Popen(command, env=plain, stdin=terminal, stdout=terminal, stderr=terminal) as process:
-            shown = b""
-            while b"fleet testbed" not in shown:
-                assert select.select([controller], [], [], 60)[0], shown
-                shown += os.read(controller, 1 << 16)
-            os.write(controller, b"\x1b[Bjq")
-            while LEAVE.encode() not in shown and select.select([controller], [], [], 10)[0]:
-                shown += os.read(controller, 1 << 16)
-            if process.poll() is None and LEAVE.encode() not in shown:
-                process.kill()
-            assert process.wait(60) == 0
-    finally:
-        daemon.close()
-        os.close(controller)
-        os.close(terminal)
+    with live(tmp_path) as (process, controller, _):
+        os.write(controller, b"\x1b[Bjq")
+        assert shown_to_the_end(controller).endswith(LEAVE.encode())
+        assert process.wait(60) == 0
 
 
 def test_nobody_there_is_said_at_once(tmp_path: Path) -> None:
