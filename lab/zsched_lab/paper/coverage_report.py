@@ -58,11 +58,15 @@ def coverage_parts(runs: Sequence[Json]) -> list[str]:
     curves = ["### Coverage over time\n", COVERAGE_SAYS, coverage_table(known)] if known else []
     if not own:
         return curves
+    static, moved = (
+        [one for one in own if SCHEMES[one["scheme"]].moves_slam is moves_slam] for moves_slam in (False, True)
+    )
     return [
         *curves,
         "### Whose CPU an edge's was\n",
         "Shares of an edge's CPU, the mean over edges and runs by time. All but zsched's own have a quota in common.\n",
-        roles_table(own),
+        *([roles_table(static)] if static else []),
+        *(["Where SLAM moves, too, an edge has one, several or none of them:\n", roles_table(moved)] if moved else []),
         "### When robots stood\n",
         stood_text(own),
     ]
@@ -129,31 +133,44 @@ def stood_text(runs: Sequence[Json]) -> str:
     """How long robots stood by what was on the edge of their SLAM, and whether the block is what it is to be.
 
     Where the merger has just left, SLAM has scans to catch up with, and its robot stands for some seconds more. So the
-    block is judged by the fixed schemes, under which the merger leaves nobody.
+    block is judged by the fixed schemes, under which the merger leaves nobody; without any by those whose SLAM stays.
     """
-    measured = [figures for figures in runs if figures.get("stood_by_state")]
-    kinds = {
-        "fixed": [one["stood_by_state"] for one in measured if one["scheme"] in FIXED_SCHEMES],
-        "moving": [one["stood_by_state"] for one in measured if one["scheme"] not in FIXED_SCHEMES],
-    }
-    told = {(kind, state): mean_stood(found, state) for kind, found in kinds.items() for state, _ in STATES}
-    if not any(told.values()):
+    found: dict[str, list[Json]] = {"fixed": [], "moving": [], "SLAM moves, too": []}
+    for one in runs:
+        if one.get("stood_by_state"):
+            found[_kind_of(one["scheme"])].append(one["stood_by_state"])
+    kinds = {kind: own for kind, own in found.items() if own}
+    if not kinds:
         return "Not measured by state.\n"
-    lines = ["| on the edge of its SLAM | fixed: robots' minutes | stood | moving: robots' minutes | stood |"]
-    lines.append("| --- | --- | --- | --- | --- |")
+    told = {(kind, state): mean_stood(own, state) for kind, own in kinds.items() for state, _ in STATES}
+    heads = " | ".join(f"{kind}: robots' minutes | stood" for kind in kinds)
+    lines = [f"| on the edge of its SLAM | {heads} |", "| --- " * (2 * len(kinds) + 1) + "|"]
     for state, says in STATES:
         cells = [cell for kind in kinds for cell in _stood_cells(told[kind, state])]
         lines.append(f"| {says} | {' | '.join(cells)} |")
-    model, both = told["fixed", "model"], told["fixed", "both"]
+    return "\n".join([*lines, *_faithful(told)]) + "\n"
+
+
+def _kind_of(scheme: str) -> str:
+    if scheme in FIXED_SCHEMES:
+        return "fixed"
+    return "SLAM moves, too" if SCHEMES[scheme].moves_slam else "moving"
+
+
+def _faithful(told: Mapping[tuple[str, str], tuple[float, float] | None]) -> list[str]:
+    """Whether the block is what it is to be; nothing where no robot was seen in the states that tell it."""
+    most = f"{100.0 * STANDS_AT_MOST:.0f} %"
+    model, both = told.get(("fixed", "model")), told.get(("fixed", "both"))
+    beside = told.get(("moving", "model"))
     if model is not None and both is not None:
         is_faithful = model[1] < STANDS_AT_MOST < both[1]
-        verdict = "as it must be" if is_faithful else "**not what the block is to show**"
-        most = f"{100.0 * STANDS_AT_MOST:.0f} %"
-        lines += [
-            "",
-            f"Under fixed schemes less than {most} beside the model alone, and more with the merger: {verdict}.",
-        ]
-    return "\n".join(lines) + "\n"
+        says = f"Under fixed schemes less than {most} beside the model alone, and more with the merger"
+    elif ("fixed", "idle") not in told and beside is not None:
+        is_faithful = beside[1] < STANDS_AT_MOST
+        says = f"Where SLAM stays less than {most} beside the model alone"
+    else:
+        return []
+    return ["", f"{says}: {'as it must be' if is_faithful else '**not what the block is to show**'}."]
 
 
 def _stood_cells(row: tuple[float, float] | None) -> tuple[str, str]:

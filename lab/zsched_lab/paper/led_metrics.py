@@ -92,12 +92,16 @@ def led_of(records: Sequence[Json], run: Mapping[str, Any]) -> dict[str, float] 
 
 
 def stood_figures(
-    folder: Path, run: Mapping[str, Any], slam_on: Mapping[str, NodeId], owners: Callable[[float], NodeId | None]
+    folder: Path,
+    run: Mapping[str, Any],
+    slam_on: Mapping[NodeId, Callable[[float], NodeId | None]],
+    owners: Callable[[float], NodeId | None],
 ) -> Json:
     """{state of its SLAM's edge: {"s": robots' seconds, "stood": share of them}}, over the drive.
 
-    The states are those of `zsched_lab.paper.roles.state_of`; ``owners`` tells who owned the task when. A moment counts
-    by both its ends, so one in which a load or the task came or went counts for no state. Empty: nobody led a robot.
+    The states are those of `zsched_lab.paper.roles.state_of`. ``slam_on`` tells for each robot where its SLAM was when,
+    ``owners`` who owned the task when. A moment counts by both its ends, so one in which a load, the task or SLAM came
+    or went counts for no state. Empty: nobody led a robot.
     """
     found: dict[str, list[float]] = {}
     zero_s, duration_s = float(run["zero_s"]), float(run["duration_s"])
@@ -107,15 +111,14 @@ def stood_figures(
     for robot in sorted(slam_on):
         records = read_records(folder / "records" / f"{robot}.ndjson")
         told = [record for record in records if record["kind"] == "progress" and record.get("corrections")]
-        node = slam_on[robot]
-
-        def state(t_s: float, node: NodeId = node) -> str:
-            return state_of(node in loaded_at(loads, t_s), owners(t_s) == node)
+        def state(t_s: float, slam: Callable[[float], NodeId | None] = slam_on[robot]) -> tuple[NodeId | None, str]:
+            node = slam(t_s)
+            return node, state_of(node in loaded_at(loads, t_s), node is not None and owners(t_s) == node)
 
         for before, after in itertools.pairwise(told):
             begin, end = float(before["t_s"]) - zero_s, float(after["t_s"]) - zero_s
             if begin >= 0.0 and end <= duration_s and state(begin) == state(end):
-                row = found.setdefault(state(begin), [0.0, 0.0])
+                row = found.setdefault(state(begin)[1], [0.0, 0.0])
                 row[0] += end - begin
                 row[1] += float(after["stopped_s"]) - float(before["stopped_s"])
     return {

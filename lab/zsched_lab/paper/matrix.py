@@ -30,7 +30,7 @@ IDLE_FLOOR = 0.05
 GIVE_UP = 3
 """This many cells in a row stay invalid: the machine or the fleet is at fault, and the rest would fail as well."""
 METRICS = "metrics.json"
-DEFINITIONS = 5
+DEFINITIONS = 6
 """Raise it when a figure's definition changes: figures of finished runs are then made again."""
 Say = Callable[[str], None]
 Json = dict[str, Any]

@@ -13,7 +13,7 @@ import itertools
 import json
 import statistics
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -34,6 +34,7 @@ from zsched_lab.paper.arrivals import Arrival, Streams
 from zsched_lab.paper.led_metrics import coverage_figures, led_figures, merge_cpu_s, stood_figures
 from zsched_lab.paper.load import Window, loaded_at
 from zsched_lab.paper.oracle import changes, utilities
+from zsched_lab.paper.robots import slam_task
 from zsched_lab.paper.roles import role_figures
 from zsched_lab.paper.scenario import Scenario
 
@@ -123,7 +124,7 @@ def measure(folder: Path, scenario: Scenario, truth: Truth) -> Json:
         **map_figures(streams, truth, len(run["robots"])),
         **coverage_figures(streams, duration_s, scenario.duration_s, truth.area_m2),
         **led_figures(folder, run),
-        "stood_by_state": stood_figures(folder, run, scenario.explore.slam_on, partial(owner_at, owners)),
+        "stood_by_state": stood_figures(folder, run, slam_places(run, scenario.explore.slam_on), partial(owner_at, owners)),
         "merge_cpu_s": merge_cpu_s(nodes, len(streams.stamps)),
         "roles": role_figures(nodes, run["shares"], partial(owner_at, owners)),
         "other_moves": sum(
@@ -310,6 +311,18 @@ def owner_at(owners: Sequence[tuple[float, NodeId]], t_s: float) -> NodeId | Non
     """Who owned the task at ``t_s``; ``None`` before the first."""
     index = bisect.bisect_right([start for start, _ in owners], t_s)
     return owners[index - 1][1] if index else None
+
+
+def slam_places(
+    run: Mapping[str, Any], slam_on: Mapping[NodeId, NodeId]
+) -> dict[NodeId, Callable[[float], NodeId | None]]:
+    """Where each robot's SLAM was when: with its task's owner where it is a task of the fleet, else where it stays."""
+    tasks = run.get("others") or {}
+    told = {robot: tasks.get(slam_task(robot)) for robot in slam_on}
+    return {
+        robot: partial(owner_at, owners_within(own, float(run["duration_s"])) if own else [(0.0, slam_on[robot])])
+        for robot, own in told.items()
+    }
 
 
 def owned_s(owners: Sequence[tuple[float, NodeId]], node: NodeId, duration_s: float) -> float:

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 
 from zsched_lab.paper.claims import LEAST_RUNS, Difference, declared
 from zsched_lab.paper.scenario import MATRIX
+from zsched_lab.paper.schemes import SCHEMES, Family
 from zsched_lab.paper.tables import Json, losses_table
 
 ENDED_SAY = (
@@ -70,26 +71,27 @@ def declared_parts(groups: Mapping[str, Sequence[Json]], scenario: Json) -> list
     """
     parts = []
     for metric, heading, says in DECLARED:
-        if table := _declared_table(groups, scenario, metric):
-            parts += [heading, says, table]
+        ours = [name for name, scheme in SCHEMES.items() if scheme.family is Family.OURS]
+        tables = [table for name in ours if (table := _declared_table(groups, scenario, metric, name))]
+        parts += [heading, says, *tables] if tables else []
     return parts
 
 
-def _declared_table(groups: Mapping[str, Sequence[Json]], scenario: Json, metric: str) -> str:
+def _declared_table(groups: Mapping[str, Sequence[Json]], scenario: Json, metric: str, scheme: str) -> str:
     lines = []
     for title, runs in groups.items():
         block = scenario.get("blocks", {}).get(str(runs[0].get("block", MATRIX)) if runs else MATRIX, {})
         wanted = max(int(block.get("runs") or 0), LEAST_RUNS)
-        for against, one in declared(runs, metric):
+        for against, one in declared(runs, metric, scheme):
             cells = (title, against, f"{one.runs} of {wanted}", f"{one.mine:.3f}", f"{one.theirs:.3f}", one.text())
             lines.append(f"| {' | '.join(cells)} | {declared_verdict(one, wanted)} |")
-    titles = ("where", "zsched against", "runs", "zsched's", "theirs", "difference")
-    head = [f"| {' | '.join(titles)} | zsched is |", "| --- " * (len(titles) + 1) + "|"]
+    titles = ("where", f"{scheme} against", "runs", "its own", "theirs", "difference")
+    head = [f"| {' | '.join(titles)} | {scheme} is |", "| --- " * (len(titles) + 1) + "|"]
     return "\n".join([*head, *lines]) + "\n" if lines else ""
 
 
 def declared_verdict(one: Difference, wanted: int) -> str:
-    """Whether zsched covers more, by an interval that is clear of 0; nothing is said before all runs are done."""
+    """Whether ours covers more, by an interval that is clear of 0; nothing is said before all runs are done."""
     if one.runs < wanted:
         return "no verdict: too few runs"
     if one.low <= 0.0 <= one.high:

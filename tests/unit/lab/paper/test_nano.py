@@ -40,6 +40,7 @@ from zsched_lab.paper.led_metrics import (
     stood_figures,
 )
 from zsched_lab.paper.matrix import invalid_reason
+from zsched_lab.paper.metrics import slam_places
 from zsched_lab.paper.places import robots_scenario_path, scenario_path, shipped_names, shipped_scenario
 from zsched_lab.paper.plan import AROUND_S, cell_s, plan_text
 from zsched_lab.paper.remarks import declared_parts
@@ -431,26 +432,29 @@ def test_how_long_robots_stood_is_told_by_what_was_on_the_edge_of_their_slam(tmp
     (tmp_path / "records").mkdir()
     stopped = (0.0, 0.0, 0.5, 0.5, 1.0, 2.0, 2.5, 3.0, 3.0, 3.25, 3.25)
     lines = [
-        {"kind": "progress", "t_s": 100.0 + t, "stopped_s": s, "corrections": 5 * t} for t, s in enumerate(stopped, -1)
+        {"kind": "progress", "t_s": 100.0 + t, "stopped_s": s, "corrections": 10 + 5 * t}
+        for t, s in enumerate(stopped, -1)
     ]
-    text = "\n".join(json.dumps(line) for line in [{"kind": "start", "t_s": 99.0}, *lines])
+    text = "".join(json.dumps(line) + "\n" for line in [{"kind": "start", "t_s": 99.0}, *lines])
     (tmp_path / "records/robot1.ndjson").write_text(text)
     run = {"zero_s": 100.0, "duration_s": 9.0, "loads": [{"node": "edge1", "start_s": 2.0, "end_s": 8.0}]}
 
     def owner(t_s: float) -> str:
         return "edge1" if t_s >= 4.0 else "edge2"
 
-    found = stood_figures(tmp_path, run, {"robot1": "edge1"}, owner)
-    assert (
-        found
-        == {
-            "idle": {"s": 1.0, "stood": 0.5},
-            "model": {"s": 1.0, "stood": 0.5},
-            "both": {"s": 3.0, "stood": 0.3333},
-            "merge": {"s": 1.0, "stood": 0.0},
-        }
-        or found
-    )
+    found = stood_figures(tmp_path, run, slam_places(run, {"robot1": "edge1"}), owner)
+    assert found == {
+        "idle": {"s": 1.0, "stood": 0.5},
+        "model": {"s": 1.0, "stood": 0.5},
+        "both": {"s": 3.0, "stood": 0.3333},
+        "merge": {"s": 1.0, "stood": 0.0},
+    }
+    places = [("edge1", -9.0), ("edge3", 4.5), ("edge2", 6.5)]
+    moved = run | {"others": {"slam_robot1": [{"node": node, "t_s": t_s} for node, t_s in places]}}
+    assert stood_figures(tmp_path, moved, slam_places(moved, {"robot1": "edge1"}), owner) == {
+        "idle": {"s": 4.0, "stood": 0.3125},
+        "model": {"s": 1.0, "stood": 0.5},
+    }, "its edge is where SLAM is then; of the seconds in which it moved nothing is told"
     assert mean_stood([found, {"both": {"s": 6.0, "stood": 0.0}}], "both") == pytest.approx((9.0, 1.0 / 9.0), abs=0.01)
     assert mean_stood([{}], "both") is None
     assert stood_figures(tmp_path, run, {}, owner) == {}
@@ -472,6 +476,27 @@ def test_a_block_whose_robots_stand_beside_the_model_alone_is_not_what_it_is_to_
     for model, both in ((0.06, 0.2), (0.0, 0.04)):
         assert "**not what the block is to show**" in stood(model, both)
     assert "Not measured" in stood_text([a_run("zsched", 0, 0.5)])
+
+
+def test_a_block_without_fixed_schemes_is_judged_where_slam_stays() -> None:
+    def stood(model: float) -> str:
+        states = {"idle": {"s": 60.0, "stood": 0.0}, "model": {"s": 60.0, "stood": model}}
+        moved = {"idle": {"s": 120.0, "stood": 0.25}, "model": {"s": 30.0, "stood": 0.9}}
+        return stood_text(
+            [a_run("zsched", 0, 0.5, stood_by_state=states), a_run("zsched_slam", 0, 0.5, stood_by_state=moved)]
+        )
+
+    head = "| on the edge of its SLAM | moving: robots' minutes | stood | SLAM moves, too: robots' minutes | stood |"
+    assert head in stood(0.01)
+    assert "| and the model | 1.0 | 1.0 % | 0.5 | 90.0 % |" in stood(0.01)
+    assert "Where SLAM stays less than 5 % beside the model alone: as it must be." in stood(0.04)
+    assert "**not what the block is to show**" in stood(0.06)
+    only_moved = stood_text([a_run("zsched_slam", 0, 0.5, stood_by_state={"model": {"s": 9.0, "stood": 0.9}})])
+    assert "must be" not in only_moved
+    assert "not what" not in only_moved
+    parts = "\n".join(coverage_parts([a_run("zsched", 0, 0.5), a_run("zsched_slam", 0, 0.5)]))
+    assert parts.count("| on the edge | ") == 2, "whose CPU an edge's was is told apart, too"
+    assert parts.index("Where SLAM moves, too") > parts.index("| on the edge | ")
     assert "### When robots stood" in "\n".join(coverage_parts(the_runs()))
 
 
@@ -514,6 +539,14 @@ def test_what_was_declared_of_led_robots_is_printed_and_has_a_verdict_when_all_r
     assert told["dyna_both"].runs == 5
     assert told["dyna_both"].high < 0.0 < told["the best fixed one, fixed_e2"].low
     assert declared([{**one, "stopped_ratio": None} for one in runs]) == [], "nobody leads them"
+    moved = [a_run("zsched_slam", run, 0.5 + 0.02 * run) for run in range(5)]
+    assert "zsched_slam" not in dict(declared(runs + moved)), "whose question it is stands first"
+    ((against, worse),) = [one for one in declared(runs + moved, scheme="zsched_slam") if one[0] == "zsched"]
+    assert worse.mine == pytest.approx(0.27)
+    assert worse.theirs == pytest.approx(0.335)
+    both_told = "\n".join(declared_parts({"nano": runs + moved}, {"blocks": {"nano": {"runs": 5}}}))
+    assert f"| nano | {against} | 5 of 5 | 0.270 | 0.335 | {worse.text()} | **worse** |" in both_told
+    assert both_told.index("| where | zsched against |") < both_told.index("| where | zsched_slam against |")
 
     results = results_of(runs)
     results["scenario"]["blocks"]["nano"]["runs"] = 5
