@@ -52,6 +52,8 @@ class JobNeed(Struct, frozen=True):
     """How often they come, > 0."""
     is_serial: bool
     """One thread does it, so it uses at most one core at a time."""
+    holds_turn: bool = False
+    """Its worker is busy while it waits for other things, too, and takes the next one behind it."""
 
     def most_cores(self, speed: float, need_cores: float) -> float | None:
         """What the worker can use at a time on a machine of ``speed``; ``None``: any amount.
@@ -64,12 +66,9 @@ class JobNeed(Struct, frozen=True):
         return cpu_s / (cpu_s + self.other_s) + max(need_cores - self.hz * cpu_s, 0.0)
 
     def age_s(self, speed: float, free_cores: float) -> float:
-        """Expected seconds from arrival to end where a job gets this many cores while it runs, at most one.
-
-        A thread that does one job after the other is busy while its job waits for other things, too.
-        """
+        """Expected seconds from arrival to end where a job gets this many cores while it runs, at most one."""
         stretch = 1.0 / min(max(free_cores, LEAST_FREE_CORES), 1.0)
-        held_s, beside_s = (self.other_s, 0.0) if self.is_serial else (0.0, self.other_s)
+        held_s, beside_s = (self.other_s, 0.0) if self.holds_turn else (0.0, self.other_s)
         cpu_s = self.work_s / speed
         queue_ratio = min(1.0 + self.queueing * crowd(self.hz * (held_s + cpu_s)), MOST_QUEUE_RATIO)
         return beside_s + queue_ratio * (held_s + stretch * cpu_s)
@@ -94,10 +93,13 @@ def told_job(jobs: Jobs, speed: float, known: JobNeed | None, *, is_calm: bool) 
     """A job by its worker's report, on a machine of ``speed``.
 
     ``known``: what was known before. ``is_calm``: the machine has had CPU to spare for `CALM_S`. A job of several
-    threads does not tell how long it waits for a CPU, and on a full machine its whole time is no work.
+    threads does not tell how long it waits for a CPU, and on a full machine its whole time is no work. What of its time
+    is no CPU time is a wait for other things, a GPU perhaps, where the machine had CPU to spare.
     """
-    is_serial, waits_s = jobs.wait_s is not None, other_s(jobs)
-    cpu_s = jobs.cpu_s if is_serial else _at_once(jobs.cpu_s, jobs.time_s, speed, known, is_calm=is_calm)
+    is_serial, cpu_s, waits_s = True, jobs.cpu_s, other_s(jobs)
+    if jobs.wait_s is None:
+        is_serial, cpu_s = False, _at_once(jobs.cpu_s, jobs.time_s, speed, known, is_calm=is_calm)
+        waits_s = _for_others(jobs.time_s - cpu_s, known, is_calm=is_calm)
     crowded = crowd(jobs.wanted_hz * (waits_s + cpu_s))
     queueing = RANDOM_QUEUEING if known is None else known.queueing
     if jobs.age_s is not None and jobs.time_s > 0.0:
@@ -110,6 +112,7 @@ def told_job(jobs: Jobs, speed: float, known: JobNeed | None, *, is_calm: bool) 
         queueing=queueing,
         hz=max(jobs.wanted_hz, jobs.done_hz),
         is_serial=is_serial,
+        holds_turn=True,
     )
 
 
@@ -120,6 +123,13 @@ def _at_once(cpu_s: float, time_s: float, speed: float, known: JobNeed | None, *
     """
     cpu_s = min(cpu_s, time_s)
     return cpu_s if is_calm or known is None else min(cpu_s, known.work_s / speed)
+
+
+def _for_others(rest_s: float, known: JobNeed | None, *, is_calm: bool) -> float:
+    """What of a job's time that is no work is a wait for other things; on a full machine that of before, at most."""
+    if is_calm:
+        return max(rest_s, 0.0)
+    return 0.0 if known is None else min(max(rest_s, 0.0), known.other_s)
 
 
 class Heard(Struct, frozen=True):
@@ -142,7 +152,7 @@ class Heard(Struct, frozen=True):
             queue_s = min(waits_s, LIKELY_QUEUEING * crowded_s)
             other_s = waits_s - queue_s
         else:
-            other_s = 0.0 if known is None else min(waits_s, known.other_s)
+            other_s = _for_others(waits_s, known, is_calm=False)
             queue_s = 0.0 if known is None else min(waits_s - other_s, known.queueing * crowded_s)
         queueing = queue_s / crowded_s if crowded_s > 0.0 else 0.0
         return JobNeed(work_s=cpu_s * speed, other_s=other_s, queueing=queueing, hz=hz, is_serial=False)

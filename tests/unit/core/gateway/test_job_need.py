@@ -118,6 +118,20 @@ def test_how_irregularly_jobs_of_several_threads_come_is_seen_anew_on_every_calm
     assert seen(0.15, quiet, is_calm=False).queueing == 0.0, "on a full machine that may be a wait for a CPU"
 
 
+def test_a_job_of_several_threads_that_waits_for_a_gpu_waits_as_long_on_every_machine() -> None:
+    """0.15 s of 0.2 s were neither work nor a wait, so every machine promised 0.05 s, and none kept it."""
+    jobs = Jobs(time_s=0.2, cpu_s=0.05, age_s=0.2, done_hz=4.0, wanted_hz=4.0)
+    job = told_job(jobs, 1.0, None, is_calm=True)
+    assert (job.work_s, job.other_s, job.most_cores(1.0, 0.2)) == pytest.approx((0.05, 0.15, None))
+    assert job.age_s(1.0, 4.0) == pytest.approx(0.2), "as it was seen there"
+    assert job.age_s(0.5, 4.0) == pytest.approx(0.25)
+    queued = told_job(replace(jobs, age_s=0.3), 1.0, None, is_calm=True)
+    assert queued.age_s(1.0, 4.0) == pytest.approx(0.3), "behind another one that waits there"
+    late = told_job(replace(jobs, time_s=0.35, age_s=0.35), 1.0, job, is_calm=False)
+    assert (late.work_s, late.other_s) == pytest.approx((0.05, 0.15)), "more than that may be a wait for a CPU"
+    assert told_job(jobs, 1.0, None, is_calm=False).other_s == 0.0
+
+
 def test_what_runs_beside_the_jobs_is_no_part_of_their_one_thread() -> None:
     """0.8 cores of jobs and 0.45 beside them lack nothing on a machine that has 1.25."""
     jobs = Jobs(time_s=0.05, cpu_s=0.05, wait_s=0.0, age_s=0.05, done_hz=16.0, wanted_hz=16.0)
