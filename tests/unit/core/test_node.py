@@ -1131,6 +1131,26 @@ def test_what_a_worker_here_says_of_its_jobs_is_in_the_next_profile_and_in_the_s
     assert shown.workers[0].jobs is not None
 
 
+def test_work_that_a_worker_had_when_it_was_killed_is_no_hang_of_the_next_one() -> None:
+    """Who follows says nothing before it has work; it was told to hang, and to start it anew changed nothing."""
+    node = started("edge1")
+
+    def unended_s(now: float) -> float | None:
+        sample = replace(SAMPLE, workers=(load_of(cpu_cores=0.0, memory_mb=9.0),))
+        (told,) = of(node.handle(ev.ProfileSampled(device=sample), now), do.PublishProfile)
+        found: float | None = told.profile.workers[0].unended_s
+        return found
+
+    node.handle(ev.WorkerChanged(task="merge", state=WorkerState.READY), 100.0)
+    node.handle(word(1, waiting=1), 100.0)
+    assert unended_s(140.0) == pytest.approx(40.0)
+    for state in (WorkerState.STARTING, WorkerState.READY):
+        node.handle(ev.WorkerChanged(task="merge", state=state), 141.0)
+    assert unended_s(200.0) is None
+    node.handle(replace(word(1, waiting=1), incarnation="8"), 201.0)
+    assert unended_s(240.0) == pytest.approx(39.0)
+
+
 def test_a_worker_s_word_that_cannot_be_true_or_is_of_no_worker_here_only_counts() -> None:
     node = started("edge1")
     node.handle(word(50), 100.0)

@@ -153,6 +153,8 @@ def _told(weights: Weights) -> str:
 
 def _on_worker(node: Stages, event: ev.WorkerChanged, todo: ToDo, now: float) -> None:
     was_ready = node.worker_states.get(event.task) is WorkerState.READY
+    if event.state is not WorkerState.READY:
+        node.profiler.note_end(event.task)
     story = node.workers.on_changed(event)
     if story is None:
         if was_ready and event.state is WorkerState.READY:

@@ -85,6 +85,10 @@ class JobMeter:
         for_s = now - self._works_since
         return min(for_s, MAX_JOB_S) if for_s >= UNENDED_S else None
 
+    def end(self) -> None:
+        """The worker has ended, whatever it had in hand; the next one begins idle."""
+        self._works_since = None
+
     def look(self, now: float) -> None:
         """Smooth the reports since the last look, at the moment of the machine's sample."""
         newest, before, since = self._newest, self._looked, self._looked_at

@@ -197,6 +197,11 @@ class Profiler:
         meter = self._jobs.setdefault(report.task, JobMeter(_job_tau_s(self._timing)))
         return meter.absorb(report, now)
 
+    def note_end(self, task: TaskId) -> None:
+        """The task's worker here has ended, or is started anew."""
+        if task in self._jobs:
+            self._jobs[task].end()
+
     def _link(self, sample: LinkSample, now: float) -> Link:
         rssi = trend = None
         if sample.source is LinkSource.FIXED:  # the file's word, and no reading: nothing in it is an outlier
