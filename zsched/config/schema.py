@@ -231,7 +231,7 @@ def _weight_told(gauge: Gauge) -> str:
 def _limit_told(gauge: Gauge) -> str:
     beyond, inside = ("below", "above") if gauge.is_floor else ("above", "below")
     back = f"{gauge.margin * 100:g} %" if not gauge.unit else f"{gauge.margin:g} {gauge.unit}"
-    return f"Limit of {gauge.says}. The owner is left {beyond} it; a node becomes a candidate {back} {inside} it."
+    return f"Limit of {gauge.says}. The owner is left {beyond} it; a node gets the task from another one {back} {inside} it."
 
 
 WEIGHTS: Final = Record(

@@ -298,14 +298,18 @@ def _advise_gpu(task: TaskSpec, given: Section, out: Collector) -> None:
 
 
 def _advise_gpu_limit(task: TaskSpec, given: Section, out: Collector) -> None:
-    """A limit that the task's own use breaks on an idle machine keeps it from all of them."""
+    """A limit that the task's own use breaks on an idle machine keeps it from all of them.
+
+    Within the margin a machine may have it, and none gets it from another one.
+    """
     gpu = BY_NAME["gpu"]
     limit = dict(task.gauge_limits).get(gpu.name, gpu.high)
     back = gpu.back_from(limit)
     if limit < gpu.high and task.demand.gpu > back:
         section: Section = given.get("limits")
+        whose = "" if task.demand.gpu > limit else " from another one"
         message = (
-            f"no machine can get the task: its own demand of {task.demand.gpu:g} is above {back:g}, "
+            f"no machine can get the task{whose}: its own demand of {task.demand.gpu:g} is above {back:g}, "
             f"which is the limit less the margin of {gpu.margin:g}"
         )
         enough = min(task.demand.gpu + gpu.margin, gpu.high)

@@ -873,6 +873,7 @@ def test_a_limit_that_the_task_itself_breaks_everywhere_is_a_warning(settings: s
     found = [one for one in result.warnings if "no machine can get the task" in one.message]
     assert [one.hint.endswith(hint) for one in found] == ([True] if above else [])
     assert all(f"is above {above}, which" in one.message for one in found)
+    assert all(("from another one" in one.message) == ("0.35" in settings or "0.95" in settings) for one in found)
 
 
 # --- the price -------------------------------------------------------------------------------------------------------

@@ -52,10 +52,13 @@ def refusal(
     needed_mb: float,
     use: Use,
     gauges: Mapping[GaugeName, float],
+    *,
+    has_owner: bool = True,
 ) -> str:
     """Why the node may not have the task; empty when it may.
 
-    ``needed_mb``: memory without which the task is not placed, as it is part of ``use``.
+    ``needed_mb``: memory without which the task is not placed, as it is part of ``use``. ``has_owner``: a living one
+    has the task, from which it could move back.
     """
     if profile.draining:
         return "draining"
@@ -69,7 +72,9 @@ def refusal(
     is_owner = profile.node == allocation.owner
     if not is_owner and not may_get(spec, state):
         return f"worker {state}{why}"
-    return lacks_memory(profile, needed_mb, use) or _beyond_limits(spec, profile, gauges, is_owner=is_owner)
+    return lacks_memory(profile, needed_mb, use) or _beyond_limits(
+        spec, profile, gauges, is_owner=is_owner, has_owner=has_owner
+    )
 
 
 def lacks_memory(profile: Profile, needed_mb: float, use: Use) -> str:
@@ -80,10 +85,13 @@ def lacks_memory(profile: Profile, needed_mb: float, use: Use) -> str:
     return f"needs {needed_mb:.0f} MiB, has {max(profile.memory_mb - used + needed_mb, 0.0):.0f} free"
 
 
-def _beyond_limits(spec: TaskSpec, profile: Profile, gauges: Mapping[GaugeName, float], *, is_owner: bool) -> str:
+def _beyond_limits(
+    spec: TaskSpec, profile: Profile, gauges: Mapping[GaugeName, float], *, is_owner: bool, has_owner: bool
+) -> str:
     """Why the machine's gauges forbid the task; empty: they do not.
 
-    An owner whose GPU may be busy with the task alone, for all that is known, is not left for that.
+    An owner whose GPU may be busy with the task alone, for all that is known, is not left for that. A task that nobody
+    has goes to a machine inside the margin, too: there is no other one that it could move back to.
     """
     told = dict(possible(profile.gauges)) if spec.gauge_limits else {}
     added = {"gpu"} if spec.demand.gpu and not is_owner else set[str]()
@@ -92,7 +100,11 @@ def _beyond_limits(spec: TaskSpec, profile: Profile, gauges: Mapping[GaugeName, 
         limits["gpu"] = BY_NAME["gpu"].high
     faults = (
         BY_NAME[name].fault(
-            gauges.get(name), limit, is_owner=is_owner, is_reckoned=name in added, is_old=name not in told
+            gauges.get(name),
+            limit,
+            has_margin=has_owner and not is_owner,
+            is_reckoned=name in added,
+            is_old=name not in told,
         )
         for name, limit in limits.items()
     )

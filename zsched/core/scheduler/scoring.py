@@ -135,7 +135,7 @@ def score(
         gauges = predicted_gauges(spec, allocation, profile, bookings, gateway, now)
         needed = demand if has_owner and candidate != owner else spec.demand
         least_use = use if needed is demand else predicted(profile, own, needed, coming)
-        reason = refusal(spec, allocation, profile, needed.memory_mb, least_use, gauges)
+        reason = refusal(spec, allocation, profile, needed.memory_mb, least_use, gauges, has_owner=has_owner)
         if reason:
             refused.append((candidate, reason))
             continue

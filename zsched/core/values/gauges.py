@@ -57,21 +57,21 @@ class Gauge(Struct, frozen=True, kw_only=True):
         return min(max(limit + (self.margin if self.is_floor else -self.margin), self.low), self.high)
 
     def fault(
-        self, reading: float | None, limit: float, *, is_owner: bool, is_reckoned: bool = False, is_old: bool = False
+        self, reading: float | None, limit: float, *, has_margin: bool, is_reckoned: bool = False, is_old: bool = False
     ) -> str:
         """Why a node with this reading may not have a task with this limit; empty: it may.
 
         Args:
             reading: in the gauge's unit, predicted with the task; ``None``: not measured.
             limit: the task's.
-            is_owner: whether it has the task: it is left at the limit, and got back inside the margin only.
+            has_margin: whether it must be inside by the margin: an owner is left at the limit, and got back inside only.
             is_reckoned: whether the reading has what the task would add.
             is_old: whether it is the last one, of a reader that has failed since.
 
         >>> battery = GAUGES[1]
-        >>> battery.fault(0.18, 0.2, is_owner=True)
+        >>> battery.fault(0.18, 0.2, has_margin=False)
         'battery is at 18 %, limit 20 %'
-        >>> battery.fault(0.22, 0.2, is_owner=True), battery.fault(0.22, 0.2, is_owner=False)
+        >>> battery.fault(0.22, 0.2, has_margin=False), battery.fault(0.22, 0.2, has_margin=True)
         ('', 'battery is at 22 %, limit 20 %, back from 25 % on')
         """
         if reading is None:
@@ -84,7 +84,7 @@ class Gauge(Struct, frozen=True, kw_only=True):
         if inside < 0.0:
             return f"{self.name} {at}, limit {self.shown(limit)}"
         back = self.back_from(limit)
-        if is_owner or sign * (reading - back) >= 0.0:
+        if not has_margin or sign * (reading - back) >= 0.0:
             return ""
         return f"{self.name} {at}, limit {self.shown(limit)}, back from {self.shown(back)} on"
 

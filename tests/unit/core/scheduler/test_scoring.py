@@ -751,6 +751,25 @@ def test_limits_refuse_the_owner_too(gauges: dict[str, float], why: str) -> None
     assert dict(scored(gauged("edge1", **gauges), spec=spec).refused).get("edge1", "") == why
 
 
+@pytest.mark.parametrize("agreed", [allocation(), allocation(owner=None)])
+@pytest.mark.parametrize(
+    ("spec", "told", "is_refused"),
+    [
+        (replace(SPEC, gauge_limits=(("battery", 0.2),)), gauged("edge2", battery=0.22), False),
+        (replace(SPEC, gauge_limits=(("battery", 0.2),)), gauged("edge2", battery=0.19), True),
+        (replace(SPEC, gauge_limits=(("gpu", 0.6),), demand=Demand(gpu=0.5)), gauged("edge2", gpu=0.05), False),
+        (replace(SPEC, gauge_limits=(("gpu", 0.6),), demand=Demand(gpu=0.5)), gauged("edge2", gpu=0.15), True),
+    ],
+)
+def test_a_task_that_nobody_has_goes_inside_the_margin_too(
+    agreed: Allocation, spec: TaskSpec, told: Profile, is_refused: bool
+) -> None:
+    """The owner is gone, or there was none: three robots at 22 % kept a task with a limit of 20 % from all of them."""
+    vector = scored(told, spec=spec, agreed=agreed, states={"edge1": PeerState.GONE})
+    assert ("edge2" in dict(vector.refused)) == is_refused
+    assert "edge2" in dict(scored(told, gauged("edge1"), spec=spec).refused), "from a living owner it does not"
+
+
 def test_a_node_comes_back_inside_the_margin_only() -> None:
     spec = replace(SPEC, gauge_limits=(("battery", 0.2),))
     vector = scored(gauged("edge2", battery=0.22), gauged("edge3", battery=0.25), spec=spec)
