@@ -274,11 +274,17 @@ def _changes(figures: Figures, verdict: Verdict, again: Decided, sums: tuple[Can
         yield f"{again.needed} robots must tell their utilities, {heard} did"
         return
     allocation = figures.allocation
+    is_away = allocation.home not in (None, allocation.owner) and again.leaving is None and not allocation.paused
+    if is_away and verdict.outcome == Outcome.WAIT:  # its pin takes it home, whatever the others are worth
+        yield f"what holds it back must end: {verdict.reason}"
+        return
     if allocation.paused or (allocation.pinned and (allocation.is_bound or again.leaving is None)):
         yield f"an operator must end that the task is {'paused' if allocation.paused else 'pinned'}"
     others = [one for one in sums if not one.is_owner]
     owner = next((one for one in sums if one.is_owner), None)
-    if not any(one.total is not None for one in others):
+    if is_away:
+        yield f"or {allocation.home} must be able to have it"
+    elif not any(one.total is not None for one in others):
         yield "another candidate must be able to have the task"
     elif allocation.owner is not None and again.leaving is None and owner is not None and owner.total is not None:
         yield from _leads(figures, again, owner, [one for one in others if one.total is not None])

@@ -367,6 +367,28 @@ def test_an_order_that_holds_a_task_is_named_and_only_a_hard_pin_holds_one_that_
     assert named == ([] if word is None else [f"an operator must end that the task is {word}"])
 
 
+def test_what_would_take_a_task_to_the_node_it_is_pinned_to_is_told_by_the_pin_alone() -> None:
+    """It said that the pin must end, and by how much another must lead, of a task that its pin took home."""
+    pin = Pin(node="edge2", asked=ADA, revision=4, is_hard=False)
+    agreed = allocation_of(4, "edge1", 3, tuning=TUNING, pinned=True, pin=pin)
+    on_its_way = decision_of(allocation=agreed, judge=JudgeMemory(fit_since=999.5))
+    assert "fit for 0.5 of" in on_its_way.verdict.reason
+    assert explained(on_its_way).changes == (f"what holds it back must end: {on_its_way.verdict.reason}",)
+    lost = decision_of(allocation=agreed)
+    vectors = tuple(
+        replace(
+            one,
+            utilities=tuple(utility for utility in one.utilities if utility.candidate != "edge2"),
+            refused=(("edge2", "draining"),),
+        )
+        for one in lost.figures.vectors
+    )
+    told = explained(judged_again(lost, replace(lost.figures, vectors=vectors)))
+    assert told.changes[:2] == ("an operator must end that the task is pinned", "or edge2 must be able to have it")
+    assert any(text.startswith("edge2 cannot have it: ") for text in told.changes)
+    assert not [text for text in told.changes if "leads" in text or "worth" in text]
+
+
 # --- what one robot sees ---------------------------------------------------------------------------------------------
 
 
