@@ -113,6 +113,7 @@ class SessionWatch:
     def is_due(self, node: Node, now: float) -> bool:
         """Whether the sessions hold no more and it is this node's turn to open them anew; problems are told."""
         if not self._may_begin_anew:
+            node.set_problem(SESSIONS, None)
             return False
         electors, alive = node.fleet.electors, node.membership.alive()
         lives = {name: node.membership.incarnation(name) for name in alive}
@@ -128,6 +129,7 @@ class SessionWatch:
                 self._reopening.want(order, lives, now, first_s=first_wait_s(node.fleet.timing))
             elif not self._has_roamed:
                 self._reopening.forget()
+                node.set_problem(SESSIONS, None)  # what was wanted is wanted no more
         if self._has_roamed:
             self._reopening.want(((node.me,),), lives, now, first_s=0.0)  # nobody else begins again for it
         lacks = () if self._reopening.due_at is None else node.lacking(now)
