@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from collections.abc import Set as AbstractSet
 from random import Random
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Final
 
 from zsched.core import instructions as do
 from zsched.core.electorate.numbers import known_at_start
@@ -60,6 +60,8 @@ from zsched.core.vote.expiry import Expiry
 from zsched.core.vote.retuning import Retuning
 from zsched.core.vote.voting import Votes
 
+OWN_FILE: Final = "fleet/file"
+"""The problem that this machine's file differs from the agreed document: it may for good, and nothing goes on for it."""
 HISTORY = 32
 """Past values of a task that status can show."""
 

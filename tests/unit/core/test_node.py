@@ -26,6 +26,7 @@ from zsched.core.membership.identity import QUIET_S
 from zsched.core.membership.knocking import KNOCKERS_KEPT, SHOWN_AFTER_S
 from zsched.core.node import Node
 from zsched.core.register.register import FROM_A_PEER
+from zsched.core.stages import OWN_FILE
 from zsched.core.status import build_snapshot
 from zsched.core.todo import ToDo
 from zsched.core.values.beat import Beat
@@ -827,11 +828,12 @@ def test_beats_in_turn_are_no_news() -> None:
     ("news", "is_calm"),
     [
         (ev.ProblemReported(source="disk", problem="slow"), True),
+        (ev.ProblemReported(source=OWN_FILE, problem="it differs"), True),
         (ev.ProblemReported(source="fleet/document", problem="it is fetched"), False),
         (ev.StreamsCounted(counts=(StreamCount(stream="merge/in/0", in_flight=1),)), False),
         (accept(5, "robot2", allocation_of(5, "edge2", 3)), False),
     ],
-    ids=["at rest", "a problem of the fleet", "a sample under way", "a value that is not learnt yet"],
+    ids=["at rest", "a file of its own", "a problem of the fleet", "a sample under way", "a value that is not learnt yet"],
 )
 def test_beats_say_that_a_node_is_calm_while_nothing_goes_on_there(news: ev.Event, *, is_calm: bool) -> None:
     node, sent = started(learnt=allocation_of(4, "edge1", 2)), False
@@ -1259,6 +1261,15 @@ def test_a_gap_at_a_move_is_in_the_story_of_its_task_once() -> None:
     told = [one for batch in batches for one in of(batch, do.RecordStory) if one.gap_s is not None]
     assert [(one.stage, one.task, one.epoch, one.gap_s) for one in told] == [("route", "merge", 2, 0.25)]
     assert told[0].text.startswith("merge/out/0: 250 ms")
+
+
+def test_a_document_that_was_not_valid_beside_this_machines_file_is_tried_again_when_that_has_changed() -> None:
+    """It was refused until the daemon's next start, though the operator had done what the problem said."""
+    node = started()
+    refused = node.agreement._numbers.documents.refused
+    refused["0d"] = "it has no section `security:`, and the file here has one"
+    node.handle(ev.FleetChanged(fleet=FLEET), 101.0)
+    assert refused == {}
 
 
 TIMED = (StreamCount(stream="merge/out/0", answer_s=0.2, paired_hz=5.0),)

@@ -14,7 +14,7 @@ from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.membership.identity import Verdict
 from zsched.core.membership.peers import LOSS_FACTOR, Transition
-from zsched.core.stages import Handler, Stages
+from zsched.core.stages import OWN_FILE, Handler, Stages
 from zsched.core.status import has_quorum
 from zsched.core.todo import ToDo
 from zsched.core.values.beat import Beat
@@ -86,7 +86,7 @@ def is_restless(node: Stages, now: float) -> bool:
         is_agreeing
         or is_moving
         or not all(count.is_still for count in node.stream_counts)  # a full radio delays beats; slow ones are too late
-        or any(name.startswith("fleet/") for name in node.problems)
+        or any(name.startswith("fleet/") and name != OWN_FILE for name in node.problems)
     )
 
 

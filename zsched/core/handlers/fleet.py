@@ -19,7 +19,7 @@ from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.executor.handover import Executor
 from zsched.core.handlers.work import carry_out
-from zsched.core.stages import HISTORY, Handler, Stages
+from zsched.core.stages import HISTORY, OWN_FILE, Handler, Stages
 from zsched.core.todo import ToDo
 from zsched.core.values.adoption import in_force, obstacle
 from zsched.core.values.electorate import CREATION_STEP
@@ -178,12 +178,16 @@ def compare_file(node: Stages) -> None:
             f"the fleet file here differs from the agreed document, by which this node goes; what it would change: "
             f"`zsched apply {node.fleet_path} --plan`; to take the document: `zsched fleet export -o {node.fleet_path}`"
         )
-    node.set_problem("fleet/file", complaint)
+    node.set_problem(OWN_FILE, complaint)
 
 
 def _on_fleet(node: Stages, event: ev.FleetChanged, todo: ToDo, now: float) -> None:
-    """An operator has changed the file; once a document is agreed, a file is only compared with it."""
+    """An operator has changed the file; once a document is agreed, a file is only compared with it.
+
+    A document that was not valid beside the file as it was is asked for again.
+    """
     node.by_file = fleet_hash(event.fleet)
+    node.agreement.retry_documents()
     compare_file(node)
     if node.agreement.document is not None or _is_refused(node, event.fleet):
         return

@@ -446,6 +446,10 @@ class Agreement:
             self._numbers.documents.on_refused(event.document, event.reason, is_of_disk=event.is_of_disk)
         self.orders.on_refused(event, todo)
 
+    def retry_documents(self) -> None:
+        """Documents that were not valid here may be now; they are asked for at the next word of them."""
+        self._numbers.documents.refused.clear()
+
     def change_fleet(self, change: FleetChange, todo: ToDo, now: float) -> str:
         """Try to commit a change of the fleet; why it cannot be made, or nothing."""
         return self._numbers.propose(change, todo, now)

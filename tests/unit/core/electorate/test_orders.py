@@ -259,6 +259,9 @@ def test_a_value_is_refused_for_good_while_its_document_is_not_valid_here() -> N
     assert of(todo, do.FetchDocument) == []
     assert "no robot" in agreement.problems["fleet/document"]
     assert agreement.counters["document_refused"] == 1
+    agreement.retry_documents()
+    assert "no robot" not in agreement.problems.get("fleet/document", "")
+    assert of(asked(agreement, accept_of(ADOPT.apply(FIRST)))[0], do.FetchDocument), "the file here has changed"
 
 
 # --- what is learnt --------------------------------------------------------------------------------------------------
