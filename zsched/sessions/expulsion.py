@@ -207,8 +207,9 @@ class Expulsion:
     def _begin(self) -> None:
         with self._lock:
             if self._thread is None:
-                self._thread = guarded(self._run, name="expulsion")
-                self._thread.start()
+                thread = guarded(self._run, name="expulsion")
+                thread.start()  # where no thread is to be had the next link that is refused tries again
+                self._thread = thread
 
     def _put(self, is_meant: Callable[[zenoh.Link], bool] | None) -> None:
         try:

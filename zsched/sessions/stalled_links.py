@@ -82,10 +82,14 @@ class StalledLinks(contextlib.AbstractContextManager[None]):
 
     def _begin(self) -> None:
         with self._lock:
-            self._wake.set()
             if self._thread is None:
-                self._thread = guarded(self._run, name="zsched stalled links")
-                self._thread.start()
+                thread = guarded(self._run, name="zsched stalled links")
+                try:
+                    thread.start()
+                except RuntimeError:  # no thread is to be had: a put goes on without, and the next one tries again
+                    return
+                self._thread = thread
+            self._wake.set()
 
     def _run(self) -> None:
         busy_at = monotonic_s()

@@ -14,6 +14,7 @@ from zsched.core.values.plan import Direction, RosGraph, Route, StreamSettings
 from zsched.relay.graph import GraphMirror
 from zsched.relay.matching import Matching
 from zsched.relay.streams.history import MAX_ASKERS, HeldValues
+from zsched.sessions.stalled_links import StalledLinks
 
 ROS = Route(
     stream="t/in/0",
@@ -31,6 +32,15 @@ def test_workers_are_watched_later() -> None:
         matching.watch(WorkerWatch(task="t"))
     matching.watch(WorkerWatch(task="t"))
     until(lambda: bool(told), "what is seen")
+
+
+def test_stalled_links_are_watched_later_and_a_put_goes_on_meanwhile() -> None:
+    stalled = StalledLinks(cast("Any", SimpleNamespace(info=SimpleNamespace(links=tuple))), 1.5)
+    with no_threads(), stalled:
+        assert stalled.is_resting
+    with stalled:
+        assert not stalled.is_resting
+    stalled.close()
 
 
 def test_the_graph_is_mirrored_later() -> None:
