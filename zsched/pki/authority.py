@@ -406,12 +406,17 @@ def create(folder: Path, fleet: str, passphrase: bytes, now: datetime, creation:
     Raises:
         AdapterError: there is one already, or the folder cannot be written.
     """
-    if (folder / RECORD).exists():
-        raise AdapterError(
-            f"{folder} holds an authority; `zsched pki show` tells of it; another folder: --authority DIR"
-        )
-    authority = Authority(folder, Record(fleet=fleet, number=0, trusted=(), creation=creation))
-    authority._found(passphrase, now, {})  # noqa: SLF001 - of this module
+    try:
+        make_folder(folder)
+    except OSError as error:
+        raise AdapterError(f"{folder}: cannot be written: {error.strerror}") from error
+    with _locked(folder):  # two that begin at once would keep the key of one and the record of the other
+        if (folder / RECORD).exists():
+            raise AdapterError(
+                f"{folder} holds an authority; `zsched pki show` tells of it; another folder: --authority DIR"
+            )
+        authority = Authority(folder, Record(fleet=fleet, number=0, trusted=(), creation=creation))
+        authority._found(passphrase, now, {})  # noqa: SLF001 - of this module
     return authority
 
 
@@ -422,9 +427,31 @@ def opened(folder: Path, fleet: str) -> Iterator[Authority]:
     Raises:
         AdapterError: there is none, it is another fleet's, or its record is damaged.
     """
+    held = _read(folder).fleet
+    if held != fleet:
+        raise AdapterError(f"{folder} holds the authority of fleet {held}, not of {fleet}; say --authority DIR")
+    with _locked(folder):
+        authority = Authority(folder, _read(folder))  # with what the one before us has changed
+        authority.mend()
+        yield authority
+
+
+@contextlib.contextmanager
+def _locked(folder: Path) -> Iterator[None]:
     try:
-        record = _record(json.loads(read_regular(folder / RECORD, MAX_BYTES)))
         descriptor = open_lock(folder / LOCK)
+    except OSError as error:
+        raise AdapterError(f"{folder}: its lock cannot be read: {error.strerror}") from error
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _read(folder: Path) -> Record:
+    try:
+        return _record(json.loads(read_regular(folder / RECORD, MAX_BYTES)))
     except FileNotFoundError as error:
         raise AdapterError(
             f"there is no authority in {folder}; `zsched pki init` makes one, --authority DIR says where it lies"
@@ -433,17 +460,6 @@ def opened(folder: Path, fleet: str) -> Iterator[Authority]:
         raise AdapterError(f"{folder}: cannot be read: {error.strerror}") from error
     except (ValueError, KeyError, TypeError) as error:
         raise AdapterError(f"{folder / RECORD} is damaged ({error!r}); bring it back from a backup") from error
-    if record.fleet != fleet:
-        os.close(descriptor)
-        raise AdapterError(f"{folder} holds the authority of fleet {record.fleet}, not of {fleet}; say --authority DIR")
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
-        record = _record(json.loads(read_regular(folder / RECORD, MAX_BYTES)))  # what the one before us has changed
-        authority = Authority(folder, record)
-        authority.mend()
-        yield authority
-    finally:
-        os.close(descriptor)
 
 
 def _record(body: dict[str, Any]) -> Record:

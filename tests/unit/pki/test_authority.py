@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import errno
 import json
 import os
 import stat
 import subprocess
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import pytest
 from cryptography import x509
@@ -76,7 +80,7 @@ def test_the_authority_signs_end_entities_only_and_its_signature_holds(authority
 def test_the_key_is_the_owners_alone_and_no_part_of_a_file_is_left(authority: Authority) -> None:
     issue(authority)
     modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in authority.folder.iterdir()}
-    assert modes == {key_name(1): 0o600, TRUSTED: 0o644, RECORD: 0o644}
+    assert modes == {key_name(1): 0o600, TRUSTED: 0o644, RECORD: 0o644, module.LOCK: 0o600}
     assert stat.S_IMODE(authority.folder.stat().st_mode) == 0o700
 
 
@@ -345,6 +349,24 @@ def test_a_folder_that_is_none_another_fleets_or_damaged_is_refused(authority: A
     (authority.folder / RECORD).write_text("{}")
     with pytest.raises(AdapterError, match="is damaged"), opened(authority.folder, FLEET):
         pass
+
+
+def test_of_two_who_begin_an_authority_at_once_one_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both were told that they had one, and the key of one lay beside the record of the other."""
+    both, begin = threading.Barrier(2), made.new_authority
+
+    def slow(*arguments: Any) -> Any:
+        with contextlib.suppress(threading.BrokenBarrierError):
+            both.wait(0.5)
+        return begin(*arguments)
+
+    monkeypatch.setattr(made, "new_authority", slow)
+    with ThreadPoolExecutor(2) as pool:
+        tries = [pool.submit(create, tmp_path / "both", FLEET, b"", NOW) for _ in range(2)]
+    (failure,) = [error for one in tries if (error := one.exception(10)) is not None]
+    assert "holds an authority" in str(failure)
+    with opened(tmp_path / "both", FLEET) as authority:
+        assert issue(authority)
 
 
 def test_names_that_no_certificate_holds_are_refused(authority: Authority) -> None:
