@@ -512,7 +512,8 @@ class InputStream:
         with self._lock:
             if self._next is not None and monotonic_s() > self._hold_until:
                 self._end_hold()
-            self._send_passed_over(monotonic_s())
+            if not self._is_paused:  # else `resume` sends it, behind what came before
+                self._send_passed_over(monotonic_s())
         for slot in tuple(self._slots.values()):
             slot.outlet.look_after()
 

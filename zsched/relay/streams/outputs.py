@@ -361,8 +361,10 @@ class OutputStream:
             self._left.clear()
             for slot in self._slots.values():
                 slot.held.clear()
-        for epoch in sorted(self._slots, reverse=True):
-            self.close_slot(epoch)
+            # Those that were cut first, or one of them would carry again while the carrier closes.
+            order = sorted(self._slots.values(), key=lambda slot: (not self._is_cut(slot), -slot.epoch))
+        for slot in order:
+            self.close_slot(slot.epoch)
         self._end_late()
         for ends in self._ends.values():
             undeclare(ends)

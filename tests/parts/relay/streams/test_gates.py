@@ -424,6 +424,35 @@ def test_the_newest_value_that_is_given_up_with_a_data_session_comes_again(
     kept.undeclare()
 
 
+def test_what_a_rate_held_back_waits_for_the_next_data_session_in_its_order(bench: Bench) -> None:
+    """The newest one went ahead of what had come before it, and came again behind that."""
+    got: list[str] = []
+    kept = bench.outside.declare_subscriber("edge1/t/in", lambda s: got.append(s.payload.to_string()))
+    stream = bench.flowing(way_in(StreamClass.LATEST, keep_last=2, max_hz=10))
+    publisher = bench.publisher("robot1/in")
+    publisher.put("0")
+    until(lambda: got == ["0"], "what passes")
+    stream.hold()
+    time.sleep(0.2)  # the rate lets the next one pass
+    for number in range(1, 5):
+        publisher.put(str(number))
+    until(lambda: stream.count().messages == 5, "all are taken")
+    assert drops(stream)["thinned"], "the newest, at least"
+    time.sleep(0.2)  # the one that the rate has held back is due
+    stream.look_after()
+    stream.resume()
+
+    def newest_came() -> bool:
+        stream.look_after()
+        return got[-1:] == ["4"]
+
+    until(newest_came, "the newest")
+    publisher.put("5")
+    until(lambda: got[-1:] == ["5"] or newest_came(), "one more")
+    assert got == sorted(got, key=int), "in order"
+    kept.undeclare()
+
+
 def test_a_thinned_stream_ends_with_its_newest_value(bench: Bench) -> None:
     got: list[str] = []
     kept = bench.outside.declare_subscriber("edge1/t/in", lambda s: got.append(s.payload.to_string()))
@@ -515,6 +544,25 @@ def test_what_a_cut_owner_had_on_its_way_is_counted_once_its_slot_is_closed(benc
 
     until(is_left, "the end of the subscription")
     assert move.is_through("new 1")
+
+
+def test_a_stream_that_closes_gives_no_owner_that_is_cut_the_word_again(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It carried for a moment, while the carrier's slot closed."""
+    move, carriers, close = Handover(bench, HandoverRule.LATEST), [], OutputStream.close_slot
+    move.put(move.old, "old 1")
+    move.stream.flip(2, drops_held=False)
+    move.put(move.new, "new 1")
+    assert move.is_through("old 1", "new 1")
+
+    def noted(stream: OutputStream, epoch: int) -> None:
+        close(stream, epoch)
+        carriers.append(None if stream._carrier is None else stream._carrier.epoch)
+
+    monkeypatch.setattr(OutputStream, "close_slot", noted)
+    move.stream.close()
+    assert carriers == [2, None]
 
 
 def test_with_all_the_new_owner_waits_for_the_old_ones_last(bench: Bench) -> None:
