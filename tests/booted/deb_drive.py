@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import pwd
+import shutil
 import socket
 import subprocess
 import sys
@@ -133,7 +134,7 @@ def begin_fleet(report: Report) -> None:
     report["init"] = said(ZSCHED, "init", "--config", FLEET, "--node", "robot1")
     edge = ["--config", FLEET, "--node", "edge1", "--state-dir", str(EDGE / "state")]
     report["init_edge"] = said(ZSCHED, "init", *edge)
-    report["start"] = said("systemctl", "enable", "--now", "zsched.service")
+    report["start"] = said("systemctl", "enable", "--now", "zsched.service", "zsched-renew.timer")
     command = ["systemd-run", "--unit=edge1", "--service-type=exec", "-p", "KillMode=mixed", ZSCHED, "up", *edge]
     report["start_edge"] = said(*command, "--runtime-dir", str(EDGE / "run"))
     wait_for(lambda: is_settled(ROBOT_SOCKET), 60.0, "the fleet settles")
@@ -228,6 +229,29 @@ def removed() -> Report:
     }
 
 
+def active(*units: str) -> list[str]:
+    """What systemd says of each, whether it runs."""
+    return [run("systemctl", "is-active", unit).stdout.strip() for unit in units]
+
+
+def comes_back() -> Report:
+    """Installed again after a removal; then stopped by hand and upgraded; then purged under an installation by pip."""
+    units = ("zsched.service", "zsched-renew.timer")
+    again = put("new")
+    found: Report = {"again": again, "back": active(*units)}
+    run("systemctl", "stop", *units)
+    found |= {"upgrade": put("old"), "stopped": active(*units), "taken": take_away()}
+    HOME.mkdir(exist_ok=True)
+    (HOME / "pyvenv.cfg").write_text("home = /usr/bin\n")
+    found["spared"] = dpkg("-P", "zsched")
+    found["kept"] = [name for name in (FLEET, "/var/lib/zsched/", str(HOME)) if Path(name).exists()]
+    shutil.rmtree(HOME)
+    found["last"] = put("new")
+    run("systemctl", "stop", *units)
+    take_away()
+    return found
+
+
 def refused() -> dict[str, Any]:
     """Where pip has installed already."""
     HOME.mkdir()
@@ -256,6 +280,8 @@ def observe(report: Report) -> None:
     report["upgrade"] = changed("new")
     report["downgrade"] = changed("old")
     report["remove"] = removed()
+    if not BY_PIP:
+        report["back"] = comes_back()
     run("systemctl", "stop", "edge1")
     report["purge"] = purge()
     after = listing()
