@@ -31,6 +31,10 @@ _WORD_AFTER: Final = re.compile(
     r"""(?P<value>"(?:[^"\\]|\\.)*"|'(?:[^']|'')*'|[^\s,{}\[\]#"'][^,\]\n#]*)"""
 )
 """An option in a list of words, and the word behind it."""
+_SHELL_WORD: Final = re.compile(
+    r"(?P<name>--[A-Za-z_][\w-]*)(?P<sep>[ \t]+)(?P<value>'[^']*'|\\?\"[^\"\\]*\\?\"|[^\s\"',;&|\]}\\-][^\s\"',;&|\]}\\]*)"
+)
+"""An option in a line for a shell, and the word behind it."""
 _OPTION: Final = re.compile(r"(?P<name>(?:--)?[A-Za-z_][\w-]*)(?P<sep>=)(?P<value>\"[^\"]*\"|'[^']*'|[^\s,;&\]\"']+)")
 _URL: Final = re.compile(r"(?P<head>\b[a-z][a-z0-9+.-]*://)[^/\s@\"']+@")
 _PEM: Final = re.compile(r"-----BEGIN ([A-Z ]*PRIVATE KEY)-----.*?-----END \1-----", re.DOTALL)
@@ -75,8 +79,12 @@ def clean(text: str, secrets: Iterable[str] = ()) -> str:
 
 
 def clean_yaml(text: str, secrets: Iterable[str] = ()) -> str:
-    """The same of a fleet file, whose values also follow ``name: `` or stand in a block below it."""
-    lines = _lines(_WORD_AFTER.sub(_without_value, clean(text, secrets)).split("\n"))
+    """The same of a fleet file, whose values also follow ``name: `` or stand in a block below it, or behind an option.
+
+    One with a fault tells no ``secrets`` of its own.
+    """
+    cleaned = _SHELL_WORD.sub(_without_value, _WORD_AFTER.sub(_without_value, clean(text, secrets)))
+    lines = _lines(cleaned.split("\n"))
     return "\n".join(_PAIR.sub(_without_value, line) for line in lines)
 
 

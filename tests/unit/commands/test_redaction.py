@@ -75,6 +75,9 @@ def test_words_of_a_line_for_a_shell_are_looked_at_too(option: str) -> None:
         'command: ["slam", "--api-key", "abcd\\"1234", "--mode", "fast"]',
         'command:\n        - slam\n        - --api-key\n        - "abcd1234"\n        - --mode\n        - fast',
         "command: [slam]\n      env: {DB_PASSWORD: 'abcd''1234'}\n      args: [--mode, fast]",
+        'command: [bash, -c, "exec slam --api-key abcd1234 --mode fast"]',
+        "command: [bash, -c, \"exec slam --api-key 'abcd1234' --mode fast\"]",
+        'command: [bash, -c, "exec slam --api-key \\"abcd1234\\" --mode fast"]',
     ],
 )
 def test_a_fleet_file_with_faults_loses_what_stands_behind_an_option_too(words: str) -> None:
