@@ -30,11 +30,15 @@ class FetchError(BuildError):
 
 
 def pip(*arguments: str, env: dict[str, str] | None = None) -> None:
-    """Run pip. Raises `BuildError`; `FetchError` where it got nothing from the index."""
+    """Run pip. Raises `BuildError`; `FetchError` where it got nothing from the index.
+
+    An index that has other versions than the locked ones is there: the lock is at fault.
+    """
     command = [sys.executable, "-m", "pip", "--disable-pip-version-check", *arguments]
     done = subprocess.run(command, capture_output=True, text=True, timeout=PIP_S, check=False, env=env)
     if done.returncode != 0:
-        kind = FetchError if "Could not find a version" in done.stderr or "Connection" in done.stderr else BuildError
+        is_away = any(words in done.stderr for words in ("from versions: none", "Connection", "Max retries"))
+        kind = FetchError if is_away else BuildError
         raise kind(f"pip {arguments[0]} failed:\n{done.stdout[-1000:]}{done.stderr[-2000:]}")
 
 
