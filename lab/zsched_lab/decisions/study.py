@@ -142,24 +142,30 @@ def play(
 ) -> Iterator[str]:
     """Play every case for about ``hours``, one history per seed, and append each result to ``out``.
 
-    Histories that ``out`` holds already are not played again. Yields one line per history for people. ``only`` names
+    What ``out`` holds of a rule already is not played again. Yields one line per history for people. ``only`` names
     the rules that take part (none: all).
     """
-    done = {(row["case"], row["seed"]) for row in read(out)}
+    done = {(row["case"], row["seed"], row["rule"]) for row in read(out)}
+    if out.exists() and not out.read_text(encoding="utf-8").endswith("\n"):
+        with out.open("a", encoding="utf-8") as file:
+            file.write("\n")  # a run was killed while it wrote
     for case in cases:
         count = max(1, round(hours * case.share / case.hours))
         for seed in seeds[:count]:
-            if (case.name, seed) in done:
-                continue
             world = case.build(seed, case.hours)
+            told = (entry for entry in case.cast(world, seed) if not only or entry.name in only)
+            cast = tuple(entry for entry in told if (case.name, seed, entry.name) not in done)
+            has_oracle = (case.name, seed, "oracle") in done
+            if has_oracle and not cast:
+                continue
             truth = truth_of(world, move_cost_s=case.move_cost_s)
-            cast = tuple(entry for entry in case.cast(world, seed) if not only or entry.name in only)
             moves = replay(world, cast, seed)
             rows = [
                 {"case": case.name, "seed": seed, "rule": name, **asdict(figures(world, truth, made))}
                 for name, made in moves.items()
             ]
-            rows.append({"case": case.name, "seed": seed, "rule": "oracle", **asdict(truth.figures())})
+            if not has_oracle:
+                rows.append({"case": case.name, "seed": seed, "rule": "oracle", **asdict(truth.figures())})
             with out.open("a", encoding="utf-8") as file:
                 file.writelines(json.dumps(row) + "\n" for row in rows)
             yield f"{case.name} seed {seed}: {len(rows)} rules, {case.hours:g} h"

@@ -6,8 +6,6 @@ Knows: options, exit codes, files of the folder. Does not know: how a run is mad
 from __future__ import annotations
 
 import json
-import os
-import platform
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -32,7 +30,7 @@ from zsched_lab.paper.published import RESULTS, unpack
 from zsched_lab.paper.radio_bench import RADIO_SCHEMES, radio_results, run_radio
 from zsched_lab.paper.report import groups_of, in_block, is_whole, main_level, report
 from zsched_lab.paper.robots import ExploreRobots, LogRobots, Robots, slam_task
-from zsched_lab.paper.run import CellRun, Inputs, write_json
+from zsched_lab.paper.run import CellRun, Inputs, machine_text, write_json
 from zsched_lab.paper.scenario import MATRIX, Scenario, load_scenario
 from zsched_lab.paper.schemes import QUICK_SCHEMES
 from zsched_lab.paper.snippet import snippet
@@ -272,14 +270,14 @@ def conclude(options: BenchOptions, scenario: Scenario, inputs: InputsOf, cells:
     results = {
         "schema": RESULTS_SCHEMA,
         "version": __version__,
-        "machine": f"{os.cpu_count()} cores, {platform.machine()}, Linux {platform.release()}, "
-        f"Python {platform.python_version()}",
+        "machine": machine_text(),
         "command": command_of(options),
         "scenario": asdict(scenario) | {"fleet": scenario.fleet.name},
         "input": inputs.name,
         "drives": inputs.drives.name if inputs.drives else None,
         "runs": runs,
         "invalid": invalid,
+        "interrupted": sorted(path.name for path in (options.out / "runs").glob("*.interrupted-*")),
         "missing": [cell.name for cell in undone(options.out, cells)],
         "skipped": rest.skipped,
         "radio": rest.radio,

@@ -3,9 +3,9 @@
 Knows: which cells there are, which are done, what makes a run invalid. Does not know: how a run is made or reported.
 
 A cell is done when its ``metrics.json`` is there; figures by older definitions are made again from its records.
-A run whose host was short of CPU, or one of whose processes failed, is moved aside (``NAME.invalid-N``) and repeated,
-at most `ATTEMPTS` times in all; what stays invalid is reported, not counted. A run that was cut (a signal, a kill) is
-moved aside (``NAME.interrupted-N``) and made again.
+A run whose host was short of CPU, one of whose processes failed, or whose records are damaged, is moved aside
+(``NAME.invalid-N``) and repeated, at most `ATTEMPTS` times in all; what stays invalid is reported, not counted. A run
+that was cut (a signal, a kill) is moved aside (``NAME.interrupted-N``) and made again.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+from mcap.exceptions import McapError
 
 from zsched_lab.fleet.children import ChildError
 from zsched_lab.paper.cells import Cell
@@ -128,9 +130,13 @@ class Matrix:
         except ChildError as error:
             return str(error)
         reason = invalid_reason(self._scenario, run["host"])
-        if reason is None:
+        if reason is not None:
+            return reason
+        try:
             self._say("      " + self._note(cell, folder))
-        return reason
+        except (OSError, ValueError, McapError) as error:  # a recorder was killed, say: such a run is made again
+            return f"its records cannot be measured: {error!r}"
+        return None
 
 
 def undone(out: Path, cells: Iterable[Cell]) -> list[Cell]:

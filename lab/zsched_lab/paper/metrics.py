@@ -114,7 +114,7 @@ def measure(folder: Path, scenario: Scenario, truth: Truth) -> Json:
             key: run[key]
             for key in ("scheme", "family", "block", "level", "run", "seed", "host", "mode", "input", "links")
         },
-        "version": run.get("version"),  # runs may be made on several days
+        **{key: run.get(key) for key in ("version", "machine")},  # runs may be made on several days and machines
         "nodes": per_edge,
         **over_nodes(per_edge),
         **stream_figures(streams, len(run["robots"]), duration_s),

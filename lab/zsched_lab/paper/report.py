@@ -6,6 +6,7 @@ about.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 
 from zsched_lab.paper.claims import (
@@ -187,8 +188,8 @@ def floors_text(groups: Mapping[str, Sequence[Json]]) -> str:
     beyond = [name for name, (_, low, _) in floors.items() if low > LATENCY_GOAL]
     told = f" The claim and the goal of {LATENCY_GOAL:.0%} lie outside ({', '.join(beyond)})." if beyond else ""
     text = (
-        f"A merger that costs nothing gains {means} of the task latency, by an estimate in virtual time with the 95% "
-        f"intervals {intervals}.{told} It is no bound: a scheme of few runs may be better by luck.\n"
+        f"In the published runs a merger that costs nothing gains {means} of the task latency, by an estimate in "
+        f"virtual time with the 95% intervals {intervals}.{told} It is no bound: a scheme of few runs may be better by luck.\n"
     )
     return text.replace("%", " %")
 
@@ -389,6 +390,12 @@ def conditions_text(results: Json) -> str:
         f"* Warm-up before the drive: {scenario.get('warm_up_s', 0.0):g} s.",
         f"* Pressure outside the quotas: at most {scenario['pressure_limit']:g} allowed, at most {worst} seen.",
     ]
+    for name, says in (("version", "Program"), ("machine", "Machine")):  # runs may be made on several days
+        kinds = Counter(str(figures.get(name) or "not kept") for figures in results["runs"])
+        told = "; ".join(f"{kind}: {count} runs" for kind, count in sorted(kinds.items()))
+        lines.append(f"* {says}: {told or '-'}.")
+    broken = results.get("interrupted", ())
+    lines += [f"* Broken off or failed, and made again: {', '.join(broken)}."] if broken else []
     missing = results.get("missing", ())
     lines += [f"* No valid run of {len(missing)} cells: {', '.join(missing)}."] if missing else []
     lines += [f"* Repeated: {one['cell']}: {one['reason'].splitlines()[0]}" for one in results["invalid"]]

@@ -9,6 +9,8 @@ decisions, accounting, what each robot saw), ``streams*.mcap`` and ``logs/``.
 from __future__ import annotations
 
 import json
+import os
+import platform
 import sys
 import tempfile
 import time
@@ -22,6 +24,7 @@ from ruamel.yaml import YAML
 
 from zsched import __version__
 from zsched.adapters.host.operator_client import ask
+from zsched.adapters.machine.core_speed import processor
 from zsched.clock import monotonic_s
 from zsched.core.values.model import NodeId
 from zsched.tasks.map_merge.merger import Mode
@@ -342,6 +345,7 @@ class CellRun:
         body = {
             "schema": RUN_SCHEMA,
             "version": __version__,
+            "machine": machine_text(),
             "scenario": self._scenario.name,
             "scheme": self._cell.scheme.name,
             "family": self._cell.scheme.family.value,
@@ -372,6 +376,12 @@ class CellRun:
 
     def _tell(self, t_s: float, text: str) -> None:
         self._recorder.write("events", {"kind": "event", "t_s": t_s, "text": text})
+
+
+def machine_text() -> str:
+    """What this run is made on, in a few words."""
+    parts = (f"{os.cpu_count()} cores", processor() or platform.machine(), f"Linux {platform.release()}")
+    return f"{', '.join(parts)}, Python {platform.python_version()}"
 
 
 def write_json(path: Path, body: Mapping[str, Any]) -> None:

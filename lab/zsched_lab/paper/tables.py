@@ -34,7 +34,7 @@ COLUMNS = (
     ("moves", "moves", 1),
     ("wasted_moves", "wasted", 1),
     ("other_moves", "moves of others", 1),
-    ("move_gap_max_s", "max gap s", 2),
+    ("move_gap_max_s", "longest gap s, mean", 2),
     ("lost_per_move", "lost/move", 1),
     ("regret", "regret", 3),
 )

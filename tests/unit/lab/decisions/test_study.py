@@ -38,6 +38,17 @@ def test_a_later_run_goes_on_where_the_earlier_one_ended(results: Path, tmp_path
     assert len(study.read(copy)) == len(lines)
 
 
+def test_a_later_run_plays_the_rules_that_are_missing_and_no_other(results: Path, tmp_path: Path) -> None:
+    """A history counted as played when one rule of it was: after `--only` the others were never played there."""
+    copy = tmp_path / "some.ndjson"
+    lines = results.read_text().splitlines()
+    copy.write_text("\n".join(line for line in lines if '"argmax"' not in line) + '\n{"case": "long", "se')
+    assert len(played(copy, 0.08)) == 3
+    rows, before = study.read(copy), study.read(results)
+    assert sorted(rows, key=str) == sorted(before, key=str)
+    assert played(copy, 0.08) == []
+
+
 def test_every_rule_and_the_oracle_have_a_line_for_every_history(results: Path) -> None:
     rows = study.read(results)
     found = {(row["case"], row["seed"], row["rule"]) for row in rows}

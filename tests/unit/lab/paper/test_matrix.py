@@ -1,11 +1,13 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from mcap.exceptions import EndOfFile
 
 from zsched_lab.fleet.children import ChildError
 from zsched_lab.paper.bench import BenchOptions, InputsOf, claim_folder, command_of, plan_body, planned, run_bench
@@ -169,11 +171,21 @@ class Outcomes:
         return {"host": {"pressure": outcome, "idle_ratio": 0.5}}
 
 
-def play(scenario: Scenario, out: Path, runs: Outcomes, *names: str) -> list[str]:
+def plainly(_cell: Cell, folder: Path) -> tuple[dict[str, Any], str]:
+    return {"folder": folder.name}, "fine"
+
+
+def play(
+    scenario: Scenario,
+    out: Path,
+    runs: Outcomes,
+    *names: str,
+    measure: Callable[[Cell, Path], tuple[dict[str, Any], str]] = plainly,
+) -> list[str]:
     said: list[str] = []
     scenario = replace(scenario, pressure_limit=0.2, sweep=Sweep(), blocks={})
     cells = cells_of(scenario, names, runs=1)
-    Matrix(scenario, runs.make, lambda _, folder: ({"folder": folder.name}, "fine"), out, said.append).run(cells)
+    Matrix(scenario, runs.make, measure, out, said.append).run(cells)
     valid, invalid = collect(out, cells)
     return [*said, f"{len(valid)} valid, {len(invalid)} invalid"]
 
@@ -186,6 +198,24 @@ def test_an_invalid_run_is_repeated_and_kept_aside(scenario: Scenario, tmp_path:
     assert said[-1] == "2 valid, 2 invalid"
     assert any("pressure 0.90" in line for line in said)
     assert (tmp_path / "runs" / "one-zsched-1.invalid-2" / "half").exists()
+
+
+@pytest.mark.parametrize("error", [EndOfFile(), ValueError("no footer"), OSError("short read")])
+def test_a_run_whose_records_are_damaged_is_made_again(scenario: Scenario, tmp_path: Path, error: Exception) -> None:
+    """Its recorder was killed, say; the whole bench ended with a traceback."""
+    measured: list[str] = []
+
+    def measure(cell: Cell, folder: Path) -> tuple[dict[str, Any], str]:
+        measured.append(cell.name)
+        if len(measured) == 1:
+            raise error
+        return plainly(cell, folder)
+
+    runs = Outcomes(0.1, 0.1, 0.1)
+    said = play(scenario, tmp_path, runs, "zsched", "random", measure=measure)
+    assert runs.made == ["one-zsched-1"] * 2 + ["one-random-1"]
+    assert said[-1] == "2 valid, 1 invalid"
+    assert any("cannot be measured" in line for line in said)
 
 
 def test_what_stays_invalid_does_not_stop_the_rest(scenario: Scenario, tmp_path: Path) -> None:
