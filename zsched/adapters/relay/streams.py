@@ -25,7 +25,7 @@ from zsched.adapters.relay.silence import Silence
 from zsched.clock import awake_s
 from zsched.core.events import ProblemReported, RelayChanged
 from zsched.core.relay_protocol import HandleReport, RelayStarted, RelayStop, TaskEnded, WorkerWatch
-from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.model import MAX_REASON, NodeId, TaskId
 from zsched.core.values.plan import Role, RoutePlan
 from zsched.core.values.struct import Struct, field, replace
 from zsched.errors import AdapterError, WireError
@@ -60,6 +60,8 @@ _log = logging.getLogger("zsched.streams")
 
 _Key = tuple[str, str]
 _Told = RoutePlan | Role | WorkerWatch | TaskEnded
+TOO_LARGE: Final = "relay/plan"
+"""Of the problem that the relay goes by an older plan, for the newest one is too large."""
 _KINDS: Final = ("plan", "role", "watch")
 """What a task has in the table."""
 
@@ -366,6 +368,8 @@ class RelayHandle:
         return start_relay(self._command, self._bequest.door, self._bequest.listen, code_digest(), ends_other)
 
     def _write(self, relay: RelayChild, outbox: _Outbox) -> None:
+        too_large: dict[tuple[str, TaskId], str] = {}
+        """{what the relay was to be told: why it was not}, until something of that kind fits."""
         try:
             texts = self._configs if relay.is_child else self._configs[: int(self._reopens)]
             for text in texts:
@@ -375,12 +379,17 @@ class RelayHandle:
                     self._lack = found
                     relay.hang_up()  # it carries on alone, as without a daemon, until the next one is ready
                     return
+                kind = (type(value).__name__, value.task)
                 try:
                     frame = wire.encode(value)
                 except WireError as error:
-                    self._on_report(ProblemReported(source="relay", problem=f"a plan is too large: {error}"[:400]))
+                    too_large[kind] = f"a plan of {value.task} is too large: {error}"[:MAX_REASON]
+                    self._on_report(ProblemReported(source=TOO_LARGE, problem=too_large[kind]))
                     continue
                 write_frame(relay.descriptor, frame)
+                if too_large.pop(kind, None) is not None:
+                    left = next(iter(too_large.values()), None)
+                    self._on_report(ProblemReported(source=TOO_LARGE, problem=left))
             write_frame(relay.descriptor, wire.encode(RelayStop()))
         except OSError:
             return  # it is gone: the reader says so

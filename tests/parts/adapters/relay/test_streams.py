@@ -17,10 +17,20 @@ import pytest
 from support.waiting import until
 from zsched.adapters.relay import streams
 from zsched.adapters.relay.child import RelayChild
-from zsched.adapters.relay.streams import RelayHandle
-from zsched.core.events import RelayChanged
+from zsched.adapters.relay.streams import TOO_LARGE, RelayHandle
+from zsched.core.events import ProblemReported, RelayChanged
 from zsched.core.relay_protocol import HandleReport, RelayStarted, RelayStop
-from zsched.core.values.plan import Role, WorkerRole
+from zsched.core.values.plan import (
+    Direction,
+    ReadyWhen,
+    Role,
+    Route,
+    RoutePhase,
+    RoutePlan,
+    Slot,
+    StreamSettings,
+    WorkerRole,
+)
 from zsched.ipc.pipe import write_frame
 from zsched.sessions.config import data_config
 from zsched.wire import codec as wire
@@ -58,6 +68,27 @@ def daemon() -> Iterator[Daemon]:
         pid = made.handle.pid
         made.handle.stop(2.0)
         assert pid is None or not is_there(pid)
+
+
+def test_a_plan_that_is_too_large_is_told_until_one_fits(daemon: Daemon) -> None:
+    """The problem stood until the relay's next start, beside streams that flowed."""
+
+    def plan(routes: int, task: str = "t") -> RoutePlan:
+        key = "k" * 500
+        route = Route(stream="t/in/0", direction=Direction.INPUT, from_expr=key, to_expr=key, settings=StreamSettings())
+        slot = Slot(epoch=1, owner="edge1", routes=(route,) * routes, ready_when=ReadyWhen.MATCHING)
+        return RoutePlan(task=task, phase=RoutePhase.PREPARE, current=slot)
+
+    def told() -> list[str | None]:
+        found = [one for one in tuple(daemon.reports) if isinstance(one, ProblemReported)]
+        return [one.problem for one in found if one.source == TOO_LARGE]
+
+    daemon.handle.apply(plan(2000))
+    until(lambda: len(told()) == 1, "the problem")
+    assert "a plan of t is too large" in str(told()[0])
+    daemon.handle.apply(plan(1, "other"))
+    daemon.handle.apply(plan(1))
+    until(lambda: told()[1:] == [None], "its end")
 
 
 def test_a_killed_relay_is_replaced(daemon: Daemon) -> None:
