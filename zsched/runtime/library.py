@@ -53,6 +53,8 @@ class Library:
         self._wanted: set[str] = set()
         """Hashes whose fetch waits or is under way: once is enough."""
         self._recent: deque[str] = deque(maxlen=RECENT)
+        self._complaint = ("", "")
+        """(document, why it was refused): the last one that was logged."""
         self._kept: tuple[str, ...] = ()
         """What the node's state names; at a start `keep` says it, before anything is stored."""
         self._thread = guarded(self._run, name="zsched-library")
@@ -135,12 +137,15 @@ class Library:
             self.store.save(content)
         except (ConfigError, AdapterError, WireError) as error:
             reason = str(error)
-            log.warning("document refused document=%s why=%s", name, reason)
+            if (name, reason) != self._complaint:  # a full disk refuses it every three seconds
+                log.warning("document refused document=%s why=%s", name, reason)
+            self._complaint = (name, reason)
             is_of_disk = isinstance(error, AdapterError)
             self._post(
                 ev.DocumentRefused(document=name, reason=reason[:MAX_FAULT], request=request, is_of_disk=is_of_disk)
             )
             return
+        self._complaint = ("", "")
         if name in self._recent:  # one that comes again takes no other's place
             self._recent.remove(name)
         self._recent.append(name)

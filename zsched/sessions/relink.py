@@ -34,6 +34,8 @@ class Introducer:
         self._session_config = session_config
         self._thread: threading.Thread | None = None
         self._ended = threading.Event()
+        self._count = 0
+        """How often it has been done."""
 
     @cached_property
     def _config(self) -> str | None:
@@ -42,11 +44,15 @@ class Introducer:
 
     def introduce(self) -> None:
         """Begin, and return at once; nothing while it is under way, or where zenoh redials everybody by itself."""
-        is_busy = self._thread is not None and self._thread.is_alive()
-        if self._ended.is_set() or is_busy or self._config is None:
+        if self._ended.is_set() or self.introducing or self._config is None:
             return
         self._thread = guarded(self._introduce, self._config, name="introduction", is_lasting=False)
         self._thread.start()
+
+    @property
+    def introducing(self) -> bool:
+        """Whether it is under way."""
+        return self._thread is not None and self._thread.is_alive()
 
     def close(self) -> None:
         """End what is under way."""
@@ -55,7 +61,9 @@ class Introducer:
             self._thread.join(STAY_S)
 
     def _introduce(self, config: str) -> None:
-        _log.info("somebody is missing: introducing all peers to each other")
+        self._count += 1
+        if self._count & (self._count - 1) == 0:  # a machine that is off is missed once a minute, for good
+            _log.info("somebody is missing: introducing all peers to each other count=%d", self._count)
         try:
             with zenoh.open(zenoh.Config.from_json5(config)):
                 self._ended.wait(STAY_S)

@@ -177,13 +177,24 @@ def test_a_fleet_file_that_does_not_secure_this_fleet_keeps_no_document_out(
     assert isinstance(desk.next(), ev.DocumentStored)
 
 
-def test_a_full_disk_refuses_a_document(desk: Desk, tmp_path: Path) -> None:
+def test_a_full_disk_refuses_a_document_and_is_logged_once(
+    desk: Desk, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It is asked for again every three seconds."""
     (tmp_path / "documents").write_text("in the way")
-    desk.library.order(do.StoreDocument(request=3, content=document()))
-    event = desk.next()
-    assert isinstance(event, ev.DocumentRefused)
-    assert event.is_of_disk
-    assert "cannot write" in event.reason
+    for number in range(3):
+        desk.library.order(do.StoreDocument(request=number, content=document()))
+        event = desk.next()
+        assert isinstance(event, ev.DocumentRefused)
+        assert event.is_of_disk
+        assert "cannot write" in event.reason
+    assert caplog.text.count("document refused") == 1
+    (tmp_path / "documents").unlink()
+    desk.library.order(do.StoreDocument(request=4, content=document()))
+    assert isinstance(desk.next(), ev.DocumentStored)
+    desk.library.order(do.StoreDocument(request=5, content=document(text="fleet: [")))
+    assert isinstance(desk.next(), ev.DocumentRefused)
+    assert caplog.text.count("document refused") == 2
 
 
 def test_what_the_state_names_is_kept_and_peers_fill_no_disk(desk: Desk) -> None:
