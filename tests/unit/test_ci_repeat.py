@@ -40,7 +40,9 @@ def test_a_test_that_fails_again_fails_the_run(tmp_path: Path) -> None:
 
 
 def test_a_test_that_is_skipped_the_second_time_does_not_pass(tmp_path: Path) -> None:
-    skips = FLAKY.replace("    assert was_there", "    if was_there:\n        pytest.skip('gone')\n    assert was_there")
+    skips = FLAKY.replace(
+        "    assert was_there", "    if was_there:\n        pytest.skip('gone')\n    assert was_there"
+    )
     code, told = run(tmp_path, "import pytest\n" + skips)
     assert code == 1
     assert told.splitlines()[-1] == "FAILED twice: test_it.py::test_fails_the_first_time"

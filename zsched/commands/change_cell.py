@@ -17,7 +17,7 @@ from typing import Final
 from zsched import paths
 from zsched.clock import monotonic_s
 from zsched.commands.apply import OPEN_NETWORK
-from zsched.commands.ask import Door, ask_door, door_of, find_door, fleet_here
+from zsched.commands.ask import Door, ask_door, door_of, fleet_here
 from zsched.commands.common import CliError, Json, check_dangers, check_reason, nearest, warn
 from zsched.commands.document import (
     ConflictError,
@@ -45,6 +45,7 @@ from zsched.commands.leave import (
     others_of,
     own_door,
     stop_daemon,
+    view_of,
     without,
 )
 from zsched.commands.membership import (
@@ -124,7 +125,7 @@ def change_cells(order: LeaveOrder, word: str) -> int:
     if (status["fleet"], status["node"]) != (fleet, me):
         other = f"{status['node']} of fleet {status['fleet']}"
         raise CliError(EXIT_USAGE, f"the daemon here is {other}, and {order.places.state} is {me}'s; give --state-dir")
-    view = OrderView(door=door, is_json=order.is_json, is_yes=order.is_yes, is_plan=order.is_plan, reason=order.reason)
+    view = view_of(order, door)
     files = belongings(order.places, is_purged=False)
     way = Way(order=order, view=view, me=me, began=monotonic_s(), files=files)
     there = _found(way, fleet, word, going)
@@ -157,7 +158,7 @@ def _runs_in(order: LeaveOrder, fleet: str) -> bool:
 def _taken_back(order: LeaveOrder, me: NodeId, fleet: str) -> int:
     """End a change that has not gone further than the former cell's flag."""
     door = own_door(order, me)
-    view = OrderView(door=door, is_json=order.is_json, is_yes=order.is_yes, is_plan=order.is_plan, reason=order.reason)
+    view = view_of(order, door)
     code = undrain(view, [me])
     if code == EXIT_OK and not order.is_plan:
         next_cell.end(order.places.state)
@@ -469,22 +470,10 @@ def _left_s(way: Way) -> float:
     return max(way.order.deadline_s - (monotonic_s() - way.began), 0.0)
 
 
-def _own(way: Way) -> Door:
-    """The daemon of this machine.
-
-    Raises:
-        CliError: it does not run.
-    """
-    door = find_door(way.order.runtime_dir, way.me)
-    if door.node is not None:
-        raise CliError(EXIT_UNREACHABLE, f"no daemon of {way.me} runs on this machine")
-    return door
-
-
 def _runs(way: Way, fleet: str) -> bool:
     """Whether this machine's daemon runs, and in that fleet."""
     with contextlib.suppress(CliError):
-        return bool(status_of(_own(way))["fleet"] == fleet)
+        return bool(status_of(own_door(way.order, way.me))["fleet"] == fleet)
     return False
 
 
@@ -504,7 +493,7 @@ def _tell_how_to_start(way: Way) -> None:
 
 def _not_taken(way: Way, fleet: str) -> str:
     """Why this node is not ready in its cell yet, as it and another node see it; empty: it is."""
-    door = _own(way)
+    door = own_door(way.order, way.me)
     status = status_of(door)
     if not status["quorum"]["ok"]:
         return f"it hears {status['quorum']['alive']} of the {status['quorum']['electors']} electors of {fleet}"
@@ -566,7 +555,7 @@ def _go_back(way: Way, going: Change, why: str) -> int:
         raise CliError(EXIT_FAILED, f"{me}: {why}; {told}; give `{order.leaving_for(fleet)}` again once that is mended")
     warn(f"{me}: {why}; it goes back to {going.former}")
     if _runs(way, fleet):
-        there = Way(order=order, view=OrderView(door=_own(way)), me=me, began=way.began, files=())
+        there = Way(order=order, view=OrderView(door=own_door(way.order, way.me)), me=me, began=way.began, files=())
         stop_daemon(there, fleet, f"{me} goes back")
     next_cell.go_back(going, order.places)
     if not _started(way):
@@ -575,7 +564,7 @@ def _go_back(way: Way, going: Change, why: str) -> int:
     if lack:
         told = f"{me} has its files of {going.former} again: {lack}"
         raise CliError(EXIT_TIMED_OUT, f"{told}; then: zsched undrain {me}")
-    view = OrderView(door=_own(way), is_yes=True, is_json=order.is_json, reason="it goes back")
+    view = OrderView(door=own_door(way.order, way.me), is_yes=True, is_json=order.is_json, reason="it goes back")
     undrain(view, [me])
     next_cell.end(order.places.state)
     forget = f"{fleet} names it until somebody there says: zsched node forget {me}"
@@ -585,4 +574,8 @@ def _go_back(way: Way, going: Change, why: str) -> int:
 def _not_back(way: Way, fleet: str) -> str:
     if not _runs(way, fleet):
         return f"its daemon does not run: {'; '.join(how_to_start(way.me, way.order.places))}"
-    return "" if status_of(_own(way))["quorum"]["ok"] else f"it does not hear a majority of {fleet}'s electors"
+    return (
+        ""
+        if status_of(own_door(way.order, way.me))["quorum"]["ok"]
+        else f"it does not hear a majority of {fleet}'s electors"
+    )

@@ -151,7 +151,8 @@ def _check_names(door: Door, past: Past) -> None:
     Raises:
         CliError: there is none of that name, or nobody answers.
     """
-    from zsched.commands.orders import check_name, status_of  # noqa: PLC0415 - loads the values, which showing needs not
+    from zsched.commands.document import status_of  # noqa: PLC0415 - loads the values, which showing needs not
+    from zsched.commands.orders import check_name  # noqa: PLC0415 - the same
 
     if past.task is None and past.about is None:
         return

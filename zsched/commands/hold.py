@@ -12,6 +12,7 @@ from typing import Final
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, print_json, say
+from zsched.commands.document import status_of
 from zsched.commands.orders import (
     CODES,
     NOTHING,
@@ -21,7 +22,6 @@ from zsched.commands.orders import (
     begin,
     check_name,
     check_said,
-    status_of,
     tell_results,
 )
 from zsched.commands.page import span

@@ -160,12 +160,12 @@ def leave(order: LeaveOrder) -> int:
             if not order.is_json:
                 say(f"{me} is no node of {fleet} any more, and its daemon has ended")
             _warn(order, authority_danger(order, fleet))  # it has happened: there is nothing to accept
-        code = _asked(_view(order, Door(socket=Path())), order, fleet, me, files, rows)
+        code = _asked(view_of(order, Door(socket=Path())), order, fleet, me, files, rows)
         return _end(order, fleet, me) if code is None else code
     if (status["fleet"], status["node"]) != (fleet, me):
         other = f"{status['node']} of fleet {status['fleet']}"
         raise CliError(EXIT_USAGE, f"the daemon here is {other}, and {order.places.state} is {me}'s; give --state-dir")
-    way = Way(order=order, view=_view(order, door), me=me, began=monotonic_s(), files=files)
+    way = Way(order=order, view=view_of(order, door), me=me, began=monotonic_s(), files=files)
     code = _take_leave(way, status)
     if code != EXIT_OK:
         return code
@@ -185,7 +185,8 @@ def own_door(order: LeaveOrder, me: str) -> Door:
     return door
 
 
-def _view(order: LeaveOrder, door: Door) -> OrderView:
+def view_of(order: LeaveOrder, door: Door) -> OrderView:
+    """The order as it goes to that daemon."""
     return OrderView(door=door, is_json=order.is_json, is_yes=order.is_yes, is_plan=order.is_plan, reason=order.reason)
 
 

@@ -9,7 +9,8 @@ from typing import Final
 
 from zsched.commands.ask import Door
 from zsched.commands.common import Json, print_json, say
-from zsched.commands.orders import show_rows, status_of
+from zsched.commands.document import status_of
+from zsched.commands.orders import show_rows
 from zsched.commands.page import span
 from zsched.commands.report import FLAGS, told_flag, told_hold, told_rollout
 from zsched.exits import EXIT_OK

@@ -12,6 +12,7 @@ from typing import Final, NamedTuple
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, print_json, say, told_task
+from zsched.commands.document import status_of
 from zsched.commands.orders import (
     PAUSE_S,
     OrderView,
@@ -20,7 +21,6 @@ from zsched.commands.orders import (
     check_said,
     lost_since,
     refused,
-    status_of,
     statuses_of,
     tell_uncounted,
     told_losses,

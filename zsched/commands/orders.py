@@ -14,7 +14,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from zsched.commands.ask import Door, ask_door, operator_at
+from zsched.commands.ask import Door, operator_at
 from zsched.commands.common import CliError, Json, check_reason, nearest, print_json, say, says_yes, warn
 from zsched.commands.document import ask_all
 from zsched.commands.page import span
@@ -96,11 +96,6 @@ def check_said(view: OrderView) -> None:
     check_reason(view.reason)
     if view.for_s is not None and not 1.0 <= view.for_s <= MAX_FOR_S:
         raise CliError(EXIT_USAGE, f"--for: {span(view.for_s)} is not from 1s to 366d")
-
-
-def status_of(door: Door) -> Json:
-    """What a daemon says of the fleet. Raises `CliError`: nobody answers."""
-    return ask_door(door, {"verb": "status"})
 
 
 def statuses_of(door: Door, first: Json, names: Sequence[str]) -> tuple[dict[str, Json], dict[str, str]]:

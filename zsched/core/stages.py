@@ -61,7 +61,7 @@ from zsched.core.vote.retuning import Retuning
 from zsched.core.vote.voting import Votes
 
 OWN_FILE: Final = "fleet/file"
-"""The problem that this machine's file differs from the agreed document: it may for good, and nothing goes on for it."""
+"""The problem that this machine's file differs from the agreed document, which it may for good."""
 HISTORY = 32
 """Past values of a task that status can show."""
 

@@ -44,13 +44,13 @@ class Introducer:
 
     def introduce(self) -> None:
         """Begin, and return at once; nothing while it is under way, or where zenoh redials everybody by itself."""
-        if self._ended.is_set() or self.introducing or self._config is None:
+        if self._ended.is_set() or self.is_under_way or self._config is None:
             return
         self._thread = guarded(self._introduce, self._config, name="introduction", is_lasting=False)
         self._thread.start()
 
     @property
-    def introducing(self) -> bool:
+    def is_under_way(self) -> bool:
         """Whether it is under way."""
         return self._thread is not None and self._thread.is_alive()
 

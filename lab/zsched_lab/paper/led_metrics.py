@@ -111,6 +111,7 @@ def stood_figures(
     for robot in sorted(slam_on):
         records = read_records(folder / "records" / f"{robot}.ndjson")
         told = [record for record in records if record["kind"] == "progress" and record.get("corrections")]
+
         def state(t_s: float, slam: Callable[[float], NodeId | None] = slam_on[robot]) -> tuple[NodeId | None, str]:
             node = slam(t_s)
             return node, state_of(node in loaded_at(loads, t_s), node is not None and owners(t_s) == node)

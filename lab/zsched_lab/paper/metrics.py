@@ -124,7 +124,9 @@ def measure(folder: Path, scenario: Scenario, truth: Truth) -> Json:
         **map_figures(streams, truth, len(run["robots"])),
         **coverage_figures(streams, duration_s, scenario.duration_s, truth.area_m2),
         **led_figures(folder, run),
-        "stood_by_state": stood_figures(folder, run, slam_places(run, scenario.explore.slam_on), partial(owner_at, owners)),
+        "stood_by_state": stood_figures(
+            folder, run, slam_places(run, scenario.explore.slam_on), partial(owner_at, owners)
+        ),
         "merge_cpu_s": merge_cpu_s(nodes, len(streams.stamps)),
         "roles": role_figures(nodes, run["shares"], partial(owner_at, owners)),
         "other_moves": sum(

@@ -97,7 +97,7 @@ def pages(monkeypatch: pytest.MonkeyPatch) -> Pages:
         entry("learnt \x1b[2J", 60.0, task="other", move={**MOVE, "left": None, "votes": []}),
     )
     monkeypatch.setattr(verb, "ask_door", made.ask)
-    monkeypatch.setattr("zsched.commands.orders.status_of", lambda _door: STATUS)
+    monkeypatch.setattr("zsched.commands.document.status_of", lambda _door: STATUS)
     monkeypatch.setattr("zsched.commands.history.time.sleep", lambda _s: None)
     return made
 

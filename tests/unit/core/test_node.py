@@ -833,7 +833,13 @@ def test_beats_in_turn_are_no_news() -> None:
         (ev.StreamsCounted(counts=(StreamCount(stream="merge/in/0", in_flight=1),)), False),
         (accept(5, "robot2", allocation_of(5, "edge2", 3)), False),
     ],
-    ids=["at rest", "a file of its own", "a problem of the fleet", "a sample under way", "a value that is not learnt yet"],
+    ids=[
+        "at rest",
+        "a file of its own",
+        "a problem of the fleet",
+        "a sample under way",
+        "a value that is not learnt yet",
+    ],
 )
 def test_beats_say_that_a_node_is_calm_while_nothing_goes_on_there(news: ev.Event, *, is_calm: bool) -> None:
     node, sent = started(learnt=allocation_of(4, "edge1", 2)), False

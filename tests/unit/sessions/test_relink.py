@@ -33,6 +33,6 @@ def test_a_machine_that_is_missed_for_good_is_logged_ever_more_seldom(
         for count in range(1, 10):
             introducer.introduce()
             until(lambda count=count: len(opened) == count, "an introduction")  # type: ignore[misc]
-            until(lambda: not introducer.introducing, "its end")
+            until(lambda: not introducer.is_under_way, "its end")
     introducer.close()
     assert [record.args for record in caplog.records if "introducing" in record.message] == [(1,), (2,), (4,), (8,)]

@@ -64,7 +64,7 @@ class Gauge(Struct, frozen=True, kw_only=True):
         Args:
             reading: in the gauge's unit, predicted with the task; ``None``: not measured.
             limit: the task's.
-            has_margin: whether it must be inside by the margin: an owner is left at the limit, and got back inside only.
+            has_margin: whether it must be inside by the margin; an owner is left at the limit itself.
             is_reckoned: whether the reading has what the task would add.
             is_old: whether it is the last one, of a reader that has failed since.
 
