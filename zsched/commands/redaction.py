@@ -32,7 +32,8 @@ _WORD_AFTER: Final = re.compile(
 )
 """An option in a list of words, and the word behind it."""
 _SHELL_WORD: Final = re.compile(
-    r"(?P<name>--[A-Za-z_][\w-]*)(?P<sep>[ \t]+)(?P<value>'[^']*'|\\?\"[^\"\\]*\\?\"|[^\s\"',;&|\]}\\-][^\s\"',;&|\]}\\]*)"
+    r"""(?P<name>--[A-Za-z_][\w-]*)(?P<sep>[ \t]+)"""
+    r"""(?P<value>'[^']*'|\\?"[^"\\]*\\?"|[^\s"',;&|\]}\\-][^\s"',;&|\]}\\]*)"""
 )
 """An option in a line for a shell, and the word behind it."""
 _OPTION: Final = re.compile(r"(?P<name>(?:--)?[A-Za-z_][\w-]*)(?P<sep>=)(?P<value>\"[^\"]*\"|'[^']*'|[^\s,;&\]\"']+)")

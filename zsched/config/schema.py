@@ -231,7 +231,8 @@ def _weight_told(gauge: Gauge) -> str:
 def _limit_told(gauge: Gauge) -> str:
     beyond, inside = ("below", "above") if gauge.is_floor else ("above", "below")
     back = f"{gauge.margin * 100:g} %" if not gauge.unit else f"{gauge.margin:g} {gauge.unit}"
-    return f"Limit of {gauge.says}. The owner is left {beyond} it; a node gets the task from another one {back} {inside} it."
+    owner = f"Limit of {gauge.says}. The owner is left {beyond} it"
+    return f"{owner}; a node gets the task from another one {back} {inside} it."
 
 
 WEIGHTS: Final = Record(

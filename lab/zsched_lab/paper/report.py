@@ -189,7 +189,8 @@ def floors_text(groups: Mapping[str, Sequence[Json]]) -> str:
     told = f" The claim and the goal of {LATENCY_GOAL:.0%} lie outside ({', '.join(beyond)})." if beyond else ""
     text = (
         f"In the published runs a merger that costs nothing gains {means} of the task latency, by an estimate in "
-        f"virtual time with the 95% intervals {intervals}.{told} It is no bound: a scheme of few runs may be better by luck.\n"
+        f"virtual time with the 95% intervals {intervals}.{told} It is no bound: a scheme of few runs may be better by "
+        "luck.\n"
     )
     return text.replace("%", " %")
 

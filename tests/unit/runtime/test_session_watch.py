@@ -26,7 +26,7 @@ NOWHERE = Endpoints(
 
 
 def test_that_sessions_cannot_be_opened_anew_is_no_problem_any_more_once_nobody_wants_it(tmp_path: Path) -> None:
-    """The file here has a fault; then the fleet is again what the sessions were opened by. The status told it for good."""
+    """The file here has a fault; then the fleet is what the sessions were opened by again. It was told for good."""
     fleet = fleet_of(task_of(candidates=("edge1",)), of=("edge1", "robot1"), electors=("robot1",))
     fleet = replace(fleet, security=Security(folder=str(tmp_path)))
     electorate = electorate_hash(fleet)
