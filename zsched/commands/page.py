@@ -129,7 +129,7 @@ def missed_of(stream: dict[str, Any]) -> int:
 
 
 def since_drop(stream: dict[str, Any]) -> str:
-    """The same of a stream's drops."""
+    """Behind the number of a stream's drops, as `none_for`."""
     return none_for(stream.get("dropped_s"))
 
 

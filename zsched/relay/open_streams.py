@@ -47,12 +47,12 @@ class OpenStreams:
         self.outputs: dict[str, OutputStream] = {}
         self._closed: dict[str, StreamCount] = {}
         """What streams have counted that were closed, and may come again by the same name..."""
+        self._changing = threading.Lock()
+        """...which a reader of counters sees in one of both places."""
         self._left: dict[str, KeptValues] = {}
         """{key expression: what inputs kept that were closed since `keep`}: rules may change places, and settings."""
         self._late: set[str] = set()
         """Those of them whose next input could not be opened for a moment: it is tried again."""
-        self._changing = threading.Lock()
-        """...which a reader of counters sees in one of both places."""
 
     def all(self) -> list[InputStream | OutputStream]:
         """Inputs, then outputs."""

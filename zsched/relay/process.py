@@ -29,7 +29,7 @@ from zsched.clock import awake_s, monotonic_s
 from zsched.core.events import FrameDropped, ProblemReported, RoleEnded, StreamsCounted
 from zsched.core.membership.relink import Introductions
 from zsched.core.relay_protocol import RelayReport, RelayStarted, RelayStop, TaskEnded, WorkerSeen, WorkerWatch
-from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.model import MAX_REASON, NodeId, TaskId
 from zsched.core.values.plan import Role, Route, RoutePlan, StreamCount
 from zsched.errors import WireError
 from zsched.guard import ends_within, guarded, on_failure
@@ -319,7 +319,9 @@ class RelayProcess:
             try:
                 command = wire.decode(frame, *COMMANDS)
             except WireError as error:
-                self._reporter.report(ProblemReported(source=SOURCE, problem=f"unreadable command: {error}"[:400]))
+                self._reporter.report(
+                    ProblemReported(source=SOURCE, problem=f"unreadable command: {error}"[:MAX_REASON])
+                )
                 continue
             if isinstance(command, RelayStop):
                 return True
@@ -557,7 +559,7 @@ def _reopen(relay: RelayProcess, reporter: Reporter, commands: int) -> bool:
         relay.reopen(text.decode())
     except (zenoh.ZError, WireError, OSError, ValueError) as error:
         problem = f"its data session is not opened anew: {why_not_open((text or b'').decode(), error)}"
-        reporter.report(ProblemReported(source=SOURCE, problem=problem[:400]))
+        reporter.report(ProblemReported(source=SOURCE, problem=problem[:MAX_REASON]))
         reporter.flush(CLOSE_S)
         return False
     return True

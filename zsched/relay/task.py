@@ -19,7 +19,7 @@ from zenoh import Session, Timestamp
 from zsched.clock import monotonic_s
 from zsched.core.events import ProblemReported, SlotDrained, SlotFlipped, SlotReady
 from zsched.core.relay_protocol import RelayReport, SlotLost
-from zsched.core.values.model import TaskId
+from zsched.core.values.model import MAX_REASON, TaskId
 from zsched.core.values.plan import (
     Direction,
     DrainingSlot,
@@ -286,7 +286,7 @@ class TaskRelay:
 
     def _problem(self, text: str) -> None:
         self._has_problem = True
-        self._report(ProblemReported(source=f"relay/{self._task}", problem=text[:400]))
+        self._report(ProblemReported(source=f"relay/{self._task}", problem=text[:MAX_REASON]))
 
     def _end_problem(self) -> None:
         """A plan was taken to its end: what was told is over, unless a stream of one of its slots is not open."""
@@ -313,8 +313,8 @@ class TaskRelay:
             return
         self._leaving, self._is_away = None, True
         lost, carrier = sum(source.leave() for source in self._streams.inputs.values()), self._carrier()
-        if lost and carrier is not None:
-            self._report(SlotLost(task=self._task, epoch=carrier.slot.epoch, owner=carrier.slot.owner, samples=lost))
+        if carrier is not None:
+            self._tell_lost(carrier.slot, lost)
         for sink in self._streams.outputs.values():
             sink.leave()
         leaving.has_left.set()
@@ -423,16 +423,8 @@ class TaskRelay:
             self._open(plan.current, is_from_start=plan.phase is RoutePhase.PREPARE)
         self._carry_on()
         current = self._current()
-        if current is not None and plan.phase is RoutePhase.CLOSE:
-            self._flip(current)  # it was opened anew: its owner counts as ready by another rule
-        if current is not None and plan.phase is RoutePhase.FLIP:
-            self._flip_by = monotonic_s() + FLIP_WAIT_S
-        if current is not None and plan.phase is RoutePhase.PREPARE and current.is_ready:
-            self._report(SlotReady(task=self._task, epoch=current.slot.epoch))  # asked again: say it again
         if current is not None:
-            current.lack = None  # the same
-        if current is not None and plan.phase is RoutePhase.FLIP and current.is_flipped:
-            self._report_flip(current.slot.epoch, 0)  # for another daemon
+            self._follow(plan.phase, current)
         for sink in self._streams.outputs.values():
             sink.resume(0 if plan.current is None else plan.current.epoch)
         self._forget_streams()
@@ -440,6 +432,18 @@ class TaskRelay:
             self._task, tuple(route for state in self._slots.values() for route in state.slot.routes)
         )
         self._end_problem()
+
+    def _follow(self, phase: RoutePhase, current: _OpenSlot) -> None:
+        """Do for the plan's own slot what its phase asks; what was said of it before is said again."""
+        if phase is RoutePhase.CLOSE:
+            self._flip(current)  # it was opened anew: its owner counts as ready by another rule
+        elif phase is RoutePhase.PREPARE and current.is_ready:
+            self._report(SlotReady(task=self._task, epoch=current.slot.epoch))
+        current.lack = None
+        if phase is RoutePhase.FLIP:
+            self._flip_by = monotonic_s() + FLIP_WAIT_S
+            if current.is_flipped:
+                self._report_flip(current.slot.epoch, 0)  # for another daemon
 
     def _inherited(self, plan: RoutePlan) -> tuple[Slot, ...]:
         """The slot that carries since another daemon's time, while the new owner is not ready, and what drains."""
@@ -460,8 +464,7 @@ class TaskRelay:
         epoch, before = slot.epoch, {route.stream: route for route in state.slot.routes}
         wanted = {route.stream: route for route in slot.routes}
         lost = sum(self._close_stream(epoch, route) for stream, route in before.items() if wanted.get(stream) != route)
-        if lost:
-            self._report(SlotLost(task=self._task, epoch=epoch, owner=slot.owner, samples=lost))
+        self._tell_lost(slot, lost)
         state.slot = slot
         for stream, route in wanted.items():
             if before.get(stream) != route:
@@ -564,8 +567,8 @@ class TaskRelay:
             source.take_left(epoch) + source.close_slot(epoch, has_answer=self._has_answer)
             for source in self._streams.inputs.values()
         )
-        if lost and state is not None:
-            self._report(SlotLost(task=self._task, epoch=epoch, owner=state.slot.owner, samples=lost))
+        if state is not None:
+            self._tell_lost(state.slot, lost)
         for sink in self._streams.outputs.values():
             sink.close_slot(epoch)
         self._services.close_slot(epoch)
@@ -578,9 +581,13 @@ class TaskRelay:
             state.left, state.left_at = state.left + left, state.left_at or now
         if state.left_at is None or now - state.left_at < GATHER_S:
             return
-        slot, lost = state.slot, state.left
-        state.left, state.left_at = 0, None
-        self._report(SlotLost(task=self._task, epoch=slot.epoch, owner=slot.owner, samples=lost))
+        lost, state.left, state.left_at = state.left, 0, None
+        self._tell_lost(state.slot, lost)
+
+    def _tell_lost(self, slot: Slot, samples: int) -> None:
+        """Report how many samples that were with the owner of a slot it has not acknowledged, if any."""
+        if samples:
+            self._report(SlotLost(task=self._task, epoch=slot.epoch, owner=slot.owner, samples=samples))
 
     def _forget_streams(self) -> None:
         """Close streams that no slot names any more; without any slot they stay, and with them the kept values."""

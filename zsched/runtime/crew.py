@@ -217,8 +217,7 @@ class Crew:
     def on_trouble(self, trouble: WorkerTrouble) -> None:
         """A worker here says that its callbacks raise, for one; of a process that has ended that is no news."""
         with self._lock:
-            current = self._lives.get(trouble.task)
-            if current is None or str(current) == trouble.incarnation:
+            if self._is_of(trouble.task, trouble.incarnation):
                 self._post(
                     ev.WorkerTroubled(
                         task=trouble.task, count=trouble.count, text=trouble.text, is_cold=trouble.is_cold
@@ -228,8 +227,12 @@ class Crew:
     def is_ours(self, jobs: ev.WorkerJobs) -> bool:
         """Whether that is the word of a worker that runs here, or of one that somebody else started."""
         with self._lock:
-            current = self._lives.get(jobs.task)
-            return current is None or str(current) == jobs.incarnation
+            return self._is_of(jobs.task, jobs.incarnation)
+
+    def _is_of(self, task: TaskId, incarnation: str) -> bool:
+        """Whether that is the running process' life, or somebody else's worker's (under the lock)."""
+        current = self._lives.get(task)
+        return current is None or str(current) == incarnation
 
     def _supervisor_of(self, task: TaskId) -> WorkerSupervisor | None:
         """The supervisor, if it has a worker of the task, or will have one as soon as its thread has heard of it.

@@ -283,10 +283,10 @@ def is_of_a_later_key(invitation: Invitation, places: Places) -> bool:
     fleet, papers = _read(invitation.document.text, places.config), invitation.papers
     if papers is None or not papers.key or fleet.security is None:
         return False
-    offered = parse_common_name(_named(papers.certificate.encode()) or "", fleet.name)
+    offered = _holder(papers.certificate.encode(), fleet.name)
     if offered is None:
         return False
-    held = parse_common_name(_named(_held(Path(fleet.security.folder))) or "", fleet.name)
+    held = _holder(_held(Path(fleet.security.folder)), fleet.name)
     if held is not None:
         return (held.name, held.role) == (offered.name, offered.role) and held.key < offered.key
     if os.path.lexists(Path(fleet.security.folder) / CERTIFICATE):
@@ -385,7 +385,7 @@ def _lets_in(fleet: Fleet, invitation: Invitation) -> bool:
     pem = b"" if invitation.papers is None else invitation.papers.certificate.encode()
     with contextlib.suppress(OSError):
         pem = read_regular(Path(fleet.security.folder) / CERTIFICATE, MAX_FILE_BYTES)
-    holder = parse_common_name(_named(pem) or "", fleet.name)
+    holder = _holder(pem, fleet.name)
     return holder is None or holder in accepted(invitation.node, Role.NODE, fleet.security.revoked)
 
 
@@ -426,7 +426,7 @@ def take_later_key(
 def _drop_document(invitation: Invitation, places: Places) -> None:
     """Delete the document that the state names, if it lets nobody in by the invitation's key; others have it, too."""
     papers, let_in = invitation.papers, _let_in(invitation, places)
-    holder = None if papers is None else parse_common_name(_named(papers.certificate.encode()) or "", invitation.fleet)
+    holder = None if papers is None else _holder(papers.certificate.encode(), invitation.fleet)
     kept = _agreed_here(invitation, places)
     if kept is None or not let_in or holder in let_in:
         return
@@ -562,6 +562,11 @@ def _check_own_key(path: Path, invitation: Invitation) -> None:
         raise AdapterError(f"{path}: {error}; {advice}") from error
     if not is_ours:
         raise AdapterError(f"{path} is another key than the one that the certificate is for; {advice}")
+
+
+def _holder(pem: bytes, fleet: str) -> Holder | None:
+    """Whom of ``fleet`` a certificate names; ``None``: nobody."""
+    return parse_common_name(_named(pem) or "", fleet)
 
 
 def _named(pem: bytes) -> str | None:

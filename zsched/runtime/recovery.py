@@ -45,10 +45,7 @@ def look(fleet: Fleet, node: NodeId, config: Path, folder: Path, brought: Sequen
         AdapterError: a daemon runs in that folder, it is another node's, or a state that was brought cannot be read.
         ConfigError: the operator's zenoh file is not usable.
     """
-    file = StateFile(folder, fleet=fleet.name, node=node)
-    with file:  # a running daemon holds it: said before anybody is asked
-        file.check_owner()
-        own = file.load().state
+    own = _own_state(fleet, node, folder)
     others = tuple(map(read_state, brought))
     states = (() if own is None else (own,)) + others
     stores = [DocumentStore(folder), *(DocumentStore(path.parent) for path in brought)]
@@ -158,6 +155,13 @@ def _brought(document: str, brought: Sequence[Path]) -> Document:
     return next(content for store in stores if (content := store.load(document)) is not None)
 
 
+def _own_state(fleet: Fleet, node: NodeId, folder: Path) -> DurableState | None:
+    file = StateFile(folder, fleet=fleet.name, node=node)
+    with file:  # a running daemon holds it: said before anybody is asked
+        file.check_owner()
+        return file.load().state
+
+
 def find_side(fleet: Fleet, node: NodeId, folder: Path, wanted: str) -> tuple[DurableState | None, Sides | str]:
     """(this node's state, the generation that it changes to or why there is none).
 
@@ -165,10 +169,7 @@ def find_side(fleet: Fleet, node: NodeId, folder: Path, wanted: str) -> tuple[Du
         AdapterError: a daemon runs in that folder, or it is another node's.
         ConfigError: the operator's zenoh file is not usable.
     """
-    file = StateFile(folder, fleet=fleet.name, node=node)
-    with file:
-        file.check_owner()
-        own = file.load().state
+    own = _own_state(fleet, node, folder)
     return own, choose_side(fleet, own, sides_of(ask_others(fleet, node).answers), wanted)
 
 

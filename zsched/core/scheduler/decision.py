@@ -17,7 +17,6 @@ from zsched.core.scheduler.standing import Standing, compare
 from zsched.core.values.decision import Figures, Rules, Verdict
 from zsched.core.values.fleet import TaskSpec, WorkerSpec
 from zsched.core.values.model import Allocation, NodeId, PeerState
-from zsched.core.values.profile import WorkerState
 from zsched.core.values.quorum import majority
 from zsched.core.values.struct import Struct, replace
 
@@ -198,20 +197,8 @@ def _escape(judge: Judge, standing: Standing, figures: Figures) -> str | None:
     state = figures.owner_state
     if state is PeerState.SUSPECT and not figures.is_called_escape:
         state = PeerState.ALIVE  # in grace; only a peer's word makes our own suspicion enough
-    not_ready_for = _not_ready_for(judge, figures)
+    not_ready_for = judge.not_ready_for(profile, figures.now)
     return escape_reason(judge.spec, allocation, state, profile, standing, not_ready_for)
-
-
-def _not_ready_for(judge: Judge, figures: Figures) -> float:
-    """For how long the owner's worker was heard not to be ready; who is not heard says nothing about it."""
-    profile, now = figures.owner_profile, figures.now
-    load = None if profile is None else profile.worker(figures.task)
-    if profile is None or (load is not None and load.state is WorkerState.READY):
-        judge.not_ready_since = None
-        return 0.0
-    if judge.not_ready_since is None:
-        judge.not_ready_since = now
-    return now - judge.not_ready_since
 
 
 def _look_ahead(judge: Judge, judgement: Judgement, standing: Standing, figures: Figures) -> Judgement:

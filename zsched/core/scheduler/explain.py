@@ -9,16 +9,15 @@ The sums are not taken from the verdict. They are made again from the robots' te
 from __future__ import annotations
 
 import math
-import statistics
 from collections.abc import Iterator
 
 from zsched.core.scheduler.damping import WINDOW_S, Damping
 from zsched.core.scheduler.decision import Decided, decide_again, verdict_of
 from zsched.core.scheduler.judge import Outcome
-from zsched.core.scheduler.standing import Standing, counted, joined, pick, rounded
+from zsched.core.scheduler.standing import Standing, counted, joined, mean_of, pick, rounded
 from zsched.core.scheduler.utility import total_utility
 from zsched.core.values.decision import Decision, Figures, Verdict
-from zsched.core.values.model import Aggregate, NodeId, PeerState, Tuning, Utility, UtilityVector
+from zsched.core.values.model import NodeId, PeerState, Tuning, Utility, UtilityVector
 from zsched.core.values.quorum import majority
 from zsched.core.values.struct import Struct, replace
 from zsched.core.values.words import Readings
@@ -354,7 +353,7 @@ def owner_cpu_below(figures: Figures, standing: Standing, owner: CandidateSum, r
         for one in column:
             lower = one if one.cpu is None else replace(one, cpu=min(one.cpu, level))
             values.append(utility_of(lower, tuning) or 0.0)
-        mean = statistics.fmean if tuning.aggregate is Aggregate.MEAN else statistics.median
+        mean = mean_of(tuning.aggregate)
         return rounded(rival_total) > rounded(max(mean(values) + owner.bonus - owner.penalty, 0.0))
 
     low, high = 0.0, max(terms)

@@ -84,6 +84,16 @@ class Judge:
         if is_new_owner:
             self.not_ready_since = None
 
+    def not_ready_for(self, profile: Profile | None, now: float) -> float:
+        """For how many seconds the owner's worker was heard not to be ready; who is not heard says nothing about it."""
+        load = None if profile is None else profile.worker(self.spec.name)
+        if profile is None or (load is not None and load.state is WorkerState.READY):
+            self.not_ready_since = None
+            return 0.0
+        if self.not_ready_since is None:
+            self.not_ready_since = now
+        return now - self.not_ready_since
+
     def memory(self) -> JudgeMemory:
         """What this judge remembers, as a value."""
         players, watched_at = self.learnt.memory() if self.spec.learns_patience else ((), None)

@@ -47,7 +47,7 @@ def compare(spec: TaskSpec, allocation: Allocation, vectors: Mapping[NodeId, Uti
         for candidate, utility in {utility.candidate: utility for utility in vector.utilities}.items():
             columns.setdefault(candidate, []).append(utility)  # once per voter, however often its vector names it
         reasons.update(vector.refused)
-    mean = statistics.fmean if allocation.tuning.aggregate is Aggregate.MEAN else statistics.median
+    mean = mean_of(allocation.tuning.aggregate)
     vetoed: dict[NodeId, str] = {}
     kept: list[NodeId] = []
     for candidate in spec.candidates:
@@ -68,6 +68,11 @@ def compare(spec: TaskSpec, allocation: Allocation, vectors: Mapping[NodeId, Uti
         voters_heard=len(fresh),
         penalties=joined(dict(vector.penalties) for vector in fresh),
     )
+
+
+def mean_of(aggregate: Aggregate) -> Callable[[list[float]], float]:
+    """How robots' utilities become one."""
+    return statistics.fmean if aggregate is Aggregate.MEAN else statistics.median
 
 
 def counted(candidates: Iterable[NodeId], vectors: tuple[UtilityVector, ...]) -> tuple[UtilityVector, ...]:
