@@ -22,7 +22,7 @@ from zsched.core.values.fleet import (
 from zsched.core.values.model import ScoreForm, Tuning, Weights
 from zsched_lab.decisions.entries import CPU_ONLY, MEMORY_ONLY, PAPER_COST, RAW
 from zsched_lab.decisions.rules import CoreRule, PickRule, Rule
-from zsched_lab.decisions.service.replay import Player, is_of_task
+from zsched_lab.decisions.service.replay import Deadline, Player, is_of_task
 from zsched_lab.decisions.view import Look, Sight
 from zsched_lab.decisions.world import EVEN, RADIO_ONLY
 
@@ -47,11 +47,12 @@ def players() -> tuple[Player, ...]:
 def zsched(name: str, **settings: Any) -> Player:
     """The production's decision. What ``settings`` do not say is what a fleet file gets that does not say it.
 
-    They are fields of `Tuning` and `TaskSpec`, and those of `OWN`.
+    They are fields of `Tuning` and `TaskSpec`, those of `OWN`, and ``deadline`` (`Deadline`).
     """
     given = dict(settings)
     smoothing_s = given.pop("smoothing_s", Look().smoothing_s)
     is_told, tells_jobs = bool(given.pop("is_told", True)), bool(given.pop("tells_jobs", True))
+    deadline = given.pop("deadline", None)
     changes = {key: given.pop(key) for key in tuple(given) if is_of_task(key)}
     is_service = given.setdefault("score", DEFAULT_SCORE) is ScoreForm.SERVICE  # no task here weighs the network
     trigger_s = given.pop("time_to_trigger_s", None)
@@ -69,6 +70,7 @@ def zsched(name: str, **settings: Any) -> Player:
         changes=changes,
         is_told=is_told,
         tells_jobs=tells_jobs,
+        deadline=deadline,
     )
 
 
@@ -126,4 +128,4 @@ def _value(key: str, text: str) -> Any:
 def _kinds() -> Mapping[str, Any]:
     hints = {**get_type_hints(TaskSpec), **get_type_hints(Tuning)}
     names = {one.name for one in fields(Tuning)} | {name for name in hints if is_of_task(name)}
-    return {**{name: hints[name] for name in names}, **dict.fromkeys(OWN, float)}
+    return {**{name: hints[name] for name in names}, **dict.fromkeys(OWN, float), "deadline": Deadline}

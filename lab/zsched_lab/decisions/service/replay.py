@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
+from enum import StrEnum
 from typing import Any, Final
 
 from zsched.core.events import WorkerJobs
@@ -32,6 +33,13 @@ from zsched_lab.decisions.world import DT_S
 WIRED: Final = (LinkSample(source=LinkSource.WIRED),)
 
 
+class Deadline(StrEnum):
+    """What a task with a deadline is to have few of: the figures that a history counts (`Work`)."""
+
+    MISSED = "missed"
+    SLOW = "slow"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Player:
     """One rule in a comparison: how it looks at the fleet, what it scores by, and how it is made for a task."""
@@ -47,6 +55,15 @@ class Player:
     """Machines tell when a worker's processes always want to run, as the kernel's run-queue delay does."""
     tells_jobs: bool = True
     """Workers tell of their jobs, as those do that use the library."""
+    deadline: Deadline | None = None
+    """``objective: latency``, with that one of each task's deadlines."""
+
+    def tuning_of(self, work: Work) -> Tuning:
+        """How a task is scored."""
+        if self.deadline is None:
+            return self.tuning
+        within_s = work.deadline_s if self.deadline is Deadline.MISSED else work.slow_s
+        return replace(self.tuning, deadline_ms=1e3 * within_s)
 
 
 class Scene:
@@ -54,11 +71,14 @@ class Scene:
 
     def __init__(self, history: History, player: Player) -> None:
         timing = replace(history.fleet.timing, smoothing_s=max(player.look.smoothing_s, 1e-9))
-        specs = tuple(replace(spec, tuning=player.tuning, **player.changes) for spec in history.fleet.tasks)
+        specs = tuple(
+            replace(spec, tuning=player.tuning_of(work), **player.changes)
+            for spec, work in zip(history.fleet.tasks, history.works, strict=True)
+        )
         self.fleet = replace(history.fleet, timing=timing, tasks=specs)
         self.gateway = Gateway(self.fleet)
         self.values = {
-            spec.name: Allocation(task=spec.name, revision=0, epoch=0, owner=None, tuning=player.tuning)
+            spec.name: Allocation(task=spec.name, revision=0, epoch=0, owner=None, tuning=spec.tuning)
             for spec in specs
         }
         self.states = dict.fromkeys((node.name for node in self.fleet.nodes), PeerState.ALIVE)

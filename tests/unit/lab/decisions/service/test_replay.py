@@ -153,9 +153,21 @@ def test_a_rule_may_be_described() -> None:
     assert isinstance(made, CoreRule)
     assert (made.time_to_trigger_s, timer.tuning.bonus, timer.tuning.cool_down_s) == (2.0, 0.1, 10.0)
     assert {type(judge) for judge in made._judges} == {TimedJudge}
-    for wrong in ("x:speed=3", "x:patience", ":patience=1", "x:bonus=7", "x:demand=1", "x:exclusive=maybe"):
+    for wrong in ("x:speed=3", "x:patience", ":patience=1", "x:bonus=7", "x:demand=1", "x:exclusive=maybe", "x:deadline=1"):
         with pytest.raises(ValueError, match=r"."):
             cast.described(wrong)
+
+
+@pytest.mark.parametrize(("word", "name"), [("missed", "deadline_s"), ("slow", "slow_s")])
+def test_a_rule_with_a_deadline_scores_each_task_by_its_own(word: str, name: str) -> None:
+    history = build(seed=9, hours=0.01, load_s=0.0, tasks=3)
+    made = Scene(history, cast.described(f"late:deadline={word}"))
+    wanted = [1e3 * getattr(work, name) for work in history.works]
+    assert len(set(wanted)) == 3
+    assert [spec.tuning.deadline_ms for spec in made.fleet.tasks] == wanted
+    assert [value.tuning.deadline_ms for value in made.values.values()] == wanted
+    plain = Scene(history, ZSCHED)
+    assert {value.tuning.deadline_ms for value in plain.values.values()} == {None}
 
 
 def test_what_has_just_come_to_a_machine_is_booked_there_before_it_shows() -> None:
