@@ -20,7 +20,7 @@ import math
 import threading
 from typing import Final
 
-from zenoh import Session
+from zenoh import Session, ZError
 
 from zsched.clock import monotonic_s
 from zsched.guard import guarded
@@ -114,7 +114,10 @@ class StalledLinks(contextlib.AbstractContextManager[None]):
         if now - since < QUICK_TICK_S:
             self._full.clear()
             return
-        links = self._sockets.links()
+        try:
+            links = self._sockets.links()
+        except ZError:
+            return  # the session closes, and a put still waits
         ready = with_room(links, 0.0)
         before, self._full = self._full, {}
         for link in links:
