@@ -658,4 +658,25 @@ STREAM_BUGS = (
         "if False:",
         ("tests/parts/runtime/test_crew.py",),
     ),
+    _bug(
+        "what a rate held back goes ahead onto the next session",
+        "zsched.relay.streams.inputs",
+        "            if not self._is_paused:  # else `resume` sends it, behind what came before",
+        "            if True:",
+        _GATES,
+    ),
+    _bug(
+        "a stream that closes lets an owner that is cut carry again",
+        "zsched.relay.streams.outputs",
+        "key=lambda slot: (not self._is_cut(slot), -slot.epoch)",
+        "key=lambda slot: -slot.epoch",
+        _GATES,
+    ),
+    _bug(
+        "a watch that found no thread counts as begun",
+        "zsched.sessions.stalled_links",
+        "        with self._lock:\n            if self._thread is None:",
+        "        with self._lock:\n            self._wake.set()\n            if self._thread is None:",
+        ("tests/unit/relay/test_no_threads.py",),
+    ),
 )
