@@ -135,7 +135,7 @@ def stood_text(runs: Sequence[Json]) -> str:
     Where the merger has just left, SLAM has scans to catch up with, and its robot stands for some seconds more. So the
     block is judged by the fixed schemes, under which the merger leaves nobody; without any by those whose SLAM stays.
     """
-    found: dict[str, list[Json]] = {"fixed": [], "moving": [], "SLAM moves, too": []}
+    found: dict[str, list[dict[str, Any]]] = {"fixed": [], "moving": [], "SLAM moves, too": []}
     for one in runs:
         if one.get("stood_by_state"):
             found[_kind_of(one["scheme"])].append(one["stood_by_state"])

@@ -53,10 +53,10 @@ def test_an_owner_is_left_beyond_the_limit_and_others_wait_for_the_margin(
     name: str, limit: float, out: float, at: float, inside: float
 ) -> None:
     gauge = BY_NAME[name]
-    assert gauge.fault(out, limit, is_owner=True)
-    assert gauge.fault(at, limit, is_owner=True) == ""
-    assert "back from" in gauge.fault(at, limit, is_owner=False)
-    assert gauge.fault(inside, limit, is_owner=False) == ""
+    assert gauge.fault(out, limit, has_margin=False)
+    assert gauge.fault(at, limit, has_margin=False) == ""
+    assert "back from" in gauge.fault(at, limit, has_margin=True)
+    assert gauge.fault(inside, limit, has_margin=True) == ""
 
 
 @pytest.mark.parametrize(("name", "limit"), [("gpu", 1.0), ("battery", 0.0)])
@@ -64,13 +64,13 @@ def test_a_limit_that_no_reading_is_beyond_only_asks_for_the_gauge(name: str, li
     """Nor is it missed by the margin, or by what a task would add: three GPUs at 95 % are three candidates."""
     gauge = BY_NAME[name]
     for reading in (limit, limit + 0.03 * (1 if gauge.is_floor else -1)):
-        assert gauge.fault(reading, limit, is_owner=False) == gauge.fault(reading, limit, is_owner=True) == ""
-    assert BY_NAME["gpu"].fault(1.3, 1.0, is_owner=False, is_reckoned=True) == ""
-    assert BY_NAME["gpu"].fault(None, 1.0, is_owner=False) == "gpu is not measured"
+        assert gauge.fault(reading, limit, has_margin=True) == gauge.fault(reading, limit, has_margin=False) == ""
+    assert BY_NAME["gpu"].fault(1.3, 1.0, has_margin=True, is_reckoned=True) == ""
+    assert BY_NAME["gpu"].fault(None, 1.0, has_margin=True) == "gpu is not measured"
 
 
 def test_only_a_machine_without_a_gpu_is_refused_for_what_is_not_measured() -> None:
-    told = {gauge.name: gauge.fault(None, gauge.best, is_owner=False) for gauge in GAUGES}
+    told = {gauge.name: gauge.fault(None, gauge.best, has_margin=True) for gauge in GAUGES}
     assert told == {"gpu": "gpu is not measured", "battery": "", "temperature_c": ""}
 
 
@@ -136,4 +136,4 @@ def test_no_limit_keeps_out_the_best_machine_there_can_be(name: str) -> None:
     gauge = BY_NAME[name]
     steps = (gauge.low + (gauge.high - gauge.low) * step / 100 for step in range(101))
     best = gauge.high if gauge.is_floor else gauge.low
-    assert {gauge.fault(best, limit, is_owner=False) for limit in steps} == {""}
+    assert {gauge.fault(best, limit, has_margin=True) for limit in steps} == {""}
