@@ -78,8 +78,7 @@ class Scene:
         self.fleet = replace(history.fleet, timing=timing, tasks=specs)
         self.gateway = Gateway(self.fleet)
         self.values = {
-            spec.name: Allocation(task=spec.name, revision=0, epoch=0, owner=None, tuning=spec.tuning)
-            for spec in specs
+            spec.name: Allocation(task=spec.name, revision=0, epoch=0, owner=None, tuning=spec.tuning) for spec in specs
         }
         self.states = dict.fromkeys((node.name for node in self.fleet.nodes), PeerState.ALIVE)
         self._history, self._is_told = history, player.is_told

@@ -153,7 +153,15 @@ def test_a_rule_may_be_described() -> None:
     assert isinstance(made, CoreRule)
     assert (made.time_to_trigger_s, timer.tuning.bonus, timer.tuning.cool_down_s) == (2.0, 0.1, 10.0)
     assert {type(judge) for judge in made._judges} == {TimedJudge}
-    for wrong in ("x:speed=3", "x:patience", ":patience=1", "x:bonus=7", "x:demand=1", "x:exclusive=maybe", "x:deadline=1"):
+    for wrong in (
+        "x:speed=3",
+        "x:patience",
+        ":patience=1",
+        "x:bonus=7",
+        "x:demand=1",
+        "x:exclusive=maybe",
+        "x:deadline=1",
+    ):
         with pytest.raises(ValueError, match=r"."):
             cast.described(wrong)
 
