@@ -95,7 +95,16 @@ def _told(name: str, flag: Json) -> str:
 def tasks_have_owners(scene: Scene) -> Result:
     """Whether each task has a living owner, and the electors could choose another."""
     status, quorum = scene.status, scene.status["quorum"]
-    found = []
+    owners = ", ".join(f"{task['name']} on {task['owner']}" for task in status["tasks"]) or "no tasks"
+    return joined(
+        lacks_of_owners(status),
+        passed(f"{owners}; {quorum['alive']} of {quorum['electors']} electors, {quorum['needed']} needed"),
+    )
+
+
+def lacks_of_owners(status: Json) -> list[Result]:
+    """What a node's status has to say of that: no quorum, tasks without an owner that works, or without a spare."""
+    found, quorum = [], status["quorum"]
     if not quorum["ok"]:
         told = f"no quorum: {quorum['alive']} of {quorum['electors']} electors can answer, {quorum['needed']} needed"
         found.append(failed(told, fix="start the daemons of the other electors, or see PROBLEMS in zsched status"))
@@ -108,10 +117,7 @@ def tasks_have_owners(scene: Scene) -> Result:
         found += _lost_workers(status, task)
         spare = (f"{task['name']}: {text}" for text in task["problems"] if text.startswith(NO_SPARE))
         found += [warned(told, fix="PROBLEMS in zsched status say what each of them lacks") for told in spare]
-    owners = ", ".join(f"{task['name']} on {task['owner']}" for task in status["tasks"]) or "no tasks"
-    return joined(
-        found, passed(f"{owners}; {quorum['alive']} of {quorum['electors']} electors, {quorum['needed']} needed")
-    )
+    return found
 
 
 def _lost_workers(status: Json, task: Json) -> Iterator[Result]:

@@ -11,7 +11,8 @@ from collections.abc import Iterator, Mapping
 from typing import Final
 
 from zsched.core.values.fleet import fleet_hash
-from zsched.doctor.daemon import judged_lag
+from zsched.core.values.struct import replace
+from zsched.doctor.daemon import judged_lag, lacks_of_owners
 from zsched.doctor.model import SEAT_ADVICE, Json, Result, Scene, counted, failed, joined, passed, skipped, warned
 from zsched.doctor.network import addresses, connected
 
@@ -222,12 +223,26 @@ def _cores(machine: Json) -> float:
     return float(machine["cpu_cores"] or 0.0) * float(machine.get("speed") or 1.0)
 
 
+def have_owners(scene: Scene) -> Result:
+    """Whether every node sees a quorum, and an owner of each task that works."""
+    found: dict[Result, list[str]] = {}
+    for name, status in sorted(scene.statuses.items()):
+        for lack in lacks_of_owners(status):
+            found.setdefault(lack, []).append(name)
+    told = [
+        replace(lack, evidence=tuple(f"{', '.join(names)}: {line}" for line in lack.evidence))
+        for lack, names in found.items()
+    ]
+    return joined(told, passed(f"{counted(len(scene.statuses), 'nodes')}, each sees an owner of every task"))
+
+
 def see_no_problem(scene: Scene) -> Result:
-    """Whether no other node names a problem of its own."""
+    """Whether no other node names a problem, of its own or of a task: what its streams wait for, say."""
     found: dict[str, list[str]] = {}
     for name, status in sorted(scene.statuses.items()):
-        for problem in status["problems"]:
-            found.setdefault(str(problem), []).append(name)
+        tasks = [f"{task['name']}: {problem}" for task in status["tasks"] for problem in task["problems"]]
+        for problem in (*map(str, status["problems"]), *tasks):
+            found.setdefault(problem, []).append(name)
     lines = [f"{', '.join(names)}: {problem}" for problem, names in found.items()]
     if not lines:
         return passed(f"{counted(len(scene.statuses), 'nodes')}, no problem")

@@ -143,6 +143,12 @@ CHECKS: Final[tuple[Check, ...]] = (
         run=fleet.agree_on_registers,
         needs=Needs.FLEET,
     ),
+    Check(
+        name="fleet.owners",
+        asks="Does every node see a quorum, and an owner of each task?",
+        run=fleet.have_owners,
+        needs=Needs.FLEET,
+    ),
     Check(name="fleet.electors", asks="Has every elector its state?", run=fleet.have_electors, needs=Needs.FLEET),
     Check(name="fleet.lag", asks="Does every decision loop turn in time?", run=fleet.are_quick, needs=Needs.FLEET),
     Check(name="fleet.timing", asks="Do answers come in time?", run=fleet.answer_in_time, needs=Needs.FLEET),

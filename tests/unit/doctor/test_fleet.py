@@ -130,6 +130,31 @@ def test_a_slow_loop_and_a_slow_answer_are_found(tmp_path: Path) -> None:
     assert_finds(run("fleet.timing", slow), WARN, "robot3, took 200 ms")
 
 
+def test_a_task_without_an_owner_is_found_from_a_machine_that_is_no_node(tmp_path: Path) -> None:
+    """It passed: no daemon names an owner that is not there among its problems."""
+    scene = replace(fleet_scene(tmp_path), node="laptop", own=None, state_folder=tmp_path / "none")
+    assert run("fleet.owners", scene).verdict is PASS
+    (task,) = scene.statuses["robot2"]["tasks"]
+    for name in ("robot1", "robot2"):
+        scene = planted(scene, name, tasks=[{**task, "owner": None, "owner_state": None}])
+    found = {check.name: result for check, result in run_all(scene)}
+    assert_finds(found["fleet.owners"], FAIL, "robot1, robot2: merge has no owner")
+    quorum = {**scene.statuses["robot3"]["quorum"], "ok": False}
+    assert_finds(run("fleet.owners", planted(scene, "robot3", quorum=quorum)), FAIL, "robot3: no quorum", "no owner")
+
+
+def test_what_a_robot_s_streams_wait_for_is_found_from_every_node(tmp_path: Path) -> None:
+    """Only that robot's status has it, and there it stands with the task."""
+    scene = fleet_scene(tmp_path)
+    (task,) = scene.statuses["robot2"]["tasks"]
+    waits = "this robot's streams have waited for edge1 for 600 s"
+    assert_finds(
+        run("fleet.problems", planted(scene, "robot2", tasks=[{**task, "problems": [waits]}])),
+        WARN,
+        f"robot2: merge: {waits}",
+    )
+
+
 def test_a_clock_in_doubt_and_a_problem_elsewhere_are_told(tmp_path: Path) -> None:
     problem = "clock: this machine's clock is slewed by +8.30%, leases allow for 0.10%"
     scene = planted(fleet_scene(tmp_path), "robot2", problems=[problem])
