@@ -4,6 +4,7 @@
 const KEPT_S = 900;
 const LONGEST_S = 3600;
 const MOST_EVENTS = 200;
+const SILENT_MS = 20000;  // the server pings every 15 s
 const state = { now: null, points: {}, moves: [], events: [], explained: {}, open: new Set(), token: "", isCut: false };
 const byId = (id) => document.getElementById(id);
 
@@ -317,8 +318,22 @@ function cut(text) {
 
 const bearer = () => (state.token ? { Authorization: `Bearer ${state.token}` } : {});
 
+// A machine without power, or a tunnel that hangs, says nothing, and ends nothing either.
 async function listen() {
-  const answer = await fetch("/api/live", { headers: bearer(), cache: "no-store" });
+  const silence = new AbortController();
+  let heardAt = Date.now();
+  const watch = setInterval(() => {
+    if (Date.now() - heardAt > SILENT_MS) silence.abort(new Error(`no word for ${SILENT_MS / 1000} s`));
+  }, 1000);
+  try {
+    await hear(silence.signal, () => { heardAt = Date.now(); });
+  } finally {
+    clearInterval(watch);
+  }
+}
+
+async function hear(signal, heard) {
+  const answer = await fetch("/api/live", { headers: bearer(), cache: "no-store", signal });
   byId("ask").hidden = answer.status !== 401;
   if (!answer.ok) {
     const body = await answer.json().catch(() => ({}));
@@ -328,6 +343,7 @@ async function listen() {
   for (let text = "";;) {
     const { value, done } = await reader.read();
     if (done) return;
+    heard();
     const blocks = (text + decoder.decode(value, { stream: true })).split("\n\n");
     text = blocks.pop();
     for (const block of blocks) {
