@@ -150,12 +150,16 @@ class _Drive:
         self._news: queue.SimpleQueue[int | Ended | None] = queue.SimpleQueue()
         """A signal, an end that the engine tells, or ``None``: the command has ended."""
         self._child: subprocess.Popen[bytes] | None = None
+        self._is_asked = False
+        """Whether somebody has asked for its end."""
         self._signals = 0
 
     def run(self) -> int:
         for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda number, _frame: self._news.put(number))
+            signal.signal(number, self._take)
         refused = self._engine.begin(self._news.put)
+        if self._is_asked:  # there is nothing to stop yet, and it would start behind the signal
+            return EXIT_OK
         if refused is not None:
             return self._ends(refused)
         with _Keeper(self._engine.last_resort(), is_always=not self._engine.leaves_nothing):
@@ -170,6 +174,10 @@ class _Drive:
                 follower.wait()
         self._place.forget()
         return EXIT_OK if end is None else self._ends(end)
+
+    def _take(self, number: int, _frame: object) -> None:
+        self._is_asked = True
+        self._news.put(number)
 
     def _start(self) -> None:
         command = self._engine.run()

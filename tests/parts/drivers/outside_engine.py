@@ -14,7 +14,7 @@ from zsched.drivers.place import Place
 
 
 class Outside:
-    """``mode``: refuse, deaf (hears SIGKILL only), messy (leaves something to be cleared away), or anything else."""
+    """``mode``: refuse, late (a signal comes while it begins), deaf (hears SIGKILL only), messy (leaves something to be cleared away), or anything else."""
 
     is_child = False
 
@@ -26,6 +26,9 @@ class Outside:
         del tell_end
         if self._mode == "refuse":
             return Ended(reason="there is no such thing here", is_final=True)
+        if self._mode == "late":
+            os.kill(os.getpid(), signal.SIGTERM)
+            return None
         deaf = "trap '' TERM; " if self._mode == "deaf" else ""
         script = f'setsid sh -c "{deaf}echo it runs; while :; do sleep 0.05; done" >&2 & echo $!'
         done = subprocess.run(["sh", "-c", script], stdout=subprocess.PIPE, text=True, check=True)
@@ -33,6 +36,8 @@ class Outside:
         return None
 
     def run(self) -> Sequence[str]:
+        if self._mode == "late":
+            print("it is started", flush=True)
         return ("tail", f"--pid={self._pid}", "-s", "0.05", "-f", "/dev/null")
 
     def log(self) -> Sequence[str]:

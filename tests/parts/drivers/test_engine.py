@@ -75,6 +75,13 @@ def test_what_cannot_run_here_says_so_by_its_status(tmp_path: Path) -> None:
         assert process.returncode == 78
 
 
+def test_a_stop_that_comes_while_the_driver_begins_starts_no_worker(tmp_path: Path) -> None:
+    """A withdrawn standby was started, and killed hard after its grace."""
+    with driver(tmp_path, "late") as process:
+        assert output(process) == ""
+        assert process.returncode == 0
+
+
 @pytest.mark.parametrize("mode", ["", "deaf"])
 def test_signals_end_the_worker_the_second_one_at_once(tmp_path: Path, mode: str) -> None:
     with driver(tmp_path, mode) as process:
