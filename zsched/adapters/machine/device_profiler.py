@@ -23,7 +23,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from zsched.adapters.machine.cgroup import CgroupTree, CpuQuota, MemoryQuota
-from zsched.clock import boot_s, monotonic_s
+from zsched.clock import awake_s, boot_s
 from zsched.core.profile.appetite import Appetite, Thread
 from zsched.core.values.model import TaskId
 from zsched.core.values.profile import DeviceSample, WorkerLoad, WorkerState
@@ -129,7 +129,7 @@ class DeviceProfiler:
 
     def sample(self, workers: Mapping[TaskId, tuple[WorkerState, int | None]]) -> DeviceSample:
         """Measure now; ``workers`` gives each task's state and process id (``None``: no process)."""
-        now = monotonic_s()
+        now = awake_s()  # processes and the kernel's ticks stand still during a suspend, too
         if self._limits_at_s is None or now - self._limits_at_s >= LIMITS_EVERY_S:
             self._look_up_limits(now)
         stat = read_file(f"{self._proc}/stat")

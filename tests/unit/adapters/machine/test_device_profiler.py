@@ -39,7 +39,7 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     made = Clock()
-    monkeypatch.setattr(device_profiler, "monotonic_s", lambda: made.now)
+    monkeypatch.setattr(device_profiler, "awake_s", lambda: made.now)
     return made
 
 

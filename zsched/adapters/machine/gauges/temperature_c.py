@@ -1,7 +1,8 @@
-"""The hottest sensor of the machine, by /sys/class/thermal, or by /sys/class/hwmon where there are no thermal zones.
+"""The hottest sensor of the machine: thermal zones and processors' own sensors, or else whatever hwmon has.
 
 Knows: sensors that report no temperature of the machine: a zone that is off (the kernel's -274 °C, or 0), Jetson's
-PMIC-Die, which always says 100 °C. Does not know: which sensor belongs to what.
+PMIC-Die, which always says 100 °C; drivers of processors, for on AMD's the only zone may be the firmware's, which can
+stand still. Does not know: what else a sensor belongs to; a board's open pins may say 127 °C, so they come last.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ from zsched.adapters.machine.gauges import number
 
 NO_SENSORS = frozenset({"PMIC-Die"})
 """Types of zones whose figure is a constant."""
+OF_PROCESSORS = frozenset({"k10temp", "zenpower", "coretemp", "cpu_thermal"})
+"""Names in hwmon of drivers that read the processor itself."""
 
 
 class Reader:
@@ -23,9 +26,11 @@ class Reader:
 
     def read(self) -> float | None:
         """``None`` without a sensor that tells anything."""
-        zones = [zone / "temp" for zone in (self._class / "thermal").glob("thermal_zone*") if not _is_constant(zone)]
-        degrees = _degrees(zones) or _degrees([*(self._class / "hwmon").glob("hwmon*/temp*_input")])
-        return max(degrees, default=None)
+        thermal, hwmon = (self._class / "thermal").glob("thermal_zone*"), self._class / "hwmon"
+        zones = [zone / "temp" for zone in thermal if _word(zone / "type") not in NO_SENSORS]
+        own = [folder for folder in hwmon.glob("hwmon*") if _word(folder / "name") in OF_PROCESSORS]
+        inside = [file for folder in own for file in folder.glob("temp*_input")]
+        return max(_degrees([*zones, *inside]) or _degrees([*hwmon.glob("hwmon*/temp*_input")]), default=None)
 
 
 def _degrees(files: list[Path]) -> list[float]:
@@ -33,8 +38,8 @@ def _degrees(files: list[Path]) -> list[float]:
     return [value for value in read if -60.0 < value < 200.0 and value]
 
 
-def _is_constant(zone: Path) -> bool:
+def _word(file: Path) -> str:
     try:
-        return (zone / "type").read_text(encoding="utf-8", errors="replace").strip() in NO_SENSORS
+        return file.read_text(encoding="utf-8", errors="replace").strip()
     except OSError:
-        return False
+        return ""

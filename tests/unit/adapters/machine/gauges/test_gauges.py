@@ -80,6 +80,15 @@ def test_the_hottest_zone_counts_but_no_constant_and_none_that_is_off(tmp_path: 
     assert temperature_c.Reader(tmp_path).read() == 51.5
 
 
+def test_a_processor_s_own_sensor_counts_beside_a_zone_of_the_firmware_s(tmp_path: Path) -> None:
+    """On AMD's the only zone may stand at 32 °C for good; a board's open pin says 127 °C."""
+    zone(tmp_path, 0, "acpitz", "32000\n")
+    tree(tmp_path, sys__class__hwmon__hwmon0__name="nct6775\n", sys__class__hwmon__hwmon0__temp2_input="127000")
+    assert temperature_c.Reader(tmp_path).read() == 32.0
+    tree(tmp_path, sys__class__hwmon__hwmon1__name="k10temp\n", sys__class__hwmon__hwmon1__temp1_input="81125")
+    assert temperature_c.Reader(tmp_path).read() == 81.125
+
+
 def test_without_thermal_zones_the_hottest_of_hwmon_counts(tmp_path: Path) -> None:
     tree(tmp_path, sys__class__hwmon__hwmon0__temp1_input="45000", sys__class__hwmon__hwmon1__temp2_input="62250")
     assert temperature_c.Reader(tmp_path).read() == 62.25
