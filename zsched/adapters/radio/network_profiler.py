@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Protocol
 
 from zsched.adapters.radio.nl80211 import GenericNetlink, Nl80211Error, Station
-from zsched.clock import monotonic_s
+from zsched.clock import awake_s, monotonic_s
 from zsched.core.values.fleet import LinkSpec, NodeSpec
 from zsched.core.values.profile import LinkSample, LinkSource
 from zsched.core.values.struct import Struct
@@ -28,6 +28,8 @@ NO_SAMPLE = frozenset({-2.0, -256.0})
 """In recorded drives: no sample yet, interface absent."""
 MAX_TRACE_BYTES = 32 << 20
 """A recorded drive, unpacked: a day at 5 Hz takes 20 MB."""
+ASK_AGAIN_S = 30.0
+"""A kernel without nl80211 is asked again after this time: an adapter may be plugged in later."""
 TRACE_HOLD_S = 2.0
 """A recorded value stands for this long when the rows behind it have none; then nothing is measured."""
 
@@ -147,6 +149,8 @@ class WifiReader:
         self._spec = spec
         self._fallback = WirelessReader(spec, root)
         self._netlink: GenericNetlink | None = None
+        self._refused: Nl80211Error | None = None
+        self._ask_at = -math.inf
         self._before: Station | None = None
 
     def read(self) -> LinkSample:
@@ -178,11 +182,22 @@ class WifiReader:
             self._netlink = None
 
     def _station(self) -> Station:
-        self._netlink = self._netlink or GenericNetlink()
+        self._netlink = self._netlink or self._opened()
         index = next((found.index for found in self._netlink.interfaces() if found.name == self._spec.value), None)
         if index is None:
             raise Nl80211Error("there is no such wireless interface")
         return choose_station(self._netlink.stations(index), self._spec.mac)
+
+    def _opened(self) -> GenericNetlink:
+        """A socket that knows nl80211; a kernel without it looks for a module each time, by a process of its own."""
+        now = awake_s()
+        if self._refused is not None and now < self._ask_at:
+            raise self._refused
+        try:
+            return GenericNetlink()
+        except Nl80211Error as error:
+            self._refused, self._ask_at = error, now + ASK_AGAIN_S
+            raise
 
 
 def choose_station(stations: Sequence[Station], mac: str) -> Station:

@@ -103,6 +103,24 @@ def test_wifi_falls_back_to_the_wireless_file_and_says_so(tmp_path: Path) -> Non
     reader.close()
 
 
+def test_a_kernel_without_nl80211_is_asked_for_it_seldom(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It starts a process to look for the module, each time; a radio is read five times a second."""
+    asked, now = [], [1000.0]
+
+    def refused() -> None:
+        asked.append(now[0])
+        raise Nl80211Error("nl80211: netlink: No such file or directory")
+
+    monkeypatch.setattr(network_profiler, "GenericNetlink", refused)
+    monkeypatch.setattr(network_profiler, "awake_s", lambda: now[0])
+    (reader,) = readers_for(node(LinkSpec(source=LinkSource.NL80211, value="wlan0")), root=tmp_path)
+    for _ in range(200):
+        reader.read()
+        assert "nl80211: netlink" in str(reader.problem)
+        now[0] += 0.2
+    assert asked == pytest.approx([1000.0, 1030.0], abs=0.3)
+
+
 @pytest.mark.parametrize("signal_dbm", [None, -61.0])
 def test_a_driver_that_tells_no_signal_is_a_problem(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, signal_dbm: float | None
