@@ -47,6 +47,8 @@ ASKED_LIMIT = 4
 """Questions of other machines that may wait for the log's thread."""
 QUEUE_LIMIT = 1000
 CLOSE_S = 0.5
+RETRY_S = 5.0
+"""A disk that refuses lines is asked again after this time, also where there is no new one."""
 _BODY = b',"decision":'
 """Where a judgement's figures begin; in a string its quotes would be escaped."""
 
@@ -138,7 +140,7 @@ class DecisionLog:
     # --- writing (its thread) ----------------------------------------------------------------------------------------
 
     def _run(self) -> None:
-        while (item := self._queue.get()) is not None:
+        while (item := self._next()) is not None:
             if isinstance(item, _Question):
                 self._tell(item)
                 continue
@@ -146,6 +148,15 @@ class DecisionLog:
             crowded_out, self._crowded_out = self._crowded_out, 0
             self._lost += crowded_out
             self._write(at, story)
+
+    def _next(self) -> tuple[float, RecordStory] | _Question | None:
+        """The next item; a disk that refuses is asked again meanwhile, for at rest no line comes for hours."""
+        while self._is_failing:
+            try:
+                return self._queue.get(timeout=RETRY_S)
+            except queue.Empty:
+                self._write(wall_s(), None)
+        return self._queue.get()
 
     def _tell(self, question: _Question) -> None:
         try:
@@ -155,15 +166,17 @@ class DecisionLog:
         self._askers.release()
         question.answer(told)
 
-    def _write(self, at: float, story: RecordStory) -> None:
+    def _write(self, at: float, story: RecordStory | None) -> None:
+        """Write what is owed, and a story if there is one."""
         try:
             if self._lost:
                 text = f"{self._lost} lines of this log are lost: the disk refused them, or they came too fast"
                 self._append(self._line(at, RecordStory(stage="log", text=text)))
                 self._lost = 0
-            self._append(self._line(at, story))
+            if story is not None:
+                self._append(self._line(at, story))
         except OSError as error:
-            self._lost += 1
+            self._lost += story is not None
             if not self._is_failing:
                 path = self._folder / NAME
                 self._on_problem(f"the decision log {path} is not written: {error.strerror}; see `df {self._folder}`")

@@ -16,6 +16,8 @@ import pytest
 
 from support.decisions import figures_of
 from support.fleets import task_of
+from support.waiting import until
+from zsched.adapters.host import decision_log
 from zsched.adapters.host.decision_log import NAME, OLD_NAME, QUEUE_LIMIT, SCHEMA, DecisionLog, read_page
 from zsched.core.instructions import RecordStory
 from zsched.core.values.decision import Decision, HistoryLine, Move, Verdict
@@ -125,6 +127,19 @@ def test_a_full_disk_costs_lines_which_are_counted_and_told_and_never_half_a_lin
         "end",
     ]
     assert kept.told[1:] == [None]
+
+
+def test_a_disk_that_has_room_again_is_seen_without_a_new_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A fleet at rest writes none for hours, and its status had the problem for as long."""
+    kept = Kept(tmp_path)
+    kept.write(story("first"))
+    with full_disk((tmp_path / NAME).stat().st_size + 40):
+        kept.write(story("lost"))
+    monkeypatch.setattr(decision_log, "RETRY_S", 0.01)
+    kept.log.start()
+    until(lambda: kept.told[1:] == [None], "the end of the problem")
+    kept.log.close()
+    assert str(lines(tmp_path)[-1]["text"]).startswith("2 lines of this log are lost")
 
 
 def test_a_queue_without_room_counts_what_it_refuses_and_keeps_nobody_waiting(tmp_path: Path) -> None:
