@@ -7,7 +7,17 @@ from __future__ import annotations
 
 from typing import Any
 
-from zsched.commands.page import DROPS_OVER_S, Cell, Page, clock_time, missed_of, name_room, short_name, span
+from zsched.commands.page import (
+    DROPS_OVER_S,
+    SINCE_START,
+    Cell,
+    Page,
+    clock_time,
+    missed_of,
+    name_room,
+    short_name,
+    span,
+)
 from zsched.commands.report import (
     STATE_STYLES,
     flag_rows,
@@ -93,6 +103,7 @@ def _missed(task: Json) -> tuple[str, bool]:
     losers = [stream for stream in task["streams"] if missed_of(stream)]
     if not losers:
         return "-", False
-    ages = [stream["dropped_s"] for stream in losers if stream.get("dropped_s") is not None]
-    is_over = bool(ages) and min(ages) > DROPS_OVER_S
-    return f"{sum(map(missed_of, losers))}{' (none in the last minute)' if is_over else ''}", not is_over
+    ages = [stream.get("dropped_s", 0.0) for stream in losers]
+    is_over = all(age_s is None or age_s > DROPS_OVER_S for age_s in ages)
+    told = SINCE_START if all(age_s is None for age_s in ages) else " (none in the last minute)"
+    return f"{sum(map(missed_of, losers))}{told if is_over else ''}", not is_over

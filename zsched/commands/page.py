@@ -118,6 +118,10 @@ def clock_time(then: float, now: float) -> str:
     return time.strftime("%H:%M:%S" if told[:3] == today[:3] else "%m-%d %H:%M", told)
 
 
+SINCE_START: Final = " (none since the daemon's start)"
+"""Behind a number of drops that are all older."""
+
+
 def none_for(age_s: float | None) -> str:
     """Behind a number of drops: that they are over, once none has come for a minute."""
     return f" (none in the last minute, last {span(age_s)} ago)" if age_s is not None and age_s > DROPS_OVER_S else ""
@@ -129,8 +133,9 @@ def missed_of(stream: dict[str, Any]) -> int:
 
 
 def since_drop(stream: dict[str, Any]) -> str:
-    """Behind the number of a stream's drops, as `none_for`."""
-    return none_for(stream.get("dropped_s"))
+    """Behind the number of a stream's drops, as `none_for`; the relay's books are older than its daemon."""
+    age_s = stream.get("dropped_s", 0.0)  # a later field of the schema's major version
+    return SINCE_START if age_s is None else none_for(age_s)
 
 
 def memory(mib: float) -> str:

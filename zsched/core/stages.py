@@ -115,6 +115,8 @@ class Stages:
     is_draining = False
     loop_lag_s = 0.0
     stream_counts: tuple[StreamCount, ...] = ()
+    counted_at: float | None = None
+    """When the relay last told them."""
     dropped_at: dict[str, float]
     """{counter: when it rose last}, of those that count invalid frames and links."""
     beat_sequence = 0
@@ -202,8 +204,8 @@ class Stages:
         leases = self.agreement.leases
         self.tenure = Tenure(fleet, me, leases, self.executors)
         self.sealing = Sealing(fleet, me, self.executors, leases.over_at, lambda: leases.terms)
-        self.missed: dict[str, tuple[int, float]] = {}
-        """{stream: (how many of its samples somebody may miss, when that last rose)}."""
+        self.missed: dict[str, tuple[int, float | None]] = {}
+        """{stream: (how many of its samples somebody may miss, when that last rose; ``None``: before we started)}."""
         self.rates = StreamRates()
         self.gaps = StreamGaps()
         self.killed_at: dict[TaskId, float] = {}

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator
 
 from zsched.core.executor.handover import Executor, Phase
 from zsched.core.executor.rollouts import waiting
+from zsched.core.route.rates import STALE_S
 from zsched.core.scheduler.eligibility import may_get
 from zsched.core.scheduler.judge import by
 from zsched.core.scheduler.rounds import TaskRound
@@ -389,7 +390,7 @@ def _task_status(node: Stages, spec: TaskSpec, now: float) -> TaskStatus:
         gap_s=_move_gap(node, executor),
         tells_no_jobs=not tells_jobs(spec.worker),
         streams=tuple(
-            _with_flow(_with_keys(_with_age(count, node.missed, now), routes.get(count.stream)), node, now)
+            _with_flow(_with_keys(_with_ages(count, node, now), routes.get(count.stream)), node, now)
             for count in node.stream_counts
             if count.stream.startswith(prefix)
         ),
@@ -576,8 +577,17 @@ def _untaken(task: TaskSpec, executor: Executor, known: Unready | None) -> str:
     return f"our relay sees nobody take {', '.join(keys) or 'them'}{newer}"
 
 
-def _with_age(count: StreamCount, missed: dict[str, tuple[int, float]], now: float) -> StreamCount:
-    return replace(count, dropped_s=now - missed[count.stream][1]) if count.missed and count.stream in missed else count
+def _with_ages(count: StreamCount, node: Stages, now: float) -> StreamCount:
+    """What the relay told a while ago is older by now; what it has not told for long is not known any more."""
+    told_s = max(now - node.counted_at, 0.0) if node.counted_at is not None else 0.0
+    rose_at = node.missed.get(count.stream, (0, None))[1] if count.missed else None
+    return replace(
+        count,
+        dropped_s=None if rose_at is None else now - rose_at,
+        last_seen_s=None if count.last_seen_s is None else count.last_seen_s + told_s,
+        answer_s=count.answer_s if told_s <= STALE_S else None,
+        paired_hz=count.paired_hz if told_s <= STALE_S else None,
+    )
 
 
 def _with_keys(count: StreamCount, route: Route | None) -> StreamCount:

@@ -73,6 +73,8 @@ def test_missed_samples_are_counted_whatever_became_of_them_and_what_a_rule_want
     assert last_row(status).endswith(" 105")
     stream["dropped_s"] = 185.0
     assert last_row(status).endswith(" 105 (none in the last minute)")
+    stream["dropped_s"] = None
+    assert last_row(status).endswith(" 105 (none since the daemon's start)")
 
 
 def test_wall_times_stand_beside_ages_where_the_clock_is_given() -> None:

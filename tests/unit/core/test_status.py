@@ -771,6 +771,7 @@ def test_an_owner_that_has_work_and_ends_no_job_is_a_problem(
     assert all(one.endswith("`zsched restart merge` starts it anew") for one in problems)
     node.fleet = replace(FLEET, tasks=tuple(replace(task, worker=WorkerSpec()) for task in FLEET.tasks))
     problems = [one for one in build_snapshot(node, 101.0).tasks[0].problems if "finished no job" in one]
+    assert len(problems) == (told is not None)
     assert all(one.endswith("in a callback; start it again there") for one in problems), "it is somebody else's"
 
 
@@ -953,6 +954,21 @@ def test_what_was_missed_has_an_age_and_what_a_rule_wants_has_none() -> None:
         assert ages == [None, None if not lost else {110.0: 5.0, 120.0: 15.0, 130.0: 5.0}[now]]
 
 
+def test_a_stream_grows_older_while_the_relay_tells_nothing() -> None:
+    """It stood at a tenth of a second for good: the one fault for which somebody looks at it."""
+    node = make()
+    told = StreamCount(stream="merge/out/0", messages=7, last_seen_s=0.1, answer_s=0.2, paired_hz=5.0)
+    node.handle(ev.StreamsCounted(counts=(told, StreamCount(stream="merge/in/0"))), 100.0)
+
+    def seen(now: float) -> tuple[float | None, float | None, float | None]:
+        count, never = build_snapshot(node, now).tasks[0].streams
+        assert never.last_seen_s is None
+        return count.last_seen_s, count.answer_s, count.paired_hz
+
+    assert seen(101.0) == (pytest.approx(1.1), 0.2, 5.0)
+    assert seen(160.0) == (pytest.approx(60.1), None, None)
+
+
 def test_a_node_tells_how_long_it_waits_for_the_end_of_an_order() -> None:
     node = make()
     assert build_snapshot(node, 100.0).order_s == node.fleet.timing.order_s > 0.0
@@ -966,9 +982,12 @@ def test_drops_have_an_age_and_an_input_its_way_in() -> None:
         once = StreamCount(stream="merge/in/2", drops=(("no_route", 1),))
         node.handle(ev.StreamsCounted(counts=(count, StreamCount(stream="merge/in/1"), once)), now)
     snapshot = build_snapshot(node, 190.0)
-    assert [count.dropped_s for count in snapshot.tasks[0].streams] == [70.0, None, 90.0]
+    assert [count.dropped_s for count in snapshot.tasks[0].streams] == [70.0, None, None], (
+        "what it began with is older than this daemon"
+    )
     text = render_status(snapshot_json(snapshot), 100, color=False)
     assert "dropped 4 overflow (none in the last minute, last 1m" in text
+    assert "dropped 1 no_route (none since the daemon's start)" in text
     assert "applications here join at tcp/127.0.0.1:7458 (mode client)" in text
     node.handle(ev.StreamsCounted(counts=(StreamCount(stream="merge/in/0", drops=(("overflow", 5),)),)), 191.0)
     assert "(none in" not in render_status(snapshot_json(build_snapshot(node, 191.0)), 100, color=False)

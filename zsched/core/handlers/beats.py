@@ -81,11 +81,13 @@ def is_restless(node: Stages, now: float) -> bool:
     if node.tenure.exclusive or not node.votes.is_idle or node.membership.is_uneasy(now):
         return True
     is_agreeing = node.agreement.acceptor.has_parked or node.agreement.next_deadline() < math.inf
+    told_s = 0.0 if node.counted_at is None else max(now - node.counted_at, 0.0)
     is_moving = any(executor.next_deadline() < math.inf for executor in node.executors.values())
     return (
         is_agreeing
         or is_moving
-        or not all(count.is_still for count in node.stream_counts)  # a full radio delays beats; slow ones are too late
+        # a full radio delays beats, and slow ones are too late
+        or not all(count.is_still(told_s) for count in node.stream_counts)
         or any(name.startswith("fleet/") and name != OWN_FILE for name in node.problems)
     )
 

@@ -228,10 +228,11 @@ def _on_role_ended(node: Stages, event: ev.RoleEnded, todo: ToDo, _now: float) -
 
 
 def _on_counted(node: Stages, event: ev.StreamsCounted, todo: ToDo, now: float) -> None:
-    node.stream_counts = event.counts
+    rose_at = None if node.counted_at is None else now  # the relay's books are older than this daemon
+    node.stream_counts, node.counted_at = event.counts, now
     for count in event.counts:
-        if count.missed and node.missed.get(count.stream, (0, 0.0))[0] != count.missed:
-            node.missed[count.stream] = (count.missed, now)
+        if count.missed and node.missed.get(count.stream, (0, None))[0] != count.missed:
+            node.missed[count.stream] = (count.missed, rose_at)
     node.rates.absorb(event.counts, now)
     for count in node.gaps.absorb(event.counts, now):
         _tell_gap(node, count, todo)

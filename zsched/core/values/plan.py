@@ -206,7 +206,7 @@ class StreamCount(Struct, frozen=True, kw_only=True):
     drops: tuple[tuple[str, int], ...] = ()
     """(reason, count): ``overflow``, ``no_route``, ``stale_epoch``, ``loop``, ``stalled``..."""
     dropped_s: float | None = None
-    """Filled in by the status: seconds since `missed` last rose; ``None``: nothing was missed so far."""
+    """Filled in by the status: seconds since `missed` last rose; ``None``: not since the daemon's start."""
     last_seen_s: float | None = None
     """Seconds since the newest message, ``None`` before the first."""
     acknowledged: int | None = None
@@ -255,7 +255,6 @@ class StreamCount(Struct, frozen=True, kw_only=True):
         """Samples that somebody may miss."""
         return missed(self.drops, self.lost, self.at_most_lost)
 
-    @property
-    def is_still(self) -> bool:
-        """Whether nothing flows and nothing is under way."""
-        return not self.in_flight and (self.last_seen_s is None or self.last_seen_s >= STILL_S)
+    def is_still(self, told_s: float = 0.0) -> bool:
+        """Whether nothing flows and nothing is under way, by what was told ``told_s`` ago."""
+        return not self.in_flight and (self.last_seen_s is None or self.last_seen_s + told_s >= STILL_S)
