@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import threading
 import time
@@ -357,7 +358,7 @@ def test_version_names_what_a_bug_report_needs() -> None:
 def test_wrong_usage_exits_with_2_and_explains_on_stderr(arguments: tuple[str, ...]) -> None:
     result = run(*arguments)
     assert (result.exit_code, result.stdout) == (2, "")
-    assert "zsched" in result.stderr or "Usage" in result.stderr
+    assert arguments[-1] in result.stderr, "it names what is wrong"
 
 
 @pytest.mark.parametrize("verb", ["up", "init", "status", "weights", "stream", "check", "demo", "version"])
@@ -367,7 +368,7 @@ def test_help_of_every_verb_fits_a_small_terminal(verb: str, monkeypatch: pytest
     assert result.exit_code == 0
     assert result.stdout.startswith("Usage: ")
     assert max(map(len, result.stdout.splitlines())) <= 80
-    assert verb in run("--help").stdout
+    assert re.search(rf"^ +{verb} ", run("--help").stdout, re.MULTILINE)
 
 
 # --- what is written about it ----------------------------------------------------------------------------------------

@@ -8,8 +8,11 @@ from typing import Any
 import pytest
 
 from zsched.errors import WireError
+from zsched.wire import seal
 from zsched.wire.seal import MAX_SEAL, Act, Seal, pack, signed_bytes, unpack
 
+TOO_LARGE = seal._HEAD.pack(seal.VERSION, 7, 1, 64, MAX_SEAL) + b"s" * 64 + b"c" * MAX_SEAL
+"""As it should be, but for its size."""
 SEAL = Seal(life=7, sequence=2**63, signature=b"s" * 64, certificate=b"c" * 474)
 
 
@@ -24,14 +27,15 @@ def test_a_cut_seal_is_refused(length: int) -> None:
     assert caught.value.reason == "seal"
 
 
-@pytest.mark.parametrize("data", [b"\x02" + pack(SEAL)[1:], pack(SEAL) + b"x", b"\x01" * (MAX_SEAL + 1)])
+@pytest.mark.parametrize("data", [b"\x02" + pack(SEAL)[1:], pack(SEAL) + b"x", TOO_LARGE])
 def test_a_foreign_seal_is_refused(data: bytes) -> None:
-    with pytest.raises(WireError):
+    with pytest.raises(WireError) as caught:
         unpack(data)
+    assert caught.value.reason == "seal"
 
 
 def test_a_seal_that_is_too_large_is_not_sent() -> None:
-    with pytest.raises(WireError):
+    with pytest.raises(WireError, match="size"):
         pack(Seal(life=0, sequence=0, signature=b"", certificate=b"c" * MAX_SEAL))
 
 

@@ -14,6 +14,7 @@ from zsched.commands.history import moves_of, wall_text
 from zsched.commands.watch.feed import News
 from zsched.core.values.electorate import CREATION_STEP
 from zsched.core.values.struct import Struct
+from zsched.exits import EXIT_OK
 
 POINTS: Final = 900
 """Of a task's utilities: a quarter of an hour at one a second."""
@@ -42,6 +43,8 @@ class Past:
         self.answered_at = 0.0
         self.why = ""
         """Why nobody answers; empty while somebody does."""
+        self.code = EXIT_OK
+        """The exit code for that."""
         self.points: dict[str, deque[Point]] = {}
         self.events: deque[Json] = deque(maxlen=MOST_EVENTS)
         """Lines of the decision log, the newest last."""
@@ -51,7 +54,7 @@ class Past:
     def take(self, news: News) -> None:
         """Keep what is new."""
         self._now = news.at
-        self.why = news.why
+        self.why, self.code = news.why, news.code
         for entry in news.entries:
             self.events.append(entry)
             if "move" in entry or "took_s" in entry:

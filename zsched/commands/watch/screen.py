@@ -28,7 +28,7 @@ from zsched.commands.watch.feed import Feed, News
 from zsched.commands.watch.past import Past
 from zsched.commands.watch.top import MIN_HEIGHT, MIN_WIDTH, Frame, render_top
 from zsched.core.values.struct import Struct, replace
-from zsched.exits import EXIT_OK, EXIT_USAGE
+from zsched.exits import EXIT_USAGE
 from zsched.guard import guarded
 
 ENTER, LEAVE = "\x1b[?1049h\x1b[?25l", "\x1b[?25h\x1b[?1049l"
@@ -74,7 +74,7 @@ def top(view: TopView, *, is_once: bool) -> int:
         sys.stdout.write("\n".join(lines) + "\n")
         return code_of(first.status)
     _live(view, feed, past)
-    return EXIT_OK if past.status is None else code_of(past.status)
+    return past.code if past.why or past.status is None else code_of(past.status)
 
 
 def _live(view: TopView, feed: Feed, past: Past) -> None:

@@ -233,7 +233,8 @@ def _streams(task: Json, frame: Frame) -> list[str]:
         told += [f"{missed} missed"] if missed else []
         ends = f"{stream.get('from_expr', '')} -> {stream.get('to_expr', '')}" if stream.get("from_expr") else ""
         name = stream["stream"].removeprefix(prefix)
-        page.row(("", 1, ""), (name, 6, ""), (" · ".join(told) or "nothing yet", 44, ""), (ends, frame.width, "dim"))
+        unknown = "rate not known" if stream["messages"] else "nothing yet"
+        page.row(("", 1, ""), (name, 6, ""), (" · ".join(told) or unknown, 44, ""), (ends, frame.width, "dim"))
     return page.lines
 
 

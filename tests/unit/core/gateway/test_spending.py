@@ -76,6 +76,7 @@ def test_a_robot_with_an_answer_in_20_s_stays_the_clock_for_some_of_them() -> No
         counts = (("robot1", math.floor(at / 20.0)), ("robot2", math.floor((at + 7.0) / 20.0)))
         spending.absorb(0.02 * at, counts, float(at))
         assert spending.per_answer_s is None or spending.per_answer_s == pytest.approx(0.2, rel=0.001)
+    assert spending.per_answer_s is not None
 
 
 def test_a_robot_that_comes_and_goes_changes_nothing() -> None:

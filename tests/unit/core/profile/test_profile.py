@@ -494,7 +494,7 @@ def test_a_profile_carries_the_trend_of_a_radio_and_none_of_a_cable() -> None:
 
 def test_the_threads_of_a_worker_are_smoothed_in_step_with_those_of_its_machine() -> None:
     """So the rest, all others, stays what it is while the worker starts, works and ends."""
-    profiler = make_profiler()
+    profiler, compared = make_profiler(), 0
     for step, own in enumerate((None, None, 0.0, 2.0, 1.0, 3.0, 0.0, None, None)):
         load = load_of(runnable=own)
         sample = replace(device(), runnable=4.0 + (own or 0.0), workers=() if own is None else (load,))
@@ -505,9 +505,12 @@ def test_the_threads_of_a_worker_are_smoothed_in_step_with_those_of_its_machine(
         assert told.runnable is not None
         if mine is not None and mine.runnable is not None:
             assert told.runnable - mine.runnable == pytest.approx(4.0)
+            compared += 1
+    assert compared >= 5
     profiler.absorb(replace(device(), workers=(load_of(runnable=2.0),)), (), now=9.0)
     mine = taken(profiler, 9.0).worker("merge")
-    assert mine is None or mine.runnable is None, "nobody counts the machine's"
+    assert mine is not None
+    assert mine.runnable is None, "nobody counts the machine's"
 
 
 def test_who_wants_to_run_is_smoothed_and_unknown_at_once_where_nobody_counts() -> None:

@@ -523,8 +523,10 @@ def test_who_has_lost_its_state_and_gets_another_seat_elects_if_nothing_else_for
         agreed(agreement.on_learnt, ev.LearntReceived(learnt=told, is_answer=True), 100.2)
     assert agreement.fleet_value == back
     assert agreement.is_elector is not bool(why)
+    assert ("state" in agreement.problems) is bool(why)
     assert why in agreement.problems.get("state", "")
     after = agreement.to_persist(100.3)
+    assert (after is None) is (why == "the disk is full")
     assert after is None or (after.lost, after.disputed) == ("", disputed)
 
 

@@ -181,9 +181,11 @@ def test_malformed_grid_is_refused_with_its_reason(payload: bytes, reason: str) 
 def test_huge_size_is_refused_before_anything_is_allocated() -> None:
     raw = bytearray(encode_grid(Grid(data=np.zeros((0, 0), dtype=np.int8), resolution=0.05, frame_id="")))
     at = 4 + 8 + 8 + 8 + 4  # header; stamp; frame id and its padding; load time; resolution
-    raw[at : at + 8] = (2**31).to_bytes(4, "little") * 2
-    with pytest.raises(CdrError):
+    raw[at : at + 8] = (20_000).to_bytes(4, "little") * 2
+    raw[-4:] = (20_000**2).to_bytes(4, "little")  # the count of cells, of which none follows
+    with pytest.raises(CdrError) as caught:
         decode_grid(bytes(raw))
+    assert caught.value.reason == "size"
 
 
 @settings(max_examples=300)
