@@ -14,7 +14,10 @@ from zsched.drivers.place import Place
 
 
 class Outside:
-    """``mode``: refuse, late (a signal comes while it begins), deaf (hears SIGKILL only), messy (leaves something to be cleared away), or anything else."""
+    """``mode``: refuse, late (a signal comes while it begins), deaf (hears SIGKILL only), or anything else.
+
+    messy: it leaves something to be cleared away.
+    """
 
     is_child = False
 
