@@ -829,7 +829,7 @@ def test_beats_in_turn_are_no_news() -> None:
     [
         (ev.ProblemReported(source="disk", problem="slow"), True),
         (ev.ProblemReported(source=OWN_FILE, problem="it differs"), True),
-        (ev.StreamsCounted(counts=(StreamCount(stream="merge/in/0", last_seen_s=0.1),)), True),
+        (ev.StreamsCounted(counts=(StreamCount(stream="merge/in/0", last_seen_s=1.5),)), True),
         (ev.ProblemReported(source="fleet/document", problem="it is fetched"), False),
         (ev.StreamsCounted(counts=(StreamCount(stream="merge/in/0", in_flight=1),)), False),
         (accept(5, "robot2", allocation_of(5, "edge2", 3)), False),

@@ -38,7 +38,7 @@ def seen(scene: Scene, listener: str, speaker: str, state: str) -> Scene:
 def test_a_fleet_in_order_has_no_fault(tmp_path: Path) -> None:
     results = [(check, result) for check, result in run_all(fleet_scene(tmp_path)) if check.needs is Needs.FLEET]
     bad = [check.name for check, result in results if result.fix and check.name != "fleet.addresses"]
-    assert (bad, len(results)) == ([], 12)
+    assert (bad, len(results)) == ([], 13)
 
 
 def test_nodes_that_do_not_answer_are_named(tmp_path: Path) -> None:

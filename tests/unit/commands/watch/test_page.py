@@ -5,13 +5,14 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
+from pathlib import Path
 
 import pytest
 
-from zsched.commands.watch.gate import PAGE
+from zsched.commands.watch import web
 from zsched.commands.watch.web import PING_S
 
-SCRIPT = (PAGE / "page.js").read_text(encoding="utf-8")
+SCRIPT = (Path(web.__file__).parent / "page" / "page.js").read_text(encoding="utf-8")
 SILENT = re.compile(r"SILENT_MS = (\d+);")
 RUN = """
 const says = (text) => new TextEncoder().encode(text);
