@@ -23,6 +23,7 @@ import pytest
 from support.waiting import DEADLINE_S, until
 from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.commands.watch.screen import ENTER, LEAVE
+from zsched.exits import EXIT_UNREACHABLE
 
 STATUS: dict[str, Any] = json.loads(
     (Path(__file__).parents[3] / "unit/commands/watch/recorded/fleet.json").read_text(encoding="utf-8")
@@ -111,6 +112,6 @@ def test_a_daemon_that_goes_away_is_said_and_ctrl_c_ends(terminal: Terminal, dae
     daemon.close()
     terminal.wait_for("no answer since")
     terminal.type("\x03")
-    assert terminal.process.wait(DEADLINE_S) == 0
+    assert terminal.process.wait(DEADLINE_S) == EXIT_UNREACHABLE
     assert terminal.read().endswith(LEAVE)
     assert terminal.attributes() == terminal.before
