@@ -52,7 +52,7 @@ class TopView(Struct, frozen=True, kw_only=True):
 
 
 def top(view: TopView, *, is_once: bool) -> int:
-    """Show the fleet until ``q``, Ctrl-C or SIGTERM, or once; returns the exit code of the last answer, or that of none.
+    """Show the fleet until ``q``, Ctrl-C or SIGTERM, or once; returns the exit code of the last answer, or of none.
 
     Raises:
         CliError: already the first question found nobody, or there is no terminal (2).
