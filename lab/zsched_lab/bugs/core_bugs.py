@@ -1273,8 +1273,8 @@ VOTE_BUGS = (
     _bug(
         "median and mean swapped",
         STANDING,
-        "if allocation.tuning.aggregate is Aggregate.MEAN",
-        "if allocation.tuning.aggregate is not Aggregate.MEAN",
+        "if aggregate is Aggregate.MEAN",
+        "if aggregate is not Aggregate.MEAN",
         _SCHEDULER,
     ),
 )
