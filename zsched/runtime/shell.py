@@ -330,7 +330,7 @@ class Shell:
                 self._inbox.post_quietly(report)
                 self.measure_soon()
             return
-        if isinstance(report, ev.StreamsCounted) and all(count.is_still for count in report.counts):
+        if isinstance(report, ev.StreamsCounted) and all(count.is_still() for count in report.counts):
             # they can wait until the loop is awake
             self._inbox.post_quietly(report)
             return
