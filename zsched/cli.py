@@ -152,6 +152,7 @@ def main() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the interpreter will try once more
         if error.errno != errno.EPIPE:  # who read it has seen enough
             warn(f"zsched: the answer cannot be written: {error.strerror}; see where stdout goes")
+            code = code or EXIT_FAILED
     _end(code)
 
 

@@ -35,12 +35,14 @@ def test_an_interrupt_while_it_loads_is_no_traceback() -> None:
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
 
 
+@pytest.mark.parametrize("unbuffered", ["", "1"])
 @pytest.mark.parametrize("verb", [["version"], ["version", "--json"], ["--help"]])
-def test_an_answer_that_cannot_be_written_is_said_in_a_sentence(verb: list[str]) -> None:
+def test_an_answer_that_cannot_be_written_is_said_in_a_sentence(verb: list[str], unbuffered: str) -> None:
     """As when the disk behind ``> file`` is full."""
     with Path("/dev/full").open("wb") as full:
         command = [sys.executable, "-c", MAIN, *verb]
-        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60, check=False)
+        env = {**os.environ, "PYTHONUNBUFFERED": unbuffered}  # with a buffer the last flush finds it
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60, check=False, env=env)
     assert done.returncode == 1
     assert done.stderr == "zsched: the answer cannot be written: No space left on device; see where stdout goes\n"
 
