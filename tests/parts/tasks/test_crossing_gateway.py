@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import pytest
 import zenoh
 
+from support.waiting import until
 from zsched.clock import monotonic_s
 from zsched.core.values.struct import replace
 from zsched.sessions.config import client_config
@@ -146,4 +147,5 @@ def test_an_owner_that_refuses_for_good_is_asked_once_whatever_standbys_say(ther
     began_at = monotonic_s()
     assert Ways([way]).give(PARCEL, 10.0, lambda _pause_s: True) == f"at {there.endpoint} {refused}"
     assert monotonic_s() - began_at < 5.0
+    until(lambda: len(there.asked) >= 3, "the question at all of them, whose word is not waited for")
     assert sorted(node for node, _ in there.asked) == ["edge1", "edge2", "edge3"]
