@@ -8,7 +8,6 @@ from __future__ import annotations
 from typing import Any
 
 from zsched.commands.page import (
-    DROPS_OVER_S,
     SINCE_START,
     Cell,
     Page,
@@ -16,6 +15,7 @@ from zsched.commands.page import (
     missed_of,
     name_room,
     short_name,
+    since_drop,
     span,
 )
 from zsched.commands.report import (
@@ -103,7 +103,6 @@ def _missed(task: Json) -> tuple[str, bool]:
     losers = [stream for stream in task["streams"] if missed_of(stream)]
     if not losers:
         return "-", False
-    ages = [stream.get("dropped_s", 0.0) for stream in losers]
-    is_over = all(age_s is None or age_s > DROPS_OVER_S for age_s in ages)
-    told = SINCE_START if all(age_s is None for age_s in ages) else " (none in the last minute)"
-    return f"{sum(map(missed_of, losers))}{told if is_over else ''}", not is_over
+    over = [since_drop(stream) for stream in losers]
+    told = SINCE_START if set(over) == {SINCE_START} else " (none in the last minute)"
+    return f"{sum(map(missed_of, losers))}{told if all(over) else ''}", not all(over)

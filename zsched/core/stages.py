@@ -337,6 +337,10 @@ class Stages:
             return NO_DOUBTS
         return Doubts(in_grace=in_grace, unproven=unproven, unseen=unseen, unfit=unfit)
 
+    def counts_age_s(self, now: float) -> float:
+        """For how long the relay has told no counts; 0 before the first."""
+        return 0.0 if self.counted_at is None else max(now - self.counted_at, 0.0)
+
     def set_problem(self, source: str, problem: str | None) -> None:
         """Show a problem in the status, or (``None``) that it is over."""
         if problem is None:

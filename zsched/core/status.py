@@ -579,7 +579,7 @@ def _untaken(task: TaskSpec, executor: Executor, known: Unready | None) -> str:
 
 def _with_ages(count: StreamCount, node: Stages, now: float) -> StreamCount:
     """What the relay told a while ago is older by now; what it has not told for long is not known any more."""
-    told_s = max(now - node.counted_at, 0.0) if node.counted_at is not None else 0.0
+    told_s = node.counts_age_s(now)
     rose_at = node.missed.get(count.stream, (0, None))[1] if count.missed else None
     return replace(
         count,

@@ -81,7 +81,7 @@ def is_restless(node: Stages, now: float) -> bool:
     if node.tenure.exclusive or not node.votes.is_idle or node.membership.is_uneasy(now):
         return True
     is_agreeing = node.agreement.acceptor.has_parked or node.agreement.next_deadline() < math.inf
-    told_s = 0.0 if node.counted_at is None else max(now - node.counted_at, 0.0)
+    told_s = node.counts_age_s(now)
     is_moving = any(executor.next_deadline() < math.inf for executor in node.executors.values())
     return (
         is_agreeing
