@@ -61,12 +61,16 @@ def is_of_this_version(scene: Scene) -> Result:
 
 def sees_no_problem(scene: Scene) -> Result:
     """Whether the daemon names no problem, of itself, its tasks or the fleet."""
-    status = scene.status
-    own = [str(problem) for problem in status["problems"]]
-    tasks = [f"{task['name']}: {problem}" for task in status["tasks"] for problem in task["problems"]]
-    if not own and not tasks:
+    found = problems_of(scene.status)
+    if not found:
         return passed(f"{scene.node} names no problem")
-    return warned(*own, *tasks, fix="each line says what to do; zsched status shows them, too")
+    return warned(*found, fix="each line says what to do; zsched status shows them, too")
+
+
+def problems_of(status: Json) -> list[str]:
+    """What a node names: of itself and the fleet, then of its tasks."""
+    tasks = [f"{task['name']}: {problem}" for task in status["tasks"] for problem in task["problems"]]
+    return [*map(str, status["problems"]), *tasks]
 
 
 def nodes_get_tasks(scene: Scene) -> Result:

@@ -7,15 +7,16 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
-from typing import Final
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Final, TypeVar
 
 from zsched.core.values.fleet import fleet_hash
 from zsched.core.values.struct import replace
-from zsched.doctor.daemon import judged_lag, lacks_of_owners
+from zsched.doctor.daemon import judged_lag, lacks_of_owners, problems_of
 from zsched.doctor.model import SEAT_ADVICE, Json, Result, Scene, counted, failed, joined, passed, skipped, warned
 from zsched.doctor.network import addresses, connected
 
+T = TypeVar("T")
 HASH_DIGITS: Final = 8
 HEARD: Final = ("alive", "suspect")
 
@@ -223,27 +224,27 @@ def _cores(machine: Json) -> float:
     return float(machine["cpu_cores"] or 0.0) * float(machine.get("speed") or 1.0)
 
 
+def _who_tells(scene: Scene, told: Callable[[Json], Iterable[T]]) -> dict[T, list[str]]:
+    """{what a status tells: the nodes whose status does}, in the order of the nodes."""
+    found: dict[T, list[str]] = {}
+    for name, status in sorted(scene.statuses.items()):
+        for one in told(status):
+            found.setdefault(one, []).append(name)
+    return found
+
+
 def have_owners(scene: Scene) -> Result:
     """Whether every node sees a quorum, and an owner of each task that works."""
-    found: dict[Result, list[str]] = {}
-    for name, status in sorted(scene.statuses.items()):
-        for lack in lacks_of_owners(status):
-            found.setdefault(lack, []).append(name)
     told = [
         replace(lack, evidence=tuple(f"{', '.join(names)}: {line}" for line in lack.evidence))
-        for lack, names in found.items()
+        for lack, names in _who_tells(scene, lacks_of_owners).items()
     ]
     return joined(told, passed(f"{counted(len(scene.statuses), 'nodes')}, each sees an owner of every task"))
 
 
 def see_no_problem(scene: Scene) -> Result:
     """Whether no other node names a problem, of its own or of a task: what its streams wait for, say."""
-    found: dict[str, list[str]] = {}
-    for name, status in sorted(scene.statuses.items()):
-        tasks = [f"{task['name']}: {problem}" for task in status["tasks"] for problem in task["problems"]]
-        for problem in (*map(str, status["problems"]), *tasks):
-            found.setdefault(problem, []).append(name)
-    lines = [f"{', '.join(names)}: {problem}" for problem, names in found.items()]
+    lines = [f"{', '.join(names)}: {problem}" for problem, names in _who_tells(scene, problems_of).items()]
     if not lines:
         return passed(f"{counted(len(scene.statuses), 'nodes')}, no problem")
     return warned(*lines, fix="each line says what to do; zsched status --node NAME shows them")
