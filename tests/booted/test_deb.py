@@ -153,25 +153,24 @@ def test_another_version_comes_under_a_reliable_stream_that_loses_nothing(
     assert (found["running"] == report["first"]) == (step == "downgrade"), found
 
 
-def test_installed_again_it_runs_again_and_an_upgrade_starts_none_that_was_stopped(
-    report: dict[str, Any], given: dict[str, Any]
-) -> None:
+@pytest.fixture(scope="module")
+def back(report: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
+    """What was seen when it came back after a removal."""
     if by_pip(given):
-        pytest.skip("nothing starts it there")
-    back = report["back"]
+        pytest.skip("there is no package, whose scripts would do it")
+    found: dict[str, Any] = report["back"]
+    return found
+
+
+def test_installed_again_it_runs_again_and_an_upgrade_starts_none_that_was_stopped(back: dict[str, Any]) -> None:
     assert back["again"]["code"] == 0, back
     assert back["back"] == ["active", "active"], back
     assert back["upgrade"]["code"] == 0, back
     assert back["stopped"] == ["inactive", "inactive"], back
 
 
-def test_a_purge_spares_an_installation_by_pip_that_has_come_since(
-    report: dict[str, Any], given: dict[str, Any]
-) -> None:
+def test_a_purge_spares_an_installation_by_pip_that_has_come_since(back: dict[str, Any]) -> None:
     """It deleted that, and the node's key and state with it, under a running daemon."""
-    if by_pip(given):
-        pytest.skip("there is no package")
-    back = report["back"]
     assert back["spared"]["code"] == 0, back
     assert "holds an installation by pip now" in back["spared"]["said"]
     assert back["kept"] == ["/etc/zsched/fleet.yaml", "/var/lib/zsched/", "/opt/zsched"]
