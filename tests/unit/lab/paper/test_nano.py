@@ -57,7 +57,7 @@ from zsched_lab.paper.robots import ODOMETRY, ExploreRobots, Place, slam_task
 from zsched_lab.paper.roles import REST, RoleMeter, mean_shares, role_figures
 from zsched_lab.paper.run import CellRun, Inputs
 from zsched_lab.paper.scenario import MATRIX, NodeShare, Scenario, load_scenario
-from zsched_lab.paper.schemes import FIXED_SCHEMES, SCHEMES
+from zsched_lab.paper.schemes import FIXED_SCHEMES, PAPER_SCHEMES, SCHEMES
 from zsched_lab.paper.snippet import moves_text
 
 AUTHORS = {"slam": 0.352, "model": 0.60, "merge": 0.096, "navigation": 0.027}
@@ -81,7 +81,7 @@ def options(tmp_path: Path, name: str, **given: Any) -> BenchOptions:
 
 
 def test_the_shipped_scenarios_are_found_by_name_and_nothing_else_is() -> None:
-    assert shipped_names() == ("heavy-again", "heavy-oracle", "nano", "nano-moves", "paper")
+    assert shipped_names() == ("heavy-again", "heavy-all", "heavy-oracle", "nano", "nano-moves", "paper")
     assert shipped_scenario("paper") == scenario_path()
     assert shipped_scenario("nono") is None
     assert shipped_scenario("../paper") is None
@@ -121,6 +121,7 @@ def test_each_declared_block_is_all_that_its_scenario_runs() -> None:
         "nano-moves": (("dyna_both", "dyna_both_slam", "zsched", "zsched_slam"), 5),
         "heavy-again": (("fixed_e1", "fixed_e2", "fixed_e3", "dyna_both", "zsched"), 8),
         "heavy-oracle": (("dyna_both", "zsched", "oracle"), 8),
+        "heavy-all": ((*FIXED_SCHEMES, *PAPER_SCHEMES, "zsched", "oracle"), 5),
     }
     limits, seeds = set(), set(range(20260, 20260 + 100))
     for name, (schemes, runs) in wanted.items():
@@ -144,7 +145,7 @@ def test_every_second_run_takes_the_schemes_in_reverse() -> None:
     assert abs(order[0].index("zsched") - order[0].index("dyna_both")) == 1
 
 
-@pytest.mark.parametrize("name", ["heavy-again", "heavy-oracle"])
+@pytest.mark.parametrize("name", ["heavy-again", "heavy-oracle", "heavy-all"])
 def test_heavy_again_is_heavy(name: str) -> None:
     paper, again = load_scenario(scenario_path()), shipped(name)
     heavy = paper.blocks["heavy"]
