@@ -166,6 +166,7 @@ GAINS = (
     "map_hz",
     "task_latency_s",
     "merge_latency_p95_s",
+    "served_ratio",
 )
 """What a better place is to bring."""
 

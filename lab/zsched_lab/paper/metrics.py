@@ -41,6 +41,8 @@ from zsched_lab.paper.scenario import Scenario
 WASTED_S = 30.0
 """A move back to the node that was left within this time was for nothing."""
 HELD_EVERY_S = 5.0
+FRESH_S = 0.5
+"""A robot is served while its newest merged map is at most this old (`docs/evaluation/nano.md`, ``heavy_all``)."""
 Json = dict[str, Any]
 WALL_M = 0.1
 """So far may a wall be off: two cells of `nano`'s maps, twice the error of a robot's pose."""
@@ -239,7 +241,25 @@ def stream_figures(streams: Streams, robots: int, duration_s: float) -> Json:
         "map_hz": len(inside) / robots / duration_s,
         "mb_per_map": received / len(inside) / 1e6 if inside else None,
         **{f"merge_latency_p{p}_s": percentile(latencies, p / 100) for p in (50, 95, 99)},
+        "served_ratio": sum(served_s(maps, duration_s) for maps in streams.maps.values()) / robots / duration_s,
     }
+
+
+def served_s(maps: Sequence[Arrival], duration_s: float) -> float:
+    """Seconds of the drive in which one robot's newest merged map is at most `FRESH_S` old by its newest input.
+
+    So a map counts from its arrival until `FRESH_S` after that input's stamp, and an older one that overtakes it adds
+    nothing. This is the age of information (Kaul, Yates, Gruteser, INFOCOM 2012) held against a deadline.
+
+    >>> served_s([Arrival(0.25, 0.125, 1, 0.0), Arrival(2.0, 0.25, 1, 0.0), Arrival(5.0, 0.75, 1, 0.0)], 10.0)
+    0.625
+    """
+    served, until = 0.0, 0.0
+    for arrival in maps:
+        end = min(arrival.t_s - arrival.latency_s + FRESH_S, duration_s)
+        served += max(end - max(arrival.t_s, until, 0.0), 0.0)
+        until = max(until, end)
+    return served
 
 
 def percentile(ordered: Sequence[float], share: float) -> float | None:

@@ -24,6 +24,7 @@ COLUMNS = (
     ("is_done", "done", 2),
     ("merge_latency_p50_s", "p50 s", 2),
     ("merge_latency_p95_s", "p95 s", 2),
+    ("served_ratio", "served", 3),
     ("cpu_peak", "CPU peak", 2),
     ("memory_mean", "mem mean", 2),
     ("ssim_rebased", "SSIM", 3),

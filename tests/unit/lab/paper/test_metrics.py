@@ -15,6 +15,7 @@ from zsched.tasks.map_merge.cdr import encode_grid
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import FREE, OCCUPIED, UNKNOWN, Grid
 from zsched_lab.fleet.recorder import Recorder
+from zsched_lab.paper.arrivals import Arrival
 from zsched_lab.paper.drive_clock import begun_before, smoothed
 from zsched_lab.paper.load import Window
 from zsched_lab.paper.metrics import (
@@ -30,6 +31,7 @@ from zsched_lab.paper.metrics import (
     owners_within,
     percentile,
     reached_s,
+    served_s,
     wasted,
 )
 from zsched_lab.paper.places import scenario_path
@@ -78,6 +80,20 @@ def test_walls_are_found_where_they_are_and_not_by_a_map_that_lies_elsewhere() -
         line[4:9, 4] = OCCUPIED
         own = Truth(Grid(data=line, resolution=room.resolution, origin=room.origin))
         assert (own.walls(encode_grid(Grid(data=line, resolution=room.resolution, origin=off))) == 1.0) is is_found
+
+
+def test_a_robot_is_served_while_its_newest_map_is_fresh() -> None:
+    def served(*maps: tuple[float, float]) -> float:
+        return served_s([Arrival(t_s, latency_s, 1, 0.0) for t_s, latency_s in maps], 10.0)
+
+    assert served() == 0.0, "without a map nobody is"
+    assert served((1.0, 0.1)) == pytest.approx(0.4)
+    assert served((1.0, 0.1), (1.1, 0.1)) == pytest.approx(0.5), "what two maps serve counts once"
+    assert served((1.0, 0.1), (1.1, 0.4)) == pytest.approx(0.4), "an older one that comes behind adds nothing"
+    assert served((1.0, 0.6), (2.0, 0.5)) == 0.0, "what comes too late serves nobody"
+    assert served((-0.2, 0.1)) == pytest.approx(0.2), "what came before the drive serves in it"
+    assert served((9.9, 0.1)) == pytest.approx(0.1)
+    assert served((10.2, 0.1)) == 0.0
 
 
 def part_of_room(share: float, stamp_ns: int = 0, margin: int = 0) -> bytes:
@@ -136,6 +152,7 @@ def test_a_runs_figures_by_their_definitions(tmp_path: Path, scenario: Scenario)
     assert figures["map_hz"] == pytest.approx(0.9)
     assert figures["merge_latency_p50_s"] == pytest.approx(0.2)
     assert figures["merge_latency_p99_s"] == pytest.approx(0.3)
+    assert figures["served_ratio"] == pytest.approx(9 * (0.3 + 0.2) / 2 / 10)
     assert figures["coverage"] == pytest.approx(0.9)
     assert figures["moves"] == 1
     assert figures["wasted_moves"] == 0
