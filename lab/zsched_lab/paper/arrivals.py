@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from zsched.core.values.model import NodeId
+from zsched.tasks.map_merge.geometry import Pose2
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,5 +34,7 @@ class Streams:
     held: dict[float, list[int]] = field(default_factory=dict)
     """{instant: keys of the maps that the robots held then}."""
     payloads: dict[int, bytes] = field(default_factory=dict)
+    frames: dict[int, Pose2] = field(default_factory=dict)
+    """{key: pose of that map's frame in the truth}."""
     stamps: set[int] = field(default_factory=set)
     """Keys of the merged maps of the drive: what two robots received once counts once."""

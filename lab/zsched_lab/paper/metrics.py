@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from zsched.core.values.model import NodeId
 from zsched.tasks.map_merge.cdr import CdrError, decode_grid
+from zsched.tasks.map_merge.geometry import FloatArray, Pose2
 from zsched.tasks.map_merge.grid import Grid
 from zsched_lab.demo.plots import wider
 from zsched_lab.fleet.recorder import read_records
@@ -40,6 +41,7 @@ from zsched_lab.paper.scenario import Scenario
 
 WASTED_S = 30.0
 """A move back to the node that was left within this time was for nothing."""
+WORLD = Pose2()
 HELD_EVERY_S = 5.0
 FRESH_S = 0.5
 """A robot is served while its newest merged map is at most this old (`docs/evaluation/nano.md`, ``heavy_all``)."""
@@ -62,17 +64,17 @@ class Truth:
         self.area_m2 = self._x.size * grid.resolution**2
         """What can be known."""
 
-    def coverage(self, payload: bytes) -> float:
+    def coverage(self, payload: bytes, world_t_map: Pose2 = WORLD) -> float:
         """Share of the known cells that the map in ``payload`` knows; 0 for what is no map.
 
-        Looked up at the middle of each of the truth's cells (neither is turned).
+        Looked up at the middle of each of the truth's cells. ``world_t_map``: the pose of the map's frame in the truth.
         """
         grid = grid_of(payload)
         if grid is None or not self._x.size:
             return 0.0
-        return _share(grid, grid.known, self._x, self._y)
+        return _share(grid, grid.known, *_seen_from(world_t_map, self._x, self._y))
 
-    def walls(self, payload: bytes) -> float:
+    def walls(self, payload: bytes, world_t_map: Pose2 = WORLD) -> float:
         """Share of the truth's walls that the map has within `WALL_M` of where they are; 0 for what is no map.
 
         A map whose parts lie in the wrong places knows as much as a right one, and has hardly a wall in its place.
@@ -80,7 +82,16 @@ class Truth:
         grid = grid_of(payload)
         if grid is None or not self._wall_x.size:
             return 0.0
-        return _share(grid, wider(grid.occupied, round(WALL_M / grid.resolution)), self._wall_x, self._wall_y)
+        x, y = _seen_from(world_t_map, self._wall_x, self._wall_y)
+        return _share(grid, wider(grid.occupied, round(WALL_M / grid.resolution)), x, y)
+
+
+def _seen_from(frame: Pose2, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The same points (m) in ``frame``, a pose in the world."""
+    if frame == WORLD:
+        return x, y
+    points = frame.inverse().apply(np.column_stack((x, y)))
+    return points[:, 0], points[:, 1]
 
 
 def _share(grid: Grid, cells: NDArray[np.bool_], x: NDArray[Any], y: NDArray[Any]) -> float:
@@ -160,6 +171,7 @@ def read_streams(folder: Path, run: Mapping[str, Any], truth: Truth) -> Streams:
     known: dict[int, tuple[float, float]] = {}
     newest: dict[NodeId, int] = {}
     instants = held_instants(float(run["duration_s"]))
+    frames = Frames(folder, run)
     for topic, log_ns, sent_ns, data in messages(sorted(folder.glob("streams*.mcap"))):
         robot, _, name = topic.partition("/")
         t_s = (log_ns - offset_ns) / 1e9
@@ -171,7 +183,8 @@ def read_streams(folder: Path, run: Mapping[str, Any], truth: Truth) -> Streams:
             keep(found, newest, instants.pop(0))
         key = hash(data)
         if key not in known:
-            known[key] = truth.coverage(data), truth.walls(data)
+            found.frames[key] = frames.at(log_ns)
+            known[key] = truth.coverage(data, found.frames[key]), truth.walls(data, found.frames[key])
         newest[robot] = key
         if 0.0 <= t_s <= float(run["duration_s"]):
             found.stamps.add(key)
@@ -181,6 +194,27 @@ def read_streams(folder: Path, run: Mapping[str, Any], truth: Truth) -> Streams:
     for instant in instants:
         keep(found, newest, instant)
     return found
+
+
+class Frames:
+    """In which frame merged maps lie: the truth's, or that of a robot whose start the merger was not told.
+
+    The merger tells by its status which robot is its reference, from its first merge on.
+    """
+
+    def __init__(self, folder: Path, run: Mapping[str, Any]) -> None:
+        untold = {robot: Pose2(**pose) for robot, pose in (run.get("untold_frames") or {}).items()}
+        self._since: list[tuple[int, Pose2]] = []
+        if not untold:
+            return
+        for topic, log_ns, _, data in messages(sorted(folder.glob("streams*.mcap"))):
+            if topic.endswith("/status") and (reference := json.loads(data).get("reference")) is not None:
+                self._since.append((log_ns, untold.get(reference, WORLD)))
+
+    def at(self, log_ns: int) -> Pose2:
+        """The frame, as a pose in the truth, of a map that came then; before the first word it is the first word's."""
+        index = bisect.bisect_right(self._since, log_ns, key=lambda one: one[0])
+        return self._since[max(index - 1, 0)][1] if self._since else WORLD
 
 
 def held_instants(duration_s: float) -> list[float]:
@@ -367,7 +401,7 @@ def map_figures(streams: Streams, truth: Truth, robots: int) -> Json:
     """
     blank = score_map(None, truth.grid)
     held = {key for keys in streams.held.values() for key in keys}
-    scored = {key: score_map(grid_of(streams.payloads[key]), truth.grid) for key in held}
+    scored = {key: score_map(grid_of(streams.payloads[key]), truth.grid, streams.frames[key]) for key in held}
     by_instant = [
         [*(scored[key] for key in keys), *[blank] * (robots - len(keys))] for _, keys in sorted(streams.held.items())
     ]

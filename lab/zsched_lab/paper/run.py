@@ -108,6 +108,7 @@ class CellRun:
         self._recorder = Recorder(self._records)
         self._plan_path = folder / "plan.json"
         self._seed = scenario.run_seed(cell.run)
+        self._untold: dict[NodeId, dict[str, float]] = {}
         self._bandwidth_mbit = bandwidth_of(scenario, cell)
         self.left_behind: list[str] = []
         """What could not be removed when the run had ended."""
@@ -179,8 +180,10 @@ class CellRun:
         robots = sorted(name for name, node in tree["nodes"].items() if node["kind"] == "robot")
         frames = dict(zip(robots, self._inputs.robots.frames(len(robots), self._seed), strict=True))
         merge = merge_of(self._scenario, self._cell)
-        # Where the merger knows the first robot's start only, merged maps still lie in the truth's frame.
+        # The merger is told the first robot's start at least, so that its maps lie in the truth's frame; where another
+        # robot's map came first, they lie in that one's.
         told = dict(list(frames.items())[:1]) if merge.mode == Mode.ESTIMATE else frames
+        self._untold = {robot: asdict(pose) for robot, pose in frames.items() if robot not in told}
         options = worker_options(Mode.KNOWN, told) | {
             "--mode": (merge.mode,),
             "--rate": (f"{merge.rate_hz:g}",),
@@ -363,6 +366,7 @@ class CellRun:
             "duration_s": drove_s,
             "warm_up_s": self._scenario.warm_up_s,
             "robots": parts.fleet.robots,
+            "untold_frames": self._untold,
             "shares": {node: asdict(share) for node, share in self._scenario.nodes.items()},
             "windows": [asdict(window) for window in self._windows],
             "loads": [asdict(load) for load in parts.loads.past],

@@ -20,6 +20,7 @@ from zsched_lab.paper.drive_clock import begun_before, smoothed
 from zsched_lab.paper.load import Window
 from zsched_lab.paper.metrics import (
     WALL_M,
+    WORLD,
     Truth,
     brief,
     held_instants,
@@ -82,6 +83,33 @@ def test_walls_are_found_where_they_are_and_not_by_a_map_that_lies_elsewhere() -
         assert (own.walls(encode_grid(Grid(data=line, resolution=room.resolution, origin=off))) == 1.0) is is_found
 
 
+def test_a_turned_map_is_held_against_the_truth_in_its_own_frame() -> None:
+    room, frame = a_room(), Pose2(x=1.5, y=-0.5, yaw=math.pi)
+    rows, columns = room.data.shape
+    corner = frame.inverse().apply_point(room.origin.x + columns * SIDE, room.origin.y + rows * SIDE)
+    turned = Grid(data=room.data[::-1, ::-1].copy(), resolution=SIDE, origin=Pose2(x=corner[0], y=corner[1]))
+    truth, payload = Truth(room), encode_grid(turned)
+    assert (truth.coverage(payload, frame), truth.walls(payload, frame)) == (1.0, 1.0)
+    assert truth.coverage(payload) < 0.9
+    assert truth.walls(payload) < 0.9
+
+
+def test_maps_of_another_reference_are_moved_to_the_truth(tmp_path: Path, scenario: Scenario) -> None:
+    """Where a robot whose start the merger was not told came first, its maps lie in that robot's frame."""
+    frame, keys = Pose2(x=1.5, y=-0.5), ("coverage", "wall_f1", "ssim_rebased", "coverage_mean", "walls_mean")
+    untold = {"robot2": {"x": frame.x, "y": frame.y, "yaw": 0.0}}
+
+    def figures(name: str, **changed: Any) -> list[float]:
+        (tmp_path / name).mkdir()
+        found = measure(write_run(tmp_path / name, **changed), scenario, Truth(a_room()))
+        return [found[key] for key in keys]
+
+    wanted = pytest.approx(figures("first"))
+    assert figures("second", reference="robot2", frame=frame, untold_frames=untold) == wanted
+    assert figures("told", reference="robot1", untold_frames=untold) == wanted
+    assert figures("unread", reference="robot2", frame=frame) != wanted
+
+
 def test_a_robot_is_served_while_its_newest_map_is_fresh() -> None:
     def served(*maps: tuple[float, float]) -> float:
         return served_s([Arrival(t_s, latency_s, 1, 0.0) for t_s, latency_s in maps], 10.0)
@@ -96,13 +124,16 @@ def test_a_robot_is_served_while_its_newest_map_is_fresh() -> None:
     assert served((10.2, 0.1)) == 0.0
 
 
-def part_of_room(share: float, stamp_ns: int = 0, margin: int = 0) -> bytes:
-    """The room's left part, in a canvas with a margin around it: as a merged map that grows."""
+def part_of_room(share: float, stamp_ns: int = 0, margin: int = 0, frame: Pose2 = WORLD) -> bytes:
+    """The room's left part, in a canvas with a margin around it: as a merged map that grows.
+
+    It lies in ``frame``, a pose in the room that is not turned.
+    """
     room = a_room()
     data = room.data.copy()
     data[:, int(share * data.shape[1]) :] = UNKNOWN
     data = np.pad(data, margin, constant_values=UNKNOWN)
-    origin = Pose2(x=room.origin.x - margin * SIDE, y=room.origin.y - margin * SIDE)
+    origin = Pose2(x=room.origin.x - margin * SIDE - frame.x, y=room.origin.y - margin * SIDE - frame.y)
     return encode_grid(Grid(data=data, resolution=SIDE, origin=origin, stamp_ns=stamp_ns))
 
 
@@ -112,8 +143,11 @@ def scenario() -> Scenario:
     return replace(load_scenario(scenario_path()), nodes=shares, target_coverage=0.8)
 
 
-def write_run(folder: Path, **changed: Any) -> Path:
-    """A run of 10 s with two robots: a merged map each second that knows a tenth more; edge1 to edge2 at 4.5 s."""
+def write_run(folder: Path, reference: str | None = None, frame: Pose2 = WORLD, **changed: Any) -> Path:
+    """A run of 10 s with two robots: a merged map each second that knows a tenth more; edge1 to edge2 at 4.5 s.
+
+    ``frame``: in which merged maps lie, that of ``reference``, which is told from the third second on.
+    """
     moves = [(-0.5, "edge1"), (4.5, "edge2")]
     run = {
         "scheme": "zsched", "family": "zsched", "block": "matrix", "level": "one", "run": 0, "seed": 1,
@@ -136,9 +170,10 @@ def write_run(folder: Path, **changed: Any) -> Path:
             at_ns = ZERO_NS + second * 10**9
             for index, robot in enumerate(("robot1", "robot2")):
                 file.write(Heard(f"{robot}/map", b"x" * 100, at_ns - 5 * 10**8))
-                payload = part_of_room(second / 10, stamp_ns=at_ns - 2 * 10**8, margin=second)
+                payload = part_of_room(second / 10, stamp_ns=at_ns - 2 * 10**8, margin=second, frame=frame)
                 file.write(Heard(f"{robot}/global_map", payload, at_ns + index * 10**8))
-                file.write(Heard(f"{robot}/map_merge/status", b"{}", at_ns))
+                told = json.dumps({"reference": reference if second > 2 else None}).encode()
+                file.write(Heard(f"{robot}/map_merge/status", told, at_ns))
         file.close()
     (folder / "run.json").write_text(json.dumps(run))
     return folder
