@@ -110,6 +110,7 @@ class Node(Stages):
 
     def _note_lag(self, lag_s: float, now: float) -> None:
         self.loop_lag_s = max(self.loop_lag_s, lag_s)
+        self.recent_lag.note(lag_s, now)
         self.membership.note_lag(lag_s)
         self.hangs.note_lag(lag_s, now)
 

@@ -39,6 +39,7 @@ from zsched.core.membership.solitude import Solitude
 from zsched.core.profile.answers import Answers
 from zsched.core.profile.profile import Profiler
 from zsched.core.profile.relay_ends import RelayEnds
+from zsched.core.recent import RecentWorst
 from zsched.core.route.gaps import StreamGaps
 from zsched.core.route.rates import StreamRates
 from zsched.core.scheduler.flags import NodeFlags
@@ -62,6 +63,8 @@ from zsched.core.vote.voting import Votes
 
 OWN_FILE: Final = "fleet/file"
 """The problem that this machine's file differs from the agreed document, which it may for good."""
+LAG_SHOWN_S: Final = 30.0
+"""A delay of the loop is shown for so long: who looks at the status never comes in the moment of one."""
 HISTORY = 32
 """Past values of a task that status can show."""
 
@@ -114,6 +117,7 @@ class Stages:
     """Who is let in to this node's sessions, for the status (`Exposure`)."""
     is_draining = False
     loop_lag_s = 0.0
+    """The longest delay since the last beat, for the beat; `recent_lag` is what the status shows."""
     stream_counts: tuple[StreamCount, ...] = ()
     counted_at: float | None = None
     """When the relay last told them."""
@@ -201,6 +205,7 @@ class Stages:
         self.rollouts = Rollouts()
         self.rollouts.take(fleet, now)
         self.hangs = HangWatch(fleet)
+        self.recent_lag = RecentWorst(LAG_SHOWN_S)
         leases = self.agreement.leases
         self.tenure = Tenure(fleet, me, leases, self.executors)
         self.sealing = Sealing(fleet, me, self.executors, leases.over_at, lambda: leases.terms)

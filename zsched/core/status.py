@@ -83,7 +83,7 @@ def build_snapshot(node: Stages, now: float) -> Snapshot:
         kind=node.kind.value,
         incarnation=node.incarnation,
         up_s=now - node.started_at,
-        loop_lag_s=node.loop_lag_s,
+        loop_lag_s=node.recent_lag.worst(now),
         quorum=quorum,
         nodes=tuple(_node_status(node, spec, now) for spec in node.fleet.nodes),
         tasks=tuple(_task_status(node, spec, now) for spec in node.fleet.tasks),

@@ -40,7 +40,8 @@ def is_quick(scene: Scene) -> Result:
 def judged_lag(node: str, status: Json, beat_s: float, suspect_s: float) -> Result:
     """What the lag of a decision loop means: it beats every ``beat_s``, and is suspect after ``suspect_s``."""
     lag_s = float(status["loop_lag_s"])
-    told = f"{node}: the decision loop lags by {1000 * lag_s:.1f} ms, a beat is due every {1000 * beat_s:g} ms"
+    told = f"{node}: the decision loop lags by up to {1000 * lag_s:.1f} ms of late"
+    told += f", a beat is due every {1000 * beat_s:g} ms"
     fix = f"see what takes the CPU of {node} (top); demand: {{cpu_cores:}} of its tasks; a slower `timing:`"
     if lag_s > suspect_s / 2:
         return failed(told, f"the others suspect it after {suspect_s:g} s of silence", fix=fix)

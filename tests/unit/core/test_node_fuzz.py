@@ -127,6 +127,16 @@ def test_a_late_wake_up_is_told_in_the_next_beat_only() -> None:
     assert beat.loop_lag_s == pytest.approx(0.0, abs=1e-6)
 
 
+def test_the_status_tells_of_a_late_wake_up_for_half_a_minute() -> None:
+    """Each beat begins anew, and it goes out in the moment in which the delay is measured."""
+    node = make("robot1")
+    node.start(100.0)
+    late = node.next_deadline() + 0.5
+    node.handle(ev.DeadlineReached(), late)
+    shown = [build_snapshot(node, late + after_s).loop_lag_s for after_s in (0.0, 29.0, 45.0)]
+    assert shown == [pytest.approx(0.5), pytest.approx(0.5), 0.0]
+
+
 def test_fading_doubt_is_no_lag() -> None:
     """A limit that shrinks with the doubt may end in the past; that must not feed the doubt again."""
     node = make("robot1")

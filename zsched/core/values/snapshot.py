@@ -227,6 +227,7 @@ class Snapshot(Struct, frozen=True, kw_only=True):
     incarnation: int
     up_s: float
     loop_lag_s: float
+    """The longest delay of the decision loop in the last half minute or so."""
     quorum: QuorumStatus
     nodes: tuple[NodeStatus, ...]
     tasks: tuple[TaskStatus, ...]
