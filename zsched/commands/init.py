@@ -76,7 +76,7 @@ def create_state(
     state = places.state_folder(state_dir, os.environ)
     if is_settling:
         done = settle_dispute(fleet, name, state)
-        say(f"{name}: {'settled; restart its daemon' if done else 'there was no dispute'}")
+        say(f"{name}: {'settled; start its daemon' if done else 'there was no dispute'}")
         return
     if is_forced and not generation:
         raise CliError(EXIT_USAGE, "--force goes with --generation G")

@@ -26,6 +26,7 @@ from zsched.exits import EXIT_FAILED, EXIT_OK
 
 MIB: Final = 1 << 20
 NODE_STATES: Final = ("alive", "suspect", "gone", "unknown")
+HEARD: Final = ("alive", "suspect")
 WORKER_STATES: Final = ("starting", "ready", "stopped", "failed")
 COUNTED: Final = {
     "acknowledged": "Samples of an input that workers have processed.",
@@ -63,7 +64,8 @@ def _of_daemon(status: Json) -> Iterator[Family]:
     yield "zsched_up", "gauge", "Whether the daemon answers.", [({}, 1.0)]
     yield "zsched_info", "gauge", "Who answers.", [(named, 1.0)]
     yield "zsched_uptime_seconds", "gauge", "Since the daemon's start.", [({}, status["up_s"])]
-    yield "zsched_loop_lag_seconds", "gauge", "Longest delay of the decision loop.", [({}, status["loop_lag_s"])]
+    lag = [({}, status["loop_lag_s"])]
+    yield "zsched_loop_lag_seconds", "gauge", "Longest delay of the decision loop in the last half minute.", lag
     for key, text in (("electors", "Electors."), ("alive", "Electors that can answer."), ("needed", "Majority.")):
         yield f"zsched_quorum_{key}", "gauge", text, [({}, quorum[key])]
     yield "zsched_quorum_ok", "gauge", "Whether anything can be agreed.", [({}, quorum["ok"])]
@@ -73,13 +75,14 @@ def _of_daemon(status: Json) -> Iterator[Family]:
     yield "zsched_events_total", "counter", "Dropped frames and other events, by name.", counters
 
 
-def _of_nodes(nodes: list[Json]) -> Iterator[Family]:
-    states = [({"node": n["name"], "state": s}, n["state"] == s) for n in nodes for s in NODE_STATES]
+def _of_nodes(every: list[Json]) -> Iterator[Family]:
+    states = [({"node": n["name"], "state": s}, n["state"] == s) for n in every for s in NODE_STATES]
     yield "zsched_node_state", "gauge", "1 for the state that the node is in.", states
-    yield "zsched_node_draining", "gauge", "Whether it hands over what it owns.", _each(nodes, "draining")
-    flags = [({"node": n["name"], "kind": f["kind"]}, 1.0) for n in nodes for f in n.get("flags", ())]
+    flags = [({"node": n["name"], "kind": f["kind"]}, 1.0) for n in every for f in n.get("flags", ())]
     yield "zsched_node_flag", "gauge", "1 for what an operator has said of the node: drain, ineligible, leave.", flags
-    yield "zsched_node_profile_age_seconds", "gauge", "Age of its newest profile.", _each(nodes, "age_s")
+    yield "zsched_node_profile_age_seconds", "gauge", "Age of its newest profile.", _each(every, "age_s")
+    nodes = [node for node in every if node["state"] in HEARD]  # the last figures of one that is gone are no samples
+    yield "zsched_node_draining", "gauge", "Whether it hands over what it owns.", _each(nodes, "draining")
     yield "zsched_node_cpu_cores", "gauge", "Cores.", _each(nodes, "cpu_cores")
     yield "zsched_node_cpu_used_cores", "gauge", "Cores in use.", _each(nodes, "cpu_used_cores")
     yield "zsched_node_memory_bytes", "gauge", "Memory.", _each(nodes, "memory_mb", MIB)

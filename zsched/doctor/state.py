@@ -60,7 +60,10 @@ def makes_an_elector(scene: Scene) -> Result:
         fix = "bring the fleet file of the others here, or see docs/guide/service.md, Add or remove a machine"
         return failed("the state is one of other electors than the fleet file names", fix=fix)
     if state.disputed:
-        return failed(state.disputed, fix="remove the other machine of this name, then: zsched init --settle")
+        return failed(
+            state.disputed,
+            fix="remove the other machine of this name, stop zsched here, then: zsched init --settle, and start it",
+        )
     if state.lost:
         return failed(str(state.lost), fix="zsched init --help says how this node becomes an elector again")
     return passed(f"{scene.node} is one of {len(scene.fleet.electors)} electors, and its state is theirs")

@@ -67,6 +67,30 @@ def test_figures_are_the_status_s() -> None:
     assert values(text, "zsched_up") == {(): 1}
 
 
+@pytest.mark.parametrize(
+    ("state", "is_told"), [("alive", True), ("suspect", True), ("gone", False), ("unknown", False)]
+)
+def test_the_last_figures_of_a_node_that_is_gone_are_no_samples(state: str, is_told: bool) -> None:
+    """An alert on a failed worker went on for a machine that was switched off."""
+    status = recorded()
+    node = status["nodes"][0]
+    node |= {
+        "state": state,
+        "gauges": {"battery": 0.5},
+        "links": [{"peer": None, "source": "wireless", "rssi_dbm": -60.0}],
+    }
+    assert node["workers"]
+    text = metrics_text(status)
+    told = {
+        name for name, family in parsed(text).items() if any(s.labels.get("node") == "edge1" for s in family.samples)
+    }
+    always = {"zsched_node_state", "zsched_node_profile_age_seconds", "zsched_task_owner", "zsched_task_utility_ratio"}
+    assert always <= told
+    figures = {"zsched_node_cpu_cores", "zsched_node_cpu_used_cores", "zsched_node_memory_bytes", "zsched_node_gauge"}
+    figures |= {"zsched_link_rssi_dbm", "zsched_worker_state", "zsched_node_draining"}
+    assert figures & told == (figures if is_told else set())
+
+
 def test_a_task_that_no_other_candidate_could_take_is_told() -> None:
     status = recorded()
     assert values(metrics_text(status), "zsched_task_without_spare") == {("echo",): 0}

@@ -56,6 +56,7 @@ from zsched.core.vote.witness import Witness, as_seen, as_tuple
 
 HELM_BALLOTS = 2
 """Each elector proposes a change of the electors so many times ``ballot_s`` after the one before."""
+SETTLE = "`zsched init --settle`, with its daemon stopped"
 SETTLE_AFTER_START_S = 0.3
 """A starting elector learns first what was accepted before (an identity round), once its peers are connected."""
 
@@ -121,7 +122,7 @@ class Agreement:
             value = None if durable.fleet_register is None else durable.fleet_register.learnt
             self._complain_of_loss(is_agreed=value is not None and bool(value.document))
         if self._disputed:
-            self._problems["state"] = f"{self._disputed}; no elector until `zsched init --settle`"
+            self._problems["state"] = f"{self._disputed}; no elector until {SETTLE}"
         self.counters: Counter[str] = Counter()
         # A state of today's names no creations: its registers are those of its generation.
         held = () if durable is None else durable.registers
@@ -741,7 +742,7 @@ class Agreement:
         if self._disputed:
             return
         self._disputed = reason
-        self._problems["state"] = f"{reason}; no elector until `zsched init --settle`"
+        self._problems["state"] = f"{reason}; no elector until {SETTLE}"
         self._stop_electing()
         todo.must_persist |= self._durable is not None
 
