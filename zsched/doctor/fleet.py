@@ -10,7 +10,7 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Final, TypeVar
 
-from zsched.core.values.fleet import fleet_hash
+from zsched.core.values.fleet import TUNED_LINKS, TUNED_RULES, fleet_hash
 from zsched.core.values.struct import replace
 from zsched.doctor.daemon import judged_lag, lacks_of_owners, problems_of
 from zsched.doctor.model import SEAT_ADVICE, Json, Result, Scene, counted, failed, joined, passed, skipped, warned
@@ -114,11 +114,19 @@ def _values(task: str, statuses: Mapping[str, Json]) -> dict[tuple[int, int, str
     return found
 
 
+LEFT_TO_FILE: Final = frozenset((*TUNED_RULES, *TUNED_LINKS))
+
+
 def _rest_hash(task: Json) -> str:
-    """A hash of what else the register holds: tuning and orders, but not for how long each node has known them."""
+    """A hash of what else the register holds: tuning and orders, but not for how long each node has known them.
+
+    Settings that a tuning may leave to the file stand in the status as they are in force there. Where files differ they
+    do, too, and no register does.
+    """
     orders = {key: task.get(key) for key in ("pause", "pin")}
     kept = {key: {name: hold[name] for name in hold if name != "known_s"} for key, hold in orders.items() if hold}
-    text = json.dumps({"tuning": task.get("tuning"), **kept}, sort_keys=True)
+    agreed = {name: value for name, value in (task.get("tuning") or {}).items() if name not in LEFT_TO_FILE}
+    text = json.dumps({"tuning": agreed, **kept}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:HASH_DIGITS]
 
 
@@ -173,7 +181,7 @@ def are_quick(scene: Scene) -> Result:
     lags = {name: judged_lag(name, status, timing.beat_s, timing.suspect_s) for name, status in scene.statuses.items()}
     most = max((float(status["loop_lag_s"]) for status in scene.statuses.values()), default=0.0)
     bad = (result for result in lags.values() if result.fix)
-    return joined(bad, passed(f"the slowest decision loop lags by {1000 * most:.1f} ms"))
+    return joined(bad, passed(f"the slowest decision loop lagged by up to {1000 * most:.1f} ms of late"))
 
 
 def answer_in_time(scene: Scene) -> Result:

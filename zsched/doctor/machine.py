@@ -18,7 +18,7 @@ from zsched.adapters.machine.shared_memory import FOLDER
 from zsched.adapters.radio.nl80211 import GenericNetlink, Nl80211Error
 from zsched.clock import ClockWatch
 from zsched.core.events import ClockCompared
-from zsched.core.values.fleet import LinkSpec, SharedMemory, runs_worker
+from zsched.core.values.fleet import LinkSpec, SharedMemory, Standby, runs_worker
 from zsched.core.values.profile import LinkSource
 from zsched.core.vote.clocks import is_bad
 from zsched.doctor.model import Result, Scene, counted, failed, joined, passed, skipped, warned
@@ -103,7 +103,9 @@ def can_do_all_at_once(scene: Scene) -> Result:
     """Whether the memory suffices for all workers that this machine keeps at the same time."""
     sample = DeviceProfiler(scene.root).sample({})
     mine = [task for task in scene.fleet.tasks if runs_worker(task, scene.node, scene.me.kind)]
-    needed = sum(task.demand.memory_mb for task in mine)
+    kept = [task.demand.memory_mb for task in mine if task.worker.standby is not Standby.COLD]
+    cold = [task.demand.memory_mb for task in mine if task.worker.standby is Standby.COLD]
+    needed = sum(kept) + max(cold, default=0.0)  # one of the cold ones is started, when the machine gets its task
     told = f"{counted(len(mine), 'workers')}: {needed:g} MiB by the fleet file; {sample.memory_mb:.0f} MiB here"
     if needed <= sample.memory_mb:
         return passed(told)

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Final
 
 from zsched.clock import wall_ns
+from zsched.config.schema import is_own_host
 from zsched.core.membership.refused import SHOWN_S
 from zsched.core.values.certificates import Role, parse_common_name
 from zsched.core.values.fleet import Security
@@ -204,11 +205,15 @@ def is_not_open_to_everybody(scene: Scene) -> Result:
     if not plain:
         return passed("whoever connects needs a certificate")
     found = [(end, address) for end in plain for address in _addresses(scene, end)]
+    named = [end for end in plain if not any(one == end for one, _ in found) and not is_own_host(end)]
     public = [f"{end} at {address}" for end, address in found if address.is_global]
     fix = "secure the fleet (docs/guide/secure.md)"
     if public:
         told = f"anybody in the internet may read and change everything: {', '.join(public)}"
         return failed(told, fix=f"{fix}, or let it listen at a private address only")
+    if named:
+        told = f"without certificates, and at an address that only its name server knows: {', '.join(named)}"
+        return warned(told, fix=f"{fix}, or give the address in `listen:`")
     if all(address.is_loopback for _, address in found):
         return passed("without certificates, and only for this machine")
     return warned("without certificates: whoever is in its private network may read and change everything", fix=fix)

@@ -48,18 +48,25 @@ def commands_are_there(scene: Scene) -> Result:
 def _command(task: TaskSpec) -> Result:
     program, *words = task.worker.command
     fix = f"install it, or correct `worker: {{command:}}` of {task.name} (full paths)"
-    if program not in PYTHON:
-        where = shutil.which(program, path=dict(task.worker.env).get("PATH"))
-        if where is None:
-            return failed(f"{task.name}: there is no program {program} that may be run", fix=fix)
-        return passed(f"{task.name}: {where}")
-    script = _script(words)
+    where = program if program in PYTHON else shutil.which(program, path=dict(task.worker.env).get("PATH"))
+    if where is None:
+        return failed(f"{task.name}: there is no program {program} that may be run", fix=fix)
+    script = _script(words) if _is_python(program) else None
     if script is not None and not Path(script).is_file():
         return failed(f"{task.name}: there is no file {script}", fix=fix)
     if script is not None and not Path(script).is_absolute():
         told = f"{task.name}: {script} is looked for in the folder in which the daemon was started"
         return warned(told, fix=f"give the full path in `worker: {{command:}}` of {task.name}")
-    return passed(f"{task.name}: {sys.executable} {' '.join(words)}")
+    return passed(f"{task.name}: {sys.executable} {' '.join(words)}" if program in PYTHON else f"{task.name}: {where}")
+
+
+def _is_python(program: str) -> bool:
+    """Whether a program is an interpreter of Python, by its name.
+
+    >>> [_is_python(name) for name in ("python", "/usr/bin/python3.11", "/opt/worker", "pythonize")]
+    [True, True, False, False]
+    """
+    return Path(program).name.rstrip("0123456789.") == "python"
 
 
 def packages_are_there(scene: Scene) -> Result:
@@ -72,12 +79,12 @@ def packages_are_there(scene: Scene) -> Result:
 def _packages(task: TaskSpec, user: tuple[int, int] | None) -> Result | None:
     """``user``: as whom an operator's program may run here, where that is not who asks."""
     program, *words = task.worker.command
-    if Path(program).name.rstrip("0123456789.") != "python":
+    if not _is_python(program):
         return None
     python = sys.executable if program in PYTHON else program
     module, script = _module(words), _script(words)
     if module is None and (script is None or not Path(script).is_file()):
-        return None
+        return None if script is None else skipped(f"{task.name}: there is no file {script}")
     kind, what = ("file", str(script)) if module is None else ("module", module)
     own: dict[str, Any] = {} if user is None else {"user": user[0], "group": user[1], "extra_groups": [], "cwd": "/"}
     try:
@@ -118,9 +125,16 @@ def _module(words: list[str]) -> str | None:
 
 
 def _script(words: list[str]) -> str | None:
-    """The script, where one is named."""
-    first = next(iter(words), "-")
-    return first if first.endswith(".py") or "/" in first else None
+    """The script, where one is named: the first word that is no option, nor the value of one."""
+    is_value = False
+    for word in words:
+        if word in ("-m", "-c"):
+            return None
+        if is_value or word.startswith("-"):
+            is_value = word in ("-W", "-X")
+            continue
+        return word if word.endswith(".py") or "/" in word else None
+    return None
 
 
 def engines_are_there(scene: Scene) -> Result:

@@ -18,6 +18,7 @@ from support.fleet_values import fleet_value_of
 from support.planted_faults import found_in
 from zsched.adapters.host.document_store import DocumentStore
 from zsched.adapters.host.operator_socket import OperatorSocket
+from zsched.adapters.machine.device_profiler import DeviceProfiler
 from zsched.adapters.radio.nl80211 import GenericNetlink, Interface
 from zsched.clock import ClockWatch, Drift
 from zsched.config.load import check_file, load_fleet
@@ -514,6 +515,19 @@ def test_a_machine_that_is_too_small_for_a_task_is_found(tmp_path: Path) -> None
     assert_finds(run("machine.memory", with_demand("{memory_mb: 60000000}")), WARN, "1 worker")
 
 
+@pytest.mark.parametrize(("standby", "verdict"), [("warm", WARN), ("cold", PASS)])
+def test_cold_standbys_are_not_all_kept_at_once(tmp_path: Path, standby: str, verdict: Verdict) -> None:
+    """The advice was to make some of them cold, which was not looked at."""
+    half = DeviceProfiler().sample({}).memory_mb * 0.6
+    worker = f"    demand: {{memory_mb: {half:.0f}}}\n    weights"
+    text = FLEET.replace("    weights", worker).replace("worker: {", f"worker: {{standby: {standby}, ")
+    assert f"standby: {standby}" in text
+    task = text[text.index("  merge:") :]
+    assert task.count("  merge:") == 1
+    scene = scene_of(tmp_path, text + task.replace("merge:", "other:").replace("/merge/", "/other/"))
+    assert run("machine.memory", scene).verdict is verdict
+
+
 class PlantedRadio(GenericNetlink):
     """A kernel with one Wi-Fi interface."""
 
@@ -617,6 +631,8 @@ def with_command(folder: Path, command: str) -> Scene:
         ("[nosuchprogram, --x]", FAIL, "nosuchprogram"),
         ("[/opt/nowhere/worker]", FAIL, "/opt/nowhere/worker"),
         ("[python, /opt/nowhere/worker.py]", FAIL, "no file /opt/nowhere/worker.py"),
+        ("[python, -u, -W, ignore, /opt/nowhere/worker.py]", FAIL, "no file /opt/nowhere/worker.py"),
+        (f"[{sys.executable}, -u, /opt/nowhere/worker.py]", FAIL, "no file /opt/nowhere/worker.py"),
     ],
 )
 def test_a_worker_whose_program_is_missing_is_found(tmp_path: Path, command: str, verdict: Verdict, word: str) -> None:

@@ -302,6 +302,10 @@ def test_a_session_without_certificates_at_a_public_address_is_found(tmp_path: P
         tmp_path, FLEET.replace("control: tcp/0.0.0.0:21257", "control: 'tcp/[2001:4860::1]:7'"), root=tmp_path
     )
     assert_finds(run("tls.open", addressed), FAIL, "2001:4860::1")
+    named = FLEET.replace("control: tcp/0.0.0.0:21257", "control: 'tcp/robot1.example.com:7'")
+    assert_finds(run("tls.open", scene_of(tmp_path, named, root=tmp_path)), WARN, "tcp/robot1.example.com:7")
+    own = named.replace("robot1.example.com", "localhost")
+    assert run("tls.open", scene_of(tmp_path, own, root=tmp_path)).verdict is PASS
 
 
 def test_plain_text_beside_tls_is_found(secured: Scene, tmp_path: Path) -> None:
