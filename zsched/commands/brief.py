@@ -15,6 +15,7 @@ from zsched.commands.page import (
     missed_of,
     name_room,
     short_name,
+    short_span,
     since_drop,
     span,
 )
@@ -31,6 +32,7 @@ from zsched.commands.report import (
 
 Json = dict[str, Any]
 
+SINCE_ROOM = 15
 TITLES = ("TASK", "owner", "state", "since", "phase", "in", "out", "missed")
 NO_TASK = "none yet; `zsched task add FILE` gives the fleet one"
 
@@ -55,7 +57,7 @@ def task_rows(page: Page, status: Json, at: float | None) -> None:
         return
     task_room = name_room(page.width, 10, *(len(task["name"]) for task in tasks))
     owner_room = name_room(page.width, 6, *(len(task["owner"] or "nobody") + len(_marks(task)) for task in tasks))
-    columns = (task_room, owner_room, 8, 15 if at is not None else 6, 9, -7, -7, page.width)
+    columns = (task_room, owner_room, 8, SINCE_ROOM if at is not None else 6, 9, -7, -7, page.width)
     page.row(*((t, w, "dim" if i else "stage") for i, (t, w) in enumerate(zip(TITLES, columns, strict=True))))
     for task in tasks:
         cells = _cells(task, at, task_room, owner_room)
@@ -72,7 +74,11 @@ def _pin_rows(page: Page, status: Json) -> None:
 
 def _cells(task: Json, at: float | None, task_room: int, owner_room: int) -> list[Cell]:
     marks, owner, since_s, state = _marks(task), task["owner"], task["since_s"], task["owner_state"]
-    since = span(since_s) + ("" if at is None or since_s is None else f" {clock_time(at - since_s, at)}")
+    since = span(since_s)
+    if at is not None and since_s is not None:
+        since += f" {clock_time(at - since_s, at)}"
+        if len(since) > SINCE_ROOM:  # of another day
+            since = f"{short_span(since_s)} {clock_time(at - since_s, at)}"
     missed, is_new = _missed(task)
     return [
         (short_name(task["name"], task_room), "bold"),

@@ -5,6 +5,7 @@ Knows: columns, cutting, ANSI styles, how figures and moments are written. Does 
 
 from __future__ import annotations
 
+import re
 import textwrap
 import time
 from typing import Any, Final, TypeAlias
@@ -112,6 +113,16 @@ def span(seconds: float | None) -> str:
     return f"{whole}s"
 
 
+def short_span(seconds: float | None) -> str:
+    """The same in at most four characters from ten minutes on: ``45m 12h 2d``.
+
+    >>> [short_span(seconds) for seconds in (None, 303.0, 2712.0, 43_500.0, 864_000.0)]
+    ['-', '5m03s', '45m', '12h', '10d']
+    """
+    told = span(seconds)
+    return told if len(told) <= 5 else re.split(r"(?<=[dhm])", told)[0]
+
+
 def clock_time(then: float, now: float) -> str:
     """A moment of today as ``14:03:22``, an older one as ``11-22 14:03`` (local time; seconds since 1970)."""
     told, today = time.localtime(then), time.localtime(now)
@@ -139,8 +150,11 @@ def since_drop(stream: dict[str, Any]) -> str:
 
 
 def memory(mib: float) -> str:
-    """Memory given in MiB: ``98M``, ``23.5G``."""
-    return f"{mib:.0f}M" if mib < 1000 else f"{mib / 1024:.1f}G"
+    """Memory given in MiB: ``98M``, ``23.5G``, ``126G``."""
+    if mib < 1000:
+        return f"{mib:.0f}M"
+    gib = mib / 1024
+    return f"{gib:.1f}G" if gib < 99.95 else f"{gib:.0f}G"
 
 
 def size(count: int) -> str:

@@ -430,7 +430,11 @@ class Stage:
         """Whether the fleet can still be seen without this node."""
         door = self._view.door
         if door.endpoint:
-            return door.node != owner
+            try:
+                passed_on_by = ask_door(replace(door, node=None), {"verb": "status"})["node"]
+            except CliError:
+                return False
+            return owner not in (door.node, passed_on_by)
         return any(name != owner for name in self._sockets)
 
     def _strike(self, step: Step, owner: str, *, is_plan: bool) -> str:

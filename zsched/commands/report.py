@@ -18,6 +18,7 @@ from zsched.commands.page import (
     name_room,
     none_for,
     short_name,
+    short_span,
     since_drop,
     size,
     span,
@@ -157,7 +158,7 @@ def node_rows(page: Page, status: Json, title: str) -> None:
     is_wide = page.width >= 96
     bar = 8 if is_wide else 4
     is_timed = is_wide and any(node.get("speed") is not None for node in nodes)
-    columns = (name, 5, 8, -5, bar, -4, 10 if is_timed else 6, 9, 7, page.width)
+    columns = (name, 5, 8, -5, bar, -4, 11 if is_timed else 6, 9, 7, page.width)
     titles = (title, "kind", "state", "age", "cpu", "", "cores", "memory", "link", "workers")
     styles = ("stage", *["dim"] * (len(titles) - 1))
     page.row(*zip(titles, columns, styles, strict=True))
@@ -219,7 +220,7 @@ def _node_cells(node: Json, bar: int, room: int, *, is_me: bool, is_wide: bool) 
         (short_name(node["name"], room - is_me) + "*" * is_me, "bold" if is_me else ""),
         (node["kind"], ""),
         (state, STATE_STYLES.get(state, "red")),
-        (span(node["age_s"]), ""),
+        (short_span(node["age_s"]), ""),
         ("" if cpu is None else "█" * filled + "░" * (bar - filled), level),
         (_percent(cpu), ""),
         (_cores(cores, node.get("speed") if is_wide else None), "dim"),

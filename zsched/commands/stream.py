@@ -334,9 +334,11 @@ def _tap(view: StreamView, word: str | None) -> StreamTap:
     """A tap on the keys that ``word`` means at the node that is asked.
 
     Raises:
-        CliError: no daemon (3), no way to the node's data (3), no such stream or key (1, 2).
+        CliError: no daemon (3), no way to the node's data (3), no such stream or key (1, 2), a node of a cell (2).
     """
     door = find_door(view.runtime_dir, view.node)
+    if door.cell is not None:
+        raise CliError(EXIT_USAGE, "--node CELL/NODE: this verb joins the data network; ask on a machine of that fleet")
     keys = keys_for(ask_door(door, {"verb": "status"}), word)
     access = ask_door(Door(socket=door.socket), {"verb": "access", **_asked(door)})
     sides: dict[str, str] = access["sides"]

@@ -82,6 +82,8 @@ def test_wall_times_stand_beside_ages_where_the_clock_is_given() -> None:
     status["tasks"][0]["since_s"] = 61.0
     assert "1m01s 11:58:59" in last_row(status, NOON)
     assert ":59" not in last_row(status)
+    before = {**status, "tasks": [{**status["tasks"][0], "since_s": 36_300.0 + 4 * 3600}]}
+    assert "14h 03-03 21:55 " in last_row(before, NOON), "of another day: the date, and the age in short"
     status["tasks"][0]["history"][-1]["age_s"] = 90000.0
     whole = render_status(status, 120, color=False, at=NOON)
     assert "known here for 1m01s, since 11:58:59" in whole

@@ -194,6 +194,25 @@ def test_where_every_step_is_refused_no_promise_was_kept(refusing: Daemon, more:
     assert (planned.exit_code, refusing.done) == (0, []), "nothing would be done"
 
 
+@pytest.mark.parametrize("node", [None, "robot1"])
+@pytest.mark.parametrize(("through", "is_seen"), [("edge1", False), ("edge2", True), (None, False)])
+def test_the_node_at_the_endpoint_is_the_eye_whoever_answers(
+    monkeypatch: pytest.MonkeyPatch, through: str | None, node: str | None, *, is_seen: bool
+) -> None:
+    """Without --node, or with another one, the owner passed every look on, and was ended."""
+
+    def answer(door: Door, _request: Json) -> Json:
+        if through is None:
+            raise CliError(3, "nobody answers")
+        return {"node": door.node or through}
+
+    monkeypatch.setattr(rehearse, "ask_door", answer)
+    stage = object.__new__(Stage)
+    stage._view = OrderView(door=Door(socket=Path(), endpoint="tcp/127.0.0.1:1", node=node))
+    assert stage._has_other_eye("edge1") is is_seen
+    assert node is None or not stage._has_other_eye(node)
+
+
 def test_only_steps_that_were_shown_as_possible_are_played(refusing: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
     """The kill was left out at the question, and is possible when its turn comes."""
 

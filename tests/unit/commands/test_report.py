@@ -459,6 +459,19 @@ def test_block_with_a_long_title_pushes_its_text_along() -> None:
     assert page.lines == ["TASK a_long_name  owned"]
 
 
+@pytest.mark.parametrize(
+    ("age_s", "told"), [(303.0, "5m03s"), (2712.0, "45m"), (43_500.0, "12h"), (1_000_000.0, "11d")]
+)
+def test_an_age_of_a_node_fits_its_column(age_s: float, told: str) -> None:
+    status = recorded("healthy")
+    status["nodes"][0] |= {"state": "gone", "age_s": age_s, "speed": 0.713, "cpu_cores": 16.0, "memory_mb": 128_614.0}
+    line = next(line for line in render_status(status, 120, color=False).splitlines() if line.startswith("edge1 "))
+    assert f" {told} " in line
+    assert "of 16 x0.71 " in line
+    assert " 126G " in line
+    assert "…" not in line
+
+
 def test_speed_of_the_cores_what_a_starved_worker_wants_and_the_score_are_shown_where_there_is_room() -> None:
     status = recorded("healthy")
     (node, *_), (task, *_) = status["nodes"], status["tasks"]

@@ -17,9 +17,10 @@ from support.schemas import faults
 from zsched.adapters.network.stream_tap import Tapped
 from zsched.cli import app
 from zsched.commands import stream as stream_verb
+from zsched.commands.ask import Door
 from zsched.commands.common import CliError
 from zsched.commands.stream import KeyStats, StreamView, _print_rates, _print_sample, keys_for, rates, show_rates
-from zsched.core.values.fleet import LocalSide
+from zsched.core.values.fleet import Cell, LocalSide
 from zsched.runtime.access import StreamAccess
 
 
@@ -86,6 +87,16 @@ def test_a_word_that_cannot_be_listened_to_is_refused(word: str, code: int, said
     with pytest.raises(CliError, match=said) as caught:
         keys_for(status(stream(), stream(**SRV)), word)
     assert caught.value.code == code
+
+
+def test_a_node_of_a_cell_is_no_place_to_listen_from_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its status came through the gateway, and then a socket "." was asked for its data."""
+    cell = Cell(name="hall-b", gateways=("tcp/127.0.0.1:1",))
+    monkeypatch.setattr(stream_verb, "find_door", lambda *_given: Door(socket=Path(), endpoint="x", cell=cell))
+    view = StreamView(runtime_dir=None, node="hall-b/robot3", is_json=False, window_s=1.0)
+    with pytest.raises(CliError, match="CELL/NODE: this verb joins the data network") as caught:
+        show_rates(view, None, "hz")
+    assert caught.value.code == 2
 
 
 def test_streams_without_an_owner_lead_nowhere() -> None:

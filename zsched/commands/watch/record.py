@@ -64,6 +64,8 @@ def record(view: RecordView) -> int:
             raise CliError(EXIT_USAGE, f"{option} joins the data network of a daemon here; --connect only asks")
     feed = Feed(lambda: find_door(view.runtime_dir, view.node, connect=view.connect))
     door = feed.door()
+    if door.cell is not None and (view.maps or view.frames):
+        raise CliError(EXIT_USAGE, "--map and --tf join the data network: record them on a machine of that fleet")
     first = feed.ask()
     if first.status is None:
         raise CliError(first.code, first.why)

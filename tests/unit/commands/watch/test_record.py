@@ -16,7 +16,10 @@ from support.mcap_files import read_mcap
 from support.schemas import faults
 from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.cli import app
+from zsched.commands.ask import Door
+from zsched.commands.watch import record
 from zsched.commands.watch.tracks import FRAMES, GRID, JSON_SCHEMAS, of_entry, of_status, ros_keys, topic_of
+from zsched.core.values.fleet import Cell
 
 RECORDED = Path(__file__).parent / "recorded"
 
@@ -160,6 +163,11 @@ def test_what_cannot_be_done_is_said_before_anything_is_written(folder: Path, mo
     ):
         refused = run("-o", file, *words)
         assert (refused.exit_code, text in refused.stderr) == (code, True), refused.stderr
+    cell = Door(socket=Path(), endpoint="x", cell=Cell(name="hall-b", gateways=("tcp/127.0.0.1:1",)))
+    with monkeypatch.context() as patched:
+        patched.setattr(record, "find_door", lambda *_given, **_more: cell)
+        refused = run("-o", file, "--node", "hall-b/robot3", "--map", "robot3/map")
+    assert (refused.exit_code, "on a machine of that fleet" in refused.stderr) == (2, True), refused.stderr
     assert run("-o", folder / "none" / "x.mcap").exit_code == 1
     monkeypatch.setitem(sys.modules, "mcap.writer", None)
     refused = run("-o", file)
