@@ -38,25 +38,29 @@ class PairLink(Struct, frozen=True):
     utility: float
 
 
-def pair_link(voter: NodeId, candidate: NodeId, gateway: Gateway, limits: LinkLimits, now: float) -> PairLink | None:
+def pair_link(
+    voter: NodeId, candidate: NodeId, gateway: Gateway, limits: LinkLimits, now: float, margin_db: float = 0.0
+) -> PairLink | None:
     """Eq. 3 for one (robot, candidate) pair, or ``None`` when nobody measured it.
+
+    A candidate is reached from ``margin_db`` above nu on (docs/decisions/0130).
 
     A link measured between the two counts as it is, from either end. Else both reach each other through one access
     point, and ``limits.pair`` says how the two ways become one.
     """
     if voter == candidate:
         return PairLink(is_reached=True, utility=1.0)
-    ends = (gateway.fresh(voter, now), gateway.fresh(candidate, now))
+    ends, least_dbm = (gateway.fresh(voter, now), gateway.fresh(candidate, now)), limits.nu_dbm + margin_db
     for end, other in ((ends[0], candidate), (ends[1], voter)):
         direct = None if end is None else _way(end, other, limits)
         if direct is not None:
-            return PairLink(is_reached=direct.now_dbm >= limits.nu_dbm, utility=_worth(direct.ahead_dbm, limits))
+            return PairLink(is_reached=direct.now_dbm >= least_dbm, utility=_worth(direct.ahead_dbm, limits))
     if ends[0] is None or ends[1] is None:
         return None
     own, its = _way(ends[0], None, limits), _way(ends[1], None, limits)
     if own is None or its is None:
         return None
-    is_reached = min(own.now_dbm, its.now_dbm) >= limits.nu_dbm
+    is_reached = min(own.now_dbm, its.now_dbm) >= least_dbm
     return PairLink(is_reached=is_reached, utility=_joint(own, its, limits))
 
 

@@ -40,6 +40,10 @@ from zsched.core.values.profile import Profile
 from zsched.core.values.struct import Struct, field, replace
 from zsched.core.values.words import GaugeName
 
+REACH_MARGIN_DB = 3.0
+"""A robot that reaches the owner reaches another candidate only from so much above nu on: twice what a smoothed signal
+scatters by, so that one that stands about nu moves a task once (docs/decisions/0130)."""
+
 
 class _Terms(Struct, frozen=True):
     """Eq. 1-3 for one candidate; ``None`` where the metric is not measured. Of the gauges the weighed ones."""
@@ -106,6 +110,10 @@ def score(
         gateway.fresh(owner, now),
         is_spared=owner in doubts.in_grace,
     )
+    margin_db = 0.0
+    if has_owner and owner is not None and form is ScoreForm.SERVICE and owner not in doubts.unseen:
+        way = pair_link(voter, owner, gateway, spec.limits, now)
+        margin_db = REACH_MARGIN_DB if way is None or way.is_reached else 0.0
     terms: dict[NodeId, _Terms] = {}
     unreachable: list[NodeId] = []
     refused: list[tuple[NodeId, str]] = []
@@ -139,7 +147,7 @@ def score(
         if reason:
             refused.append((candidate, reason))
             continue
-        link = pair_link(voter, candidate, gateway, spec.limits, now)
+        link = pair_link(voter, candidate, gateway, spec.limits, now, 0.0 if candidate == owner else margin_db)
         if link is not None and not link.is_reached:
             unreachable.append(candidate)
             continue

@@ -204,7 +204,12 @@ class StreamRule(Struct, frozen=True, kw_only=True):
 class LinkLimits:
     """Eq. 3: nu (least usable) and rho (best achievable) in dBm, and how links are read."""
 
-    nu_dbm: float = key(-80.0, "Least usable signal (Eq. 3): below it the candidate's utility is 0.", DBM)
+    nu_dbm: float = key(
+        -80.0,
+        "Least usable signal (Eq. 3): below it the candidate's utility is 0. While a robot reaches the owner, it "
+        "reaches others from 3 dB above it on (`score: service`).",
+        DBM,
+    )
     rho_dbm: float = key(-40.0, "Best achievable signal (Eq. 3); above `nu_dbm`.", DBM)
     pair: PairReading = key(
         PairReading.CANDIDATE,

@@ -248,6 +248,26 @@ def test_a_link_below_nu_is_zero_even_without_weight_at_nu_it_is_reached() -> No
 
 
 @pytest.mark.parametrize(
+    ("own", "theirs", "is_reached"),
+    [(-79.0, -77.1, False), (-79.0, -77.0, True), (-80.1, -79.0, True), (None, -77.1, False)],
+)
+def test_who_reaches_the_owner_reaches_another_candidate_from_a_margin_on(
+    own: float | None, theirs: float, *, is_reached: bool
+) -> None:
+    """A signal that scatters about nu moved the task there and back: below is an escape, above a planned move."""
+    tuning = Tuning(weights=CPU, score=ScoreForm.SERVICE)
+    edges = (profile("edge1", links=radio(own)), profile("edge2", links=radio(theirs)))
+    by_service = replace(allocation(), tuning=tuning)
+    vector = scored(ROBOT, *edges, agreed=by_service)
+    assert vector.utilities[1].reachable is is_reached
+    assert vector.utilities[0].reachable is (own is None or own >= -80.0)
+    for free in (replace(by_service, owner=None), allocation()):
+        assert scored(ROBOT, *edges, agreed=free).utilities[1].reachable, "nobody has it, or the paper's score"
+    gone = scored(ROBOT, *edges, agreed=by_service, states={"edge1": PeerState.GONE})
+    assert gone.utilities[1].reachable
+
+
+@pytest.mark.parametrize(
     ("candidate", "reason"),
     [
         (profile("edge2", draining=True), "draining"),
