@@ -303,6 +303,9 @@ def _with_use(
         return replace(known, work=min(UNSURE * use, most), is_sure=False)
     if most > use or is_new or is_starved:
         return replace(known, work=least, is_sure=is_held)
+    if told is not None and told > use and load.jobs is not None and load.jobs.wait_s is not None and is_short(load):
+        # its one thread waits for other things, too, so it never always wants to run, and a quicker core would do more
+        return replace(known, work=told, is_sure=False)
     return replace(known, work=use, is_sure=True)
 
 
@@ -350,7 +353,7 @@ def _with_job(known: _Known, load: WorkerLoad, speed: float, *, is_new: bool, is
     """
     is_old = load.renewal is not Renewal.NONE
     if load.jobs is not None:
-        job = told_job(load.jobs, speed, known.job, is_calm=is_calm)
+        job = told_job(load.jobs, speed, known.job, is_calm=is_calm, used_cores=load.cpu_cores)
         # a worker that has just come may begin with nothing, and its first jobs be small by that
         job_work_s = known.job_work_s if is_new and known.before is not None else load.jobs.cpu_s * speed
         return replace(known, job=job, job_work_s=job_work_s, is_job_old=is_old)

@@ -37,6 +37,8 @@ LIKELY_QUEUEING = 3.0
 """Answers wait for each other by at most this factor (1: they come at random); longer waits are for other things."""
 MOST_QUEUE_RATIO = 20.0
 """No queue makes a job's age more than this many times its own time: whatever was told, it is much too late then."""
+ONE_THREAD_CORES = 1.1
+"""Jobs that use more, as the worker's processes do, are several at a time: a thread uses one core at most."""
 
 
 class JobNeed(Struct, frozen=True):
@@ -54,6 +56,8 @@ class JobNeed(Struct, frozen=True):
     """One thread does it, so it uses at most one core at a time."""
     holds_turn: bool = False
     """Its worker is busy while it waits for other things, too, and takes the next one behind it."""
+    is_one_of_several: bool = False
+    """Several threads were seen to do jobs at a time, each its own (a service's, an author's)."""
 
     def most_cores(self, speed: float, need_cores: float) -> float | None:
         """What the worker can use at a time on a machine of ``speed``; ``None``: any amount.
@@ -89,14 +93,20 @@ def other_s(jobs: Jobs) -> float:
     return 0.0 if jobs.wait_s is None else max(jobs.time_s - jobs.wait_s - jobs.cpu_s, 0.0)
 
 
-def told_job(jobs: Jobs, speed: float, known: JobNeed | None, *, is_calm: bool) -> JobNeed:
+def told_job(
+    jobs: Jobs, speed: float, known: JobNeed | None, *, is_calm: bool, used_cores: float | None = None
+) -> JobNeed:
     """A job by its worker's report, on a machine of ``speed``.
 
-    ``known``: what was known before. ``is_calm``: the machine has had CPU to spare for `CALM_S`. A job of several
-    threads does not tell how long it waits for a CPU, and on a full machine its whole time is no work. What of its time
-    is no CPU time is a wait for other things, a GPU perhaps, where the machine had CPU to spare.
+    ``known``: what was known before. ``used_cores``: what the worker's processes use. ``is_calm``: the machine has had
+    CPU to spare for `CALM_S`. A job of several threads does not tell how long it waits for a CPU, and on a full machine
+    its whole time is no work. What of its time is no CPU time is a wait for other things, a GPU perhaps, where the
+    machine had CPU to spare.
     """
-    is_serial, cpu_s, waits_s = True, jobs.cpu_s, other_s(jobs)
+    # either figure alone may be off for a moment: the rate by a job that is longer than its window, the use by helpers
+    is_seen = min(jobs.done_hz * jobs.cpu_s, used_cores or 0.0) > ONE_THREAD_CORES
+    is_one_of_several = jobs.wait_s is not None and (is_seen or (known is not None and known.is_one_of_several))
+    is_serial, cpu_s, waits_s = not is_one_of_several, jobs.cpu_s, other_s(jobs)
     if jobs.wait_s is None:
         is_serial, cpu_s = False, _at_once(jobs.cpu_s, jobs.time_s, speed, known, is_calm=is_calm)
         waits_s = _for_others(jobs.time_s - cpu_s, known, is_calm=is_calm)
@@ -113,6 +123,7 @@ def told_job(jobs: Jobs, speed: float, known: JobNeed | None, *, is_calm: bool) 
         hz=max(jobs.wanted_hz, jobs.done_hz),
         is_serial=is_serial,
         holds_turn=True,
+        is_one_of_several=is_one_of_several,
     )
 
 

@@ -207,7 +207,7 @@ def told(
     time_s = other_s + cpu_s / got
     done_hz = min(wanted_hz, 1.0 / time_s)
     jobs = Jobs(
-        time_s=time_s, cpu_s=cpu_s, wait_s=time_s - cpu_s - other_s, age_s=time_s, done_hz=done_hz, wanted_hz=wanted_hz
+        time_s=time_s, cpu_s=cpu_s, wait_s=max(time_s - cpu_s - other_s, 0.0), age_s=time_s, done_hz=done_hz, wanted_hz=wanted_hz
     )
     return profile(done_hz * cpu_s, cpu=used, speed=speed, jobs=jobs, wanted=1.0 if got < 1.0 else None)
 
@@ -274,6 +274,20 @@ def test_jobs_that_wait_for_a_disk_need_no_other_machine() -> None:
     assert learnt(at_disk).cpu_cores == pytest.approx(max(5.0 * 0.05, TASK.demand.cpu_cores))
     both = told(10.0, cpu_s=0.1, other_s=0.1, got=0.25)
     assert learnt(both).cpu_cores == pytest.approx(5.0 * 0.1), "alone it would do five a second"
+
+
+def test_a_job_that_also_waits_for_a_disk_lacks_a_quicker_core_on_a_machine_with_cpu_to_spare() -> None:
+    """20 ms of CPU and 10 ms of other waits, 50 times a second: at speed 1 a third is skipped, at speed 2 nothing."""
+    demands, slow = Demands(), told(50.0, cpu_s=0.02, other_s=0.01, speed=1.0, used=1.0)
+    quick = told(50.0, cpu_s=0.01, other_s=0.01, speed=2.0, used=1.0)
+    for look in range(40):
+        demands.learn("merge", slow, look * EVERY_S, fastest=2.0)
+    assert demands.at(TASK, slow).cpu_cores == pytest.approx(1.0)
+    assert demands.at(TASK, quick).cpu_cores == pytest.approx(0.5), "which one thread has there"
+    alike = Demands()
+    for look in range(40):
+        alike.learn("merge", slow, look * EVERY_S)
+    assert alike.at(TASK, slow).cpu_cores == pytest.approx(0.02 / 0.03), "where nobody is quicker it lacks nothing"
 
 
 def test_what_several_threads_leave_undone_counts_where_they_always_want_to_run() -> None:

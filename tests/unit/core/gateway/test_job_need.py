@@ -76,6 +76,22 @@ def test_a_serial_worker_is_busy_while_its_job_waits_for_other_things_as_well() 
     assert job.age_s(2.0, 4.0) == pytest.approx(0.075 * (1.0 + crowd(0.375)))
 
 
+def test_jobs_that_several_threads_do_at_a_time_may_use_several_cores() -> None:
+    """Each thread by itself tells how long it waited for a CPU; their jobs together are no single thread's."""
+    four = Jobs(time_s=0.1, cpu_s=0.1, wait_s=0.0, done_hz=25.0, wanted_hz=25.0)
+    job = told_job(four, 1.0, None, is_calm=True, used_cores=2.5)
+    assert job.most_cores(1.0, 2.5) is None
+    starved = replace(four, time_s=0.4, wait_s=0.3, done_hz=6.0)
+    assert told_job(starved, 1.0, job, is_calm=False, used_cores=0.6).most_cores(1.0, 2.5) is None, "it stays known"
+    assert told_job(starved, 1.0, None, is_calm=False, used_cores=0.6).most_cores(1.0, 0.5) == pytest.approx(1.0)
+    of_helpers = told_job(replace(four, wait_s=None), 1.0, job, is_calm=True, used_cores=2.5)
+    assert not of_helpers.is_one_of_several
+    for one in (replace(four, done_hz=5.0), replace(four, cpu_s=0.04)):
+        assert told_job(one, 1.0, None, is_calm=True, used_cores=2.5).is_serial, "helpers that do no jobs use it"
+    long = replace(four, time_s=5.0, cpu_s=5.0, done_hz=1.0)
+    assert told_job(long, 1.0, None, is_calm=True, used_cores=1.0).is_serial, "a job that is longer than the window"
+
+
 def test_a_queue_under_a_load_is_at_most_the_usual_one() -> None:
     usual = JobNeed(work_s=0.1, other_s=0.0, queueing=1.0, hz=5.0, is_serial=True)
 
