@@ -483,6 +483,7 @@ class Rounds:
         """A newer revision is known, and its tuning: an edge, which judges nothing, tells it all the same."""
         task = self.tasks[name]
         task.told = ""
+        task.is_called = task.is_called_escape = False  # a call is to a vote on the value before
         if tuning is not None:
             task.under(tuning)
         task.judge.reset(is_new_owner=is_new_epoch)

@@ -312,6 +312,15 @@ def test_what_staying_costs_while_an_operator_holds_a_task_moves_nothing_afterwa
     assert robot.outcome() is Outcome.WAIT
 
 
+def test_a_call_to_a_vote_ends_with_the_value_that_it_was_for() -> None:
+    """Its caller's timers counted for that one: the next is judged with all of them."""
+    robot = Robot(owner_cpu=3.9)
+    robot.decider.rounds.on_called("merge", is_escape=True, now=robot.now)
+    assert (robot.task.is_called, robot.task.is_called_escape) == (True, True)
+    robot.decider.on_learnt("merge", is_new_epoch=True, now=robot.now)
+    assert (robot.task.is_called, robot.task.is_called_escape) == (False, False)
+
+
 def test_gone_owner_is_left_in_one_round_by_whoever_is_there() -> None:
     robot = Robot(fleet=replace(FLEET, electors=("edge1", "edge2", "robot1")))
     robot.states.update(edge1=PeerState.GONE, robot2=PeerState.GONE, robot3=PeerState.GONE)
