@@ -64,7 +64,8 @@ def _worth(spec: TaskSpec) -> Iterator[str]:
     for name, limit in spec.gauge_limits:
         gauge = BY_NAME[name]
         side, unknown = ("below" if gauge.is_floor else "above"), ("refused" if gauge.is_needed else "taken")
-        told = f"a machine with {gauge.says} {side} {gauge.shown(limit)} is left, or not taken (limits.{name})"
+        left = "is not taken, an owner stays" if name == "gpu" and not spec.demand.gpu else "is left, or not taken"
+        told = f"a machine with {gauge.says} {side} {gauge.shown(limit)} {left} (limits.{name})"
         yield f"{told}; one where it is not measured is {unknown}"
     reach = f"a candidate counts that {_REACH[spec.reach.value]} (reach)"
     yield f"{reach}; the robots' {tuning.aggregate} decides (aggregate)"

@@ -10,7 +10,7 @@ from support.fleets import task_of, tuning_of
 from zsched.commands.rules import LONGEST_S, left_after_s, told
 from zsched.config.schema import LINK_LIMITS, SCHEDULING
 from zsched.core.scheduler.utility import total_utility
-from zsched.core.values.fleet import LinkLimits, TaskSpec, Timing
+from zsched.core.values.fleet import Demand, LinkLimits, TaskSpec, Timing
 from zsched.core.values.model import PairReading, ScoreForm, Weights
 
 TIMING = Timing()
@@ -38,6 +38,11 @@ def test_every_setting_is_named_with_its_key() -> None:
         (replace(SPEC, tuning=replace(RADIO, bonus=0.2)), "; by 0.1 never"),
         (SPEC, "below -80 dBm (link.nu_dbm)"),
         (replace(SPEC, gauge_limits=(("battery", 0.2),)), "the battery's charge below 20 % is left, or not taken"),
+        (replace(SPEC, gauge_limits=(("gpu", 0.8),)), "above 80 % is not taken, an owner stays (limits.gpu)"),
+        (
+            replace(SPEC, gauge_limits=(("gpu", 0.8),), demand=Demand(gpu=0.3)),
+            "the use of the freest GPU above 80 % is left, or not taken",
+        ),
         (SPEC, "signals count as they are (link.foresee_s)"),
         (replace(SPEC, limits=LinkLimits(foresee_s=3.0)), "as they will be in 3 s, at most 6 dB away (link.foresee_s)"),
         (replace(SPEC, limits=LinkLimits(pair=PairReading.WEAKER)), "the weaker of the two ways counts"),

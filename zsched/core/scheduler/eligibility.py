@@ -15,6 +15,9 @@ from zsched.core.values.model import Allocation, PeerState
 from zsched.core.values.profile import Profile, WorkerState
 from zsched.core.values.words import GaugeName
 
+_NEEDS = "needs "
+_BACK = ", back from "
+
 
 def is_out(spec: TaskSpec, profile: Profile) -> bool:
     """Whether a node cannot have the task until an operator or a restart changes something there."""
@@ -82,7 +85,16 @@ def lacks_memory(profile: Profile, needed_mb: float, use: Use) -> str:
     used = use.memory_mb
     if used is None or used <= profile.memory_mb:
         return ""
-    return f"needs {needed_mb:.0f} MiB, has {max(profile.memory_mb - used + needed_mb, 0.0):.0f} free"
+    return f"{_NEEDS}{needed_mb:.0f} MiB, has {max(profile.memory_mb - used + needed_mb, 0.0):.0f} free"
+
+
+def is_for_comers(reason: str) -> bool:
+    """Whether a refusal may be by what counts only while the task has an owner: learnt memory, a gauge's margin.
+
+    >>> [is_for_comers(why) for why in ("needs 6144 MiB, has 5120 free", "worker starting")]
+    [True, False]
+    """
+    return reason.startswith(_NEEDS) or _BACK in reason
 
 
 def _beyond_limits(

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 
 from zsched.core.scheduler.damping import WINDOW_S, Damping
 from zsched.core.scheduler.decision import Decided, decide_again, verdict_of
+from zsched.core.scheduler.eligibility import is_for_comers
 from zsched.core.scheduler.judge import Outcome
 from zsched.core.scheduler.standing import Standing, counted, joined, mean_of, pick, rounded
 from zsched.core.scheduler.utility import total_utility
@@ -184,11 +185,10 @@ def _cut_off(vector: UtilityVector, node: NodeId, figures: Figures) -> UtilityVe
         return vector
     others = [one for one in vector.utilities if one.candidate != node]
     lost = Utility(candidate=node, value=0.0, reachable=False)
-    return replace(
-        vector,
-        utilities=tuple(sorted((*others, lost), key=lambda one: one.candidate)),
-        refused=tuple(pair for pair in vector.refused if pair[0] != node),
-    )
+    kept = [pair for pair in vector.refused if pair[0] != node]
+    if node == figures.allocation.owner:  # what only keeps others from a task that somebody has
+        kept = [(name, f"{why}, which may not matter then" if is_for_comers(why) else why) for name, why in kept]
+    return replace(vector, utilities=tuple(sorted((*others, lost), key=lambda one: one.candidate)), refused=tuple(kept))
 
 
 # --- the sums --------------------------------------------------------------------------------------------------------
