@@ -469,7 +469,7 @@ class TaskRelay:
         for stream, route in wanted.items():
             if before.get(stream) != route:
                 self._try_route(slot, route, is_from_start=False)
-        if state.is_flipped:
+        if state is self._carrier():  # a slot that was left drains, and gets nothing new
             self._flip_anew(epoch)
 
     def _carry_on(self) -> None:

@@ -258,6 +258,30 @@ def test_what_carries_goes_on_when_the_fleet_file_changes_its_streams_in_the_mid
         undeclare(one)
 
 
+def test_a_slot_that_was_left_gets_nothing_new_when_one_of_its_streams_changes(scene: Scene) -> None:
+    """A changed fleet file may come with a slot that still drains: what runs on goes to the one that carries."""
+    left, now = whole(3, "edge1", BEST, BRIEF), whole(4, "edge2", BEST, BRIEF)
+    before, got = list[bytes](), list[bytes]()
+    kept = [
+        scene.other.declare_subscriber(f"{edge}/t/robot1/in", partial(_take, heard))
+        for edge, heard in (("edge1", before), ("edge2", got))
+    ]
+    scene.task.apply(RoutePlan(task="t", phase=RoutePhase.CLOSE, current=left))
+    for phase in (RoutePhase.PREPARE, RoutePhase.FLIP):
+        scene.task.apply(RoutePlan(task="t", phase=phase, current=now, predecessors=(left,)))
+    until(lambda: any(isinstance(word, SlotFlipped) and word.epoch == 4 for word in scene.words), "the flip")
+    out = replace(left.routes[1], settings=replace(BEST, depth=20))
+    changed = replace(left, routes=(left.routes[0], out, left.routes[2]))
+    scene.task.apply(RoutePlan(task="t", phase=RoutePhase.FLIP, current=now, predecessors=(changed,)))
+    until(lambda: 3 not in scene.task._slots or scene.task._slots[3].slot == changed, "the change")
+    assert 3 in scene.task._slots, "it drains still"
+    scene.other.put("robot1/in", b"x")
+    until(lambda: before or got, "the input", 5.0)
+    assert (before, got) == ([], [b"x"])
+    for one in kept:
+        undeclare(one)
+
+
 def _counts(got: list[bytes], count: int) -> bool:
     return len(got) == count
 

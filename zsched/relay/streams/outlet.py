@@ -322,7 +322,7 @@ class Outlet:
             if self._acks is not None:
                 self._acks.forget(lane.eid)
         if self._queue is None:
-            self._undeclare()
+            self._leave()
             return self.counted()
         left = self._queue.close(self._leave)
         if self._crowd is not None:
@@ -512,17 +512,18 @@ class Outlet:
                 put_marker(self._session, lane.key, lane.source_id, lane.publisher.priority, marker)
 
     def _leave(self) -> None:
-        """The last words to a worker: of class ``reliable`` it must not do any more what it still has.
+        """The last words to a worker: it must not do any more what it still has, for that has been counted.
 
         A lane of which it has done all, and that has not ended, is left for good, too: for the worker's end, which
-        waits for the end of all that it has heard, nothing comes of it any more (`reopen` of the data session).
+        waits for the end of all that it has heard, nothing comes of it any more (`reopen` of the data session, a
+        changed stream, a relay that ends).
         """
         with self._lock:
             lanes = tuple(self._lanes.values())
             is_left = self._acks is not None and not self._has_put_ends
-            open_lanes = [one for one in lanes if is_left and one.count and not one.in_flight]
-            if self._greetings is not None:
-                open_lanes += [one for one in lanes if one.in_flight]
+            open_lanes = [
+                one for one in lanes if (is_left and one.count) or (self._greetings is not None and one.in_flight)
+            ]
         try:
             for lane in open_lanes:
                 self._put_left(lane)

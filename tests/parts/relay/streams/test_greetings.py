@@ -29,6 +29,7 @@ from zsched.wire.keyspace import END_CHUNK, Keyspace
 KEYS = Keyspace("t")
 RELIABLE = StreamSettings(stream_class=StreamClass.RELIABLE, depth=100)
 LATEST = StreamSettings(stream_class=StreamClass.LATEST)
+BEST_EFFORT = StreamSettings(stream_class=StreamClass.BEST_EFFORT)
 REPLAYED = StreamSettings(stream_class=StreamClass.RELIABLE, depth=100, on_crash=OnCrash.REPLAY)
 
 
@@ -510,6 +511,19 @@ def test_a_worker_is_told_its_epoch_and_when_it_is_left_with_work_that_this_is_g
     is_told = done < 2 or not has_ended
     assert given_up == [EndMarker(epoch=0, count=2, slot=7, is_given_up=True)] * is_told
     last.undeclare()
+
+
+@pytest.mark.parametrize("settings", [BEST_EFFORT, LATEST], ids=["best effort", "latest"])
+def test_a_stream_of_any_class_that_closes_without_its_end_is_given_up(bench: Bench, settings: StreamSettings) -> None:
+    """Its worker waited for the end of it, and with it the next move's answers for the whole drain time."""
+    receiver = Receiver(bench.other, bench.relay, "edge1/in")
+    outlet = bench.outlet("robot1/in", "edge1/in", settings, epoch=7)
+    until(lambda: outlet.is_matching, "the receiver is there")
+    outlet.send(bench.sample())
+    until(lambda: bool(receiver.got), "the value")
+    outlet.undeclare()
+    until(lambda: any(start.is_given_up for start in receiver.starts), "that it is given up", 10.0)
+    assert [start.count for start in receiver.starts if start.is_given_up] == [1]
 
 
 def test_a_worker_of_class_latest_is_told_its_epoch_before_any_value(bench: Bench) -> None:
