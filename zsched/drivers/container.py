@@ -15,6 +15,7 @@ import json
 import os
 import shlex
 import shutil
+import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -75,7 +76,7 @@ def why_it_ended(image: str, status: int, *, is_oom: bool, last_line: str) -> En
         return Ended(reason=f"the command of {image} {what} (status {status}){tail}", is_final=True)
     if is_oom:
         return Ended(reason=f"the container of {image} was killed: out of memory{tail}")
-    if status > SIGNALLED:
+    if SIGNALLED < status <= SIGNALLED + signal.SIGRTMAX:
         return Ended(reason=f"the container of {image} was killed by signal {status - SIGNALLED}{tail}")
     if status == 0:
         return Ended(reason=f"the container of {image} has ended or was stopped by somebody else{tail}")

@@ -94,7 +94,7 @@ class LifecycleNode:
         except (OSError, ConfigError) as error:
             return Ended(reason=f"the services of {self._node} cannot be asked: {error}")
         key = Keyspace(self._place.fleet).role(self._place.node, self._place.task)
-        RoleWatch(self._session, key, self._on_role, self._stop, relay_endpoint(text)).start()
+        RoleWatch(self._session, key, self._on_role, self._stop, relay_endpoint(text), again_s=LOOK_S).start()
         guarded(self._lead, self._session, name="zsched lifecycle", is_lasting=False).start()
         return None
 

@@ -39,11 +39,17 @@ class RoleWatch:
         on_role: Callable[[Role], None],
         stop: threading.Event,
         relay: str = "",
+        again_s: float | None = None,
     ) -> None:
-        """``key`` is that of this node's role for the task; ``relay``: the endpoint of its relay, where we dial one."""
+        """``key`` is that of this node's role for the task; ``relay``: the endpoint of its relay, where we dial one.
+
+        ``again_s``: it is asked for again so often, for a relay that tells it once: who declares no token while it is
+        idle is not told anew when its link is back.
+        """
         self._session, self._key, self._on_role, self._stop = session, key, on_role, stop
         self._relay = relay.partition("#")[0].partition("?")[0]
         self._told = threading.Event()
+        self._again_s = again_s
         self._token: zenoh.LivelinessToken | None = None
         self._watch: zenoh.Subscriber[None] | None = None
         self.strangers = 0
@@ -81,7 +87,7 @@ class RoleWatch:
     def _run(self) -> None:
         is_answered, pause_s = False, RETRY_S
         while not self._stop.is_set():
-            self._told.wait(None if is_answered else pause_s)
+            self._told.wait(self._again_s if is_answered else pause_s)
             self._told.clear()
             is_answered = self._is_answered()
             if is_answered:

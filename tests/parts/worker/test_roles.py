@@ -36,8 +36,8 @@ class Scene:
     heard: list[Role] = field(default_factory=list)
     stop: threading.Event = field(default_factory=threading.Event)
 
-    def watch(self) -> RoleWatch:
-        made = RoleWatch(self.worker, KEY, self.heard.append, self.stop, self.endpoint)
+    def watch(self, again_s: float | None = None) -> RoleWatch:
+        made = RoleWatch(self.worker, KEY, self.heard.append, self.stop, self.endpoint, again_s)
         made.start()
         return made
 
@@ -89,6 +89,19 @@ def test_a_role_that_changes_is_asked_for_and_a_late_relay_is_waited_for(scene: 
     server.set(idle)
     until(lambda: scene.heard[-1] == idle, "the next one")
     watch.undeclare()
+
+
+def test_a_role_that_was_told_while_the_link_was_away_is_asked_for_again(scene: Scene) -> None:
+    """Who declares no token is told once: a node of a driver stayed inactive beside a task that its machine owned."""
+    server = RoleServer(scene.relay, KEYS, "edge1")
+    idle = Role(task="task", role=WorkerRole.IDLE)
+    server.set(idle)
+    watch = scene.watch(again_s=0.2)
+    until(lambda: idle in scene.heard, "the first role")
+    assert watch._watch is not None
+    watch._watch.undeclare()  # as a link that is away: it hears no put
+    server.set(ACTIVE)
+    until(lambda: scene.heard[-1] == ACTIVE, "the role that it did not hear", 10.0)
 
 
 def test_a_role_is_told_again_when_its_token_goes_and_it_should_not(scene: Scene) -> None:

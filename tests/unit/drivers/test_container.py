@@ -31,6 +31,7 @@ def test_examples_in_the_module_hold() -> None:
         (126, f"the command of {IMAGE} cannot be executed (status 126): bye", True),
         (127, f"the command of {IMAGE} is not in the image (status 127): bye", True),
         (137, f"the container of {IMAGE} was killed by signal 9: bye", False),
+        (255, f"the container of {IMAGE} failed with status 255: bye", False),
     ],
 )
 def test_the_reason_names_the_status_and_the_last_words(status: int, reason: str, *, is_final: bool) -> None:
