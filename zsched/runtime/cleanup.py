@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Final
 
 from zsched.clock import monotonic_s
-from zsched.exits import EXIT_CONFIG, EXIT_LEFT
+from zsched.exits import EXIT_CONFIG, EXIT_LEFT, EXIT_USAGE
 from zsched.ipc.takeover import relays_in
 
 DEADLINE_S: Final = 1.0
@@ -32,7 +32,7 @@ def spares_relay(environment: Mapping[str, str]) -> bool:
 
     Not after a stop that had to be forced ("timeout"), nor after an exit that systemd does not answer with a restart.
     """
-    is_last = environment.get("EXIT_STATUS") in (str(EXIT_CONFIG), str(EXIT_LEFT))
+    is_last = environment.get("EXIT_STATUS") in (str(EXIT_USAGE), str(EXIT_CONFIG), str(EXIT_LEFT))
     return environment.get("SERVICE_RESULT") != "timeout" and not is_last
 
 

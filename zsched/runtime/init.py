@@ -34,6 +34,9 @@ class Heard(Struct, frozen=True, kw_only=True):
     """The generation that knows this node by a seat which it must not answer for: see `begin_anew`."""
 
 
+_MOVE_AWAY = "if this machine is {node} and no other one is, move the file away, then again"
+
+
 def init_state(fleet: Fleet, node: NodeId, folder: Path, generation: int) -> Path:
     """Write the blank state of ``node``; returns the file's path. Asks nobody: see `check_blank`.
 
@@ -49,6 +52,9 @@ def init_state(fleet: Fleet, node: NodeId, folder: Path, generation: int) -> Pat
         fleet, node, generation, before, incarnation=wall_tenths(), hardware=hardware_id(), disk=secrets.token_hex(8)
     )
     with StateFile(folder, fleet=fleet.name, node=node) as file:
+        if generation == 0 and file.path.exists() and before is None:
+            file.check_owner()
+            raise AdapterError(f"{file.path} exists already ({file.load().problem}); {_MOVE_AWAY.format(node=node)}")
         file.create(state)
         return file.path
 
@@ -73,8 +79,7 @@ def begin_anew(fleet: Fleet, node: NodeId, folder: Path, side: Sides) -> Path:
     )
     with StateFile(folder, fleet=fleet.name, node=node) as file:
         if file.path.exists():
-            advice = f"if this machine is {node} and no other one is, move the file away, then again"
-            raise AdapterError(f"{file.path} exists already, and is not usable here; {advice}")
+            raise AdapterError(f"{file.path} exists already, and is not usable here; {_MOVE_AWAY.format(node=node)}")
         file.create(state)
         return file.path
 

@@ -329,7 +329,8 @@ def _agreed_here(invitation: Invitation, places: Places) -> tuple[int, Document]
 def mend(invitation: Invitation, places: Places, *, is_plan: bool) -> tuple[Fleet, tuple[Written, ...]]:
     """Write what this machine, which is an invitation's node by its state, lacks beside that; ``is_plan``: only say it.
 
-    The state stays as it is: an elector that forgets a promise can split the fleet. So does every file that is there.
+    The state stays, but for the number of the installation in it: an elector that forgets a promise can split the
+    fleet. So does every file that is there.
 
     Raises:
         AdapterError: there are files of others, the invitation does not bring what lacks, or a file cannot be written.
@@ -346,6 +347,8 @@ def mend(invitation: Invitation, places: Places, *, is_plan: bool) -> tuple[Flee
         written += tuple(Written(path=folder / name, what=_WHAT[name]) for name in lacking)
     if is_plan:
         return fleet, written
+    # a service without privileges reads the installation's number alone
+    StateFile(places.state, fleet=invitation.fleet, node=invitation.node).note_hardware()
     if folder is not None and lacking and invitation.papers is not None:
         _put_papers(folder, invitation.papers, lacking)
     if content is not None:  # the file last: by it is seen that nothing is missing

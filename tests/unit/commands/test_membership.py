@@ -25,6 +25,7 @@ from typer.testing import CliRunner, Result
 
 from support.fleet_values import fleet_value_of
 from support.schemas import faults
+from zsched.adapters.host import state_file
 from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.adapters.host.state_file import StateFile
 from zsched.cli import app
@@ -861,6 +862,33 @@ def test_a_machine_whose_system_was_installed_anew_gets_its_certificate_back_and
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
     assert stat.S_IMODE((folder / "pki" / "key.pem").stat().st_mode) == 0o600
     assert "nothing to do" in run("join", file, *here(folder)).stdout
+
+
+@pytest.mark.parametrize("is_same", [True, False])
+def test_a_new_installation_has_another_machine_id_and_the_state_is_kept_all_the_same(
+    node: Node, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, is_same: bool
+) -> None:
+    """The board's own number tells that it is the same machine; the advice was to move an elector's state away."""
+    secured(tmp_path, node)
+    file, folder = tmp_path / "robot2.invite", tmp_path / "robot2"
+    assert run("invite", "robot2", "--address", "192.0.2.12", "--yes", "-o", file).exit_code == 0
+    for module in (state_file, membership_files):
+        monkeypatch.setattr(module, "hardware_id", lambda: "machine:aa,serial:cc")
+    assert run("join", file, *here(folder)).exit_code == 0
+    fleet, before = decode_invitation(file.read_bytes()).fleet, (folder / "state" / "state").read_bytes()
+    (folder / "fleet.yaml").unlink()
+    anew = f"machine:bb,serial:{'cc' if is_same else 'dd'}"
+    for module in (state_file, membership_files):
+        monkeypatch.setattr(module, "hardware_id", lambda: anew)
+    done = run("join", file, *here(folder))
+    assert (done.exit_code == 0) is is_same, done.stderr
+    if not is_same:
+        assert "was written on another machine" in " ".join(done.stderr.split())
+        assert (folder / "state" / "state").read_bytes() == before
+        return
+    kept = StateFile(folder / "state", fleet=fleet, node="robot2", hardware="machine:bb").load().state
+    assert kept is not None, "a service without privileges reads the installation's number alone"
+    assert kept.hardware == anew
 
 
 def test_what_an_invitation_does_not_bring_is_named(node: Node, tmp_path: Path) -> None:

@@ -22,10 +22,20 @@ from zsched.runtime.cleanup import GROUPS, end_all, members, own_group, spares_r
         ({"SERVICE_RESULT": "watchdog", "EXIT_CODE": "dumped", "EXIT_STATUS": "ABRT"}, True),
         ({"SERVICE_RESULT": "exit-code", "EXIT_CODE": "exited", "EXIT_STATUS": "1"}, True),
         ({"SERVICE_RESULT": "timeout", "EXIT_CODE": "killed", "EXIT_STATUS": "KILL"}, False),
+        ({"SERVICE_RESULT": "exit-code", "EXIT_CODE": "exited", "EXIT_STATUS": "2"}, False),
         ({"SERVICE_RESULT": "exit-code", "EXIT_CODE": "exited", "EXIT_STATUS": "78"}, False),
         ({"SERVICE_RESULT": "success", "EXIT_CODE": "exited", "EXIT_STATUS": "79"}, False),
     ],
-    ids=["stopped or restarted", "killed", "wedged", "failed", "hung at the stop", "misconfigured", "left"],
+    ids=[
+        "stopped or restarted",
+        "killed",
+        "wedged",
+        "failed",
+        "hung at the stop",
+        "a wrong word",
+        "misconfigured",
+        "left",
+    ],
 )
 def test_a_relay_is_spared_when_a_daemon_follows(said: dict[str, str], *, spares: bool) -> None:
     assert spares_relay(said) is spares

@@ -68,6 +68,16 @@ def test_damaged_state_is_not_taken_for_none(fleet: Fleet, tmp_path: Path) -> No
         init_state(fleet, "robot1", tmp_path, 0)
 
 
+def test_a_state_that_cannot_be_used_is_moved_away_and_the_fleet_is_left_as_it_is(fleet: Fleet, tmp_path: Path) -> None:
+    """One damaged file of a machine that never voted led to `--generation 1 --force` on every node."""
+    path = init_state(fleet, "edge1", tmp_path, 0)
+    path.write_bytes(b"\xc1 no state")
+    with pytest.raises(AdapterError, match="move the file away, then again") as refused:
+        init_state(fleet, "edge1", tmp_path, 0)
+    assert "--generation" not in str(refused.value)
+    assert path.read_bytes() == b"\xc1 no state"
+
+
 def test_new_generation_starts_above_every_older_revision_and_epoch(fleet: Fleet, tmp_path: Path) -> None:
     init_state(fleet, "robot1", tmp_path, 0)
     first = load(fleet, tmp_path).incarnation

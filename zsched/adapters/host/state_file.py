@@ -40,6 +40,8 @@ HARDWARE_SOURCES = (
     ("serial", "proc/device-tree/serial-number"),
 )
 """machine-id(5), the BIOS's UUID (readable by root only), a board's serial number."""
+HARDWARE_ITSELF = frozenset({"dmi", "serial"})
+"""Of them, those that a new installation of the system does not change."""
 
 
 class LoadResult(Struct, frozen=True, kw_only=True):
@@ -154,6 +156,19 @@ class StateFile:
             state = replace(state, incarnation=max(state.incarnation, found.state.incarnation))
         self.save(state)
 
+    def note_hardware(self) -> None:
+        """Write this machine's present `hardware_id` into the state, where another installation's stands in it.
+
+        Raises:
+            AdapterError: a daemon holds the state, or it cannot be written.
+        """
+        state = self.load().state
+        if state is None or state.hardware == self._hardware:
+            return
+        if _parts(state.hardware).keys() <= _parts(self._hardware).keys():  # else it was told more by who may read more
+            with self:
+                self.save(replace(state, hardware=self._hardware))
+
     def load(self) -> LoadResult:
         """Read and check the state: whole, this fleet's, this node's, written on this machine."""
         found = self._read()
@@ -248,9 +263,16 @@ def hardware_id(root: Path = Path("/")) -> str:
 
 
 def is_same_hardware(stored: str, current: str) -> bool:
-    """Whether two `hardware_id` do not contradict each other: every source that both could read agrees."""
+    """Whether two `hardware_id` do not contradict each other, by the sources that both could read.
+
+    Where one of them is the machine's own (`HARDWARE_ITSELF`), the installation's is not asked: a new one has another.
+
+    >>> is_same_hardware("machine:aa,serial:cc", "machine:bb,serial:cc"), is_same_hardware("machine:aa", "machine:bb")
+    (True, False)
+    """
     theirs, ours = _parts(stored), _parts(current)
-    return all(theirs[name] == ours[name] for name in theirs.keys() & ours.keys())
+    common = theirs.keys() & ours.keys()
+    return all(theirs[name] == ours[name] for name in common & HARDWARE_ITSELF or common)
 
 
 def _parts(hardware: str) -> dict[str, str]:

@@ -15,7 +15,7 @@ import pytest
 
 from zsched.adapters.host.systemd import Notifier, watchdog_interval_s
 from zsched.daemon import RELOAD_SIGNAL, RESTART_SIGNAL
-from zsched.exits import EXIT_CONFIG, EXIT_LEFT
+from zsched.exits import EXIT_CONFIG, EXIT_LEFT, EXIT_USAGE
 from zsched.runtime.descriptors import WANTED
 
 UNIT = Path(__file__).parents[4] / "systemd" / "zsched.service"
@@ -86,7 +86,7 @@ def test_unit_promises_what_the_daemon_keeps() -> None:
     assert service["Type"] == "notify"
     assert service["ExecStart"] == "/opt/zsched/bin/zsched up --config /etc/zsched/fleet.yaml"
     assert service["Restart"] == "always"
-    assert service["RestartPreventExitStatus"] == f"{EXIT_CONFIG} {EXIT_LEFT}"
+    assert service["RestartPreventExitStatus"] == f"{EXIT_USAGE} {EXIT_CONFIG} {EXIT_LEFT}"
     assert service["SuccessExitStatus"] == str(EXIT_LEFT)
     assert service["WatchdogSec"] == "10"
     assert service["KillMode"] == "process"

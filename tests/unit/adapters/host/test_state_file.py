@@ -263,4 +263,6 @@ def test_hardware_is_told_by_what_can_be_read(tmp_path: Path) -> None:
     assert is_same_hardware(alone, both)
     assert is_same_hardware("", both)
     assert not is_same_hardware(both.replace("serial:", "serial:0"), both)
+    assert is_same_hardware(both.replace("machine:", "machine:0"), both), "a new installation has another number"
+    assert not is_same_hardware(alone.replace("machine:", "machine:0"), both), "where nothing else can be compared"
     assert "abc" not in both

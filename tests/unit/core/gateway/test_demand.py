@@ -206,9 +206,8 @@ def told(
     """A serial worker that gets ``got`` of a core when it runs, and skips what it cannot do."""
     time_s = other_s + cpu_s / got
     done_hz = min(wanted_hz, 1.0 / time_s)
-    jobs = Jobs(
-        time_s=time_s, cpu_s=cpu_s, wait_s=max(time_s - cpu_s - other_s, 0.0), age_s=time_s, done_hz=done_hz, wanted_hz=wanted_hz
-    )
+    wait_s = max(time_s - cpu_s - other_s, 0.0)
+    jobs = Jobs(time_s=time_s, cpu_s=cpu_s, wait_s=wait_s, age_s=time_s, done_hz=done_hz, wanted_hz=wanted_hz)
     return profile(done_hz * cpu_s, cpu=used, speed=speed, jobs=jobs, wanted=1.0 if got < 1.0 else None)
 
 
