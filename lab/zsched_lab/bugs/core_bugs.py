@@ -1277,6 +1277,34 @@ VOTE_BUGS = (
         "if aggregate is not Aggregate.MEAN",
         _SCHEDULER,
     ),
+    _bug(
+        "a call to a vote outlives its value",
+        "zsched.core.scheduler.rounds",
+        "        task.is_called = task.is_called_escape = False  # a call is to a vote on the value before\n",
+        "",
+        ("tests/unit/core/scheduler/test_rounds.py",),
+    ),
+    _bug(
+        "a signal that scatters about nu moves a task there and back",
+        "zsched.core.scheduler.scoring",
+        "REACH_MARGIN_DB if way is None or way.is_reached else 0.0",
+        "0.0",
+        ("tests/unit/core/scheduler/test_scoring.py",),
+    ),
+    _bug(
+        "a pool of threads is taken for one thread",
+        "zsched.core.gateway.job_need",
+        "is_one_of_several = jobs.wait_s is not None and",
+        "is_one_of_several = False and",
+        ("tests/unit/core/gateway/test_job_need.py",),
+    ),
+    _bug(
+        "what a slow core leaves undone is no need",
+        "zsched.core.gateway.demand",
+        "        return replace(known, work=told, is_sure=False)\n    return",
+        "        return replace(known, work=use, is_sure=False)\n    return",
+        ("tests/unit/core/gateway/test_demand.py",),
+    ),
 )
 
 HANDOVER_BUGS = (

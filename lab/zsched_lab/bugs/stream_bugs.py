@@ -679,4 +679,18 @@ STREAM_BUGS = (
         "        with self._lock:\n            self._wake.set()\n            if self._thread is None:",
         ("tests/unit/relay/test_no_threads.py",),
     ),
+    _bug(
+        "a slot that was left gets streams again",
+        TASK,
+        "        if state is self._carrier():  # a slot that was left",
+        "        if state.is_flipped:  # a slot that was left",
+        _TASK,
+    ),
+    _bug(
+        "a best-effort stream that closes stays open at the worker",
+        "zsched.relay.streams.outlet",
+        "            self._leave()\n            return self.counted()",
+        "            self._undeclare()\n            return self.counted()",
+        _GREETINGS,
+    ),
 )
