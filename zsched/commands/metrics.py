@@ -64,8 +64,8 @@ def _of_daemon(status: Json) -> Iterator[Family]:
     yield "zsched_up", "gauge", "Whether the daemon answers.", [({}, 1.0)]
     yield "zsched_info", "gauge", "Who answers.", [(named, 1.0)]
     yield "zsched_uptime_seconds", "gauge", "Since the daemon's start.", [({}, status["up_s"])]
-    lag = [({}, status["loop_lag_s"])]
-    yield "zsched_loop_lag_seconds", "gauge", "Longest delay of the decision loop in the last half minute.", lag
+    says = "Longest delay of the decision loop in the last half minute."
+    yield "zsched_loop_lag_seconds", "gauge", says, [({}, status["loop_lag_s"])]
     for key, text in (("electors", "Electors."), ("alive", "Electors that can answer."), ("needed", "Majority.")):
         yield f"zsched_quorum_{key}", "gauge", text, [({}, quorum[key])]
     yield "zsched_quorum_ok", "gauge", "Whether anything can be agreed.", [({}, quorum["ok"])]

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from zsched.core.values.model import NodeId
 from zsched.tasks.map_merge.cdr import CdrError, decode_grid
-from zsched.tasks.map_merge.geometry import FloatArray, Pose2
+from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid
 from zsched_lab.demo.plots import wider
 from zsched_lab.fleet.recorder import read_records
@@ -86,7 +86,7 @@ class Truth:
         return _share(grid, wider(grid.occupied, round(WALL_M / grid.resolution)), x, y)
 
 
-def _seen_from(frame: Pose2, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _seen_from(frame: Pose2, x: NDArray[Any], y: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
     """The same points (m) in ``frame``, a pose in the world."""
     if frame == WORLD:
         return x, y
