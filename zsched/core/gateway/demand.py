@@ -137,7 +137,10 @@ class Demands:
             speed = self._speeds.of(task, profile, is_there=True)
             fastest = max(fastest or speed, speed)
             is_starved = is_full(profile) and not _gets_all(load, load.cpu_cores)
-            found = _with_use(found, load, load.cpu_cores, speed, fastest, is_new=is_new, is_starved=is_starved)
+            is_calm = now - found.full_at > CALM_S
+            found = _with_use(
+                found, load, load.cpu_cores, speed, fastest, is_new=is_new, is_starved=is_starved, is_calm=is_calm
+            )
             if before is not None:
                 has_jobs = job_cpu_s is not None
                 found = self._compared(task, profile, found, before, is_new=is_new, has_jobs=has_jobs)
@@ -291,7 +294,15 @@ def _gets_all(load: WorkerLoad, cores: float) -> bool:
 
 
 def _with_use(
-    known: _Known, load: WorkerLoad, cores: float, speed: float, fastest: float, *, is_new: bool, is_starved: bool
+    known: _Known,
+    load: WorkerLoad,
+    cores: float,
+    speed: float,
+    fastest: float,
+    *,
+    is_new: bool,
+    is_starved: bool,
+    is_calm: bool,
 ) -> _Known:
     """With the work that its use of ``cores`` shows (`Demands.learn`)."""
     use, most = cores * speed, (load.wanted_cores or 0.0) * speed
@@ -303,8 +314,10 @@ def _with_use(
         return replace(known, work=min(UNSURE * use, most), is_sure=False)
     if most > use or is_new or is_starved:
         return replace(known, work=least, is_sure=is_held)
-    if told is not None and told > use and load.jobs is not None and load.jobs.wait_s is not None and is_short(load):
-        # its one thread waits for other things, too, so it never always wants to run, and a quicker core would do more
+    is_timed = load.jobs is not None and load.jobs.wait_s is not None
+    if is_calm and is_timed and told is not None and told > use and is_short(load):
+        # its one thread waits for other things, too, so it never always wants to run, and a quicker core would do more;
+        # what a load held up is undone for some seconds behind its end
         return replace(known, work=told, is_sure=False)
     return replace(known, work=use, is_sure=True)
 
