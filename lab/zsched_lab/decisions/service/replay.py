@@ -205,7 +205,7 @@ class _Book:
         self._wait_s += done * (max(time_s - cpu_s, 0.0) if is_starved else 0.0)
 
     def report(self, task: TaskId, life: int, now: float) -> WorkerJobs:
-        """Of several processes nobody tells what they wait for."""
+        """Of several processes nobody tells what they wait for. Jobs come evenly, so none waits for its turn."""
         return WorkerJobs(
             task=task,
             incarnation=str(life),
@@ -215,6 +215,7 @@ class _Book:
             time_s=self._time_s,
             cpu_s=self._cpu_s,
             wait_s=self._wait_s if self._is_serial else None,
+            age_s=self._time_s,
         )
 
 
