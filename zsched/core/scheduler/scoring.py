@@ -6,6 +6,7 @@ a task (`zsched.core.scheduler.eligibility`), what other robots say (`zsched.cor
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
 
@@ -45,6 +46,13 @@ REACH_MARGIN_DB = 3.0
 scatters by, so that one that stands about nu moves a task once (docs/decisions/0130)."""
 
 
+_NAMES = {
+    flags: frozenset(name for name, is_there in zip(("cpu", "memory", "network"), flags, strict=True) if is_there)
+    for flags in itertools.product((False, True), repeat=3)
+}
+"""{which of Eq. 1-3 are measured: their names}."""
+
+
 class _Terms(Struct, frozen=True):
     """Eq. 1-3 for one candidate; ``None`` where the metric is not measured. Of the gauges the weighed ones."""
 
@@ -55,8 +63,8 @@ class _Terms(Struct, frozen=True):
 
     def names(self) -> frozenset[str]:
         """The measured metrics."""
-        three = (("cpu", self.cpu), ("memory", self.memory), ("network", self.network))
-        return frozenset([*[name for name, term in three if term is not None], *self.gauges])
+        three = _NAMES[self.cpu is not None, self.memory is not None, self.network is not None]
+        return three.union(self.gauges) if self.gauges else three
 
 
 class Doubts(Struct, frozen=True, kw_only=True):
@@ -168,8 +176,10 @@ def score(
     measured = frozenset[str]().union(*named.values())
     utilities = [Utility(candidate=name, value=0.0, reachable=False) for name in unreachable]
     for candidate, term in terms.items():
-        assumed = {name: 1.0 for name in sorted(measured - named[candidate]) if name in BY_NAME and _is_assumed(name)}
-        by_gauge = {**term.gauges, **assumed}
+        by_gauge = term.gauges
+        if lacking := measured - named[candidate]:
+            assumed = {name: 1.0 for name in sorted(lacking) if name in BY_NAME and _is_assumed(name)}
+            by_gauge = {**by_gauge, **assumed}
         value = total_utility(
             allocation.tuning.weights,
             cpu=term.cpu,
@@ -204,6 +214,8 @@ def score(
 
 def _gauges(allocation: Allocation, gauges: Mapping[GaugeName, float]) -> dict[str, float]:
     """The terms of the weighed gauges that this node measures."""
+    if not allocation.tuning.weights.gauges:
+        return {}
     weighed = {name for name, _ in allocation.tuning.weights.gauges}
     return {name: BY_NAME[name].term(reading) for name, reading in gauges.items() if name in weighed}
 
