@@ -205,7 +205,7 @@ def is_not_open_to_everybody(scene: Scene) -> Result:
     if not plain:
         return passed("whoever connects needs a certificate")
     found = [(end, address) for end in plain for address in _addresses(scene, end)]
-    named = [end for end in plain if not any(one == end for one, _ in found) and not is_own_host(end)]
+    named = [end for end in plain if end not in dict(found) and not is_own_host(end)]
     public = [f"{end} at {address}" for end, address in found if address.is_global]
     fix = "secure the fleet (docs/guide/secure.md)"
     if public:

@@ -47,14 +47,20 @@ def init_state(fleet: Fleet, node: NodeId, folder: Path, generation: int) -> Pat
         AdapterError: there is a state already, another node's for instance, or the folder cannot be written.
     """
     _check_range(generation)
-    before = StateFile(folder, fleet=fleet.name, node=node).load().state
+    found = StateFile(folder, fleet=fleet.name, node=node).load()
     state = blank_state(
-        fleet, node, generation, before, incarnation=wall_tenths(), hardware=hardware_id(), disk=secrets.token_hex(8)
+        fleet,
+        node,
+        generation,
+        found.state,
+        incarnation=wall_tenths(),
+        hardware=hardware_id(),
+        disk=secrets.token_hex(8),
     )
     with StateFile(folder, fleet=fleet.name, node=node) as file:
-        if generation == 0 and file.path.exists() and before is None:
+        if generation == 0 and file.path.exists() and found.state is None:
             file.check_owner()
-            raise AdapterError(f"{file.path} exists already ({file.load().problem}); {_MOVE_AWAY.format(node=node)}")
+            raise AdapterError(f"{file.path} exists already ({found.problem}); {_MOVE_AWAY.format(node=node)}")
         file.create(state)
         return file.path
 

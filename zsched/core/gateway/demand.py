@@ -126,7 +126,7 @@ class Demands:
         found = replace(known, seen_s=now)
         if is_full(profile):
             found = replace(found, full_at=now)
-        is_new = now - found.since < SETTLE_S
+        is_new, is_calm = now - found.since < SETTLE_S, now - found.full_at > CALM_S
         before = found.before if now - found.since < COMPARED_S else None
         job_cpu_s = self._job_cpu_s(task, load, None if is_new else heard, now)
         if before is not None:
@@ -137,14 +137,13 @@ class Demands:
             speed = self._speeds.of(task, profile, is_there=True)
             fastest = max(fastest or speed, speed)
             is_starved = is_full(profile) and not _gets_all(load, load.cpu_cores)
-            is_calm = now - found.full_at > CALM_S
             found = _with_use(
                 found, load, load.cpu_cores, speed, fastest, is_new=is_new, is_starved=is_starved, is_calm=is_calm
             )
             if before is not None:
                 has_jobs = job_cpu_s is not None
                 found = self._compared(task, profile, found, before, is_new=is_new, has_jobs=has_jobs)
-        speed, is_calm = self._speeds.of(task, profile, is_there=True), now - found.full_at > CALM_S
+        speed = self._speeds.of(task, profile, is_there=True)
         if heard is not None and load.jobs is None and not is_new:
             hz = self._spending[task].answers_hz if task in self._spending else None
             found = _with_heard(found, load, heard, job_cpu_s, hz, speed, is_calm=is_calm)
