@@ -902,8 +902,8 @@ VOTE_BUGS = (
     _bug(
         "unreachable left out instead of 0",
         SCORING,
-        "utilities = [Utility(candidate=name, value=0.0, reachable=False) for name in unreachable]",
-        "utilities: list[Utility] = []",
+        "utilities += [Utility(candidate=name, value=0.0, reachable=False) for name in unreachable]",
+        "pass",
         _SCHEDULER,
     ),
     _bug(
@@ -916,8 +916,8 @@ VOTE_BUGS = (
     _bug(
         "a node that is back gets a task before its streams are proven",
         SCORING,
-        "if candidate in doubts.unproven and candidate != owner:",
-        "if candidate in doubts.unproven and not candidate:",
+        '(self.unproven.get(candidate, "") if candidate != owner else "")',
+        '(self.unproven.get(candidate, "") if not candidate else "")',
         (*_SCHEDULER, "tests/sim/test_return.py"),
     ),
     _bug(
@@ -1287,7 +1287,7 @@ VOTE_BUGS = (
     _bug(
         "a signal that scatters about nu moves a task there and back",
         "zsched.core.scheduler.scoring",
-        "REACH_MARGIN_DB if way is None or way.is_reached else 0.0",
+        "REACH_MARGIN_DB if of_owner is None or of_owner.is_reached else 0.0",
         "0.0",
         ("tests/unit/core/scheduler/test_scoring.py",),
     ),

@@ -79,6 +79,10 @@ class Doubts(Struct, frozen=True, kw_only=True):
     unfit: Mapping[NodeId, str] = field(default_factory=dict)
     """{candidate: why it may not have the task, though it has it} of an exclusive task (`zsched.core.vote.lease`)."""
 
+    def against(self, candidate: NodeId, owner: NodeId | None) -> str:
+        """Why a candidate that is alive may not have the task; empty: nothing is against it."""
+        return self.unfit.get(candidate) or (self.unproven.get(candidate, "") if candidate != owner else "")
+
 
 NO_DOUBTS = Doubts()
 NOTHING_HELD: Mapping[NodeId, float] = {}
@@ -107,7 +111,6 @@ def score(
     Memory that a worker has come to use forbids a candidate that lacks it, while the task runs elsewhere. Without an
     owner the file's figure alone does: a worker that starts anew may need far less, and any place is better than none.
     """
-    form = allocation.tuning.score
     away_s = NOTHING_HELD
     if allocation.tuning.deadline_ms is not None:
         away_s = ways(voter, spec.candidates, round_trips, gateway, now)
@@ -118,10 +121,10 @@ def score(
         gateway.fresh(owner, now),
         is_spared=owner in doubts.in_grace,
     )
+    of_owner = pair_link(voter, owner, gateway, spec.limits, now) if has_owner and owner is not None else None
     margin_db = 0.0
-    if has_owner and owner is not None and form is ScoreForm.SERVICE and owner not in doubts.unseen:
-        way = pair_link(voter, owner, gateway, spec.limits, now)
-        margin_db = REACH_MARGIN_DB if way is None or way.is_reached else 0.0
+    if has_owner and allocation.tuning.score is ScoreForm.SERVICE and owner not in doubts.unseen:
+        margin_db = REACH_MARGIN_DB if of_owner is None or of_owner.is_reached else 0.0
     terms: dict[NodeId, _Terms] = {}
     unreachable: list[NodeId] = []
     refused: list[tuple[NodeId, str]] = []
@@ -134,17 +137,13 @@ def score(
         if (state is not PeerState.ALIVE and not is_spared) or candidate in doubts.unseen:
             unreachable.append(candidate)
             continue
-        if candidate in doubts.unfit:
-            refused.append((candidate, doubts.unfit[candidate]))
-            continue
-        if candidate in doubts.unproven and candidate != owner:
-            refused.append((candidate, doubts.unproven[candidate]))
+        if doubt := doubts.against(candidate, owner):
+            refused.append((candidate, doubt))
             continue
         profile = gateway.fresh(candidate, now)
         if profile is None:
             refused.append((candidate, "no fresh profile"))
             continue
-        load = profile.worker(spec.name)
         demand, coming = gateway.demand(spec, profile), coming_use(spec, profile, bookings, gateway, now)
         own = own_use(spec, allocation, profile, demand)
         use = predicted(profile, own, demand, coming)
@@ -155,38 +154,52 @@ def score(
         if reason:
             refused.append((candidate, reason))
             continue
-        link = pair_link(voter, candidate, gateway, spec.limits, now, 0.0 if candidate == owner else margin_db)
+        is_kept = has_owner and candidate == owner
+        link = of_owner if is_kept else pair_link(voter, candidate, gateway, spec.limits, now, margin_db)
         if link is not None and not link.is_reached:
             unreachable.append(candidate)
             continue
         fair = gateway.share(spec, profile, demand.cpu_cores, coming.cpu_cores)
+        load = profile.worker(spec.name)
         # what an owner that is short gets is measured
         is_measured = candidate == owner and load is not None and is_short(load)
         least = min(fair, own.cpu_cores) if is_measured else fair
         network_s = away_s.get(candidate, 0.0)
         cpu = _cpu(spec, profile, demand, use, allocation.tuning, gateway.demands, network_s, least, fair)
-        memory = _memory(spec, profile, demand, use, form)
+        memory = _memory(spec, profile, demand, use, allocation.tuning.score)
         weighed = _gauges(allocation, gauges)
         terms[candidate] = _Terms(cpu, memory, None if link is None else link.utility, weighed)
     _spare_gpu(spec, allocation, terms)
-    if len(terms) > 1 and all(term.network is None for name, term in terms.items() if name != voter):
-        # A robot always reaches itself: nobody measures that.
-        terms = {name: replace(term, network=None) for name, term in terms.items()}
+    _spare_own_link(voter, terms)
+    utilities, unmeasured = _weighed(allocation.tuning, terms)
+    utilities += [Utility(candidate=name, value=0.0, reachable=False) for name in unreachable]
+    return UtilityVector(
+        voter=voter,
+        task=spec.name,
+        revision=allocation.revision,
+        utilities=tuple(sorted(utilities, key=lambda utility: utility.candidate)),
+        refused=tuple(sorted((*refused, *unmeasured))),
+        penalties=tuple(sorted((name, round(penalty, 4)) for name, penalty in penalties.items())),
+    )
+
+
+def _weighed(tuning: Tuning, terms: Mapping[NodeId, _Terms]) -> tuple[list[Utility], list[tuple[NodeId, str]]]:
+    """What each candidate is worth by its terms, and why some have no worth."""
     named = {name: term.names() for name, term in terms.items()}
     measured = frozenset[str]().union(*named.values())
-    utilities = [Utility(candidate=name, value=0.0, reachable=False) for name in unreachable]
+    utilities, refused = [], []
     for candidate, term in terms.items():
         by_gauge = term.gauges
         if lacking := measured - named[candidate]:
             assumed = {name: 1.0 for name in sorted(lacking) if name in BY_NAME and _is_assumed(name)}
             by_gauge = {**by_gauge, **assumed}
         value = total_utility(
-            allocation.tuning.weights,
+            tuning.weights,
             cpu=term.cpu,
             memory=term.memory,
             network=term.network,
             measured=measured,
-            form=form,
+            form=tuning.score,
             gauges=by_gauge,
         )
         if value is None:
@@ -202,14 +215,14 @@ def score(
                 gauges=tuple(sorted(by_gauge.items())),
             )
         )
-    return UtilityVector(
-        voter=voter,
-        task=spec.name,
-        revision=allocation.revision,
-        utilities=tuple(sorted(utilities, key=lambda utility: utility.candidate)),
-        refused=tuple(sorted(refused)),
-        penalties=tuple(sorted((name, round(penalty, 4)) for name, penalty in penalties.items())),
-    )
+    return utilities, refused
+
+
+def _spare_own_link(voter: NodeId, terms: dict[NodeId, _Terms]) -> None:
+    """Drop a robot's link to itself where no other is measured: a robot always reaches itself, nobody measures that."""
+    if len(terms) > 1 and all(term.network is None for name, term in terms.items() if name != voter):
+        for name, term in terms.items():
+            terms[name] = replace(term, network=None)
 
 
 def _gauges(allocation: Allocation, gauges: Mapping[GaugeName, float]) -> dict[str, float]:
