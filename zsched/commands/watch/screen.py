@@ -31,8 +31,9 @@ from zsched.core.values.struct import Struct, replace
 from zsched.exits import EXIT_USAGE
 from zsched.guard import guarded
 
-ENTER, LEAVE = "\x1b[?1049h\x1b[?25l", "\x1b[?25h\x1b[?1049l"
-"""To the other screen of the terminal, without a cursor; and back to what stood there."""
+ENTER, LEAVE = "\x1b[?1049h\x1b[?25l\x1b[?7l", "\x1b[?7h\x1b[?25h\x1b[?1049l"
+"""To the other screen of the terminal, without a cursor; and back to what stood there. A line that is too wide all the
+same (a character may take two columns) is cut by the terminal, instead of moving all lines below it."""
 HOME, REST_OF_LINE, REST_OF_SCREEN = "\x1b[H", "\x1b[K", "\x1b[J"
 ENDS: Final = ("q", "Q", "\x03", "\x04")
 STEPS: Final = {"\x1b[A": -1, "\x1b[B": 1, "k": -1, "j": 1, "\x1b[5~": -10, "\x1b[6~": 10}
@@ -153,5 +154,9 @@ def _frame(view: TopView, first_task: int) -> Frame:
 
 
 def _drawn(lines: list[str]) -> str:
-    """The lines from the top of the screen; what was there is overwritten, so nothing flickers."""
-    return HOME + f"{REST_OF_LINE}\r\n".join(lines) + REST_OF_LINE + REST_OF_SCREEN
+    """The lines from the top of the screen; what was there is overwritten, so nothing flickers.
+
+    Each is cleared before it is written: behind a whole line the cursor stands on its last character.
+    """
+    *others, last = lines or [""]
+    return HOME + "".join(f"{REST_OF_LINE}{line}\r\n" for line in others) + REST_OF_SCREEN + last

@@ -10,6 +10,7 @@ import os
 import pty
 import re
 import select
+import shutil
 import struct
 import subprocess
 import sys
@@ -22,7 +23,7 @@ import pytest
 
 from support.waiting import DEADLINE_S, until
 from zsched.adapters.host.operator_socket import OperatorSocket
-from zsched.commands.watch.screen import ENTER, LEAVE
+from zsched.commands.watch.screen import ENTER, LEAVE, _drawn
 from zsched.exits import EXIT_UNREACHABLE
 
 STATUS: dict[str, Any] = json.loads(
@@ -66,8 +67,7 @@ class Terminal:
 
     def screen(self) -> list[str]:
         """The lines of the newest whole screen."""
-        last = re.sub(r"\x1b\[[0-9;]*m|\x1b\[K", "", self.read()).split("\x1b[H")[-2]
-        return last.removesuffix("\x1b[J").split("\r\n")
+        return re.sub(r"\x1b\[[0-9;]*m|\x1b\[[JK]", "", self.read()).split("\x1b[H")[-2].split("\r\n")
 
     def attributes(self) -> list[Any]:
         return termios.tcgetattr(self._terminal)
@@ -105,6 +105,28 @@ def test_it_draws_follows_the_size_and_leaves_the_terminal_as_it_was_on_q(termin
     assert terminal.process.wait(DEADLINE_S) == 0
     assert terminal.read().endswith(LEAVE)
     assert terminal.attributes() == terminal.before
+
+
+@pytest.mark.skipif(shutil.which("tmux") is None, reason="tmux draws the screen")
+def test_a_line_of_wide_characters_is_cut_and_moves_no_other(tmp_path: Path) -> None:
+    """A character of two columns makes a line twice as wide as its length, and the whole line keeps its last one."""
+    lines = ["a" * 40, "\u6f22" * 40, "next", *[""] * 2, "z" * 40]
+    drawn = tmp_path / "drawn"
+    drawn.write_text(ENTER + _drawn(["old" * 13] * 6) + _drawn(lines), encoding="utf-8")
+    tmux = ["tmux", "-u", "-S", str(tmp_path / "tmux")]
+    cat = f"stty raw; cat {drawn}; sleep 60"
+    words = {**os.environ, "LC_ALL": "C.UTF-8"}
+    subprocess.run([*tmux, "new-session", "-d", "-x", "40", "-y", "6", cat], check=True, timeout=10, env=words)
+
+    def seen() -> list[str]:
+        shown = subprocess.run([*tmux, "capture-pane", "-p"], check=True, timeout=10, capture_output=True, env=words)
+        return shown.stdout.decode().splitlines()
+
+    try:
+        until(lambda: seen()[-1].startswith("z"), "the last line")
+        assert seen() == ["a" * 40, "\u6f22" * 20, "next", "", "", "z" * 40]
+    finally:
+        subprocess.run([*tmux, "kill-server"], check=True, timeout=10, env=words)
 
 
 def test_a_daemon_that_goes_away_is_said_and_ctrl_c_ends(terminal: Terminal, daemon: OperatorSocket) -> None:
