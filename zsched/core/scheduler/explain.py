@@ -15,7 +15,7 @@ from zsched.core.scheduler.damping import WINDOW_S, Damping
 from zsched.core.scheduler.decision import Decided, decide_again, verdict_of
 from zsched.core.scheduler.eligibility import is_for_comers
 from zsched.core.scheduler.judge import Outcome
-from zsched.core.scheduler.standing import Standing, counted, joined, mean_of, pick, rounded
+from zsched.core.scheduler.standing import RESOLUTION, Standing, counted, joined, mean_of, pick, rounded
 from zsched.core.scheduler.utility import total_utility
 from zsched.core.values.decision import Decision, Figures, Verdict
 from zsched.core.values.model import NodeId, PeerState, Tuning, Utility, UtilityVector
@@ -23,8 +23,8 @@ from zsched.core.values.quorum import majority
 from zsched.core.values.struct import Struct, replace
 from zsched.core.values.words import Readings
 
-_TIE = 1 / 512
-"""Totals are compared to 1/256: so far above the owner's rounded one another total counts as higher."""
+_TIE = RESOLUTION / 2
+"""So far above the owner's rounded total another one counts as higher."""
 _SHOWN = 10_000
 """A worth is shown to four digits: one that is needed is rounded up, so that it is enough."""
 _HALVINGS = 40

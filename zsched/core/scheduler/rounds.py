@@ -433,7 +433,7 @@ class Rounds:
         if text == task.told:
             return
         task.told = text
-        scores = " ".join(f"{name}={value:.3f}" for name, value in sorted(judgement.aggregates.items()))
+        scores = " ".join(f"{name}={value:.4f}" for name, value in sorted(judgement.aggregates.items()))
         told = f"{text}: {judgement.reason} [{scores}]"
         name = task.spec.name
         decision = self.decision(name, task.judged_at)

@@ -15,10 +15,17 @@ from zsched.core.values.model import Aggregate, Allocation, NodeId, Reach, Utili
 from zsched.core.values.quorum import majority
 from zsched.core.values.struct import Struct, field
 
+RESOLUTION = 1 / 1024
+"""Aggregates are compared to this: half of what a tenth of a machine's free share is worth (0132)."""
+
 
 def rounded(aggregate: float) -> float:
-    """An aggregate to 1/256: sums of floats differ by their order, and a difference that small decides nothing."""
-    return round(aggregate * 256) / 256
+    """An aggregate to `RESOLUTION`: sums of floats differ by their order, and a difference that small decides nothing.
+
+    >>> rounded(0.5 + 0.4 / 1024), rounded(0.5 + 0.6 / 1024)
+    (0.5, 0.5009765625)
+    """
+    return round(aggregate / RESOLUTION) * RESOLUTION
 
 
 class Standing(Struct, frozen=True, kw_only=True):
@@ -109,7 +116,7 @@ def joined(penalties: Iterable[Mapping[NodeId, float]]) -> dict[NodeId, float]:
 
 
 def pick(aggregates: Mapping[NodeId, float], owner: NodeId | None) -> NodeId | None:
-    """The candidate with the highest aggregate; ties (to 1/256) go to the owner, then to the lowest name."""
+    """The candidate with the highest aggregate; ties (to 1/1024) go to the owner, then to the lowest name."""
     if not aggregates:
         return None
     return min(aggregates, key=lambda name: (-rounded(aggregates[name]), name != owner, name))

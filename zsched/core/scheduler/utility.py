@@ -72,8 +72,9 @@ def memory_utility(delta: float, theta: float, mu: float) -> float:
 
 LEAST_NEED_RATIO = 0.05
 """Of what is free a task counts as needing at least this share of a machine: also of a small one more is better."""
-SPARE = 0.05
-"""The part of a term that is the machine's free share: enough to place tasks apart, too little to be worth a move."""
+SPARE = 0.02
+"""The part of a term that is the machine's free share: enough to place tasks apart, and less than the default bonus in
+CPU and memory together, so a task that lacks nothing does not move for more room (docs/decisions/0132)."""
 
 
 def service_utility(
@@ -92,13 +93,13 @@ def service_utility(
             too late (`on_time`).
 
     >>> round(service_utility(free=1.0, demand=2.0, capacity=4.0), 4)
-    0.4875
+    0.495
     >>> round(service_utility(free=4.0, demand=2.0, capacity=4.0), 4)
     1.0
     >>> round(service_utility(free=0.0, demand=0.1, capacity=16.0, least=0.9), 4)
-    0.9503
+    0.9801
     >>> round(service_utility(free=4.0, demand=2.0, capacity=4.0, most=1.0), 4)
-    0.525
+    0.51
     """
     room = max(free, 0.0) / max(demand, LEAST_NEED_RATIO * capacity)
     if demand > 0.0:
@@ -174,7 +175,7 @@ def memory_service(free: float, demand: float, capacity: float, floor_ratio: flo
         floor_ratio: of the machine, in [0, 1).
 
     >>> round(memory_service(free=400.0, demand=300.0, capacity=4000.0, floor_ratio=0.05), 3)
-    0.883
+    0.908
     """
     return service_utility(free, demand, capacity) * spare_factor(free - demand, capacity, floor_ratio)
 

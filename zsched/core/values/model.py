@@ -304,7 +304,7 @@ class UtilityVector(Struct, frozen=True, kw_only=True):
 class Proposal(Struct, frozen=True, kw_only=True):
     """One robot's ballot paper in Alg. 3: who should own ``task``, judged at ``base_revision``.
 
-    ``aggregate`` is the joint utility that the robot computed for the candidate (a tie-break, rounded to 1/256);
+    ``aggregate`` is the joint utility that the robot computed for the candidate (a tie-break, rounded to 1/1024);
     ``is_escape`` says that the robot holds the owner for gone, not ready or below its floor.
     """
 

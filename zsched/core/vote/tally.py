@@ -5,7 +5,7 @@ committed (`zsched.core.register.register`).
 
 An outcome needs fresh proposals on the same base revision from a majority of the robots. (For an escape: of the robots
 that are not gone; the electors' majority alone guards uniqueness.) Then the most proposed candidate wins. Ties go to
-the owner, then to the higher aggregate (to 1/256), then to the lowest name. A proposal for the owner means staying.
+the owner, then to the higher aggregate (to 1/1024), then to the lowest name. A proposal for the owner means staying.
 """
 
 from __future__ import annotations

@@ -136,11 +136,11 @@ def test_strangers_in_a_vector_change_nothing_and_nobody_heard_vetoes_all() -> N
         ({"edge1": 0.5, "edge2": 0.5}, "edge2", "edge2"),
         ({"edge2": 0.5, "edge1": 0.5}, None, "edge1"),
         ({"edge2": 0.5, "edge1": 0.5}, "edge3", "edge1"),
-        ({"edge1": 0.5, "edge2": 0.5 + 1 / 1024}, "edge1", "edge1"),
-        ({"edge1": 0.5, "edge2": 0.5 + 1 / 256}, "edge1", "edge2"),
+        ({"edge1": 0.5, "edge2": 0.5 + 0.4 / 1024}, "edge1", "edge1"),
+        ({"edge1": 0.5, "edge2": 0.5 + 1 / 1024}, "edge1", "edge2"),
     ],
 )
-def test_pick_takes_the_highest_to_one_in_256_then_the_owner_then_the_name(
+def test_pick_takes_the_highest_to_one_in_1024_then_the_owner_then_the_name(
     aggregates: Mapping[str, float], owner: str | None, picked: str | None
 ) -> None:
     assert pick(aggregates, owner) == picked

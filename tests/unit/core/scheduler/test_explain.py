@@ -149,10 +149,10 @@ def test_a_candidate_that_lacks_worth_moves_the_task_when_it_has_it() -> None:
 
 
 def test_the_worth_that_is_named_lies_above_the_middle_between_two_steps() -> None:
-    """An owner's total is a step of 1/256 here, and half a step above it rounds to the next one: 0.5 + 1/512."""
+    """An owner's total is a step of 1/1024 here, and half a step above it rounds to the next one: 0.5 + 1/2048."""
     told = explained(decision_worth({"edge1": 0.5, "edge2": 0.4, "edge3": 0.3}))
-    assert told.changes[0] == "edge2 would have to be worth 0.5020 instead of 0.4000 (+0.1020)"
-    assert [pick({"edge1": 0.5, "edge2": one}, "edge1") for one in (0.5019, 0.5020)] == ["edge1", "edge2"]
+    assert told.changes[0] == "edge2 would have to be worth 0.5005 instead of 0.4000 (+0.1005)"
+    assert [pick({"edge1": 0.5, "edge2": one}, "edge1") for one in (0.5004, 0.5005)] == ["edge1", "edge2"]
 
 
 @pytest.mark.parametrize("seed", range(50))
@@ -171,9 +171,9 @@ def test_the_worth_that_is_named_makes_up_for_a_penalty_also_above_the_joint_wor
     """A total is never below 0: what is lacked is more than the distance between the totals then."""
     worth = {"edge1": 0.4, "edge2": joint, "edge3": 0.0}
     told = explained(decision_worth(worth, penalty=0.35))
-    lack = 0.7504 - joint
-    assert told.changes[0] == f"edge2 would have to be worth 0.7504 instead of {joint:.4f} ({lack:+.4f})"
-    for needed, begins in ((0.7504, "edge2 leads by"), (0.7503, "edge2 would have to be worth")):
+    lack = 0.7509 - joint
+    assert told.changes[0] == f"edge2 would have to be worth 0.7509 instead of {joint:.4f} ({lack:+.4f})"
+    for needed, begins in ((0.7509, "edge2 leads by"), (0.7508, "edge2 would have to be worth")):
         again = explained(decision_worth({**worth, "edge2": needed}, penalty=0.35))
         assert again.changes[0].startswith(begins)
 
@@ -205,7 +205,7 @@ def test_a_robot_that_does_not_know_the_owner_s_cpu_term_goes_on_as_it_does() ->
         assert rival.total is not None
         return owner_cpu_below(decision.figures, replace(standing, vectors=tuple(vectors)), owner, rival.total)
 
-    of_all, of_two = level(*ROBOTS), level("robot1", "robot2")
+    of_all, of_two = level(*ROBOTS), level("robot2", "robot3")
     assert of_all is not None
     assert of_two is not None
     assert of_two < of_all, "two terms must make up for what the third does not lose"

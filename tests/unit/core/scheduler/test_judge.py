@@ -78,7 +78,7 @@ EQUAL = {"edge1": 0.5, "edge2": 0.5}
 
 
 @pytest.mark.parametrize(
-    ("challenger", "leads"), [(0.4, False), (0.5, False), (0.6, False), (0.6 + 1 / 1024, False), (0.61, True)]
+    ("challenger", "leads"), [(0.4, False), (0.5, False), (0.6, False), (0.6 + 0.05 / 1024, False), (0.602, True)]
 )
 def test_a_challenger_must_beat_the_owner_with_its_bonus(challenger: float, *, leads: bool) -> None:
     judgement = judged(Judge(spec=SPEC), {"edge1": 0.5, "edge2": challenger}, now=0.0)

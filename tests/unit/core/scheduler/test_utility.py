@@ -10,8 +10,10 @@ from hypothesis import strategies as st
 from zsched.core.scheduler import standing, utility
 from zsched.core.scheduler.standing import rounded
 from zsched.core.scheduler.utility import (
+    LEAST_NEED_RATIO,
     clamp,
     cpu_utility,
+    memory_service,
     memory_utility,
     network_utility,
     predicted_use,
@@ -164,6 +166,22 @@ def test_below_the_need_a_term_falls_as_the_work_that_is_done_and_above_it_next_
     assert service_utility(1.0, 2.0, 4.0) == pytest.approx(whole / 2, rel=0.02)
     assert whole < service_utility(4.0, 2.0, 4.0) < whole + DEFAULT_BONUS
     assert service_utility(4.0, 0.2, 4.0) <= service_utility(0.2, 0.2, 4.0) + DEFAULT_BONUS, "idle beside just enough"
+
+
+@SEEDED
+@given(st.floats(0.1, 64.0), st.floats(64.0, 1e6), st.data())
+def test_a_task_that_lacks_nothing_is_not_moved_for_more_room(cores: float, memory: float, data: st.DataObject) -> None:
+    """The largest lead that free CPU and memory together can give stays below the bonus, and rounds below it."""
+    need_cores, need_mb = data.draw(st.floats(0.0, cores)), data.draw(st.floats(0.0, memory))
+    least_cores, least_mb = max(need_cores, LEAST_NEED_RATIO * cores), max(need_mb, LEAST_NEED_RATIO * memory)
+
+    def worth(free_cores: float, free_mb: float) -> float:
+        cpu = service_utility(free_cores, need_cores, cores)
+        room = memory_service(free_mb, need_mb, memory, 0.0)
+        shares = Weights(cpu=0.5, memory=0.5, network=0.0)
+        return total_utility(shares, cpu=cpu, memory=room, network=None, measured=ALL, form=SERVICE) or 0.0
+
+    assert rounded(worth(cores, memory)) < rounded(worth(least_cores, least_mb) + DEFAULT_BONUS)
 
 
 def test_a_tenth_of_a_machine_places_tasks_apart_however_much_room_there_is() -> None:

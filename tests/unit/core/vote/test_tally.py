@@ -154,8 +154,8 @@ def test_a_tie_without_the_owner_goes_to_the_higher_aggregate() -> None:
     assert result.winner == "edge3"
 
 
-def test_aggregates_equal_to_one_in_256_leave_it_to_the_lowest_name() -> None:
-    result = counted(paper("r1", "edge3", 0.5 + 1 / 1024), paper("r2", "edge2", 0.5), owner=None, is_over=True)
+def test_aggregates_equal_to_one_in_1024_leave_it_to_the_lowest_name() -> None:
+    result = counted(paper("r1", "edge3", 0.5 + 0.4 / 1024), paper("r2", "edge2", 0.5), owner=None, is_over=True)
 
     assert (result.outcome, result.winner) == (VoteOutcome.WON, "edge2")
 
