@@ -1,9 +1,10 @@
 """The share of time in which the GPU worked: by sysfs (Jetson, amdgpu), or by the library of NVIDIA's driver (NVML).
 
-Knows: Jetson's ``load`` (per mille), amdgpu's ``gpu_busy_percent``, five functions of ``libnvidia-ml.so.1``. Of several
-GPUs the freest counts. Does not know: which process uses how much.
+Knows: Jetson's ``load`` (per mille), five functions of ``libnvidia-ml.so.1``, amdgpu's ``gpu_busy_percent``. Of several
+GPUs of one maker the freest counts. Does not know: which process uses how much.
 
-On a Jetson NVML finds a GPU and answers "not supported", so sysfs goes first. NVML is called by ctypes: five calls need
+On a Jetson NVML finds a GPU and answers "not supported", so its file goes first. amdgpu goes last: a processor's own GPU
+idles beside the card that does the work, and would be the freest one. NVML is called by ctypes: five calls need
 no bindings. The library is loaded only where the driver is. What it has opened tells nothing any more once the driver
 was reset or loaded anew, so it is opened again then.
 """
@@ -38,13 +39,15 @@ class Reader:
     def read(self) -> float | None:
         """``None`` without a GPU that reports its use."""
         loads = [load / 1000.0 for file in self._found(*JETSON) if (load := number(file)) is not None]
-        loads += [busy / 100.0 for file in self._found(AMD) if (busy := number(file)) is not None]
         if not loads and (self._root / DRIVER).exists():
             self._nvml = self._nvml or _Nvml(self._library)
             loads = self._nvml.loads()
             if self._nvml.is_lost:
                 self._nvml.close()
                 self._nvml = None
+                return None
+        if not loads:
+            loads = [busy / 100.0 for file in self._found(AMD) if (busy := number(file)) is not None]
         return min(loads, default=None)
 
     def _found(self, *patterns: str) -> list[Path]:

@@ -136,6 +136,16 @@ def test_nvml_is_asked_where_the_driver_is_and_a_gpu_that_fails_is_left_out(tmp_
     assert reader.read() == pytest.approx(0.35)
 
 
+def test_the_processors_own_gpu_does_not_hide_the_card_beside_it(tmp_path: Path) -> None:
+    idle = {"sys__class__drm__card1__device__gpu_busy_percent": "0\n"}
+    tree(tmp_path, proc__driver__nvidia__version="NVRM\n", **idle)
+    name = library(tmp_path)
+    reader = gpu.Reader(tmp_path, name)
+    assert reader.read() == pytest.approx(0.35)
+    ctypes.CDLL(name).reset()
+    assert reader.read() is None, "the card tells nothing for a moment: that does not make the machine idle"
+
+
 def test_nvml_that_is_not_there_does_not_start_or_tells_nothing_is_no_reading(tmp_path: Path) -> None:
     tree(tmp_path, proc__driver__nvidia__version="NVRM\n")
     with pytest.raises(OSError, match="no-such-library"):
