@@ -549,7 +549,7 @@ def _route(page: Page, status: Json, task: Json) -> None:
             text += since_drop(stream)
         parts.append((text, "yellow" if missed_of(stream) and not since_drop(stream) else ""))
     parts += [(hint, "yellow") for hint in _unanswered(task)]
-    unheard = [one for one in task["streams"] if not one["messages"] and f"{prefix}in/" in one["stream"]]
+    unheard = [one for one in task["streams"] if one["last_seen_s"] is None and f"{prefix}in/" in one["stream"]]
     first = next((one["name"] for one in status["tasks"] if one["streams"]), None)
     if first is None and status["kind"] == "robot":  # no counts yet: an application may join all the same
         first = status["tasks"][0]["name"]
@@ -562,16 +562,20 @@ def _route(page: Page, status: Json, task: Json) -> None:
 def _last(status: Json, stream: Json) -> str:
     if stream["last_seen_s"] is not None:
         return f"last {span(stream['last_seen_s'])} ago"
-    return "none since the relay's start" if stream["messages"] else _awaited(status, stream)
+    return _awaited(status, stream)
 
 
 def _awaited(status: Json, stream: Json) -> str:
-    """Of a stream that never saw a message: for an input, which key it waits for, and where to publish it."""
+    """Of a stream without a message: for an input, which key it waits for, and where to publish it.
+
+    What it counted before is kept when the relay starts anew, and when the stream's key is changed.
+    """
+    told = "none since the relay's start or the stream's last change" if stream["messages"] else "nothing yet"
     key = stream.get("from_expr") if "/in/" in stream["stream"] else None  # later fields of the schema's major version
     if not key:
-        return "nothing yet"
+        return told
     where = ", ".join(status.get("joins_at", ()))
-    return f"nothing yet: waits for a message on {key}" + (f" from an application at {where}" if where else "")
+    return f"{told}: waits for a message on {key}" + (f" from an application at {where}" if where else "")
 
 
 def rate(stream: Json) -> str:

@@ -23,7 +23,7 @@ RELAY_FIX: Final = "journalctl -u zsched says what became of the relay"
 
 
 def inputs_have_publishers(scene: Scene) -> Result:
-    """Whether each input of this machine has ever had a message."""
+    """Whether each input of this machine has had a message, on the key that it has now."""
     streams = list(_carried(scene, "/in/"))
     if not streams:
         return skipped(f"{scene.node} carries no inputs")
@@ -31,8 +31,10 @@ def inputs_have_publishers(scene: Scene) -> Result:
         return young
     found = []
     for task, stream in streams:
-        if not stream["messages"] and task["owner"] is not None:
+        if stream["last_seen_s"] is None and task["owner"] is not None:
             told = f"{stream['stream']}: nobody has published {stream['from_expr'] or 'its key'} on {scene.node}"
+            # what came before, on another key maybe, is still in its count
+            told += " since the relay's start or the stream's last change" if stream["messages"] else ""
             found.append(warned(told, fix=f"the application must put that key, and dial {_joins_at(scene)}"))
     return joined(found, passed(f"{counted(len(streams), 'inputs')}, each has had messages"))
 

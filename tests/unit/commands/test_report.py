@@ -314,8 +314,9 @@ def test_an_input_that_had_messages_before_its_relays_start_waits_for_no_first_o
     status = recorded("healthy")
     for stream in status["tasks"][0]["streams"]:
         stream["last_seen_s"] = None
+        stream["from_expr"] = "robot1/mapp"
     text = " ".join(render_status(status, 100, color=False).split())
-    assert "none since the relay's start" in text
+    assert "none since the relay's start or the stream's last change: waits for a message on robot1/mapp" in text
     assert "nothing yet" not in text
 
 

@@ -3,10 +3,10 @@
 Knows: Jetson's ``load`` (per mille), five functions of ``libnvidia-ml.so.1``, amdgpu's ``gpu_busy_percent``. Of several
 GPUs of one maker the freest counts. Does not know: which process uses how much.
 
-On a Jetson NVML finds a GPU and answers "not supported", so its file goes first. amdgpu goes last: a processor's own GPU
-idles beside the card that does the work, and would be the freest one. NVML is called by ctypes: five calls need
-no bindings. The library is loaded only where the driver is. What it has opened tells nothing any more once the driver
-was reset or loaded anew, so it is opened again then.
+On a Jetson NVML finds a GPU and answers "not supported", so its file goes first. amdgpu goes last: a processor's own
+GPU idles beside the card that does the work, and would be the freest one. NVML is called by ctypes: five calls need no
+bindings. The library is loaded only where the driver is. What it has opened tells nothing any more once the driver was
+reset or loaded anew, so it is opened again then.
 """
 
 from __future__ import annotations
