@@ -105,5 +105,6 @@ def test_a_worker_s_jobs_take_longer_beside_a_load_and_its_need_stays(bed: Testb
     assert 0.0 < counts[f"{TASK}/out/0"] < 10.0, "the robot sees how far answers come behind their questions"
     task = bed.task("robot1")
     assert task["tuning"]["deadline_ms"] == 1000.0
-    assert 0.0 <= dict(task["round_trips"])["edge1"] < 1.0, "the way is measured"
+    assert dict(task["round_trips"])["edge1"] >= 0.0, "the way is measured"
+    bed.wait(lambda: dict(bed.task("robot1")["round_trips"])["edge1"] < 0.05, 30, "it is no longer than it is")
     bed.wait(lambda: shown(bed)["workers"][0]["jobs"] is None, 30, "who has nothing to do says nothing")

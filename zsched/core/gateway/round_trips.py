@@ -4,8 +4,9 @@ Knows: which of our profiles another node has, and for how long. Does not know: 
 
 Every node's profile names the newest profile that it has of each other node, and for how long it has held it (as NTP
 does, and RTCP's DLSR, RFC 3550). The time since we sent that profile, less the hold, is the round trip, whatever the
-clocks show. A busy daemon takes a frame late, so the least of the last few counts. A way that becomes longer is seen
-that many profiles later. After a break the first one counts alone: what was before tells of another time.
+clocks show. Profiles are taken as they come while any task has a deadline; a busy daemon takes a frame late all the
+same, so the least of the last few counts. A way that becomes longer is seen that many profiles later. After a break the
+first one counts alone: what was before tells of another time.
 """
 
 from __future__ import annotations

@@ -39,7 +39,8 @@ def publish_profile(node: Stages, todo: ToDo, now: float) -> None:
     if node.has_deadlines:
         node.round_trips.note_sent(profile, now)
     node.gateway.absorb(profile, now)
-    todo.add(do.PublishProfile(profile=profile, is_news=node.profiler.has_news))
+    # A profile that waits for the hearer's next deadline would seem to have been under way for so long.
+    todo.add(do.PublishProfile(profile=profile, is_news=node.profiler.has_news or node.has_deadlines))
     _look_for_hangs(node, todo, now)
 
 
