@@ -108,8 +108,8 @@ class Gateway:
             return
         spec = self._tasks.get(task)
         candidates = () if spec is None else spec.candidates
-        known = [self._profiles[name][0] for name in candidates if name in self._profiles]
-        fastest = max((self.demands.speed(task, one) for one in known), default=None)
+        heard_now = (self.fresh(name, now) for name in candidates)  # a machine that is gone would do none of it
+        fastest = max((self.demands.speed(task, one) for one in heard_now if one is not None), default=None)
         if self.demands.is_replaced(task, profile):
             self.forget(task)
         has_share = self._shares.learn(task, profile, now)

@@ -9,7 +9,7 @@ from support.fleets import fleet_of, task_of
 from support.profiles import load_of, profile_of
 from zsched.core.gateway.gateway import EdgeData, Gateway
 from zsched.core.values.fleet import Demand
-from zsched.core.values.profile import Profile, WorkerState
+from zsched.core.values.profile import Jobs, Profile, WorkerState
 
 TASK = task_of(demand=Demand(cpu_cores=0.4, memory_mb=250.0))
 FLEET = fleet_of(TASK, of=("edge1", "edge2", "robot1"), electors=("robot1",))
@@ -155,6 +155,26 @@ def test_an_owner_without_a_fresh_profile_or_worker_is_not_learnt_from() -> None
 
     gateway.learn_demand("merge", "edge1", TTL_S)
     assert gateway.demand(TASK, profile()) == Demand(cpu_cores=1.5, memory_mb=600.0)
+
+
+@pytest.mark.parametrize("is_gone", [True, False])
+def test_a_quicker_machine_that_is_gone_does_not_set_the_need(*, is_gone: bool) -> None:
+    """Jobs that also wait for a disk, on a slow core: it needs what the quickest machine that is there would do."""
+    task = task_of(candidates=("edge1", "edge2"))
+    gateway = Gateway(fleet_of(task, of=("edge1", "edge2", "robot1"), electors=("robot1",)))
+    quick = profile_of("edge2", speed=4.0)
+    jobs = Jobs(time_s=0.2, cpu_s=0.15, wait_s=0.0, done_hz=5.0, wanted_hz=10.0)
+    load = load_of(cpu_cores=0.75, runnable=0.75, jobs=jobs)
+    slow = profile_of(speed=1.0, cpu_used_cores=0.75, runnable=0.75, workers=(load,))
+    gateway.absorb(quick, 0.0)
+    for sequence in range(30):
+        now = 100.0 + sequence
+        gateway.absorb(replace(slow, sequence=sequence), now)
+        if not is_gone:
+            gateway.absorb(replace(quick, sequence=sequence + 2), now)
+        gateway.learn_demand("merge", "edge1", now)
+    need = gateway.demand(task, slow).cpu_cores
+    assert need == pytest.approx(0.75 if is_gone else 1.5, rel=0.05)
 
 
 def test_profiles_are_fresh_together_until_the_first_of_them_is_not() -> None:
